@@ -9,7 +9,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.identify.fit import fit
 from nics_drl_bridge.identify.identify import calibrate, identify
-from nics_drl_bridge.report.calibration_pictures import timing_curves
+from nics_drl_bridge.report.fit_pictures import timing_curves
 from nics_drl_bridge.threads import Crew, one_blas_thread
 
 

@@ -28,8 +28,7 @@ from nics_drl_bridge.policy.training_settings import TrainingSettings, load_trai
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import save_recording
-from nics_drl_bridge.report.calibration_pictures import CAPTIONS, calibration_pictures
-from nics_drl_bridge.report.fit_pictures import accuracy
+from nics_drl_bridge.report.fit_pictures import CAPTIONS, accuracy, calibration_pictures
 from nics_drl_bridge.report.page import Block, Code, Picture, Table, page
 from nics_drl_bridge.report.pictures import Point, training_curve, trajectories
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot

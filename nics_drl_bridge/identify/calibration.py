@@ -88,9 +88,7 @@ def align(drive: Drive, calibration: Calibration) -> Samples:
 
     A recording that needs no correction is used bit for bit. Otherwise the pose is smoothed by
     local parabolas as far as its noise requires, and rows in gaps of the pose are dropped.
-
-    Raises:
-        RecordingError: the streams do not overlap in time.
+    Raises RecordingError: the streams do not overlap in time.
     """
     recording = drive.recording
     if calibration.is_identity and (shared := _shared_stamps(recording)) is not None:

@@ -18,23 +18,19 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import signals
 from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.drive import MIN_STAMPS, Drive, TwistIntervals
-from nics_drl_bridge.identify.statistics import (
-    minimise,
-    standard_errors,
-    uncertainty,
-    unexplained,
-)
+from nics_drl_bridge.identify.statistics import minimise, standard_errors, uncertainty, unexplained
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Target = tuple[Array, Array, Array]  # start (n,), end (n,) of intervals, a signal's means (n, K)
+Residual = Callable[[Array], Array]  # of a trial delay [s] and maybe the logarithms of lags
 
 STEP_S = 0.01
 LEAD_S = 2.0  # for the states to forget their initial values
 STEPS_S = (0.05, 0.005, 0.0005)
 SEARCH_S = 5.0
-LAG_RANGE_S = (0.005, 2.0)
+BOUNDS = ((-0.5, np.log(0.005)), (0.5, np.log(2.0)))  # of the delay [s], of log(lag / s)
 MAX_ROWS = 2000
 EXACT = 1e-6
 LONG_STEP = 1.5  # a step longer than this many usual steps is a gap
@@ -95,7 +91,7 @@ def response_residual(
 
     def residual(lags: Array, delay: float) -> Array:
         if not spec.state:
-            means = signals.held_features(command, spec, powers, start - delay, end - delay)
+            means = signals.held(command, spec, start - delay, end - delay, powers)
             return unexplained(means, signal)
         chi = taylor.evaluate(signals.inferred_states(command, spec, lags, delay, grid), powers)
         return unexplained(signals.interval_means(grid, chi, start, end), signal)
@@ -103,7 +99,7 @@ def response_residual(
     return residual
 
 
-def state_residual(command: Stream, state: Stream, spec: RobotSpec) -> Callable[[Array], Array]:
+def state_residual(command: Stream, state: Stream, spec: RobotSpec) -> Residual:
     """Returns the residual of a measured state's rates, given a delay (1,) of the commands [s]."""
     span = np.diff(state.t)
     keep = np.flatnonzero((span > 0.0) & (span < LONG_STEP * np.median(span)))
@@ -120,7 +116,7 @@ def state_residual(command: Stream, state: Stream, spec: RobotSpec) -> Callable[
     return residual
 
 
-def residual_by_shift(state: Stream, target: Target) -> Callable[[Array], Array]:
+def residual_by_shift(state: Stream, target: Target) -> Residual:
     """Returns the residual of the pose's rates, given a delay (1,) of the measured state [s]."""
     start, end, signal = target
     chi = taylor.evaluate(state.values, taylor.exponents(state.values.shape[1], 2))
@@ -132,18 +128,13 @@ def residual_by_shift(state: Stream, target: Target) -> Callable[[Array], Array]
     return residual
 
 
-def _search_or_zero(
-    residual: Callable[[Array], Array], centers: tuple[float, ...] = (0.0,)
-) -> DelayEstimate:
-    """Estimates a delay; exactly zero if zero explains the signal to rounding."""
+def _search_or_zero(residual: Residual, centers: tuple[float, ...] = (0.0,)) -> DelayEstimate:
     if np.sqrt((residual(np.zeros(1)) ** 2).mean()) < EXACT:
         return DelayEstimate(0.0, 0.0, np.zeros(0), np.zeros(0), 1.0)
     return _search(residual, centers, np.zeros(0))
 
 
-def _search(
-    residual: Callable[[Array], Array], centers: tuple[float, ...], lags: Array
-) -> DelayEstimate:
+def _search(residual: Residual, centers: tuple[float, ...], lags: Array) -> DelayEstimate:
     """Finds the delay on ever finer grids, then refines it together with the lags' logarithms."""
     around, log_lags = np.array(centers), np.log(lags)
     for reach, step in zip((SEARCH_S, *STEPS_S[:-1]), STEPS_S, strict=True):
@@ -151,10 +142,7 @@ def _search(
         cost = [float((residual(np.append(d, log_lags)) ** 2).sum()) for d in tries]
         around = tries[[int(np.argmin(cost))]]
     start = np.append(around, log_lags)
-    low, high = (
-        np.append(start[0] + reach, np.full(len(lags), np.log(least)))
-        for reach, least in zip((-0.5, 0.5), LAG_RANGE_S, strict=True)
-    )
+    low, high = (np.append(start[0] + reach, np.full(len(lags), limit)) for reach, limit in BOUNDS)
     found, jacobian, rest = minimise(residual, start, np.full(len(start), 0.1), (low, high))
     if float((rest**2).sum()) >= min(cost):
         found, rest = start, residual(start)
@@ -178,29 +166,30 @@ class TimingEstimate:
 def timing_of(drive: Drive) -> TimingEstimate:
     """Estimates clock offset, latency and lags as far as the recording allows (RecordingError)."""
     recording, spec, twists = drive.recording, drive.spec, drive.twists
+    command, state, place = recording.command, recording.state, recording.source
     missing = [v.name for v in spec.state if v.follows is None]
-    if recording.state is None and missing:
+    if state is None and missing:
         raise RecordingError(
-            f"{recording.source}: has no measured state, and {missing[0]!r} of robot {spec.name!r} "
-            "follows no command; record the state too, or add `follows:` to the robot's YAML file."
+            f"{place}: has no measured state, and {missing[0]!r} of robot {spec.name!r} follows no "
+            "command; record the state too, or add `follows:` to the robot's YAML file."
         )
     if len(twists.start) < MIN_STAMPS:
         raise RecordingError(
-            f"{recording.source}: pose: only {len(twists.start)} usable intervals; record a drive "
-            "of 20 s or more without long gaps."
+            f"{place}: pose: only {len(twists.start)} usable intervals; record a drive of 20 s or "
+            "more without long gaps."
         )
-    if recording.state is not None:
-        return _timing_of_measured_state(drive, recording.state)
-    if not signals.moved_commands(recording.command).any():
-        start = recording.command.t[0] - recording.pose.t[0]
+    if state is not None:
+        return _timing_of_measured_state(drive, state)
+    if not signals.moved_commands(command).any():
+        start = command.t[0] - recording.pose.t[0]
         return nominal_timing(drive, float(start) if abs(start) > 60.0 else 0.0)
     target = (twists.start, twists.end, twists.twist)
-    if recording.pose.clock == recording.command.clock:
-        delay = delay_of_response(recording.command, spec, target)
-        latency = if_certain(max(delay.value, 0.0), delay.sigma, MIN_TIME_S)
-        sigma = {"command_latency_s": delay.sigma}
-        return TimingEstimate(0.0, latency, sigma, delay.lags, delay.lag_sigma, True)
-    return _timing_of_two_clocks(recording, spec, target)
+    if recording.pose.clock != command.clock:
+        return _timing_of_two_clocks(recording, spec, target)
+    delay = delay_of_response(command, spec, target)
+    latency = if_certain(max(delay.value, 0.0), delay.sigma, MIN_TIME_S)
+    sigma = {"command_latency_s": delay.sigma}
+    return TimingEstimate(0.0, latency, sigma, delay.lags, delay.lag_sigma, True)
 
 
 def nominal_timing(drive: Drive, offset: float = 0.0) -> TimingEstimate:
@@ -211,18 +200,14 @@ def nominal_timing(drive: Drive, offset: float = 0.0) -> TimingEstimate:
 
 def _timing_of_two_clocks(recording: Recording, spec: RobotSpec, target: Target) -> TimingEstimate:
     """Estimates offset and latency apart if the wheels follow the commands, else their sum."""
-    centers, wheels = _likely_shifts(recording), _wheel_delay(recording, spec)
-    delay = delay_of_response(
-        recording.command, spec, target, centers, None if wheels is None else wheels.lags
-    )
+    wheels = _wheel_delay(recording, spec)
+    lags = None if wheels is None else wheels.lags
+    delay = delay_of_response(recording.command, spec, target, _likely_shifts(recording), lags)
     if wheels is None:
         sigma = {"clock_offset_s": delay.sigma}
         return TimingEstimate(-delay.value, 0.0, sigma, delay.lags, delay.lag_sigma, False)
-    sigma = {
-        "clock_offset_s": float(np.hypot(wheels.sigma, delay.sigma)),
-        "command_latency_s": wheels.sigma,
-    }
-    latency = max(wheels.value, 0.0)
+    both, latency = float(np.hypot(wheels.sigma, delay.sigma)), max(wheels.value, 0.0)
+    sigma = {"clock_offset_s": both, "command_latency_s": wheels.sigma}
     offset = latency - delay.value
     return TimingEstimate(offset, latency, sigma, wheels.lags, wheels.lag_sigma, True)
 
@@ -268,13 +253,12 @@ def if_certain(value: float, sigma: float, least: float) -> float:
 
 def expected_states(drive: Drive, twists: TwistIntervals, timing: TimingEstimate) -> Array:
     """Returns the mean state (n, S) over the intervals of the twists; inferred ones at gain 1."""
-    recording, (start, end) = drive.recording, twists.on_clock(timing.offset)
-    if recording.state is not None:
-        return signals.interval_means(recording.state.t, recording.state.values, start, end)
-    grid = np.arange(min(start[0], recording.command.t[0]) - 1.0, end[-1] + 0.01, 0.01)
-    states = signals.inferred_states(
-        recording.command, drive.spec, timing.lags, timing.latency, grid
-    )
+    command, state = drive.recording.command, drive.recording.state
+    start, end = twists.on_clock(timing.offset)
+    if state is not None:
+        return signals.interval_means(state.t, state.values, start, end)
+    grid = np.arange(min(start[0], command.t[0]) - 1.0, end[-1] + 0.01, 0.01)
+    states = signals.inferred_states(command, drive.spec, timing.lags, timing.latency, grid)
     return signals.interval_means(grid, states, start, end)
 
 
@@ -334,17 +318,17 @@ def with_wheels(drive: Drive, calibration: Calibration) -> Calibration:
         agreement = float((difference * turn).mean()) / size
         swapped = agreement < 0.0 if abs(agreement) > 0.5 else None
         calibration = replace(calibration, wheels_swapped=swapped)
+    sigma = dict(calibration.uncertainty)
     rows = {
         "wheel_scale": (wheels.mean(axis=1), speed_along(drive, calibration)),
         "turn_scale": (difference, turn),
     }
+    scales: dict[str, Any] = {}
     for name, (units, moved) in rows.items():
         if not float(units @ units) > 0.0:
             continue
         scale = float(units @ moved / (units @ units))
-        sigma = float(standard_errors(units[:, None], moved - scale * units)[0])
-        if abs(scale) > CERTAIN * sigma:
-            known: dict[str, Any] = {name: scale}
-            known["uncertainty"] = {**calibration.uncertainty, name: sigma}
-            calibration = replace(calibration, **known)
-    return calibration
+        error = float(standard_errors(units[:, None], moved - scale * units)[0])
+        if abs(scale) > CERTAIN * error:
+            scales[name], sigma[name] = scale, error
+    return replace(calibration, **scales, uncertainty=sigma)

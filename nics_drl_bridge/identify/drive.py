@@ -78,10 +78,23 @@ class Drive:
 
     @cached_property
     def twists(self) -> TwistIntervals:
-        """Twists of the tracked body over intervals as long as the pose noise requires."""
-        (t, pose), bursts = (self.dated.t, self.dated.values), self.bursts
-        stride = 1 if bursts is not None else _stride(t, pose, self.pose_noise or (0.0, 0.0))
-        limit = 1.8 * bursts.period_s if bursts is not None else MAX_GAP_S
+        """Twists of the tracked body over intervals as long as the pose noise requires.
+
+        Between samples so far apart, motion stands out of the noise.
+        """
+        t, pose, stride, limit = self.dated.t, self.dated.values, 1, MAX_GAP_S
+        if self.bursts is not None:
+            limit = 1.8 * self.bursts.period_s
+        else:
+            dt = float(np.median(np.diff(t)))
+            coarse = max(1, round(MAX_SPAN_S / dt))
+            far = geometry.log(geometry.between(pose[:-coarse:coarse], pose[coarse::coarse]))
+            far = far / (coarse * dt)
+            speed = float(np.sqrt((far[:, :2] ** 2).sum(axis=1).mean())) if len(far) else 0.0
+            turn = float(np.sqrt((far[:, 2] ** 2).mean())) if len(far) else 0.0
+            both = zip(self.pose_noise or (0.0, 0.0), (speed, turn), strict=True)
+            needed = max(noise / max(SLOPE_NOISE * size, 1e-9) for noise, size in both)
+            stride = int(np.clip(np.ceil(np.sqrt(2.0) * needed / dt), 1, coarse))
         t, pose = t[::stride], pose[::stride]
         span = np.diff(t)
         usable = (span > 0.0) & (span < max(limit, 3.0 * float(np.median(span))))
@@ -137,34 +150,26 @@ def pose_noise(pose: Stream, bursts: Bursts | None) -> tuple[float, float] | Non
     They come from sixth differences, in which smooth motion vanishes; in bursts, whose sample
     times are not known well enough, from stretches at rest. None if there are none.
     """
-    if bursts is None:
-        rest = _high_differences(pose)
-        sigma = np.median(np.abs(rest), axis=0) / GAUSSIAN_MAD if len(rest) >= DIFFERENCE else None
-    else:
+    if bursts is not None:
         sigma = _spread_at_rest(unwrapped(pose.values))
+    else:
+        rest = pose_residual(pose)
+        sigma = np.median(np.abs(rest), axis=0) / GAUSSIAN_MAD if len(rest) >= DIFFERENCE else None
     if sigma is None:
         return None
     sigma = np.where(sigma < NEGLIGIBLE, 0.0, sigma)
     return float(np.hypot(sigma[0], sigma[1]) / np.sqrt(2.0)), float(sigma[2])
 
 
-def pose_residual(drive: Drive) -> Array | None:
-    """Returns the noise (n, 3) of poses at its own scale; None for bursts or too few poses."""
-    pose = drive.recording.pose
-    if drive.bursts is not None or len(pose.t) <= 2 * DIFFERENCE:
-        return None
-    return _high_differences(pose)
-
-
-def _high_differences(pose: Stream) -> Array:
+def pose_residual(pose: Stream) -> Array:
     """Returns sixth differences (n, 3) at the scale of the noise, over gap-free stretches."""
-    rest = np.diff(unwrapped(pose.values), DIFFERENCE, axis=0) / DIFFERENCE_GAIN
+    rest = np.asarray(np.diff(unwrapped(pose.values), DIFFERENCE, axis=0) / DIFFERENCE_GAIN)
     if not len(rest):
-        return np.asarray(rest)
+        return rest
     span = np.diff(pose.t)
     even = np.abs(span - np.median(span)) < UNEVEN * np.median(span)
     whole = np.convolve(even, np.ones(DIFFERENCE), "valid") > DIFFERENCE - 0.5
-    return np.asarray(rest[whole] if whole.mean() > LEAST_WHOLE else rest)
+    return np.asarray(rest[whole]) if whole.mean() > LEAST_WHOLE else rest
 
 
 def _spread_at_rest(pose: Array) -> Array | None:
@@ -192,15 +197,3 @@ class TwistIntervals:
     def on_clock(self, offset: float) -> tuple[Array, Array]:
         """Returns start and end on a clock that is ahead of the pose's by an offset."""
         return self.start + offset, self.end + offset
-
-
-def _stride(t: Array, pose: Array, noise: tuple[float, float]) -> int:
-    """Returns the number of samples between poses that makes motion stand out of the noise."""
-    dt = float(np.median(np.diff(t)))
-    coarse = max(1, round(MAX_SPAN_S / dt))
-    far = geometry.log(geometry.between(pose[:-coarse:coarse], pose[coarse::coarse]))
-    far = far / (coarse * dt)
-    speed = float(np.sqrt((far[:, :2] ** 2).sum(axis=1).mean())) if len(far) else 0.0
-    turn = float(np.sqrt((far[:, 2] ** 2).mean())) if len(far) else 0.0
-    needed = max(n / max(SLOPE_NOISE * v, 1e-9) for n, v in zip(noise, (speed, turn), strict=True))
-    return int(np.clip(np.ceil(np.sqrt(2.0) * needed / dt), 1, coarse))

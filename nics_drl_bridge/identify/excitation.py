@@ -116,9 +116,7 @@ def moved_terms(
             "lower the order."
         )
     if len(unmoved) == len(names):
-        raise FitError(
-            "no command ever changed, so nothing can be learnt; vary each over its range."
-        )
+        raise FitError("no command ever changed, so nothing can be learnt; vary each command.")
     return moved
 
 
@@ -182,14 +180,13 @@ def plausible(x: Array, spec: RobotSpec) -> NDArray[np.bool_]:
 
 def _concentrated(chi: Array, target: Array, chosen: NDArray[np.intp]) -> Array:
     """Returns absolute residuals (T,) of the fit to the best fitting rows, found from `chosen`."""
-    rest = _left(chi, target, chosen)
     for _ in range(CONCENTRATIONS):
+        rest = _left(chi, target, chosen)
         again = np.argsort(rest, kind="stable")[: len(chosen)]
         if np.array_equal(np.sort(again), np.sort(chosen)):
-            break
+            return rest
         chosen = again
-        rest = _left(chi, target, chosen)
-    return rest
+    return _left(chi, target, chosen)
 
 
 def _left(chi: Array, target: Array, rows: NDArray[np.intp] | slice = slice(None)) -> Array:

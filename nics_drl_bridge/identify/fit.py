@@ -52,8 +52,7 @@ SAME_STEP, ROUNDING_S = 1e-3, 1e-6
 def parse_alpha(text: str) -> Alpha:
     """Parses a pruning threshold of Eq. 2.
 
-    Raises:
-        ConfigError: it is neither a number from 0 to 1 nor `auto`.
+    Raises ConfigError: it is neither a number from 0 to 1 nor `auto`.
     """
     if text == "auto":
         return "auto"
@@ -117,11 +116,9 @@ def regress(
 
     The order of the expansion is 1 to 4; the paper's is 2. `noisy` is any recording but an exact
     one: insignificant terms are dropped before Eq. 2 is applied to the rest, and the body twist is
-    a function of the state alone, if there is one, and zero at zero speed, if the speed moved.
-    For within a step a command acts through the state, and in noise the two can't be told apart.
-
-    Raises:
-        FitError: too few samples, or nothing moved.
+    a function of the state alone, if there is one, and zero at zero speed, if the speed moved. For
+    within a step a command acts through the state, and in noise the two can't be told apart.
+    Raises FitError: too few samples, or nothing moved.
     """
     believed = plausible(samples.x, spec)
     samples = samples.rows(believed)
@@ -156,7 +153,6 @@ def regress(
 
 
 def _scale(chi: Array) -> Array:
-    """Returns the spread (K,) of each feature; 1 for the constant."""
     spread = chi.std(axis=0)
     return np.where(spread > 0.0, spread, 1.0)
 

@@ -280,11 +280,9 @@ def identify(
     """Learns a robot's motion from the first part of a recording and tests it on the rest.
 
     Every command must have varied. The first part ends at `train_until`, counted from the first
-    pose [s]; after two thirds of the drive when None. For the other options, see `Settings`.
-
-    Raises:
-        RecordingError: the recording can't be used for this robot.
-        FitError: the drive does not contain enough information to fit a model.
+    pose [s]; after two thirds of the drive when None. For the other options, see `Settings`. Raises
+    RecordingError: the recording can't be used for this robot. Raises FitError: the drive does not
+    contain enough information to fit a model.
     """
     drive = Drive(check(recording, spec), spec)
     until = TRAIN_SHARE * drive.duration_s if train_until is None else train_until
@@ -301,8 +299,7 @@ def identify(
 def calibrate(recording: Recording, spec: RobotSpec) -> Calibration:
     """Estimates the corrections that a recording needs before a fit; the identity if none.
 
-    Raises:
-        RecordingError: the recording can't be used for this robot.
+    Raises RecordingError: the recording can't be used for this robot.
     """
     found = run(CALIBRATION, Drive(check(recording, spec), spec))
     return replace(found.calibration, notes=_sentences(found))

@@ -54,17 +54,11 @@ def _follow_derivatives(now, values, dof, free, dx, dy, turn, along_x, along_y, 
 def follow(ends, moved, x, steps, share, terms, free, dt):  # type: ignore[no-untyped-def]
     """Integrates body twists along courses of X that do not depend on the coefficients.
 
-    Each step is the exact arc of its twist, as in the simulator. Shapes: W windows, T steps, V
-    variables, P free coefficients.
-
-    Args:
-        ends: (W, 3) output: end poses relative to the starts, headings unwrapped.
-        moved: (W, 3, P) output: their derivatives by the free coefficients. P = 0 skips them.
-        x: (W, T, V + 1) X during each step, and a last entry of 1.
-        steps, share: (W,) whole steps to the end, and the remaining fraction of one more.
-        terms: of the twist, see `robot.kernels.Terms`.
-        free: (P,) indices of the free terms.
-        dt: length of a step [s].
+    Each step is the exact arc of its twist, as in the simulator. Written are `ends` (W, 3), the end
+    poses relative to the starts, headings unwrapped, and `moved` (W, 3, P), their derivatives by
+    the `free` (P,) of the `terms` of the twist (`robot.kernels.Terms`); P = 0 skips them. `x` (W,
+    T, V + 1) is X during each step, and a last entry of 1; `steps`, `share` (W,) are the whole
+    steps to the end and the remaining fraction of one more; `dt` is the length of a step [s].
     """
     dof, coefficient = terms.dof, terms.coefficient
     factors, count = terms.factors, terms.degree

@@ -16,13 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array, rotate, wrap_angle
+from nics_drl_bridge.identify import clocks
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.clocks import (
-    LONG_STEP,
-    TimingEstimate,
-    expected_states,
-    if_certain,
-)
 from nics_drl_bridge.identify.drive import Drive, TwistIntervals
 from nics_drl_bridge.identify.signals import followed, held
 from nics_drl_bridge.identify.statistics import standard_errors
@@ -48,7 +43,9 @@ class Mounting:
     turns: bool  # True if the robot turned at all
 
 
-def mounting_of(drive: Drive, timing: TimingEstimate, speed: Array | None) -> Mounting | None:
+def mounting_of(
+    drive: Drive, timing: clocks.TimingEstimate, speed: Array | None
+) -> Mounting | None:
     """Estimates the mounting as far as the drive shows it; None if it does not.
 
     The speed (n,) along the direction of travel is expected over the intervals of the twists, up to
@@ -73,14 +70,11 @@ def mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
     names = ("rotation_rad", "lever_arm_x_m", "lever_arm_y_m")
     values = map(float, (mounting.rotation, *mounting.lever))
     sigmas = tuple(map(float, (mounting.rotation_sigma, *mounting.lever_sigma)))
-    rotation, x, y = (if_certain(v, s, MIN_LENGTH) for v, s in zip(values, sigmas, strict=True))
+    both = zip(values, sigmas, strict=True)
+    rotation, x, y = (clocks.if_certain(value, sigma, MIN_LENGTH) for value, sigma in both)
     learnt = {n: s for n, s in zip(names, sigmas, strict=True) if not np.isnan(s)}
-    return replace(
-        calibration,
-        rotation_rad=rotation,
-        lever_arm_m=(x, y),
-        uncertainty={**calibration.uncertainty, **learnt},
-    )
+    uncertainty = {**calibration.uncertainty, **learnt}
+    return replace(calibration, rotation_rad=rotation, lever_arm_m=(x, y), uncertainty=uncertainty)
 
 
 def mounting_without_lateral_motion(motion: TwistIntervals, forward: Array) -> Mounting | None:
@@ -132,14 +126,16 @@ def lateral_lever(motion: TwistIntervals, rotation: float, speed: Array) -> tupl
     return -float(beta[1]), float(standard_errors(chi, along - chi @ beta)[1])
 
 
-def _by_commands(timing: TimingEstimate, drive: Drive, twists: TwistIntervals) -> Mounting | None:
+def _by_commands(
+    timing: clocks.TimingEstimate, drive: Drive, twists: TwistIntervals
+) -> Mounting | None:
     """Estimates the mounting on an omnidirectional robot from its state, or else its commands.
 
     None unless the robot moved along x and y and turned.
     """
     recording, spec = drive.recording, drive.spec
     if spec.state:
-        expected = expected_states(drive, twists, timing)
+        expected = clocks.expected_states(drive, twists, timing)
         command = _as_commands(expected, drive, timing.latency)
     else:
         begin = twists.start + timing.offset - timing.latency
@@ -155,12 +151,9 @@ def _by_commands(timing: TimingEstimate, drive: Drive, twists: TwistIntervals) -
     across = rotate(gain[2, :2], -rotation) / gain[2, 2]  # (-lever_y, lever_x)
     scale = float(np.hypot(gain[0, 0], gain[0, 1]))
     return Mounting(
-        float(wrap_angle(rotation)),
-        np.array([across[1], -across[0]]),
-        float(spread[0, 1] / scale),
-        np.full(2, float(spread[2, 0] / abs(gain[2, 2]))),
-        True,
-    )
+        float(wrap_angle(rotation)), np.array([across[1], -across[0]]), float(spread[0, 1] / scale),
+        np.full(2, float(spread[2, 0] / abs(gain[2, 2]))), True,
+    )  # fmt: skip
 
 
 def _as_commands(states: Array, drive: Drive, latency: float) -> Array:
@@ -169,7 +162,7 @@ def _as_commands(states: Array, drive: Drive, latency: float) -> Array:
     if stream is None:
         return states[:, np.argsort(followed(spec))]
     span = np.diff(stream.t)
-    keep = (span > 0.0) & (span < LONG_STEP * np.median(span))
+    keep = (span > 0.0) & (span < clocks.LONG_STEP * np.median(span))
     keep &= _fresh(command, stream.t[:-1] - latency)
     rates = np.diff(stream.values, axis=0)[keep] / span[keep, None]
     before = stream.values[:-1][keep]
@@ -188,10 +181,10 @@ def _fresh(command: Stream, start: Array) -> NDArray[np.bool_]:
     """Selects the times (n,) at which the command is known: not in gaps of regular rows."""
     span = np.diff(command.t)
     usual = float(np.median(span)) if len(span) else 0.0
-    if not (span < LONG_STEP * usual).mean() > REGULAR:
+    if not (span < clocks.LONG_STEP * usual).mean() > REGULAR:
         return np.ones(len(start), dtype=np.bool_)
     row = np.searchsorted(command.t, start + 1e-9, "right") - 1
-    return np.asarray(np.append(span, 0.0)[np.clip(row, 0, None)] < LONG_STEP * usual)
+    return np.asarray(np.append(span, 0.0)[np.clip(row, 0, None)] < clocks.LONG_STEP * usual)
 
 
 Estimate = Callable[[Drive, TwistIntervals], Mounting | None]
@@ -207,33 +200,23 @@ def jackknifed(
     whole = estimate(drive, twists)
     if whole is None:
         return None
-    edges = np.linspace(twists.start[0], twists.end[-1], BLOCKS + 1)
-    parts = (estimate(*_without(drive, twists, offset, *ends)) for ends in pairwise(edges))
-    found = [part for part in parts if part is not None]
+    edges, found = np.linspace(twists.start[0], twists.end[-1], BLOCKS + 1), []
+    for begin, end in pairwise(edges):
+        rows, rest = (twists.end <= begin) | (twists.start >= end), drive
+        if (state := drive.recording.state) is not None:
+            outside = (state.t < begin + offset) | (state.t > end + offset)
+            rest = drive.part(replace(drive.recording, state=state.rows(outside)))
+        kept = TwistIntervals(twists.start[rows], twists.end[rows], twists.twist[rows])
+        if (part := estimate(rest, kept)) is not None:
+            found.append(part)
     if len(found) < BLOCKS:
         return whole
     rotation = wrap_angle(np.array([p.rotation - whole.rotation for p in found]))
-    lever = np.array([p.lever for p in found])
-    return replace(
-        whole,
-        rotation_sigma=max(whole.rotation_sigma, float(_spread(rotation))),
-        lever_sigma=np.maximum(whole.lever_sigma, _spread(lever)),
-    )
+    rotation_sigma = max(whole.rotation_sigma, float(_spread(rotation)))
+    lever_sigma = np.maximum(whole.lever_sigma, _spread(np.array([p.lever for p in found])))
+    return replace(whole, rotation_sigma=rotation_sigma, lever_sigma=lever_sigma)
 
 
 def _spread(values: Array) -> Array:
     """Returns standard errors (...) from estimates (B, ...) that each omit one block."""
     return np.asarray(np.sqrt((len(values) - 1.0) * values.var(axis=0)))
-
-
-def _without(
-    drive: Drive, twists: TwistIntervals, offset: float, begin: float, end: float
-) -> tuple[Drive, TwistIntervals]:
-    """Drops the twists and the measured state between two times of the pose's clock [s]."""
-    rows = (twists.end <= begin) | (twists.start >= end)
-    kept = TwistIntervals(twists.start[rows], twists.end[rows], twists.twist[rows])
-    state = drive.recording.state
-    if state is None:
-        return drive, kept
-    outside = (state.t < begin + offset) | (state.t > end + offset)
-    return drive.part(replace(drive.recording, state=state.rows(outside))), kept

@@ -7,22 +7,15 @@ reported velocities from the motion.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify import open_loop
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, find_bursts, pose_noise
-from nics_drl_bridge.identify.open_loop import (
-    Windows,
-    course_of,
-    predict,
-    relative_ends,
-    tracked_ends,
-    windows,
-)
 from nics_drl_bridge.identify.signals import white_noise
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.noise import ASSUMED_STATE_DRIFT, MEASURED, Level, Noise, assumed
@@ -52,7 +45,7 @@ def sensor_noise(drive: Drive) -> Noise:
     known = np.array([part for part in parts if part is not None])
     spread = known.std(axis=0, ddof=1) / np.sqrt(len(known)) if len(known) > 1 else [None, None]
     position, heading = (
-        Level(std=std, unit=unit, source=MEASURED, uncertainty=None if u is None else float(u))
+        _measured(std, unit, None if u is None else float(u))
         for std, unit, u in zip(whole, ("m", "rad"), spread, strict=True)
     )
     return Noise(pose_position=position, pose_heading=heading)
@@ -65,18 +58,18 @@ def motion_noise(
 
     The odometry's is that of the recorded one; else of the wheels, if their scale is known.
     """
-    measured: dict[str, Level | dict[str, Level]] = {
-        "state_drift": _state_drift(drive, model, samples)
-    }
+    measured: dict[str, Any] = {"state_drift": _state_drift(drive, model, samples)}
     rest = odometry_residual(drive, calibration, model, samples)
     if rest is not None:
         linear = (_level(rest[:, i], "m/s") for i in (0, 1))
         measured["odom_linear"] = max(linear, key=lambda found: found.std)
         measured["odom_angular"] = _level(rest[:, 2], "rad/s")
-    drift = _pose_drift(sensor, drive, calibration, model)
-    if drift is not None:
-        measured |= {"position_drift": drift[0], "heading_drift": drift[1]}
+    measured |= _pose_drift(sensor, drive, calibration, model)
     return sensor.model_copy(update=measured)
+
+
+def _measured(std: float, unit: str, uncertainty: float | None) -> Level:
+    return Level(std=std, unit=unit, source=MEASURED, uncertainty=uncertainty)
 
 
 def level(variances: Array, unit: str) -> Level:
@@ -84,27 +77,44 @@ def level(variances: Array, unit: str) -> Level:
 
     The uncertainty comes from blocks of the drive.
     """
-    variance = max(float(variances.mean()), 0.0)
+    std = float(np.sqrt(max(float(variances.mean()), 0.0)))
     means = np.array([part.mean() for part in np.array_split(variances, BLOCKS)])
     spread = float(means.std(ddof=1) / np.sqrt(BLOCKS))
-    std = float(np.sqrt(variance))
     if std < NEGLIGIBLE:
-        return Level(std=0.0, unit=unit, source=MEASURED, uncertainty=0.0)
-    uncertainty = spread / (2.0 * std) if std**2 > spread else float(np.sqrt(spread))
-    return Level(std=std, unit=unit, source=MEASURED, uncertainty=uncertainty)
+        return _measured(0.0, unit, 0.0)
+    return _measured(std, unit, spread / (2.0 * std) if std**2 > spread else float(np.sqrt(spread)))
+
+
+def _errors(
+    drive: Drive, calibration: Calibration, model: TaylorModel, horizon: float
+) -> tuple[open_loop.Windows, Array] | None:
+    chosen = open_loop.windows(drive, calibration, 0.0, drive.duration_s, horizon, SPACING_S)
+    if len(chosen.start_t) < MIN_WINDOWS:
+        return None
+    if (state := drive.recording.state) is None:
+        ends = open_loop.predict(model, calibration, drive, chosen)
+    else:  # from the state measured all the way, so that its drift is not counted twice
+        course = open_loop.course_of(model, calibration, drive, chosen)
+        begin = chosen.start_t + calibration.clock_offset_s
+        t = begin[:, None] + model.dt * np.arange(course.x.shape[1])
+        for i, column in enumerate(state.values.T):
+            course.x[:, :, i] = np.interp(t, state.t, column)
+        ends = open_loop.tracked_ends(
+            chosen, calibration, open_loop.relative_ends(course, model)[0]
+        )
+    return chosen, geometry.between(ends, chosen.end)
 
 
 def _pose_drift(
     sensor: Noise, drive: Drive, calibration: Calibration, model: TaylorModel
-) -> tuple[Level, Level] | None:
-    """Returns the drift of position and heading; None if too short or the model diverges."""
-    chosen = windows(drive, calibration, 0.0, drive.duration_s, HORIZON_S, SPACING_S)
-    if len(chosen.start_t) < MIN_WINDOWS:
-        return None
-    error = geometry.between(_predicted(drive, calibration, model, chosen), chosen.end)
+) -> dict[str, Level]:
+    """Returns the drift of position and heading; none if too short or the model diverges."""
+    if (found := _errors(drive, calibration, model, HORIZON_S)) is None:
+        return {}
+    chosen, error = found
     size = np.hypot(error[:, 0], error[:, 1])
     if not (size < RUN_AWAY_M).all():
-        return None
+        return {}
     inside = size <= OUTLYING * max(float(np.median(size)), TINY)
     position, _, heading = sensor.pose
     away = np.sum((chosen.end - chosen.start)[inside, :2] ** 2, axis=1)
@@ -113,7 +123,10 @@ def _pose_drift(
     # Errors of the initial heading, and heading drift on the way, cause lateral errors.
     aside = 0.5 * away * (heading**2 + grown / 3.0)
     shift = 0.5 * size[inside] ** 2 - 2.0 * position**2 - aside
-    return level(shift / HORIZON_S, "m/sqrt(s)"), level(turn / HORIZON_S, "rad/sqrt(s)")
+    return {
+        "position_drift": level(shift / HORIZON_S, "m/sqrt(s)"),
+        "heading_drift": level(turn / HORIZON_S, "rad/sqrt(s)"),
+    }
 
 
 def drift_growth(
@@ -125,29 +138,11 @@ def drift_growth(
     """
     rows = []
     for horizon in GROWTH_S:
-        chosen = windows(drive, calibration, 0.0, drive.duration_s, horizon, SPACING_S)
-        if len(chosen.start_t) < MIN_WINDOWS:
+        if (found := _errors(drive, calibration, model, horizon)) is None:
             break
-        error = geometry.between(_predicted(drive, calibration, model, chosen), chosen.end)
-        square = np.mean(error**2, axis=0)
+        square = np.mean(found[1] ** 2, axis=0)
         rows.append((horizon, np.sqrt(0.5 * (square[0] + square[1])), np.sqrt(square[2])))
     return tuple(np.array(rows).T) if rows else None
-
-
-def _predicted(
-    drive: Drive, calibration: Calibration, model: TaylorModel, chosen: Windows
-) -> Array:
-    """Predicts end poses (W, 3) from the state, measured so that its drift is not counted twice."""
-    state = drive.recording.state
-    if state is None:
-        return predict(model, calibration, drive, chosen)
-    course = course_of(model, calibration, drive, chosen)
-    x, begin = course.x.copy(), chosen.start_t + calibration.clock_offset_s
-    t = begin[:, None] + model.dt * np.arange(x.shape[1])
-    for i, column in enumerate(state.values.T):
-        x[:, :, i] = np.interp(t, state.t, column)
-    course = replace(course, x=x)
-    return tracked_ends(course.chosen, calibration, relative_ends(course, model)[0])
 
 
 def _state_drift(drive: Drive, model: TaylorModel, samples: Samples) -> dict[str, Level]:
@@ -210,5 +205,4 @@ def _level(rest: Array, unit: str) -> Level:
         float(np.percentile(np.abs(part - np.median(part)), WITHIN_SIGMA))
         for part in (rest, *np.array_split(rest, BLOCKS))
     )
-    uncertainty = float(np.std(parts, ddof=1) / np.sqrt(BLOCKS))
-    return Level(std=std, unit=unit, source=MEASURED, uncertainty=uncertainty)
+    return _measured(std, unit, float(np.std(parts, ddof=1) / np.sqrt(BLOCKS)))

@@ -66,7 +66,11 @@ def windows(
     if calibration.responses:
         first = max(first, drive.recording.command.t[0] - calibration.clock_offset_s + SETTLE_S)
     begin = np.flatnonzero((t >= first) & (t + horizon <= origin + stop + period / 2.0))
-    begin = begin[_spaced(t[begin], spacing)]
+    chosen: list[int] = []
+    for k in begin:
+        if not chosen or t[k] - t[chosen[-1]] > 0.9 * spacing:
+            chosen.append(int(k))
+    begin = np.array(chosen, dtype=np.intp)
     after = np.clip(np.searchsorted(t, t[begin] + horizon), 1, len(t) - 1)
     before_is_nearer = t[begin] + horizon - t[after - 1] < t[after] - t[begin] - horizon
     end = after - before_is_nearer
@@ -75,15 +79,6 @@ def windows(
     begin, end = begin[good], end[good]
     length = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T)))
     return Windows(t[begin], t[end], pose[begin], pose[end], length[end] - length[begin])
-
-
-def _spaced(t: Array, spacing: float) -> NDArray[np.intp]:
-    """Returns indices of times (T,) that are at least (nearly) `spacing` apart [s]."""
-    chosen: list[int] = []
-    for k, value in enumerate(t):
-        if not chosen or value - t[chosen[-1]] > 0.9 * spacing:
-            chosen.append(k)
-    return np.array(chosen, dtype=np.intp)
 
 
 def predict(model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows) -> Array:
@@ -172,24 +167,15 @@ def open_loop_error(
     position = np.hypot(error[:, 0], error[:, 1])
     moved = chosen.end - chosen.start
     return OpenLoop(
-        horizon_s=horizon,
-        windows=len(position),
-        mean_position_error_m=float(position.mean()),
-        median_position_error_m=float(np.median(position)),
-        max_position_error_m=float(position.max()),
-        mean_heading_error_rad=float(np.abs(geometry.wrap_angle(error[:, 2])).mean()),
-        mean_path_m=float(chosen.path.mean()),
-        median_displacement_m=float(np.median(np.hypot(moved[:, 0], moved[:, 1]))),
-    )
+        horizon, len(position), float(position.mean()), float(np.median(position)),
+        float(position.max()), float(np.abs(geometry.wrap_angle(error[:, 2])).mean()),
+        float(chosen.path.mean()), float(np.median(np.hypot(moved[:, 0], moved[:, 1]))),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Course:
-    """X over windows, step by step, of a drive whose state was measured.
-
-    One pass through a window gives the pose at its end and its derivatives by all coefficients of
-    the twist.
-    """
+    """X over windows, step by step, of a drive whose state was measured."""
 
     chosen: Windows  # the windows
     x: Array  # (W, T, V + 1) X during each step, and a last entry of 1

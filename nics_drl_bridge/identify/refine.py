@@ -9,24 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify import open_loop
 from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.open_loop import (
-    Course,
-    Windows,
-    course_of,
-    predict,
-    relative_ends,
-    tracked_ends,
-    tracked_slopes,
-    windows,
-)
+from nics_drl_bridge.identify.signals import speed_index
 from nics_drl_bridge.identify.statistics import clustered_errors, minimise, uncertainty
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -60,23 +53,24 @@ def refined(
     """
     model, calibration = by_definition(linear.with_errors({}), calibration, drive.spec)
     problem = problem_of(model, calibration, drive)
-    if problem is None:
-        return merged(model, linear, {}), calibration, (
-            "The training part is too short to refine the model by its errors over seconds; record "
-            "a longer drive."
-        )  # fmt: skip
-    try:
-        best = simplify(problem, refine(problem, model, calibration))
-    except np.linalg.LinAlgError:  # the model is unstable: its slopes overflow
-        return merged(model, linear, {}), calibration, (
-            "The predictions of the fitted model run away on the training part, so that it could "
-            "not be refined."
-        )  # fmt: skip
-    errors = replace(best.model, std_errors=best.std_errors).named_errors
-    return merged(best.model, linear, errors), best.calibration, (
-        "Coefficients and calibration were refined by the open-loop errors over up to 5 s: "
-        f"{best.error:.4f} m (root mean square) is left on the training part."
-    )  # fmt: skip
+    why = (
+        "The training part is too short to refine the model by its errors over seconds; record a "
+        "longer drive."
+    )
+    if problem is not None:
+        try:
+            best = simplify(problem, refine(problem, model, calibration))
+            errors = replace(best.model, std_errors=best.std_errors).named_errors
+            return merged(best.model, linear, errors), best.calibration, (
+                "Coefficients and calibration were refined by the open-loop errors over up to 5 s: "
+                f"{best.error:.4f} m (root mean square) is left on the training part."
+            )  # fmt: skip
+        except np.linalg.LinAlgError:  # the model is unstable: its slopes overflow
+            why = (
+                "The predictions of the fitted model run away on the training part, so that it "
+                "could not be refined."
+            )
+    return merged(model, linear, {}), calibration, why
 
 
 def by_definition(
@@ -89,11 +83,9 @@ def by_definition(
     coefficients = model.coefficients.copy()
     if not spec.moves_sideways:
         coefficients[1] = 0.0
-    responses = list(calibration.responses)
-    speeds = [i for i, v in enumerate(spec.state) if v.unit == "m/s"]
-    if responses and len(speeds) == 1:
-        i = speeds[0]
-        alone = linear_term(model, spec, spec.state[i].name)
+    responses, i = list(calibration.responses), speed_index(spec)
+    if responses and i is not None:
+        (alone,) = linear_terms(model, spec.state[i].name)
         scale = 0.0 if alone is None else float(coefficients[0, alone])
         if scale > 0.0:
             coefficients = coefficients / scale ** model.powers[:, i]
@@ -111,9 +103,9 @@ def merged(model: TaylorModel, linear: TaylorModel, refined: Errors) -> TaylorMo
     larger of both.
     """
     first, rows = linear.named_errors, {}
-    for d, dof in enumerate(model.dofs):
-        before = dict(zip(linear.term_names, linear.coefficients[d], strict=True))
-        after = zip(model.term_names, model.coefficients[d], strict=True)
+    for dof, old, new in zip(model.dofs, linear.coefficients, model.coefficients, strict=True):
+        before = dict(zip(linear.term_names, old, strict=True))
+        after = zip(model.term_names, new, strict=True)
         known = first.get(dof, {})
         rows[dof] = dict(known) if all(before.get(k, 0.0) == v for k, v in after) else {}
         for term, error in refined.get(dof, {}).items():
@@ -126,34 +118,32 @@ class Problem:
     """Prediction problem of a refinement: windows of one drive, the same for every trial model."""
 
     drive: Drive
-    chosen: tuple[Windows, ...]  # of each horizon, without those that contain a jump of the pose
-    courses: tuple[Course, ...]  # of X over them if the state was measured, else empty
+    chosen: tuple[open_loop.Windows, ...]  # of each horizon, without jumps of the pose
+    courses: tuple[open_loop.Course, ...]  # of X over them if the state was measured, else empty
 
 
 def problem_of(model: TaylorModel, calibration: Calibration, drive: Drive) -> Problem | None:
     """Selects the windows of a training part to predict; None if it is too short."""
-    until = drive.settings.train_until_s
-    found = (windows(drive, calibration, 0.0, until, h, SPACING_S) for h in HORIZONS_S)
-    chosen = tuple(
-        _without_outliers(w, predict(model, calibration, drive, w) - w.end)
-        for w in found
-        if len(w.start_t) >= MIN_WINDOWS
-    )
+    until, chosen = drive.settings.train_until_s, []
+    for horizon in HORIZONS_S:
+        found = open_loop.windows(drive, calibration, 0.0, until, horizon, SPACING_S)
+        if len(found.start_t) >= MIN_WINDOWS:
+            error = open_loop.predict(model, calibration, drive, found) - found.end
+            chosen.append(_without_outliers(found, error))
     if not chosen:
         return None
     measured = drive.recording.state is not None
-    courses = (course_of(model, calibration, drive, w) for w in chosen if measured)
-    return Problem(drive, chosen, tuple(courses))
+    courses = (open_loop.course_of(model, calibration, drive, w) for w in chosen if measured)
+    return Problem(drive, tuple(chosen), tuple(courses))
 
 
-def _without_outliers(chosen: Windows, error: Array) -> Windows:
-    """Drops windows that contain a jump of the pose, or have one at an end."""
+def _without_outliers(chosen: open_loop.Windows, error: Array) -> open_loop.Windows:
     size = np.hypot(error[:, 0], error[:, 1])
     far = max(OUTLYING * float(np.median(size)), OUTLYING_SHARE * float(chosen.path.max()))
     inside = size <= far
     if inside.all() or inside.mean() < 1.0 - MOST_OUTLIERS or inside.sum() < MIN_WINDOWS:
         return chosen
-    return Windows(*(values[inside] for values in vars(chosen).values()))
+    return open_loop.Windows(*(values[inside] for values in vars(chosen).values()))
 
 
 def prediction_errors(problem: Problem, model: TaylorModel, calibration: Calibration) -> Array:
@@ -162,10 +152,10 @@ def prediction_errors(problem: Problem, model: TaylorModel, calibration: Calibra
     with np.errstate(all="ignore"):  # a trial step may diverge; it is then rejected
         for k, chosen in enumerate(problem.chosen):
             if problem.courses:
-                ends = relative_ends(problem.courses[k], model)[0]
-                predicted = tracked_ends(chosen, calibration, ends)
+                ends = open_loop.relative_ends(problem.courses[k], model)[0]
+                predicted = open_loop.tracked_ends(chosen, calibration, ends)
             else:
-                predicted = predict(model, calibration, problem.drive, chosen)
+                predicted = open_loop.predict(model, calibration, problem.drive, chosen)
             error = predicted - chosen.end
             error[:, 2] = HEADING_ARM_M * geometry.wrap_angle(error[:, 2])
             parts.append(error.ravel())
@@ -179,14 +169,13 @@ def prediction_slopes(
     """Returns the derivatives (n, P) of `prediction_errors` for a measured state."""
     parts = []
     for course in problem.courses:
-        ends, moved = relative_ends(course, model, free.coefficients)
-        slope = tracked_slopes(course, calibration, ends, moved)
-        if free.turn:
-            turned = [
-                tracked_ends(course.chosen, replace(calibration, rotation_rad=angle), ends)
-                for angle in calibration.rotation_rad + np.array([-TURN_RAD, TURN_RAD])
-            ]
-            aside = (turned[1] - turned[0])[:, :, None]
+        ends, moved = open_loop.relative_ends(course, model, free.coefficients)
+        slope = open_loop.tracked_slopes(course, calibration, ends, moved)
+        if "rotation_rad" in free.names:
+            angles = calibration.rotation_rad + np.array([-TURN_RAD, TURN_RAD])
+            either = (replace(calibration, rotation_rad=angle) for angle in angles)
+            right, left = (open_loop.tracked_ends(course.chosen, c, ends) for c in either)
+            aside = (left - right)[:, :, None]
             aside[:, 2] = geometry.wrap_angle(aside[:, 2])
             slope = np.concatenate([slope, aside / (2.0 * TURN_RAD)], axis=2)
         slope[:, 2] *= HEADING_ARM_M
@@ -197,15 +186,15 @@ def prediction_slopes(
 
 @dataclass(frozen=True)
 class _Free:
-    """Free parameters: coefficients (D, K), a time of the calibration, its rotation."""
-
-    coefficients: Mask
-    time: str | None
-    turn: bool
+    model: TaylorModel
+    calibration: Calibration
+    coefficients: Mask  # (D, K) that are free
+    time: str | None  # free field of the calibration
+    names: tuple[str, ...]  # all such fields
 
     @classmethod
     def of(cls, model: TaylorModel, calibration: Calibration, spec: RobotSpec) -> _Free:
-        """Returns what is fixed neither by definition nor by measurement.
+        """Frees what is fixed neither by definition nor by measurement.
 
         A time estimated from a measured state is fixed. The rotation is defined by the direction in
         which a robot can't move: an omnidirectional robot can be described equally well in any
@@ -217,15 +206,23 @@ class _Free:
         elif calibration.responses and calibration.command_latency_s > 0.0:
             time = "command_latency_s"
         turn = "rotation_rad" in known and not calibration.is_exact and not spec.moves_sideways
-        return cls(free_coefficients(model, calibration, spec), time, turn)
+        names = (*([time] if time else ()), *(["rotation_rad"] if turn else ()))
+        return cls(model, calibration, free_coefficients(model, calibration), time, names)
 
-    @property
-    def names(self) -> list[str]:
-        """Names of the free fields of the calibration."""
-        return ([self.time] if self.time else []) + (["rotation_rad"] if self.turn else [])
+    def at(self, theta: Array) -> tuple[TaylorModel, Calibration]:
+        """Returns model and calibration at parameters (P,); fixed gains follow their lags."""
+        coefficients, count = self.model.coefficients.copy(), int(self.coefficients.sum())
+        coefficients[self.coefficients] = theta[:count]
+        for i, response in enumerate(self.calibration.responses):
+            own, command = linear_terms(self.model, response.state, response.command)
+            if own is not None and command is not None and not self.coefficients[3 + i, command]:
+                coefficients[3 + i, command] = -response.gain * coefficients[3 + i, own]
+        values: dict[str, Any] = dict(zip(self.names, map(float, theta[count:]), strict=True))
+        model = replace(self.model, coefficients=coefficients)
+        return model, replace(self.calibration, **values)
 
 
-def free_coefficients(model: TaylorModel, calibration: Calibration, spec: RobotSpec) -> Mask:
+def free_coefficients(model: TaylorModel, calibration: Calibration) -> Mask:
     """Selects the free coefficients (D, K): kept, and not fixed by the definition of a state.
 
     An inferred speed is by definition the speed along the direction of travel, so that
@@ -235,13 +232,13 @@ def free_coefficients(model: TaylorModel, calibration: Calibration, spec: RobotS
     if not calibration.responses:
         free[3:] = False  # the rates of a measured state were fitted to that state itself
     for i, response in enumerate(calibration.responses):
-        alone = linear_term(model, spec, response.state)
+        alone, command = linear_terms(model, response.state, response.command)
         if alone is None:
             continue
         if model.coefficients[0, alone] == 1.0:
             free[0, alone] = False
         else:  # the scale of this state is arbitrary, so its gain is fixed
-            free[3 + i, linear_term(model, spec, response.command)] = False
+            free[3 + i, command] = False
         if lag_is_measured(calibration):
             free[3 + i, alone] = False
     return np.asarray(free)
@@ -252,11 +249,11 @@ def lag_is_measured(calibration: Calibration) -> bool:
     return {"clock_offset_s", "command_latency_s"} <= set(calibration.uncertainty)
 
 
-def linear_term(model: TaylorModel, spec: RobotSpec, name: str | None) -> int | None:
-    """Returns the column of the term that is one variable alone; None without such a term."""
-    wanted = np.array([v == name for v in spec.variable_names], dtype=np.int64)
-    hits = np.flatnonzero((model.powers == wanted).all(axis=1))
-    return int(hits[0]) if len(hits) else None
+def linear_terms(model: TaylorModel, *names: str | None) -> list[int | None]:
+    """Returns the columns of the terms that are one variable alone; None without such a term."""
+    wanted = (np.array([v == name for v in model.variables], dtype=np.int64) for name in names)
+    hits = (np.flatnonzero((model.powers == row).all(axis=1)) for row in wanted)
+    return [int(hit[0]) if len(hit) else None for hit in hits]
 
 
 @dataclass(frozen=True)
@@ -278,22 +275,18 @@ def refine(problem: Problem, model: TaylorModel, calibration: Calibration) -> Re
     scale[len(first) :] = LEAST_SCALE  # s, rad
 
     def residual(value: Array) -> Array:
-        return prediction_errors(problem, *_unpack(problem, free, model, calibration, value))
+        return prediction_errors(problem, *free.at(value))
 
     def jacobian(value: Array) -> Array:
-        there = _unpack(problem, free, model, calibration, value)
-        return prediction_slopes(problem, *there, free)
+        return prediction_slopes(problem, *free.at(value), free)
 
-    theta, slope, rest = minimise(
-        residual, theta, scale, jacobian=jacobian if problem.courses else None
-    )
-    model, moved = _unpack(problem, free, model, calibration, theta)
+    given = jacobian if problem.courses else None
+    theta, slope, rest = minimise(residual, theta, scale, jacobian=given)
+    model, calibration = free.at(theta)
     sigma = uncertainty(slope, rest)[len(first) :]
-    calibration = _with_uncertainty(problem, free, model, moved, sigma)
-    error = float(np.sqrt(np.mean(rest**2)))
-    return Refined(
-        model, calibration, error, _coefficient_errors(problem, free, slope, rest, model)
-    )
+    calibration = _with_uncertainty(free, model, calibration, sigma)
+    errors = _coefficient_errors(problem, free, slope, rest, model)
+    return Refined(model, calibration, float(np.sqrt(np.mean(rest**2))), errors)
 
 
 def _coefficient_errors(
@@ -303,38 +296,20 @@ def _coefficient_errors(
     starts = np.concatenate([np.repeat(w.start_t, 3) for w in problem.chosen])
     cluster = np.floor((starts - starts.min()) / max(HORIZONS_S)).astype(np.intp)
     errors = np.full(model.coefficients.shape, np.nan)
-    count = int(free.coefficients.sum())
-    errors[free.coefficients] = clustered_errors(jacobian, rest, cluster)[:count]
-    for state in problem.drive.spec.state:
-        tied = [linear_term(model, problem.drive.spec, n) for n in (state.name, state.follows)]
-        d = model.dofs.index(f"d_{state.name}")
-        if None in tied or not free.coefficients[d, tied[0]] or free.coefficients[d, tied[1]]:
+    errors[free.coefficients] = clustered_errors(jacobian, rest, cluster)[: free.coefficients.sum()]
+    for d, state in enumerate(problem.drive.spec.state, start=3):
+        own, command = linear_terms(model, state.name, state.follows)
+        if own is None or command is None:
             continue
-        gain = abs(model.coefficients[d, tied[1]] / model.coefficients[d, tied[0]])
-        errors[d, tied[1]] = gain * errors[d, tied[0]]
+        if free.coefficients[d, own] and not free.coefficients[d, command]:
+            gain = abs(model.coefficients[d, command] / model.coefficients[d, own])
+            errors[d, command] = gain * errors[d, own]
     return errors
 
 
-def _unpack(
-    problem: Problem, free: _Free, model: TaylorModel, calibration: Calibration, theta: Array
-) -> tuple[TaylorModel, Calibration]:
-    """Returns model and calibration with the free parameters; fixed gains follow their lags."""
-    coefficients, count = model.coefficients.copy(), int(free.coefficients.sum())
-    coefficients[free.coefficients] = theta[:count]
-    for i, response in enumerate(calibration.responses):
-        own, command = (
-            linear_term(model, problem.drive.spec, n) for n in (response.state, response.command)
-        )
-        if own is not None and command is not None and not free.coefficients[3 + i, command]:
-            coefficients[3 + i, command] = -response.gain * coefficients[3 + i, own]
-    values = dict(zip(free.names, map(float, theta[count:]), strict=True))
-    return replace(model, coefficients=coefficients), replace(calibration, **values)  # type: ignore[arg-type]
-
-
 def _with_uncertainty(
-    problem: Problem, free: _Free, model: TaylorModel, calibration: Calibration, sigma: Array
+    free: _Free, model: TaylorModel, calibration: Calibration, sigma: Array
 ) -> Calibration:
-    """Completes a refined calibration by uncertainties, and by the responses of the model."""
     known = calibration.uncertainty
     spread = dict(zip(free.names, map(float, sigma), strict=True))
     if free.time:
@@ -343,23 +318,24 @@ def _with_uncertainty(
         both = np.hypot(spread["clock_offset_s"], known["command_latency_s"])
         spread["clock_offset_s"] = float(both)
     rotation = calibration.rotation_rad
+    turned = float(geometry.wrap_angle(rotation)) if "rotation_rad" in free.names else rotation
     return replace(
         calibration,
-        rotation_rad=float(geometry.wrap_angle(rotation)) if free.turn else rotation,
+        rotation_rad=turned,
         uncertainty={**known, **spread},
-        responses=tuple(_response(model, problem.drive.spec, r) for r in calibration.responses),
+        responses=tuple(_response(model, i, r) for i, r in enumerate(calibration.responses)),
     )
 
 
-def _response(model: TaylorModel, spec: RobotSpec, response: Response) -> Response:
+def _response(model: TaylorModel, i: int, response: Response) -> Response:
     """Returns the lag and gain that correspond to the coefficients of the state's rate."""
-    d = model.dofs.index(f"d_{response.state}")
-    own, command = (linear_term(model, spec, n) for n in (response.state, response.command))
-    if own is None or command is None or not 0.0 < -model.coefficients[d, own] * model.dt < 1.0:
+    own, command = linear_terms(model, response.state, response.command)
+    row = model.coefficients[3 + i]
+    if own is None or command is None or not 0.0 < -row[own] * model.dt < 1.0:
         return response
-    rate = -float(model.coefficients[d, own])
+    rate = -float(row[own])
     lag = -model.dt / float(np.log1p(-rate * model.dt))
-    return replace(response, lag_s=lag, gain=float(model.coefficients[d, command]) / rate)
+    return replace(response, lag_s=lag, gain=float(row[command]) / rate)
 
 
 def simplify(problem: Problem, refined: Refined) -> Refined:
@@ -369,7 +345,7 @@ def simplify(problem: Problem, refined: Refined) -> Refined:
     """
     best, tried = refined, set[tuple[int, int]]()
     limit = refined.error * (1.0 + WORTH)
-    while (weakest := _weakest(best, problem.drive.spec, tried)) is not None:
+    while (weakest := _weakest(best, tried)) is not None:
         tried.add(weakest)
         coefficients = best.model.coefficients.copy()
         coefficients[weakest] = 0.0
@@ -388,12 +364,10 @@ def simplify(problem: Problem, refined: Refined) -> Refined:
     return replace(best, model=model, std_errors=best.std_errors[:, used])
 
 
-def _weakest(
-    refined: Refined, spec: RobotSpec, tried: set[tuple[int, int]]
-) -> tuple[int, int] | None:
+def _weakest(refined: Refined, tried: set[tuple[int, int]]) -> tuple[int, int] | None:
     """Returns the untried free term of the twist with the least weight over the range of X."""
     model = refined.model
-    free = free_coefficients(model, refined.calibration, spec)[:3]
+    free = free_coefficients(model, refined.calibration)[:3]
     reach = np.maximum(np.abs(model.low), np.abs(model.high))
     size = np.abs(model.coefficients[:3]) * np.prod(reach**model.powers, axis=1)
     size = size / np.maximum(size.sum(axis=1, keepdims=True), 1e-12)

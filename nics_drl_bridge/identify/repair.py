@@ -19,7 +19,6 @@ from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.signals import interval_means
 from nics_drl_bridge.identify.statistics import unexplained
 from nics_drl_bridge.recording.recording import Recording, Stream
-from nics_drl_bridge.robot.spec import RobotSpec, Variable
 
 NEIGHBOURS = 3  # a jump is measured by the median difference from this many samples on either side
 STEPS = 6.0  # it is larger than this many usual changes from sample to sample,
@@ -39,10 +38,10 @@ CONSISTENT, INCONSISTENT = 0.9, 0.6  # direction of travel in the body frame; 1 
 
 def repaired(drive: Drive) -> tuple[Drive, tuple[str, ...]]:
     """Drops repeated rows and jumps, and clips commands; returns one sentence per kind of fault."""
-    recording, repeated = _without_repetitions(drive.recording)
-    drive, jumps = _without_jumps(drive.part(recording))
-    recording, beyond = _within_limits(drive.recording, drive.spec)
-    return drive.part(recording), (*repeated, *jumps, *beyond)
+    notes: list[str] = []
+    for repair in (_without_repetitions, _without_jumps, _within_limits):
+        drive = drive.part(repair(drive, notes))
+    return drive, tuple(notes)
 
 
 def _with_rows(recording: Recording, name: str, keep: NDArray[np.bool_]) -> Recording:
@@ -50,8 +49,8 @@ def _with_rows(recording: Recording, name: str, keep: NDArray[np.bool_]) -> Reco
     return replace(recording, **some)
 
 
-def _without_repetitions(recording: Recording) -> tuple[Recording, list[str]]:
-    notes = []
+def _without_repetitions(drive: Drive, notes: list[str]) -> Recording:
+    recording = drive.recording
     for name, stream in recording.streams.items():
         again = (np.diff(stream.t) == 0.0) & (np.diff(stream.values, axis=0) == 0.0).all(axis=1)
         if again.any():
@@ -60,11 +59,11 @@ def _without_repetitions(recording: Recording) -> tuple[Recording, list[str]]:
                 f"{name}: {int(again.sum())} of {len(stream.t)} rows repeat the row before them, "
                 "stamp and all, and were left out."
             )
-    return recording, notes
+    return recording
 
 
-def _without_jumps(drive: Drive) -> tuple[Drive, list[str]]:
-    recording, notes = drive.recording, []
+def _without_jumps(drive: Drive, notes: list[str]) -> Recording:
+    recording = drive.recording
     found = {"pose": _jumps_of_pose(drive)}
     if recording.state is not None and drive.spec.state:
         found["state"] = _jumps_of_state(recording.state)
@@ -81,7 +80,7 @@ def _without_jumps(drive: Drive) -> tuple[Drive, list[str]]:
                 f"{name}: {int(jump.sum())} of {len(jump)} rows ({share:.1%}) jump away from "
                 "their neighbours and back, and were left out as outliers."
             )
-    return drive.part(recording), notes
+    return recording
 
 
 def _jumps_of_pose(drive: Drive) -> NDArray[np.bool_]:
@@ -106,46 +105,42 @@ def _jumps_of_state(state: Stream) -> NDArray[np.bool_]:
 
 def _stands_out(values: Array, least: Array, turning: bool = False) -> NDArray[np.bool_]:
     """Selects values (T,) that differ alike from both sides, by `least` and `STEPS` changes."""
-    if len(values) <= 2 * NEIGHBOURS:
-        return np.zeros(len(values), dtype=np.bool_)
-    back, ahead = _differences(values, turning)
+    count = len(values)
+    if count <= 2 * NEIGHBOURS:
+        return np.zeros(count, dtype=np.bool_)
+    back, ahead = np.zeros((2, NEIGHBOURS, count))  # differences; zero at the ends
+    for n in range(1, NEIGHBOURS + 1):
+        difference = values[n:] - values[:-n]
+        difference = geometry.wrap_angle(difference) if turning else difference
+        back[n - 1, n:], ahead[n - 1, :-n] = difference, -difference
     usual = float(np.percentile(np.abs(back[0][1:]), USUAL))
     before, after = np.median(back, axis=0), np.median(ahead, axis=0)
     apart = np.minimum(np.abs(before), np.abs(after))
     return np.asarray((before * after > 0.0) & (apart > np.maximum(STEPS * usual, least)))
 
 
-def _differences(values: Array, turning: bool) -> tuple[Array, Array]:
-    """Returns differences (NEIGHBOURS, T) from the samples before and after; zero at the ends."""
-    count = len(values)
-    back, ahead = np.zeros((NEIGHBOURS, count)), np.zeros((NEIGHBOURS, count))
-    for n in range(1, NEIGHBOURS + 1):
-        difference = values[n:] - values[:-n]
-        difference = geometry.wrap_angle(difference) if turning else difference
-        back[n - 1, n:], ahead[n - 1, :-n] = difference, -difference
-    return back, ahead
-
-
-def _within_limits(recording: Recording, spec: RobotSpec) -> tuple[Recording, list[str]]:
+def _within_limits(drive: Drive, notes: list[str]) -> Recording:
     """Clips commands to the robot's limits, unless it followed them beyond."""
+    recording, spec = drive.recording, drive.spec
     low, high, values = spec.command_low, spec.command_high, recording.command.values
     margin = EXCESS * (high - low)
     beyond = (values < low - margin) | (values > high + margin)
     if not beyond.any():
-        return recording, []
+        return recording
     clipped = np.where(beyond, np.clip(values, low, high), values)
     if _rates_left(recording, values) < _rates_left(recording, clipped):
-        return recording, [
+        notes.append(
             "Commands were beyond the limits in the robot's YAML file, and the robot followed them "
             "there: widen the limits, or the simulator will not go so far."
-        ]
-    notes = [
+        )
+        return recording
+    notes += [
         f"{c.name} was beyond the robot's limits, {c.min:g} to {c.max:g} {c.unit}, in {share:.0%} "
         "of the rows: it was taken as held at them; the model says nothing of the range beyond."
         for c, share in zip(spec.command, beyond.mean(axis=0), strict=True)
         if share > 0.0
     ]
-    return replace(recording, command=replace(recording.command, values=clipped)), notes
+    return replace(recording, command=replace(recording.command, values=clipped))
 
 
 def _rates_left(recording: Recording, command: Array) -> float:
@@ -166,10 +161,9 @@ def _rates_left(recording: Recording, command: Array) -> float:
 def check_units(drive: Drive) -> None:
     """Refuses states and commands, with a RecordingError, that only another unit can explain."""
     recording, spec = drive.recording, drive.spec
-    streams: list[tuple[Stream, tuple[Variable, ...]]] = [(recording.command, spec.command)]
-    if recording.state is not None:
-        streams.append((recording.state, spec.state))
-    for stream, variables in streams:
+    for stream, variables in ((recording.command, spec.command), (recording.state, spec.state)):
+        if stream is None:
+            continue
         sizes = np.percentile(np.abs(stream.values), UNIT_PERCENTILE, axis=0)
         for variable, size in zip(variables, sizes, strict=True):
             limit = max(abs(variable.min), abs(variable.max))
@@ -189,7 +183,10 @@ def check_axes(drive: Drive) -> None:
     mirrored, then x, y or heading is reversed.
     """
     recording = drive.recording
-    t, pose = _far_apart(drive.dated, TRAVEL_SHARE * drive.spec.footprint_radius)
+    path = np.append(0.0, np.cumsum(np.hypot(*np.diff(drive.dated.values[:, :2], axis=0).T)))
+    apart = max(TRAVEL_SHARE * drive.spec.footprint_radius, 1e-3)
+    some = drive.dated.rows(np.unique(np.searchsorted(path, np.arange(0.0, path[-1], apart))))
+    t, pose = some.t, some.values
     if len(t) < MIN_DIRECTIONS or np.ptp(np.unwrap(pose[:, 2])) < MIN_TURN:
         return
     other = pose * np.array([1.0, 1.0, -1.0])
@@ -205,14 +202,6 @@ def check_axes(drive: Drive) -> None:
             "x, y and heading is reversed: they must be x forward, y left, heading "
             "counter-clockwise (REP-103)."
         )
-
-
-def _far_apart(dated: Stream, distance: float) -> tuple[Array, Array]:
-    """Returns stamps (n,) and poses (n, 3) of a stream, about `distance` [m] apart."""
-    path = np.append(0.0, np.cumsum(np.hypot(*np.diff(dated.values[:, :2], axis=0).T)))
-    marks = np.arange(0.0, path[-1], max(distance, 1e-3))
-    chosen = np.unique(np.searchsorted(path, marks))
-    return dated.t[chosen], dated.values[chosen]
 
 
 def _steadiness(pose: Array) -> float:

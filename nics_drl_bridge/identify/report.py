@@ -15,7 +15,6 @@ from nics_drl_bridge.identify.fit import ORDER, Alpha
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.statistics import Curve
 from nics_drl_bridge.identify.verdict import FAR_OFF
-from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
@@ -30,6 +29,9 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
     """Returns the report on a recording from a source as text for people."""
     model, total = identified.model, identified.fit.regression.terms_total
     latency, until = identified.recording.latency.sentences(), identified.train_until_s
+    units = dict(zip(spec.variable_names, spec.variable_units, strict=True))
+    ranges = zip(model.variables, model.low, model.high, strict=True)
+    notes = identified.notes or ("Nothing had to be corrected.",)
     sections: dict[str, Iterable[str]] = {
         f"Fit report: robot {spec.name!r} from {source}": (),
         f"Kept {model.terms_kept} of {total} terms, step {model.dt:g} s "
@@ -42,40 +44,35 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
             identified
         ),
         f"Open loop, on data held out from the fit (after {until:.1f} s):": _held_out(identified),
-        "Valid where the drive was:": _box(model, spec),
+        "Valid where the drive was:": (
+            f"{name:<24} {low:.4g} to {high:.4g} {units[name]}" for name, low, high in ranges
+        ),
         "Calibration (standard uncertainties):": (e.text for e in estimates(identified).values()),
         "Noise that the simulator and the estimator use (standard deviations):": (
             identified.noise.sentences()
         ),
         **({"Latency of the device, which simulator_node has too:": latency} if latency else {}),
-        "Found, and not learnt:": map(_item, identified.notes or ("Nothing had to be corrected.",)),
+        "Found, and not learnt:": (
+            fill(note, WIDTH - 2, initial_indent="- ", subsequent_indent="    ") for note in notes
+        ),
     }
     paragraphs = ([head, *(f"  {line}" for line in lines)] for head, lines in sections.items())
     return "\n\n".join("\n".join(lines) for lines in paragraphs) + "\n"
 
 
-def _item(note: str) -> str:
-    return fill(note, WIDTH - 2, initial_indent="- ", subsequent_indent="    ")
-
-
-def _box(model: TaylorModel, spec: RobotSpec) -> Iterator[str]:
-    units = dict(zip(spec.variable_names, spec.variable_units, strict=True))
-    for name, low, high in zip(model.variables, model.low, model.high, strict=True):
-        yield f"{name:<24} {low:.4g} to {high:.4g} {units[name]}"
-
-
 def equations_with_errors(model: TaylorModel) -> list[str]:
     """Returns one line per degree of freedom: `wz = (4.63 +- 0.02)*speed*steering  [rad/s]`."""
-    errors, names, lines = model.named_errors, model.term_names, []
-    for d, dof in enumerate(model.dofs):
+    errors, lines = model.named_errors, []
+    for dof, unit, row in zip(model.dofs, model.dof_units, model.coefficients, strict=True):
         text = ""
-        for k in np.flatnonzero(model.coefficients[d]):
-            value, name = float(model.coefficients[d, k]), names[k]
+        for name, value in zip(model.term_names, map(float, row), strict=True):
+            if value == 0.0:
+                continue
             sign = ("-" if value < 0 else "") if not text else (" - " if value < 0 else " + ")
             mark = " (assumed)" if (dof, name) in model.assumed else ""
             number = with_error(abs(value), errors.get(dof, {}).get(name))
             text += f"{sign}{number}" + ("" if name == "1" else f"*{name}") + mark
-        lines.append(f"{dof} = {text or '0'}  [{model.dof_units[d]}]")
+        lines.append(f"{dof} = {text or '0'}  [{unit}]")
     return lines
 
 
@@ -115,36 +112,31 @@ def _curve(curve: Curve) -> list[str]:
     return fill(text, WIDTH, subsequent_indent=" " * 15).splitlines()
 
 
-def _errors(identified: Identified) -> list[str]:
+def _errors(identified: Identified) -> Iterator[str]:
     fit, model = identified.fit, identified.model
-    return [
-        f"{dof:<24} RMSE {rmse:.3g} {unit}, R2 {r2:.6f}, condition number {number:.3g}"
-        for dof, unit, rmse, r2, number in zip(
-            model.dofs, model.dof_units, fit.rmse, fit.r2, fit.condition, strict=True
-        )
-    ]
+    rows = zip(model.dofs, model.dof_units, fit.rmse, fit.r2, fit.condition, strict=True)
+    for dof, unit, rmse, r2, number in rows:
+        yield f"{dof:<24} RMSE {rmse:.3g} {unit}, R2 {r2:.6f}, condition number {number:.3g}"
 
 
 def _held_out(identified: Identified) -> Iterator[str]:
-    held_out, model, quality = identified.held_out, identified.model, identified.model.quality
-    if held_out is None:
+    found, model, quality = identified.held_out, identified.model, identified.model.quality
+    if found is None:
         yield "the drive is too short to hold data out"
     else:
-        mean, most = held_out.mean_position_error_m, held_out.max_position_error_m
-        turn, path = held_out.mean_heading_error_rad, held_out.mean_path_m
         yield (
-            f"after {held_out.horizon_s:g} s: position error {mean:.3g} m on average, "
-            f"{most:.3g} m at most,"
+            f"after {found.horizon_s:g} s: position error {found.mean_position_error_m:.3g} m on "
+            f"average, {found.max_position_error_m:.3g} m at most,"
         )
         yield (
-            f"heading error {turn:.3g} rad on average, over a mean path of {path:.2f} m "
-            f"({held_out.windows} windows)"
+            f"heading error {found.mean_heading_error_rad:.3g} rad on average, over a mean path of "
+            f"{found.mean_path_m:.2f} m ({found.windows} windows)"
         )
     if quality is not None and quality.held_out_rmse:
         yield "the rates there:"
-        rows = zip(model.dof_units, quality.held_out_rmse.items(), strict=True)
-        for unit, (dof, rmse) in rows:
-            yield f"{dof:<24} RMSE {rmse:.3g} {unit}, R2 {quality.held_out_r2[dof]:.6f}"
+        for unit, dof in zip(model.dof_units, quality.held_out_rmse, strict=True):
+            rmse, r2 = quality.held_out_rmse[dof], quality.held_out_r2[dof]
+            yield f"{dof:<24} RMSE {rmse:.3g} {unit}, R2 {r2:.6f}"
 
 
 @dataclass(frozen=True)
@@ -173,18 +165,14 @@ def estimates(identified: Identified) -> dict[str, CalibratedValue]:
     """Returns all estimates of the calibration by their names in `Calibration`."""
     recording, found = identified.recording, identified.calibration
     sigma, mounting = found.uncertainty, identified.findings.mounting
-    clocks = "pose and commands are on one clock"
-    if recording.pose.clock != recording.command.clock:
-        clocks = "no command changed"
-    latency = "no command changed"
-    if "clock_offset_s" in sigma:
-        latency = "only its sum with the clock offset is known"
-    turns = "the drive shows too few directions of motion"
-    if mounting is not None and not mounting.turns:
-        turns = "the robot never turned"
-    wheels = "the wheels do not show it"
-    if recording.wheels is None:
-        wheels = "no wheel speeds were recorded"
+    one_clock = recording.pose.clock == recording.command.clock
+    clocks = "pose and commands are on one clock" if one_clock else "no command changed"
+    both = "clock_offset_s" in sigma
+    latency = "only its sum with the clock offset is known" if both else "no command changed"
+    turned = mounting is None or mounting.turns
+    turns = "the drive shows too few directions of motion" if turned else "the robot never turned"
+    unknown = recording.wheels is None
+    wheels = "no wheel speeds were recorded" if unknown else "the wheels do not show it"
     rows = {
         "clock_offset_s": ("clock offset", found.clock_offset_s, "s", clocks),
         "command_latency_s": ("command latency", found.command_latency_s, "s", latency),
@@ -202,9 +190,8 @@ def estimates(identified: Identified) -> dict[str, CalibratedValue]:
             zero = value == 0.0 and key in ("rotation_rad", "lever_arm_x_m", "lever_arm_y_m")
             remark = "below its uncertainty: taken as zero" if zero else ""
             values[key] = CalibratedValue(name, value, sigma[key], unit, remark)
-    if found.burst_period_s > 0.0:
-        period = CalibratedValue("period of bursts", found.burst_period_s, None, "s")
-        values["burst_period_s"] = period
+    if (period := found.burst_period_s) > 0.0:
+        values["burst_period_s"] = CalibratedValue("period of bursts", period, None, "s")
     swapped = found.wheels_swapped
     meaning = {None: wheels, True: "left and right are interchanged", False: "as named"}[swapped]
     known = None if swapped is None else float(swapped)
@@ -247,12 +234,19 @@ def why_useless(identified: Identified, spec: RobotSpec, order: int = ORDER) -> 
 
 def _suspicion(identified: Identified, spec: RobotSpec, order: int) -> str:
     recording, unmoved = identified.recording, identified.fit.unmoved
-    step, name = max(_steps(recording, spec, unmoved), default=(0.0, ""))
     rows = recording.pose if recording.state is None else recording.state
     apart = f"{np.median(np.diff(rows.t)):.2g} s apart"
-    if step > COARSE:
+    coarsest = (0.0, "")
+    if recording.state is not None:
+        spread = np.ptp(np.percentile(rows.values, ENDS, axis=0), axis=0)
+        steps = np.percentile(np.abs(np.diff(rows.values, axis=0)), ENDS[1], axis=0)
+        for variable, step, size in zip(spec.state, steps, spread, strict=True):
+            if size > 0.0 and variable.name not in unmoved:
+                coarsest = max(coarsest, (float(step / size), variable.name))
+    share, name = coarsest  # the greatest step between rows, as a share of its range
+    if share > COARSE:
         return (
-            f"{name} changes by {step:.0%} of its range between rows that are {apart}, so record "
+            f"{name} changes by {share:.0%} of its range between rows that are {apart}, so record "
             "at a higher rate"
         )
     if unmoved:
@@ -267,20 +261,3 @@ def _suspicion(identified: Identified, spec: RobotSpec, order: int) -> str:
         f"each command, that its pose did not jump and that rows {apart} show how it responds, and "
         "record anew"
     )
-
-
-def _steps(
-    recording: Recording, spec: RobotSpec, unmoved: tuple[str, ...]
-) -> list[tuple[float, str]]:
-    """Returns the step between rows, as a share of its range, of each measured state that moved."""
-    if recording.state is None:
-        return []
-    moved = [i for i, v in enumerate(spec.state) if v.name not in unmoved]
-    values = recording.state.values[:, moved]
-    spread = np.ptp(np.percentile(values, ENDS, axis=0), axis=0)
-    steps = np.percentile(np.abs(np.diff(values, axis=0)), ENDS[1], axis=0)
-    return [
-        (float(step / size), spec.state[i].name)
-        for i, step, size in zip(moved, steps, spread, strict=True)
-        if size > 0.0
-    ]

@@ -19,59 +19,41 @@ DIFFERENCE_GAIN = np.sqrt(924.0)  # white noise grows by this in a sixth differe
 GAUSSIAN_MAD = 0.6745
 
 
-def held(command: Stream, spec: RobotSpec, start: Array, end: Array) -> Array:
+def held(
+    command: Stream,
+    spec: RobotSpec,
+    start: Array,
+    end: Array,
+    powers: NDArray[np.int64] | None = None,
+) -> Array:
     """Returns the mean (..., C) of held commands over intervals (...) on the commands' clock [s].
 
-    Before its first command a robot stands still: commands that ever change are zero then.
-    A command that never changes is assumed to have had that value before.
+    Given powers (K, C), the mean (..., K) of these features of the commands. Before its first
+    command a robot stands still: commands that ever change are zero then. A command that never
+    changes is assumed to have had that value before.
     """
-    return _means_of_held(command.t, _since_ever(command, spec), start, end)
-
-
-def held_features(
-    command: Stream, spec: RobotSpec, powers: NDArray[np.int64], start: Array, end: Array
-) -> Array:
-    """Returns means (..., K) of features (K, C) of held commands over intervals, as in `held`."""
-    features = taylor.evaluate(_since_ever(command, spec), powers)
-    return _means_of_held(command.t, features, start, end)
-
-
-def _since_ever(command: Stream, spec: RobotSpec) -> Array:
-    """Returns commands (T + 1, C), first that in effect before the first one."""
     still = np.clip(0.0, spec.command_low, spec.command_high)
     before = np.where(moved_commands(command), still, command.values[0])
-    return np.concatenate([before[None], command.values])
-
-
-def _means_of_held(t: Array, values: Array, start: Array, end: Array) -> Array:
-    """Returns means (..., K) over intervals of values (T + 1, K) that change at times (T,)."""
-    low, high = min(start.min(), t[0]) - 1.0, max(end.max(), t[-1]) + 1.0
-    edges = np.concatenate([[low], t, [high]])
+    values = np.concatenate([before[None], command.values])
+    if powers is not None:
+        values = taylor.evaluate(values, powers)
+    low, high = min(start.min(), command.t[0]) - 1.0, max(end.max(), command.t[-1]) + 1.0
+    edges = np.concatenate([[low], command.t, [high]])
     return _means(edges, values * np.diff(edges)[:, None], start, end)
+
+
+def interval_means(t: Array, values: Array, start: Array, end: Array) -> Array:
+    """Returns means (n, K) over intervals (n,) of values (T, K), linear between stamps (T,)."""
+    return _means(t, np.diff(t)[:, None] * (values[1:] + values[:-1]) / 2.0, start, end)
 
 
 def _means(t: Array, parts: Array, start: Array, end: Array) -> Array:
     """Returns means (..., K) over intervals of what has the integrals (T, K) between times."""
     area = np.concatenate([np.zeros((1, parts.shape[1])), np.cumsum(parts, axis=0)])
-    means = [
-        (np.interp(end, t, column) - np.interp(start, t, column)) / (end - start)
-        for column in area.T
-    ]
-    return np.stack(means, axis=-1) if means else np.zeros((*start.shape, 0))
-
-
-def lagged(signal: Array, lags: Array, dt: float, initial: Array) -> Array:
-    """Returns first-order responses (T, S) to signals (T, S) that are constant over each step [s].
-
-    Given are the time constants (S,) [s] and the responses (S,) at the start; returned are those at
-    the start of each step.
-    """
-    decay = np.exp(-dt / np.maximum(lags, 1e-6))
-    columns = [
-        lfilter([0.0, 1.0 - a], [1.0, -a], signal[:, i], zi=[initial[i]])[0]
-        for i, a in enumerate(decay)
-    ]
-    return np.stack(columns, axis=1) if columns else np.zeros((len(signal), 0))
+    means = np.empty((*start.shape, parts.shape[1]))
+    for k, column in enumerate(area.T):
+        means[..., k] = np.interp(end, t, column) - np.interp(start, t, column)
+    return means / (end - start)[..., None]
 
 
 def moved_commands(command: Stream) -> NDArray[np.bool_]:
@@ -107,18 +89,17 @@ def inferred_states(
 ) -> Array:
     """Infers states (T, S) at uniform times (T,) on the commands' clock, with gain one.
 
-    Each follows its command; if the command never changes, the state keeps its value.
+    Each is a first-order response to its command with a time constant of `lags` (S,) [s]; if the
+    command never changes, the state keeps its value.
     """
-    dt = float(grid[1] - grid[0])
-    target = held(command, spec, grid - latency, grid + dt - latency)[:, followed(spec)]
+    dt, follows = float(grid[1] - grid[0]), followed(spec)
+    target = held(command, spec, grid - latency, grid + dt - latency)[:, follows]
     long_ago = np.array([command.t[0] - 2.0])
-    initial = held(command, spec, long_ago, long_ago + 1.0)[0, followed(spec)]
-    return lagged(target, lags, dt, initial)
-
-
-def interval_means(t: Array, values: Array, start: Array, end: Array) -> Array:
-    """Returns means (n, K) over intervals (n,) of values (T, K), linear between stamps (T,)."""
-    return _means(t, np.diff(t)[:, None] * (values[1:] + values[:-1]) / 2.0, start, end)
+    initial = held(command, spec, long_ago, long_ago + 1.0)[0, follows]
+    states = np.empty((len(grid), len(follows)))
+    for i, a in enumerate(np.exp(-dt / np.maximum(lags, 1e-6))):
+        states[:, i] = lfilter([0.0, 1.0 - a], [1.0, -a], target[:, i], zi=[initial[i]])[0]
+    return states
 
 
 def white_noise(values: Array) -> Array:

@@ -54,15 +54,10 @@ def minimise(
     if jacobian is not None:
         slope = lambda z: jacobian(start + (z - 1.0) * scale) * scale  # noqa: E731
     found = least_squares(
-        lambda z: residual(start + (z - 1.0) * scale),
-        np.ones(len(start)),
-        jac=slope,
+        lambda z: residual(start + (z - 1.0) * scale), np.ones(len(start)), jac=slope,
         bounds=((low - start) / scale + 1.0, (high - start) / scale + 1.0),
-        diff_step=DIFFERENCE,
-        xtol=TOLERANCE,
-        ftol=TOLERANCE,
-        max_nfev=MAX_STEPS,
-    )
+        diff_step=DIFFERENCE, xtol=TOLERANCE, ftol=TOLERANCE, max_nfev=MAX_STEPS,
+    )  # fmt: skip
     return start + (found.x - 1.0) * scale, found.jac / scale, np.asarray(found.fun)
 
 
@@ -73,7 +68,10 @@ def uncertainty(jacobian: Array, residual: Array) -> Array:
     rho = float((rest[1:] * rest[:-1]).sum()) / power if power > 0.0 else 0.0
     rho = float(np.clip(rho, 0.0, 0.95))
     variance = power / max(1, len(residual) - jacobian.shape[1]) * (1.0 + rho) / (1.0 - rho)
-    covariance = np.linalg.pinv(jacobian.T @ jacobian) * variance
+    return _deviations(np.linalg.pinv(jacobian.T @ jacobian) * variance)
+
+
+def _deviations(covariance: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
 
 
@@ -91,8 +89,7 @@ def standard_errors(chi: Array, residual: Array) -> Array:
     unit = chi / scale
     middle = long_run(unit, residual)
     inverse = np.linalg.pinv(unit.T @ unit, hermitian=True)
-    covariance = inverse @ middle @ inverse * count / (count - terms)
-    return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)) / scale)
+    return np.asarray(_deviations(inverse @ middle @ inverse * count / (count - terms)) / scale)
 
 
 def long_run(chi: Array, residual: Array) -> Array:
@@ -122,8 +119,7 @@ def clustered_errors(jacobian: Array, residual: Array, cluster: NDArray[np.intp]
     few = len(groups) / (len(groups) - 1.0) * (count - 1.0) / (count - terms)
     if len(groups) > 3:  # the variance of Student's t
         few *= (len(groups) - 1.0) / (len(groups) - 3.0)
-    covariance = inverse @ (sums.T @ sums) @ inverse * few
-    return np.asarray(np.sqrt(np.maximum(np.diag(covariance), 0.0)))
+    return _deviations(inverse @ (sums.T @ sums) @ inverse * few)
 
 
 def correlation_reach(residual: Array) -> int:

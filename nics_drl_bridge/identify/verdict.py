@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from math import isfinite
+from typing import Any
 
 import numpy as np
 
@@ -32,190 +33,181 @@ MANY_OUTLIERS = 0.001
 MIRRORED = -0.5  # correlation of yaw rate and steering below which the robot turns the wrong way
 
 
-def about_stamps(drive: Drive) -> list[str]:
-    """Returns sentences on the stamps and the noise of the poses."""
-    notes = []
+def about_stamps(drive: Drive) -> Iterator[str]:
+    """Tells of the stamps and the noise of the poses."""
     if drive.bursts is not None:
-        notes.append(
+        yield (
             f"The poses arrive in bursts of about {drive.bursts.size:.0f} every "
             f"{drive.bursts.period_s:.3f} s: their stamps are arrival times; the samples of a "
             "burst were spread over the time since the one before."
         )
     if drive.pose_noise is None:
-        notes.append(
-            "The noise of the pose could not be measured; let the robot stand still for 2 s at the "
-            "start."
-        )
-    return notes
+        yield "The noise of the pose was not measured; let the robot stand still for 2 s at first."
 
 
-def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate) -> list[str]:
-    """Returns sentences on clock offset and latency."""
-    sigma, recording, notes = calibration.uncertainty, drive.recording, []
+def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate) -> Iterator[str]:
+    """Tells of clock offset and latency."""
+    sigma, recording = calibration.uncertainty, drive.recording
     clocks_differ = recording.pose.clock != recording.command.clock
     if clocks_differ and "clock_offset_s" in sigma:
-        notes.append(
+        yield (
             f"Pose and commands are stamped by different clocks: {calibration.clock_offset_s:.4f} "
             f"s (+- {sigma['clock_offset_s']:.4f} s) added to the pose's stamps gives the "
             "commands' clock."
         )
     if not moved_commands(recording.command).any():
-        notes.append("No command ever changed, so clock offset and latency could not be learnt.")
+        yield "No command ever changed, so clock offset and latency could not be learnt."
     elif not timing.separated and clocks_differ:
-        notes.append(
+        yield (
             "Only the sum of clock offset and command latency can be known, since nothing measured "
             "on the commands' clock follows them; the latency is taken as zero. Record the wheels "
             "or the state to tell them apart."
         )
     if timing.separated and calibration.command_latency_s > 0.0:
-        notes.append(
+        yield (
             f"Commands take effect {calibration.command_latency_s:.4f} s (+- "
             f"{sigma['command_latency_s']:.4f} s) after their stamps."
         )
-    return notes
 
 
-def about_mounting(drive: Drive, calibration: Calibration, mounting: Mounting | None) -> list[str]:
-    """Returns sentences on where and how the tracked body sits on the robot."""
+def about_mounting(
+    drive: Drive, calibration: Calibration, mounting: Mounting | None
+) -> Iterator[str]:
+    """Tells where and how the tracked body sits on the robot."""
     if mounting is None:
-        return [
+        yield (
             "How the tracked body sits on the robot could not be learnt, and is taken to be "
             "exactly at base_link; drive in every direction and turn."
-        ]
-    notes, (x, y) = [], calibration.lever_arm_m
+        )
+        return
+    x, y = calibration.lever_arm_m
     known_x, known_y = ~np.isnan(mounting.lever_sigma)
     if calibration.rotation_rad != 0.0:
         sigma = calibration.uncertainty.get("rotation_rad", mounting.rotation_sigma)
-        notes.append(
+        yield (
             f"The direction of travel lies {calibration.rotation_rad:.4f} rad (+- {sigma:.4f} rad) "
             "from the tracked body's heading."
         )
     if not known_x:
         why = "all of the path had one curvature" if mounting.turns else "the robot never turned"
-        notes.append(
+        yield (
             f"Where the tracked point lies on the robot could not be learnt, since {why}: it is "
             "taken as base_link, and the rotation holds for this curvature; drive left, right and "
             "straight on to learn it."
         )
     elif (x, y) != (0.0, 0.0):
-        notes.append(f"The tracked point lies at x {x:.4f} m, y {y:.4f} m of base_link.")
+        yield f"The tracked point lies at x {x:.4f} m, y {y:.4f} m of base_link."
     if known_x and not known_y and not drive.spec.moves_sideways:
-        notes.append(
+        yield (
             "The tracked point's place along y could not be learnt, since no speed was known "
             "apart from the tracked one; it is taken as zero."
         )
-    return notes
 
 
-def about_responses(drive: Drive, calibration: Calibration, timing: TimingEstimate) -> list[str]:
-    """Returns sentences on states that were not measured, and on the wheels."""
-    notes = []
+def about_responses(
+    drive: Drive, calibration: Calibration, timing: TimingEstimate
+) -> Iterator[str]:
+    """Tells of states that were not measured, and of the wheels."""
     moved = moved_commands(drive.recording.command)
     names = [c.name for c, m in zip(drive.spec.command, moved, strict=True) if m]
     for response, sigma in zip(calibration.responses, timing.lag_sigma, strict=False):
-        if response.command not in names:
-            notes.append(
-                f"{response.command} never changed, so how {response.state} follows it could not "
-                f"be learnt; drive with {response.command} changing over its whole range."
+        state, command = response.state, response.command
+        if command not in names:
+            yield (
+                f"{command} never changed, so how {state} follows it could not be learnt; drive "
+                f"with {command} changing over its whole range."
             )
         else:
             spread = "" if np.isnan(sigma) else f" (+- {sigma:.4f} s)"
-            notes.append(
-                f"{response.state} was not measured: it is taken to follow {response.command} with "
-                f"a lag of {response.lag_s:.4f} s{spread} and a gain of {response.gain:.4f}."
+            yield (
+                f"{state} was not measured: it is taken to follow {command} with a lag of "
+                f"{response.lag_s:.4f} s{spread} and a gain of {response.gain:.4f}."
             )
     if calibration.wheel_scale is not None:
         scale, sigma = calibration.wheel_scale, calibration.uncertainty["wheel_scale"]
-        notes.append(f"A unit of the wheels' speed is {scale:.4g} m/s (+- {sigma:.2g} m/s).")
+        yield f"A unit of the wheels' speed is {scale:.4g} m/s (+- {sigma:.2g} m/s)."
     if calibration.wheels_swapped:
-        notes.append(
+        yield (
             "Left and right wheel look interchanged: the wheel recorded as the left one is the "
             "faster one when the robot turns left, and the slower one when it turns right."
         )
-    return notes
 
 
 def refuse_unexcited(excitation: Excitation, spec: RobotSpec) -> None:
     """Refuses a drive, with a FitError, that did not move every input independently."""
-    still = excitation.unmoved
-    commands = [c.name for c in spec.command]
-    named = [name for name in still if name in commands] or still
-    if named:
-        raise FitError(
-            f"{_list(named)} never moved in this drive; drive with {_list(named)} changing over "
-            "the whole range, or allow a model without."
-        )
-    if excitation.together:
-        raise FitError(
-            f"{_list(excitation.together)} always moved together in this drive; drive with "
-            "each changing on its own, or allow a model without."
-        )
+    still, commands = excitation.unmoved, {c.name for c in spec.command}
+    for names, fault, way in (
+        (
+            [n for n in still if n in commands] or still,
+            "never moved",
+            "changing over the whole range",
+        ),
+        (excitation.together, "always moved together", "each changing on its own"),
+    ):
+        if told := _list(names):
+            raise FitError(f"{told} {fault}; drive with {told} {way}, or allow a model without.")
 
 
-def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> list[str]:
-    """Returns sentences on inputs that the drive did not move, or not independently.
+def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> Iterator[str]:
+    """Tells of inputs that the drive did not move, or not independently.
 
-    Also on states that depended on others, and on commands with two values only.
+    Also of states that depended on others, and of commands with two values only.
     """
     already = {name for r in calibration.responses for name in (r.command, r.state)}
-    excitation, notes = linear.regression.excitation, []
+    excitation = linear.regression.excitation
     if unmoved := ", ".join(excitation.unmoved):
-        notes.append(
+        yield (
             f"The model has no terms of {unmoved}, which never moved: it holds for this drive's "
             "constant value only."
         )
     if missing := ", ".join(name for name in excitation.unmoved if name not in already):
-        notes.append(f"Drive with {missing} changing over the whole range to learn them.")
-    if excitation.together:
-        notes.append(
-            f"{_list(excitation.together)} always moved together, so their effects can't be told "
-            "apart: the model holds for this proportion only; drive with each changing on its own."
+        yield f"Drive with {missing} changing over the whole range to learn them."
+    if together := _list(excitation.together):
+        yield (
+            f"{together} always moved together, so their effects can't be told apart: the model "
+            "holds for this proportion only; drive with each changing on its own."
         )
     if copies := _list([v.name for v in spec.state if v.name in linear.regression.dependent]):
-        notes.append(
+        yield (
             f"{copies} always followed from the other variables, so their effects can't be "
             "told apart: the model does without, and holds for as long as that is so."
         )
     levels = {n: v for n, v in excitation.levels.items() if n not in excitation.unmoved}
     if coarse := _list([name for name, count in levels.items() if count == FEW_LEVELS]):
-        notes.append(
+        yield (
             f"{coarse} took two values only: between them the model is a straight line, "
             "whatever the robot does; drive with values in between."
         )
-    return notes
 
 
-def doubts(linear: Fit, held_out: OpenLoop | None, exact: bool) -> list[str]:
-    """Returns a sentence on each reason to doubt the fit or its predictions."""
-    notes = []
-    for d, dof in enumerate(linear.model.dofs):
-        if linear.outliers[d] > MANY_OUTLIERS:
-            notes.append(
-                f"{linear.outliers[d]:.1%} of the rows of {dof} were outliers and were left out "
-                "of the fit."
-            )
-        if linear.condition[d] > ILL_CONDITIONED:
-            notes.append(
+def doubts(linear: Fit, held_out: OpenLoop | None, exact: bool) -> Iterator[str]:
+    """Tells each reason to doubt the fit or its predictions."""
+    dofs = linear.model.dofs
+    for dof, outliers, condition in zip(dofs, linear.outliers, linear.condition, strict=True):
+        if outliers > MANY_OUTLIERS:
+            yield f"{outliers:.1%} of the rows of {dof} were outliers and left out of the fit."
+        if condition > ILL_CONDITIONED:
+            yield (
                 f"The terms of {dof} are nearly copies of each other on this drive (condition "
-                f"number {linear.condition[d]:.1g}): their coefficients are no use one by one; "
-                "lower the order or drive with more variety."
+                f"number {condition:.1g}): their coefficients are no use one by one; lower the "
+                "order or drive with more variety."
             )
     fitted = {c.dof for c in linear.curves} - {"vy"} if exact else set()
-    r2 = zip(linear.model.dofs, linear.r2, strict=True)
-    if lost := _list([dof for dof, share in r2 if share < UNEXPLAINED and dof in fitted]):
-        notes.append(
+    explained = zip(dofs, linear.r2, strict=True)
+    if lost := _list([dof for dof, share in explained if share < UNEXPLAINED and dof in fitted]):
+        yield (
             f"The model explains less than half of {lost}: the robot did not follow its commands "
             "in a way that a polynomial can describe; do not trust its predictions."
         )
-    if held_out is not None and held_out.mean_path_m > 0.0:
-        share = held_out.mean_position_error_m / held_out.mean_path_m
+    if held_out is None or not held_out.mean_path_m > 0.0:
+        return
+    share = held_out.mean_position_error_m / held_out.mean_path_m
+    if not share <= FAR_OFF:
         end = f"end {share:.0%} of their path away" if isfinite(share) else "run away"
-        if not share <= FAR_OFF:
-            notes.append(
-                f"On unseen data the predictions {end}: the response does not follow the commands "
-                "as the model has it; do not train with this model."
-            )
-    return notes
+        yield (
+            f"On unseen data the predictions {end}: the response does not follow the commands as "
+            "the model has it; do not train with this model."
+        )
 
 
 def _list(names: Sequence[str]) -> str:
@@ -223,8 +215,8 @@ def _list(names: Sequence[str]) -> str:
     return " and ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
 
 
-def mirror_note(samples: Samples, spec: RobotSpec) -> list[str]:
-    """Returns a sentence if the robot turns right when commanded to turn left."""
+def mirror_note(samples: Samples, spec: RobotSpec) -> Iterator[str]:
+    """Tells if the robot turns right when commanded to turn left."""
     for i, command in enumerate(spec.command, start=len(spec.state)):
         if not command.turns:
             continue
@@ -232,12 +224,12 @@ def mirror_note(samples: Samples, spec: RobotSpec) -> list[str]:
         if command.steers:
             wanted = wanted * np.sign(samples.dq[:, 0])
         if min(turn.std(), wanted.std()) > 1e-3 and np.corrcoef(turn, wanted)[0, 1] < MIRRORED:
-            return [
+            yield (
                 f"The robot turns right where {command.name} is positive: the recording is a "
                 "mirror image (y and heading reversed), or the sign of the command is; the model "
                 "moves as recorded."
-            ]
-    return []
+            )
+            return
 
 
 def unseen_samples(samples: Samples, drive: Drive, calibration: Calibration) -> Samples | None:
@@ -274,25 +266,19 @@ def with_quality(
     def by_dof(values: Array) -> dict[str, float]:
         return {dof: float(value) for dof, value in zip(model.dofs, values, strict=True)}
 
-    rmse, r2 = {}, {}
+    figures: dict[str, Any] = {"held_out_rmse": {}, "held_out_r2": {}}
     if unseen is not None:
         believed = unseen.rows(plausible(unseen.x, spec))
-        rmse, r2 = map(by_dof, errors_of(model, believed))
-    quality = Quality(
-        samples=len(linear.regression.samples.t),
-        outliers=by_dof(linear.outliers),
-        condition=by_dof(linear.condition),
-        rmse=by_dof(linear.rmse),
-        r2=by_dof(linear.r2),
-        held_out_rmse=rmse,
-        held_out_r2=r2,
-    )
+        errors = map(by_dof, errors_of(model, believed))
+        figures |= zip(("held_out_rmse", "held_out_r2"), errors, strict=True)
     if held_out is not None:
-        quality = replace(
-            quality,
-            open_loop_horizon_s=held_out.horizon_s,
-            open_loop_position_error_m=held_out.mean_position_error_m,
-            open_loop_heading_error_rad=held_out.mean_heading_error_rad,
-            open_loop_path_m=held_out.mean_path_m,
-        )
+        figures |= {
+            "open_loop_horizon_s": held_out.horizon_s,
+            "open_loop_position_error_m": held_out.mean_position_error_m,
+            "open_loop_heading_error_rad": held_out.mean_heading_error_rad,
+            "open_loop_path_m": held_out.mean_path_m,
+        }
+    measures = ("outliers", "condition", "rmse", "r2")
+    figures |= {name: by_dof(getattr(linear, name)) for name in measures}
+    quality = Quality(samples=len(linear.regression.samples.t), **figures)
     return replace(model, quality=quality)

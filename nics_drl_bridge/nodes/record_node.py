@@ -25,7 +25,8 @@ from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.qos import QosWatch
 from nics_drl_bridge.nodes.runner import EXIT_BAD_INPUT, declare, last_word, run_node, steadily
-from nics_drl_bridge.recording.bag_reader import JointMessage, gather, state_of, wheels_of
+from nics_drl_bridge.recording.bag_file import Message
+from nics_drl_bridge.recording.bag_reader import joint_streams
 from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S, DrivePlan
 from nics_drl_bridge.recording.messages import imu_row, pose_row, stamp, twist_row
 from nics_drl_bridge.recording.recording import Recording
@@ -136,7 +137,7 @@ class DriveLog:
         self._spec, self._roles, self._now = spec, roles, now
         self._commands, self._odom, self._twist = _Rows("cmd_vel"), _Rows("odom"), _Rows("odom")
         self._pose, self._imu = _Rows("pose"), _Rows("imu")
-        self._joints: list[JointMessage] = []
+        self._joints: list[Message] = []
 
     @property
     def seconds(self) -> float:
@@ -165,8 +166,7 @@ class DriveLog:
 
     def joints(self, message: JointState) -> None:
         """Records the data of the joints."""
-        values = list(message.position), list(message.velocity)
-        self._joints.append(JointMessage(self._now(), stamp(message), message.name, *values))
+        self._joints.append(Message(self._now(), message))
 
     def check(self) -> None:
         """Checks, before the robot moves, that the recording will be usable.
@@ -176,7 +176,7 @@ class DriveLog:
         """
         measured = [v.name for v in self._spec.state if v.follows is None]
         if self._joints:
-            state_of(gather("joint_states", self._joints), self._spec, self._roles, PLACE)
+            joint_streams("joint_states", self._joints, self._spec, self._roles, PLACE)
         elif measured or self._roles.state:
             raise BackendError(
                 f"topic 'joint_states': nothing has arrived, but {(measured or ['the state'])[0]} "
@@ -210,10 +210,7 @@ class DriveLog:
         if len(self._imu) >= FEWEST:
             data["imu"] = self._imu.data()
         if len(self._joints) >= FEWEST:
-            table = gather("joint_states", self._joints)
-            state = state_of(table, self._spec, self._roles, PLACE)
-            wheels = wheels_of(table, self._roles, PLACE)
-            data |= {n: d for n, d in (("state", state), ("wheels", wheels)) if d is not None}
+            data |= joint_streams("joint_states", self._joints, self._spec, self._roles, PLACE)
         try:
             found: dict[str, Any] = dict(streams(data, self._roles.stamps, PLACE))
         except RecordingError:

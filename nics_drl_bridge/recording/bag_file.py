@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from nics_drl_bridge.config import no_device, parse_yaml, read_text
-from nics_drl_bridge.errors import LONGEST_NAME, BridgeError, RecordingError, shortened
+from nics_drl_bridge.errors import BridgeError, RecordingError, shortened
 from nics_drl_bridge.recording.messages import Offer, check_libraries, offers_of, stamp, typestore
 from nics_drl_bridge.recording.stamping import Nanoseconds
 
@@ -32,7 +32,7 @@ DATABASE = ".db3"
 SUFFIXES = (".mcap", DATABASE)
 COMPRESSED = (".zst", ".zstd")
 URI_SIGNS = "?#%"
-CURE = "save the rest with `nics bag salvage`, try `ros2 bag reindex`, or record anew."
+LONGEST_NAME, LONGEST_REASON = 60, 260  # of a topic or type, and of a fault [characters]
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,8 @@ def is_storage(path: Path) -> bool:
 def opened(path: str | Path) -> Iterator[BagFile]:
     """Opens a bag, given its folder or its only file.
 
-    Raises:
-        RecordingError: there is no such bag, it is damaged, empty or was not closed, or a library
-            is not installed; any exception of rosbags on a damaged bag becomes one sentence.
+    Raises RecordingError if there is no such bag, it is damaged, empty or was not closed, or a
+    library is not installed; any exception of rosbags on a damaged bag becomes one sentence.
     """
     path = Path(path)
     check_libraries(path, "reading")
@@ -71,37 +70,32 @@ def opened(path: str | Path) -> Iterator[BagFile]:
 
     try:
         place = _place(path)
+        files = [place, *(place.iterdir() if place.is_dir() else ())]
         # rosbags opens databases by URI, which these characters cut.
         sign = next((sign for sign in URI_SIGNS if sign in str(place)), None)
-        if sign and any(DATABASE in p.suffixes for p in (place, *place.glob(f"*{DATABASE}*"))):
+        if sign and any(DATABASE in file.suffixes for file in files):
             raise RecordingError(
                 f"{place}: SQLite can't open what has {sign!r} in its path; rename the folder."
             )
-        for file in (place, *(place.iterdir() if place.is_dir() else ())):
+        for file in files:
             no_device(file)
         with TemporaryDirectory() as room:  # before rosbags, which unpacks chunks of any size
             for file in _listed(place, Path(room)) if place.is_dir() else [place]:
-                _check_storage(path, file)
+                _check_storage(file)
         with Reader(place) as reader:
-            _check_summary(path, reader)
-            _check_topics(path, reader)
+            _check_summary(reader)
+            if not reader.message_count:
+                raise RecordingError(f"{path}: holds no messages; record a drive of 20 s or more.")
             yield BagFile(reader, str(path))
     except BridgeError:
         raise
     except Exception as error:  # noqa: BLE001 - the reader can raise anything on a damaged file
+        why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
         raise RecordingError(
-            f"{path}: can't be read as a bag ({_reason(error)}); it is damaged or was not closed: "
-            f"{CURE}"
+            f"{path}: can't be read as a bag ({shortened(why, LONGEST_REASON)}); it is damaged or "
+            "was not closed: save the rest with `nics bag salvage`, try `ros2 bag reindex`, or "
+            "record anew."
         ) from None
-
-
-def _damaged(place: object, what: str) -> RecordingError:
-    return RecordingError(f"{place}: {what}; it is damaged: {CURE}")
-
-
-def _reason(error: object) -> str:
-    text = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-    return text if len(text) <= 200 else f"{text[:200]}..."
 
 
 def _place(path: Path) -> Path:
@@ -120,8 +114,7 @@ def _place(path: Path) -> Path:
     file = files[0] if path.is_dir() else path
     if file.suffix in COMPRESSED:
         raise RecordingError(
-            f"{file}: is compressed; unpack it with `zstd -d`, or give the bag's folder with its "
-            f"{METADATA}."
+            f"{file}: is compressed; unpack it with `zstd -d`, or give the folder with {METADATA}."
         )
     return file
 
@@ -152,67 +145,49 @@ def _listed(folder: Path, room: Path) -> list[Path]:
     return [unpack_file(file, room / file.stem) for file in files]
 
 
-def _storages(reader: Reader) -> list[Any]:
-    """Returns the readers of an open bag's files, decompressed if need be."""
-    return list(getattr(reader.storage, "storages", [reader.storage]))
-
-
-def _check_storage(path: Path, file: Path) -> None:
+def _check_storage(file: Path) -> None:
     from nics_drl_bridge.recording.mcap import DamageError, check_mcap
 
-    if file.suffix == DATABASE:
-        _check_database(path, file)
+    if file.suffix != DATABASE:
+        try:
+            check_mcap(file)
+        except DamageError as damage:
+            raise ValueError(f"{file.name} is damaged at {damage}") from None
         return
-    try:
-        check_mcap(file)
-    except DamageError as damage:
-        raise RecordingError(f"{path}: {file.name} is damaged at {damage}; {CURE}") from None
-
-
-def _check_database(path: Path, database: Path) -> None:
-    journal = database.with_name(f"{database.name}-wal")
+    journal = file.with_name(f"{file.name}-wal")
     if journal.is_file() and journal.stat().st_size > 0:
-        raise RecordingError(
-            f"{path}: was not closed, part of it is still in {journal.name}; stop the recorder, "
-            f"or close it with `sqlite3 {database.name} .quit`."
+        raise ValueError(
+            f"part of it is still in {journal.name}; stop the recorder, or close it with `sqlite3 "
+            f"{file.name} .quit`"
         )
-    place = f"{database.absolute().as_uri()}?mode=ro&immutable=1"
+    place = f"{file.absolute().as_uri()}?mode=ro&immutable=1"
     with closing(sqlite3.connect(place, uri=True)) as base:
         (verdict,) = base.execute("PRAGMA integrity_check(1)").fetchone()
     if verdict != "ok":
-        raise _damaged(path, f"its database is broken ({_reason(verdict)})")
+        raise ValueError(f"its database is broken: {verdict}")
 
 
-def _check_summary(path: Path, reader: Reader) -> None:
-    counted = sum(connection.msgcount for connection in reader.connections)
-    held = sum(storage.metadata.message_count for storage in _storages(reader))
-    if held != counted:
-        raise _damaged(path, f"its summary speaks of {counted} messages, its files hold {held}")
-    if (whole := reader.message_count) != counted:
-        raise _damaged(
-            path, f"its summary speaks of {whole} messages, its topics add up to {counted}"
-        )
-    if counted == 0:
-        raise RecordingError(f"{path}: holds no messages; record a drive of 20 s or more.")
-
-
-def _check_topics(path: Path, reader: Reader) -> None:
-    """Compares the topics of a bag's summary with those of its files."""
+def _check_summary(reader: Reader) -> None:
     from nics_drl_bridge.recording.mcap import check_message
 
-    if not all(isinstance(c.topic, str) and c.topic for c in reader.connections):
-        raise _damaged(path, "its summary has lost the name of a topic")
-    summary, held = _counts(reader), sum(map(_counts, _storages(reader)), Counter())
+    storages: list[Any] = list(getattr(reader.storage, "storages", [reader.storage]))
+    summary, held = _counts(reader), sum(map(_counts, storages), Counter())
+    told, there = summary.total(), sum(each.metadata.message_count for each in storages)
+    if there != told:
+        raise ValueError(f"its summary speaks of {told} messages, its files hold {there}")
+    if (whole := reader.message_count) != told:
+        raise ValueError(f"its summary speaks of {whole} messages, its topics add up to {told}")
+    if not all(isinstance(topic, str) and topic for topic, _ in summary):
+        raise ValueError("its summary has lost the name of a topic")
     for topic, kind in sorted(set(summary + held), key=str):
-        if summary[topic, kind] != held[topic, kind]:
+        if (promised := summary[topic, kind]) != (found := held[topic, kind]):
             names = (repr(shortened(str(name), LONGEST_NAME)) for name in (topic, kind))
-            raise _damaged(
-                path,
-                f"topic {' of type '.join(names)} has {held[topic, kind]} messages in its files, "
-                f"{summary[topic, kind]} by its summary",
+            raise ValueError(
+                f"topic {' of type '.join(names)} has {found} messages in its files, {promised} by "
+                "its summary"
             )
     if reader.compression_mode == "message":
-        for storage in _storages(reader):
+        for storage in storages:
             for _, _, data in storage.messages(storage.connections):
                 check_message(data)
 
@@ -233,20 +208,20 @@ def times_of(messages: Sequence[Message]) -> tuple[Nanoseconds, Nanoseconds | No
 
 
 class BagFile:
-    """An open bag whose topics are read completely or not at all.
+    """A bag in `opened`, whose topics are read completely or not at all.
 
-    Attributes:
-        place: its name, for errors.
-        types: message type of each topic; several are joined by `and`.
-        empty: topics without messages.
+    A topic raises ValueError, which becomes the RecordingError of `opened`, if messages of it are
+    missing, outside of the bag's time span, or damaged.
     """
 
     def __init__(self, reader: Reader, place: str) -> None:
-        self._reader, self._store, self.place = reader, typestore(), place
+        self._reader, self._store = reader, typestore()
+        self.place = place  # its name, for errors
         self._connections: dict[str, list[Connection]] = {}
         for connection in reader.connections:
             self._connections.setdefault(connection.topic, []).append(connection)
         topics = self._connections.items()
+        # Message type of each topic; several are joined by `and`.
         self.types = {t: " and ".join(sorted({c.msgtype for c in some})) for t, some in topics}
         self.empty = frozenset(t for t, some in topics if not sum(c.msgcount for c in some))
 
@@ -265,13 +240,15 @@ class BagFile:
         return self.types[topic] in self._store.fielddefs
 
     def messages(self, topic: str) -> list[Message]:
-        """Returns all messages of a topic.
-
-        Raises:
-            RecordingError: messages are missing, outside of the bag's time span, or damaged.
-        """
-        raw = self._raw(topic)
-        return [Message(ns, self._decoded(topic, k, t, d)) for k, (t, ns, d) in enumerate(raw)]
+        """Returns all messages of a topic."""
+        found = []
+        for k, (kind, ns, data) in enumerate(self._raw(topic)):
+            try:
+                found.append(Message(ns, self._store.deserialize_cdr(data, kind)))
+            except Exception as error:  # noqa: BLE001 - damaged bytes break the decoder in any way
+                what = f"topic {topic!r}: message {k} can't be decoded as {kind} ({error})"
+                raise ValueError(what) from None
+        return found
 
     def serialized(self, topic: str) -> list[tuple[int, bytes]]:
         """Returns the same messages undecoded: time of receipt [ns] and bytes."""
@@ -283,16 +260,9 @@ class BagFile:
         promised = sum(connection.msgcount for connection in connections)
         first, last = self.span_ns
         if len(raw) != promised:
-            what = f"topic {topic!r} has {len(raw)} messages, by the bag's summary {promised}"
-            raise _damaged(self.place, what)
+            raise ValueError(f"topic {topic!r} has {len(raw)} messages, by the summary {promised}")
         if any(not first <= ns <= last for _, ns, _ in raw):
-            what = f"topic {topic!r} has messages outside of the time span of the bag's summary"
-            raise _damaged(self.place, what)
+            raise ValueError(
+                f"topic {topic!r} has messages outside of the time span of its summary"
+            )
         return raw
-
-    def _decoded(self, topic: str, k: int, kind: str, data: bytes) -> Any:
-        try:
-            return self._store.deserialize_cdr(data, kind)
-        except Exception as error:  # noqa: BLE001 - the decoder can raise anything on damaged bytes
-            what = f"topic {topic!r}: message {k} can't be decoded as {kind} ({_reason(error)})"
-            raise _damaged(self.place, what) from None

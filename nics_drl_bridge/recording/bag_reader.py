@@ -27,7 +27,6 @@ from nics_drl_bridge.recording.messages import (
     imu_row,
     pose_row,
     quaternion,
-    stamp,
     twist_row,
 )
 from nics_drl_bridge.recording.recording import Recording, check
@@ -43,15 +42,15 @@ PERCENTILES = (5.0, 50.0, 95.0)
 SPANNED = 0.9  # share of a uniform distribution between the first and last of these percentiles
 
 
-def load_bag(path: str | Path, mapping: TopicRoles, spec: RobotSpec) -> Recording:
+def load_bag(path: str | Path, spec: RobotSpec | None, mapping: TopicRoles) -> Recording:
     """Reads a drive of a robot from a bag: its folder or its only file.
 
-    Missing roles of topics are guessed; for the clocks see `stamping.streams`.
-
-    Raises:
-        RecordingError: the bag is damaged or incomplete, a topic is missing or ambiguous, or
-            the data can't be used for this robot; one sentence with place and fix.
+    Missing roles of topics are guessed; for the clocks see `stamping.streams`. RecordingError, one
+    sentence with place and fix: the bag is damaged or incomplete, a topic is missing or ambiguous,
+    or the data can't be used for this robot.
     """
+    if spec is None:
+        raise RecordingError(f"{path}: is a bag; say of which robot, with a RobotSpec.")
     with opened(path) as bag:
         topics = roles.assign(mapping, bag.types, bag.empty, bag.place)
         data = {
@@ -59,17 +58,11 @@ def load_bag(path: str | Path, mapping: TopicRoles, spec: RobotSpec) -> Recordin
             "pose": _pose(bag, topics.get("pose") or topics["odom"], mapping),
         }
         if "pose" in topics and "odom" in topics:
-            odometry = bag.messages(topics["odom"])
-            data["odometry"] = _table(bag, topics["odom"], odometry, twist_row)
-        if "joint_states" in topics:
-            joints = gather(
-                topics["joint_states"], map(_joints, bag.messages(topics["joint_states"]))
-            )
-            state = state_of(joints, spec, mapping, bag.place)
-            wheels = wheels_of(joints, mapping, bag.place)
-            data |= {n: d for n, d in (("state", state), ("wheels", wheels)) if d is not None}
+            data["odometry"] = _table(bag, topics["odom"], twist_row)
+        if topic := topics.get("joint_states"):
+            data |= joint_streams(topic, bag.messages(topic), spec, mapping, bag.place)
         if "imu" in topics:
-            data["imu"] = _table(bag, topics["imu"], bag.messages(topics["imu"]), imu_row)
+            data["imu"] = _table(bag, topics["imu"], imu_row)
         latency = latency_of(bag, topics.get("odom"))
     made = streams(data, mapping.stamps, str(path))
     recording = Recording(**made, source=str(path), variables=spec.variable_names, latency=latency)
@@ -77,8 +70,9 @@ def load_bag(path: str | Path, mapping: TopicRoles, spec: RobotSpec) -> Recordin
 
 
 def _table(
-    bag: BagFile, topic: str, messages: Sequence[Message], row: Callable[[Any], Row]
+    bag: BagFile, topic: str, row: Callable[[Any], Row], messages: Sequence[Message] | None = None
 ) -> TopicData:
+    messages = bag.messages(topic) if messages is None else messages
     receive, header = times_of(messages)
     values = np.array([row(m.content) for m in messages], dtype=np.float64)
     for k in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1]:
@@ -90,15 +84,15 @@ def _table(
 
 
 def _command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
-    if bag.types[topic] in (roles.ACKERMANN, roles.ACKERMANN_STAMPED):
-        for variable in spec.command:
-            if variable.turns and not variable.steers:
-                raise RecordingError(
-                    f"{bag.place}: topic {topic!r} holds steering angles [rad], but "
-                    f"{variable.name!r} of robot {spec.name!r} is in {variable.unit}; choose the "
-                    "robot that drove, or another topic."
-                )
-    data = _table(bag, topic, bag.messages(topic), command_row)
+    for variable in spec.command:
+        steered = bag.types[topic] in (roles.ACKERMANN, roles.ACKERMANN_STAMPED)
+        if steered and variable.turns and not variable.steers:
+            raise RecordingError(
+                f"{bag.place}: topic {topic!r} holds steering angles [rad], but {variable.name!r} "
+                f"of robot {spec.name!r} is in {variable.unit}; choose the robot that drove, or "
+                "another topic."
+            )
+    data = _table(bag, topic, command_row)
     return replace(data, values=spec.from_cmd_vel(data.values))
 
 
@@ -114,7 +108,7 @@ def _pose(bag: BagFile, topic: str, mapping: TopicRoles) -> TopicData:
             f"{bag.place}: topic {topic!r}: message {k}: the quaternion has the length "
             f"{length[k]:.3f} and not 1; check its publisher, or choose another topic."
         )
-    return _table(bag, topic, messages, pose_row)
+    return _table(bag, topic, pose_row, messages)
 
 
 def _of_one_body(
@@ -134,13 +128,23 @@ def _of_one_body(
     }
     if len(pairs) == 1:
         return [message for pair, message in single if pair in pairs]
-    named = " with the given names" if any(wanted) else ""
     problem = "several transforms" if pairs else "no transform"
+    named = " with the given names" if any(wanted) else ""
+    listed = ", ".join(sorted(f"{a} -> {b}" for a, b in there)) or "none"
     raise RecordingError(
         f"{bag.place}: topic {topic!r} holds {problem}{named}; write those of the robot into the "
-        f"topics file, as in `frame: world` and `child_frame: base_link`; it holds "
-        f"{', '.join(sorted(f'{a} -> {b}' for a, b in there)) or 'none'}."
+        f"topics file, as in `frame: world` and `child_frame: base_link`; it holds {listed}."
     )
+
+
+def joint_streams(
+    topic: str, messages: Sequence[Message], spec: RobotSpec, mapping: TopicRoles, place: str
+) -> dict[str, TopicData]:
+    """Returns state and wheels, each if the joints show it; for errors see `state_of`."""
+    joints = gather(topic, messages)
+    found = {"state": state_of(joints, spec, mapping, place)}
+    found["wheels"] = wheels_of(joints, mapping, place)
+    return {name: data for name, data in found.items() if data is not None}
 
 
 class Joints(NamedTuple):
@@ -148,63 +152,44 @@ class Joints(NamedTuple):
 
     topic: str
     receive_ns: Nanoseconds  # (T,)
-    header_ns: Nanoseconds  # (T,)
+    header_ns: Nanoseconds | None  # (T,)
     names: tuple[str, ...]
     position: Array  # (T, J) [rad or m]
     velocity: Array  # (T, J) [rad/s or m/s]
 
 
-class JointMessage(NamedTuple):
-    """One message; positions or velocities may be empty."""
-
-    receive_ns: int
-    header_ns: int
-    names: Sequence[str]
-    position: Sequence[float]
-    velocity: Sequence[float]
-
-
-def _joints(message: Message) -> JointMessage:
-    found = message.content
-    return JointMessage(
-        message.receive_ns, stamp(found), found.name, found.position, found.velocity
-    )
-
-
-def gather(topic: str, messages: Iterable[JointMessage]) -> Joints:
+def gather(topic: str, messages: Sequence[Message]) -> Joints:
     """Collects messages, which may contain different joints, in one table."""
-    messages = list(messages)
-    names = tuple(dict.fromkeys(name for message in messages for name in message.names))
+    names = tuple(dict.fromkeys(name for message in messages for name in message.content.name))
     position, velocity = np.full((2, len(messages), len(names)), np.nan)
     for row, message in enumerate(messages):
-        columns = [names.index(name) for name in message.names]
-        for table, values in ((position, message.position), (velocity, message.velocity)):
+        told = message.content
+        columns = [names.index(name) for name in told.name]
+        for table, values in ((position, told.position), (velocity, told.velocity)):
             if len(values) == len(columns):
                 table[row, columns] = values
-    receive = np.array([m.receive_ns for m in messages], dtype=np.int64)
-    header = np.array([m.header_ns for m in messages], dtype=np.int64)
-    return Joints(topic, receive, header, names, position, velocity)
+    return Joints(topic, *times_of(messages), names, position, velocity)
 
 
 def state_of(joints: Joints, spec: RobotSpec, mapping: TopicRoles, place: str) -> TopicData | None:
     """Returns the measured state (T, S), from the messages that contain all of it.
 
-    None if joints of some state variables are missing, but each follows a command.
-
-    Raises:
-        RecordingError: a named joint does not exist, or a required state was not measured.
+    None if joints of some state variables are missing, but each follows a command. RecordingError
+    if a named joint does not exist, or a required state was not measured.
     """
     known = [v.name for v in spec.state]
-    for name in mapping.state:
-        if name not in known:
-            raise RecordingError(
-                f"{place}: topics: robot {spec.name!r} has no state {name!r}; "
-                f"{nearest(name, known)}"
-            )
+    for name in sorted(mapping.state.keys() - set(known)):
+        raise RecordingError(
+            f"{place}: topics: robot {spec.name!r} has no state {name!r}; {nearest(name, known)}"
+        )
     sources = {v.name: _source(joints, v, mapping, place) for v in spec.state}
     found = [source for source in sources.values() if source is not None]
     if spec.state and len(found) == len(sources):
-        columns = [_column(joints, v, s) for v, s in zip(spec.state, found, strict=True)]
+        columns = []
+        for variable, source in zip(spec.state, found, strict=True):
+            usual = "position" if variable.unit in POSITION_UNITS else "velocity"
+            table = joints.position if (source.field or usual) == "position" else joints.velocity
+            columns.append(source.scale * table[:, joints.names.index(source.joint)])
         return _complete(joints, np.stack(columns, axis=1), [s.joint for s in found], place)
     if mapping.state or any(v.follows is None for v in spec.state):
         missing = next(name for name, source in sources.items() if source is None)
@@ -255,14 +240,7 @@ def _alike(names: Iterable[str], wanted: str) -> str | None:
     return wanted if wanted in found else found[0] if len(found) == 1 else None
 
 
-def _column(joints: Joints, variable: StateVariable, source: JointSource) -> Array:
-    usual = "position" if variable.unit in POSITION_UNITS else "velocity"
-    table = joints.position if (source.field or usual) == "position" else joints.velocity
-    return np.asarray(source.scale * table[:, joints.names.index(source.joint)])
-
-
 def _complete(joints: Joints, values: Array, names: Sequence[str], place: str) -> TopicData:
-    """Drops the messages about other joints."""
     keep = np.asarray(np.isfinite(values).all(axis=1))
     if not keep.any():
         raise RecordingError(
@@ -278,11 +256,8 @@ def latency_of(bag: BagFile, odom: str | None = None) -> Latency:
     If a topic is missing, has too few messages or is stamped by another clock, its delay is
     unknown. The odometry topic is by default the one of that type or name.
     """
-    scan, odom = _topic(bag, SCAN, "scan"), odom or _topic(bag, roles.ODOMETRY, "odom")
-    return Latency(
-        scan=None if scan is None else _delay(bag.messages(scan)),
-        odom=None if odom is None else _delay(bag.messages(odom)),
-    )
+    odom = odom or _topic(bag, roles.ODOMETRY, "odom")
+    return Latency(scan=_delay(bag, _topic(bag, SCAN, "scan")), odom=_delay(bag, odom))
 
 
 def _topic(bag: BagFile, kind: str, name: str) -> str | None:
@@ -293,12 +268,10 @@ def _topic(bag: BagFile, kind: str, name: str) -> str | None:
     return found[0] if len(found) == 1 else None
 
 
-def _delay(messages: Sequence[Message]) -> Delay | None:
-    """Fits a uniform distribution to the delays of stamped messages."""
-    if len(messages) < LEAST_MESSAGES:
-        return None
+def _delay(bag: BagFile, topic: str | None) -> Delay | None:
+    messages = bag.messages(topic) if topic else []
     receive, stamps = times_of(messages)
-    if stamps is None or not stamps.all():
+    if len(messages) < LEAST_MESSAGES or stamps is None or not stamps.all():
         return None
     late = (receive - stamps) * S_PER_NS - np.array([_sweep(m.content) for m in messages])
     low, middle, high = np.percentile(late, PERCENTILES)
@@ -310,6 +283,5 @@ def _delay(messages: Sequence[Message]) -> Delay | None:
 
 def _sweep(scan: Any) -> float:
     """Returns the time from a scan's stamp, that of beam 0, to its last beam [s]; else 0."""
-    if not hasattr(scan, "ranges"):
-        return 0.0
-    return max(0.0, float(scan.time_increment)) * max(0, len(scan.ranges) - 1)
+    beams = len(getattr(scan, "ranges", ()))
+    return max(0.0, float(scan.time_increment)) * (beams - 1) if beams else 0.0

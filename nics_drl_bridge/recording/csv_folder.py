@@ -34,10 +34,7 @@ def load_csv_folder(path: str | Path) -> Recording:
     `cmd.csv` (linear.x, angular.z) and `vrpn.csv` are required; wheels are read if both files
     exist. The heading is the yaw of the quaternion. Commands and wheels are stamped by the robot's
     clock, the pose by that of the motion capture; calibration estimates the offset between them.
-
-    Raises:
-        RecordingError: a file is missing, empty, or contains an unusable row; one sentence with
-            the file, the row and the fix.
+    RecordingError names the file, the row and the fix.
     """
     path = Path(path)
     if not path.is_dir():
@@ -50,84 +47,85 @@ def load_csv_folder(path: str | Path) -> Recording:
     tables = {name: _read(path / name) for name in COLUMNS if (path / name).exists()}
     command, vrpn = tables["cmd.csv"], tables["vrpn.csv"]
     _check_units(path, tables)
+    wheels = None
+    if "L_wheel.csv" in tables and "R_wheel.csv" in tables:
+        left, right = tables["L_wheel.csv"], tables["R_wheel.csv"]
+        at_left = np.interp(left[:, 1], right[:, 1], right[:, 0])
+        wheels = Stream(left[:, 1], np.stack([left[:, 0], at_left], axis=1), ROBOT_CLOCK)
     return Recording(
         command=Stream(command[:, 2], command[:, :2], ROBOT_CLOCK),
-        pose=Stream(vrpn[:, 7] * 1e-9, _pose(path / "vrpn.csv", vrpn), POSE_CLOCK),
-        wheels=_wheels(tables),
+        pose=Stream(vrpn[:, 7] * 1e-9, _poses(vrpn), POSE_CLOCK),
+        wheels=wheels,
         source=str(path),
     )
 
 
 def _read(path: Path) -> Array:
     """Reads the numbers of a file and checks them row by row; time is the last column."""
-    columns = COLUMNS[path.name]
+    no_device(path)
     try:
-        text = _lines(path)
-        rows = [(line, row) for line, row in enumerate(csv.reader(text), 1) if row]
+        rows = [(line, row) for line, row in enumerate(csv.reader(_lines(path)), 1) if row]
+        if not rows:
+            raise ValueError("is empty; record the drive anew")
+        table = np.array([_numbers(line, row, COLUMNS[path.name]) for line, row in rows])
+        for k in np.flatnonzero(np.diff(table[:, -1]) < 0.0)[:1]:
+            raise ValueError(
+                f"row {rows[k + 1][0]}: time runs backwards ({table[k, -1]:.6f}, then "
+                f"{table[k + 1, -1]:.6f}); sort the rows, or cut the file there"
+            )
+        if path.name == "vrpn.csv":
+            norm = np.linalg.norm(table[:, 3:7], axis=1)
+            for k in np.flatnonzero(np.abs(norm - 1.0) > 0.05)[:1]:
+                raise ValueError(
+                    f"row {rows[k][0]}: the quaternion has the length {norm[k]:.3f} and not 1; "
+                    "check the order of the columns (x, y, z, qx, qy, qz, qw, time)"
+                )
     except UnicodeDecodeError:
-        raise RecordingError(
-            f"{path}: is not UTF-8 text; it must hold comma-separated numbers."
-        ) from None
+        why = "is not UTF-8 text; it must hold comma-separated numbers"
     except (OSError, csv.Error) as error:
-        raise RecordingError(f"{path}: can't be read ({error}).") from None
-    if not rows:
-        raise RecordingError(f"{path}: is empty; record the drive anew.")
-    table = np.array([_numbers(path, line, row, columns) for line, row in rows])
-    for k in np.flatnonzero(np.diff(table[:, -1]) < 0.0)[:1]:
-        raise RecordingError(
-            f"{path}: row {rows[k + 1][0]}: time runs backwards ({table[k, -1]:.6f}, then "
-            f"{table[k + 1, -1]:.6f}); sort the rows, or cut the file there."
-        )
-    return table
+        why = f"can't be read ({error})"
+    except ValueError as error:
+        why = str(error)
+    else:
+        return table
+    raise RecordingError(f"{path}: {why}.")
 
 
 def _lines(path: Path) -> list[str]:
     """Reads the lines of a file; refuses files and lines larger than those of any drive."""
-    if no_device(path).stat().st_size > MOST_BYTES:
-        raise RecordingError(
-            f"{path}: is larger than {MOST_BYTES // 2**20} MB, which no drive is; cut it."
-        )
+    if path.stat().st_size > MOST_BYTES:
+        raise ValueError(f"is larger than {MOST_BYTES // 2**20} MB, which no drive is; cut it")
     lines = path.read_bytes().split(b"\n")
     if len(lines) > MOST_ROWS:
-        raise RecordingError(
-            f"{path}: has {len(lines)} rows, and a drive at most {MOST_ROWS}; cut it."
-        )
+        raise ValueError(f"has {len(lines)} rows, and a drive at most {MOST_ROWS}; cut it")
     for k, line in enumerate(lines, 1):
         if len(line) > LONGEST_ROW:
-            raise RecordingError(
-                f"{path}: row {k} has {len(line)} characters, which no row has; remove it."
-            )
+            raise ValueError(f"row {k} has {len(line)} characters, which no row has; remove it")
     return [str(line, "utf-8") for line in lines]
 
 
-def _numbers(path: Path, line: int, row: list[str], columns: tuple[str, ...]) -> list[float]:
+def _numbers(line: int, row: list[str], columns: tuple[str, ...]) -> list[float]:
     if len(row) != len(columns):
-        raise RecordingError(
-            f"{path}: row {line} has {len(row)} columns where {len(columns)} are needed "
-            f"({', '.join(columns)}); mend the row, or remove it."
+        raise ValueError(
+            f"row {line} has {len(row)} columns where {len(columns)} are needed "
+            f"({', '.join(columns)}); mend the row, or remove it"
         )
     values = []
     for name, text in zip(columns, row, strict=True):
         try:
             values.append(float(text))
         except ValueError:
-            raise RecordingError(
-                f"{path}: row {line}: {name} is {text[:40]!r}, which is no number; "
-                "mend the row, or remove it (these files have no header)."
+            raise ValueError(
+                f"row {line}: {name} is {text[:40]!r}, which is no number; mend the row, or "
+                "remove it (these files have no header)"
             ) from None
     if not np.isfinite(values).all():
-        raise RecordingError(f"{path}: row {line} holds NaN or inf; remove the row.")
+        raise ValueError(f"row {line} holds NaN or inf; remove the row")
     return values
 
 
-def _pose(path: Path, vrpn: Array) -> Array:
+def _poses(vrpn: Array) -> Array:
     qx, qy, qz, qw = vrpn[:, 3:7].T
-    norm = np.linalg.norm(vrpn[:, 3:7], axis=1)
-    for k in np.flatnonzero(np.abs(norm - 1.0) > 0.05)[:1]:
-        raise RecordingError(
-            f"{path}: row {k + 1}: the quaternion has the length {norm[k]:.3f} and not 1; check "
-            "the order of the columns (x, y, z, qx, qy, qz, qw, time)."
-        )
     heading = np.arctan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy**2 + qz**2))
     return np.stack([vrpn[:, 0], vrpn[:, 1], heading], axis=1)
 
@@ -150,11 +148,3 @@ def _check_units(path: Path, tables: dict[str, Array]) -> None:
                 f"{path / name}: lasts {lasted:.3g} s where the commands last {seconds:.3g} s; "
                 f"its stamps must be in {unit}."
             )
-
-
-def _wheels(tables: dict[str, Array]) -> Stream | None:
-    if "L_wheel.csv" not in tables or "R_wheel.csv" not in tables:
-        return None
-    left, right = tables["L_wheel.csv"], tables["R_wheel.csv"]
-    at_left = np.interp(left[:, 1], right[:, 1], right[:, 0])
-    return Stream(left[:, 1], np.stack([left[:, 0], at_left], axis=1), ROBOT_CLOCK)

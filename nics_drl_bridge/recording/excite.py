@@ -52,24 +52,18 @@ ATTEMPTS = 8
 class Exploration:
     """Generator of a robot's commands, one per period, that tracks the robot's pose.
 
-    It drives within a circle of radius `bound` [m] around the start, which contains the whole
-    robot, for a duration [s] including 1 s of standstill at both ends, at up to a share `speed` of
-    the greatest speeds and rates; angles use their full range.
+    It drives within the circle of its plan around the start, which contains the whole robot, with
+    1 s of standstill at both ends, at up to the plan's share of the greatest speeds and rates;
+    angles use their full range.
     """
 
-    def __init__(
-        self,
-        spec: RobotSpec,
-        bound: float,
-        duration: float,
-        rng: np.random.Generator,
-        speed: float = 1.0,
-    ) -> None:
+    def __init__(self, plan: DrivePlan, rng: np.random.Generator) -> None:
+        spec, self._plan = plan.robot, plan
         self._motion, self._rng = expected_motion(spec), rng
-        share = np.array([1.0 if c.unit in POSITION_UNITS else speed for c in spec.command])
+        share = np.array([1.0 if c.unit in POSITION_UNITS else plan.speed for c in spec.command])
         self.low, self.high = share * spec.command_low, share * spec.command_high
         self.rest = np.clip(np.zeros(len(spec.command)), self.low, self.high)
-        self._ticks, self._still = round(duration / PERIOD_S), round(STILL_S / PERIOD_S)
+        self._ticks, self._still = round(plan.duration / PERIOD_S), round(STILL_S / PERIOD_S)
         self._ramp = round(RAMP_S / PERIOD_S)
         self._visits = np.full((BINS,) * len(spec.command), 1.0 / BINS)
         self._tick, self._lost, self._turn = 0, 0, 0
@@ -78,7 +72,7 @@ class Exploration:
         self.pose: Array = np.zeros(3)
         self._before, self._seen = self.pose, False
         fastest = np.hypot(*spec.to_cmd_vel(np.maximum(-self.low, self.high))[:2])
-        self._outermost = bound - spec.footprint_radius
+        self._outermost = plan.bound - spec.footprint_radius
         self.keep_within = self._outermost - MARGIN_M - REACTION_S * float(fastest)
         turning = np.array([c.turns for c in spec.command])
         self._ways = self._ways_back(np.where(turning, TURNING, TURNING_SPEED))
@@ -89,11 +83,6 @@ class Exploration:
         """True if the drive is over."""
         return self._tick >= self._ticks
 
-    @property
-    def stuck(self) -> bool:
-        """True if the robot has found no acceptable segment `LOST` times in a row."""
-        return self._lost >= LOST
-
     def see(self, pose: Array) -> None:
         """Observes the pose (3,) at the start of the current period, in the start frame."""
         self.pose = geometry.compose(pose, geometry.between(self._before, self.pose))
@@ -101,14 +90,37 @@ class Exploration:
 
     def next(self) -> Array:
         """Returns the command (C,) for the period that begins now."""
-        if self._tick < self._still or self.done:
-            command = self.rest
-        else:
+        command = self.rest
+        if self._still <= self._tick < self._ticks:
             if len(self._queue) == 0 or self._goes_astray():
                 self._queue = self._segment()
             command, self._queue = np.asarray(self._queue[0]), self._queue[1:]
-        self._follow(command)
+        poses, states = self._roll(command[None, None])
+        self._before, self.pose = self.pose, poses[0, -1]
+        self._state, self._command = states[0, -1], command
+        self._visits[self._cells(command)] += 1.0
+        self._tick += 1
         return command
+
+    def expected(self) -> Pattern | None:
+        """Drives to the end; None if it finds no way back into its circle, or shows too little.
+
+        Every command must cover its range, and no two may be correlated.
+        """
+        poses, commands = [self.pose], []
+        while not self.done:
+            commands.append(self.next())
+            poses.append(self.pose)
+            if self._lost >= LOST:
+                return None
+        command, plan = np.array(commands), self._plan
+        if (command.std(axis=0) < SPREAD * (self.high - self.low)).any():
+            return None
+        footprint = plan.robot.footprint_radius
+        pattern = Pattern(PERIOD_S, command, np.array(poses), plan.bound, footprint)
+        alike = np.corrcoef(command, rowvar=False).reshape(len(self.low), -1)
+        varied = (np.abs(alike - np.eye(len(alike))) < ALIKE).all()
+        return pattern if varied and pattern.reach <= plan.bound else None
 
     def _goes_astray(self) -> bool:
         """True if, from the observed pose, the rest of the segment leads too far out."""
@@ -121,26 +133,16 @@ class Exploration:
         """Returns the greatest allowed distance from the start, at least the present one [m]."""
         return max(self.keep_within, float(_distance(self.pose))) + TOLERANCE_M
 
-    def _follow(self, command: Array) -> None:
-        poses, states = self._roll(command[None, None])
-        self._before, self.pose = self.pose, poses[0, -1]
-        self._state, self._command = states[0, -1], command
-        self._visits[self._cells(command)] += 1.0
-        self._tick += 1
-
     def _roll(self, commands: Array, period: float = PERIOD_S) -> tuple[Array, Array]:
-        """Rolls out commands (K, T, C) from the present pose and state."""
         many = len(commands)
         pose, state = np.repeat(self.pose[None], many, 0), np.repeat(self._state[None], many, 0)
         return self._motion.roll(pose, state, commands, period)
 
     def _cells(self, command: Array) -> tuple[NDArray[np.intp], ...]:
-        """Returns the cell indices of commands (..., C), by dimension."""
         share = (command - self.low) / (self.high - self.low)
         return tuple(np.moveaxis(np.clip((share * BINS).astype(np.intp), 0, BINS - 1), -1, 0))
 
     def _segment(self) -> Array:
-        """Returns the commands (T, C) up to the next decision."""
         left = self._ticks - self._still - self._tick
         if left <= self._ramp:
             return np.asarray(self._towards(self.rest[None], left + self._still)[0])
@@ -155,7 +157,6 @@ class Exploration:
         return self._least_harm(length)
 
     def _candidates(self, alone: bool) -> Array:
-        """Draws random levels (K, C) for one command or for several."""
         size = (CANDIDATES, len(self.low))
         fresh = self._rng.uniform(self.low, self.high, size)
         changed = self._rng.random(size) < (0.0 if alone else REDRAWN)
@@ -226,7 +227,6 @@ class Exploration:
 
 
 def _distance(pose: Array) -> Array:
-    """Returns the distance of poses (..., 3) from the start [m]."""
     return np.asarray(np.hypot(pose[..., 0], pose[..., 1]))
 
 
@@ -308,8 +308,7 @@ class ExpectedMotion:
 def expected_motion(spec: RobotSpec) -> ExpectedMotion:
     """Returns the motion of a robot's textbook kinematics, else its `cmd_vel` as body twist.
 
-    Raises:
-        ConfigError: the spec names no textbook, and a command is not part of a twist.
+    Raises ConfigError: the spec names no textbook, and a command is not part of a twist.
     """
     if spec.textbook is not None:
         book = textbook(spec)
@@ -358,46 +357,23 @@ class DrivePlan:
     def preview(self) -> Pattern:
         """Returns the pattern of the drive under the expected motion.
 
-        Raises:
-            ConfigError: the circle is too small for the robot to show its motion in it.
+        Raises ConfigError: the circle is too small for the robot to show its motion in it.
         """
         return self._found[1]
 
     def _attempt(self, number: int) -> Exploration:
-        rng = np.random.default_rng([self.seed, number])
-        return Exploration(self.robot, self.bound, self.duration, rng, self.speed)
+        return Exploration(self, np.random.default_rng([self.seed, number]))
 
     @cached_property
     def _found(self) -> tuple[int, Pattern]:
         """Number and pattern of the first attempt that varies all commands within the circle."""
         for number in range(ATTEMPTS):
             drive = self._attempt(number)
-            if drive.keep_within <= 0.0:
-                break
-            pattern = _driven(drive, self.bound, self.robot.footprint_radius)
-            if pattern is not None and pattern.reach <= self.bound and _varied(pattern, drive):
+            pattern = drive.expected() if drive.keep_within > 0.0 else None
+            if pattern is not None:
                 return number, pattern
         raise ConfigError(
             f"bound {self.bound:g}: a circle of {self.bound:g} m around the start is too small "
             f"for robot {self.robot.name!r} to show its motion within {self.duration:g} s; give "
             "it more space, less speed, or more time."
         )
-
-
-def _driven(drive: Exploration, bound: float, footprint: float) -> Pattern | None:
-    """Returns the expected pattern of a drive; None if it finds no way back into its circle."""
-    poses, commands = [drive.pose], []
-    while not drive.done:
-        commands.append(drive.next())
-        poses.append(drive.pose)
-        if drive.stuck:
-            return None
-    return Pattern(PERIOD_S, np.array(commands), np.array(poses), bound, footprint)
-
-
-def _varied(pattern: Pattern, drive: Exploration) -> bool:
-    """True if every command covers its range and no two are correlated."""
-    if (pattern.command.std(axis=0) < SPREAD * (drive.high - drive.low)).any():
-        return False
-    alike = np.corrcoef(pattern.command, rowvar=False).reshape(len(drive.low), -1)
-    return bool((np.abs(alike - np.eye(len(alike))) < ALIKE).all())

@@ -64,8 +64,7 @@ class _View:
 def records(data: memoryview, place: int = 0) -> Iterator[Record]:
     """Yields the records from an offset on, until the end of the data or a footer.
 
-    Raises:
-        DamageError: a record is truncated, of an unknown kind, or shorter than its fields.
+    Raises DamageError: a record is truncated, of an unknown kind, or shorter than its fields.
     """
     stream = _View(data, place)
     source = cast("IO[bytes]", stream)
@@ -162,8 +161,6 @@ def seal(path: Path) -> None:
 
 @dataclass
 class _Walk:
-    """Contents found while walking through a file."""
-
     data: McapSummary = field(default_factory=McapSummary)  # of the data section
     summary: McapSummary = field(default_factory=McapSummary)  # of the summary
     data_end: int = 0  # offset of the summary; 0 within the data
@@ -178,10 +175,8 @@ class _Walk:
 def check_mcap(path: Path) -> None:
     """Checks a file (https://mcap.dev/spec) from its first byte to its last.
 
-    Counts, times and index must agree, and every checksum present must match.
-
-    Raises:
-        DamageError: it is truncated, a checksum is wrong, or two of its parts disagree.
+    Counts, times and index must agree, and every checksum present must match. Raises DamageError:
+    it is truncated, a checksum is wrong, or two of its parts disagree.
     """
     if path.stat().st_size < len(MAGIC):
         raise DamageError(0, "the file is empty or ends at once")
@@ -266,7 +261,6 @@ def _in_summary(walk: _Walk, record: Record) -> None:
 
 
 def _agree(walk: _Walk) -> None:
-    """Compares the summary, if there is one, with the data."""
     data, summary = walk.data, walk.summary
     for name in ("schemas", "channels"):
         ours, theirs = getattr(data, name), getattr(summary, name)
@@ -277,18 +271,17 @@ def _agree(walk: _Walk) -> None:
             raise DamageError(walk.data_end, f"the channel {channel.topic!r} has no schema")
     if walk.indexed and walk.indexed != walk.chunks:
         raise DamageError(walk.data_end, "the index of its chunks does not fit them")
-    if walk.statistics is not None and not _fits(walk.statistics.content, walk):
+    if walk.statistics is None:
+        return
+    told: kinds.Statistics = walk.statistics.content
+    counts = Counter({key: n for key, n in told.channel_message_counts.items() if n})
+    if not (
+        told.message_count == data.counts.total()
+        and (not counts or counts == data.counts)
+        and told.chunk_count in (0, len(walk.chunks))
+        and data.span in (None, (told.message_start_time, told.message_end_time))
+    ):
         raise DamageError(walk.statistics.offset, "its statistics do not fit its messages")
-
-
-def _fits(statistics: kinds.Statistics, walk: _Walk) -> bool:
-    counts = Counter({key: n for key, n in statistics.channel_message_counts.items() if n})
-    return (
-        statistics.message_count == walk.data.counts.total()
-        and (not counts or counts == walk.data.counts)
-        and statistics.chunk_count in (0, len(walk.chunks))
-        and walk.data.span in (None, (statistics.message_start_time, statistics.message_end_time))
-    )
 
 
 def _zstd() -> Any:
@@ -301,9 +294,8 @@ def _zstd() -> Any:
 def unpack(data: bytes, compression: str, most: int = MOST_UNPACKED) -> bytes:
     """Decompresses the content of a chunk by `lz4` or `zstd`: a few bytes can unpack to terabytes.
 
-    Raises:
-        ValueError: the result is larger than `most` bytes, or the data is truncated. Other
-            exceptions of the libraries on damaged data are passed on.
+    Raises ValueError: the result is larger than `most` bytes, or the data is truncated. Other
+    exceptions of the libraries on damaged data are passed on.
     """
     if compression == "zstd":
         unpacker = _zstd().ZstdDecompressor()

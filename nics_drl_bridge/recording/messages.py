@@ -31,12 +31,11 @@ WHEELS = ("left_wheel", "right_wheel")
 
 def check_libraries(path: Path, what: str, instead: str = "") -> None:
     """Raises RecordingError if a library that `reading` or `writing` a bag needs is missing."""
-    for library in LIBRARIES:
-        if find_spec(library) is None:
-            raise RecordingError(
-                f"{path}: {what} a bag needs the library {library}; install it with "
-                f"pip install 'nics_drl_bridge[bags]'{instead}."
-            )
+    for library in (each for each in LIBRARIES if find_spec(each) is None):
+        raise RecordingError(
+            f"{path}: {what} a bag needs the library {library}; install it with "
+            f"pip install 'nics_drl_bridge[bags]'{instead}."
+        )
 
 
 def typestore() -> Typestore:
@@ -70,7 +69,6 @@ def command_row(message: Any) -> Row:
 
 
 def _place(message: Any) -> tuple[Any, Any]:
-    """Returns position and quaternion of any message that has them."""
     if hasattr(message, "transform"):
         return message.transform.translation, message.transform.rotation
     pose = getattr(message.pose, "pose", message.pose)

@@ -26,18 +26,10 @@ class Format(NamedTuple):
     has_topics: bool = False
 
 
-def _load_bag(path: Path, spec: RobotSpec | None, topics: TopicRoles) -> Recording:
-    if spec is None:
-        raise RecordingError(f"{path}: is a bag; say of which robot, with a RobotSpec.")
-    return load_bag(path, topics, spec)
-
-
 FORMATS = (
-    Format("a rosbag2", lambda path: path.exists() and is_bag(path), _load_bag, has_topics=True),
+    Format("a rosbag2", lambda p: p.exists() and is_bag(p), load_bag, has_topics=True),
     Format("a folder of CSV files", Path.is_dir, lambda path, *_: load_csv_folder(path)),
-    Format(
-        "an .npz file", lambda path: path.suffix == ".npz", lambda path, *_: load_recording(path)
-    ),
+    Format("an .npz file", lambda p: p.suffix == ".npz", lambda path, *_: load_recording(path)),
 )
 """The first that recognises a path reads it."""
 
@@ -45,13 +37,10 @@ FORMATS = (
 def read_recording(
     path: str | Path, spec: RobotSpec | None = None, topics: TopicRoles | None = None
 ) -> Recording:
-    """Reads a recording of any of `FORMATS`.
+    """Reads a recording of any of `FORMATS`; RecordingError if there is none, or it can't be read.
 
     The robot defines the meaning of a bag's `cmd_vel` and joints; the roles of its topics are
     guessed by default.
-
-    Raises:
-        RecordingError: there is no recording, or it can't be read.
     """
     path, topics = Path(path), topics or TopicRoles()
     found = next((each for each in FORMATS if each.recognises(path)), None)

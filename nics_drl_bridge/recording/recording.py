@@ -16,17 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge import geometry
+from nics_drl_bridge import files, geometry
 from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.files import (
-    MOST_BYTES,
-    check_sealed,
-    read_file,
-    sealed,
-    sha256,
-    write_bytes,
-)
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.robot.noise import Latency
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -118,9 +110,8 @@ def samples_on_one_clock(t: Array, pose: Array, state: Array, command: Array) ->
 def check(recording: Recording, spec: RobotSpec) -> Recording:
     """Returns a recording that can be used for a robot.
 
-    Raises:
-        RecordingError: it is of another robot, a stream is empty, contains NaN, runs backwards or
-            has the wrong width, or the pose has wrong units; one sentence with the place.
+    RecordingError names the place: it is of another robot, a stream is empty, contains NaN, runs
+    backwards or has the wrong width, or the pose has wrong units.
     """
     if recording.variables and recording.variables != spec.variable_names:
         raise RecordingError(
@@ -128,22 +119,22 @@ def check(recording: Recording, spec: RobotSpec) -> Recording:
             f"the robot {spec.name!r} has {', '.join(spec.variable_names)}: choose the robot that "
             "drove."
         )
-    width = {"command": len(spec.command), "state": len(spec.state)}
-    width |= {"pose": 3, "wheels": 2, "imu": 3, "odometry": 3}
+    width = {"command": len(spec.command), "state": len(spec.state), "wheels": 2}
     for name, stream in recording.streams.items():
-        _check_stream(f"{recording.source}: {name}", stream, width[name])
-    _check_units(recording, spec)
+        if fault := _fault(stream, width.get(name, 3)):
+            raise RecordingError(f"{recording.source}: {name}: {fault}.")
+    if fault := _wrong_unit(recording.pose, spec):
+        raise RecordingError(f"{recording.source}: pose: {fault}.")
     return recording
 
 
-def _check_units(recording: Recording, spec: RobotSpec) -> None:
-    """Refuses a pose that only degrees, millimetres or milliseconds can explain."""
-    pose, place = recording.pose, f"{recording.source}: pose"
+def _wrong_unit(pose: Stream, spec: RobotSpec) -> str:
+    """Tells of a pose that only degrees, millimetres or milliseconds can explain."""
     turn = np.percentile(np.abs(geometry.wrap_angle(np.diff(pose.values[:, 2]))), 95)
     if turn > LARGEST_TURN:
-        raise RecordingError(
-            f"{place}: the heading jumps by {turn:.1f} rad between neighbouring samples; it must "
-            "be in radians (degrees look like this)."
+        return (
+            f"the heading jumps by {turn:.1f} rad between neighbouring samples; it must be in "
+            "radians (degrees look like this)"
         )
     speeds = [v for v in spec.command if v.unit == "m/s"]
     fastest = max((max(abs(v.min), abs(v.max)) for v in speeds), default=np.inf)
@@ -151,36 +142,36 @@ def _check_units(recording: Recording, spec: RobotSpec) -> None:
     step, took = np.diff(pose.values[every, :2], axis=0), np.diff(pose.t[every])
     speed = np.percentile(np.hypot(*step.T) / np.maximum(took, 1e-9), 90) if len(took) else 0.0
     if speed > TOO_FAST * fastest:
-        raise RecordingError(
-            f"{place}: moves at {speed:.3g} m/s, a robot whose commands end at {fastest:g} m/s; "
-            "positions must be in metres and stamps in seconds."
+        return (
+            f"moves at {speed:.3g} m/s, a robot whose commands end at {fastest:g} m/s; positions "
+            "must be in metres and stamps in seconds"
         )
-    if np.median(np.diff(pose.t)) > SLOWEST_SAMPLING_S:
-        raise RecordingError(
-            f"{place}: there are {np.median(np.diff(pose.t)):.3g} s between samples; stamps must "
-            "be in seconds (milliseconds look like this)."
+    span = np.median(np.diff(pose.t))
+    if span > SLOWEST_SAMPLING_S:
+        return (
+            f"there are {span:.3g} s between samples; stamps must be in seconds (milliseconds "
+            "look like this)"
         )
+    return ""
 
 
-def _check_stream(place: str, stream: Stream, width: int) -> None:
-    if stream.values.ndim != 2 or stream.values.shape != (len(stream.t), width):
-        raise RecordingError(
-            f"{place}: has the shape {stream.values.shape} where ({len(stream.t)}, {width}) is "
-            "needed; check that the recording is of this robot."
+def _fault(stream: Stream, width: int) -> str:
+    t, values = stream.t, stream.values
+    if values.shape != (len(t), width):
+        return (
+            f"has the shape {values.shape} where ({len(t)}, {width}) is needed; check that the "
+            "recording is of this robot"
         )
-    if len(stream.t) < 2:
-        raise RecordingError(
-            f"{place}: has {len(stream.t)} samples; record a drive of 20 s or more."
+    if len(t) < 2:
+        return f"has {len(t)} samples; record a drive of 20 s or more"
+    for row in np.flatnonzero(~np.isfinite(values).all(axis=1) | ~np.isfinite(t))[:1]:
+        return f"row {row} holds NaN or inf; remove the row, or find out why it was recorded"
+    for row in np.flatnonzero(np.diff(t) < 0.0)[:1]:
+        return (
+            f"time runs backwards at row {row + 1} ({t[row]:.6f} s, then {t[row + 1]:.6f} s); sort "
+            "the rows, or cut the file there"
         )
-    for row in np.flatnonzero(~np.isfinite(stream.values).all(axis=1) | ~np.isfinite(stream.t))[:1]:
-        raise RecordingError(
-            f"{place}: row {row} holds NaN or inf; remove the row, or find out why it was recorded."
-        )
-    for row in np.flatnonzero(np.diff(stream.t) < 0.0)[:1]:
-        raise RecordingError(
-            f"{place}: time runs backwards at row {row + 1} ({stream.t[row]:.6f} s, then "
-            f"{stream.t[row + 1]:.6f} s); sort the rows, or cut the file there."
-        )
+    return ""
 
 
 def save_recording(recording: Recording, path: str | Path) -> None:
@@ -188,48 +179,51 @@ def save_recording(recording: Recording, path: str | Path) -> None:
 
     A checksum follows the archive, which `numpy.load` reads nevertheless.
     """
+    streams = recording.streams
     arrays: dict[str, NDArray[Any]] = {}
-    clocks = {}
-    for name, stream in recording.streams.items():
+    for name, stream in streams.items():
         arrays[f"{name}_t"], arrays[name] = stream.t, stream.values
-        clocks[name] = stream.clock
     meta = {
         "format": FORMAT,
         "source": recording.source,
-        "clocks": clocks,
+        "clocks": {name: stream.clock for name, stream in streams.items()},
         "variables": recording.variables,
     }
     if recording.latency.measured:
         meta["latency"] = recording.latency.model_dump(mode="json")
     buffer = io.BytesIO()
     np.savez_compressed(buffer, meta=np.array(json.dumps(meta)), **arrays)  # type: ignore[arg-type]
-    write_bytes(path, sealed(buffer.getvalue()))
+    files.write_bytes(path, files.sealed(buffer.getvalue()))
 
 
 def load_recording(path: str | Path) -> Recording:
     """Reads a recording written by `save_recording`.
 
-    Raises:
-        RecordingError: there is no such file, or it is not an `.npz`, damaged or incomplete.
+    Raises RecordingError if there is no such file, or it is not an `.npz`, damaged or incomplete.
     """
     try:
-        data = read_file(no_device(Path(path)))
+        data = files.read_file(no_device(Path(path)))
         arrays = _arrays(data)
         meta = json.loads(str(arrays["meta"]))
-        _check_seal(data, meta["format"])
-        if meta["format"] not in (FORMAT, COMMENT_FORMAT, UNSEALED_FORMAT):
+        version = meta["format"]
+        if version == FORMAT:
+            files.check_sealed(io.BytesIO(data))
+        elif version == COMMENT_FORMAT and data[-64:] != files.sha256(data[:-64]).encode():
+            raise ValueError("its checksum is missing or does not fit the rest")
+        if version not in (FORMAT, COMMENT_FORMAT, UNSEALED_FORMAT):
             raise RecordingError(
-                f"{path}: format {meta['format']!r} is not {FORMAT!r}; record it anew or use the "
-                "version of the package that wrote it."
+                f"{path}: format {version!r} is not {FORMAT!r}; record it anew or use the version "
+                "of the package that wrote it."
             )
         streams = {
             name: Stream(arrays[f"{name}_t"].astype(float), arrays[name].astype(float), clock)
             for name, clock in meta["clocks"].items()
         }
-        latency = Latency.model_validate(meta.get("latency", {}))
-        return Recording(
-            **streams, source=str(path), variables=tuple(meta["variables"]), latency=latency
+        latency, variables = (
+            Latency.model_validate(meta.get("latency", {})),
+            tuple(meta["variables"]),
         )
+        return Recording(**streams, source=str(path), variables=variables, latency=latency)
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file; check the path.") from None
     except (AttributeError, KeyError, RecursionError, TypeError) as error:
@@ -238,25 +232,17 @@ def load_recording(path: str | Path) -> Recording:
             "nics_drl_bridge.recording.recording.save_recording."
         ) from None
     except (ValueError, OSError) as error:
-        raise RecordingError(
-            f"{path}: can't be read as .npz ({error}); it may be damaged."
-        ) from None
+        why = f"can't be read as .npz ({error}); it may be damaged"
+        raise RecordingError(f"{path}: {why}.") from None
 
 
 def _arrays(data: bytes) -> dict[str, NDArray[Any]]:
     """The arrays of an `.npz` file's content. Raises ValueError if it is damaged or too large."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            if sum(member.file_size for member in archive.infolist()) > MOST_BYTES:
-                raise ValueError(f"unpacked it is larger than {MOST_BYTES // 2**20} MB")
+            if sum(member.file_size for member in archive.infolist()) > files.MOST_BYTES:
+                raise ValueError(f"unpacked it is larger than {files.MOST_BYTES // 2**20} MB")
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
             return {name: arrays[name] for name in arrays.files}
     except Exception as error:  # noqa: BLE001 - damage breaks zipfile and numpy in any way
         raise ValueError(str(error) or type(error).__name__) from None
-
-
-def _check_seal(data: bytes, version: str) -> None:
-    if version == FORMAT:
-        check_sealed(io.BytesIO(data))
-    elif version == COMMENT_FORMAT and data[-64:] != sha256(data[:-64]).encode():
-        raise ValueError("its checksum is missing or does not fit the rest")

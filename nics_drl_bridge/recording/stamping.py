@@ -54,10 +54,8 @@ def streams(data: Mapping[str, TopicData], stamps: Stamps, place: str) -> dict[s
     `receive`). Others are of a foreign clock (`header`): their stamps are shifted by the median
     delay, so that only a small offset is left for calibration. Command, state, wheels and IMU are
     put on one clock, by receipt if need be. The few messages that arrived after one with a later
-    stamp are sorted, and those before a simulation's first time are dropped.
-
-    Raises:
-        RecordingError: headers are missing, of several clocks, or run backwards.
+    stamp are sorted, and those before a simulation's first time are dropped. RecordingError if
+    headers are missing, of several clocks, or run backwards.
     """
     if stamps != "receive":
         data = {name: _in_order(part, place) for name, part in data.items()}
@@ -86,47 +84,40 @@ def _clocks(
 ) -> dict[str, tuple[str, int]]:
     """Returns each stream's clock, and the shift of its stamps to the recorder's clock [ns]."""
     foreign: dict[str, int] = {}
-    clocks = {}
-    for name, part in data.items():
-        ns = headers[name]
+    clocks = dict.fromkeys(data, (RECEIVE, 0))
+    for name, ns in headers.items():
         if ns is None:
-            clocks[name] = (RECEIVE, 0)
             continue
-        delay = part.receive_ns - ns
-        median = int(np.median(delay))
+        topic, delay = data[name].topic, data[name].receive_ns - ns
+        median, least, most = int(np.median(delay)), delay.min(), delay.max()
         usual = np.percentile(delay, 100.0 - STALLED)
-        wander = max(usual - median, median - delay.min()) * S_PER_NS
-        if wander > MAX_WANDER_S or (delay.max() - median) * S_PER_NS > MAX_STALL_S:
+        wander = max(usual - median, median - least) * S_PER_NS
+        if wander > MAX_WANDER_S or (most - median) * S_PER_NS > MAX_STALL_S:
             raise RecordingError(
-                f"{place}: topic {part.topic!r}: its header stamps lie "
-                f"{delay.min() * S_PER_NS:.3f} to {delay.max() * S_PER_NS:.3f} s before their "
-                "receipt, so they are of several clocks or of a simulated time at another rate; "
-                "write `stamps: receive` into the topics "
+                f"{place}: topic {topic!r}: its header stamps lie {least * S_PER_NS:.3f} to "
+                f"{most * S_PER_NS:.3f} s before their receipt, so they are of several clocks or "
+                "of a simulated time at another rate; write `stamps: receive` into the topics "
                 "file, and record a simulation with `ros2 bag record --use-sim-time`."
             )
-        if SAME_CLOCK_S[0] <= median * S_PER_NS <= SAME_CLOCK_S[1]:
-            clocks[name] = (RECEIVE, 0)
-            continue
-        alike = (c for c, d in foreign.items() if abs(d - median) * S_PER_NS < SAME_CLOCK_S[1])
-        clock = next(alike, f"{HEADER} of {part.topic}" if foreign else HEADER)
-        clocks[name] = (clock, foreign.setdefault(clock, median))
+        if not SAME_CLOCK_S[0] <= median * S_PER_NS <= SAME_CLOCK_S[1]:
+            alike = (c for c, d in foreign.items() if abs(d - median) * S_PER_NS < SAME_CLOCK_S[1])
+            clock = next(alike, f"{HEADER} of {topic}" if foreign else HEADER)
+            clocks[name] = (clock, foreign.setdefault(clock, median))
     return clocks
 
 
 def _header(part: TopicData, stamps: Stamps, place: str) -> Nanoseconds | None:
-    """Returns the checked header stamps of a topic; None if there are none."""
     ns, topic = part.header_ns, f"{place}: topic {part.topic!r}"
-    empty = np.zeros(0, bool) if ns is None else ns == 0
-    if ns is None or empty.all():
+    if ns is None or not ns.any():
         if stamps == "header":
             raise RecordingError(
                 f"{topic}: its messages have no header stamps; write `stamps: auto` into the "
                 "topics file."
             )
         return None
-    if empty.any():
+    if not ns.all():
         raise RecordingError(
-            f"{topic}: {empty.sum()} of {len(ns)} headers have no stamp; write `stamps: "
+            f"{topic}: {(ns == 0).sum()} of {len(ns)} headers have no stamp; write `stamps: "
             "receive` into the topics file."
         )
     return ns
@@ -134,13 +125,13 @@ def _header(part: TopicData, stamps: Stamps, place: str) -> Nanoseconds | None:
 
 def _in_order(part: TopicData, place: str) -> TopicData:
     """Drops unstamped messages at the start, and sorts the few late ones by stamp."""
-    if part.header_ns is None or not part.header_ns.any():
-        return part
-    first = int(np.argmax(part.header_ns != 0))
-    if first <= MAX_UNSTAMPED * len(part.header_ns):
-        part = part.rows(np.arange(first, len(part.header_ns)))
     ns = part.header_ns
-    if ns is None or not ns.all():
+    if ns is None or not ns.any():
+        return part
+    first = int(np.argmax(ns != 0))
+    if first <= MAX_UNSTAMPED * len(ns):
+        part, ns = part.rows(np.arange(first, len(ns))), ns[first:]
+    if not ns.all():
         return part
     late = np.maximum.accumulate(ns) - ns
     if np.mean(late > 0) > MAX_LATE or late.max() * S_PER_NS > MAX_WANDER_S:

@@ -57,8 +57,13 @@ def record(
     h, per_hold = dt / inner, round(hold / dt)
     holds = int(np.ceil(duration / hold))
     held = rng.uniform(spec.command_low, spec.command_high, (holds, len(spec.command)))
-    state, arcs = _follow(book, held, per_hold * inner, h)
-    pose = _chain(geometry.exp(arcs))
+    since = np.asarray(np.arange(per_hold * inner)[:, None] * h, dtype=np.float64)
+    now, states, arcs = np.zeros(len(book.lag)), [], []
+    for goal in book.target(held):
+        states.append(book.respond(now, goal, since))
+        arcs.append(_arc(book, now, goal, since, h))
+        now = book.respond(now, goal, per_hold * inner * h)
+    state, pose = np.concatenate(states), _chain(geometry.exp(np.concatenate(arcs)))
     t = np.asarray(np.arange(holds * per_hold) * dt, dtype=np.float64)
     return Recording(
         Stream(t, np.repeat(held, per_hold, axis=0)),
@@ -67,18 +72,6 @@ def record(
         source=f"textbook {spec.name}",
         variables=spec.variable_names,
     )
-
-
-def _follow(book: Textbook, held: Array, steps: int, h: float) -> tuple[Array, Array]:
-    """Returns the states at the start of each of `steps` substeps per command, and their arcs."""
-    since = np.asarray(np.arange(steps)[:, None] * h, dtype=np.float64)
-    state = np.zeros(len(book.lag))
-    states, arcs = [], []
-    for goal in book.target(held):
-        states.append(book.respond(state, goal, since))
-        arcs.append(_arc(book, state, goal, since, h))
-        state = book.respond(state, goal, steps * h)
-    return np.concatenate(states), np.concatenate(arcs)
 
 
 def _chain(relative: Array) -> Array:

@@ -99,9 +99,8 @@ def assign(
 ) -> dict[str, str]:
     """Assigns topics to roles: a `cmd_vel`, and a `pose` or an `odom` or both.
 
-    Raises:
-        RecordingError: a topic is missing, of a wrong type, or several fit a role; one sentence
-            with the available topics and the fix.
+    RecordingError if a topic is missing, of a wrong type, or several fit a role; one sentence with
+    the available topics and the fix.
     """
     table = _Topics(types, empty, place)
     found = {}
@@ -113,7 +112,7 @@ def assign(
             found[role] = topic
     for needed, words in ((("cmd_vel",), "commands"), (("pose", "odom"), "poses")):
         if not found.keys() & set(needed):
-            raise table.missing(needed, words)
+            raise RecordingError(f"{place}: {table.missing(needed, words)}")
     return found
 
 
@@ -124,7 +123,7 @@ class _Topics:
     place: str  # of the bag, for errors
 
     def choose(self, role: str, wanted: str | None) -> str | None:
-        """Returns the topic of a role: the wanted one, or a guess."""
+        """Returns the topic of a role: the wanted one; or the only one with the usual name."""
         if wanted == NONE:
             return None
         if wanted is None:
@@ -143,10 +142,10 @@ class _Topics:
 
     def _guess(self, role: str) -> str | None:
         """Returns the only topic with the most reliable usual name; None if no name matches."""
-        allowed = set(TYPES[role]) - set(NEVER_GUESSED.get(role, ()))
-        full = [t for t, kind in self.types.items() if kind in allowed and t not in self.empty]
+        never = NEVER_GUESSED.get(role, ())
+        full = [topic for topic in self._fitting(role) if self.types[topic] not in never]
         for pattern in USUAL[role]:
-            found = sorted(t for t in full if re.search(pattern, t))
+            found = [topic for topic in full if re.search(pattern, topic)]
             if len(found) > 1:
                 without = "" if role == REQUIRED else f", or {role}={NONE} for none"
                 several = ", ".join(f"{t} ({self.types[t]})" for t in found)
@@ -158,28 +157,21 @@ class _Topics:
                 return found[0]
         return None
 
-    def missing(self, roles: Sequence[str], words: str) -> RecordingError:
-        """Returns the error that no topic has any of the roles, with the fix."""
-        fitting = [(role, topic) for role in roles for topic in self._fitting(role)]
+    def missing(self, roles: Sequence[str], words: str) -> str:
+        """Tells that no topic has any of the roles, with the fix."""
+        kinds = dict.fromkeys(kind for role in roles for kind in TYPES[role])
+        advice = f"record one of type {', '.join(kinds)}"
+        fitting = [f"{role}={topic}" for role in roles for topic in self._fitting(role)]
         if fitting:
-            role, topic = fitting[0]
-            advice = f"say which does, as in --topic {role}={topic}"
-        else:
-            kinds = dict.fromkeys(kind for role in roles for kind in TYPES[role])
-            advice = f"record one of type {', '.join(kinds)}"
-        return RecordingError(
-            f"{self.place}: no topic is known to hold the {words}; {advice}; {self._listed(roles)}"
-        )
+            advice = f"say which does, as in --topic {fitting[0]}"
+        return f"no topic is known to hold the {words}; {advice}; {self._listed(roles)}"
 
-    def _fitting(self, role: str) -> list[str]:
-        """Returns the topics with messages of a type allowed in the role."""
-        return sorted(
-            t for t, kind in self.types.items() if kind in TYPES[role] and t not in self.empty
-        )
+    def _fitting(self, *roles: str) -> list[str]:
+        kinds = {kind for role in roles for kind in TYPES[role]}
+        return sorted(t for t, kind in self.types.items() if kind in kinds and t not in self.empty)
 
     def _listed(self, roles: Sequence[str]) -> str:
-        """Lists the topics with their types, those that fit a role first."""
-        fitting = {topic for role in roles for topic in self._fitting(role)}
+        fitting = self._fitting(*roles)
         topics = sorted(self.types, key=lambda topic: (topic not in fitting, topic))
         told = [
             f"{topic} ({self.types[topic]}{', empty' if topic in self.empty else ''})"

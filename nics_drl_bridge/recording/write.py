@@ -49,9 +49,8 @@ CHUNK_BYTES = 1 << 16  # damage costs a whole chunk, since each checksum covers 
 def check_out(path: str | Path) -> Path:
     """Checks an output path of a recording: an `.npz` file or the folder of a rosbag2.
 
-    Raises:
-        ConfigError: it exists already, or has another suffix.
-        RecordingError: it needs a library that is missing.
+    Raises ConfigError: it exists already, or has another suffix. Raises RecordingError: it needs a
+    library that is missing.
     """
     path = Path(path)
     if path.exists():
@@ -84,11 +83,13 @@ def write_bag(
     `/joint_states`, the IMU `/imu`. Headers contain the streams' stamps. For errors see `bag_sink`.
     """
     with bag_sink(path, storage) as sink:
-        messages = _Messages(store := sink.store)
+        messages, command = _Messages(store := sink.store), recording.command
         for topic, kind, stream, make in _topics(recording, spec, messages):
             sink.add_topic(topic, kind)
             stamps = np.round(stream.t * NS_PER_S).astype(np.int64) + START_NS
-            receive = stamps + _to_commands_clock(recording, stream)
+            # By their receipt, streams of other clocks start together with the commands.
+            late = 0.0 if stream.clock == command.clock else float(command.t[0] - stream.t[0])
+            receive = stamps + round(late * NS_PER_S)
             for k, values in enumerate(stream.values):
                 message = make(messages.header(int(stamps[k])), values)
                 sink.write(topic, int(receive[k]), bytes(store.serialize_cdr(message, kind)))
@@ -97,20 +98,20 @@ def write_bag(
 def _topics(
     recording: Recording, spec: RobotSpec, messages: _Messages
 ) -> Iterator[tuple[str, str, Stream, Make]]:
-    """Yields topic, type, stream and the function that makes a message of a row."""
     beside = recording.odometry is not None or recording.pose.clock != recording.command.clock
     joints, names, still = recording.wheels, list(WHEELS), np.zeros(len(WHEELS), dtype=bool)
     if recording.state is not None:
         joints, names = recording.state, [v.name for v in spec.state]
         still = np.array([v.unit in POSITION_UNITS for v in spec.state])
+    pose = ("/odom", topic_roles.ODOMETRY, recording.pose, messages.odometry)
+    if beside:
+        pose = ("/pose", topic_roles.POSE, recording.pose, messages.pose_stamped)
     topics: list[tuple[str, str, Stream | None, Make]] = [
         (
             "/cmd_vel", topic_roles.TWIST, recording.command,
             lambda _, row: messages.twist(spec.to_cmd_vel(row)),
         ),
-        ("/pose", topic_roles.POSE, recording.pose, messages.pose_stamped)
-        if beside
-        else ("/odom", topic_roles.ODOMETRY, recording.pose, messages.odometry),
+        pose,
         ("/odom", topic_roles.ODOMETRY, recording.odometry, messages.speeds),
         (
             "/joint_states", topic_roles.JOINTS, joints,
@@ -123,16 +124,7 @@ def _topics(
             yield topic, kind, stream, make
 
 
-def _to_commands_clock(recording: Recording, stream: Stream) -> int:
-    """Returns the offset from stamp to receipt [ns]: streams of other clocks start together."""
-    if stream.clock == recording.command.clock:
-        return 0
-    return round(float(recording.command.t[0] - stream.t[0]) * NS_PER_S)
-
-
 class _Messages:
-    """Conversion of rows to messages."""
-
     def __init__(self, store: Typestore) -> None:
         self._types = store.types
 
@@ -185,17 +177,12 @@ class _Messages:
 
 
 class BagSink:
-    """An open bag, created by `bag_sink` with an open writer of rosbags.
-
-    Attributes:
-        store: known message types.
-        counts: number of messages by topic.
-    """
+    """An open bag, created by `bag_sink` with an open writer of rosbags."""
 
     def __init__(self, writer: Writer) -> None:
-        self._writer, self.store = writer, typestore()
+        self._writer, self.store = writer, typestore()  # the known message types
         self._connections: dict[str, Connection] = {}
-        self.counts: dict[str, int] = {}
+        self.counts: dict[str, int] = {}  # number of messages by topic
 
     def add_topic(
         self,
@@ -248,10 +235,8 @@ def bag_sink(path: str | Path, storage: Storage = "mcap") -> Iterator[BagSink]:
 
     It is written to a hidden folder `.NAME.*` next to `path`. After an error nothing is left; a
     killed process or a full disk leaves that folder, from which `salvage` recovers the flushed
-    messages. MCAP has checksums, so that any damage is found; SQLite has none.
-
-    Raises:
-        RecordingError: the folder exists already or can't be written, or a library is missing.
+    messages. MCAP has checksums, so that any damage is found; SQLite has none. Raises
+    RecordingError: the folder exists already or can't be written, or a library is missing.
     """
     path = Path(path)
     check_libraries(path, "writing")

@@ -1,126 +1,113 @@
 """Checks of the data received from a robot against the expectations of a model.
 
-Each check is a function of the facts; it yields a finding for each fault.
+Each check is a function of the facts; it yields a finding for each fault, on a role's topic.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Literal
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.geometry import wrap_angle
+from nics_drl_bridge.geometry import Array, wrap_angle
 from nics_drl_bridge.interface import S_PER_NS
-from nics_drl_bridge.report.doctor_facts import (
-    CLOCK,
-    CMD_VEL,
-    KINDS,
-    ODOM,
-    SCAN,
-    TWIST_STAMPED_TYPE,
-    Expected,
-    Facts,
-    Layout,
-    Mismatch,
-    filling,
-    seen,
-)
+from nics_drl_bridge.report import doctor_facts
+from nics_drl_bridge.report.doctor_facts import CLOCK, CMD_VEL, KINDS, ODOM, SCAN, Expected, Facts
 from nics_drl_bridge.robot.spec import RobotSpec
 
-Array = NDArray[np.float64]
-Fault = tuple[str, str, bool]
-"""Fault, remedy, and True if it is severe."""
+Mismatch = doctor_facts.Mismatch
+Findings = Iterator[Mismatch]
 
-LEAST_PATH_M, LEAST_TURN_RAD = 0.3, 0.3
-"""A drive with less motion than this does not determine scales."""
+LEAST_PATH_M, LEAST_TURN_RAD = 0.3, 0.3  # a drive with less motion does not determine scales
 TOLERANCE = 1.4  # differences of the pose and the twist must agree within this factor
+# Below this correlation a ratio of pose and twist is meaningless; the same for commands, which the
+# robot follows with delay and within its limits.
 ALIKE, LEAST_ALIKE = 0.8, 0.3
-"""Below this correlation a ratio of pose and twist is meaningless; the same for commands, which the
-robot follows with delay and within its limits."""
-JUMP, JUMP_M = 5.0, 0.2
-"""A step is a jump beyond this multiple of what the maximum speed allows, and this length [m]."""
+JUMP, JUMP_M = 5.0, 0.2  # a step is a jump beyond this multiple of the top speed's, and this length
 QUATERNION_TOLERANCE = 0.05
 LEAST_STEPS = 10
 UNITS = ((1000.0, "mm/s"), (100.0, "cm/s"), (3.6, "km/h"), (180.0 / np.pi, "degrees per second"))
 RATE_TOLERANCE = 0.2
+# Stamps are from the future if this much after their arrival; too old for the command gate if this
+# much before it; and so far before it that the clocks must differ.
 FUTURE_S, LATE_S, OFFSET_S = 0.005, 0.35, 5.0
-"""Stamps are from the future if this much after their arrival; too old for the command gate if this
-much before it; and so far before it that the clocks must differ."""
 STALE_CLOCK_S = 1.0
 BODY_FRAMES = ("base_link", "base_footprint")
-LAYOUT = "beam layout"
 ANGLE_TOLERANCE = 0.5  # tolerance of a beam's direction, in increments
-ODD_SHARE = 0.01
-"""A value in more than this share of the beams is taken to be intended by the lidar."""
+ODD_SHARE = 0.01  # a value in more than this share of the beams is intended by the lidar
+
+error, warning = partial(Mismatch, "error"), partial(Mismatch, "warning")
+no_match, layout_error = partial(error, "quality of service"), partial(error, "beam layout", SCAN)
+odometry_error = partial(error, "odometry", ODOM)
+odometry_warning = partial(warning, "odometry", ODOM)
 
 
 def examine(facts: Facts, expected: Expected) -> list[Mismatch]:
     """Runs all checks and returns their findings, errors first."""
-    expected = seen(facts, expected)
+    expected = doctor_facts.seen(facts, expected)
     checks = (
         presence, quality, speakers, frames, rates, latency, clock, layout, ranges, motion,
     )  # fmt: skip
     found = [finding for check in checks for finding in check(facts, expected)]
-    return sorted(found, key=lambda finding: finding.severity)
+    named = [replace(finding, where=facts.names[finding.where]) for finding in found]
+    return sorted(named, key=lambda finding: finding.severity)
 
 
-def presence(facts: Facts, _: Expected) -> Iterator[Mismatch]:
+def presence(facts: Facts, _: Expected) -> Findings:
     """Finds missing and silent topics, and wrong types."""
     for role in (SCAN, ODOM, CMD_VEL):
-        name = facts.names[role]
-        there = facts.topics.get(name)
+        there = facts.topics.get(facts.names[role])
         types = () if there is None else there.types
-        wrong = [kind for kind in types if kind not in KINDS[role]]
-        if wrong or len(types) > 1:
+        if len(types) > 1 or set(types) - set(KINDS[role]):
             fix = f"publish {KINDS[role][0]}, or remap the topic that is one"
-            yield Mismatch("error", "type", name, f"is of {' and '.join(types)}", fix)
+            yield error("type", role, f"is of {' and '.join(types)}", fix)
         elif role == CMD_VEL:
             if facts.live and (there is None or not there.asks):
                 fix = "start the base, or correct its namespace or the name of its topic"
-                yield Mismatch("error", "missing topic", name, "nobody listens to it", fix)
+                yield error("missing topic", role, "nobody listens to it", fix)
         elif role not in facts.heard:
             what = "there is no such topic" if there is None else "nothing was heard on it"
             near = [topic for topic, ends in facts.topics.items() if KINDS[role][0] in ends.types]
             hint = f"; {', '.join(near)} is of its type: remap it" if near and not there else ""
             fix = f"start its driver, or correct namespace or ROS_DOMAIN_ID{hint}"
-            yield Mismatch("error", "missing topic", name, what, fix)
-        if TWIST_STAMPED_TYPE in types and not facts.live:
+            yield error("missing topic", role, what, fix)
+        if doctor_facts.TWIST_STAMPED_TYPE in types and not facts.live:
             fix = "set `enable_stamped_cmd_vel` where the package's nodes are to take it"
-            yield Mismatch("warning", "type", name, "is a TwistStamped, not a Twist", fix)
+            yield warning("type", role, "is a TwistStamped, not a Twist", fix)
 
 
-def quality(facts: Facts, _: Expected) -> Iterator[Mismatch]:
+def quality(facts: Facts, _: Expected) -> Findings:
     """Finds pairs of publisher and subscriber with incompatible quality of service."""
     for role, name in facts.names.items():
-        there = facts.topics.get(name)
-        if there is None:
+        if (there := facts.topics.get(name)) is None:
             continue
         weak = any(not offer.reliable for offer in there.offers)
         if role != CLOCK and weak and any(ask.reliable for ask in there.asks):
-            fix = "let the publisher be reliable, or the subscriber best effort"
             what = "is sent best effort, and a subscriber asks for reliable: they never match"
-            yield Mismatch("error", "quality of service", name, what, fix)
+            yield no_match(
+                role, what, "let the publisher be reliable, or the subscriber best effort"
+            )
         passing = any(not offer.transient_local for offer in there.offers)
         if passing and any(ask.transient_local for ask in there.asks):
-            fix = "let both be volatile"
             what = "is sent volatile, and a subscriber asks for transient local: they never match"
-            yield Mismatch("error", "quality of service", name, what, fix)
+            yield no_match(role, what, "let both be volatile")
 
 
-def speakers(facts: Facts, _: Expected) -> Iterator[Mismatch]:
+def speakers(facts: Facts, _: Expected) -> Findings:
     """Finds several publishers on topics that must have a single one."""
     for role in (CMD_VEL, ODOM, SCAN, CLOCK):
         there = facts.topics.get(facts.names[role])
         if there is not None and len(there.offers) > 1:
             what = f"has {len(there.offers)} publishers, which overrule each other"
             fix = "end all but one: joystick, navigation, a second simulator"
-            yield Mismatch("error", "publishers", facts.names[role], what, fix)
+            yield error("publishers", role, what, fix)
 
 
-def frames(facts: Facts, expected: Expected) -> Iterator[Mismatch]:
+def frames(facts: Facts, expected: Expected) -> Findings:
     """Checks names of frames against REP-105 and the lidar's frame."""
     wanted = (
         (SCAN, "frames", (expected.lidar.frame,), "header.frame_id"),
@@ -128,77 +115,64 @@ def frames(facts: Facts, expected: Expected) -> Iterator[Mismatch]:
         (ODOM, "children", BODY_FRAMES, "child_frame_id"),
     )
     for role, attribute, good, place in wanted:
-        heard = facts.heard.get(role)
-        if heard is None:
-            continue
-        for frame in sorted(getattr(heard, attribute)):
+        for frame in sorted(getattr(facts.heard.get(role), attribute, ())):
             if frame.rpartition("/")[2] in good and not frame.startswith("/"):
                 continue  # robots of a fleet have prefixes
+            fix = f"call it {good[0]!r} (REP-105), without a leading slash"
             if role == SCAN and frame not in ("", "map", "odom", *BODY_FRAMES):
                 fix = f"call it {good[0]!r} in the driver, or set `frame: {frame}` in the lidar"
-            else:
-                fix = f"call it {good[0]!r} (REP-105), without a leading slash"
-            severity: Literal["error", "warning"] = "error" if role == ODOM else "warning"
-            yield Mismatch(
-                severity, "frame", facts.names[role], f"{place} is {frame!r}, not {good[0]!r}", fix
-            )
+            finding = error if role == ODOM else warning
+            yield finding("frame", role, f"{place} is {frame!r}, not {good[0]!r}", fix)
 
 
-def rates(facts: Facts, expected: Expected) -> Iterator[Mismatch]:
+def rates(facts: Facts, expected: Expected) -> Findings:
     """Checks rates: the scan's as declared, odometry at least one message per command."""
-    for role, wanted, exactly in (
-        (SCAN, expected.lidar.rate, True),
-        (ODOM, 1.0 / expected.period_s, False),
-    ):
+    for role, wanted in ((SCAN, expected.lidar.rate), (ODOM, 1.0 / expected.period_s)):
         rate = _rate(facts, role)
         if rate is None:
             continue
         slow, fast = rate < (1 - RATE_TOLERANCE) * wanted, rate > (1 + RATE_TOLERANCE) * wanted
-        if slow or (fast and exactly):
-            least = "" if exactly else "at least "
+        if slow or (fast and role == SCAN):
+            least, finding = "at least " if role == ODOM else "", error if slow else warning
             fix = "set the driver's rate; on a slow network look for losses (best effort, Wi-Fi)"
             if role == SCAN:
                 fix += f", or set `rate: {rate:.3g}` in the lidar and generate the model anew"
             what = f"comes at {rate:.3g} Hz, expected {least}{wanted:.3g} Hz"
-            yield Mismatch("error" if slow else "warning", "rate", facts.names[role], what, fix)
+            yield finding("rate", role, what, fix)
 
 
 def _rate(facts: Facts, role: str) -> float | None:
     """Rate by the stamps if there is a `/clock`: a simulation may run at another speed."""
-    heard = facts.heard.get(role)
-    if heard is None:
+    if (heard := facts.heard.get(role)) is None:
         return None
-    stamps = np.array(heard.stamps_ns, dtype=np.int64)
+    stamps = heard.stamps_ns
     if facts.clock_ns and len(stamps) > 2 and stamps[-1] > stamps[0]:
-        return float((len(stamps) - 1) / ((stamps[-1] - stamps[0]) * S_PER_NS))
+        return (len(stamps) - 1) / ((stamps[-1] - stamps[0]) * S_PER_NS)
     return heard.rate_hz
 
 
-def latency(facts: Facts, _: Expected) -> Iterator[Mismatch]:
+def latency(facts: Facts, _: Expected) -> Findings:
     """Checks arrival minus stamp, by `/clock` if there is one."""
     for role in (SCAN, ODOM):
-        heard = facts.heard.get(role)
-        if heard is None:
+        if (heard := facts.heard.get(role)) is None:
             continue
-        name, stamps = facts.names[role], np.array(heard.stamps_ns, dtype=np.int64)
-        if (stamps == 0).any():
-            what = f"{(stamps == 0).sum()} of {len(stamps)} messages are not stamped"
-            yield Mismatch("error", "stamp", name, what, "let the driver stamp its messages")
+        stamps = np.array(heard.stamps_ns, dtype=np.int64)
+        if missing := int((stamps == 0).sum()):
+            what = f"{missing} of {len(stamps)} messages are not stamped"
+            yield error("stamp", role, what, "let the driver stamp its messages")
             continue
-        if (np.diff(stamps) < 0).any():
-            what = f"{(np.diff(stamps) < 0).sum()} stamps are before the one before them"
+        if back := int((np.diff(stamps) < 0).sum()):
+            what = f"{back} stamps are before the one before them"
             fix = "look for a second publisher, or for a clock that is set while it runs"
-            yield Mismatch("error", "stamp", name, what, fix)
+            yield error("stamp", role, what, fix)
         age = float(np.median(_here(facts, heard.arrivals_ns) - stamps)) * S_PER_NS
         if -FUTURE_S <= age <= LATE_S:
             continue
         side = "after" if age < 0 else "before"
-        what = f"stamps lie {abs(age):.3f} s {side} their arrival"
+        fix = "stamp when it is measured, and look for queues, load and network on the way"
         if abs(age) > OFFSET_S or age < 0:
             fix = "synchronise the clocks (NTP, chrony), or set use_sim_time on all nodes or none"
-        else:
-            fix = "stamp when it is measured, and look for queues, load and network on the way"
-        yield Mismatch("error", "stamp", name, what, fix)
+        yield error("stamp", role, f"stamps lie {abs(age):.3f} s {side} their arrival", fix)
 
 
 def _here(facts: Facts, arrivals: Sequence[int]) -> NDArray[np.int64]:
@@ -212,60 +186,55 @@ def _here(facts: Facts, arrivals: Sequence[int]) -> NDArray[np.int64]:
     return np.asarray(np.array(facts.clock_ns, dtype=np.int64)[place])
 
 
-def clock(facts: Facts, _: Expected) -> Iterator[Mismatch]:
+def clock(facts: Facts, _: Expected) -> Findings:
     """Checks that `/clock`, if it has a publisher, advances."""
-    there = facts.topics.get(CLOCK)
+    there, heard = facts.topics.get(CLOCK), facts.heard.get(CLOCK)
     if there is None or not there.offers:
         return
     fix = "start the simulation or its clock, or set use_sim_time to false on all nodes"
-    heard = facts.heard.get(CLOCK)
     if heard is None:
-        yield Mismatch("error", "clock", CLOCK, "has a publisher and says nothing", fix)
+        yield error("clock", CLOCK, "has a publisher and says nothing", fix)
         return
     silent = (facts.end_ns - heard.arrivals_ns[-1]) * S_PER_NS
     if silent > STALE_CLOCK_S:
-        yield Mismatch("error", "clock", CLOCK, f"has been silent for {silent:.1f} s", fix)
+        yield error("clock", CLOCK, f"has been silent for {silent:.1f} s", fix)
     ticks = np.diff(facts.clock_ns)
     if (ticks < 0).any():
-        yield Mismatch("error", "clock", CLOCK, f"runs backwards {(ticks < 0).sum()} times", fix)
+        yield error("clock", CLOCK, f"runs backwards {(ticks < 0).sum()} times", fix)
     elif len(ticks) and not ticks.any():
-        yield Mismatch("error", "clock", CLOCK, "stands still", fix)
+        yield error("clock", CLOCK, "stands still", fix)
 
 
-def motion(facts: Facts, expected: Expected) -> Iterator[Mismatch]:
+def motion(facts: Facts, expected: Expected) -> Findings:
     """Checks odometry and commands: numbers, units and signs."""
-    name = facts.names[ODOM]
-    for what, fix, severe in _odometry(facts, expected.robot):
-        yield Mismatch("error" if severe else "warning", "odometry", name, what, fix)
+    yield from _odometry(facts, expected.robot)
     ratio = _scale(facts)
     if ratio is not None and ratio < 0.0:
-        what = "the robot turns against its commands"
         fix = "swap the wheels or turn the sign of angular.z: counter-clockwise is positive"
-        yield Mismatch("error", "command", facts.names[CMD_VEL], what, fix)
+        yield error("command", CMD_VEL, "the robot turns against its commands", fix)
 
 
-def _odometry(facts: Facts, robot: RobotSpec) -> Iterator[Fault]:
-    poses, twists = np.array(facts.poses), np.array(facts.twists)
+def _odometry(facts: Facts, robot: RobotSpec) -> Findings:
+    poses, twists, length = (np.array(n) for n in (facts.poses, facts.twists, facts.lengths))
     if not len(poses):
         return
     if not (np.isfinite(poses).all() and np.isfinite(twists).all()):
-        yield "holds NaN or inf", "find out why its driver sends them", True
+        yield odometry_error("holds NaN or inf", "find out why its driver sends them")
         return
-    length = np.array(facts.lengths)
-    off = np.abs(length - 1.0) > QUATERNION_TOLERANCE
-    if off.any():
-        what = f"{off.sum()} quaternions are not of length 1 but of up to {length.max():.3g}"
-        yield what, "send a quaternion, not a heading in its z, nor zeros", True
+    if off := int((np.abs(length - 1.0) > QUATERNION_TOLERANCE).sum()):
+        what = f"{off} quaternions are not of length 1 but of up to {length.max():.3g}"
+        yield odometry_error(what, "send a quaternion, not a heading in its z, nor zeros")
         return
     if facts.uncovered:
         what = f"{facts.uncovered} of {len(poses)} messages have a covariance of zeros"
-        yield what, "fill in pose.covariance and twist.covariance: zeros mean unknown", False
+        fix = "fill in pose.covariance and twist.covariance: zeros mean unknown"
+        yield odometry_warning(what, fix)
     corners = np.array([robot.command_low, robot.command_high])
     fastest = max(float(np.hypot(*robot.to_cmd_vel(row)[:2])) for row in corners)
     yield from _moves(facts, poses, twists, max(fastest, 0.1))
 
 
-def _moves(facts: Facts, poses: Array, twists: Array, fastest: float) -> Iterator[Fault]:
+def _moves(facts: Facts, poses: Array, twists: Array, fastest: float) -> Findings:
     stamps = np.array(facts.heard[ODOM].stamps_ns, dtype=np.int64)
     dt = np.diff(stamps) * S_PER_NS
     going = dt > 0.0
@@ -274,56 +243,54 @@ def _moves(facts: Facts, poses: Array, twists: Array, fastest: float) -> Iterato
     step = np.diff(poses[:, :2], axis=0)
     far = np.hypot(step[:, 0], step[:, 1])
     jumps = going & (far > JUMP_M) & (far > JUMP * fastest * dt)
-    share = float(jumps.sum() / going.sum())
-    if share > 0.2:
+    if jumps.sum() > 0.2 * going.sum():
         speed = float(np.median((far[going] / dt[going])[jumps[going]]))
         what = f"positions change by {speed:.0f} a second, the robot reaches {fastest:.2g} m/s"
-        yield what, "let positions be metres, not millimetres", True
+        yield odometry_error(what, "let positions be metres, not millimetres")
         return
     if jumps.any():
         what = f"jumps {jumps.sum()} times, by up to {far[jumps].max():.2f} m"
         fix = "odom must be continuous (REP-105): corrections belong into map -> odom"
-        yield what, fix, True
+        yield odometry_error(what, fix)
     keep = going & ~jumps
     turn = np.asarray(wrap_angle(np.diff(poses[:, 2])))
-    mean = 0.5 * (twists[1:] + twists[:-1])
+    moves = 0.5 * (twists[1:] + twists[:-1]) * dt[:, None]
     middle = poses[:-1, 2] + 0.5 * turn
     ahead = np.cos(middle) * step[:, 0] + np.sin(middle) * step[:, 1]
-    moved = bool(far[keep].sum() > LEAST_PATH_M or (np.abs(mean[:, 0]) * dt)[keep].sum() > 1.0)
-    if moved:
-        yield from _compared("linear.x", ahead[keep], (mean[:, 0] * dt)[keep], False)
-    turned = np.abs(turn[keep]).sum() > LEAST_TURN_RAD
-    if turned or (np.abs(mean[:, 2]) * dt)[keep].sum() > 2.0:
-        yield from _compared("angular.z", turn[keep], (mean[:, 2] * dt)[keep], True)
+    if far[keep].sum() > LEAST_PATH_M or np.abs(moves[keep, 0]).sum() > 1.0:
+        yield from _compared("linear.x", ahead[keep], moves[keep, 0], UNITS[:3], "m/s")
+    if np.abs(turn[keep]).sum() > LEAST_TURN_RAD or np.abs(moves[keep, 2]).sum() > 2.0:
+        yield from _compared("angular.z", turn[keep], moves[keep, 2], UNITS[3:], "rad/s")
 
 
-def _compared(field: str, real: Array, claimed: Array, angular: bool) -> Iterator[Fault]:
-    """Compares the changes of the pose (T,) with those according to the twist (T,)."""
-    ratio = _slope(real, claimed)
-    if 1.0 / TOLERANCE < ratio < TOLERANCE:
+def _compared(
+    field: str, real: Array, claimed: Array, units: Sequence[tuple[float, str]], good: str
+) -> Findings:
+    ratio, size = _slope(real, claimed), float(np.sqrt((real @ real) * (claimed @ claimed)))
+    if _alike(ratio):
         return
-    size = float(np.sqrt((real @ real) * (claimed @ claimed)))
     if size == 0.0 or abs(real @ claimed) < ALIKE * size:
-        what = f"the pose does not do what twist.{field} says"
         fix = "free the robot if it is stuck; else let both come from the same odometry"
-        yield what, fix, False
+        yield odometry_warning(f"the pose does not do what twist.{field} says", fix)
         return
-    if -TOLERANCE < ratio < -1.0 / TOLERANCE:
-        what = f"twist.{field} has the sign opposite to what the pose does"
-        yield what, "turn the sign: forward and counter-clockwise are positive (REP-103)", True
-        return
-    for factor, name in UNITS[3:] if angular else UNITS[:3]:
-        if 1.0 / TOLERANCE < ratio / factor < TOLERANCE:
-            good = "rad/s" if angular else "m/s"
-            what = f"twist.{field} is {ratio:.3g} times what the pose does: {name}"
-            yield what, f"let the twist be in {good}", True
-            return
-        if 1.0 / TOLERANCE < ratio * factor < TOLERANCE:
-            what = f"the pose changes {1 / ratio:.3g} times as fast as twist.{field} says"
-            yield what, "let the pose be in metres and radians", True
-            return
     what = f"twist.{field} is {ratio:.3g} times what the pose does"
-    yield what, "let both come from the same odometry, the twist in the body's frame", True
+    fix = "let both come from the same odometry, the twist in the body's frame"
+    if _alike(-ratio):
+        what = f"twist.{field} has the sign opposite to what the pose does"
+        fix = "turn the sign: forward and counter-clockwise are positive (REP-103)"
+    for factor, name in units:
+        if _alike(ratio / factor):
+            what, fix = f"{what}: {name}", f"let the twist be in {good}"
+            break
+        if _alike(ratio * factor):
+            what = f"the pose changes {1 / ratio:.3g} times as fast as twist.{field} says"
+            fix = "let the pose be in metres and radians"
+            break
+    yield odometry_error(what, fix)
+
+
+def _alike(ratio: float) -> bool:
+    return 1.0 / TOLERANCE < ratio < TOLERANCE
 
 
 def _slope(x: Array, y: Array) -> float:
@@ -338,98 +305,91 @@ def _scale(facts: Facts) -> float | None:
     if heard is None or odometry is None or len(facts.poses) < LEAST_STEPS:
         return None
     place = np.searchsorted(heard.arrivals_ns, odometry.arrivals_ns[:-1], side="right") - 1
-    known = place >= 0
-    turn = np.asarray(wrap_angle(np.diff(np.array(facts.poses)[:, 2])))[known]
-    forward = np.array(facts.twists)[:-1, 0][known] >= 0.0  # a car turns the other way in reverse
-    wish = np.array(facts.commands)[place[known], 2]
-    if np.abs(turn[forward]).sum() < LEAST_TURN_RAD or np.abs(wish[forward]).sum() < 1.0:
+    # A car turns the other way in reverse.
+    forward = (place >= 0) & (np.array(facts.twists)[:-1, 0] >= 0.0)
+    turn = np.asarray(wrap_angle(np.diff(np.array(facts.poses)[:, 2])))[forward]
+    wish = np.array(facts.commands)[place[forward], 2]
+    if np.abs(turn).sum() < LEAST_TURN_RAD or np.abs(wish).sum() < 1.0:
         return None
-    wish, turn = wish[forward], turn[forward]
     alike = abs(wish @ turn) / np.sqrt((wish @ wish) * (turn @ turn))
     return _slope(wish, turn) if alike > LEAST_ALIKE else None
 
 
-def layout(facts: Facts, expected: Expected) -> Iterator[Mismatch]:
+def layout(facts: Facts, expected: Expected) -> Findings:
     """Checks number and directions of the beams, and the limits of their ranges."""
-    name = facts.names[SCAN]
     if len(facts.layouts) > 1:
-        counts = sorted({one.beams for one in facts.layouts})
-        what = f"its header changes; numbers of beams are {', '.join(map(str, counts))}"
+        counts = ", ".join(map(str, sorted({one.beams for one in facts.layouts})))
         fix = "use the driver's mode of fixed angles (as `angle_compensate`), or resample"
-        yield Mismatch("error", LAYOUT, name, what, fix)
+        yield layout_error(f"its header changes; numbers of beams are {counts}", fix)
     for have in facts.layouts[:1]:
         slack = ANGLE_TOLERANCE * max(abs(have.angle_increment), 1e-9)
         if abs(have.last - have.angle_max) > slack:
             what = f"angle_max is {have.angle_max:.5f}, but its beams end at {have.last:.5f} rad"
-            yield Mismatch("warning", LAYOUT, name, what, "correct the driver's header")
+            yield warning("beam layout", SCAN, what, "correct the driver's header")
         if have.in_degrees:
             what = f"angles go from {have.angle_min:.4g} to {have.angle_max:.4g}: degrees"
-            yield Mismatch("error", "unit", name, what, "let the driver send radians")
+            yield error("unit", SCAN, what, "let the driver send radians")
         try:
             if expected.scan is not None:
-                filling(have, expected.lidar, expected.scan)
-        except ConfigError as error:
+                doctor_facts.filling(have, expected.lidar, expected.scan)
+        except ConfigError as fault:
             fix = "turn or set the lidar, or train a policy with what it sees"
-            yield Mismatch("error", LAYOUT, name, str(error), fix)
+            yield layout_error(str(fault), fix)
         else:
-            yield from _beams(have, expected, name)
+            yield from _beams(have, expected)
 
 
-def _beams(have: Layout, expected: Expected, name: str) -> Iterator[Mismatch]:
-    """Compares a header's beams and range limits with those of the expected lidar."""
+def _beams(have: doctor_facts.Layout, expected: Expected) -> Findings:
     want = expected.lidar.header
     fix = "set the driver, or make a lidar file of what it sends and generate the model anew"
     if have.beams != expected.lidar.beams:
-        what = f"has {have.beams} beams, expected {expected.lidar.beams}"
-        yield Mismatch("error", LAYOUT, name, what, fix)
+        yield layout_error(f"has {have.beams} beams, expected {expected.lidar.beams}", fix)
+    off = max(abs(have.angle_min - want.angle_min), abs(have.last - want.angle_max))
     if have.angle_increment < 0.0:
         if expected.scan is None and not have.in_degrees:
             what = "its beams go clockwise (angle_increment is negative)"
             turn = "turn the order in the driver (`inverted`): they go counter-clockwise (REP-103)"
-            yield Mismatch("error", LAYOUT, name, what, turn)
-    elif not have.in_degrees and max(
-        abs(have.angle_min - want.angle_min), abs(have.last - want.angle_max)
-    ) > ANGLE_TOLERANCE * abs(want.angle_increment):
+            yield layout_error(what, turn)
+    elif not have.in_degrees and off > ANGLE_TOLERANCE * abs(want.angle_increment):
         wanted = f"{want.angle_min:.4f} to {want.angle_max:.4f}"
         what = f"beams go from {have.angle_min:.4f} to {have.last:.4f} rad, expected {wanted}"
-        yield Mismatch("error", LAYOUT, name, what, fix)
+        yield layout_error(what, fix)
     for key in ("range_min", "range_max"):
         ours, theirs = getattr(want, key), getattr(have, key)
-        if abs(ours - theirs) > 0.01 * max(abs(ours), 1e-3) + 1e-6:
-            big = theirs > 100.0 * max(ours, 0.1)
-            what = f"{key} is {theirs:.4g}, expected {ours:.4g} m"
-            kind = "unit" if big else "range limits"
-            yield Mismatch("error" if big else "warning", kind, name, what, fix)
+        what = f"{key} is {theirs:.4g}, expected {ours:.4g} m"
+        if theirs > 100.0 * max(ours, 0.1):
+            yield error("unit", SCAN, what, fix)
+        elif abs(ours - theirs) > 0.01 * max(abs(ours), 1e-3) + 1e-6:
+            yield warning("range limits", SCAN, what, fix)
 
 
-def ranges(facts: Facts, expected: Expected) -> Iterator[Mismatch]:
+def ranges(facts: Facts, expected: Expected) -> Findings:
     """Checks the lidar's values for no return, and the unit of its ranges."""
     if not facts.ranges:
         return
-    spec, name = expected.lidar, facts.names[SCAN]
+    spec, convention = expected.lidar, partial(error, "range convention", SCAN)
     values = np.concatenate(facts.ranges).astype(np.float64)
     finite = values[np.isfinite(values) & (values > 0.0)]
     beyond = finite > 1.001 * spec.range_max
     if len(finite) and np.median(finite) > 20.0 * spec.range_max:
         what = f"half of the ranges exceed {np.median(finite):.0f}: millimetres"
-        yield Mismatch("error", "unit", name, what, "let the driver send metres")
+        yield error("unit", SCAN, what, "let the driver send metres")
         return
     if len(finite) and beyond.mean() > ODD_SHARE:
         what = f"{100 * beyond.mean():.0f} % of the ranges exceed range_max {spec.range_max:g} m"
         fix = "set the driver's limit, or range_max of the lidar, and generate the model anew"
-        yield Mismatch("warning", "range convention", name, what, fix)
-    at_max = np.abs(values - spec.range_max) < 1e-4 * spec.range_max
-    for word, hit in (
-        ("zero", values == 0.0),
-        ("nan", np.isnan(values)),
-        ("range_max", at_max),
-        ("inf", values == np.inf),
-    ):
+        yield warning("range convention", SCAN, what, fix)
+    hits = {
+        "zero": values == 0.0,
+        "nan": np.isnan(values),
+        "range_max": np.abs(values - spec.range_max) < 1e-4 * spec.range_max,
+        "inf": values == np.inf,
+    }
+    for word, hit in hits.items():
         if hit.mean() > ODD_SHARE and word != spec.no_return:
             share = f"{100 * hit.mean():.0f} % of the ranges are {word}"
-            what = f"{share}, but no return is expected as {spec.no_return}"
             fix = f"set `no_return: {word}` in the lidar and generate the model anew"
-            yield Mismatch("error", "range convention", name, what, fix)
-    if (values < 0.0).any() and np.isfinite(values[values < 0.0]).any():
+            yield convention(f"{share}, but no return is expected as {spec.no_return}", fix)
+    if np.isfinite(values[values < 0.0]).any():
         fix = "correct the driver: too close is -inf (REP-117), nothing else is negative"
-        yield Mismatch("error", "range convention", name, "holds negative ranges", fix)
+        yield convention("holds negative ranges", fix)

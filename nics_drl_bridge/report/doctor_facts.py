@@ -17,11 +17,10 @@ from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.lidar.sectors import ScanLayout, plan_of, reader_of
 from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader
 from nics_drl_bridge.policy.contract import Contract
+from nics_drl_bridge.recording import messages
 from nics_drl_bridge.recording.bag_file import opened
-from nics_drl_bridge.recording.messages import Offer
+from nics_drl_bridge.recording.messages import Offer, Row
 from nics_drl_bridge.robot.spec import RobotSpec
-
-Row = tuple[float, float, float]
 
 SCAN, ODOM, CMD_VEL, CLOCK = "scan", "odom", "cmd_vel", "/clock"
 SCAN_TYPE, ODOM_TYPE = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
@@ -106,13 +105,12 @@ class Facts:
         heard = self.heard.setdefault(role, TopicFacts())
         heard.arrivals_ns.append(arrival_ns)
         if hasattr(message, "header"):
-            time = message.header.stamp
-            heard.stamps_ns.append(int(time.sec) * NS_PER_S + int(time.nanosec))
+            heard.stamps_ns.append(messages.stamp(message))
             heard.frames.add(str(message.header.frame_id))
         if role == SCAN:
             layout = Layout(
-                len(message.ranges), float(message.angle_min), float(message.angle_max),
-                float(message.angle_increment), float(message.range_min), float(message.range_max),
+                len(message.ranges), message.angle_min, message.angle_max, message.angle_increment,
+                message.range_min, message.range_max,
             )  # fmt: skip
             if layout not in self.layouts:
                 self.layouts.append(layout)
@@ -120,25 +118,15 @@ class Facts:
                 self.ranges.append(np.array(message.ranges, dtype=np.float32))
         elif role == ODOM:
             heard.children.add(str(message.child_frame_id))
-            self._odometry(message)
+            self.poses.append(messages.pose_row(message))
+            self.twists.append(messages.twist_row(message))
+            self.lengths.append(math.hypot(*messages.quaternion(message)))
+            covariances = message.pose.covariance, message.twist.covariance
+            self.uncovered += any(not np.any(one) for one in covariances)
         elif role == CMD_VEL:
-            self.commands.append(_twist(getattr(message, "twist", message)))
+            self.commands.append(messages.command_row(message))
         else:
             self.clock_ns.append(int(message.clock.sec) * NS_PER_S + int(message.clock.nanosec))
-
-    def _odometry(self, message: Any) -> None:
-        pose = message.pose.pose
-        q = pose.orientation
-        heading = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
-        self.lengths.append(math.sqrt(q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w))
-        self.poses.append((float(pose.position.x), float(pose.position.y), heading))
-        self.twists.append(_twist(message.twist.twist))
-        covariances = np.asarray(message.pose.covariance), np.asarray(message.twist.covariance)
-        self.uncovered += any(not one.any() for one in covariances)
-
-
-def _twist(twist: Any) -> Row:
-    return float(twist.linear.x), float(twist.linear.y), float(twist.angular.z)
 
 
 def names_in(namespace: str) -> dict[str, str]:

@@ -1,10 +1,11 @@
-"""Pictures of a fit: its data, its predictions, and the value of each term."""
+"""Pictures of a fit (its data, predictions and terms) and of its calibration, each a PNG."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,22 +13,42 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
+from nics_drl_bridge import geometry
 from nics_drl_bridge.files import write_bytes
+from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify import clocks
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.drive import Drive, pose_residual
 from nics_drl_bridge.identify.identify import Identified
+from nics_drl_bridge.identify.noise import drift_growth, odometry_residual
 from nics_drl_bridge.identify.open_loop import HORIZON_S, Windows, predict, windows
-from nics_drl_bridge.identify.signals import held
+from nics_drl_bridge.identify.report import CalibratedValue, estimates
+from nics_drl_bridge.identify.signals import DIFFERENCE, held, moved_commands, nominal_lags
 from nics_drl_bridge.recording.recording import Samples
-from nics_drl_bridge.report.calibration_pictures import calibration_pictures
 from nics_drl_bridge.report.page import DARK, MEASURED, MODEL, OTHER, png
+from nics_drl_bridge.robot.noise import Level
 from nics_drl_bridge.robot.spec import RobotSpec
-
-Array = NDArray[np.float64]
+from nics_drl_bridge.threads import one_blas_thread
 
 SHOWN_S = 8.0
 PATHS, POINTS = 6, 40
 SETTLED_S = 1.0
 LEAST_SHARE = 1e-12
 LEAST_RATE = 1e-6
+BURSTS_SHOWN = 12
+MOST_POINTS = 3000
+BINS = 60
+REACH = 5.0  # histograms end at this many standard deviations
+REACH_S, TRIALS = 0.5, 81  # largest shift in time of a curve, and number of its points
+CAPTIONS = {
+    "timing": "What each shift in time leaves unexplained; the estimate lies at the least.",
+    "bursts": "Poses that arrive in bursts, and the times that they were taken to be of.",
+    "mounting": "Velocities before and after correction: base_link of a robot that can't move "
+    "sideways has no lateral velocity.",
+    "wheels": "Wheel speeds against the motion: the scale, and which wheel is the left one.",
+    "noise": "Noise of the sensors, and how the error of predictions grows beside the drift that "
+    "simulator and estimator use.",
+}
 
 
 def write_pictures(spec: RobotSpec, identified: Identified, folder: str | Path) -> tuple[Path, ...]:
@@ -166,9 +187,223 @@ def _response(
 
 
 def _predicted(identified: Identified, chosen: Windows) -> Array:
-    """Open-loop paths (W, n, 3) over windows."""
     shares = np.linspace(0.02, 1.0, POINTS)
     ends = [chosen.start_t + share * (chosen.end_t - chosen.start_t) for share in shares]
     model, calibration, drive = identified.model, identified.calibration, identified.drive
     poses = [predict(model, calibration, drive, replace(chosen, end_t=end)) for end in ends]
     return np.stack([chosen.start, *poses], axis=1)
+
+
+def calibration_pictures(spec: RobotSpec, identified: Identified) -> dict[str, bytes]:
+    """The pictures of a calibration by name, each a PNG.
+
+    `timing`, `bursts`, `mounting`, `wheels` and `noise`, each if the recording showed it; the
+    report in text says why the others are missing.
+    """
+    found = estimates(identified)
+    drawn = {each.__name__: each(identified, found) for each in (timing, bursts, mounting, wheels)}
+    drawn["noise"] = noise(identified)
+    return {name: picture for name, picture in drawn.items() if picture is not None}
+
+
+def timing(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
+    """Draws the unexplained part over each shift in time, with the estimate and its uncertainty."""
+    curves = timing_curves(identified.drive, identified.calibration)
+    if not curves:
+        return None
+    figure = Figure(figsize=(5.2 * len(curves), 3.8), layout="constrained")
+    for axes, curve in zip(figure.subplots(1, len(curves), squeeze=False)[0], curves, strict=True):
+        estimate = found[curve.name]
+        value, sigma = estimate.value or 0.0, estimate.sigma or 0.0
+        axes.plot(curve.value, curve.unexplained, color=MEASURED)
+        span, label = 2.0 * sigma, "two standard uncertainties"
+        axes.axvspan(value - span, value + span, color=MODEL, alpha=0.25, label=label)
+        axes.axvline(value, color=MODEL, linestyle="--", label="estimate")
+        axes.set(xlabel=f"{estimate.name} [s]", ylabel="unexplained / spread of the signal")
+        _finish(axes, estimate.text)
+    return png(figure)
+
+
+def bursts(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
+    """Draws stamps of the poses as they arrived, and as they were spread."""
+    t, groups = identified.recording.pose.t, identified.drive.bursts
+    if groups is None:
+        return None
+    shown = slice(0, int(BURSTS_SHOWN * groups.size))
+    spread = identified.drive.sample_t
+    figure = Figure(figsize=(9.0, 3.8), layout="constrained")
+    axes, intervals = figure.subplots(1, 2)
+    number = np.arange(len(t))[shown]
+    axes.plot(t[shown] - t[0], number, ".", color=OTHER, label="as they arrived")
+    axes.plot(spread[shown] - t[0], number, "-", color=MODEL, label="spread over the period")
+    axes.set(xlabel="stamp [s]", ylabel="pose number")
+    _finish(axes, f"{found['burst_period_s'].text}, {groups.size:.0f} poses in each")
+    edges = np.linspace(0.0, 1.5 * groups.period_s, 60)
+    intervals.hist(np.diff(t), edges, color=OTHER, label="as they arrived")
+    intervals.hist(np.diff(spread), edges, color=MODEL, alpha=0.7, label="spread over the period")
+    intervals.set(xlabel="time between two poses [s]", ylabel="number")
+    _finish(intervals, "intervals")
+    return png(figure)
+
+
+def mounting(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
+    """Draws velocities of the tracked body and of `base_link`: rotation and lever arm as slopes."""
+    rotation, lever_x, lever_y = (
+        found[name] for name in ("rotation_rad", "lever_arm_x_m", "lever_arm_y_m")
+    )
+    if rotation.value is None:
+        return None
+    tracked = identified.drive.twists.twist
+    tracked = tracked[:: max(1, len(tracked) // MOST_POINTS)]
+    calibration = identified.calibration
+    turned = geometry.rotate(tracked[:, :2], -calibration.rotation_rad)
+    x, y = calibration.lever_arm_m
+    base = turned + tracked[:, 2:] * np.array([y, -x])
+    count = 1 if lever_x.value is None else 2
+    figure = Figure(figsize=(5.2 * count, 4.4), layout="constrained")
+    grid = figure.subplots(1, count, squeeze=False)[0]
+    _points(grid[0], (tracked[:, 0], tracked[:, 1]), (base[:, 0], base[:, 1]))
+    grid[0].set_aspect("equal", adjustable="datalim")
+    grid[0].set(xlabel="velocity along x of its own frame [m/s]", ylabel="velocity along y [m/s]")
+    _finish(grid[0], rotation.text)
+    for axes in grid[1:]:
+        _points(axes, (tracked[:, 2], turned[:, 1]), (tracked[:, 2], base[:, 1]))
+        axes.set(xlabel="yaw rate [rad/s]", ylabel="lateral velocity [m/s]")
+        _finish(axes, f"{lever_x.text}\n{lever_y.text}")
+    return png(figure)
+
+
+def _points(axes: Axes, tracked: Sequence[Array], base: Sequence[Array]) -> None:
+    axes.plot(*tracked, ".", markersize=3, color=OTHER, label="tracked body")
+    axes.plot(*base, ".", markersize=3, color=MODEL, label="base_link")
+
+
+def wheels(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
+    """Draws wheel speeds against the motion: their scale, and which wheel is the left one."""
+    drive, calibration = identified.drive, identified.calibration
+    units = clocks.wheel_means(drive, calibration)
+    if units is None or calibration.wheel_scale is None:
+        return None
+    turn, along = drive.twists.twist[:, 2], clocks.speed_along(drive, calibration)
+    rows: tuple[tuple[str, str, str, Array, Array], ...] = (
+        ("wheel_scale", "mean of both wheels [unit]", "speed [m/s]", units.mean(axis=1), along),
+        ("turn_scale", "right less left wheel [unit]", "yaw rate [rad/s]",
+         units[:, 1] - units[:, 0], turn),
+    )  # fmt: skip
+    figure = Figure(figsize=(10.0, 4.0), layout="constrained")
+    for axes, (name, x_label, y_label, x, y) in zip(figure.subplots(1, 2), rows, strict=True):
+        axes.plot(x, y, ".", markersize=4, color=MEASURED, label="measured")
+        estimate = found[name]
+        if estimate.value is not None:
+            ends = np.array([x.min(), x.max()])
+            axes.plot(ends, estimate.value * ends, "--", color=MODEL, label="scale")
+        axes.set(xlabel=x_label, ylabel=y_label)
+        swapped = "" if name == "wheel_scale" else f"\n{found['wheels_swapped'].text}"
+        _finish(axes, estimate.text + swapped)
+    return png(figure)
+
+
+def _finish(axes: Axes, title: str) -> None:
+    axes.set_title(title.replace("+-", "±"), fontsize=10, color=DARK)
+    axes.grid(alpha=0.3)
+    axes.legend(frameon=False, fontsize=9)
+
+
+def noise(identified: Identified) -> bytes | None:
+    """Draws histograms of the residuals, and the growth of the drift; None if free of noise."""
+    levels, panels = identified.noise, []
+    drive, calibration, model = identified.drive, identified.calibration, identified.model
+    if drive.bursts is None and len(pose := pose_residual(drive.recording.pose)) > DIFFERENCE:
+        panels += [("pose position", levels.pose_position, pose[:, :2].ravel())]
+        panels += [("pose heading", levels.pose_heading, pose[:, 2])]
+    odometry = odometry_residual(drive, calibration, model, identified.samples)
+    if odometry is not None:
+        panels += [("odometry, linear", levels.odom_linear, odometry[:, 0])]
+        panels += [("odometry, angular", levels.odom_angular, odometry[:, 2])]
+    panels = [p for p in panels if p[1].measured and p[1].std > 0.0]
+    grown = drift_growth(drive, calibration, model)
+    drifts = grown is not None and levels.position_drift.measured and bool(grown[1].max() > 1e-9)
+    if not panels and not drifts:
+        return None
+    count = len(panels) + 2 * drifts
+    columns = 2 if count == 4 else min(count, 3)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(4.3 * columns, 3.4 * rows), layout="constrained")
+    grid = list(figure.subplots(rows, columns, squeeze=False).ravel())
+    for axes, (name, level, rest) in zip(grid, panels, strict=False):
+        _histogram(axes, name, level, rest)
+    if drifts and grown is not None:
+        horizon, position, heading = grown
+        rows_ = (
+            ("position", levels.position_drift, position, "m"),
+            ("heading", levels.heading_drift, heading, "rad"),
+        )
+        for axes, row in zip(grid[len(panels) :], rows_, strict=False):
+            _growth(axes, horizon, *row)
+    for axes in grid[count:]:
+        axes.set_axis_off()
+    return png(figure)
+
+
+def _histogram(axes: Axes, name: str, level: Level, rest: Array) -> None:
+    edges = np.linspace(-REACH * level.std, REACH * level.std, BINS + 1)
+    axes.hist(rest - np.median(rest), list(edges), density=True, color=MEASURED, alpha=0.55)
+    normal = np.exp(-0.5 * (edges / level.std) ** 2) / (level.std * np.sqrt(2.0 * np.pi))
+    axes.plot(edges, normal, "--", color=MODEL)
+    axes.xaxis.set_major_locator(MaxNLocator(5))
+    axes.set(xlabel=f"residual [{level.unit}]", ylabel="density")
+    axes.set_title(f"noise of the {name}\n{_value(level)}", fontsize=10, color=DARK)
+
+
+def _growth(axes: Axes, horizon: Array, name: str, level: Level, error: Array, unit: str) -> None:
+    axes.plot(horizon, error, "o-", color=MEASURED, markersize=4, label="error of the prediction")
+    axes.plot(horizon, level.std * np.sqrt(horizon), "--", color=MODEL, label="the drift alone")
+    axes.set(xlabel="horizon [s]", ylabel=f"root mean square [{unit}]")
+    _finish(axes, f"drift of the {name}\n{_value(level)}")
+
+
+def _value(level: Level) -> str:
+    spread = "" if level.uncertainty is None else f" ± {level.uncertainty:.1g}"
+    return f"{level.std:.3g}{spread} {level.unit}"
+
+
+class ShiftCurve(NamedTuple):
+    """Residual against an estimated time, which is named as in `Calibration`."""
+
+    name: str
+    value: Array  # (n,) trial values of the time [s]
+    unexplained: Array  # (n,) root mean square, as a share of the signal's spread
+
+
+@one_blas_thread
+def timing_curves(drive: Drive, calibration: Calibration) -> tuple[ShiftCurve, ...]:
+    """Returns a curve for the clock offset and one for the latency, if they were estimated."""
+    if not moved_commands(drive.recording.command).any():
+        return ()
+    names = ("clock_offset_s", "command_latency_s")
+    found = (_curve(drive, calibration, name) for name in names if name in calibration.uncertainty)
+    return tuple(curve for curve in found if curve is not None)
+
+
+def _curve(drive: Drive, calibration: Calibration, name: str) -> ShiftCurve | None:
+    recording, spec, twists = drive.recording, drive.spec, drive.twists
+    state, wheels, command = recording.state, recording.wheels, recording.command
+    value = float(getattr(calibration, name)) + np.linspace(-REACH_S, REACH_S, TRIALS)
+    signal, delay = (twists.start, twists.end, twists.twist), value
+    if name == "clock_offset_s":
+        delay = -value if state is not None else calibration.command_latency_s - value
+    elif state is None and recording.pose.clock != command.clock:
+        if wheels is None:
+            return None
+        signal = (wheels.t - float(np.median(np.diff(wheels.t))), wheels.t, wheels.values)
+    if state is None:
+        lags = np.array([r.lag_s for r in calibration.responses])
+        lags = lags if len(lags) == len(spec.state) else nominal_lags(spec)
+        left = clocks.response_residual(command, spec, signal)
+        rest = [left(lags, d) for d in delay]
+    else:
+        by_delay = clocks.state_residual(command, state, spec)
+        if name == "clock_offset_s":
+            by_delay = clocks.residual_by_shift(state, signal)
+        rest = [by_delay(np.array([d])) for d in delay]
+    return ShiftCurve(name, value, np.array([np.sqrt(np.mean(r**2)) for r in rest]))

@@ -8,9 +8,8 @@ import bags
 import numpy as np
 
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.recording.bag_file import opened
+from nics_drl_bridge.recording.bag_file import Message, opened
 from nics_drl_bridge.recording.bag_reader import (
-    JointMessage,
     gather,
     latency_of,
     state_of,
@@ -214,7 +213,11 @@ MECANUM = load_robot("mecanum")
 
 def table(*messages):
     """Joints of messages (names, positions, velocities)."""
-    made = [JointMessage(k, k, *message) for k, message in enumerate(messages)]
+    kind = "sensor_msgs/msg/JointState"
+    made = [
+        Message(k, bags.new(kind, bags.header(k), names, position, velocity, ()))
+        for k, (names, position, velocity) in enumerate(messages)
+    ]
     return gather("/joint_states", made)
 
 

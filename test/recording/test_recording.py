@@ -255,7 +255,7 @@ def test_entries_that_zipfile_can_not_unpack_are_refused(tmp_path, field):
 def test_an_archive_that_unpacks_to_gigabytes_is_refused_packed(monkeypatch, tmp_path):
     path = tmp_path / "drive.npz"
     path.write_bytes(sealed(packed({"meta": np.zeros(3_000_000, np.int8)})))
-    monkeypatch.setattr(recordings, "MOST_BYTES", 2_000_000)
+    monkeypatch.setattr(recordings.files, "MOST_BYTES", 2_000_000)
     with pytest.raises(RecordingError, match="unpacked it is larger than"):
         load_recording(path)
 

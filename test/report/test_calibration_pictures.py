@@ -9,7 +9,7 @@ from identify.drives import drive, with_wheels
 from nics_drl_bridge.identify.identify import Identified, identify
 from nics_drl_bridge.identify.report import estimates, fit_report
 from nics_drl_bridge.recording.textbook import record
-from nics_drl_bridge.report.calibration_pictures import (
+from nics_drl_bridge.report.fit_pictures import (
     CAPTIONS,
     calibration_pictures,
     timing_curves,

@@ -5,8 +5,9 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,7 @@ from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from nics_drl_bridge.errors import BackendError, RecordingError, nearest
-from nics_drl_bridge.nodes import conversions
-from nics_drl_bridge.nodes.conversions import message_texts, message_type
+from nics_drl_bridge.nodes.conversions import message_texts, message_type, stamp_to_ros
 from nics_drl_bridge.nodes.qos import QosWatch, offer_of, profile_of
 from nics_drl_bridge.nodes.runner import DELIVERY_S, open_context, run_node
 from nics_drl_bridge.recording.bag_file import BagFile, opened
@@ -118,48 +118,33 @@ class BagRecorder(QosWatch):
             return
         kind = message_type(kinds[0])
         if len(kinds) > 1 or kind is None:
-            self._skip(topic, kinds)
+            why = f"is of {kinds[0]}, whose package is not installed; install it to record it"
+            if len(kinds) > 1:
+                why = f"has publishers of {' and '.join(kinds)}; end those of the wrong type"
+            self.skipped[topic] = f"{topic} {why}."
+            self._say(f"not recorded: {self.skipped[topic]}")
             return
         if known is None:
             self._sink.add_topic(topic, kinds[0], offers, message_texts(kinds[0]))
             self._say(f"{topic} ({kinds[0]})")
         else:
             self.destroy_subscription(known[1])
-        subscription = self.create_subscription(
-            kind, topic, self._taker(topic), profile_of(wanted), raw=True
-        )
-        self._heard[topic] = wanted, subscription
+        take, profile = partial(self._take, topic), profile_of(wanted)
+        self._heard[topic] = wanted, self.create_subscription(kind, topic, take, profile, raw=True)
 
-    def _skip(self, topic: str, kinds: Sequence[str]) -> None:
-        if len(kinds) > 1:
-            why = f"has publishers of {' and '.join(kinds)}; end those of the wrong type"
-        else:
-            why = f"is of {kinds[0]}, whose package is not installed; install it to record it"
-        self.skipped[topic] = f"{topic} {why}."
-        self._say(f"not recorded: {self.skipped[topic]}")
-
-    def _taker(self, topic: str) -> Callable[[Any, Any], None]:
-        def take(data: bytes, info: Any) -> None:
-            received = self._received_ns(info)
-            if received > 0:
-                self._sink.write(topic, received, data)
-
-        return take
-
-    def _received_ns(self, info: Any) -> int:
+    def _take(self, topic: str, data: bytes, info: Any) -> None:
+        received = info.get("received_timestamp") or time.time_ns()
         if self._order.use_sim_time:
-            return int(self.get_clock().now().nanoseconds)
-        return int(info.get("received_timestamp") or time.time_ns())
+            received = self.get_clock().now().nanoseconds
+        if received > 0:
+            self._sink.write(topic, int(received), data)
 
 
 def record_bag(order: BagOrder, say: Callable[[str], None]) -> dict[str, int]:
     """Records until the duration is over, SIGINT or SIGTERM; returns the messages by topic.
 
-    `say` is called with a sentence when a topic begins or can't be recorded.
-
-    Raises:
-        BackendError: nothing was received.
-        RecordingError: the bag can't be written.
+    `say` is called with a sentence when a topic begins or can't be recorded. Raises BackendError if
+    nothing was received, RecordingError if the bag can't be written.
     """
     nodes: list[BagRecorder] = []
     with bag_sink(order.out, order.storage) as sink:
@@ -169,12 +154,12 @@ def record_bag(order: BagOrder, say: Callable[[str], None]) -> dict[str, int]:
             return nodes[-1]
 
         run_node(make, ["nics"])
-        skipped = nodes[-1].skipped.values() if nodes else ()
         if not sum(sink.counts.values()):
+            skipped = " ".join(text for node in nodes for text in node.skipped.values())
             raise BackendError(
                 "nothing was heard on any of the topics, so no bag is written; start the robot, "
                 "or correct --topics, --namespace or ROS_DOMAIN_ID."
-                + (f" Not recorded: {' '.join(skipped)}" if skipped else "")
+                + (f" Not recorded: {skipped}" if skipped else "")
             )
     return sink.counts
 
@@ -193,15 +178,13 @@ class PlayOrder:
     domain_id: int | None = None  # DDS domain; the environment's by default
 
 
-Timed = tuple[int, int, str, bytes]  # receipt [ns], rank of the topic at equal times, topic, data
+Timed = tuple[int, str, bytes]  # receipt [ns], topic, data
 
 
 class _Player:
-    """Publishes messages one after another, when they are due."""
-
     def __init__(self, node: Node, order: PlayOrder, stopping: threading.Event) -> None:
         self._node, self._order, self._stopping = node, order, stopping
-        self._publishers: dict[str, Publisher] = {}
+        self.publishers: dict[str, Publisher] = {}
         self._clock = node.create_publisher(ClockMessage, CLOCK, 10) if order.clock else None
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
@@ -223,15 +206,19 @@ class _Player:
             not offers or any(offer.reliable for offer in offers),
             any(offer.transient_local for offer in offers),
         )
-        self._publishers[topic] = self._node.create_publisher(found, name, profile_of(best))
+        self.publishers[topic] = self._node.create_publisher(found, name, profile_of(best))
         return True
 
     def ready(self) -> None:
         """Waits for the node in lock-step, or a while for subscribers."""
-        publishers = self._publishers.values()
+        publishers = self.publishers.values()
         self._stopping.wait(DISCOVERY_S)
         self._wait(lambda: any(each.get_subscription_count() for each in publishers), ALONE_S)
-        self._wait(lambda: all(map(self._matched, publishers)), PATIENCE_S)
+        known = self._node.count_subscribers
+        self._wait(  # for all known subscribers to find their topic
+            lambda: all(p.get_subscription_count() >= known(p.topic_name) for p in publishers),
+            PATIENCE_S,
+        )
         if self._barrier is None or self._wait(self._barrier.service_is_ready, PATIENCE_S):
             return
         raise BackendError(
@@ -239,13 +226,7 @@ class _Player:
             "correct its name, namespace or ROS_DOMAIN_ID."
         )
 
-    def _matched(self, publisher: Publisher) -> bool:
-        """True if all known subscribers have found a topic."""
-        there = self._node.count_subscribers(publisher.topic_name)
-        return bool(publisher.get_subscription_count() >= there)
-
     def _wait(self, condition: Callable[[], bool], patience_s: float) -> bool:
-        """Waits for a condition; returns False if it did not come true in time."""
         until = time.monotonic() + patience_s
         while not (condition() or self._stopping.is_set()):
             if time.monotonic() > until:
@@ -253,16 +234,11 @@ class _Player:
             self._stopping.wait(NAP_S)
         return True
 
-    def finish(self) -> None:
-        """Waits for delivery: messages are lost if their publisher goes before."""
-        for each in self._publishers.values():
-            each.wait_for_all_acked(Duration(seconds=DELIVERY_S))
-
     def play(self, messages: list[Timed]) -> int:
         """Publishes all messages; returns their number, fewer if it is stopped."""
         first, began, sent = messages[0][0], time.monotonic_ns(), 0
         now = first
-        for due, _, topic, data in messages:
+        for due, topic, data in messages:
             while self._order.lockstep is None and now < due and not self._stopping.is_set():
                 now = min(due, now + round(CLOCK_PERIOD_NS * self._order.rate))
                 at = began + round((now - first) / self._order.rate)
@@ -272,14 +248,14 @@ class _Player:
                 break
             if self._order.lockstep is not None:
                 self._tick(due)
-            self._publishers[topic].publish(data)
+            self.publishers[topic].publish(data)
             sent += 1
             self._wait_for_peer()
         return sent
 
     def _tick(self, now_ns: int) -> None:
         if self._clock is not None:
-            self._clock.publish(ClockMessage(clock=conversions.stamp_to_ros(now_ns)))
+            self._clock.publish(ClockMessage(clock=stamp_to_ros(now_ns)))
 
     def _wait_for_peer(self) -> None:
         """Waits for the peer's answer: a node takes messages before requests that arrive later."""
@@ -299,11 +275,8 @@ def play_bag(order: PlayOrder, say: Callable[[str], None]) -> int:
 
     They are published as recorded, with the quality of service that their publishers offered.
     `/clock` gives the times of receipt, as with `ros2 bag play --clock`. `say` is called with a
-    sentence about each topic that is left out.
-
-    Raises:
-        RecordingError: the bag is damaged, lacks a topic, or none of its types is installed.
-        BackendError: the peer in lock-step does not answer.
+    sentence about each topic that is left out. Raises RecordingError if the bag is damaged, lacks a
+    topic, or none of its types is installed, BackendError if the peer does not answer.
     """
     stopping = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -319,14 +292,17 @@ def play_bag(order: PlayOrder, say: Callable[[str], None]) -> int:
         played = {t: m for t, m in messages.items() if player.offer(t, kinds[t], offers[t])}
         for topic in sorted(kinds.keys() - played.keys()):
             say(f"left out: {topic} is of {kinds[topic]}, whose package is not installed.")
-        timed = _in_order(played)
+        # In the order of receipt, at equal times in that of their topics.
+        timed = [(ns, topic, data) for topic, some in sorted(played.items()) for ns, data in some]
+        timed.sort(key=lambda one: one[:2])
         if not timed:
             raise RecordingError(f"{order.bag}: holds nothing that can be played here.")
         player.ready()
         sent = player.play(timed)
         while order.loop and not stopping.is_set():
             sent += player.play(timed)
-        player.finish()
+        for each in player.publishers.values():  # undelivered messages are lost with it
+            each.wait_for_all_acked(Duration(seconds=DELIVERY_S))
         return sent
     finally:
         node.destroy_node()
@@ -343,10 +319,3 @@ def _wanted(bag: BagFile, order: PlayOrder) -> list[str]:
         for topic in sorted(names or bag.types)
         if topic not in bag.empty and not (order.clock and topic == CLOCK)
     ]
-
-
-def _in_order(messages: Mapping[str, list[tuple[int, bytes]]]) -> list[Timed]:
-    """Returns all messages in the order of receipt, at equal times in that of their topics."""
-    ranked = enumerate(sorted(messages.items()))
-    timed = [(ns, rank, topic, data) for rank, (topic, some) in ranked for ns, data in some]
-    return sorted(timed, key=lambda one: one[:2])

@@ -19,20 +19,8 @@ from mcap.opcode import Opcode
 from mcap.records import Chunk, Message, Statistics
 
 from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.recording import mcap
 from nics_drl_bridge.recording.bag_file import COMPRESSED, DATABASE, is_storage, metadata_of
-from nics_drl_bridge.recording.mcap import (
-    COMPRESSIONS,
-    INSIDE,
-    MAGIC,
-    PREFIX,
-    DamageError,
-    McapSummary,
-    Record,
-    mapped,
-    records,
-    unpack,
-    unpacked,
-)
 from nics_drl_bridge.recording.messages import typestore
 from nics_drl_bridge.recording.write import Storage, bag_sink
 
@@ -91,9 +79,7 @@ def salvage(path: str | Path, out: str | Path, storage: Storage = "mcap") -> Sal
     From an MCAP file these are all chunks with a correct checksum, or, in chunks without one, all
     messages before the damage; from an SQLite file all readable rows. Messages that can't be
     decoded are dropped. The hidden folder that a killed recorder leaves is accepted too.
-
-    Raises:
-        RecordingError: nothing is intact, or `out` exists already.
+    Raises RecordingError: nothing is intact, or `out` exists already.
     """
     path, found = Path(path), _Found()
     for file in _files(path):
@@ -145,14 +131,13 @@ def _number(file: Path) -> tuple[int, str]:
 
 
 def _decodable(found: _Found) -> Iterator[tuple[str, int, bytes]]:
-    """Yields the decodable messages of known topics, decompressed."""
     store = typestore()
     for topic, ns, data in found.messages:
         kind = found.kinds.get(topic)
         if kind is None or not 0 <= ns < LATEST_NS:
             continue
         try:
-            plain = unpack(data, "zstd") if data.startswith(ZSTD) else data
+            plain = mcap.unpack(data, "zstd") if data.startswith(ZSTD) else data
             if kind in store.fielddefs:
                 store.deserialize_cdr(plain, kind)
         except Exception:  # noqa: BLE001, S112 - the decoder can raise anything on damaged bytes
@@ -172,28 +157,30 @@ def _promised(path: Path) -> dict[str, int] | None:
 
 def _read_mcap(file: Path, found: _Found) -> None:
     """Reads all intact messages of an MCAP file; after damage it is searched for the next chunk."""
-    told, waiting, promised = McapSummary(), list[Record](), dict[int, int]()
-    data = mapped(file) if file.stat().st_size else memoryview(b"")
-    place = len(MAGIC)
+    told, waiting, promised = mcap.McapSummary(), list[mcap.Record](), dict[int, int]()
+    data = mcap.mapped(file) if file.stat().st_size else memoryview(b"")
+    place = len(mcap.MAGIC)
     while place < len(data):
         whole = False
         try:
-            record = next(records(data, place))
+            record = next(mcap.records(data, place))
             whole, end = isinstance(record.content, Chunk), record.end
             if whole:
-                waiting += _inside(record)
-            elif isinstance(record.content, INSIDE):
+                span = record.content.message_start_time, record.content.message_end_time
+                with suppress(mcap.DamageError):
+                    waiting += _until_damage(mcap.unpacked(record), span)
+            elif isinstance(record.content, mcap.INSIDE):
                 waiting.append(record)
             elif isinstance(record.content, Statistics):
                 promised = record.content.channel_message_counts
-        except DamageError as damage:
+        except mcap.DamageError as damage:
             waiting += _cut_chunk(data, place)
             end = damage.end or len(data)
         # The length of anything but a whole chunk may be damaged: it must not swallow a chunk.
         place = end if whole else _next_chunk(data, place + 1, end)
     # Some channels may be in the summary only, behind all messages.
     for record in sorted(waiting, key=lambda each: isinstance(each.content, Message)):
-        with suppress(DamageError):
+        with suppress(mcap.DamageError):
             message = told.see(record)
             if message is not None:
                 topic = told.channels[message.channel_id].topic
@@ -209,39 +196,31 @@ def _read_mcap(file: Path, found: _Found) -> None:
         found.promised[known.topic if known else f"unknown channel {key}"] += count
 
 
-def _inside(record: Record) -> list[Record]:
-    with suppress(DamageError):
-        chunk = record.content
-        span = chunk.message_start_time, chunk.message_end_time
-        return list(_until_damage(unpacked(record), span))
-    return []
-
-
-def _cut_chunk(data: memoryview, place: int) -> list[Record]:
+def _cut_chunk(data: memoryview, place: int) -> list[mcap.Record]:
     """Returns the records of a plain chunk that is cut off or whose length is wrong."""
-    start = place + PREFIX + 40
+    start = place + mcap.PREFIX + 40
     if data[place] != Opcode.CHUNK or start >= len(data):
         return []
-    first, last, size, crc, letters = struct.unpack_from("<QQQII", data, place + PREFIX)
+    first, last, size, crc, letters = struct.unpack_from("<QQQII", data, place + mcap.PREFIX)
     content, compressed = data[start : start + size], letters > 0
     if compressed or (len(content) == size and crc and crc32(content) != crc):
         return []
     return list(_until_damage(content, (first, last)))
 
 
-def _until_damage(data: memoryview, span_ns: tuple[int, int]) -> Iterator[Record]:
+def _until_damage(data: memoryview, span_ns: tuple[int, int]) -> Iterator[mcap.Record]:
     """Yields records up to the first wrong length; messages only within the chunk's time span."""
     place: int | None = 0
     while place is not None:
         try:
-            for record in records(data, place):
+            for record in mcap.records(data, place):
                 found = record.content
-                if not isinstance(found, INSIDE):
+                if not isinstance(found, mcap.INSIDE):
                     return
                 if not isinstance(found, Message) or span_ns[0] <= found.log_time <= span_ns[1]:
                     yield record
             return
-        except DamageError as damage:
+        except mcap.DamageError as damage:
             place = damage.end
 
 
@@ -257,15 +236,15 @@ def _next_chunk(data: memoryview, start: int, end: int) -> int:
 
 
 def _looks_like_chunk(data: memoryview, place: int) -> bool:
-    name = place + PREFIX + 32
+    name = place + mcap.PREFIX + 32
     if name + 12 > len(data):
         return False
-    *_, letters = struct.unpack_from("<QQQII", data, place + PREFIX)
-    if letters > 4 or bytes(data[name : name + letters]) not in map(str.encode, COMPRESSIONS):
+    *_, letters = struct.unpack_from("<QQQII", data, place + mcap.PREFIX)
+    if letters > 4 or bytes(data[name : name + letters]) not in map(str.encode, mcap.COMPRESSIONS):
         return False
     (length,) = struct.unpack_from("<Q", data, place + 1)
     (packed,) = struct.unpack_from("<Q", data, name + letters)
-    return bool(packed + letters + 40 == length <= len(data) - place - PREFIX)
+    return bool(packed + letters + 40 == length <= len(data) - place - mcap.PREFIX)
 
 
 def _read_database(file: Path, found: _Found) -> None:
