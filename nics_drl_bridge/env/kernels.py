@@ -18,8 +18,7 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan, resample
 from nics_drl_bridge.random_kernels import episode_seed
 
-LIMIT = 1000.0
-"""Maximum distance [m], speed [m/s] and turn rate [rad/s] in an observation."""
+LIMIT = 1000.0  # Maximum distance [m], speed [m/s] and turn rate [rad/s] in an observation
 
 
 class ScanScale(NamedTuple):

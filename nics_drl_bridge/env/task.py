@@ -33,8 +33,7 @@ DRIVES = ((0, 0, 0), (1, 0, 0), (1, 0, 1), (1, 0, -1), (-1, 0, 0), (-1, 0, 1), (
 They are those of the authors' code (efc-robot/MultiVehicleEnv), as signs of `cmd_vel`: linear.x,
 linear.y, angular.z. A robot that can't reverse stays in place, and turns if it can on the spot.
 """
-SIDEWAYS = ((0, 1, 0), (0, -1, 0))
-"""Two more for a robot that moves sideways."""
+SIDEWAYS = ((0, 1, 0), (0, -1, 0))  # Two more for a robot that moves sideways
 
 
 @dataclass(frozen=True)

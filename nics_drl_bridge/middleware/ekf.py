@@ -40,8 +40,7 @@ NEWS = 0.5
 """Possible error of the state of a robot that is stuck or pushed, as a share of its range."""
 REACHABLE = 2.0
 """States and commands are limited to this many times their range: the model is invalid beyond."""
-FARTHEST = 1e8
-"""Innovations beyond this [m, rad, m/s, rad/s] are never believed."""
+FARTHEST = 1e8  # Innovations beyond this [m, rad, m/s, rad/s] are never believed
 ANYWHERE = (100.0, 100.0, np.pi)
 """Standard deviation of the pose in the map of a pose sensor, by odometry alone [m, rad]."""
 LONGEST_GAP_S = 10.0

@@ -23,10 +23,8 @@ RUNAWAY = 1e9
 diverged."""
 LEAST_PIVOT = 1e-12
 """Lower bound on a variable's variance given those before it, as a share of its own variance."""
-LEAST_VARIANCE = 1e-18
-"""Absolute lower bound on that variance."""
-ROOM = 128
-"""Number of commands for which a log has room at first."""
+LEAST_VARIANCE = 1e-18  # Absolute lower bound on that variance
+ROOM = 128  # Number of commands for which a log has room at first
 
 
 class MotionModel(NamedTuple):

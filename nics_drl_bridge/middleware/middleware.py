@@ -37,8 +37,7 @@ Array = NDArray[np.float64]
 
 NOT_FINITE = "NaN or inf"
 LEAST_STD = {Kind.YAW_RATE: LEAST_TWIST_STD, Kind.POSE: LEAST_POSE_STD}
-RATE_OVER = 32
-"""Number of arrivals over which rates are computed."""
+RATE_OVER = 32  # Number of arrivals over which rates are computed
 
 
 class Datum(NamedTuple):

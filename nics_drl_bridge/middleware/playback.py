@@ -40,8 +40,7 @@ TYPES: Mapping[str, tuple[str, ...]] = {
 }
 ALWAYS = (SCAN, ODOM, CMD_VEL)
 """Roles whose topics are used if the bag has them; the others only on request."""
-APART_S = 1.0
-"""Greatest difference between stamps of one clock at the same time of receipt [s]."""
+APART_S = 1.0  # Greatest difference between stamps of one clock at the same time of receipt [s]
 COLUMNS = ("x", "y", "heading", "vx", "vy", "wz")
 
 

@@ -20,8 +20,7 @@ from nics_drl_bridge.middleware.measurement import Acceptance, Judgement, Kind, 
 
 Array = NDArray[np.float64]
 
-HISTORY_NS = NS_PER_S
-"""Length of the past that may still change [ns]."""
+HISTORY_NS = NS_PER_S  # Length of the past that may still change [ns]
 BEFORE_START = "not after the reset"
 TOO_OLD = f"older than {HISTORY_NS / NS_PER_S:g} s"
 DUPLICATE = "duplicate"
@@ -41,8 +40,7 @@ a measure of time."""
 SIGMA, LEAST = 6.0, 0.01
 """Greatest difference between odometry's pose and twist, in standard deviations, and the one that
 is always allowed [m, rad]."""
-STILL = 0.02
-"""Slower motion [m/s, rad/s] gives no information about time."""
+STILL = 0.02  # Slower motion [m/s, rad/s] gives no information about time
 
 Moment = tuple[int, int]
 """Stamp [ns] and kind: the order of measurements, whatever the order of their arrival."""

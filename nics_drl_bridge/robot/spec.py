@@ -32,8 +32,7 @@ Unit = Literal["m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N*m", "V", 
 """SI units of a state or a command; 1 for a ratio or a count."""
 MOST_CORNERS, MOST_VARIABLES = 512, 32
 """Greatest number of corners of a footprint, and of variables of a state or a command."""
-FASTEST = 1e6
-"""Greatest absolute value of a variable, in its unit."""
+FASTEST = 1e6  # Greatest absolute value of a variable, in its unit
 
 
 def kind_names() -> list[str]:

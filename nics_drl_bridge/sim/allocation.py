@@ -22,10 +22,8 @@ from nics_drl_bridge.sim.sensing_kernels import PAST
 from nics_drl_bridge.sim.separation_kernels import MARK
 from nics_drl_bridge.sim.world import World
 
-SLICES = 16
-"""Number of groups of beams in which a skewed scan is rendered."""
-LANES = 256
-"""Number of robots moved side by side: their arrays stay in the L1 cache."""
+SLICES = 16  # Number of groups of beams in which a skewed scan is rendered
+LANES = 256  # Number of robots moved side by side: their arrays stay in the L1 cache
 CROWD = 4096
 """Least number of pairs of a robot and a body for sorting the bodies of a world into cells."""
 FEWEST_OF_A_CROWD = 8

@@ -20,8 +20,7 @@ from nics_drl_bridge.robot.kernels import wrap
 from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim.state import Array, Cells, Nearby, State, Surroundings
 
-FREE, BODIES, WALLS, MAP = 0, 1, 2, 4
-"""Bit flags of what a robot may meet."""
+FREE, BODIES, WALLS, MAP = 0, 1, 2, 4  # Bit flags of what a robot may meet
 SEVERAL = 32
 """Greatest number of bodies listed near a robot; if there are more, all bodies are tested."""
 LEFT, BOTTOM, PER_METRE, LARGEST, MOVED, FRAME = range(6)
@@ -63,9 +62,7 @@ def find_near(
     near, reach, walls = nearby.near, nearby.reach, scene.walls
     me = bodies.shape[1] - near.shape[0] + m
     x, y, own = bodies[n, me, X], bodies[n, me, Y], reach[me]
-    count, several = 0, bodies.shape[1]
-    if scene.crowded:
-        several = bodies_around(x, y, own, cells)
+    count, several = 0, bodies_around(x, y, own, cells) if scene.crowded else bodies.shape[1]
     for i in range(several):
         k = cells.found[i] if scene.crowded else i
         dx, dy, far = bodies[n, k, X] - x, bodies[n, k, Y] - y, own + reach[k]
@@ -80,12 +77,8 @@ def find_near(
         if d2 <= own * own:
             meets |= WALLS
             break
-    grid = scene.grid
-    if (
-        grid.distances.size > 0
-        and collision.map_bound(bodies[n, me], grid) <= own - bodies[n, me, RADIUS]
-    ):
-        meets |= MAP
+    if collision.map_bound(bodies[n, me], scene.grid) <= own - bodies[n, me, RADIUS]:
+        meets |= MAP  # without a map, the bound is inf
     return meets
 
 
@@ -94,18 +87,9 @@ def contact(
     body: Array, m: int, world: Array, scene: Surroundings, nearby: Nearby, spare: Array,
     limit: float,
 ) -> tuple[float, int]:  # fmt: skip
-    """Returns the clearance of robot m, placed as `body` (7,), to all that it may meet.
-
-    Args:
-        body, m: the robot.
-        world: (K + M, 7) bodies of its world.
-        scene, nearby: see `state`.
-        spare, limit: see `collision_kernels`.
-
-    Returns:
-        The clearance, at most `limit` [m], negative where it overlaps something; and the nearest
-        body, or -1.
-    """
+    """Returns the clearance of robot m, placed as `body` (7,), to all that it may meet, at most
+    `limit` [m]; and the nearest body, or -1. `world` (K + M, 7) are the bodies of its world.
+    """  # noqa: D205
     outlines, near, least, whom = scene.outlines, nearby.near, limit, -1
     if nearby.meets[m] & BODIES:
         me = world.shape[0] - near.shape[0] + m
@@ -152,8 +136,8 @@ def put_body(bodies: Array, n: int, k: int, pose: Array) -> None:
 
 
 @kernel
-def _clamp(place: float, side: int) -> int:
-    return int(min(max(place, 0.0), side - 1.0))
+def _cell(way: float, per_metre: float, side: int) -> int:
+    return int(min(max(way * per_metre, 0.0), side - 1.0))
 
 
 @kernel
@@ -174,8 +158,8 @@ def sort_bodies(bodies: Array, n: int, cells: Cells) -> None:
     for k in range(count):
         radius, cell = bodies[n, k, RADIUS], side * side
         if radius * per_metre <= 1.0:
-            i = _clamp((bodies[n, k, Y] - low_y) * per_metre, side)
-            cell = i * side + _clamp((bodies[n, k, X] - low_x) * per_metre, side)
+            i = _cell(bodies[n, k, Y] - low_y, per_metre, side)
+            cell = i * side + _cell(bodies[n, k, X] - low_x, per_metre, side)
             frame[LARGEST] = max(frame[LARGEST], radius)
         cell_of[k] = cell
         begin[cell + 1] += 1
@@ -197,10 +181,10 @@ def bodies_around(x: float, y: float, reach: float, cells: Cells) -> int:
     begin, order, frame, found = cells.begin, cells.order, cells.frame, cells.found
     side = int(math.sqrt(begin.shape[0] - 2))
     reach += frame[LARGEST] + frame[MOVED]
-    left = _clamp((x - reach - frame[LEFT]) * frame[PER_METRE], side)
-    right = _clamp((x + reach - frame[LEFT]) * frame[PER_METRE], side)
-    low = _clamp((y - reach - frame[BOTTOM]) * frame[PER_METRE], side)
-    high = _clamp((y + reach - frame[BOTTOM]) * frame[PER_METRE], side)
+    left = _cell(x - reach - frame[LEFT], frame[PER_METRE], side)
+    right = _cell(x + reach - frame[LEFT], frame[PER_METRE], side)
+    low = _cell(y - reach - frame[BOTTOM], frame[PER_METRE], side)
+    high = _cell(y + reach - frame[BOTTOM], frame[PER_METRE], side)
     count = 0
     for i in range(low, high + 1):
         for k in range(begin[i * side + left], begin[i * side + right + 1]):

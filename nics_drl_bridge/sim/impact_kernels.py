@@ -32,10 +32,8 @@ TIME, WITH, OWN, OTHERS, DEPTH, AFTER, EVENT = range(7)
 """Columns of `events`: time of a robot's first contact [s]; the other body; the rates of its own
 and of the other's nearest point along the direction between them, negative if approaching [m/s];
 and the clearance, negative where it overlaps something, before and after the substep [m]."""
-SLACK = 1e-7
-"""Bodies touch if they are nearer than this to each other and approach [m]."""
-NOTHING = 1e-12
-"""Distances up to this count as zero [m]."""
+SLACK = 1e-7  # Bodies touch if they are nearer than this to each other and approach [m]
+NOTHING = 1e-12  # Distances up to this count as zero [m]
 MOST_LOOKS = 2000
 """Iterations after which a pair counts as touching: only absurdly fast rotations need more."""
 
@@ -112,41 +110,17 @@ def speed_at(b: int, time: float, flights: Array) -> float:
 
 
 @kernel
-def _from_segment(
-    x: float, y: float, ax: float, ay: float, bx: float, by: float
-) -> tuple[float, float]:
-    """Returns the vector from the nearest point of a segment to (x, y)."""
-    ex, ey, dx, dy = bx - ax, by - ay, x - ax, y - ay
-    along = dx * ex + dy * ey
-    if along > 0.0:
-        share = min(along / (ex * ex + ey * ey), 1.0)
-        return dx - share * ex, dy - share * ey
-    return dx, dy
-
-
-@kernel
 def _between(p: Edge, q: Edge) -> tuple[float, float]:
     """Returns the vector from the nearest point of q to that of p; zero where they cross."""
-    ax, ay, bx, by = p.ax, p.ay, p.bx, p.by
-    cx, cy, dx, dy = q.ax, q.ay, q.bx, q.by
-    nx, ny = _from_segment(ax, ay, cx, cy, dx, dy)
-    if ax == bx and ay == by:
+    nx, ny = collision.from_segment(p.ax, p.ay, q.ax, q.ay, q.bx, q.by)
+    if p.ax == p.bx and p.ay == p.by:
         return nx, ny
-    one = (dx - cx) * (ay - cy) - (dy - cy) * (ax - cx)
-    two = (dx - cx) * (by - cy) - (dy - cy) * (bx - cx)
-    three = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-    four = (bx - ax) * (dy - ay) - (by - ay) * (dx - ax)
-    if (one > 0.0) != (two > 0.0) and (three > 0.0) != (four > 0.0):
+    if collision.cross(p.ax, p.ay, p.bx, p.by, q.ax, q.ay, q.bx, q.by):
         return 0.0, 0.0
-    ox, oy = _from_segment(bx, by, cx, cy, dx, dy)
-    if ox * ox + oy * oy < nx * nx + ny * ny:
-        nx, ny = ox, oy
-    ox, oy = _from_segment(cx, cy, ax, ay, bx, by)
-    if ox * ox + oy * oy < nx * nx + ny * ny:
-        nx, ny = -ox, -oy
-    ox, oy = _from_segment(dx, dy, ax, ay, bx, by)
-    if ox * ox + oy * oy < nx * nx + ny * ny:
-        nx, ny = -ox, -oy
+    for x, y, edge, sign in ((p.bx, p.by, q, 1.0), (q.ax, q.ay, p, -1.0), (q.bx, q.by, p, -1.0)):
+        ox, oy = collision.from_segment(x, y, edge.ax, edge.ay, edge.bx, edge.by)
+        if ox * ox + oy * oy < nx * nx + ny * ny:
+            nx, ny = sign * ox, sign * oy
     return nx, ny
 
 
@@ -176,9 +150,7 @@ def _reach(edge: Edge) -> float:
 @kernel
 def _next_stop(b: int, time: float, until: float, flights: Array) -> float:
     """Returns when a body stops, if it does between two times; otherwise the later one."""
-    if b >= 0 and time < flights[b, STOP] < until:
-        return flights[b, STOP]  # type: ignore[no-any-return]
-    return until
+    return flights[b, STOP] if b >= 0 and time < flights[b, STOP] < until else until
 
 
 @kernel
@@ -205,13 +177,9 @@ def _free_time(
     front, beyond = min(far, far2), max(near, near2)
     keep = 0.5 * SLACK if gap > SLACK else 0.25 * gap
     free, own, others = np.inf, 0.0, 0.0
-    for i in range(2):
-        room_p = (far if i == 0 else far2) - front
-        u = rate_p if i == 0 else rate_p2
-        for j in range(2):
-            room_q = beyond - (near if j == 0 else near2)
-            v = rate_q if j == 0 else rate_q2
-            root = _root(gap - keep + room_p + room_q, u + v, bend)
+    for ahead, u in ((far, rate_p), (far2, rate_p2)):
+        for behind, v in ((near, rate_q), (near2, rate_q2)):
+            root = _root(gap - keep + (ahead - front) + (beyond - behind), u + v, bend)
             if root < free:
                 free, own, others = root, u, v
     return free, own, others
@@ -222,13 +190,11 @@ def touch(
     a: int, edge: Edge, round_a: float, b: int, other: Edge, round_b: float,
     begin: float, until: float, moving: Moving,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Finds the first contact of an edge of body a with an edge of body b.
+    """Returns the time [s] of the first contact of an edge of body a with one of body b.
 
-    The edges are in the bodies' frames, with a radius [m] around each.
-
-    Returns:
-        The time [s], inf if not before `until`; and the velocities of the nearest points of both
-        along the direction between them, negative if approaching [m/s].
+    It is inf if not before `until`. With it come the velocities of the nearest points of both along
+    the direction between them, negative if approaching [m/s]. The edges are in the bodies' frames,
+    with a radius [m] around each.
     """
     reach_a, reach_b, time, flights = _reach(edge), _reach(other), begin, moving.flights
     for _ in range(MOST_LOOKS):
@@ -254,6 +220,12 @@ def touch(
 
 
 @kernel
+def _edges(outline: collision.Outline) -> int:
+    """Number of edges of an outline: one of a segment, and a circle counts as a single point."""
+    return outline.end - outline.begin if outline.end - outline.begin > 2 else 1
+
+
+@kernel
 def _edge_of(v: int, outline: collision.Outline) -> Edge:
     """Returns edge v of an outline, or the origin of a circle's, which has none."""
     corners, begin, end = outline.corners, outline.begin, outline.end
@@ -261,12 +233,6 @@ def _edge_of(v: int, outline: collision.Outline) -> Edge:
         return Edge(0.0, 0.0, 0.0, 0.0)
     i, j = begin + v, begin + (v + 1 if begin + v + 1 < end else 0)
     return Edge(corners[i, 0], corners[i, 1], corners[j, 0], corners[j, 1])
-
-
-@kernel
-def _edges(outline: collision.Outline) -> int:
-    """Number of edges of an outline: one of a segment, and a circle counts as a single point."""
-    return outline.end - outline.begin if outline.end - outline.begin > 2 else 1
 
 
 @kernel
@@ -329,18 +295,9 @@ def _solid(distances: Array, i: int, j: int) -> bool:
 
 
 @kernel
-def _side_of_cell(i: int, j: int, side: int, grid: MapField) -> Edge:
-    """Returns a side of cell (i, j) of a map: below, right, above or left, in the map."""
-    size, u, v = grid.cell, (0, 1, 1, 0)[side], (1, 1, 0, 0)[side]
-    u2, v2 = (1, 1, 0, 0)[side], (1, 0, 0, 1)[side]
-    local = Edge((j + u) * size, (i + v) * size, (j + u2) * size, (i + v2) * size)
-    return _in_map(local, grid.x, grid.y, grid.cos, grid.sin)  # type: ignore[no-any-return]
-
-
-@kernel
 def touch_map(event: Array, a: int, grid: MapField, begin: float, moving: Moving) -> None:
     """Does the same as `_touch_edge` for the sides of the solid cells of a map."""
-    distances, world = grid.distances, moving.world
+    distances, world, size = grid.distances, moving.world, grid.cell
     if distances.size == 0:
         return
     speed = speed_at(a, begin, moving.flights)
@@ -354,8 +311,11 @@ def touch_map(event: Array, a: int, grid: MapField, begin: float, moving: Moving
         for j in range(low_j, end_j):
             if distances[i, j] > 0.0:
                 continue
-            for side in range(4):
-                # A side between two solid cells is met by nothing.
-                if not _solid(distances, i + (1, 0, -1, 0)[side], j + (0, 1, 0, -1)[side]):
-                    edge = _side_of_cell(i, j, side, grid)
+            # Each side from corner (u, v), and the cell beyond it; a side between two solid cells is
+            # met by nothing.
+            for up, right, u, v in ((1, 0, 0, 1), (0, 1, 1, 1), (-1, 0, 1, 0), (0, -1, 0, 0)):
+                if not _solid(distances, i + up, j + right):
+                    near_x, near_y = (j + u) * size, (i + v) * size
+                    side = Edge(near_x, near_y, (j + u + up) * size, (i + v - right) * size)
+                    edge = _in_map(side, grid.x, grid.y, grid.cos, grid.sin)
                     _touch_edge(event, a, -1, edge, 0.0, begin, moving)

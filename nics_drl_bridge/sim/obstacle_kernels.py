@@ -31,30 +31,18 @@ from nics_drl_bridge.sim.separation_kernels import (
 )
 from nics_drl_bridge.sim.state import Array, State, Surroundings
 
-DRAWS = 64
-"""Greatest number of draws per obstacle and period."""
-TURN = 2.0
-"""Greatest turn rate of an obstacle [rad/s]."""
-LOOK = 1.0
-"""A wandering obstacle looks ahead by the distance of this time [s], plus its radius."""
-MARGIN = 0.1
-"""Free space that it keeps at its sides [m]."""
-TRIES = 8
-"""Directions that it tries in one period."""
-MOST_CORNERS = 32
-"""Greatest number of waypoints that a patrol passes in a period."""
-NEAREST = 1e-3
-"""Least distance for which a force is computed [m]: at 0 it has no direction."""
-FAR = 8.0
-"""Forces beyond this many ranges are neglected."""
-STRONGEST = 5.0
-"""Greatest acceleration [m/s^2]: people reach no more, and the model's is unbounded."""
-ARRIVED = 0.3
-"""A goal is reached within this distance [m]."""
-ROOM = 0.2
-"""Free space around a walker at a new goal [m]."""
-LEAST_WALK = 1.0
-"""Least distance of a new goal [m], if such a goal is found."""
+DRAWS = 64  # Greatest number of draws per obstacle and period
+TURN = 2.0  # Greatest turn rate of an obstacle [rad/s]
+LOOK = 1.0  # A wandering obstacle looks ahead by the distance of this time [s], plus its radius
+MARGIN = 0.1  # Free space that it keeps at its sides [m]
+TRIES = 8  # Directions that it tries in one period
+MOST_CORNERS = 32  # Greatest number of waypoints that a patrol passes in a period
+NEAREST = 1e-3  # Least distance for which a force is computed [m]: at 0 it has no direction
+FAR = 8.0  # Forces beyond this many ranges are neglected
+STRONGEST = 5.0  # Greatest acceleration [m/s^2]: people reach no more, and the model's is unbounded
+ARRIVED = 0.3  # A goal is reached within this distance [m]
+ROOM = 0.2  # Free space around a walker at a new goal [m]
+LEAST_WALK = 1.0  # Least distance of a new goal [m], if such a goal is found
 PATIENCE = 5.0
 """A walker gives up a goal after twice the time of the straight path plus this time [s]."""
 CANDIDATES = 16
@@ -181,17 +169,10 @@ def _follow(mark, body, row, waypoints, period, keep):  # type: ignore[no-untype
 
 @kernel
 def repulsion(rx, ry, vx, vy, foresight, strength, reach):  # type: ignore[no-untyped-def]
-    """Computes the force (3, 4) of another walker; 2 b = sqrt((|r| + |r - v dt|)^2 - (v dt)^2).
+    """Returns the acceleration (3, 4) that another walker causes, - V0 grad exp(-b / sigma) [m/s^2].
 
-    Args:
-        rx, ry: from the other to this one [m], not zero.
-        vx, vy: velocity of the other, relative to this one [m/s].
-        foresight: dt [s].
-        strength: V0 [m^2/s^2].
-        reach: sigma [m].
-
-    Returns:
-        Acceleration [m/s^2], - V0 grad exp(-b / sigma).
+    2 b = sqrt((|r| + |r - v dt|)^2 - (v dt)^2), with r from the other to this one [m], not zero, its
+    relative velocity v [m/s], `foresight` dt [s], `strength` V0 [m^2/s^2] and `reach` sigma [m].
     """
     sx, sy = vx * foresight, vy * foresight
     qx, qy = rx - sx, ry - sy

@@ -20,8 +20,7 @@ __all__ = ["Motion", "Patrol", "Pedestrian", "Wander", "plan_arrays"]
 Array = NDArray[np.float64]
 FASTEST = 10.0
 """Greatest speed of an obstacle [m/s]; beyond it a control period would be too coarse."""
-STRONGEST = 1e3
-"""Upper bound on the parameters of the social force model, each in its unit."""
+STRONGEST = 1e3  # Upper bound on the parameters of the social force model, each in its unit
 
 
 def _fast(speed: tuple[float, float]) -> tuple[float, float]:

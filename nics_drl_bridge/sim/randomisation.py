@@ -40,8 +40,7 @@ SCALED = {
     "drift": (slice(2, None), ("position_drift", "heading_drift")),
 }
 """Columns that a factor scales, and the levels that may be given instead."""
-CORNERS = 256
-"""Number of mixtures of least and greatest factors that are checked for stability."""
+CORNERS = 256  # Number of mixtures of least and greatest factors that are checked for stability
 FAULT_COLUMNS = (
     "noise_std", "noise_proportional", "dropout", "dropout_far", "too_close", "quantisation",
     "skew",
@@ -54,8 +53,7 @@ CHOICES: dict[str, tuple[int, Mapping[Any, int]]] = {
 """Faults that are drawn from several words, with their columns and values."""
 KINEMATICS_GROUP, LATENCY_GROUP, ODOMETRY_GROUP, LIDAR_GROUP, CHOICES_GROUP, SCENE_GROUP = range(6)
 GROUPS = 8
-PLACES = 1 << 20
-"""More than a group has columns; the counters of two groups never collide."""
+PLACES = 1 << 20  # More than a group has columns; the counters of two groups never collide
 UNIT = (np.zeros(1), np.ones(1))
 
 

@@ -31,14 +31,10 @@ STILL, WANDER, PATROL, PEDESTRIAN = range(4)
 # Memory of an obstacle, a row of marks (N, K, F).
 SPEED, VX, VY, DIRECTION, AIM, GOAL_X, GOAL_Y, UNTIL, INDEX, WAY, REST, MARK = range(12)
 
-SLACK = 1e-6
-"""Margin that is never used [m]: rounding must not make two bodies touch."""
-PASSES = 3
-"""Number of times a displacement is bent before the remaining excess is shortened."""
-FINEST = 0.25
-"""Least step along a path through a static map, in cells."""
-HALVINGS = 8
-"""Number of bisections of its last step to find the end of the free path."""
+SLACK = 1e-6  # Margin that is never used [m]: rounding must not make two bodies touch
+PASSES = 3  # Number of times a displacement is bent before the remaining excess is shortened
+FINEST = 0.25  # Least step along a path through a static map, in cells
+HALVINGS = 8  # Number of bisections of its last step to find the end of the free path
 
 
 class Traffic(NamedTuple):

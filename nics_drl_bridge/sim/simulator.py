@@ -29,15 +29,13 @@ from nics_drl_bridge.threads import Crew
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 R = TypeVar("R")
-MOST_ROBOTS = 1_000
-"""Greatest number of robots in one world; each is tested against every other."""
+MOST_ROBOTS = 1_000  # Greatest number of robots in one world; each is tested against every other
 MOST_NUMBERS = 2**30
 """Greatest number of values in all worlds, some GB: beams of robots, states of obstacles."""
 PER_BODY = 64
 TOLERANCE = 0.05
 """Tolerance beyond the range of commands that was recorded, as a share of their limits."""
-EVERY = 16
-"""Commands are checked in the first step after a reset and then at this interval [steps]."""
+EVERY = 16  # Commands are checked in the first step after a reset and then at this interval [steps]
 
 
 class OutsideValidityWarning(UserWarning):

@@ -139,15 +139,6 @@ def _move_world(
     drift_carefully(n, state, scene, motion, nearby, single)
 
 
-@kernel
-def _note_paths(n: int, skip: int, pose: Array, scratch: Scratch) -> None:
-    """Reports to the cells how far the robots of world n came, drift included."""
-    before, frame = scratch.scans.before, scratch.cells.frame
-    for m in range(pose.shape[1]):
-        dx, dy = pose[n, m, 0] - before[skip + m, 0], pose[n, m, 1] - before[skip + m, 1]
-        frame[contacts.MOVED] = max(frame[contacts.MOVED], math.sqrt(dx * dx + dy * dy))
-
-
 @kernel(allocates=True)
 def step_worlds(packed: Any, commands: Array, begin: int) -> None:
     """Steps the worlds of a part, from `begin` on, by one control period.
@@ -177,8 +168,6 @@ def _step(
             skip = (n - low) * many
             _move_world(n, skip, state, scene, motion, scratch)
             _measure(n, skip, state, motion, scratch)
-            if scene.crowded:
-                _note_paths(n, skip, state.pose, scratch)
             waiting = sensing.scan_or_wait(n, waiting, state, scene, view, motion, scratch)
         sensing.scan_together(waiting, state, scene, view, scratch)
         sensing.distort(low, high, state, view)
@@ -217,12 +206,15 @@ def _begin_period(
 @kernel(inline=True)
 def _measure(n: int, skip: int, state: State, motion: Dynamics, scratch: Scratch) -> None:
     """Puts the bodies of the robots of world n where they are, and reads their wheels."""
-    single, first = scratch.single, state.velocity.shape[1]
-    for m in range(state.pose.shape[1]):
-        contacts.put_body(state.bodies, n, first + m, state.pose[n, m])
-        rates_at(n, m, motion.substeps - 1, state, motion, single)
+    frame, pose, first = scratch.cells.frame, state.pose, state.velocity.shape[1]
+    for m in range(pose.shape[1]):
+        contacts.put_body(state.bodies, n, first + m, pose[n, m])
+        rates_at(n, m, motion.substeps - 1, state, motion, scratch.single)
         before = scratch.scans.before[skip + m]
-        sensing.measure(n, m, state, state.pose, before, single.dq, motion)
+        sensing.measure(n, m, state, pose, before, scratch.single.dq, motion)
+        # The cells count how far the robots came, drift included.
+        dx, dy = pose[n, m, 0] - before[0], pose[n, m, 1] - before[1]
+        frame[contacts.MOVED] = max(frame[contacts.MOVED], math.sqrt(dx * dx + dy * dy))
 
 
 @kernel(allocates=True)

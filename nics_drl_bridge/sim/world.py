@@ -22,8 +22,7 @@ Array = NDArray[np.float64]
 MOST_OBSTACLES = 10_000
 MOST_WALLS = 10_000
 MOST_PLACES = 10_000
-SMALLEST_FIELD = 0.01
-"""Least side of a field [m]."""
+SMALLEST_FIELD = 0.01  # Least side of a field [m]
 Distance = Annotated[float, Field(ge=0.0, le=LARGEST)]
 Side = Annotated[float, Field(ge=SMALLEST_FIELD, le=LARGEST)]
 Pose = tuple[Coordinate, Coordinate, Heading]
