@@ -22,33 +22,20 @@ LIMIT = 1000.0  # Maximum distance [m], speed [m/s] and turn rate [rad/s] in an 
 
 
 class ScanScale(NamedTuple):
-    """Conversion of a scan to parts of an observation, and to contacts.
+    """Conversion of a scan to parts of an observation, and to contacts."""
 
-    Attributes:
-        per_metre: 1 / the range that a share of 1 stands for [1/m], float32.
-        leaves: (B,) float32 range at which each beam leaves the footprint [m].
-        sectors: number of sectors that are observed; 0 if the beams themselves are.
-        plan: mapping of beams to sectors.
-    """
-
-    per_metre: np.float32
-    leaves: NDArray[np.float32]
-    sectors: int
-    plan: SectorPlan
+    per_metre: np.float32  # 1 / the range that a share of 1 stands for [1/m], float32
+    leaves: NDArray[np.float32]  # (B,) float32 range at which each beam leaves the footprint [m]
+    sectors: int  # number of sectors that are observed; 0 if the beams themselves are
+    plan: SectorPlan  # mapping of beams to sectors
 
 
 class GoalProgress(NamedTuple):
-    """Outcome of a step of the navigation task.
+    """Outcome of a step of the navigation task."""
 
-    Attributes:
-        approach: (R,) decrease of the distance to the goal [m].
-        reached: (R,) True at the goal.
-        touched: (R,) True if the scan shows a contact with the footprint.
-    """
-
-    approach: NDArray[np.float64]
-    reached: NDArray[np.bool_]
-    touched: NDArray[np.bool_]
+    approach: NDArray[np.float64]  # (R,) decrease of the distance to the goal [m]
+    reached: NDArray[np.bool_]  # (R,) True at the goal
+    touched: NDArray[np.bool_]  # (R,) True if the scan shows a contact with the footprint
 
 
 @kernel(allocates=True)

@@ -38,17 +38,12 @@ SIDEWAYS = ((0, 1, 0), (0, -1, 0))  # Two more for a robot that moves sideways
 
 @dataclass(frozen=True)
 class Episodes:
-    """Episodes at their start, in n worlds with M robots.
+    """Episodes at their start, in n worlds with M robots."""
 
-    Attributes:
-        seeds: (n,); all that a task draws must follow from them, see `random_kernels.uniform`.
-        starts: (n, M, 3) poses of the robots: x [m], y [m], heading [rad] in `map`.
-        goals: (n, M, 2) free points that the world drew, one per robot [m].
-    """
-
+    # (n,); all that a task draws must follow from them, see `random_kernels.uniform`
     seeds: NDArray[np.int64]
-    starts: Array
-    goals: Array
+    starts: Array  # (n, M, 3) poses of the robots: x [m], y [m], heading [rad] in `map`
+    goals: Array  # (n, M, 2) free points that the world drew, one per robot [m]
 
 
 @dataclass(frozen=True)
@@ -84,26 +79,20 @@ class Task(ABC):
     dimensions (n, M): n worlds of M robots. A task of one robot that works element by element also
     accepts the view () of a robot over ROS 2. Results per element must not depend on n: use
     `bearing` and `distance` instead of numpy's trigonometric functions.
-
-    Attributes:
-        robot: gives commands, their limits, and the footprint.
-        lidar: gives the scan.
-        actions: `continuous` (Box) or `discrete` (the paper's drives, see `DRIVES`).
-        contact_margin: a return this close to the footprint counts as a contact [m].
-        scan: sectors that observations contain instead of the lidar's beams, so that they mean the
-            same for any lidar; None keeps the beams. Contact is always judged from the beams.
-        keeps_last_scan: True if `reward`, `update` or `step_into` use `before.ranges`; otherwise
-            these may be the new ranges, which saves a copy.
-        shown: names of memory arrays that `info` always contains.
     """
 
+    # True if `reward`, `update` or `step_into` use `before.ranges`; otherwise these may be the new
+    # ranges, which saves a copy
     keeps_last_scan: ClassVar[bool] = True
-    shown: ClassVar[tuple[str, ...]] = ()
+    shown: ClassVar[tuple[str, ...]] = ()  # names of memory arrays that `info` always contains
 
-    robot: RobotSpec
-    lidar: LidarSpec
+    robot: RobotSpec  # gives commands, their limits, and the footprint
+    lidar: LidarSpec  # gives the scan
+    # `continuous` (Box) or `discrete` (the paper's drives, see `DRIVES`)
     actions: Actions = "continuous"
-    contact_margin: float = 0.02
+    contact_margin: float = 0.02  # a return this close to the footprint counts as a contact [m]
+    # sectors that observations contain instead of the lidar's beams, so that they mean the same for
+    # any lidar; None keeps the beams. Contact is always judged from the beams
     scan: ScanLayout | None = None
 
     def __post_init__(self) -> None:

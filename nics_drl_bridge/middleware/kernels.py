@@ -28,18 +28,12 @@ ROOM = 128  # Number of commands for which a log has room at first
 
 
 class MotionModel(NamedTuple):
-    """Model of the motion.
+    """Model of the motion."""
 
-    Attributes:
-        terms, series: see `robot.kernels`.
-        step_ns: the model's step [ns].
-        longest_ns: longest gap that is predicted [ns].
-    """
-
-    terms: Terms
+    terms: Terms  # `terms`, `series`: see `robot.kernels`
     series: Array
-    step_ns: int
-    longest_ns: int
+    step_ns: int  # the model's step [ns]
+    longest_ns: int  # longest gap that is predicted [ns]
 
 
 class Log(NamedTuple):

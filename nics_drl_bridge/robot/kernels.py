@@ -33,19 +33,13 @@ GREATEST_ORDER = 4
 
 
 class Terms(NamedTuple):
-    """The kept terms of a model.
+    """The kept terms of a model."""
 
-    Attributes:
-        dof: (T,) degree of freedom of each.
-        coefficient: (T,), or (T, n) of n robots.
-        factors: (T, order) indices into `x`; unused ones point to its last entry, which is 1.
-        degree: (T,) number of factors.
-    """
-
-    dof: NDArray[np.int64]
-    coefficient: Array
+    dof: NDArray[np.int64]  # (T,) degree of freedom of each
+    coefficient: Array  # (T,), or (T, n) of n robots
+    # (T, order) indices into `x`; unused ones point to its last entry, which is 1
     factors: NDArray[np.int64]
-    degree: NDArray[np.int64]
+    degree: NDArray[np.int64]  # (T,) number of factors
 
 
 def term_arrays(model: TaylorModel) -> Terms:

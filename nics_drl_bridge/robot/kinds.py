@@ -18,20 +18,14 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Textbook:
-    """Textbook kinematics of a robot.
+    """Textbook kinematics of a robot."""
 
-    Attributes:
-        twist: gives the body twist (..., 3) for a state (..., S).
-        target: gives the state (..., S) that a command (..., C) requests.
-        lag: (S,) time constants of first-order actuators [s].
-        rate: (S,) greatest rates of rate-limited actuators [its unit/s]; inf for first-order ones.
-        structure: possible products of state variables in each degree of freedom of the twist.
-    """
-
-    twist: Callable[[Array], Array]
-    target: Callable[[Array], Array]
-    lag: Array
+    twist: Callable[[Array], Array]  # gives the body twist (..., 3) for a state (..., S)
+    target: Callable[[Array], Array]  # gives the state (..., S) that a command (..., C) requests
+    lag: Array  # (S,) time constants of first-order actuators [s]
+    # (S,) greatest rates of rate-limited actuators [its unit/s]; inf for first-order ones
     rate: Array
+    # possible products of state variables in each degree of freedom of the twist
     structure: dict[str, tuple[str, ...]]
 
     def respond(self, state: Array, goal: Array, t: Array | float) -> Array:

@@ -102,28 +102,24 @@ class CommandVariable(Variable):
 
 
 class RobotSpec(Schema):
-    """Definition of a robot.
-
-    Attributes:
-        textbook: its kind: the textbook kinematics for its synthetic recordings, whose structure
-            may also be assumed for motion that a drive did not show.
-        parameters: of the textbook kinematics [m, s], see the module of that kind.
-        footprint_radius: of a circle around `base_link` [m]; optional with a `footprint`, which it
-            then circumscribes.
-        footprint: corners of a polygon instead, in `base_link` [m], in either direction.
-        state: S components, in the order of every state vector.
-        command: C components, in the order of every command vector.
-    """
+    """Definition of a robot."""
 
     name: str
     description: str = ""
+    # its kind: the textbook kinematics for its synthetic recordings, whose structure may also be
+    # assumed for motion that a drive did not show
     textbook: str | None = None
+    # of the textbook kinematics [m, s], see the module of that kind
     parameters: dict[str, float] = Field(default_factory=dict)
+    # of a circle around `base_link` [m]; optional with a `footprint`, which it then circumscribes
     footprint_radius: float = Field(ge=1e-3, le=1e3)
+    # corners of a polygon instead, in `base_link` [m], in either direction
     footprint: tuple[tuple[float, float], ...] | None = Field(
         default=None, min_length=3, max_length=MOST_CORNERS
     )
+    # S components, in the order of every state vector
     state: tuple[StateVariable, ...] = Field(default=(), max_length=MOST_VARIABLES)
+    # C components, in the order of every command vector
     command: tuple[CommandVariable, ...] = Field(min_length=1, max_length=MOST_VARIABLES)
 
     @field_validator("textbook")

@@ -73,34 +73,26 @@ AS_IT_IS: Factor = (1.0, 1.0)
 
 
 class KinematicRanges(Schema):
-    """Factors on the coefficients of the Taylor model, drawn independently for each coefficient.
+    """Factors on the coefficients of the Taylor model, drawn independently for each coefficient."""
 
-    Attributes:
-        scale: for every coefficient.
-        dofs: overrides `scale` for the coefficients of a rate, by its name in `model.yaml` (`wz`).
-        terms: overrides both, by rate and term: `{wz: {speed*steering: [0.8, 1.2]}}`.
-    """
-
-    scale: Factor = AS_IT_IS
+    scale: Factor = AS_IT_IS  # for every coefficient
+    # overrides `scale` for the coefficients of a rate, by its name in `model.yaml` (`wz`)
     dofs: dict[str, Factor] = Field(default_factory=dict)
+    # overrides both, by rate and term: `{wz: {speed*steering: [0.8, 1.2]}}`
     terms: dict[str, dict[str, Factor]] = Field(default_factory=dict)
 
 
 class OdometryRanges(Schema):
-    """Errors of odometry and motion: factors on the model's levels, or levels instead.
+    """Errors of odometry and motion: factors on the model's levels, or levels instead."""
 
-    Attributes:
-        noise: factor on the noise of the measured twist.
-        drift: factor on the part of the motion that the model does not explain; only a drift that
-            was found in the recording can be scaled.
-        odom_linear, odom_angular: noise of velocity [m/s] and yaw rate [rad/s].
-        position_drift, heading_drift: of x and y [m/sqrt(s)], and [rad/sqrt(s)].
-    """
-
-    noise: Factor | None = None
+    noise: Factor | None = None  # factor on the noise of the measured twist
+    # factor on the part of the motion that the model does not explain; only a drift that was found
+    # in the recording can be scaled
     drift: Factor | None = None
+    # `odom_linear`, `odom_angular`: noise of velocity [m/s] and yaw rate [rad/s]
     odom_linear: Level | None = None
     odom_angular: Level | None = None
+    # `position_drift`, `heading_drift`: of x and y [m/sqrt(s)], and [rad/sqrt(s)]
     position_drift: Level | None = None
     heading_drift: Level | None = None
 
@@ -114,19 +106,15 @@ class OdometryRanges(Schema):
 
 
 class LidarRanges(Schema):
-    """The lidar's noise and faults, instead of the model's; the fields of `LidarFaults`.
+    """The lidar's noise and faults, instead of the model's; the fields of `LidarFaults`."""
 
-    Attributes:
-        noise_std: see `LidarSpec` [m].
-        noise_proportional, quantisation, dropout, dropout_far: [least, greatest].
-        skew, too_close: the words that may be drawn, all equally likely.
-    """
-
-    noise_std: Level | None = None
+    noise_std: Level | None = None  # see `LidarSpec` [m]
+    # `noise_proportional`, `quantisation`, `dropout`, `dropout_far`: [least, greatest]
     noise_proportional: Level | None = None
     quantisation: Level | None = None
     dropout: Level | None = None
     dropout_far: Level | None = None
+    # `skew`, `too_close`: the words that may be drawn, all equally likely
     skew: tuple[Skew, ...] | None = Field(default=None, min_length=1)
     too_close: tuple[TooClose, ...] | None = Field(default=None, min_length=1)
 
@@ -139,16 +127,11 @@ class LidarRanges(Schema):
 
 
 class ObstacleRanges(Schema):
-    """Number and size of the obstacles of a scene.
+    """Number and size of the obstacles of a scene."""
 
-    Attributes:
-        count: [least, greatest], instead of the world's.
-        size: factor on the size of every obstacle, one per episode.
-        rungs: number of sizes to draw from, evenly spaced: each is baked beforehand.
-    """
-
-    count: tuple[int, int] | None = None
-    size: Factor = AS_IT_IS
+    count: tuple[int, int] | None = None  # [least, greatest], instead of the world's
+    size: Factor = AS_IT_IS  # factor on the size of every obstacle, one per episode
+    # number of sizes to draw from, evenly spaced: each is baked beforehand
     rungs: int = Field(default=5, ge=2, le=100)
 
     @model_validator(mode="after")
@@ -159,17 +142,12 @@ class ObstacleRanges(Schema):
 
 
 class Randomisation(Schema):
-    """Ranges that are drawn from in every episode; all else stays as in model and world.
-
-    Attributes:
-        action_latency: in addition to the model's [control periods].
-        observation_latency: age of scan and odometry [control periods].
-    """
+    """Ranges that are drawn from in every episode; all else stays as in model and world."""
 
     name: str
     kinematics: KinematicRanges = KinematicRanges()
-    action_latency: Latency = (0.0, 0.0)
-    observation_latency: Latency = (0.0, 0.0)
+    action_latency: Latency = (0.0, 0.0)  # in addition to the model's [control periods]
+    observation_latency: Latency = (0.0, 0.0)  # age of scan and odometry [control periods]
     odometry: OdometryRanges = OdometryRanges()
     lidar: LidarRanges = LidarRanges()
     obstacles: ObstacleRanges = ObstacleRanges()

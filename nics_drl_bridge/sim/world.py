@@ -31,21 +31,15 @@ Region = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 
 
 class Obstacles(Schema):
-    """A group of obstacles with common properties.
+    """A group of obstacles with common properties."""
 
-    Attributes:
-        shapes: each obstacle of the group takes one of them at random.
-        count: number of obstacles, or [least, greatest], from which each episode draws.
-        gap: free space between one of them and any other obstacle [m].
-        at: fixed poses, x, y [m], heading [rad], instead of `count` at random.
-        motion: their motion, see `sim.obstacles`; by default they stand still.
-    """
-
+    # each obstacle of the group takes one of them at random
     shapes: tuple[Shape, ...] = Field(min_length=1, max_length=MOST_SHAPES)
+    # number of obstacles, or [least, greatest], from which each episode draws
     count: int | tuple[int, int] | None = None
-    gap: Distance = 0.0
-    at: tuple[Pose, ...] = ()
-    motion: Motion | None = None
+    gap: Distance = 0.0  # free space between one of them and any other obstacle [m]
+    at: tuple[Pose, ...] = ()  # fixed poses, x, y [m], heading [rad], instead of `count` at random
+    motion: Motion | None = None  # their motion, see `sim.obstacles`; by default they stand still
 
     @field_validator("count", mode="before")
     @classmethod
@@ -101,28 +95,22 @@ class Goals(Places):
 
 
 class World(Schema):
-    """World of the episodes; everything is in the frame `map`.
+    """World of the episodes; everything is in the frame `map`."""
 
-    Attributes:
-        name: the name users refer to it by.
-        size: width along x and depth along y of a walled field around the origin [m].
-        walls: further straight walls, x1, y1, x2, y2 [m].
-        map: a static map, the YAML file of Nav2's map_server: the name of a shipped one, or a
-            path relative to the folder of the world file. A world has a `size`, a `map`, or both.
-        obstacles: groups of obstacles, see `Obstacles`.
-        clearance: free space around the footprint at start and goal, and on a path between [m].
-        goal_distance: least and greatest straight-line distance from start to goal [m].
-        starts, goals: by default anywhere.
-    """
-
-    name: str
+    name: str  # the name users refer to it by
+    # width along x and depth along y of a walled field around the origin [m]
     size: tuple[Side, Side] | None = None
+    # further straight walls, x1, y1, x2, y2 [m]
     walls: tuple[Region, ...] = Field(default=(), max_length=MOST_WALLS)
+    # a static map, the YAML file of Nav2's map_server: the name of a shipped one, or a path
+    # relative to the folder of the world file. A world has a `size`, a `map`, or both
     map: str | None = None
-    obstacles: tuple[Obstacles, ...] = ()
+    obstacles: tuple[Obstacles, ...] = ()  # groups of obstacles, see `Obstacles`
+    # free space around the footprint at start and goal, and on a path between [m]
     clearance: Distance = 0.3
+    # least and greatest straight-line distance from start to goal [m]
     goal_distance: tuple[Distance, Distance]
-    starts: Starts | None = None
+    starts: Starts | None = None  # `starts`, `goals`: by default anywhere
     goals: Goals | None = None
     _file: str | None = PrivateAttr(default=None)
 
