@@ -138,21 +138,22 @@ def _settle(
 
 
 @kernel
-def _arrive(n: int, any_moves: bool, dt: float, state: State, nearby: Nearby, single: Single,
-            series: Array) -> None:  # fmt: skip
-    """Moves the robots to the end of the substep, and rests the obstacles that stopped within it."""
-    bodies, velocity, start, events = state.bodies[n], state.velocity[n], single.start, single.events
+def _arrive(
+    n: int, any_moves: bool, motion: Dynamics, state: State, nearby: Nearby, single: Single
+) -> None:
+    """Moves robots to the end of the substep, and rests the obstacles that stopped within it."""
+    bodies, velocity, start = state.bodies[n], state.velocity[n], single.start
     for m in range(nearby.meets.shape[0]):
         if nearby.meets[m] != contacts.FREE:
             body, flight = bodies[velocity.shape[0] + m], single.flights[velocity.shape[0] + m]
-            _fly(single.trial, body, flight, flight[STOP], series)
+            _fly(single.trial, body, flight, flight[STOP], motion.series)
             for i in range(5):
                 body[i] = single.trial[i]
-            if events[m, DEPTH] < 0.0:
-                events[m, DEPTH] = events[m, AFTER]
+            if single.events[m, DEPTH] < 0.0:
+                single.events[m, DEPTH] = single.events[m, AFTER]
     for k in range(velocity.shape[0] if any_moves else 0):
         stop = single.flights[k, STOP]
-        if stop < dt:
+        if stop < motion.dt:
             start[k, 0] = bodies[k, X] + velocity[k, 0] * stop
             start[k, 1] = bodies[k, Y] + velocity[k, 1] * stop
             start[k, 2] = wrap(bodies[k, HEADING] + velocity[k, 2] * stop)
@@ -198,7 +199,7 @@ def move_carefully(
                 if events[m, DEPTH] < 0.0:
                     _leave(m, dt, scene, nearby, single, moving)
         _settle(dt, scene, nearby, events, touched, moving)
-        _arrive(n, any_moves, dt, state, nearby, single, motion.series)
+        _arrive(n, any_moves, motion, state, nearby, single)
     if any_moves:
         period = motion.substeps * dt
         contacts.move_obstacles(state.bodies, single.start, state.velocity, n, period)

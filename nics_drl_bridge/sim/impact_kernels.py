@@ -311,8 +311,8 @@ def touch_map(event: Array, a: int, grid: MapField, begin: float, moving: Moving
         for j in range(low_j, end_j):
             if distances[i, j] > 0.0:
                 continue
-            # Each side from corner (u, v), and the cell beyond it; a side between two solid cells is
-            # met by nothing.
+            # Each side from a corner (u, v), with the way to the cell beyond: between two solid
+            # cells nothing meets it.
             for up, right, u, v in ((1, 0, 0, 1), (0, 1, 1, 1), (-1, 0, 1, 0), (0, -1, 0, 0)):
                 if not _solid(distances, i + up, j + right):
                     near_x, near_y = (j + u) * size, (i + v) * size

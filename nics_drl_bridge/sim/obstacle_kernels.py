@@ -169,10 +169,10 @@ def _follow(mark, body, row, waypoints, period, keep):  # type: ignore[no-untype
 
 @kernel
 def repulsion(rx, ry, vx, vy, foresight, strength, reach):  # type: ignore[no-untyped-def]
-    """Returns the acceleration (3, 4) that another walker causes, - V0 grad exp(-b / sigma) [m/s^2].
+    """Returns the force (3, 4) of another walker [m/s^2], - V0 grad exp(-b / sigma).
 
-    2 b = sqrt((|r| + |r - v dt|)^2 - (v dt)^2), with r from the other to this one [m], not zero, its
-    relative velocity v [m/s], `foresight` dt [s], `strength` V0 [m^2/s^2] and `reach` sigma [m].
+    2 b = sqrt((|r| + |r - v dt|)^2 - (v dt)^2), with r [m] from the other to this one, not zero,
+    its relative velocity v [m/s], `foresight` dt, `strength` V0 [m^2/s^2] and `reach` sigma [m].
     """
     sx, sy = vx * foresight, vy * foresight
     qx, qy = rx - sx, ry - sy

@@ -7,6 +7,7 @@ another. A column whose bounds are equal takes that value.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -27,7 +28,7 @@ from nics_drl_bridge.robot.kernels import term_arrays
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.seeds import checked_seeds
 
-__all__ = ["Draws", "Label", "LidarRanges", "Randomisation", "Sampler", "load_randomisation"]
+__all__ = ["Draws", "LidarRanges", "Randomisation", "Sampler", "load_randomisation"]
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -165,14 +166,8 @@ def load_randomisation(name: str | Path) -> Randomisation:
     return load_yaml(find_config(name, "randomisation"), Randomisation)
 
 
-@dataclass(frozen=True)
-class Label:
-    """Name of a drawn number and its place in `Draws`."""
-
-    name: str  # human-readable: `kinematics.wz.speed*steering`, `action_latency_s`
-    field: str  # of `Draws`
-    column: int | None = None  # index along the last axis; None where there is none
-    unit: float = 1.0  # factor to multiply by, such as seconds per substep
+# Name of a drawn number (`kinematics.wz.speed*steering`), its field of `Draws`, column if any.
+Label = tuple[str, str, int | None]
 
 
 @dataclass(frozen=True)
@@ -186,33 +181,23 @@ class Draws:
     faults: Array  # (n, M, P) of each lidar, columns as in `lidar.fault_kernels`
     count: Integers | None  # (n,) obstacles in the scene; None leaves it to the world
     size: Integers | None  # (n,) index into `Randomisation.sizes`; None where there is only one
-    sizes: Array  # (R,) the sizes of `Randomisation.sizes`
+    scale: Array | None  # (n,) that size
+    latency: Array  # (n, M, 2) `delay` and `age` in seconds
     labels: tuple[Label, ...]  # of the drawn numbers that may differ from episode to episode
 
     def named(self) -> dict[str, NDArray[np.generic]]:
         """Returns the drawn numbers by name: (n, M) per robot, (n,) per scene."""
-        named: dict[str, NDArray[np.generic]] = {}
-        for label in self.labels:
-            value = getattr(self, label.field)
-            if label.field == "size":
-                value = self.sizes[value]
-            elif label.column is not None:
-                value = value[..., label.column]
-            named[label.name] = value if label.unit == 1.0 else value * label.unit
-        return named
+        return {
+            name: getattr(self, field)[() if column is None else (..., column)]
+            for name, field, column in self.labels
+        }
 
 
 class Sampler:
     """Draws the randomised numbers of episodes; a seed is bit-identical in any batch.
 
-    Args:
-        randomisation: the ranges.
-        model: provides the nominal values.
-        robots: M.
-
-    Attributes:
-        longest_delay: greatest latency of a command that may occur [substeps].
-        longest_age: greatest age of an observation that may occur [substeps].
+    The nominal values are those of the model. `longest_delay` of a command and `longest_age` of an
+    observation are the greatest that may occur [substeps].
     """
 
     def __init__(
@@ -247,12 +232,12 @@ class Sampler:
         for column, values in self._choices.items():
             drawn = _between(UNIT, chosen, robots, CHOICES_GROUP, column)[..., 0]
             faults[..., column] = values[(drawn * len(values)).astype(np.int64)]
-        counts = self.randomisation.obstacles.count is not None
+        counts, sizes = self.randomisation.obstacles.count is not None, len(self._sizes) > 1
         return Draws(
             _between(self._coefficient, chosen, robots, KINEMATICS_GROUP),
             timing[..., 0].copy(), timing[..., 1].copy(), noise, faults,
-            scene[:, 0] if counts else None, scene[:, 1] if len(self._sizes) > 1 else None,
-            self._sizes, self._labels,
+            scene[:, 0] if counts else None, scene[:, 1] if sizes else None,
+            self._sizes[scene[:, 1]] if sizes else None, timing * self._step, self._labels,
         )  # fmt: skip
 
     def _name(self, model: SimulatorModel) -> Iterator[Label]:
@@ -261,21 +246,21 @@ class Sampler:
         for column, (d, k) in enumerate(terms):
             if _varies(self._coefficient, column):
                 name = f"kinematics.{kinematics.dofs[d]}.{kinematics.term_names[k]}"
-                yield Label(name, "coefficient", column)
-        for row, name in enumerate(("action", "observation")):
-            if _varies(self._timing, row):
-                yield Label(f"{name}_latency_s", ("delay", "age")[row], None, self._step)
+                yield name, "coefficient", column
+        for column, name in enumerate(("action_latency_s", "observation_latency_s")):
+            if _varies(self._timing, column):
+                yield name, "latency", column
         states = tuple(f"state_drift.{variable.name}" for variable in model.robot.state)
         for column, noise in enumerate((*NOISE_NAMES, *states)):
             if noise and _varies(self._noise, column):
-                yield Label(f"odometry.{noise}", "noise", column)
+                yield f"odometry.{noise}", "noise", column
         for column, fault in enumerate(FAULT_COLUMNS):
             if column in self._choices or _varies(self._faults, column):
-                yield Label(f"lidar.{fault}", "faults", column)
+                yield f"lidar.{fault}", "faults", column
         if self.randomisation.obstacles.count is not None:
-            yield Label("obstacles.count", "count")
+            yield "obstacles.count", "count", None
         if len(self._sizes) > 1:
-            yield Label("obstacles.size", "size")
+            yield "obstacles.size", "scale", None
 
 
 def _between(bounds: Bounds, seeds: Integers, robots: int, group: int, column: int = 0) -> Array:
@@ -313,15 +298,9 @@ def _rate(name: str, model: TaylorModel, where: str) -> int:
 
 
 def _term(d: int, name: str, model: TaylorModel, where: str) -> int:
-    kept = np.flatnonzero(model.coefficients[d])
-    try:
-        row = taylor.parse_term(name, model.variables)
-    except ValueError:
-        row = None
-    for k in kept:
-        if row is not None and np.array_equal(model.powers[k], row):
-            return int(k)
-    known = [model.term_names[k] for k in kept]
+    known = {model.term_names[k]: int(k) for k in np.flatnonzero(model.coefficients[d])}
+    with suppress(ValueError, KeyError):
+        return known[taylor.term_name(taylor.parse_term(name, model.variables), model.variables)]
     raise ConfigError(
         f"{where}: the model has no term {name!r} there; "
         + (nearest(name, known) if known else "it has none at all: remove it.")
@@ -389,9 +368,9 @@ def _levels(ranges: Randomisation, model: SimulatorModel, where: str) -> Bounds:
 def _faults(ranges: Randomisation, lidar: LidarSpec, where: str) -> Bounds:
     """Bounds (P,) of the lidar's noise and faults."""
     bounds = []
+    spans = {name: span for name, span in ranges.lidar if span is not None and name not in CHOICES}
     for end in range(2):
-        spans = {name: span for name, span in ranges.lidar if span is not None}
-        numbers = {name: span[end] for name, span in spans.items() if name not in CHOICES}
+        numbers = {name: span[end] for name, span in spans.items()}
         std = numbers.pop("noise_std", lidar.noise_std)
         spec = lidar.model_dump() | {"noise_std": std}
         spec["faults"] |= numbers

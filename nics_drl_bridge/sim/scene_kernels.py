@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, OutlineArrays, X, Y
+from nics_drl_bridge.lidar import exact_kernels
+from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, X, Y
 from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim.state import Array, Integers, MapField
 
@@ -52,7 +53,7 @@ class ScenePlan(NamedTuple):
     """Basis of the scenes of a world: K obstacles in G groups, of H shapes in S sizes."""
 
     space: FreeSpace
-    outlines: OutlineArrays  # of all shapes, the last of which is a disc
+    outlines: exact_kernels.OutlineArrays  # of all shapes, the last of which is a disc
     radii: Array  # (H,) of the circles around them [m]
     groups: Array  # (G, GROUP)
     group: Integers  # (K,) of each obstacle
@@ -168,9 +169,10 @@ def _is_clear(x, y, room, moving, plan, bodies, scratch):  # type: ignore[no-unt
     disc = scratch.disc
     disc[X], disc[Y] = x, y
     for k in range(bodies.shape[0]):
-        if bodies[k, RADIUS] > 0.0 and (moving or plan.groups[plan.group[k], MOVING] == 0.0):
-            if not _clear_of(disc, bodies[k], room, plan.outlines, scratch.spare):
-                return False
+        counts = moving or plan.groups[plan.group[k], MOVING] == 0.0
+        near = counts and bodies[k, RADIUS] > 0.0
+        if near and not _clear_of(disc, bodies[k], room, plan.outlines, scratch.spare):
+            return False
     return True
 
 

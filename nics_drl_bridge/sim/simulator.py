@@ -121,67 +121,46 @@ def _check_memory(model: SimulatorModel, world: World, worlds: int, robots: int)
 class FastSimulator:
     """The simulator that a SimulatorModel describes, in a world.
 
-    A world is bit-identical in a batch of any size and with any number of threads.
+    A world is bit-identical in a batch of any size and with any number of threads. The M robots of
+    a world scan and collide with each other.
 
     Args:
-        model: the robot: motion, lidar, noise.
-        world: the field and its obstacles.
-        worlds: N.
-        robots: M in each world. They scan and collide with each other.
+        model, world: the robot with its lidar and noise, and the field with its obstacles.
+        worlds, robots: N, and M in each world.
         renderer: `auto`, `baked` or `exact`, see `lidar.scanner.Scanner`.
         threads: number of parts of the worlds that are stepped in parallel.
         randomisation: ranges drawn from in each episode: an object, the name of a shipped one, or
             a YAML file.
-        longest_delay: greatest latency of commands that `data.delay` may be set to [substeps]; by
-            default the model's. Raised to the randomisation's greatest.
-        longest_age: greatest age of scan and odometry that `data.age` may be set to [substeps];
-            raised to the randomisation's greatest.
+        longest_delay, longest_age: greatest values that `data.delay` of commands (by default the
+            model's) and `data.age` of scan and odometry may be set to [substeps]; raised to the
+            randomisation's greatest.
         tell: called with a message when commands leave the range that the model was fitted to.
-
-    Attributes:
-        data: all mutable state, see `State`.
-        goals: (N, M, 2) of the episodes [m].
-        parts: the worlds that each thread steps.
-        sampler: draws the scenes.
-        drawn: name -> draws of the randomisation for the running episodes, (N, M) per robot or
-            (N,) per scene; empty without randomisation.
     """
 
     def __init__(
-        self,
-        model: SimulatorModel,
-        world: World,
-        worlds: int = 1,
-        robots: int = 1,
-        renderer: Renderer = "auto",
-        threads: int = 1,
-        randomisation: str | Randomisation | None = None,
-        longest_delay: int | None = None,
-        longest_age: int = 0,
-        tell: Callable[[str], None] = warn,
-    ) -> None:
-        if worlds < 1 or robots < 1:
+        self, model: SimulatorModel, world: World, worlds: int = 1, robots: int = 1,
+        renderer: Renderer = "auto", threads: int = 1,
+        randomisation: str | Randomisation | None = None, longest_delay: int | None = None,
+        longest_age: int = 0, tell: Callable[[str], None] = warn,
+    ) -> None:  # fmt: skip
+        delay = model.timing[2] if longest_delay is None else longest_delay
+        if min(worlds, robots, threads) < 1 or delay < model.timing[2] or longest_age < 0:
             raise ConfigError(
-                f"a simulator needs at least 1 world and 1 robot, not {worlds} and {robots}."
+                f"a simulator needs at least 1 world, robot and thread, not {worlds}, {robots} and "
+                f"{threads}; a longest_delay of at least the model's {model.timing[2]} substeps "
+                f"and a longest_age of at least 0, not {delay} and {longest_age}."
             )
         _check_memory(model, world, worlds, robots)
         if isinstance(randomisation, str):
             randomisation = load_randomisation(randomisation)
         _check_speed(model.kinematics, model.robot, world)
-        self.model, self.world = model, world
-        self.randomisation = randomisation
+        self.model, self.world, self.randomisation = model, world, randomisation
         self._draws = None if randomisation is None else Sampler(randomisation, model, robots)
-        delay = model.timing[2] if longest_delay is None else longest_delay
-        if threads < 1 or delay < model.timing[2] or longest_age < 0:
-            raise ConfigError(
-                f"a simulator needs at least 1 thread, a longest_delay of at least the model's "
-                f"{model.timing[2]} substeps and a longest_age of at least 0, not {threads}, "
-                f"{delay} and {longest_age}."
-            )
         if self._draws is not None:
             delay = max(delay, self._draws.longest_delay)
             longest_age = max(longest_age, self._draws.longest_age)
-        self.goals: Array = np.zeros((worlds, robots, 2))
+        self.goals: Array = np.zeros((worlds, robots, 2))  # of the episodes [m]
+        # Draws of the randomisation for the running episodes, (N, M) per robot or (N,) per scene.
         self.drawn: dict[str, NDArray[Any]] = {}
         self._footprint = footprint_shape(model.robot)
         sizes = (1.0,) if randomisation is None else randomisation.sizes
@@ -194,7 +173,7 @@ class FastSimulator:
         self._scanner = Scanner(model.lidar, table, renderer, world.grid)
         self._sizes = Sizes(worlds, robots, self.sampler.count, delay, longest_age)
         self.data = allocate(model, self._sizes)
-        self.parts = split(worlds, threads)
+        self.parts = split(worlds, threads)  # the worlds that each thread steps
         self._boxes = {
             part.start: CommandBox(model.kinematics, model.robot, tell) for part in self.parts
         }
@@ -207,22 +186,16 @@ class FastSimulator:
         of = (self.data, scene, self.model, self._scanner, self._sizes)
         return {part.start: step_kernels.pack(part_of(*of, part)) for part in self.parts}
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Returns the state without `packed`, which a copy rebuilds."""
+    def __getstate__(self) -> dict[str, Any]:  # a copy rebuilds `packed`
         return {name: value for name, value in vars(self).items() if name != "packed"}
 
     def reset(
-        self,
-        seeds: ArrayLike,
-        worlds: ArrayLike | None = None,
-        starts: ArrayLike | None = None,
+        self, seeds: ArrayLike, worlds: ArrayLike | None = None, starts: ArrayLike | None = None
     ) -> Scenes:
-        """Begins episodes. Threads may call it in parallel, each for worlds of a different part.
+        """Begins episodes in `worlds` (n,), all by default, at `starts` (n, M, 3) if given.
 
-        Args:
-            seeds: of each episode (n,); a seed fixes scene, start, goal, noise and randomisation.
-            worlds: (n,) indices of the worlds to reset, all by default.
-            starts: (n, M, 3) poses to begin at instead of the scene's.
+        A seed (n,) fixes scene, start, goal, noise and randomisation. Threads may call it in
+        parallel, each for worlds of a different part.
 
         Raises:
             ConfigError: the seeds or starts do not fit, or the world has no room for a scene.

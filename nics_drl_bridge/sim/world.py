@@ -162,8 +162,8 @@ class World(Schema):
         rows, columns = self.grid.cells.shape
         corners = [(i - 0.5, j - 0.5) for i in (0, rows) for j in (0, columns)]
         points = self.grid.cell_to_world(corners)
-        (x1, y1), (x2, y2) = points.min(axis=0), points.max(axis=0)
-        return float(x1), float(y1), float(x2), float(y2)
+        x1, y1, x2, y2 = *points.min(axis=0).tolist(), *points.max(axis=0).tolist()
+        return x1, y1, x2, y2
 
     def all_walls(self) -> Array:
         """Returns (W, 4) the four sides of the field, if any, then the further walls [m]."""
@@ -175,11 +175,7 @@ class World(Schema):
 
 
 def load_world(name: str | Path) -> World:
-    """Loads a shipped world by name (`arena`), or any other by the path of its YAML file.
-
-    Raises:
-        ConfigError: the file or its map is missing or invalid.
-    """
+    """Loads a shipped world by name (`arena`), or any other by the path of its YAML file."""
     path = find_config(name, "worlds")
     world = load_yaml(path, World)
     if world.map is not None and Path(world.map).suffix in (".yaml", ".yml"):
@@ -192,29 +188,29 @@ def load_world(name: str | Path) -> World:
 
 def check_places(world: World) -> None:
     """Raises ConfigError for an obstacle outside the world, or that does not fit at a waypoint."""
-    x1, y1, x2, y2 = world.extent
     for g, group in enumerate(world.obstacles):
-        for n, (x, y, heading) in enumerate(group.at):
-            if not (x1 <= x <= x2 and y1 <= y <= y2):
-                raise ConfigError(
-                    f"{world.source}: key 'obstacles.{g}.at.{n}': {[x, y, heading]} is outside of "
-                    "the world; move it."
-                )
-        if not isinstance(group.motion, Patrol):
-            continue
+        where = f"{world.source}: key 'obstacles.{g}"
+        for n, pose in enumerate(group.at):
+            if not _inside(world, *pose[:2]):
+                raise ConfigError(f"{where}.at.{n}': {list(pose)} is outside the world; move it.")
         radius = max(shape.radius for shape in group.shapes)
-        for n, point in enumerate(group.motion.waypoints):
+        waypoints = group.motion.waypoints if isinstance(group.motion, Patrol) else ()
+        for n, point in enumerate(waypoints):
             if _room_at(world, *point) < radius:
                 raise ConfigError(
-                    f"{world.source}: key 'obstacles.{g}.motion.waypoints.{n}': an obstacle of "
-                    f"radius {radius:g} m does not fit there, at {list(point)}; move it."
+                    f"{where}.motion.waypoints.{n}': an obstacle of radius {radius:g} m does not "
+                    f"fit there, at {list(point)}; move it."
                 )
+
+
+def _inside(world: World, x: float, y: float) -> bool:
+    x1, y1, x2, y2 = world.extent
+    return x1 <= x <= x2 and y1 <= y <= y2
 
 
 def _room_at(world: World, x: float, y: float) -> float:
     """Free space around a point among walls and map [m], negative outside the world."""
-    x1, y1, x2, y2 = world.extent
-    if not (x1 <= x <= x2 and y1 <= y <= y2):
+    if not _inside(world, x, y):
         return -1.0
     room = wall_distance(x, y, world.all_walls())
     if world.grid is not None:
