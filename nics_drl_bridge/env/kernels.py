@@ -66,27 +66,22 @@ def finite(values):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def look(shares, ranges, scale):  # type: ignore[no-untyped-def]
-    """Writes a scan (B,) as shares (P,) of a `ScanScale`; returns True if something is too close.
+    """Writes a scan (B,) as shares (P,) of a `ScanScale`; returns True if its beams show a contact.
 
-    A share of 1 is no return, 0 too close or unknown. Contact is judged from the beams.
+    A share of 1 is no return, 0 too close or unknown.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
     hits = np.int32(0)
-    if scale.sectors == 0:
-        for b in range(shares.shape[0]):
-            # A comparison with NaN (unknown) is False; -inf (too close) is below every range.
-            share = ranges[b] * scale.per_metre
-            share = share if share > zero else zero
-            shares[b] = share if share < one else one
-            hits |= np.int32(ranges[b] < scale.leaves[b])
-        return hits != 0
-    resample(shares, ranges, scale.plan)
-    for s in range(shares.shape[0]):
-        share = shares[s] * scale.per_metre
-        share = share if share > zero else zero
-        shares[s] = share if share < one else one
     for b in range(ranges.shape[0]):
         hits |= np.int32(ranges[b] < scale.leaves[b])
+    if scale.sectors > 0:
+        resample(shares, ranges, scale.plan)
+        ranges = shares
+    for s in range(shares.shape[0]):
+        # A comparison with NaN (unknown) is False; -inf (too close) is below every range.
+        share = ranges[s] * scale.per_metre
+        share = share if share > zero else zero
+        shares[s] = share if share < one else one
     return hits != 0
 
 
@@ -131,20 +126,7 @@ def navigate(out, progress, before, pose, twist, ranges, goals, scale, radius): 
 
 @kernel(allocates=True)
 def bearings(out, poses, points):  # type: ignore[no-untyped-def]
-    """Writes `bearing` (R, M, Q, 3) of each point (R, Q, 2) from each pose (R, M, 3)."""
+    """Writes `bearing` (R, 3) of points (R, 2) from poses (R, 3)."""
     for r in range(out.shape[0]):
-        for m in range(out.shape[1]):
-            for q in range(out.shape[2]):
-                x, y = points[r, q, 0], points[r, q, 1]
-                distance, out[r, m, q, 1], out[r, m, q, 2] = bearing(poses[r, m], x, y)
-                out[r, m, q, 0] = min(distance, LIMIT)
-
-
-@kernel(allocates=True)
-def distances(out, poses, points):  # type: ignore[no-untyped-def]
-    """Writes distances (R, M, Q) [m] from each pose (R, M, 3) to each point (R, Q, 2)."""
-    for r in range(out.shape[0]):
-        for m in range(out.shape[1]):
-            for q in range(out.shape[2]):
-                dx, dy = points[r, q, 0] - poses[r, m, 0], points[r, q, 1] - poses[r, m, 1]
-                out[r, m, q] = math.sqrt(dx * dx + dy * dy)
+        distance, out[r, 1], out[r, 2] = bearing(poses[r], points[r, 0], points[r, 1])
+        out[r, 0] = min(distance, LIMIT)

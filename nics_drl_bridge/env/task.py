@@ -192,12 +192,11 @@ class Task(ABC):
 
     def _look(self, ranges: NDArray[np.float32]) -> tuple[Observation, Flags]:
         ranges = np.ascontiguousarray(ranges, np.float32)
-        rows = ranges.reshape(-1, ranges.shape[-1])
-        parts, count = rows.shape[-1] if self.scan is None else self.scan.sectors, len(rows)
-        shares, touched = np.empty((count, parts), np.float32), np.empty(count, np.bool_)
-        kernels.looks(shares, touched, rows, self.scale)
-        lead = ranges.shape[:-1]
-        return shares.reshape(*lead, parts), touched.reshape(lead)
+        lead, parts, beams = ranges.shape[:-1], self.scan_parts, ranges.shape[-1]
+        shares, touched = np.empty((*lead, parts), np.float32), np.empty(lead, np.bool_)
+        rows = shares.reshape(-1, parts), touched.reshape(-1), ranges.reshape(-1, beams)
+        kernels.looks(*rows, self.scale)
+        return shares, touched
 
     @property
     def scan_parts(self) -> int:
@@ -265,35 +264,23 @@ def team_space(space: gymnasium.Space[Any], robots: int) -> gymnasium.Space[Any]
 def bearing(pose: ArrayLike, points: ArrayLike) -> Array:
     """Returns distance [m], cosine and sine of the bearing of points (..., 2) from poses (..., 3).
 
-    The leading dimensions are broadcast. A point at the robot's position lies straight ahead;
-    distances are cut at `kernels.LIMIT`.
+    The shapes are broadcast. A point at the robot's position lies straight ahead; distances are cut
+    at `kernels.LIMIT`.
     """
-    poses, places, shape = _rows(pose, points)
-    out = np.empty((len(poses), 1, 1, 3))
-    kernels.bearings(out, poses[:, None], places[:, None])
-    return out.reshape(*shape, 3)
+    given = np.asarray(pose, np.float64), np.asarray(points, np.float64)
+    shape = np.broadcast_shapes(*(each.shape[:-1] for each in given))
+    poses, places = (np.broadcast_to(each, (*shape, each.shape[-1])) for each in given)
+    out = np.empty((*shape, 3))
+    rows = [np.ascontiguousarray(each).reshape(-1, each.shape[-1]) for each in (poses, places)]
+    kernels.bearings(out.reshape(-1, 3), *rows)
+    return out
 
 
 def distance(pose: ArrayLike, points: ArrayLike) -> Array:
     """Returns distances (...) [m] from poses (..., 2 or 3) to points (..., 2), broadcast."""
-    poses, places, shape = _rows(pose, points)
-    out = np.empty((len(poses), 1, 1))
-    kernels.distances(out, poses[:, None], places[:, None])
-    return out.reshape(shape)
-
-
-def _rows(pose: ArrayLike, points: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:
-    poses, places = np.asarray(pose, np.float64), np.asarray(points, np.float64)
-    shape = poses.shape[:-1]
-    if places.shape[:-1] != shape:
-        shape = np.broadcast_shapes(shape, places.shape[:-1])
-        poses = np.broadcast_to(poses, (*shape, poses.shape[-1]))
-        places = np.broadcast_to(places, (*shape, 2))
-    return (
-        np.ascontiguousarray(poses).reshape(-1, poses.shape[-1]),
-        np.ascontiguousarray(places).reshape(-1, 2),
-        shape,
-    )
+    offset = np.asarray(points, np.float64) - np.asarray(pose, np.float64)[..., :2]
+    x, y = offset[..., 0], offset[..., 1]
+    return np.asarray(np.sqrt(x * x + y * y))
 
 
 def limited(twist: Array) -> Array:
@@ -317,17 +304,14 @@ def contact_ranges(robot: RobotSpec, lidar: LidarSpec, margin: float) -> NDArray
     x, y, heading = lidar.mount
     angles = lidar.angles + heading
     ray = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    if robot.footprint is None:
-        leaves = _leaves_circle(ray, np.array([x, y]), robot.footprint_radius + margin)
-    else:
+    if robot.footprint is not None:
         leaves = _leaves_outline(ray, np.array(robot.footprint) - [x, y]) + margin
+    else:
+        start, radius = np.array([x, y]), robot.footprint_radius + margin
+        along = ray @ start
+        rest = radius * radius - start @ start + along * along
+        leaves = np.where(rest >= 0.0, np.sqrt(np.maximum(rest, 0.0)) - along, -np.inf)
     return leaves.astype(np.float32)
-
-
-def _leaves_circle(ray: Array, start: Array, radius: float) -> Array:
-    along = ray @ start
-    rest = radius * radius - start @ start + along * along
-    return np.where(rest >= 0.0, np.sqrt(np.maximum(rest, 0.0)) - along, -np.inf)
 
 
 def _leaves_outline(ray: Array, corners: Array) -> Array:
