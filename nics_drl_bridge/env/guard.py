@@ -61,10 +61,8 @@ SEEDS = 2**63
 def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
     """Checks the seed of the first world, from which the others count up, or one for each.
 
+    Raises ConfigError for a seed that is no integer or too large, and for options that are no dict;
     Gymnasium itself refuses negative seeds.
-
-    Raises:
-        ConfigError: a seed is not an integer or too large, or the options are not a dict.
     """
     last = SEEDS - worlds if isinstance(seed, int | np.integer) else SEEDS - 1
     for one in seed if isinstance(seed, list | tuple | np.ndarray) else [seed]:
@@ -83,11 +81,7 @@ def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
 def override(
     memory: dict[str, NDArray[Any]], options: Mapping[str, Any] | None, *of_env: str
 ) -> None:
-    """Writes values of `reset(options=...)` into all rows of the memory arrays that they name.
-
-    Raises:
-        ConfigError: a name that neither the memory nor the env has, or a wrong value.
-    """
+    """Writes values of `reset(options=...)` into all rows of the memory arrays that they name."""
     for name, value in (options or {}).items():
         if name in memory:
             give(memory[name], name, value)
@@ -97,11 +91,7 @@ def override(
 
 
 def give(rows: NDArray[Any], name: str, value: Any) -> None:
-    """Writes the value of an option of `reset(options=...)` into rows (n, ...).
-
-    Raises:
-        ConfigError: the value has a wrong shape, or contains NaN or inf.
-    """
+    """Writes the value of an option of `reset(options=...)` into rows (n, ...)."""
     try:
         given = np.asarray(value)
     except ValueError:  # a ragged list
@@ -118,12 +108,7 @@ def give(rows: NDArray[Any], name: str, value: Any) -> None:
 
 
 def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray[Any]:
-    """Returns an action as an array of its space's shape.
-
-    Raises:
-        gymnasium.error.InvalidAction: not numeric, of another shape, NaN, inf, or no action of
-            that number.
-    """
+    """Returns an action as an array of its space's shape. Raises Gymnasium's InvalidAction."""
     try:
         given = np.asarray(action)
     except ValueError as error:  # a ragged list

@@ -98,11 +98,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
     ) -> tuple[
         Observations, dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
     ]:
-        """Advances one control period; see PettingZoo.
-
-        Raises:
-            ConfigError: a remaining agent has no action.
-        """
+        """Advances one control period; see PettingZoo. Every remaining agent needs an action."""
         if missing := sorted(set(self.agents) - set(actions)):
             raise ConfigError(f"no action for {', '.join(missing)}; each agent that is left acts.")
         space = self.env.task.action_space

@@ -121,11 +121,7 @@ def _import(name: str) -> Any:
 
 
 def _load(path: Path) -> Any:
-    """Loads the module of a file, again only if the file has changed.
-
-    Raises:
-        ConfigError: the file is missing, or fails to run as Python; names the line.
-    """
+    """Loads the module of a file, again only if the file has changed."""
     if not path.is_file():
         raise ConfigError(f"task {str(path)!r}: no such file; give path/to/file.py:ClassName.")
     digest = sha256(str(path.resolve()).encode() + path.read_bytes())[:16]
@@ -187,19 +183,11 @@ register_envs()
 
 
 def make(task: str = "navigation", **arguments: Any) -> gymnasium.Env[Any, Any]:
-    """An env of a task, with Gymnasium's own wrappers and the arguments of `BridgeEnv`.
-
-    Raises:
-        ConfigError, ModelError: an unknown name or a wrong file.
-    """
+    """An env of a task, with Gymnasium's own wrappers and the arguments of `BridgeEnv`."""
     return gymnasium.make(TASK, task=task, **arguments)
 
 
 def make_vec(num_envs: int, task: str = "navigation", **arguments: Any) -> Any:
-    """A `BridgeVectorEnv`: a task in many worlds at once, for training.
-
-    Raises:
-        ConfigError, ModelError: an unknown name or a wrong file.
-    """
+    """A `BridgeVectorEnv`: a task in many worlds at once, for training."""
     vectors = import_module("nics_drl_bridge.env.vector_env")  # which imports this module
     return vectors.BridgeVectorEnv(num_envs, task=task, **arguments)

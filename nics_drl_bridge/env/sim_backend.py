@@ -181,11 +181,7 @@ def completed(backend: Any, still: NDArray[np.float64]) -> Backend:
 
 
 def make_backend(name: str, model: SimulatorModel, world: World, **options: Any) -> Any:
-    """Makes a backend by the name under which it is registered, see `extensions`.
-
-    Raises:
-        ConfigError: unknown name, its library is missing, or it has no such option.
-    """
+    """Makes a backend by the name under which it is registered, see `extensions`."""
     make = extensions.load("backends", name)
     try:
         signature(make).bind(model, world, **options)

@@ -10,9 +10,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.env import task
 from nics_drl_bridge.env.kernels import LIMIT
 from nics_drl_bridge.env.task import Episodes, Flags, Memory, Observation, Task
-from nics_drl_bridge.env.task import bearing, distance, limited, total
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import RobotView
 
@@ -103,20 +103,20 @@ class CooperativeReaching(Task):
 
     def update(self, before: RobotView, after: RobotView, memory: Memory) -> None:
         """Marks the goals that a robot is at."""
-        there = (distance(*pairs(after.pose, memory["goal"])) < self.goal_radius).any(axis=-2)
+        there = (task.distance(*pairs(after.pose, memory["goal"])) < self.goal_radius).any(axis=-2)
         memory["newly"][...] = there & ~memory["reached"]
         memory["reached"] |= there
 
     def observation(self, view: RobotView, memory: Memory) -> Observation:
         """The observation (..., M, O) of views (..., M)."""
-        goals = bearing(*pairs(view.pose, memory["goal"]))
+        goals = task.bearing(*pairs(view.pose, memory["goal"]))
         reached = np.broadcast_to(memory["reached"][..., None, :, None], (*goals.shape[:-1], 1))
         lead = view.pose.shape[:-1]
         parts = [
             self.free_share(view.ranges),
             np.concatenate([goals, reached], axis=-1).reshape(*lead, -1),
-            others(bearing(*pairs(view.pose, view.pose[..., :2]))).reshape(*lead, -1),
-            limited(view.twist),
+            others(task.bearing(*pairs(view.pose, view.pose[..., :2]))).reshape(*lead, -1),
+            task.limited(view.twist),
         ]
         return np.concatenate(parts, axis=-1, dtype=np.float32, casting="same_kind")
 
@@ -124,15 +124,18 @@ class CooperativeReaching(Task):
         """The terms (..., M)."""
         lead = after.pose.shape[:-1]
         gaps = [
-            distance(*pairs(view.pose, memory["goal"])).min(axis=-2) for view in (before, after)
+            task.distance(*pairs(view.pose, memory["goal"])).min(axis=-2)
+            for view in (before, after)
         ]
         # A goal just reached still pays its last approach.
         open_goals = ~memory["reached"] | memory["newly"]
         approach = np.where(open_goals, gaps[0] - gaps[1], 0.0)
         share = 1.0 / self.robots
-        newly = total(memory["newly"].astype(np.float64))
+        newly = task.total(memory["newly"].astype(np.float64))
         return {
-            "progress": np.full(lead, self.progress_reward * share * total(approach)[..., None]),
+            "progress": np.full(
+                lead, self.progress_reward * share * task.total(approach)[..., None]
+            ),
             "time": np.full(lead, self.time_reward),
             "reached": np.full(lead, self.reached_reward * share * newly[..., None]),
             "collision": self.collision_reward * self.touches(after.ranges),
@@ -248,7 +251,7 @@ class PursuitEvasion(Task):
 
     def _gaps(self, view: RobotView, memory: Memory) -> Array:
         """(..., M) [m] to the nearest robot of the other side that is not out; inf without one."""
-        between = distance(*pairs(view.pose, view.pose[..., :2]))
+        between = task.distance(*pairs(view.pose, view.pose[..., :2]))
         foe = (self.pursues[:, None] != self.pursues) & ~memory["out"][..., None, :]
         return np.asarray(np.where(foe, between, np.inf).min(axis=-1))
 
@@ -257,13 +260,13 @@ class PursuitEvasion(Task):
         lead = view.pose.shape[:-1]
         mates = np.broadcast_to(self.pursues[:, None] == self.pursues, (*lead, self.robots))
         out = np.broadcast_to(memory["out"][..., None, :], (*lead, self.robots))
-        places = bearing(*pairs(view.pose, view.pose[..., :2]))
+        places = task.bearing(*pairs(view.pose, view.pose[..., :2]))
         known = np.concatenate([places, mates[..., None], out[..., None]], axis=-1)
         parts: list[NDArray[Any]] = [
             self.free_share(view.ranges),
             others(known).reshape(*lead, -1),
             np.broadcast_to(self.pursues[:, None], (*lead, 1)),
-            limited(view.twist),
+            task.limited(view.twist),
         ]
         return np.concatenate(parts, axis=-1, dtype=np.float32, casting="same_kind")
 

@@ -365,9 +365,6 @@ def named_seeds(
 
     The seed is that of the first world, or of each (None keeps its present one), or None for all.
     For `chosen` worlds that are `unnamed`, as they never had a seed, one is drawn if none is given.
-
-    Raises:
-        ConfigError: wrong number of seeds, or a negative one.
     """
     count = len(chosen)
     if isinstance(seed, Sequence | np.ndarray):

@@ -10,7 +10,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.middleware import kernels
 from nics_drl_bridge.middleware.belief import Anchor, Belief, Foreseen, Unseen, parted
-from nics_drl_bridge.middleware.kernels import CommandLog, MotionModel
+from nics_drl_bridge.middleware.kernels import MotionModel, log_of, logged
 from nics_drl_bridge.middleware.measurement import (
     Acceptance,
     Judgement,
@@ -76,7 +76,6 @@ class Estimator:
         }
         self.unseen = Unseen(model, self._process, self._noise[Kind.TWIST], self._news)
         self._observe_pose = np.eye(3, 3 + size)
-        self._log = CommandLog(len(model.robot.command))
         self._filter, self._trial = (ExtendedKalmanFilter(3 + size, 3) for _ in range(2))
         self._anchor: Anchor | None = None
         self._foreseen: Foreseen | None = None  # of the present belief and commands
@@ -90,7 +89,7 @@ class Estimator:
         mean, deviation = np.zeros(self._filter.dim_x), np.full(self._filter.dim_x, START_STD)
         mean[:3], deviation[:3] = pose, std
         self.belief = Belief(time_ns, mean, np.diag(deviation**2), (0, 0, 0), None, False)
-        self._log.clear()
+        self._log = log_of(np.zeros(len(self._least)))
 
     def anchor(self, odom: Array) -> None:
         """Records the present pose (3,) in `odom`."""
@@ -107,7 +106,7 @@ class Estimator:
         known = self._anchor is not None and continuous
         since = anchor._replace(time_ns=time_ns - round(seconds * NS_PER_S)) if known else None
         self.belief = Belief(time_ns, anchor.mean, covariance, (0, 0, 0), since, True)
-        self._log.keep(np.minimum(np.maximum(command, self._least), self._most))
+        self._log = log_of(np.minimum(np.maximum(command, self._least), self._most))
 
     @property
     def belief(self) -> Belief:
@@ -146,7 +145,9 @@ class Estimator:
         needed_ns = self.time_ns if needed_ns is None else needed_ns
         self._foreseen = None
         possible = np.minimum(np.maximum(command, self._least), self._most)
-        return self._log.add(self.effective_ns(stamp_ns), possible, needed_ns)
+        log = logged(self._log, self.effective_ns(stamp_ns), possible, needed_ns)
+        self._log = log or self._log
+        return log is not None
 
     def at(self, time_ns: int) -> tuple[Array, Array]:
         """Predicts pose (3,) and body twist (3,) at a time, without moving the estimate.
@@ -155,7 +156,7 @@ class Estimator:
         estimate's, the estimate itself is returned.
         """
         mean, twist = kernels.look_ahead(
-            self._filter.x, self.time_ns, time_ns, self._motion, self._log.arrays
+            self._filter.x, self.time_ns, time_ns, self._motion, self._log
         )
         return mean[:3], twist
 
@@ -187,27 +188,18 @@ class Estimator:
         return trial.K, trial.P
 
     def _forecast(self, time_ns: int) -> Foreseen:
-        log = self._log.arrays
+        own, motion, log = self._filter, self._motion, self._log
         mean, covariance = kernels.forecast(
-            self._filter.x, self._filter.P, self._process, self.time_ns, time_ns, self._motion, log
+            own.x, own.P, self._process, self.time_ns, time_ns, motion, log
         )
-        if time_ns - self.time_ns > self._motion.longest_ns:
+        if time_ns - self.time_ns > motion.longest_ns:
             covariance = self.unseen.doubted(covariance, (time_ns - self.time_ns) / NS_PER_S)
-        return Foreseen(time_ns, mean, covariance, kernels.expect(mean, time_ns, self._motion, log))
+        return Foreseen(time_ns, mean, covariance, kernels.expect(mean, time_ns, motion, log))
 
-    def update_twist(self, twist: ArrayLike) -> Judgement:
-        """Corrects by a measured body twist (3,) at the time of the estimate."""
-        return self.correct(Measurement(Kind.TWIST, np.array(twist, dtype=np.float64)))
-
-    def update_yaw_rate(self, rate: float, std: float | None = None) -> Judgement:
-        """Corrects by a measured yaw rate [rad/s]."""
-        noise = None if std is None else np.array([[std**2]])
-        return self.correct(Measurement(Kind.YAW_RATE, np.array([rate]), noise))
-
-    def update_pose(self, pose: ArrayLike, std: ArrayLike | None = None) -> Judgement:
-        """Corrects by a pose (3,) in `map`; standard deviations (3,), or the model's sensor's."""
-        noise = None if std is None else np.diag(np.asarray(std, dtype=np.float64) ** 2)
-        return self.correct(Measurement(Kind.POSE, np.array(pose, dtype=np.float64), noise))
+    def update(self, kind: Kind, value: ArrayLike, std: ArrayLike | None = None) -> Judgement:
+        """Corrects by a measured value (n,), with its standard deviations or the model's."""
+        noise = None if std is None else np.diag(np.atleast_1d(std) ** 2.0)
+        return self.correct(Measurement(kind, np.atleast_1d(value).astype(np.float64), noise))
 
     def correct(self, measurement: Measurement) -> Judgement:
         """Corrects by a measurement at the time of the estimate, unless it is an outlier.
@@ -270,8 +262,8 @@ class Estimator:
         if (here := self._foreseen_here) is not None:
             twist, derivative = here.expected
         else:
-            log = self._log.arrays
-            twist, derivative = kernels.expect(self._filter.x, self.time_ns, self._motion, log)
+            now = self.time_ns
+            twist, derivative = kernels.expect(self._filter.x, now, self._motion, self._log)
         return (twist, derivative) if kind is Kind.TWIST else (twist[2:], derivative[2:])
 
     @property

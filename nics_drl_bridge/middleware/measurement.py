@@ -66,13 +66,10 @@ class Judgement(NamedTuple):
 
 
 def checked_covariance(covariance: ArrayLike | None, size: int, least_std: float) -> Array | None:
-    """Returns a covariance (size, size) that the filter can use; None if it is unknown.
+    """Returns a covariance (size, size) that the filter can use; None if it is unknown (or zeros).
 
-    All zeros means unknown, as in ROS messages. The standard deviation in any direction is raised
-    to `least_std`.
-
-    Raises:
-        ValueError: it is not a covariance.
+    The standard deviation in any direction is raised to `least_std`. Raises ValueError if it is no
+    covariance.
     """
     if covariance is None:
         return None

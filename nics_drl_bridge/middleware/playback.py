@@ -71,9 +71,8 @@ def estimate(path: str | Path, model: SimulatorModel, topics: Mapping[str, str])
     The estimate is identical in every run and on every machine with the same versions. `topics` are
     by role, see `chosen`.
 
-    Raises:
-        RecordingError: the bag is damaged, a topic is missing or of a wrong type, or its data
-            are stamped by several clocks.
+    Raises RecordingError if the bag is damaged, a topic is missing or of a wrong type, or the data
+    are stamped by several clocks.
     """
     messages = played(path, topics)
     playback, rows = Playback(model, POSE in messages), []
@@ -104,13 +103,10 @@ def played(path: str | Path, topics: Mapping[str, str]) -> dict[str, list[Messag
 
 
 def chosen(bag: BagFile, topics: Mapping[str, str]) -> dict[str, str]:
-    """Returns the topic of each role that is played.
+    """Returns the topic of each role that is played; RecordingError if it is missing or wrong.
 
     Those of `scan`, `odom` and `cmd_vel` are by default the topics of these names; `pose` and `imu`
     are left out unless `topics` names them.
-
-    Raises:
-        RecordingError: a topic does not exist or is of a wrong type, or there is no `odom`.
     """
     roles = {}
     for role, kinds in TYPES.items():

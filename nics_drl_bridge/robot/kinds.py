@@ -89,8 +89,7 @@ class RobotKind:
 def textbook(spec: RobotSpec) -> Textbook:
     """Returns the textbook kinematics of a robot, with the parameters of its spec.
 
-    Raises:
-        ConfigError: the spec names none, lacks a parameter, or has other variables.
+    Raises ConfigError if the spec names none, lacks a parameter, or has other variables.
     """
     return _made(spec, lambda kind: kind.kinematics(spec))
 
@@ -129,9 +128,7 @@ def require_textbook(spec: RobotSpec) -> str:
 def steady_twist(spec: RobotSpec, command: ArrayLike) -> Array:
     """Returns the body twist (..., 3) to which commands (..., C) lead when they are held.
 
-    Raises:
-        ConfigError: the robot steers, and neither its textbook kinematics nor its wheelbase is
-            known.
+    Raises ConfigError if it steers, and neither its kinematics nor its wheelbase is known.
     """
     if spec.steers and spec.textbook is not None:
         book = textbook(spec)

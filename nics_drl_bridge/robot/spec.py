@@ -275,9 +275,5 @@ def _edges_cross(corners: NDArray[np.float64]) -> bool:
 
 
 def load_robot(name: str | Path) -> RobotSpec:
-    """Loads a shipped robot by name (`ackermann`), or any robot by the path of its YAML file.
-
-    Raises:
-        ConfigError: unknown name or wrong key, with the nearest valid one.
-    """
+    """Loads a shipped robot by name (`ackermann`), or any robot by the path of its YAML file."""
     return load_yaml(find_config(name, "robots"), RobotSpec)

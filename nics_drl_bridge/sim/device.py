@@ -57,7 +57,7 @@ class DeviceWorld:
     @property
     def touched(self) -> list[bool]:
         """Per robot, true if it has touched something in this episode."""
-        return self._simulator.data.collided[0].astype(bool).tolist()
+        return [bool(one) for one in self._simulator.data.collided[0]]
 
     def begin(self, seed: int, starts: Array | None) -> None:
         """Begins the episode of a seed, at x, y, heading of each robot (3 M,) if given."""

@@ -237,7 +237,8 @@ class Sampler:
             _between(self._coefficient, chosen, robots, KINEMATICS_GROUP),
             timing[..., 0].copy(), timing[..., 1].copy(), noise, faults,
             scene[:, 0] if counts else None, scene[:, 1] if sizes else None,
-            self._sizes[scene[:, 1]] if sizes else None, timing * self._step, self._labels,
+            self._sizes[scene[:, 1]] if sizes else None, np.multiply(timing, self._step),
+            self._labels,
         )  # fmt: skip
 
     def _name(self, model: SimulatorModel) -> Iterator[Label]:

@@ -67,9 +67,7 @@ class SceneSampler:
     that keeps this clearance can move from one to the other among walls, map and all static
     obstacles. Obstacles overlap neither each other nor walls nor map, and keep their gaps. They may
     be scaled by `sizes`; `most` random ones may be requested if that is more than the world has.
-
-    Raises:
-        ConfigError: the world has no free space for such a robot.
+    ConfigError is raised if the world has no free space for such a robot.
     """
 
     def __init__(
@@ -137,11 +135,7 @@ class SceneSampler:
 
 
 def sample_scene(world: World, footprint: float, seed: int, robots: int = 1) -> Scene:
-    """Draws the scene of a seed for M robots of a radius [m]; identical in every process.
-
-    Raises:
-        ConfigError: the world has no room for it.
-    """
+    """Draws the scene of a seed for M robots of a radius [m]; identical in every process."""
     return _sampler(world, footprint, robots).draw([seed])[0]
 
 
@@ -239,10 +233,7 @@ def _free_space(world: World, footprint: float) -> FreeSpace:
     """Finds the free space of a world and the areas within which a robot can move.
 
     A robot moves between the centres of neighbouring cells, with the clearance of the world around
-    it. Areas too small for a start and a goal are dropped.
-
-    Raises:
-        ConfigError: no room for a start and a goal; the message names the key.
+    it. Areas too small for a start and a goal are dropped; if none is left, ConfigError is raised.
     """
     check_places(world)
     grid = NO_FIELD if world.grid is None else _closed(world.grid)
