@@ -269,7 +269,6 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         )  # fmt: skip
 
     def _row(self, rows: NDArray[Any]) -> NDArray[Any]:
-        """The row of a single robot, or (M, ...) of a team."""
         return rows[0] if self.robots == 1 else rows
 
     def _fact(self, values: NDArray[Any]) -> Any:

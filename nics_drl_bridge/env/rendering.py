@@ -67,7 +67,6 @@ class WorldPicture:
         return self._shown()
 
     def _robot(self, axes: Axes, pose: Array, ranges: NDArray[np.float32], colour: str) -> None:
-        """Draws the footprint, the heading and the scan."""
         lidar, robot = self._model.lidar, self._model.robot
         mount = geometry.compose(pose, lidar.mount)
         there = np.isfinite(ranges)
@@ -117,7 +116,6 @@ def draw_world(axes: Axes, world: World, bodies: NDArray[np.float64]) -> None:
 
 
 def _draw_map(axes: Axes, grid: GridMap) -> None:
-    """Draws occupied cells dark and unknown ones grey."""
     rows, columns = grid.cells.shape
     i, j = np.indices((rows + 1, columns + 1)) - 0.5
     corners = grid.cell_to_world(np.stack([i, j], axis=-1))

@@ -189,7 +189,6 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         out[worlds] = self.task.observation(self._view(worlds), fresh)
 
     def _view(self, rows: Rows) -> RobotView:
-        """View of the robots (n, M) of some worlds, with poses by odometry."""
         data = self.simulator.data
         return RobotView(data.odom[rows], data.twist[rows], data.ranges[rows], 0.0, 0.0, 0.0)
 
@@ -296,7 +295,6 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         }
 
     def _facts_of_step(self, outcome: Outcome) -> dict[str, Any]:
-        """Facts of a step, for every world."""
         data = self.simulator.data
         return {
             "stamp_ns": data.steps * self._period_ns,

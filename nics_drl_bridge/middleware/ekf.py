@@ -290,7 +290,6 @@ class Estimator:
         return Acceptance.JUMP if believed else Acceptance.OUTLIER
 
     def _jump(self, pose: Array, noise: Array) -> None:
-        """Replaces the estimated pose and its covariance."""
         self._filter.P = parted(self._filter.P)
         mean = np.array(self._filter.x)
         mean[:3], self._filter.P[:3, :3] = pose, noise
@@ -301,6 +300,5 @@ class Estimator:
 
 
 def _widened(low: Array, high: Array) -> tuple[Array, Array]:
-    """Returns the limits (n,) widened to the range that the filter accepts."""
     center, half = (high + low) / 2.0, REACHABLE * (high - low) / 2.0
     return center - half, center + half

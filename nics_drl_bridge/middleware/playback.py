@@ -135,7 +135,6 @@ def chosen(bag: BagFile, topics: Mapping[str, str]) -> dict[str, str]:
 def _check_clocks(
     place: str, roles: Mapping[str, str], messages: Mapping[str, list[Message]]
 ) -> None:
-    """Raises RecordingError if the stamps are not of one clock."""
     stamps = {
         role: np.array([(m.receive_ns, stamp(m.content)) for m in some], dtype=np.int64)
         for role, some in messages.items()

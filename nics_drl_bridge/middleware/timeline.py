@@ -151,7 +151,6 @@ class Timeline:
         return _Entry(moment, self._estimator.belief, measurement, verdict)
 
     def _rerun(self, place: int) -> None:
-        """Re-runs the filter over all entries from a place on."""
         self._estimator.belief = self._entries[place - 1].belief
         for k in range(place, len(self._entries)):
             entry = self._entries[k]

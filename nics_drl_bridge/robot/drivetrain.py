@@ -91,7 +91,6 @@ def _commands(spec: RobotSpec, fields: tuple[CmdVelField, ...]) -> list[int]:
 
 
 def _states(spec: RobotSpec) -> tuple[int, int]:
-    """Returns the indices of speed and steering angle in the state."""
     have = [v.unit for v in spec.state]
     if sorted(have) != ["m/s", "rad"]:
         raise ConfigError(
@@ -102,7 +101,6 @@ def _states(spec: RobotSpec) -> tuple[int, int]:
 
 
 def _actuators(p: dict[str, float], parts: tuple[str, ...]) -> tuple[Array, Array]:
-    """Returns time constants and greatest rates (S,) of actuators, by parameter names."""
     rate = np.array([p.get(f"{part}_rate", np.inf) for part in parts])
     lag = [p[f"{part}_lag"] if f"{part}_rate" not in p else 1.0 for part in parts]
     return np.array(lag), rate

@@ -245,7 +245,6 @@ class RobotSpec(Schema):
 
 
 def _reach(outline: ArrayLike) -> float:
-    """Radius of the circle around the origin that circumscribes an outline (V, 2)."""
     return float(np.hypot(*np.array(outline, dtype=np.float64).T).max())
 
 

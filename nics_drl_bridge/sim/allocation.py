@@ -132,7 +132,6 @@ def part_of(
 
 
 def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int) -> arrays.Scratch:
-    """Returns the scratch memory that one thread needs to step this many worlds."""
     kinematics, robots, count = model.kinematics, sizes.robots, sizes.obstacles
     bodies = count + robots
     blocks = -(-worlds * robots // LANES)

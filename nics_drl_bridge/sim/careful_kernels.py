@@ -54,7 +54,6 @@ def _first_touch(
     m: int, begin: float, until: float, scene: Surroundings, nearby: Nearby, events: Array,
     moving: Moving,
 ) -> None:  # fmt: skip
-    """Finds the first contact of robot m from a time of the substep on."""
     near, world, meets = nearby.near, moving.world, nearby.meets[m]
     event, me = events[m], moving.first + m
     event[TIME] = until
@@ -64,8 +63,10 @@ def _first_touch(
             k = near[m, 1 + i] if listed else i
             if k != me and world[k, RADIUS] > 0.0:
                 impact.touch_body(event, me, k, begin, moving)
-    if meets & contacts.WALLS and event[DEPTH] >= 0.0:
-        impact.touch_walls(event, me, scene.walls, begin, moving)
+    for w in range(scene.walls.shape[0] if meets & contacts.WALLS and event[DEPTH] >= 0.0 else 0):
+        wall = scene.walls[w]
+        side = impact.Edge(wall[0], wall[1], wall[2], wall[3])
+        impact.touch_edge(event, me, -1, side, 0.0, begin, moving)
     if meets & contacts.MAP and event[DEPTH] >= 0.0:
         impact.touch_map(event, me, scene.grid, begin, moving)
 
@@ -228,7 +229,6 @@ def _check_overlap(
 
 @kernel
 def _average_velocities(n: int, period: float, state: State, single: Single) -> None:
-    """Sets the velocity of stopped obstacles to their mean over the period."""
     bodies, velocity, start, began = state.bodies, state.velocity, single.start, single.began
     for k in range(velocity.shape[1]):
         stopped = start[k, 0] != began[k, 0] or start[k, 1] != began[k, 1]

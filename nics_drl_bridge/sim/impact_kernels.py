@@ -135,14 +135,12 @@ def _root(gap: float, rate: float, bend: float) -> float:
 
 @kernel
 def _in_map(edge: Edge, x: float, y: float, c: float, s: float) -> Edge:
-    """Returns an edge of a body that stands at x, y with a heading."""
     ax, ay, bx, by = edge.ax, edge.ay, edge.bx, edge.by
     return Edge(x + c * ax - s * ay, y + s * ax + c * ay, x + c * bx - s * by, y + s * bx + c * by)
 
 
 @kernel
 def _reach(edge: Edge) -> float:
-    """Distance of the farther end from the origin [m]."""
     ax, ay, bx, by = edge.ax, edge.ay, edge.bx, edge.by
     return math.sqrt(max(ax * ax + ay * ay, bx * bx + by * by))
 
@@ -236,7 +234,7 @@ def _edge_of(v: int, outline: collision.Outline) -> Edge:
 
 
 @kernel
-def _touch_edge(
+def touch_edge(
     event: Array, a: int, b: int, other: Edge, round_b: float, begin: float, moving: Moving
 ) -> None:
     """Makes `event` (EVENT,) the first contact of body a with an edge of body b, if it is sooner.
@@ -266,7 +264,7 @@ def _touch_edge(
 
 @kernel
 def touch_body(event: Array, a: int, b: int, begin: float, moving: Moving) -> None:
-    """Does the same as `_touch_edge` for all of body b."""
+    """Does the same as `touch_edge` for all of body b."""
     world, flights = moving.world, moving.flights
     x, y, _, _ = pose_at(a, begin, moving)
     ox, oy, _, _ = pose_at(b, begin, moving)
@@ -277,15 +275,7 @@ def touch_body(event: Array, a: int, b: int, begin: float, moving: Moving) -> No
     outline = collision.outline_of(world[b], moving.outlines)
     round_b = world[b, RADIUS] if outline.begin == outline.end else 0.0
     for v in range(_edges(outline)):
-        _touch_edge(event, a, b, _edge_of(v, outline), round_b, begin, moving)
-
-
-@kernel
-def touch_walls(event: Array, a: int, walls: Array, begin: float, moving: Moving) -> None:
-    """Does the same as `_touch_edge` for straight walls (W, 4)."""
-    for w in range(walls.shape[0]):
-        wall = Edge(walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3])
-        _touch_edge(event, a, -1, wall, 0.0, begin, moving)
+        touch_edge(event, a, b, _edge_of(v, outline), round_b, begin, moving)
 
 
 @kernel
@@ -296,7 +286,7 @@ def _solid(distances: Array, i: int, j: int) -> bool:
 
 @kernel
 def touch_map(event: Array, a: int, grid: MapField, begin: float, moving: Moving) -> None:
-    """Does the same as `_touch_edge` for the sides of the solid cells of a map."""
+    """Does the same as `touch_edge` for the sides of the solid cells of a map."""
     distances, world, size = grid.distances, moving.world, grid.cell
     if distances.size == 0:
         return
@@ -318,4 +308,4 @@ def touch_map(event: Array, a: int, grid: MapField, begin: float, moving: Moving
                     near_x, near_y = (j + u) * size, (i + v) * size
                     side = Edge(near_x, near_y, (j + u + up) * size, (i + v - right) * size)
                     edge = _in_map(side, grid.x, grid.y, grid.cos, grid.sin)
-                    _touch_edge(event, a, -1, edge, 0.0, begin, moving)
+                    touch_edge(event, a, -1, edge, 0.0, begin, moving)

@@ -345,7 +345,6 @@ def _latencies(ranges: Randomisation, model: SimulatorModel) -> Bounds:
 
 
 def _levels(ranges: Randomisation, model: SimulatorModel, where: str) -> Bounds:
-    """Bounds (2 + 3 + S,) of the noise."""
     odometry = ranges.odometry
     base = np.array([*model.noise.odometry, *model.noise.simulated_drift(model.robot)])
     low, high = base.copy(), base.copy()
@@ -367,7 +366,6 @@ def _levels(ranges: Randomisation, model: SimulatorModel, where: str) -> Bounds:
 
 
 def _faults(ranges: Randomisation, lidar: LidarSpec, where: str) -> Bounds:
-    """Bounds (P,) of the lidar's noise and faults."""
     bounds = []
     spans = {name: span for name, span in ranges.lidar if span is not None and name not in CHOICES}
     for end in range(2):

@@ -366,18 +366,7 @@ def _goal_of(seed, counter, x, y, plan):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _fits(x, y, gx, gy, plan, bodies, scratch):  # type: ignore[no-untyped-def]
-    """True if a start and a goal are free, in one area and neither too near nor too far."""
-    distance2 = (gx - x) * (gx - x) + (gy - y) * (gy - y)
-    if not plan.least * plan.least <= distance2 <= plan.greatest * plan.greatest:
-        return False
-    same = area_of(gx, gy, plan.space) == area_of(x, y, plan.space)
-    return same and _is_free(gx, gy, plan, bodies, scratch)
-
-
-@kernel
 def _place_robots(seed, counter, plan, bodies, starts, goals, scratch):  # type: ignore[no-untyped-def]
-    """Places starts and goals in pairs, each pair with a path between them."""
     between = 2.0 * plan.footprint + plan.clearance
     for m in range(starts.shape[0]):
         placed, detours = False, 0
@@ -388,8 +377,11 @@ def _place_robots(seed, counter, plan, bodies, starts, goals, scratch):  # type:
                 continue
             gx, gy = _goal_of(seed, counter, x, y, plan)
             counter += 4
-            apart = _apart(x, y, starts, m, between) and _apart(gx, gy, goals, m, between)
-            if not (apart and _fits(x, y, gx, gy, plan, bodies, scratch)):
+            distance2 = (gx - x) * (gx - x) + (gy - y) * (gy - y)
+            fits = plan.least * plan.least <= distance2 <= plan.greatest * plan.greatest
+            fits = fits and area_of(gx, gy, plan.space) == area_of(x, y, plan.space)
+            fits = fits and _apart(x, y, starts, m, between) and _apart(gx, gy, goals, m, between)
+            if not (fits and _is_free(gx, gy, plan, bodies, scratch)):
                 continue
             if not _is_joined(x, y, gx, gy, plan, bodies, scratch):
                 detours += 1

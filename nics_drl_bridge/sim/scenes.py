@@ -139,9 +139,7 @@ def sample_scene(world: World, footprint: float, seed: int, robots: int = 1) -> 
     return _sampler(world, footprint, robots).draw([seed])[0]
 
 
-@lru_cache(maxsize=16)
-def _sampler(world: World, footprint: float, robots: int) -> SceneSampler:
-    return SceneSampler(world, footprint, robots)
+_sampler = lru_cache(maxsize=16)(SceneSampler)
 
 
 def scaled(shape: Shape, factor: float) -> Shape:
@@ -205,7 +203,6 @@ def _plan(
 
 
 def _places(places: Starts | Goals | None) -> Array:
-    """Returns places (P, PLACE), see `scene_kernels`."""
     if places is None:
         return np.zeros((0, kernels.PLACE))
     rows = np.zeros((len(places.at) + len(places.regions), kernels.PLACE))
@@ -279,7 +276,6 @@ def _closed(grid: GridMap) -> MapField:
 
 
 def _cells_of(world: World) -> MapField:
-    """Returns the cells of a field without a map."""
     x1, y1, x2, y2 = world.extent
     size = min(CELL, min(x2 - x1, y2 - y1) / FEWEST_CELLS)
     size = max(size, math.sqrt((x2 - x1) * (y2 - y1) / MOST_CELLS))
@@ -288,7 +284,6 @@ def _cells_of(world: World) -> MapField:
 
 
 def _centres(cells: MapField) -> Array:
-    """Returns x, y of the centres of the cells (2, rows, columns) [m]."""
     rows, columns = np.indices(cells.distances.shape) + 0.5
     return np.array(kernels.place_in.py_func(rows, columns, cells))
 
@@ -305,7 +300,6 @@ def _large_enough(area: NDArray[np.int32], cell: float, least: float) -> NDArray
 def _check(
     world: World, key: str, places: Starts | Goals | None, area: NDArray[np.int32], cells: MapField
 ) -> None:
-    """Raises ConfigError for a region or a place where no robot fits."""
     if places is None:
         return
     x, y = _centres(cells)[:, area > 0]

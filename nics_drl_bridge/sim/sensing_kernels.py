@@ -101,16 +101,11 @@ def measure(
 
 
 @kernel
-def most_drift(std: Array, n: int, m: int, period: float) -> float:
-    """Upper bound on the distance by which `drift_of` can move a robot in a period [m]."""
-    return math.sqrt(3.0 * period) * (std[n, m, 2] + std[n, m, 3])  # type: ignore[no-any-return]
-
-
-@kernel
 def drift_of(n: int, m: int, state: State, period: float) -> tuple[float, float, float]:
     """Draws the motion of a robot in a period [s] that its model does not explain.
 
-    Updates its state; returns the motion ahead and aside [m], and turn [rad].
+    Updates its state; returns the motion ahead and aside [m], each at most sqrt(3 period) times its
+    deviation, and turn [rad].
     """
     std, counter = state.noise, state.steps[n] * state.pose.shape[1] + m
     # It grows with root time. Uniform draws are cheap, and over some periods they add up to normal.
@@ -177,14 +172,6 @@ def distort(low: int, high: int, state: State, view: LidarView) -> None:
 
 
 @kernel
-def _place_lidar(n: int, m: int, lag: int, state: State, scratch: Scratch, substeps: int) -> None:
-    """Writes pose and twist of a robot, `lag` substeps ago, to `spot` and `drive`."""
-    spot, drive, steps = scratch.scans.spot[0, 0], scratch.scans.drive, state.steps[n]
-    spot[0], spot[1], spot[2] = at_lag(state.past, n, m, POSE, lag, steps, substeps)
-    drive[0], drive[1], drive[2] = at_lag(state.past, n, m, TWIST, lag, steps, substeps)
-
-
-@kernel
 def _scan_alone(
     n: int, m: int, state: State, scene: Surroundings, view: LidarView, motion: Dynamics,
     scratch: Scratch,
@@ -192,8 +179,10 @@ def _scan_alone(
     """Scans one robot from its own place and time, maybe skewed."""
     scans, beams = scratch.scans, state.ranges.shape[2]
     spot, drive, skew = scans.spot, scans.drive, state.faults[n, m, fault_kernels.SKEW]
-    lag = lag_of(state.age[n, m], state.steps[n], state.past.shape[2], motion.substeps)
-    _place_lidar(n, m, lag, state, scratch, motion.substeps)
+    past, steps, substeps, here = state.past, state.steps[n], motion.substeps, spot[0, 0]
+    lag = lag_of(state.age[n, m], steps, past.shape[2], substeps)
+    here[0], here[1], here[2] = at_lag(past, n, m, POSE, lag, steps, substeps)
+    drive[0], drive[1], drive[2] = at_lag(past, n, m, TWIST, lag, steps, substeps)
     reach = view.limits[1] + math.hypot(view.mount[0], view.mount[1])
     if skew != 0.0:
         reach += math.hypot(drive[0], drive[1]) * view.sweep_time

@@ -250,7 +250,6 @@ class FastSimulator:
         self.goals[chosen] = scenes.goals
 
     def _assign(self, chosen: Indices, draws: Draws) -> None:
-        """Assigns the draws to the robots of some worlds."""
         data = self.data
         data.coefficient[chosen], data.noise[chosen] = draws.coefficient, draws.noise
         data.delay[chosen], data.age[chosen] = draws.delay, draws.age

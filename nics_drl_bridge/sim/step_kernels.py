@@ -110,7 +110,8 @@ def _move_world(
     pose, period = state.pose, motion.dt * motion.substeps
     robots, first = pose.shape[1], state.velocity.shape[1]
     for m in range(robots):
-        nearby.way[m] = lanes.pose[5, skip + m] + sensing.most_drift(state.noise, n, m, period)
+        drift = math.sqrt(3.0 * period) * (state.noise[n, m, 2] + state.noise[n, m, 3])
+        nearby.way[m] = lanes.pose[5, skip + m] + drift
     longest, moving = contacts.reaches(n, state, nearby, period)
     if scene.crowded:
         contacts.sort_bodies(state.bodies, n, scratch.cells)
@@ -173,34 +174,25 @@ def _step(
         sensing.distort(low, high, state, view)
 
 
-@kernel
-def _note_speeds(n: int, state: State, speeds: Array) -> None:
-    """Writes the velocities (M, 2) in `map` of the robots of world n, as the period begins."""
-    pose, past, step = state.pose, state.past, state.steps[n]
-    row = step % past.shape[2]
-    for m in range(pose.shape[1]):
-        vx = vy = 0.0
-        if step > 0:
-            vx, vy = past[n, m, row, sensing.TWIST], past[n, m, row, sensing.TWIST + 1]
-        c, s = math.cos(pose[n, m, 2]), math.sin(pose[n, m, 2])
-        speeds[m, 0], speeds[m, 1] = c * vx - s * vy, s * vx + c * vy
-
-
 @kernel(inline=True)
 def _begin_period(
     low: int, high: int, state: State, scene: Surroundings, motion: Dynamics, scratch: Scratch
 ) -> None:
     """Sets the velocities of the obstacles of the worlds [low, high), and notes the poses."""
-    pose, before = state.pose, scratch.scans.before
+    pose, before, speeds = state.pose, scratch.scans.before, scratch.nearby.speeds
     for n in range(low, high):
-        if scene.movers.moves:
-            _note_speeds(n, state, scratch.nearby.speeds)
-            obstacles.steer(n, state, scene, motion.dt * motion.substeps, scratch.nearby.speeds)
         for m in range(pose.shape[1]):
-            i = (n - low) * pose.shape[1] + m
+            i, row = (n - low) * pose.shape[1] + m, state.steps[n] % state.past.shape[2]
             before[i, 0], before[i, 1], before[i, 2] = pose[n, m, 0], pose[n, m, 1], pose[n, m, 2]
             if state.steps[n] == 0:
                 sensing.begin(n, m, state)
+            if scene.movers.moves:
+                twist = state.past[n, m, row, sensing.TWIST : sensing.TWIST + 2]
+                c, s = math.cos(pose[n, m, 2]), math.sin(pose[n, m, 2])
+                speeds[m, 0] = c * twist[0] - s * twist[1]
+                speeds[m, 1] = s * twist[0] + c * twist[1]
+        if scene.movers.moves:
+            obstacles.steer(n, state, scene, motion.dt * motion.substeps, speeds)
 
 
 @kernel(inline=True)
