@@ -34,14 +34,9 @@ class SimBackend:
     """
 
     def __init__(
-        self,
-        model: SimulatorModel,
-        world: World,
-        renderer: Renderer = "baked",
-        estimator: bool = False,
-        robots: int = 1,
-        **simulation: Any,
-    ) -> None:
+        self, model: SimulatorModel, world: World, renderer: Renderer = "baked",
+        estimator: bool = False, robots: int = 1, **simulation: Any,
+    ) -> None:  # fmt: skip
         self._robot = model.robot
         self.simulator = FastSimulator(model, world, robots=robots, renderer=renderer, **simulation)
         self._middlewares = [Middleware(model) for _ in range(robots if estimator else 0)]
@@ -101,14 +96,12 @@ class SimBackend:
         odom, twist, ranges = data.odom[row].copy(), data.twist[row].copy(), data.ranges[row].copy()
         if not self._middlewares:
             return RobotView(odom, twist, ranges, now * 1e-9, 0.0, 0.0)
-        views = [self._estimated(robot) for robot in range(len(self._middlewares))]
+        views = []
+        for m, middleware in enumerate(self._middlewares):
+            middleware.odometry(now, now, data.odom[0, m].copy(), data.twist[0, m].copy())
+            middleware.scan(now, now, data.ranges[0, m].copy())
+            views.append(middleware.view(now))
         return views[0] if len(views) == 1 else stacked(views)
-
-    def _estimated(self, robot: int) -> RobotView:
-        data, now, middleware = self.simulator.data, self._now_ns, self._middlewares[robot]
-        middleware.odometry(now, now, data.odom[0, robot].copy(), data.twist[0, robot].copy())
-        middleware.scan(now, now, data.ranges[0, robot].copy())
-        return middleware.view(now)
 
     def halt(self) -> None:
         """Does nothing: robots only move in `step`."""

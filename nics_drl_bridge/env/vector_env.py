@@ -74,19 +74,12 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     }
 
     def __init__(
-        self,
-        num_envs: int = 1,
-        model: str | SimulatorModel = "ackermann",
-        world: str | World = "arena",
-        task: str | type[Task] | Task = "navigation",
-        task_options: dict[str, Any] | None = None,
-        max_episode_steps: int = 300,
-        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        copy: bool = True,
-        *,
-        render_mode: str | None = None,
-        **simulation: Any,
-    ) -> None:
+        self, num_envs: int = 1, model: str | SimulatorModel = "ackermann",
+        world: str | World = "arena", task: str | type[Task] | Task = "navigation",
+        task_options: dict[str, Any] | None = None, max_episode_steps: int = 300,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP, copy: bool = True, *,
+        render_mode: str | None = None, **simulation: Any,
+    ) -> None:  # fmt: skip
         self._pictures: list[Any] = []  # `close` needs it even if the rest raises
         check_render_mode(render_mode, self.metadata)
         self.num_envs, self.render_mode = num_envs, render_mode
@@ -136,17 +129,12 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         return {**own, **data, "goals": self.simulator.goals}
 
     def reset(
-        self,
-        *,
-        seed: int | Sequence[int | None] | None = None,
+        self, *, seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
-    ) -> tuple[Observation, dict[str, Any]]:
+    ) -> tuple[Observation, dict[str, Any]]:  # fmt: skip
         """Begins an episode in every world; world i takes its seeds from `seed + i`.
 
-        Raises:
-            ConfigError: wrong number of seeds, one that is negative or too large, a wrong mask, or
-                an option that the task does not have.
-            ResetNeeded: some worlds are reset where all need it: at first and after an exception.
+        At first, and after an exception, all worlds must be reset.
         """
         check_reset(seed, options, self.num_envs)
         super().reset(seed=seed if isinstance(seed, int) else None)
@@ -222,10 +210,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     def _advance(
         self, part: slice, actions: NDArray[Any], out: Observation, begun: Flags
     ) -> Outcome:
-        """Advances the worlds of a part by one control period and writes their observations.
-
-        Those in `begun` (N,) are reset instead.
-        """
+        """Advances the worlds of a part, or resets those in `begun` (N,); writes observations."""
         data, ended = self.simulator.data, self.ended[part]
         command = self.task.command(actions)
         if self.robots > 1 and ended.any():
@@ -337,7 +322,6 @@ def joined(parts: Sequence[Outcome]) -> Outcome:
     """Joins the outcomes of consecutive parts of the worlds."""
     if len(parts) == 1:
         return parts[0]
-
     terms = {name: np.concatenate([part.terms[name] for part in parts]) for name in parts[0].terms}
     info = {name: np.concatenate([part.info[name] for part in parts]) for name in parts[0].info}
     return Outcome(terms, np.concatenate([part.ended for part in parts]), info)

@@ -48,12 +48,9 @@ def steering_angle(spec: RobotSpec) -> StateVariable:
 
 
 def wheeled(
-    spec: RobotSpec,
-    inverse: Array,
-    forward: Array,
-    fields: tuple[CmdVelField, ...],
+    spec: RobotSpec, inverse: Array, forward: Array, fields: tuple[CmdVelField, ...],
     moves: tuple[str, ...],
-) -> Textbook:
+) -> Textbook:  # fmt: skip
     """Builds the kinematics of a robot whose twist is linear in its wheel speeds, its state.
 
     `inverse` (S, C) gives wheel speeds per command, in the order of `fields`; `forward` (3, S) the

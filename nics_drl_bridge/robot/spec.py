@@ -72,9 +72,9 @@ class Variable(Schema):
 
 
 class StateVariable(Variable):
-    """A component of the state.
+    """A component of the state, with the command that it follows with a lag, if any.
 
-    If all name the command that they follow with a lag, the recording may lack the state.
+    If all of them follow one, the recording may lack the state.
     """
 
     follows: str | None = None
