@@ -133,11 +133,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begins an episode; see Gymnasium.
-
-        Raises:
-            ConfigError: a seed of 2**63 or more, or options that the task does not have.
-        """
+        """Begins an episode; see Gymnasium. ConfigError for a wrong seed or option."""
         guard.check_reset(seed, options)
         super().reset(seed=seed)
         if seed is not None or self._episode < 0:

@@ -21,10 +21,7 @@ T = TypeVar("T")
 
 
 def halts_on_error(method: Callable[Concatenate[Any, P], T]) -> Callable[Concatenate[Any, P], T]:
-    """Makes a method `halt` its object's robot if any exception leaves it, including Ctrl-C.
-
-    An error of `halt` itself is raised with the first one as its context.
-    """
+    """Makes a method `halt` its robot if any exception leaves it, including Ctrl-C."""
 
     @wraps(method)
     def guarded(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:

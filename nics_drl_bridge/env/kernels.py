@@ -106,11 +106,7 @@ def bearing(pose, x, y):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def navigate(out, progress, before, pose, twist, ranges, goals, scale, radius):  # type: ignore[no-untyped-def]
-    """Writes observations (R, P + 6), see `navigation.Navigation`, and a `GoalProgress`.
-
-    Poses before and after the step (R, 3), twists (R, 3), scans (R, B), goals (R, 2) and their
-    radius [m].
-    """
+    """Writes the observations (R, P + 6) of `navigation.Navigation`, and a `GoalProgress`."""
     parts = out.shape[1] - 6
     for i in range(out.shape[0]):
         progress.touched[i] = look(out[i, :parts], ranges[i], scale)

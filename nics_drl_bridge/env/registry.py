@@ -30,14 +30,11 @@ TASKS = {
 def make_task(
     task: str | type[Task] | Task, model: SimulatorModel, options: dict[str, Any] | None = None
 ) -> Task:
-    """Makes a task for the robot of a model.
+    """Makes a task for the robot of a model. Raises ConfigError if it does not fit.
 
     The task is the name of a shipped one (`navigation`), `path/to/file.py:ClassName`, a class, or a
     Task. Options are further arguments of the class; `scan` may also be a number of sectors, the
     name of a layout or its fields, see `sectors.layout_of`.
-
-    Raises:
-        ConfigError: no such task, an unknown argument, or a Task for another robot.
     """
     if isinstance(task, Task):
         return _checked(task, model, options)

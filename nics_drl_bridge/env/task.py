@@ -157,10 +157,7 @@ class Task(ABC):
     def step_into(
         self, out: Observation, before: RobotView, after: RobotView, memory: Memory
     ) -> Outcome:
-        """Returns the outcome of a step and writes the observation into `out`.
-
-        Override it if one pass over the scan gives several of these results.
-        """
+        """Returns the outcome of a step and writes the observation, maybe in one pass."""
         self.update(before, after, memory)
         out[...] = self.observation(after, memory)
         terms = self.reward(before, after, memory)

@@ -132,10 +132,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self, *, seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:  # fmt: skip
-        """Begins an episode in every world; world i takes its seeds from `seed + i`.
-
-        At first, and after an exception, all worlds must be reset.
-        """
+        """Begins an episode in every world; world i takes its seeds from `seed + i`."""
         check_reset(seed, options, self.num_envs)
         super().reset(seed=seed if isinstance(seed, int) else None)
         chosen = chosen_worlds(options, self.num_envs)

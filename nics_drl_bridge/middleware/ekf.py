@@ -82,10 +82,7 @@ class Estimator:
         self.reset(0, np.zeros(3))
 
     def reset(self, time_ns: int, pose: ArrayLike, std: ArrayLike = START_STD) -> None:
-        """Begins at a time [ns] and a pose (3,) in `map`, at rest, with a zero command.
-
-        The standard deviation of the pose [m, rad] is one number, or (3,).
-        """
+        """Begins at a time [ns] and a pose (3,) in `map`, of a deviation [m, rad], at rest."""
         mean, deviation = np.zeros(self._filter.dim_x), np.full(self._filter.dim_x, START_STD)
         mean[:3], deviation[:3] = pose, std
         self.belief = Belief(time_ns, mean, np.diag(deviation**2), (0, 0, 0), None, False)
@@ -98,8 +95,8 @@ class Estimator:
     def lose(self, time_ns: int, seconds: float, continuous: bool, command: Array) -> None:
         """Continues from the last odometry, seconds ago, at a time [ns] to which the clock was set.
 
-        The robot may have driven anywhere within reach since, unless odometry is `continuous`: then
-        the next one's pose bridges the motion. The command (C,) is in effect.
+        The robot may be anywhere within reach, unless odometry is `continuous`: then the next one's
+        pose bridges the motion. The command (C,) is in effect.
         """
         anchor = self._anchor or Anchor(0, np.zeros(3), self._filter.x, self._filter.P)
         covariance = self.unseen.doubted(anchor.covariance, seconds)
@@ -137,10 +134,9 @@ class Estimator:
         return stamp_ns + self._delay_ns
 
     def command(self, stamp_ns: int, command: ArrayLike, needed_ns: int | None = None) -> bool:
-        """Adds a command (C,) sent at a time [ns]; it takes effect one latency later.
+        """Adds a command (C,) sent at a time [ns]; False if there is one of that time.
 
-        The estimate may be set back as far as `needed_ns`, by default not at all. Returns False if
-        there already is a command of exactly that time, which is kept.
+        The estimate may be set back as far as `needed_ns`, by default not at all.
         """
         needed_ns = self.time_ns if needed_ns is None else needed_ns
         self._foreseen = None
@@ -150,11 +146,7 @@ class Estimator:
         return log is not None
 
     def at(self, time_ns: int) -> tuple[Array, Array]:
-        """Predicts pose (3,) and body twist (3,) at a time, without moving the estimate.
-
-        Data that arrive later, with earlier stamps, still count in full. For a time before the
-        estimate's, the estimate itself is returned.
-        """
+        """Predicts pose (3,) and body twist (3,) at a time, without moving the estimate."""
         mean, twist = kernels.look_ahead(
             self._filter.x, self.time_ns, time_ns, self._motion, self._log
         )
@@ -202,10 +194,7 @@ class Estimator:
         return self.correct(Measurement(kind, np.atleast_1d(value).astype(np.float64), noise))
 
     def correct(self, measurement: Measurement) -> Judgement:
-        """Corrects by a measurement at the time of the estimate, unless it is an outlier.
-
-        If the robot may have moved unobserved, the odometry's pose first bridges that motion.
-        """
+        """Corrects by a measurement at this time, after bridging unobserved motion."""
         kind, odom = measurement.kind, measurement.odom
         if self._lost and odom is not None:
             self._bridge(odom)

@@ -221,19 +221,13 @@ class Middleware:
     def pose(
         self, stamp_ns: int, arrival_ns: int, pose: ArrayLike, covariance: ArrayLike | None = None
     ) -> bool:
-        """Takes a pose (3,) in `map`, as of motion capture or AMCL; True if it was accepted.
-
-        Its covariance (3, 3) is the model's pose noise if it is None or all zeros.
-        """
+        """Takes a pose (3,) in `map`, by default with the model's covariance; True if used."""
         return self._optional(Kind.POSE, stamp_ns, arrival_ns, pose, covariance)
 
     def imu(
         self, stamp_ns: int, arrival_ns: int, yaw_rate: float, variance: float | None = None
     ) -> bool:
-        """Takes a gyro's yaw rate, counter-clockwise [rad/s]; True if it was accepted.
-
-        Its variance [rad^2/s^2] is that of a cheap gyro if it is None or zero.
-        """
+        """Takes a yaw rate [rad/s], by default with a cheap gyro's variance; True if used."""
         covariance = None if variance is None else [[variance]]
         return self._optional(Kind.YAW_RATE, stamp_ns, arrival_ns, [yaw_rate], covariance)
 
@@ -263,10 +257,9 @@ class Middleware:
         return reason
 
     def _follow_clock(self, odometry: ReportedPose) -> None:
-        """Continues from an odometry to whose stamp the clock was set.
+        """Continues from an odometry to whose stamp the clock was set, by the motion that it shows.
 
-        Starts at the estimate after the last used odometry and adds the motion that odometry
-        shows since; if odometry is not continuous, the robot may be anywhere within reach.
+        If odometry is not continuous, the robot may be anywhere within reach.
         """
         seconds, continuous = self._trail.seconds(odometry), self._trail.continuous(odometry)
         self.estimator.lose(odometry.stamp_ns, seconds, continuous, self._commanded)
@@ -317,10 +310,7 @@ class Middleware:
 
 
 def rehearse(model: SimulatorModel) -> RobotView:
-    """Runs a middleware through two periods of a robot at rest; returns its last view.
-
-    This compiles everything beforehand, which could take seconds while the robot moves.
-    """
+    """Compiles all by two periods of a robot at rest: it could take seconds while a robot moves."""
     middleware, period_ns = Middleware(model), round(model.control_period * 1e9)
     middleware.reset(0, np.zeros(3))
     still, free = np.zeros(3), np.full(model.lidar.beams, np.inf, np.float32)

@@ -91,10 +91,7 @@ class Timeline:
             self._entries[0].belief = self._estimator.belief
 
     def measure(self, stamp_ns: int, measurement: Measurement) -> str:
-        """Takes a measurement; returns the reason if it cannot be used, or an empty string.
-
-        The verdict of the gate is no such reason: it may change with data still to come.
-        """
+        """Takes a measurement; returns the reason if it cannot be used, or an empty string."""
         moment = (stamp_ns, measurement.kind)
         if moment > self._entries[-1].moment and stamp_ns > self._start_ns:
             self._entries.append(self._run(moment, measurement))

@@ -148,12 +148,9 @@ def _own(value, lane):  # type: ignore[no-untyped-def]
 def run(pose, x, dq, terms, series, dt, steps):  # type: ignore[no-untyped-def]
     """Moves a batch of robots by the same number of steps of dt [s], under constant commands.
 
-    Args:
-        pose: (6, n) x, y [m], cosine and sine of the heading, heading [rad], and an upper bound
-            of the path length [m], updated in place; the heading is not wrapped.
-        x: (S + C + 1, n); the state is updated in place.
-        dq: (3 + S, n) scratch memory; contains the rates of the last step afterwards.
-        terms: coefficients may be (T, n), one per robot.
+    Updated in place are `pose` (6, n), x, y [m], cosine, sine and value of the heading, unwrapped,
+    and an upper bound of the path length [m], and the state in `x` (S + C + 1, n). `dq` (3 + S, n)
+    are the rates of the last step; coefficients may be (T, n).
     """
     for _ in range(steps):
         _rates_of_all(dq, x, terms)

@@ -52,10 +52,7 @@ class TaylorModel:
         return evaluate(x, self.powers) @ self.coefficients.T
 
     def step(self, pose: ArrayLike, state: ArrayLike, command: ArrayLike) -> tuple[Array, Array]:
-        """Returns pose (..., 3) and state (..., S) after a step of `dt` under a command (..., C).
-
-        The pose moves along the exact arc of the body twist: a reference for the kernels.
-        """
+        """Returns pose (..., 3) and state (..., S) after a step of `dt` along the exact arc."""
         state = np.asarray(state, dtype=np.float64)
         x = np.concatenate([state, np.asarray(command, dtype=np.float64)], axis=-1)
         dq = self.rates(x) * self.dt

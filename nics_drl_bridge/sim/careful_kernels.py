@@ -104,10 +104,7 @@ def _within(p: int, b: int, until: float, moving: Moving) -> bool:
 def _settle(
     until: float, scene: Surroundings, nearby: Nearby, events: Array, touched: Array, moving: Moving
 ) -> None:
-    """Stops the bodies of a world at their contacts within a substep, in order of time.
-
-    `events`, `touched` (M,) and the flights of `moving` are updated.
-    """
+    """Stops bodies at their contacts within a substep, in order of time; marks `touched` (M,)."""
     flights, first, meets, robots = moving.flights, moving.first, nearby.meets, events.shape[0]
     for m in range(robots):
         events[m, TIME] = until
@@ -167,13 +164,12 @@ def move_carefully(
     n: int, any_moves: bool, state: State, scene: Surroundings, motion: Dynamics, nearby: Nearby,
     single: Single,
 ) -> None:  # fmt: skip
-    """Moves the robots of one world by one period, up to their contacts.
+    """Moves the robots of one world that may meet something by one period, up to their contacts.
 
     A robot in contact is marked and stops for the rest of the substep, and again in the next ones
-    while it would come nearer; it may move away. A robot that already overlaps something gets no
-    deeper. Without a contact it moves exactly as in `step_kernels.move_freely`. An obstacle stopped
-    by a robot is left with its mean velocity over the period. Robots that may meet nothing are not
-    moved; `any_moves` is true if any obstacle does.
+    while it would come nearer. One that already overlaps something gets no deeper. Without a
+    contact it moves exactly as in `step_kernels.move_freely`. An obstacle stopped by a robot is
+    left with its mean velocity over the period; `any_moves` is true if any obstacle does.
     """
     events, touched, dt = single.events, state.collided[n], motion.dt
     first, meets = state.velocity.shape[1], nearby.meets

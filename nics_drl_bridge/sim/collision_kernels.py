@@ -153,10 +153,7 @@ def _deepest(p, q):  # type: ignore[no-untyped-def]
 
 @kernel
 def _outline_gap(p, x, y, reach, q, limit):  # type: ignore[no-untyped-def]
-    """Signed clearance of two outlines in one frame.
-
-    A circle (x, y, reach) encloses p, preferably the one with fewer corners.
-    """
+    """Signed clearance of two outlines in one frame; a circle (x, y, reach) encloses p."""
     least, crossing, touching = limit * limit, False, False
     ax, ay = q.corners[q.end - 1, 0], q.corners[q.end - 1, 1]
     for v in range(q.begin, q.end):
@@ -266,10 +263,7 @@ def in_grid(x, y, grid):  # type: ignore[no-untyped-def]
 
 @kernel
 def cells_near(x, y, far, grid):  # type: ignore[no-untyped-def]
-    """Returns first and last + 1 row, and column, of the cells within a square around a point.
-
-    The point is in the frame of the grid, `far` half the side of the square [m].
-    """
+    """Returns first and last + 1 row and column of the cells up to `far` [m] from a point."""
     rows, columns = grid.distances.shape
     low_i, high_i = math.floor((y - far) / grid.cell), math.floor((y + far) / grid.cell)
     low_j, high_j = math.floor((x - far) / grid.cell), math.floor((x + far) / grid.cell)

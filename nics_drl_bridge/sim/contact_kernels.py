@@ -30,10 +30,9 @@ bodies in cells [m], greatest distance moved since by any body [m]."""
 
 @kernel
 def reaches(n: int, state: State, nearby: Nearby, period: float) -> tuple[float, bool]:
-    """Bounds how far the circle of each body of world n may reach from its present centre.
+    """Writes to `nearby.reach` how far each body of world n may reach in a period [s]; 0 for none.
 
-    `nearby.reach` is the result, 0 where there is no body, given `nearby.way`; `period` is in [s].
-    Returns the longest path of any body [m], and whether an obstacle moves.
+    Given `nearby.way`; returns the longest path of any body [m], and whether an obstacle moves.
     """
     reach, way, bodies, velocity = nearby.reach, nearby.way, state.bodies, state.velocity
     longest, moving = 0.0, False
@@ -55,10 +54,7 @@ def reaches(n: int, state: State, nearby: Nearby, period: float) -> tuple[float,
 def find_near(
     n: int, m: int, bodies: Array, scene: Surroundings, nearby: Nearby, cells: Cells
 ) -> int:
-    """Returns the flags of what robot m of world n may meet within the period.
-
-    Row m of `nearby.near` is a result too, given `nearby.reach`.
-    """
+    """Returns flags of what robot m of world n may meet; writes row m of `nearby.near`."""
     near, reach, walls = nearby.near, nearby.reach, scene.walls
     me = bodies.shape[1] - near.shape[0] + m
     x, y, own = bodies[n, me, X], bodies[n, me, Y], reach[me]
@@ -115,10 +111,7 @@ def contact(
 
 @kernel
 def move_obstacles(bodies: Array, start: Array, velocity: Array, n: int, time: float) -> None:
-    """Moves the obstacles of world n to their poses `time` [s] after the start of the period.
-
-    `bodies` (N, K + M, 7) is the result; `start` (K, 3) and `velocity` (N, K, 3) are in `map`.
-    """
+    """Moves the obstacles of world n to `time` [s] after their poses `start` (K, 3)."""
     for k in range(velocity.shape[1]):
         bodies[n, k, X] = start[k, 0] + velocity[n, k, 0] * time
         bodies[n, k, Y] = start[k, 1] + velocity[n, k, 1] * time

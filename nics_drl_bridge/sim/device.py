@@ -109,9 +109,9 @@ def step_covariance(std: tuple[float, float], period: float) -> Array:
 def propagate(covariance: Array, before: ArrayLike, after: ArrayLike, added: Array) -> Array:
     """Propagates the covariances (M, 3, 3) of poses by odometry (M, 3) from before to after.
 
-    A heading error rotates the motion that follows: P' = F P F^T + Q, with F the derivative of
-    the new pose with respect to the old one (Thrun et al., Probabilistic Robotics, Sec. 5.4) and
-    Q (3, 3) `added` by a period, see `step_covariance`.
+    A heading error rotates the motion that follows: P' = F P F^T + Q, with F the derivative of the
+    new pose with respect to the old one (Thrun et al., Probabilistic Robotics, Sec. 5.4), Q
+    `added`.
     """
     p, (x, y, _) = np.array(covariance, np.float64), np.subtract(before, after).T
     turned = np.stack([y, -x], axis=1)  # F differs from the identity only in its last column

@@ -164,8 +164,7 @@ def _free_time(
 ) -> tuple[float, float, float]:
     """Returns a time in which two edges cannot meet, and the rates of the corners that bound it.
 
-    The surfaces are `gap` [m] apart along n, which points from q to p; `bend` bounds the
-    acceleration between them [m/s^2].
+    They are `gap` [m] apart along n, from q to p; `bend` bounds their acceleration [m/s^2].
     """
     far, far2 = nx * p.edge.ax + ny * p.edge.ay, nx * p.edge.bx + ny * p.edge.by
     near, near2 = nx * q.edge.ax + ny * q.edge.ay, nx * q.edge.bx + ny * q.edge.by
@@ -188,11 +187,10 @@ def touch(
     a: int, edge: Edge, round_a: float, b: int, other: Edge, round_b: float,
     begin: float, until: float, moving: Moving,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Returns the time [s] of the first contact of an edge of body a with one of body b.
+    """Returns the time [s] of the first contact of an edge of body a with one of body b, else inf.
 
-    It is inf if not before `until`. With it come the velocities of the nearest points of both along
-    the direction between them, negative if approaching [m/s]. The edges are in the bodies' frames,
-    with a radius [m] around each.
+    With it come the velocities of the nearest points of both along the direction between them
+    [m/s]. The edges are in the bodies' frames, with a radius [m] around each.
     """
     reach_a, reach_b, time, flights = _reach(edge), _reach(other), begin, moving.flights
     for _ in range(MOST_LOOKS):
@@ -239,8 +237,7 @@ def touch_edge(
 ) -> None:
     """Makes `event` (EVENT,) the first contact of body a with an edge of body b, if it is sooner.
 
-    The edge is in the frame of body b, with a radius [m] around it; `begin` [s] is the time from
-    which to search.
+    The edge, in the frame of body b, has a radius [m] around it; the search is from `begin` [s] on.
     """
     world, flights = moving.world, moving.flights
     x, y, _, _ = pose_at(a, begin, moving)

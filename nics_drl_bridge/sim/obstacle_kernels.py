@@ -257,10 +257,7 @@ def _new_goal(mark, k, traffic, seed, counter, step):  # type: ignore[no-untyped
 
 @kernel
 def _walk(marks, k, traffic, seed, counter, step):  # type: ignore[no-untyped-def]
-    """Returns the next velocity of walker k in `map` [m/s]; its row of `marks` gets its goal.
-
-    It takes fewer than `DRAWS` draws from `counter` on; `step` counts periods since the reset.
-    """
+    """Returns the next velocity of walker k in `map` [m/s], after fewer than `DRAWS` draws."""
     mark, row, body, period = marks[k], traffic.plans[k], traffic.bodies[k], traffic.period
     x, y = body[X], body[Y]
     away = math.hypot(mark[at.GOAL_X] - x, mark[at.GOAL_Y] - y)

@@ -42,10 +42,7 @@ class Wander(Schema):
 
 
 class Patrol(Schema):
-    """Moves from waypoint to waypoint and waits while something is in the way.
-
-    It first moves to the first waypoint, from wherever it stands.
-    """
+    """Moves from waypoint to waypoint, and waits while something is in the way."""
 
     kind: Literal["patrol"] = "patrol"
     # x, y in `map` [m]
@@ -95,10 +92,7 @@ Motion = Annotated[Wander | Patrol | Pedestrian, Field(discriminator="kind")]
 
 
 def plan_arrays(motions: Sequence[Wander | Patrol | Pedestrian | None]) -> tuple[Array, Array]:
-    """Returns the kernels' plans: obstacle k of every world moves by motion k, if not None.
-
-    They are (K, P) rows, columns as in `separation_kernels`, and (Q, 2) waypoints of all patrols.
-    """
+    """Returns the plans (K, P) of obstacles that so move, and waypoints (Q, 2) of all patrols."""
     rows, waypoints = np.zeros((len(motions), at.PLAN)), np.zeros((0, 2))
     for row, motion in zip(rows, motions, strict=True):
         if motion is None:

@@ -196,8 +196,7 @@ class Draws:
 class Sampler:
     """Draws the randomised numbers of episodes; a seed is bit-identical in any batch.
 
-    The nominal values are those of the model. `longest_delay` of a command and `longest_age` of an
-    observation are the greatest that may occur [substeps].
+    `longest_delay` of a command and `longest_age` of an observation are the greatest [substeps].
     """
 
     def __init__(
@@ -309,10 +308,7 @@ def _term(d: int, name: str, model: TaylorModel, where: str) -> int:
 
 
 def _check_stable(model: TaylorModel, spans: Array, where: str) -> None:
-    """Raises ConfigError if a decaying state would grow for some factors.
-
-    Checks the linear part of the state's step: no eigenvalue may exceed 1 in magnitude.
-    """
+    """Raises ConfigError if the linear part of the state's step would grow for some factors."""
     size = model.state_size
     if not size:
         return

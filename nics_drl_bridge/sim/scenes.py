@@ -90,10 +90,7 @@ class SceneSampler:
         """Draws the scenes of seeds (n,); identical in every process and batch.
 
         The `count` (n,) of random obstacles is at most, and by default, that of the world; `size`
-        (n,) is the index of the size of all obstacles of a scene.
-
-        Raises:
-            ConfigError: a seed is out of range, or the world has no room for a scene.
+        (n,) is the index of their size. Raises ConfigError if the world has no room for a scene.
         """
         numbers = checked_seeds(seeds)
         n = len(numbers)

@@ -104,8 +104,8 @@ def measure(
 def drift_of(n: int, m: int, state: State, period: float) -> tuple[float, float, float]:
     """Draws the motion of a robot in a period [s] that its model does not explain.
 
-    Updates its state; returns the motion ahead and aside [m], each at most sqrt(3 period) times its
-    deviation, and turn [rad].
+    Returns the way ahead and aside [m], at most sqrt(3 period) times the deviation, and turn [rad];
+    updates the state.
     """
     std, counter = state.noise, state.steps[n] * state.pose.shape[1] + m
     # It grows with root time. Uniform draws are cheap, and over some periods they add up to normal.

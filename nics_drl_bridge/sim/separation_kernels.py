@@ -111,10 +111,7 @@ def clearance(x, y, k, traffic):  # type: ignore[no-untyped-def]
 
 @kernel
 def _hold(dx, dy, nx, ny, room, bend):  # type: ignore[no-untyped-def]
-    """Limits a displacement to `room` along n.
-
-    Either the excess along n is removed (`bend`), or the whole displacement is shortened.
-    """
+    """Limits a displacement to `room` along n: bends it, or shortens the whole."""
     ahead = dx * nx + dy * ny
     room = max(room - SLACK, 0.0)
     if ahead <= room:
@@ -203,10 +200,7 @@ def _hold_map(dx, dy, body, grid, bend):  # type: ignore[no-untyped-def]
 
 @kernel
 def restrain(dx, dy, k, traffic, bends):  # type: ignore[no-untyped-def]
-    """Returns the part of a displacement [m] that obstacle k can make within the period.
-
-    With `bends`, it slides along obstructions; otherwise it keeps its direction.
-    """
+    """Returns the displacement [m] that obstacle k can make of one; with `bends` it slides."""
     body = traffic.bodies[k]
     for _ in range(PASSES if bends else 0):
         wished_x, wished_y = dx, dy

@@ -48,10 +48,7 @@ def warn(message: str) -> None:
 
 
 class CommandBox:
-    """The range of commands that a model was fitted to, save those whose effect was assumed.
-
-    `tell` is called with the message of a warning.
-    """
+    """Range of commands that a model was fitted to, save those whose effect was assumed."""
 
     def __init__(
         self, model: TaylorModel, robot: RobotSpec, tell: Callable[[str], None] = warn
@@ -195,10 +192,8 @@ class FastSimulator:
         """Begins episodes in `worlds` (n,), all by default, at `starts` (n, M, 3) if given.
 
         A seed (n,) fixes scene, start, goal, noise and randomisation. Threads may call it in
-        parallel, each for worlds of a different part.
-
-        Raises:
-            ConfigError: the seeds or starts do not fit, or the world has no room for a scene.
+        parallel, each for worlds of a different part. Raises ConfigError if seeds, starts or a
+        scene do not fit.
         """
         chosen = np.arange(len(self.data.steps)) if worlds is None else np.asarray(worlds, np.int64)
         scenes, draws = self._draw(seeds)
@@ -260,10 +255,7 @@ class FastSimulator:
             self.drawn[name][chosen] = values
 
     def step(self, commands: ArrayLike) -> None:
-        """Moves every world by one control period; the results are in `data`.
-
-        The commands are (N, M, C), in the units and the order of the RobotSpec.
-        """
+        """Moves every world by one control period under commands (N, M, C), see `data`."""
         checked = self._checked(slice(0, len(self.data.steps)), commands)
         self.run_parts(
             lambda part: step_kernels.step_worlds(
@@ -276,10 +268,7 @@ class FastSimulator:
         return self._crew.run(function, self.parts)
 
     def step_part(self, part: slice, commands: ArrayLike) -> None:
-        """Moves the worlds of one of `parts` by one control period, in the calling thread.
-
-        The commands (n, M, C) are of these worlds; different parts may be stepped in parallel.
-        """
+        """Moves the worlds of one of `parts` under commands (n, M, C), in the calling thread."""
         checked = self._checked(part, commands)
         step_kernels.step_worlds(self.packed[part.start], checked, part.start)
 

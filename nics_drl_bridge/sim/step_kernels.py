@@ -102,10 +102,7 @@ def move_freely(begin: int, end: int, state: State, motion: Dynamics, lanes: Lan
 def _move_world(
     n: int, skip: int, state: State, scene: Surroundings, motion: Dynamics, scratch: Scratch
 ) -> None:
-    """Moves obstacles and robots of world n: freely, and carefully in tight spots.
-
-    `move_freely` has moved its first robot in lane `skip`, the others in those that follow.
-    """
+    """Moves the bodies of world n; `move_freely` has moved its robots in lanes `skip` and on."""
     lanes, nearby, single = scratch.lanes, scratch.nearby, scratch.single
     pose, period = state.pose, motion.dt * motion.substeps
     robots, first = pose.shape[1], state.velocity.shape[1]
@@ -142,10 +139,7 @@ def _move_world(
 
 @kernel(allocates=True)
 def step_worlds(packed: Any, commands: Array, begin: int) -> None:
-    """Steps the worlds of a part, from `begin` on, by one control period.
-
-    The commands are (n, M, C).
-    """
+    """Steps the worlds of a part, from `begin` on, under commands (n, M, C) for a period."""
     part = packed.part
     _step(part.state, part.scene, part.lidar, part.motion, part.scratch, commands, begin)
 
@@ -213,8 +207,7 @@ def _measure(n: int, skip: int, state: State, motion: Dynamics, scratch: Scratch
 def begin(packed: Any, chosen: Integers) -> None:
     """Begins episodes in the worlds `chosen` (n,), whose robots and obstacles are in place.
 
-    Their moving obstacles draw what they need, and the robots take their first scans: everything
-    stands still, so no scan is older or skewed.
+    The robots take their first scans: everything stands still, so no scan is older or skewed.
     """
     part = packed.part
     state, waiting = part.state, part.scratch.scans.waiting

@@ -136,10 +136,7 @@ class World(Schema):
 
     @property
     def fingerprint(self) -> str:
-        """Identifier: the name, and the first 8 digits of a SHA-256 over the whole content.
-
-        A map enters by its cells and frame, not by its path.
-        """
+        """The name, and 8 digits of a SHA-256 over the content; of a map, not its path."""
         content = self.model_dump_json(exclude={"map"}).encode()
         if self.grid is not None:
             about = repr((self.grid.cells.shape, self.grid.resolution, self.grid.origin))

@@ -372,7 +372,7 @@ def driven(robot="ackermann", seconds=2):
     """An estimator of a robot that drives as it should, at the end."""
     estimator = Estimator(builtin_model(robot))
     estimator.reset(0, np.zeros(3))
-    command = estimator._log.arrays[1][0] * 0.0
+    command = estimator._log.commands[0] * 0.0
     command[0] = 0.5
     estimator.command(0, command)
     for step in range(1, seconds * 10 + 1):
@@ -436,7 +436,7 @@ def test_absurd_commands_leave_the_filter_sound(robot, value):
     estimator = driven(robot)
     for k in range(1, 60):
         now = estimator.time_ns
-        estimator.command(now, np.full(len(estimator._log.arrays[1][0]), value))
+        estimator.command(now, np.full(len(estimator._log.commands[0]), value))
         estimator.predict(now + k * PERIOD)
         estimator.update(Kind.TWIST, np.zeros(3))
         assert np.isfinite(np.concatenate(estimator.at(now + 90 * SECOND))).all()
