@@ -56,11 +56,7 @@ SEEDS = 2**63
 
 
 def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
-    """Checks the seed of the first world, from which the others count up, or one for each.
-
-    Raises ConfigError for a seed that is no integer or too large, and for options that are no dict;
-    Gymnasium itself refuses negative seeds.
-    """
+    """Raises ConfigError for a wrong seed, of all worlds or one each, or wrong options."""
     last = SEEDS - worlds if isinstance(seed, int | np.integer) else SEEDS - 1
     for one in seed if isinstance(seed, list | tuple | np.ndarray) else [seed]:
         if not (one is None or isinstance(one, int | np.integer)):

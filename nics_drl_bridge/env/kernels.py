@@ -66,10 +66,7 @@ def finite(values):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def look(shares, ranges, scale):  # type: ignore[no-untyped-def]
-    """Writes a scan (B,) as shares (P,) of a `ScanScale`; returns True if its beams show a contact.
-
-    A share of 1 is no return, 0 too close or unknown.
-    """
+    """Writes a scan (B,) as shares (P,), 1 no return, 0 too close; True if it shows a contact."""
     zero, one = np.float32(0.0), np.float32(1.0)
     hits = np.int32(0)
     for b in range(ranges.shape[0]):

@@ -111,11 +111,7 @@ class SimBackend:
 
 
 class CompletedBackend:
-    """Wraps a user-defined backend that lacks `halt` or `facts`.
-
-    Instead of `halt` it gets a step with the command nearest to zero, `still` (C,), or (M, C) for a
-    team; its facts are those of its last step.
-    """
+    """Wraps a user's backend without `halt`, for which it steps by `still`, or without `facts`."""
 
     def __init__(self, backend: Any, still: NDArray[np.float64]) -> None:
         self._backend, self._still = backend, still

@@ -48,10 +48,7 @@ class Episodes:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of a step: terms of the reward, robots whose episode has ended, facts for `info`.
-
-    All arrays have the leading dimensions of the view; the reward is the sum of its terms.
-    """
+    """Outcome of a step: terms of the reward, whose sum it is, ended robots, facts for `info`."""
 
     terms: dict[str, Array]
     ended: Flags
@@ -60,10 +57,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Sight:
-    """Meaning of the scan parts of an observation.
-
-    Direction (P,) [rad] and origin (2,) [m] of the rays in `base_link`, range of a share of 1 [m].
-    """
+    """Directions (P,) [rad] and origin (2,) [m] of the scan parts, range of a share of 1 [m]."""
 
     angles: Array
     origin: Array
@@ -142,10 +136,7 @@ class Task(ABC):
         """Updates the memory after a step, in place, before anything is computed from it."""
 
     def command(self, action: ArrayLike) -> Array:
-        """Returns the command (..., C) of an action: (..., C) continuous, or (...) discrete.
-
-        Continuous actions are cut to [-1, 1] and scaled between the limits of the commands.
-        """
+        """Returns the command (..., C) of a discrete action, or one (..., C) cut to [-1, 1]."""
         if self.actions == "discrete":
             return np.asarray(self._commands[np.asarray(action)])
         given = np.ascontiguousarray(action)
@@ -246,10 +237,7 @@ def still(robot: RobotSpec) -> Array:
 
 
 def team_space(space: gymnasium.Space[Any], robots: int) -> gymnasium.Space[Any]:
-    """Joint space of M robots, concatenated to a vector as algorithms expect it.
-
-    Box (L,) becomes Box (M L,), Discrete becomes MultiDiscrete (M,); one robot's is unchanged.
-    """
+    """Joint space of M robots: Box (L,) becomes Box (M L,), Discrete becomes MultiDiscrete (M,)."""
     if robots == 1:
         return space
     several = gymnasium.vector.utils.batch_space(space, robots)
@@ -259,11 +247,7 @@ def team_space(space: gymnasium.Space[Any], robots: int) -> gymnasium.Space[Any]
 
 
 def bearing(pose: ArrayLike, points: ArrayLike) -> Array:
-    """Returns distance [m], cosine and sine of the bearing of points (..., 2) from poses (..., 3).
-
-    The shapes are broadcast. A point at the robot's position lies straight ahead; distances are cut
-    at `kernels.LIMIT`.
-    """
+    """Returns distance [m], cosine, sine of the bearing of points (..., 2) from poses (..., 3)."""
     given = np.asarray(pose, np.float64), np.asarray(points, np.float64)
     shape = np.broadcast_shapes(*(each.shape[:-1] for each in given))
     poses, places = (np.broadcast_to(each, (*shape, each.shape[-1])) for each in given)
@@ -294,10 +278,7 @@ def total(values: Array) -> Array:
 
 
 def contact_ranges(robot: RobotSpec, lidar: LidarSpec, margin: float) -> NDArray[np.float32]:
-    """Ranges (B,) at which each beam leaves the footprint, round or a polygon, and a margin [m].
-
-    -inf where a beam does not cross the footprint.
-    """
+    """Ranges (B,) at which each beam leaves the footprint and a margin [m]; else -inf."""
     x, y, heading = lidar.mount
     angles = lidar.angles + heading
     ray = np.stack([np.cos(angles), np.sin(angles)], axis=-1)

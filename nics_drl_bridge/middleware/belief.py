@@ -47,8 +47,7 @@ class Belief(NamedTuple):
 class Foreseen(NamedTuple):
     """Result of a prediction: time [ns], mean, covariance, and the expected twist measurement.
 
-    If computed in advance, `update` is the gain (3 + S, 3) and the covariance after such a
-    measurement, which do not depend on its value.
+    If computed in advance, `update` is the gain (3 + S, 3) and the covariance after it.
     """
 
     time_ns: int

@@ -48,10 +48,7 @@ def log_of(command: ArrayLike) -> Log:
 
 
 def logged(log: Log, effective_ns: int, command: ArrayLike, needed_ns: int) -> Log | None:
-    """Adds a command (C,) that takes effect at a time [ns]; drops those over before `needed_ns`.
-
-    None if there already is a command of exactly that time.
-    """
+    """Adds a command (C,), and drops those over before `needed_ns`; None for a duplicate."""
     effective, commands = log
     place = int(np.searchsorted(effective, effective_ns))
     if place < len(effective) and effective[place] == effective_ns:
@@ -80,10 +77,7 @@ def rates_jacobian(jacobian, x, terms):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def predict(mean, transition, command, dt, steps, motion):  # type: ignore[no-untyped-def]
-    """Moves the mean by `steps` steps of `dt` [s] under one command (C,), in place.
-
-    The transition is multiplied in place by the Jacobian of the motion.
-    """
+    """Moves the mean by `steps` of `dt` [s] under a command (C,), multiplying the transition."""
     size, width = mean.shape[0] - 3, command.shape[0]
     x, dq = np.ones(size + width + 1), np.zeros(3 + size)
     jacobian, step = np.zeros((3 + size, size + width)), np.eye(3 + size)
@@ -192,11 +186,9 @@ def distance(innovation, derivative, covariance, noise):  # type: ignore[no-unty
 
 @kernel(allocates=True)
 def settle(mean, covariance, low, high):  # type: ignore[no-untyped-def]
-    """Restores the constraints of an estimate, in place.
+    """Wraps the heading, clips the state to its limits (S,), makes the covariance symmetric, in place.
 
-    The heading is wrapped to [-pi, pi), the state clipped to its limits (S,), the covariance made
-    symmetric. Where rounding left a pivot of its Cholesky factor too small, the variance is raised
-    to make it positive.
+    Where rounding left a pivot of its Cholesky factor too small, the variance is raised.
     """
     size = mean.shape[0]
     mean[2] = wrap(mean[2])

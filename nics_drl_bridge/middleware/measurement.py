@@ -56,10 +56,7 @@ class Acceptance(IntEnum):
 
 
 class Judgement(NamedTuple):
-    """The estimator's verdict on a measurement, with its squared, normalised innovation.
-
-    That distance is close to the number of components of the value if the filter is consistent.
-    """
+    """The estimator's verdict on a measurement, with its squared, normalised innovation."""
 
     distance: float
     outcome: Acceptance

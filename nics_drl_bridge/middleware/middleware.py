@@ -41,10 +41,7 @@ RATE_OVER = 32  # Number of arrivals over which rates are computed
 
 
 class Datum(NamedTuple):
-    """A message as it arrived, with the number of earlier data of its topic.
-
-    The stamp is that of its header, the arrival is on the clock of the receiver.
-    """
+    """A message with its stamp, arrival on the receiver's clock, and number of earlier ones."""
 
     stamp_ns: int
     arrival_ns: int
@@ -118,11 +115,7 @@ class Middleware:
         self.reset(0, np.zeros(3))
 
     def reset(self, time_ns: int, pose: ArrayLike, std: ArrayLike = START_STD) -> None:
-        """Forgets everything; the robot is at rest at a pose (3,) in `map`.
-
-        Data that are not newer than `time_ns` correct nothing. The standard deviation of the pose
-        [m, rad] is one number, or (3,).
-        """
+        """Forgets everything; the robot is at rest at a pose (3,) in `map`, with a deviation."""
         self.cache = TopicCache()
         self._clock_jumps = 0
         self._commanded = np.zeros(self._width)

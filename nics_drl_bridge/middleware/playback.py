@@ -46,11 +46,7 @@ COLUMNS = ("x", "y", "heading", "vx", "vy", "wz")
 
 @dataclass(frozen=True)
 class EstimatedDrive:
-    """Estimates of the middleware over a drive, after each odometry that was the newest.
-
-    T stamps [ns], poses (T, 3) in `map` with their covariances (T, 3, 3), body twists (T, 3), and
-    the number of data that were not used, by reason.
-    """
+    """Estimates of the middleware over a drive, after each odometry that was the newest (T)."""
 
     stamp_ns: NDArray[np.int64]
     pose: Array

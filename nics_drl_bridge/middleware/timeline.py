@@ -252,10 +252,7 @@ class Trail:
         self._refused.append(odometry)
 
     def contradicts(self, odometry: ReportedPose) -> bool:
-        """True if an odometry's path and arrival both show that the clock was set by a little.
-
-        Such stamps look like late data, or like data after a gap.
-        """
+        """True if path and arrival of an odometry both show that the clock was set by a little."""
         if len(self._recent) <= IN_STEP:
             return False
         last = self._recent[-1]

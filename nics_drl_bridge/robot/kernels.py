@@ -225,11 +225,7 @@ def _move_widely(pose, dq, dt, series):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def rollout(poses, states, commands, terms, series, dt):  # type: ignore[no-untyped-def]
-    """Rolls out robots open-loop under commands (W, T, C), one per step of dt [s].
-
-    The first of poses (W, T + 1, 3) and states (W, T + 1, S) is given, the others are written;
-    headings are not wrapped.
-    """
+    """Rolls out robots from the first of poses (W, T + 1, 3) under commands (W, T, C)."""
     size, width = states.shape[2], commands.shape[2]
     x, dq = np.ones(size + width + 1), np.zeros(3 + size)
     for w in range(poses.shape[0]):

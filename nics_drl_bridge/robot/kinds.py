@@ -42,10 +42,7 @@ class Textbook:
 
 @dataclass(frozen=True)
 class Pivot:
-    """Vertical axis about which a wheel is steered: its link and joint, and the steering angle.
-
-    A joint of another name than the variable's follows the variable's joint.
-    """
+    """Vertical axis about which a wheel is steered; another joint follows the variable's."""
 
     link: str
     joint: str
@@ -68,10 +65,7 @@ class Wheel:
 
 @dataclass(frozen=True)
 class Drawing:
-    """Looks of a robot: its wheels, and a box (length, width) or a cylinder (radius) as body [m].
-
-    `centre` is x and height of the body's centre above `base_link` [m].
-    """
+    """Looks of a robot: wheels, a box (length, width) or cylinder (radius), its x and height."""
 
     body: tuple[float, float] | float
     centre: tuple[float, float]

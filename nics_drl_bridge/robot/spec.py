@@ -72,10 +72,7 @@ class Variable(Schema):
 
 
 class StateVariable(Variable):
-    """A component of the state, with the command that it follows with a lag, if any.
-
-    If all of them follow one, the recording may lack the state.
-    """
+    """A component of the state, and the command that it follows with a lag, if any."""
 
     follows: str | None = None
 

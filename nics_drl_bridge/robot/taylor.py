@@ -191,10 +191,7 @@ class Quality:
 
 
 class NamedTaylorModel(Schema):
-    """A TaylorModel by names, as `model.yaml` holds it: `terms` by dof and `term_name`.
-
-    `units` are those of the rates by dof, `valid` is the range of each variable in the recording.
-    """
+    """A TaylorModel by names, as `model.yaml` holds it; `valid` is the range of each variable."""
 
     dt: float = Field(gt=0.0)
     units: dict[str, str]

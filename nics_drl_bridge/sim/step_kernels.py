@@ -205,10 +205,7 @@ def _measure(n: int, skip: int, state: State, motion: Dynamics, scratch: Scratch
 
 @kernel(allocates=True)
 def begin(packed: Any, chosen: Integers) -> None:
-    """Begins episodes in the worlds `chosen` (n,), whose robots and obstacles are in place.
-
-    The robots take their first scans: everything stands still, so no scan is older or skewed.
-    """
+    """Begins episodes in the worlds `chosen` (n,): all is in place and stands still."""
     part = packed.part
     state, waiting = part.state, part.scratch.scans.waiting
     for i in range(chosen.shape[0]):

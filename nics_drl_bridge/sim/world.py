@@ -67,10 +67,7 @@ class Obstacles(Schema):
 
 
 class Places(Schema):
-    """Places anywhere in one of the regions, x1, y1, x2, y2 of opposite corners [m], or at points.
-
-    Of starts these are x, y [m], heading [rad]; of goals x, y [m].
-    """
+    """Places in regions, x1, y1, x2, y2 of opposite corners [m], or at poses or points."""
 
     regions: tuple[Region, ...] = Field(default=(), max_length=MOST_PLACES)
     at: tuple[Pose | Point, ...] = Field(default=(), max_length=MOST_PLACES)
