@@ -186,7 +186,7 @@ def distance(innovation, derivative, covariance, noise):  # type: ignore[no-unty
 
 @kernel(allocates=True)
 def settle(mean, covariance, low, high):  # type: ignore[no-untyped-def]
-    """Wraps the heading, clips the state to its limits (S,), makes the covariance symmetric, in place.
+    """Wraps the heading, clips the state to its limits (S,), makes the covariance symmetric.
 
     Where rounding left a pivot of its Cholesky factor too small, the variance is raised.
     """

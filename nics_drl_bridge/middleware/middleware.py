@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, RobotView
+from nics_drl_bridge.middleware import timeline
 from nics_drl_bridge.middleware.ekf import LEAST_POSE_STD, LEAST_TWIST_STD, START_STD, Estimator
 from nics_drl_bridge.middleware.measurement import (
     CMD_VEL,
@@ -24,14 +25,7 @@ from nics_drl_bridge.middleware.measurement import (
     TopicHealth,
     checked_covariance,
 )
-from nics_drl_bridge.middleware.timeline import (
-    BEFORE_START,
-    TOO_OLD,
-    ReportedPose,
-    Stamps,
-    Timeline,
-    Trail,
-)
+from nics_drl_bridge.middleware.timeline import ReportedPose, Stamps
 
 Array = NDArray[np.float64]
 
@@ -108,10 +102,14 @@ class Middleware:
     def __init__(self, model: SimulatorModel) -> None:
         self._beams, self._width = model.lidar.beams, len(model.robot.command)
         self.estimator = Estimator(model)
-        self._timeline = Timeline(self.estimator)
-        self._trail = Trail(self.estimator.unseen.walk)
+        self._timeline = timeline.Timeline(self.estimator)
+        self._trail = timeline.Trail(self.estimator.unseen.walk)
         self._stamps = Stamps(round(model.control_period * NS_PER_S))
-        self._off_the_clock = (self._stamps.from_the_future, TOO_OLD, BEFORE_START)
+        self._off_the_clock = (
+            self._stamps.from_the_future,
+            timeline.TOO_OLD,
+            timeline.BEFORE_START,
+        )
         self.reset(0, np.zeros(3))
 
     def reset(self, time_ns: int, pose: ArrayLike, std: ArrayLike = START_STD) -> None:
@@ -156,10 +154,6 @@ class Middleware:
             reason = self._stamps.fault(stamp_ns, arrival_ns)
             reason = reason or self._timeline.command(stamp_ns, value)
         return not reason or self.cache.reject(f"{CMD_VEL}: {reason}")
-
-    def foresee(self, stamp_ns: int) -> None:
-        """Prepares for the next expected odometry, of a stamp [ns]."""
-        self.estimator.foresee(stamp_ns)
 
     def scan(self, stamp_ns: int, arrival_ns: int, ranges: NDArray[np.float32]) -> bool:
         """Takes a scan (B,); True if it was used. Only the newest scan is kept."""
