@@ -11,14 +11,8 @@ from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.middleware import kernels
 from nics_drl_bridge.middleware.belief import Anchor, Belief, Foreseen, Unseen, parted
 from nics_drl_bridge.middleware.kernels import MotionModel, log_of, logged
-from nics_drl_bridge.middleware.measurement import (
-    Acceptance,
-    Judgement,
-    Kind,
-    Measurement,
-    pose_residual,
-)
-from nics_drl_bridge.robot.kernels import SERIES, term_arrays
+from nics_drl_bridge.middleware.measurement import Acceptance, Judgement, Kind, Measurement
+from nics_drl_bridge.robot.kernels import SERIES, term_arrays, wrap
 
 Array = NDArray[np.float64]
 
@@ -219,7 +213,7 @@ class Estimator:
         kind, value, noise, _ = measurement
         noise = self._noise[kind] if noise is None else noise
         expected, derivative = self._expect(kind)
-        residual = pose_residual if kind is Kind.POSE else np.subtract
+        residual = _between_poses if kind is Kind.POSE else np.subtract
         innovation = residual(value, expected)
         distance = kernels.distance(innovation, derivative, self._filter.P, noise)
         outcome = Acceptance.USED
@@ -291,3 +285,9 @@ class Estimator:
 def _widened(low: Array, high: Array) -> tuple[Array, Array]:
     center, half = (high + low) / 2.0, REACHABLE * (high - low) / 2.0
     return center - half, center + half
+
+
+def _between_poses(measured: Array, expected: Array) -> Array:
+    difference = measured - expected
+    difference[2] = wrap(difference[2])
+    return difference

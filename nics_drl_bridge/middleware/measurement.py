@@ -9,8 +9,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nics_drl_bridge.robot.kernels import wrap
-
 Array = NDArray[np.float64]
 
 SCAN, ODOM, CMD_VEL, POSE, IMU = "scan", "odom", "cmd_vel", "pose", "imu"
@@ -82,13 +80,6 @@ def checked_covariance(covariance: ArrayLike | None, size: int, least_std: float
     if least <= 0.0:
         raise ValueError("covariance: not positive definite")
     return given + max(least_std**2 - least, 0.0) * np.eye(size)
-
-
-def pose_residual(measured: Array, expected: Array) -> Array:
-    """Residual of two poses (3,), with the heading in [-pi, pi)."""
-    difference = measured - expected
-    difference[2] = wrap(difference[2])
-    return difference
 
 
 @dataclass(frozen=True)

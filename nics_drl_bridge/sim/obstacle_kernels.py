@@ -22,13 +22,6 @@ from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, X, Y
 from nics_drl_bridge.robot.kernels import wrap
 from nics_drl_bridge.sim import separation_kernels as at
 from nics_drl_bridge.sim.collision_kernels import on_wall
-from nics_drl_bridge.sim.separation_kernels import (
-    Traffic,
-    clearance,
-    map_direction,
-    map_distance,
-    restrain,
-)
 from nics_drl_bridge.sim.state import Array, State, Surroundings
 
 DRAWS = 64  # Greatest number of draws per obstacle and period
@@ -80,7 +73,7 @@ def steer(n: int, state: State, scene: Surroundings, period: float, speeds: Arra
     """
     velocity, seed, step, movers = state.velocity[n], state.seeds[n], state.steps[n], scene.movers
     count, plans, bodies = velocity.shape[0], movers.plans, state.bodies[n]
-    traffic = Traffic(bodies, count, speeds, plans, scene.walls, movers.half, scene.grid, period)
+    traffic = at.Traffic(bodies, count, speeds, plans, scene.walls, movers.half, scene.grid, period)
     draws = (step + 1) * count
     for k in range(count):  # walkers first: they react to the velocities of the last period
         velocity[k, :] = 0.0
@@ -98,7 +91,7 @@ def steer(n: int, state: State, scene: Surroundings, period: float, speeds: Arra
         elif kind == at.PATROL:
             dx, dy = _follow(mark, body, plans[k], movers.waypoints, period, False)
         wished_x, wished_y = dx, dy
-        dx, dy = restrain(dx, dy, k, traffic, kind != at.PATROL)
+        dx, dy = at.restrain(dx, dy, k, traffic, kind != at.PATROL)
         if kind == at.PATROL and dx == wished_x and dy == wished_y:
             _follow(mark, body, plans[k], movers.waypoints, period, True)
         mark[at.VX], mark[at.VY] = dx / period, dy / period
@@ -113,7 +106,7 @@ def _blocked(x, y, angle, reach, here, room, k, traffic):  # type: ignore[no-unt
     """True if something is near the path ahead, and nearer than at the outset."""
     for part in (0.5, 1.0):
         way = part * reach
-        free, _, _ = clearance(x + way * math.cos(angle), y + way * math.sin(angle), k, traffic)
+        free, _, _ = at.clearance(x + way * math.cos(angle), y + way * math.sin(angle), k, traffic)
         if free < room and free < here:
             return True
     return False
@@ -124,7 +117,7 @@ def _wander(mark, k, traffic, seed, counter):  # type: ignore[no-untyped-def]
     """Displacement of a wandering obstacle: ahead, turning to a free direction if blocked."""
     body, speed, period = traffic.bodies[k], mark[at.SPEED], traffic.period
     x, y, radius = body[X], body[Y], body[RADIUS]
-    here, nx, ny = clearance(x, y, k, traffic)
+    here, nx, ny = at.clearance(x, y, k, traffic)
     reach = LOOK * speed + radius
     aim, near = mark[at.AIM], here < reach + radius + MARGIN
     if near and _blocked(x, y, aim, reach, here, radius + MARGIN, k, traffic):
@@ -229,9 +222,9 @@ def _from_walls(k, traffic):  # type: ignore[no-untyped-def]
             away = math.sqrt(away2)
             size = row[at.WALL_REPULSION] / reach * math.exp(-max(away - radius, 0.0) / reach)
             ax, ay = ax + size * ox / away, ay + size * oy / away
-    away = map_distance(x, y, traffic.grid)
+    away = at.map_distance(x, y, traffic.grid)
     if away < far:
-        nx, ny = map_direction(x, y, traffic.grid)
+        nx, ny = at.map_direction(x, y, traffic.grid)
         size = row[at.WALL_REPULSION] / reach * math.exp(-max(away - radius, 0.0) / reach)
         ax, ay = ax - size * nx, ay - size * ny
     return ax, ay
@@ -248,7 +241,7 @@ def _new_goal(mark, k, traffic, seed, counter, step):  # type: ignore[no-untyped
         gy = (2.0 * _share(seed, counter + 2 * i + 1) - 1.0) * deep
         mark[at.GOAL_X], mark[at.GOAL_Y] = gx, gy
         if math.hypot(gx - x, gy - y) >= LEAST_WALK:
-            free, _, _ = clearance(gx, gy, k, traffic)
+            free, _, _ = at.clearance(gx, gy, k, traffic)
             if free >= radius + ROOM:
                 break
     way = math.hypot(mark[at.GOAL_X] - x, mark[at.GOAL_Y] - y)
