@@ -195,7 +195,13 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         reward = np.where(begun, 0.0, total(self._reward))
         over = terminated | truncated
         infos: dict[str, Any] = {}
-        facts = self._facts_of_step(outcome)
+        facts = {
+            "stamp_ns": self.simulator.data.steps * self._period_ns,
+            "true_pose": self._row(self.simulator.data.pose).copy(),
+            "true_collision": self._row(self.simulator.data.collided).astype(np.bool_),
+            **{name: self._row(values).copy() for name, values in outcome.info.items()},
+            "reward_terms": {name: self._row(t).copy() for name, t in outcome.terms.items()},
+        }
         if self._mode is AutoresetMode.SAME_STEP:
             self._end_at_once(out, over, facts, infos)
         else:
@@ -274,16 +280,6 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             "start": self._row(self._starts[rows]),
             "bodies": self._bodies[rows],
             **({"randomisation": drawn} if drawn else {}),
-        }
-
-    def _facts_of_step(self, outcome: Outcome) -> dict[str, Any]:
-        data = self.simulator.data
-        return {
-            "stamp_ns": data.steps * self._period_ns,
-            "true_pose": self._row(data.pose).copy(),
-            "true_collision": self._row(data.collided).astype(np.bool_),
-            **{name: self._row(values).copy() for name, values in outcome.info.items()},
-            "reward_terms": {name: self._row(t).copy() for name, t in outcome.terms.items()},
         }
 
     def _row(self, rows: NDArray[Any]) -> NDArray[Any]:

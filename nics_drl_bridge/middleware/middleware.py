@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -48,8 +48,8 @@ class TopicCache:
     """The newest datum, number and latest arrivals [ns] by topic; rejected data by reason."""
 
     newest: dict[str, Datum] = field(default_factory=dict)
-    rejected: dict[str, int] = field(default_factory=dict)
-    received: dict[str, int] = field(default_factory=dict)
+    rejected: Counter[str] = field(default_factory=Counter)
+    received: Counter[str] = field(default_factory=Counter)
     arrivals: dict[str, deque[int]] = field(default_factory=dict)
 
     def put(self, topic: str, stamp_ns: int, arrival_ns: int, value: Any) -> bool:
@@ -63,15 +63,15 @@ class TopicCache:
 
     def take(self, topic: str, stamp_ns: int, arrival_ns: int, value: Any) -> None:
         """Counts a datum, and stores it if it is the newest: late data may be useful, too."""
-        held, count = self.newest.get(topic), self.received.get(topic, 0)
+        held = self.newest.get(topic)
         if held is None or stamp_ns > held.stamp_ns:
-            self.newest[topic] = Datum(stamp_ns, arrival_ns, count, value)
-        self.received[topic] = count + 1
+            self.newest[topic] = Datum(stamp_ns, arrival_ns, self.received[topic], value)
+        self.received[topic] += 1
         self.arrivals.setdefault(topic, deque(maxlen=RATE_OVER)).append(arrival_ns)
 
     def reject(self, reason: str) -> bool:
         """Counts a rejected datum; False."""
-        self.rejected[reason] = self.rejected.get(reason, 0) + 1
+        self.rejected[reason] += 1
         return False
 
     def age_s(self, topic: str, now_ns: int) -> float:
@@ -105,11 +105,6 @@ class Middleware:
         self._timeline = timeline.Timeline(self.estimator)
         self._trail = timeline.Trail(self.estimator.unseen.walk)
         self._stamps = Stamps(round(model.control_period * NS_PER_S))
-        self._off_the_clock = (
-            self._stamps.from_the_future,
-            timeline.TOO_OLD,
-            timeline.BEFORE_START,
-        )
         self.reset(0, np.zeros(3))
 
     def reset(self, time_ns: int, pose: ArrayLike, std: ArrayLike = START_STD) -> None:
@@ -198,7 +193,7 @@ class Middleware:
         reason = self._measure(stamp_ns, arrival_ns, measurement, (pose, twist))
         if not reason:
             self._trail.use(odometry)
-        elif reason in self._off_the_clock:
+        elif reason in (self._stamps.from_the_future, timeline.TOO_OLD, timeline.BEFORE_START):
             if self._stamps.refuse():
                 self._follow_clock(odometry)
             else:
