@@ -130,12 +130,10 @@ class CooperativeReaching(Task):
         # A goal just reached still pays its last approach.
         open_goals = ~memory["reached"] | memory["newly"]
         approach = np.where(open_goals, gaps[0] - gaps[1], 0.0)
-        share = 1.0 / self.robots
+        share, nearer = 1.0 / self.robots, task.total(approach)
         newly = task.total(memory["newly"].astype(np.float64))
         return {
-            "progress": np.full(
-                lead, self.progress_reward * share * task.total(approach)[..., None]
-            ),
+            "progress": np.full(lead, self.progress_reward * share * nearer[..., None]),
             "time": np.full(lead, self.time_reward),
             "reached": np.full(lead, self.reached_reward * share * newly[..., None]),
             "collision": self.collision_reward * self.touches(after.ranges),

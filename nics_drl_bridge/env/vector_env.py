@@ -187,9 +187,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self.ready = False
         out = np.empty_like(self._out) if self.copy else self._out
         begun = self._over.copy()  # these ignore their action and are reset
-        outcome = joined(
-            self.simulator.run_parts(lambda part: self._advance(part, given[part], out, begun))
-        )
+        run = self.simulator.run_parts
+        outcome = joined(run(lambda part: self._advance(part, given[part], out, begun)))
         terminated = self.ended.all(axis=1) & ~begun
         truncated = (self.simulator.data.steps >= self._limit) & ~begun
         reward = np.where(begun, 0.0, total(self._reward))

@@ -171,9 +171,8 @@ class FastSimulator:
         self._sizes = Sizes(worlds, robots, self.sampler.count, delay, longest_age)
         self.data = allocate(model, self._sizes)
         self.parts = split(worlds, threads)  # the worlds that each thread steps
-        self._boxes = {
-            part.start: CommandBox(model.kinematics, model.robot, tell) for part in self.parts
-        }
+        known = model.kinematics, model.robot, tell
+        self._boxes = {part.start: CommandBox(*known) for part in self.parts}
         self._crew = Crew(len(self.parts))
 
     @cached_property
@@ -257,11 +256,8 @@ class FastSimulator:
     def step(self, commands: ArrayLike) -> None:
         """Moves every world by one control period under commands (N, M, C), see `data`."""
         checked = self._checked(slice(0, len(self.data.steps)), commands)
-        self.run_parts(
-            lambda part: step_kernels.step_worlds(
-                self.packed[part.start], checked[part], part.start
-            )
-        )
+        step, packed = step_kernels.step_worlds, self.packed
+        self.run_parts(lambda part: step(packed[part.start], checked[part], part.start))
 
     def run_parts(self, function: Callable[[slice], R]) -> list[R]:
         """Runs a function for each of `parts`, one thread per part; returns the results."""
