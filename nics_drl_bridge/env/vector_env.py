@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -144,7 +144,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         if not chosen.all():  # the others keep their observation
             self._out[...] = self.task.observation(self._view(slice(None)), self.memory)
         self._begin(np.flatnonzero(chosen), self._out, options)
-        infos = spread(self._known(chosen) | self._beginnings(chosen), chosen)
+        infos = masked(self._known() | self._beginnings(), chosen, True)
         self.ready = True
         return flat(self._out.copy() if self.copy else self._out), infos
 
@@ -242,8 +242,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             for n in np.flatnonzero(over):  # only those that ended: each needs its own object
                 shown[n] = flat(out)[n].copy()
             infos["final_obs"], infos["_final_obs"] = shown, over.copy()
-            final = self._known(over) | mapped(facts, lambda values: values[over])
-            infos["final_info"], infos["_final_info"] = spread(final, over), over.copy()
+            final = masked(self._known() | facts, over, True)
+            infos["final_info"], infos["_final_info"] = final, over.copy()
             self.simulator.run_parts(
                 lambda part: self._begin(part.start + np.flatnonzero(over[part]), out)
             )
@@ -251,33 +251,30 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
 
     def _tell(self, infos: dict[str, Any], facts: dict[str, Any], begun: Flags) -> None:
         """Adds to `infos` the facts of every world, and the beginnings of those in `begun`."""
-        infos |= masked(self._known(slice(None)), np.ones_like(begun))
-        if not begun.any():
-            infos |= masked(facts, ~begun)
-            return
-        infos |= spread(self._beginnings(begun), begun)
+        infos |= masked(self._known(), np.ones_like(begun))
+        if begun.any():
+            infos |= masked(self._beginnings(), begun, True)
         if not begun.all():
-            infos |= spread(mapped(facts, lambda values: values[~begun]), ~begun)
+            infos |= masked(facts, ~begun, bool(begun.any()))
 
-    # Facts as new arrays (N, ...) of worlds with one robot, or (N, M, ...) of teams.
+    # Facts as arrays (N, ...) of worlds with one robot, or (N, M, ...) of teams.
 
-    def _known(self, rows: Rows) -> dict[str, Any]:
-        """Facts of some worlds that are known at any time."""
-        shown = {name: self._row(self.memory[name][rows]).copy() for name in self.task.shown}
-        pose = self._row(self.simulator.data.odom[rows]).copy()
-        ages = np.zeros(len(pose))
-        return {**shown, "pose": pose, "scan_age_s": ages, "odom_age_s": ages.copy()}
+    def _known(self) -> dict[str, Any]:
+        """Copies of the facts that are known at any time."""
+        shown = {name: self._row(self.memory[name]).copy() for name in self.task.shown}
+        pose, ages = self._row(self.simulator.data.odom).copy(), np.zeros((2, self.num_envs))
+        return {**shown, "pose": pose, "scan_age_s": ages[0], "odom_age_s": ages[1]}
 
-    def _beginnings(self, rows: Flags) -> dict[str, Any]:
+    def _beginnings(self) -> dict[str, Any]:
         """Facts of episodes that begin, with the values that the randomisation drew."""
         drawn = {
-            name: self._row(values[rows]) if values.ndim > 1 else values[rows]
+            name: self._row(values) if values.ndim > 1 else values
             for name, values in self.simulator.drawn.items()
         }
         return {
-            "episode_seed": self.simulator.data.seeds[rows],
-            "start": self._row(self._starts[rows]),
-            "bodies": self._bodies[rows],
+            "episode_seed": self.simulator.data.seeds,
+            "start": self._row(self._starts),
+            "bodies": self._bodies,
             **({"randomisation": drawn} if drawn else {}),
         }
 
@@ -358,29 +355,17 @@ def named_seeds(
     return seeds, fresh
 
 
-def mapped(facts: Facts, function: Callable[[NDArray[Any]], NDArray[Any]]) -> dict[str, Any]:
-    """Applies a function to every array of facts."""
-    return {
-        name: mapped(values, function) if isinstance(values, Mapping) else function(values)
-        for name, values in facts.items()
-    }
+def masked(facts: Facts, mask: Flags, alone: bool = False) -> dict[str, Any]:
+    """Pairs each fact (N, ...) with the mask (N,) of its worlds, `_name`, as Gymnasium does.
 
-
-def masked(facts: Facts, mask: Flags) -> dict[str, Any]:
-    """Pairs each fact (N, ...) with the mask (N,) of its worlds, `_name`, as Gymnasium does."""
+    With `alone`, they are new arrays that are zero for the other worlds.
+    """
     paired: dict[str, Any] = {}
     for name, values in facts.items():
-        paired[name] = masked(values, mask) if isinstance(values, Mapping) else values
-        paired[f"_{name}"] = mask.copy()
+        paired[name], paired[f"_{name}"] = values, mask.copy()
+        if isinstance(values, Mapping):
+            paired[name] = masked(values, mask, alone)
+        elif alone:
+            paired[name] = np.zeros(values.shape, values.dtype)
+            paired[name][mask] = values[mask]
     return paired
-
-
-def spread(facts: Facts, mask: Flags) -> dict[str, Any]:
-    """Facts (n, ...) of the worlds of a mask (N,) as rows of all, zero for the others; `masked`."""
-
-    def placed(values: NDArray[Any]) -> NDArray[Any]:
-        rows = np.zeros((len(mask), *values.shape[1:]), values.dtype)
-        rows[mask] = values
-        return rows
-
-    return masked(mapped(facts, placed), mask)
