@@ -180,7 +180,8 @@ class Task(ABC):
 
     def _look(self, ranges: NDArray[np.float32]) -> tuple[Observation, Flags]:
         ranges = np.ascontiguousarray(ranges, np.float32)
-        lead, parts, beams = ranges.shape[:-1], self.scan_parts, ranges.shape[-1]
+        lead, beams = ranges.shape[:-1], ranges.shape[-1]
+        parts = beams if self.scan is None else self.scan.sectors
         shares, touched = np.empty((*lead, parts), np.float32), np.empty(lead, np.bool_)
         rows = shares.reshape(-1, parts), touched.reshape(-1), ranges.reshape(-1, beams)
         kernels.looks(*rows, self.scale)
