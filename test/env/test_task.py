@@ -213,7 +213,7 @@ def robot(footprint):
     return type(load_robot("differential")).model_validate(about)
 
 
-def lidar(mount):
+def mounted(mount):
     spec = load_lidar("paper")
     return type(spec).model_validate({**spec.model_dump(), "mount": mount})
 
@@ -221,7 +221,7 @@ def lidar(mount):
 @pytest.mark.parametrize("footprint", [TRUCK, ARROW], ids=["truck", "arrow"])
 @pytest.mark.parametrize("mount", [(0.2, 0.0, 0.0), (0.1, 0.02, 1.3)])
 def test_a_return_within_the_corners_of_a_footprint_is_a_touch(footprint, mount):
-    spec = lidar(mount)
+    spec = mounted(mount)
     found = contact_ranges(robot(footprint), spec, MARGIN)
     outline = Polygon(footprint).boundary
     for angle, leaves in zip(spec.angles[::7] + mount[2], found[::7], strict=True):
@@ -233,7 +233,7 @@ def test_a_return_within_the_corners_of_a_footprint_is_a_touch(footprint, mount)
 
 
 def test_beams_that_do_not_cross_a_footprint_touch_nothing():
-    spec = lidar((1.0, 0.0, 0.0))
+    spec = mounted((1.0, 0.0, 0.0))
     found = contact_ranges(robot(TRUCK), spec, MARGIN)
     ahead = np.abs(spec.angles) < 1.0
     assert (found[ahead] == -np.inf).all()
@@ -242,5 +242,5 @@ def test_beams_that_do_not_cross_a_footprint_touch_nothing():
 
 def test_a_round_footprint_is_left_at_its_radius_from_the_middle():
     spec = load_robot("differential")
-    found = contact_ranges(spec, lidar((0.0, 0.0, 0.5)), MARGIN)
+    found = contact_ranges(spec, mounted((0.0, 0.0, 0.5)), MARGIN)
     assert found == pytest.approx(spec.footprint_radius + MARGIN, abs=1e-6)
