@@ -90,13 +90,12 @@ def looks(shares, touched, ranges, scale):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def bearing(pose, x, y):  # type: ignore[no-untyped-def]
-    """Distance [m] from a pose (3,) to a point, and cosine and sine of its bearing."""
-    dx, dy = x - pose[0], y - pose[1]
+def bearing(dx, dy, heading):  # type: ignore[no-untyped-def]
+    """Distance [m] to a point dx, dy away, and cosine and sine of its bearing at a heading."""
     distance = math.sqrt(dx * dx + dy * dy)
     if distance == 0.0:
         return 0.0, 1.0, 0.0
-    c, s = math.cos(pose[2]), math.sin(pose[2])
+    c, s = math.cos(heading), math.sin(heading)
     forward, left = (c * dx + s * dy) / distance, (c * dy - s * dx) / distance
     return distance, min(max(forward, -1.0), 1.0), min(max(left, -1.0), 1.0)
 
@@ -107,7 +106,8 @@ def navigate(out, progress, before, pose, twist, ranges, goals, scale, radius): 
     parts = out.shape[1] - 6
     for i in range(out.shape[0]):
         progress.touched[i] = look(out[i, :parts], ranges[i], scale)
-        distance, c, s = bearing(pose[i], goals[i, 0], goals[i, 1])
+        dx, dy = goals[i, 0] - pose[i, 0], goals[i, 1] - pose[i, 1]
+        distance, c, s = bearing(dx, dy, pose[i, 2])
         dx, dy = goals[i, 0] - before[i, 0], goals[i, 1] - before[i, 1]
         progress.approach[i] = math.sqrt(dx * dx + dy * dy) - distance
         progress.reached[i] = distance < radius
@@ -118,8 +118,8 @@ def navigate(out, progress, before, pose, twist, ranges, goals, scale, radius): 
 
 
 @kernel(allocates=True)
-def bearings(out, poses, points):  # type: ignore[no-untyped-def]
-    """Writes `bearing` (R, 3) of points (R, 2) from poses (R, 3)."""
+def bearings(out, ways, headings):  # type: ignore[no-untyped-def]
+    """Writes `bearing` (R, 3) of points that are `ways` (R, 2) away, at headings (R,)."""
     for r in range(out.shape[0]):
-        distance, out[r, 1], out[r, 2] = bearing(poses[r], points[r, 0], points[r, 1])
+        distance, out[r, 1], out[r, 2] = bearing(ways[r, 0], ways[r, 1], headings[r])
         out[r, 0] = min(distance, LIMIT)

@@ -249,12 +249,11 @@ def team_space(space: gymnasium.Space[Any], robots: int) -> gymnasium.Space[Any]
 
 def bearing(pose: ArrayLike, points: ArrayLike) -> Array:
     """Returns distance [m], cosine, sine of the bearing of points (..., 2) from poses (..., 3)."""
-    given = np.asarray(pose, np.float64), np.asarray(points, np.float64)
-    shape = np.broadcast_shapes(*(each.shape[:-1] for each in given))
-    poses, places = (np.broadcast_to(each, (*shape, each.shape[-1])) for each in given)
-    out = np.empty((*shape, 3))
-    rows = [np.ascontiguousarray(each).reshape(-1, each.shape[-1]) for each in (poses, places)]
-    kernels.bearings(out.reshape(-1, 3), *rows)
+    poses = np.asarray(pose, np.float64)
+    ways = np.asarray(points, np.float64) - poses[..., :2]
+    out, headings = np.empty((*ways.shape[:-1], 3)), np.empty(ways.shape[:-1])
+    headings[...] = poses[..., 2]
+    kernels.bearings(out.reshape(-1, 3), ways.reshape(-1, 2), headings.reshape(-1))
     return out
 
 

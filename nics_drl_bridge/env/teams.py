@@ -26,9 +26,11 @@ def pairs(pose: Array, points: Array) -> tuple[Array, Array]:
 
 def others(of_all: Array) -> Array:
     """Drops the diagonal of (..., M, M, F): each robot's row of the others, (..., M, M - 1, F)."""
-    count, width = of_all.shape[-2:]
-    kept = of_all[..., ~np.eye(count, dtype=np.bool_), :]
-    return kept.reshape(*of_all.shape[:-2], count - 1, width)
+    *lead, count, _, width = of_all.shape
+    # Without its first entry, the flat row of pairs has a diagonal one after every `count` others.
+    flat = of_all.reshape(*lead, count * count, width)[..., 1:, :]
+    kept = flat.reshape(*lead, count - 1, count + 1, width)[..., :-1, :]
+    return np.asarray(kept.reshape(*lead, count, count - 1, width))
 
 
 @dataclass(frozen=True)
