@@ -94,8 +94,12 @@ def measure(
     row[MEASURED + 2] = now[2] + noise_turn
     for i in range(3):
         row[POSE + i], row[TWIST + i] = pose[n, m, i], now[i]
-    lag = lag_of(state.age[n, m], steps, rows, substeps)
     odom, twist = state.odom[n, m], state.twist[n, m]
+    if state.age[n, m] == 0:  # dividing for each robot takes a thirtieth of a step
+        for i in range(3):
+            odom[i], twist[i] = row[ODOM + i], row[MEASURED + i]
+        return
+    lag = lag_of(state.age[n, m], steps, rows, substeps)
     odom[0], odom[1], odom[2] = at_lag(state.past, n, m, ODOM, lag, steps, substeps)
     twist[0], twist[1], twist[2] = at_lag(state.past, n, m, MEASURED, lag, steps, substeps)
 
