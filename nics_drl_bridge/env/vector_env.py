@@ -252,10 +252,11 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     def _tell(self, infos: dict[str, Any], facts: dict[str, Any], begun: Flags) -> None:
         """Adds to `infos` the facts of every world, and the beginnings of those in `begun`."""
         infos |= masked(self._known(), np.ones_like(begun))
-        if begun.any():
+        some = bool(begun.any())
+        if some:
             infos |= masked(self._beginnings(), begun, True)
-        if not begun.all():
-            infos |= masked(facts, ~begun, bool(begun.any()))
+        if not (some and begun.all()):
+            infos |= masked(facts, ~begun, some)
 
     # Facts as arrays (N, ...) of worlds with one robot, or (N, M, ...) of teams.
 
