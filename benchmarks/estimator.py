@@ -26,7 +26,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import SimulatorModel, builtin_model
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.middleware.ekf import Estimator
-from nics_drl_bridge.middleware.measurement import ODOM
+from nics_drl_bridge.middleware.measurement import ODOM, Kind
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.middleware.timeline import ReportedPose
 from nics_drl_bridge.robot.noise import Level, Noise
@@ -204,11 +204,11 @@ def random_steps(model: SimulatorModel, steps: int, seed: int) -> dict[str, Any]
         elif kind == 1:
             estimator.command(now, rng.uniform(low, high))
         elif kind == 2:
-            estimator.update_twist(rng.normal(size=3) * 10.0 ** rng.uniform(-3.0, 2.0))
+            estimator.update(Kind.TWIST, rng.normal(size=3) * 10.0 ** rng.uniform(-3.0, 2.0))
         elif kind == 3:
-            estimator.update_yaw_rate(float(rng.normal()), 10.0 ** rng.uniform(-6.0, 1.0))
+            estimator.update(Kind.YAW_RATE, float(rng.normal()), 10.0 ** rng.uniform(-6.0, 1.0))
         else:
-            estimator.update_pose(rng.normal(size=3), 10.0 ** rng.uniform(-6.0, 3.0, 3))
+            estimator.update(Kind.POSE, rng.normal(size=3), 10.0 ** rng.uniform(-6.0, 3.0, 3))
         mean, covariance = estimator.belief.mean, estimator.belief.covariance
         sound = sound and bool(np.isfinite(mean).all() and (covariance == covariance.T).all())
         try:

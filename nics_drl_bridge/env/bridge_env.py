@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
+from functools import reduce
+from operator import add
 from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.env.guard import (
-    check_action,
-    check_command,
-    check_reset,
-    give,
-    halts_on_error,
-    override,
-)
+from nics_drl_bridge.env import guard
+from nics_drl_bridge.env.guard import give, halts_on_error
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.sim_backend import completed, make_backend
 from nics_drl_bridge.env.task import Episodes, Memory, Task, still, team_space
@@ -102,17 +98,12 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     }
 
     def __init__(
-        self,
-        backend: str | Backend = "sim",
-        model: str | SimulatorModel = "ackermann",
-        world: str | World = "arena",
-        task: str | type[Task] | Task = "navigation",
-        task_options: dict[str, Any] | None = None,
-        estimator: bool | None = None,
+        self, backend: str | Backend = "sim", model: str | SimulatorModel = "ackermann",
+        world: str | World = "arena", task: str | type[Task] | Task = "navigation",
+        task_options: dict[str, Any] | None = None, estimator: bool | None = None,
         backend_options: dict[str, Any] | None = None,
-        randomisation: str | Randomisation | None = None,
-        render_mode: str | None = None,
-    ) -> None:
+        randomisation: str | Randomisation | None = None, render_mode: str | None = None,
+    ) -> None:  # fmt: skip
         check_render_mode(render_mode, self.metadata)
         self.render_mode = render_mode
         self.model = open_model(model) if isinstance(model, str) else model
@@ -143,12 +134,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """Begins an episode; see Gymnasium.
-
-        Raises:
-            ConfigError: a seed of 2**63 or more, or options that the task does not have.
-        """
-        check_reset(seed, options)
+        """Begins an episode; see Gymnasium. ConfigError for a wrong seed or option."""
+        guard.check_reset(seed, options)
         super().reset(seed=seed)
         if seed is not None or self._episode < 0:
             self._seed = int(self.np_random.integers(2**31)) if seed is None else int(seed)
@@ -163,15 +150,12 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         episodes = Episodes(np.array([episode]), starts[None], self.scene.goals[None])
         self._rehearse(episodes)
         memory = self.task.reset(episodes)
-        override(memory, options, "start")
+        guard.override(memory, options, "start")
         self._view = self._lifted(self._backend.reset(Start(episode, self._row(starts))))
         self.memory = memory
         self.ended = np.zeros(self.robots, np.bool_)
-        facts: dict[str, Any] = {
-            "episode_seed": episode,
-            "start": self._row(starts),
-            "bodies": self.scene.bodies.copy(),
-        }
+        facts: dict[str, Any] = {"episode_seed": episode, "start": self._row(starts)}
+        facts["bodies"] = self.scene.bodies.copy()
         if drawn := self._backend.facts().get("randomisation"):
             facts["randomisation"] = drawn
         observation = self.task.observation(self._view, self.memory)[0]
@@ -180,10 +164,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         return observation.reshape(-1), self._info(self._view, facts)
 
     def _rehearse(self, episodes: Episodes) -> None:
-        """Runs the task once on a step that is never made, because the robot may be a real one.
-
-        A task may compile code for seconds, while a robot with a command would drive on.
-        """
+        """Runs the task once without a step: it may compile for seconds, and the robot be real."""
         if self._rehearsed:
             return
         free = np.full((1, self.robots, self.model.lidar.beams), np.inf, np.float32)
@@ -211,9 +192,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         each = [0.0] * self.robots
         for term in values.values():  # in the order of the vector env's sum
             each = [one + another for one, another in zip(each, term, strict=True)]
-        reward = each[0]
-        for one in each[1:]:
-            reward += one
+        reward = reduce(add, each)
         alone = self.robots == 1
         info["reward_terms"] = {name: v[0] for name, v in values.items()} if alone else terms
         if self.render_mode == "human":
@@ -237,9 +216,9 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         before = self._view
         if before is None:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
-        given = check_action(action, self.action_space, "action")
+        given = guard.check_action(action, self.action_space, "action")
         made = self.task.command(given.reshape(self._each))[0]
-        command = self._row(check_command(made, self._rest))
+        command = self._row(guard.check_command(made, self._rest))
         waiting = self.robots > 1 and bool(self.ended.any())
         if waiting:
             command = np.where(self.ended[:, None], self._still, command)
@@ -256,10 +235,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         return out[0], terms, self._info(view, facts)
 
     def halt(self) -> None:
-        """Stops the robot with a zero command until the next reset.
-
-        Any exception that leaves `reset`, `step`, `render` or `close` has done so already.
-        """
+        """Stops the robot until the next reset; any exception has done so already."""
         self._view = None
         self._backend.halt()
 
@@ -274,7 +250,6 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         )  # fmt: skip
 
     def _row(self, rows: NDArray[Any]) -> NDArray[Any]:
-        """The row of a single robot, or (M, ...) of a team."""
         return rows[0] if self.robots == 1 else rows
 
     def _fact(self, values: NDArray[Any]) -> Any:

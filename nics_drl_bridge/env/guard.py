@@ -21,10 +21,7 @@ T = TypeVar("T")
 
 
 def halts_on_error(method: Callable[Concatenate[Any, P], T]) -> Callable[Concatenate[Any, P], T]:
-    """Makes a method `halt` its object's robot if any exception leaves it, including Ctrl-C.
-
-    An error of `halt` itself is raised with the first one as its context.
-    """
+    """Makes a method `halt` its robot if any exception leaves it, including Ctrl-C."""
 
     @wraps(method)
     def guarded(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> T:
@@ -59,13 +56,7 @@ SEEDS = 2**63
 
 
 def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
-    """Checks the seed of the first world, from which the others count up, or one for each.
-
-    Gymnasium itself refuses negative seeds.
-
-    Raises:
-        ConfigError: a seed is not an integer or too large, or the options are not a dict.
-    """
+    """Raises ConfigError for a wrong seed, of all worlds or one each, or wrong options."""
     last = SEEDS - worlds if isinstance(seed, int | np.integer) else SEEDS - 1
     for one in seed if isinstance(seed, list | tuple | np.ndarray) else [seed]:
         if not (one is None or isinstance(one, int | np.integer)):
@@ -83,11 +74,7 @@ def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
 def override(
     memory: dict[str, NDArray[Any]], options: Mapping[str, Any] | None, *of_env: str
 ) -> None:
-    """Writes values of `reset(options=...)` into all rows of the memory arrays that they name.
-
-    Raises:
-        ConfigError: a name that neither the memory nor the env has, or a wrong value.
-    """
+    """Writes values of `reset(options=...)` into all rows of the memory arrays that they name."""
     for name, value in (options or {}).items():
         if name in memory:
             give(memory[name], name, value)
@@ -97,11 +84,7 @@ def override(
 
 
 def give(rows: NDArray[Any], name: str, value: Any) -> None:
-    """Writes the value of an option of `reset(options=...)` into rows (n, ...).
-
-    Raises:
-        ConfigError: the value has a wrong shape, or contains NaN or inf.
-    """
+    """Writes the value of an option of `reset(options=...)` into rows (n, ...)."""
     try:
         given = np.asarray(value)
     except ValueError:  # a ragged list
@@ -118,12 +101,7 @@ def give(rows: NDArray[Any], name: str, value: Any) -> None:
 
 
 def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray[Any]:
-    """Returns an action as an array of its space's shape.
-
-    Raises:
-        gymnasium.error.InvalidAction: not numeric, of another shape, NaN, inf, or no action of
-            that number.
-    """
+    """Returns an action as an array of its space's shape. Raises Gymnasium's InvalidAction."""
     try:
         given = np.asarray(action)
     except ValueError as error:  # a ragged list

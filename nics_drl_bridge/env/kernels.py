@@ -18,38 +18,24 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan, resample
 from nics_drl_bridge.random_kernels import episode_seed
 
-LIMIT = 1000.0
-"""Maximum distance [m], speed [m/s] and turn rate [rad/s] in an observation."""
+LIMIT = 1000.0  # Maximum distance [m], speed [m/s] and turn rate [rad/s] in an observation
 
 
 class ScanScale(NamedTuple):
-    """Conversion of a scan to parts of an observation, and to contacts.
+    """Conversion of a scan to parts of an observation, and to contacts."""
 
-    Attributes:
-        per_metre: 1 / the range that a share of 1 stands for [1/m], float32.
-        leaves: (B,) float32 range at which each beam leaves the footprint [m].
-        sectors: number of sectors that are observed; 0 if the beams themselves are.
-        plan: mapping of beams to sectors.
-    """
-
-    per_metre: np.float32
-    leaves: NDArray[np.float32]
-    sectors: int
-    plan: SectorPlan
+    per_metre: np.float32  # 1 / the range that a share of 1 stands for [1/m], float32
+    leaves: NDArray[np.float32]  # (B,) float32 range at which each beam leaves the footprint [m]
+    sectors: int  # number of sectors that are observed; 0 if the beams themselves are
+    plan: SectorPlan  # mapping of beams to sectors
 
 
 class GoalProgress(NamedTuple):
-    """Outcome of a step of the navigation task.
+    """Outcome of a step of the navigation task."""
 
-    Attributes:
-        approach: (R,) decrease of the distance to the goal [m].
-        reached: (R,) True at the goal.
-        touched: (R,) True if the scan shows a contact with the footprint.
-    """
-
-    approach: NDArray[np.float64]
-    reached: NDArray[np.bool_]
-    touched: NDArray[np.bool_]
+    approach: NDArray[np.float64]  # (R,) decrease of the distance to the goal [m]
+    reached: NDArray[np.bool_]  # (R,) True at the goal
+    touched: NDArray[np.bool_]  # (R,) True if the scan shows a contact with the footprint
 
 
 @kernel(allocates=True)
@@ -80,27 +66,19 @@ def finite(values):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def look(shares, ranges, scale):  # type: ignore[no-untyped-def]
-    """Writes a scan (B,) as shares (P,) of a `ScanScale`; returns True if something is too close.
-
-    A share of 1 is no return, 0 too close or unknown. Contact is judged from the beams.
-    """
+    """Writes a scan (B,) as shares (P,), 1 no return, 0 too close; True if it shows a contact."""
     zero, one = np.float32(0.0), np.float32(1.0)
     hits = np.int32(0)
-    if scale.sectors == 0:
-        for b in range(shares.shape[0]):
-            # A comparison with NaN (unknown) is False; -inf (too close) is below every range.
-            share = ranges[b] * scale.per_metre
-            share = share if share > zero else zero
-            shares[b] = share if share < one else one
-            hits |= np.int32(ranges[b] < scale.leaves[b])
-        return hits != 0
-    resample(shares, ranges, scale.plan)
-    for s in range(shares.shape[0]):
-        share = shares[s] * scale.per_metre
-        share = share if share > zero else zero
-        shares[s] = share if share < one else one
     for b in range(ranges.shape[0]):
         hits |= np.int32(ranges[b] < scale.leaves[b])
+    if scale.sectors > 0:
+        resample(shares, ranges, scale.plan)
+        ranges = shares
+    for s in range(shares.shape[0]):
+        # A comparison with NaN (unknown) is False; -inf (too close) is below every range.
+        share = ranges[s] * scale.per_metre
+        share = share if share > zero else zero
+        shares[s] = share if share < one else one
     return hits != 0
 
 
@@ -112,28 +90,24 @@ def looks(shares, touched, ranges, scale):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def bearing(pose, x, y):  # type: ignore[no-untyped-def]
-    """Distance [m] from a pose (3,) to a point, and cosine and sine of its bearing."""
-    dx, dy = x - pose[0], y - pose[1]
+def bearing(dx, dy, heading):  # type: ignore[no-untyped-def]
+    """Distance [m] to a point dx, dy away, and cosine and sine of its bearing at a heading."""
     distance = math.sqrt(dx * dx + dy * dy)
     if distance == 0.0:
         return 0.0, 1.0, 0.0
-    c, s = math.cos(pose[2]), math.sin(pose[2])
+    c, s = math.cos(heading), math.sin(heading)
     forward, left = (c * dx + s * dy) / distance, (c * dy - s * dx) / distance
     return distance, min(max(forward, -1.0), 1.0), min(max(left, -1.0), 1.0)
 
 
 @kernel(allocates=True)
 def navigate(out, progress, before, pose, twist, ranges, goals, scale, radius):  # type: ignore[no-untyped-def]
-    """Writes observations (R, P + 6), see `navigation.Navigation`, and a `GoalProgress`.
-
-    Poses before and after the step (R, 3), twists (R, 3), scans (R, B), goals (R, 2) and their
-    radius [m].
-    """
+    """Writes the observations (R, P + 6) of `navigation.Navigation`, and a `GoalProgress`."""
     parts = out.shape[1] - 6
     for i in range(out.shape[0]):
         progress.touched[i] = look(out[i, :parts], ranges[i], scale)
-        distance, c, s = bearing(pose[i], goals[i, 0], goals[i, 1])
+        dx, dy = goals[i, 0] - pose[i, 0], goals[i, 1] - pose[i, 1]
+        distance, c, s = bearing(dx, dy, pose[i, 2])
         dx, dy = goals[i, 0] - before[i, 0], goals[i, 1] - before[i, 1]
         progress.approach[i] = math.sqrt(dx * dx + dy * dy) - distance
         progress.reached[i] = distance < radius
@@ -144,21 +118,8 @@ def navigate(out, progress, before, pose, twist, ranges, goals, scale, radius): 
 
 
 @kernel(allocates=True)
-def bearings(out, poses, points):  # type: ignore[no-untyped-def]
-    """Writes `bearing` (R, M, Q, 3) of each point (R, Q, 2) from each pose (R, M, 3)."""
+def bearings(out, ways, headings):  # type: ignore[no-untyped-def]
+    """Writes `bearing` (R, 3) of points that are `ways` (R, 2) away, at headings (R,)."""
     for r in range(out.shape[0]):
-        for m in range(out.shape[1]):
-            for q in range(out.shape[2]):
-                x, y = points[r, q, 0], points[r, q, 1]
-                distance, out[r, m, q, 1], out[r, m, q, 2] = bearing(poses[r, m], x, y)
-                out[r, m, q, 0] = min(distance, LIMIT)
-
-
-@kernel(allocates=True)
-def distances(out, poses, points):  # type: ignore[no-untyped-def]
-    """Writes distances (R, M, Q) [m] from each pose (R, M, 3) to each point (R, Q, 2)."""
-    for r in range(out.shape[0]):
-        for m in range(out.shape[1]):
-            for q in range(out.shape[2]):
-                dx, dy = points[r, q, 0] - poses[r, m, 0], points[r, q, 1] - poses[r, m, 1]
-                out[r, m, q] = math.sqrt(dx * dx + dy * dy)
+        distance, out[r, 1], out[r, 2] = bearing(ways[r, 0], ways[r, 1], headings[r])
+        out[r, 0] = min(distance, LIMIT)

@@ -50,15 +50,11 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
     }
 
     def __init__(
-        self,
-        model: str | SimulatorModel = "ackermann",
-        world: str | World = "arena",
+        self, model: str | SimulatorModel = "ackermann", world: str | World = "arena",
         task: str | type[Task] | Task = "cooperative_reaching",
-        task_options: dict[str, Any] | None = None,
-        max_episode_steps: int = MAX_EPISODE_STEPS,
-        randomisation: str | Randomisation | None = None,
-        render_mode: str | None = None,
-    ) -> None:
+        task_options: dict[str, Any] | None = None, max_episode_steps: int = MAX_EPISODE_STEPS,
+        randomisation: str | Randomisation | None = None, render_mode: str | None = None,
+    ) -> None:  # fmt: skip
         self.env = BridgeEnv(
             "sim", model, world, task, task_options,
             randomisation=randomisation, render_mode=render_mode,
@@ -98,11 +94,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
     ) -> tuple[
         Observations, dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
     ]:
-        """Advances one control period; see PettingZoo.
-
-        Raises:
-            ConfigError: a remaining agent has no action.
-        """
+        """Advances one control period; see PettingZoo. Every remaining agent needs an action."""
         if missing := sorted(set(self.agents) - set(actions)):
             raise ConfigError(f"no action for {', '.join(missing)}; each agent that is left acts.")
         space = self.env.task.action_space

@@ -27,14 +27,11 @@ TASKS = {
 def make_task(
     task: str | type[Task] | Task, model: SimulatorModel, options: dict[str, Any] | None = None
 ) -> Task:
-    """Makes a task for the robot of a model.
+    """Makes a task for the robot of a model. Raises ConfigError if it does not fit.
 
     The task is the name of a shipped one (`navigation`), `path/to/file.py:ClassName`, a class, or a
     Task. Options are further arguments of the class; `scan` may also be a number of sectors, the
     name of a layout or its fields, see `sectors.layout_of`; `sensors` are names.
-
-    Raises:
-        ConfigError: no such task, an unknown argument, or a Task for another robot.
     """
     if isinstance(task, Task):
         return _checked(task, model, options)
@@ -153,19 +150,11 @@ register_envs()
 
 
 def make(task: str = "navigation", **arguments: Any) -> gymnasium.Env[Any, Any]:
-    """An env of a task, with Gymnasium's own wrappers and the arguments of `BridgeEnv`.
-
-    Raises:
-        ConfigError, ModelError: an unknown name or a wrong file.
-    """
+    """An env of a task, with Gymnasium's own wrappers and the arguments of `BridgeEnv`."""
     return gymnasium.make(TASK, task=task, **arguments)
 
 
 def make_vec(num_envs: int, task: str = "navigation", **arguments: Any) -> Any:
-    """A `BridgeVectorEnv`: a task in many worlds at once, for training.
-
-    Raises:
-        ConfigError, ModelError: an unknown name or a wrong file.
-    """
+    """A `BridgeVectorEnv`: a task in many worlds at once, for training."""
     vectors = import_module("nics_drl_bridge.env.vector_env")  # which imports this module
     return vectors.BridgeVectorEnv(num_envs, task=task, **arguments)

@@ -26,10 +26,7 @@ ROBOTS = ("#1f6fb2", "#2f855a", "#7a4fa3", "#b7791f", "#0f766e", "#9d174d")
 
 
 class WorldPicture:
-    """Picture of walls, obstacles, goals, robots and their scans, redrawn at every step.
-
-    The mode is `rgb_array`, or `human`, which shows a window if there is a display.
-    """
+    """Picture of a world, redrawn at every step: `rgb_array`, or `human` in a window."""
 
     def __init__(self, model: SimulatorModel, world: World, mode: str, fps: int) -> None:
         self._model, self._world = model, world
@@ -49,10 +46,7 @@ class WorldPicture:
     def draw(
         self, poses: Array, ranges: NDArray[Any], bodies: Array, memory: dict[str, NDArray[Any]]
     ) -> NDArray[np.uint8] | None:
-        """Draws robots at poses (M, 3) with scans (M, B), bodies (K, 7), and the memory's `goal`.
-
-        Returns pixels (H, W, 3); None for `human`.
-        """
+        """Draws robots (M, 3), scans (M, B), bodies (K, 7), goals; pixels unless `human`."""
         axes = self._axes
         axes.clear()
         axes.set_axis_off()
@@ -67,7 +61,6 @@ class WorldPicture:
         return self._shown()
 
     def _robot(self, axes: Axes, pose: Array, ranges: NDArray[np.float32], colour: str) -> None:
-        """Draws the footprint, the heading and the scan."""
         lidar, robot = self._model.lidar, self._model.robot
         mount = geometry.compose(pose, lidar.mount)
         there = np.isfinite(ranges)
@@ -117,7 +110,6 @@ def draw_world(axes: Axes, world: World, bodies: NDArray[np.float64]) -> None:
 
 
 def _draw_map(axes: Axes, grid: GridMap) -> None:
-    """Draws occupied cells dark and unknown ones grey."""
     rows, columns = grid.cells.shape
     i, j = np.indices((rows + 1, columns + 1)) - 0.5
     corners = grid.cell_to_world(np.stack([i, j], axis=-1))

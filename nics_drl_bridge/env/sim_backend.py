@@ -34,14 +34,9 @@ class SimBackend:
     """
 
     def __init__(
-        self,
-        model: SimulatorModel,
-        world: World,
-        renderer: Renderer = "baked",
-        estimator: bool = False,
-        robots: int = 1,
-        **simulation: Any,
-    ) -> None:
+        self, model: SimulatorModel, world: World, renderer: Renderer = "baked",
+        estimator: bool = False, robots: int = 1, **simulation: Any,
+    ) -> None:  # fmt: skip
         self._robot = model.robot
         self.simulator = FastSimulator(model, world, robots=robots, renderer=renderer, **simulation)
         self._middlewares = [Middleware(model) for _ in range(robots if estimator else 0)]
@@ -102,16 +97,14 @@ class SimBackend:
         if not self._middlewares:
             sensed = {name: each[row].copy() for name, each in self.simulator.readings.items()}
             return RobotView(odom, twist, ranges, now * 1e-9, 0.0, 0.0, sensed)
-        views = [self._estimated(robot) for robot in range(len(self._middlewares))]
+        views = []
+        for m, middleware in enumerate(self._middlewares):
+            middleware.odometry(now, now, data.odom[0, m].copy(), data.twist[0, m].copy())
+            middleware.scan(now, now, data.ranges[0, m].copy())
+            for name, readings in self.simulator.readings.items():
+                middleware.sense(name, now, now, readings[0, m].copy())
+            views.append(middleware.view(now))
         return views[0] if len(views) == 1 else stacked(views)
-
-    def _estimated(self, robot: int) -> RobotView:
-        data, now, middleware = self.simulator.data, self._now_ns, self._middlewares[robot]
-        middleware.odometry(now, now, data.odom[0, robot].copy(), data.twist[0, robot].copy())
-        middleware.scan(now, now, data.ranges[0, robot].copy())
-        for name, readings in self.simulator.readings.items():
-            middleware.sense(name, now, now, readings[0, robot].copy())
-        return middleware.view(now)
 
     def halt(self) -> None:
         """Does nothing: robots only move in `step`."""
@@ -121,11 +114,7 @@ class SimBackend:
 
 
 class CompletedBackend:
-    """Wraps a user-defined backend that lacks `halt` or `facts`.
-
-    Instead of `halt` it gets a step with the command nearest to zero, `still` (C,), or (M, C) for a
-    team; its facts are those of its last step.
-    """
+    """Wraps a user's backend without `halt`, for which it steps by `still`, or without `facts`."""
 
     def __init__(self, backend: Any, still: NDArray[np.float64]) -> None:
         self._backend, self._still = backend, still
@@ -184,11 +173,7 @@ def completed(backend: Any, still: NDArray[np.float64]) -> Backend:
 
 
 def make_backend(name: str, model: SimulatorModel, world: World, **options: Any) -> Any:
-    """Makes a backend by the name under which it is registered, see `extensions`.
-
-    Raises:
-        ConfigError: unknown name, its library is missing, or it has no such option.
-    """
+    """Makes a backend by the name under which it is registered, see `extensions`."""
     make = extensions.load("backends", name)
     try:
         signature(make).bind(model, world, **options)

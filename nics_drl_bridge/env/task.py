@@ -34,31 +34,22 @@ DRIVES = ((0, 0, 0), (1, 0, 0), (1, 0, 1), (1, 0, -1), (-1, 0, 0), (-1, 0, 1), (
 They are those of the authors' code (efc-robot/MultiVehicleEnv), as signs of `cmd_vel`: linear.x,
 linear.y, angular.z. A robot that can't reverse stays in place, and turns if it can on the spot.
 """
-SIDEWAYS = ((0, 1, 0), (0, -1, 0))
-"""Two more for a robot that moves sideways."""
+SIDEWAYS = ((0, 1, 0), (0, -1, 0))  # Two more for a robot that moves sideways
 
 
 @dataclass(frozen=True)
 class Episodes:
-    """Episodes at their start, in n worlds with M robots.
+    """Episodes at their start, in n worlds with M robots."""
 
-    Attributes:
-        seeds: (n,); all that a task draws must follow from them, see `random_kernels.uniform`.
-        starts: (n, M, 3) poses of the robots: x [m], y [m], heading [rad] in `map`.
-        goals: (n, M, 2) free points that the world drew, one per robot [m].
-    """
-
+    # (n,); all that a task draws must follow from them, see `random_kernels.uniform`
     seeds: NDArray[np.int64]
-    starts: Array
-    goals: Array
+    starts: Array  # (n, M, 3) poses of the robots: x [m], y [m], heading [rad] in `map`
+    goals: Array  # (n, M, 2) free points that the world drew, one per robot [m]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of a step: terms of the reward, robots whose episode has ended, facts for `info`.
-
-    All arrays have the leading dimensions of the view; the reward is the sum of its terms.
-    """
+    """Outcome of a step: terms of the reward, whose sum it is, ended robots, facts for `info`."""
 
     terms: dict[str, Array]
     ended: Flags
@@ -67,10 +58,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Sight:
-    """Meaning of the scan parts of an observation.
-
-    Direction (P,) [rad] and origin (2,) [m] of the rays in `base_link`, range of a share of 1 [m].
-    """
+    """Directions (P,) [rad] and origin (2,) [m] of the scan parts, range of a share of 1 [m]."""
 
     angles: Array
     origin: Array
@@ -86,31 +74,24 @@ class Task(ABC):
     dimensions (n, M): n worlds of M robots. A task of one robot that works element by element also
     accepts the view () of a robot over ROS 2. Results per element must not depend on n: use
     `bearing` and `distance` instead of numpy's trigonometric functions.
-
-    Attributes:
-        robot: gives commands, their limits, and the footprint.
-        lidar: gives the scan.
-        actions: `continuous` (Box) or `discrete` (the paper's drives, see `DRIVES`).
-        contact_margin: a return this close to the footprint counts as a contact [m].
-        sensors: further sensors of the robot whose shares end each observation; a task that does
-            not observe them (`observes_sensors`) refuses them, but finds all of them in its views.
-        scan: sectors that observations contain instead of the lidar's beams, so that they mean the
-            same for any lidar; None keeps the beams. Contact is always judged from the beams.
-        keeps_last_scan: True if `reward`, `update` or `step_into` use `before.ranges`; otherwise
-            these may be the new ranges, which saves a copy.
-        shown: names of memory arrays that `info` always contains.
     """
 
+    # True if `reward`, `update` or `step_into` use `before.ranges`; otherwise these may be the new
+    # ranges, which saves a copy
     keeps_last_scan: ClassVar[bool] = True
+    # True if it observes further sensors, `sensors`; they are in all views in any case
     observes_sensors: ClassVar[bool] = False
-    shown: ClassVar[tuple[str, ...]] = ()
+    shown: ClassVar[tuple[str, ...]] = ()  # names of memory arrays that `info` always contains
 
-    robot: RobotSpec
-    lidar: LidarSpec
+    robot: RobotSpec  # gives commands, their limits, and the footprint
+    lidar: LidarSpec  # gives the scan
+    # `continuous` (Box) or `discrete` (the paper's drives, see `DRIVES`)
     actions: Actions = "continuous"
-    contact_margin: float = 0.02
+    contact_margin: float = 0.02  # a return this close to the footprint counts as a contact [m]
+    # sectors that observations contain instead of the lidar's beams, so that they mean the same for
+    # any lidar; None keeps the beams. Contact is always judged from the beams
     scan: ScanLayout | None = None
-    sensors: tuple[Sensor, ...] = ()
+    sensors: tuple[Sensor, ...] = ()  # further ones, whose shares end each observation
 
     def __post_init__(self) -> None:
         if self.actions not in ("continuous", "discrete"):
@@ -162,10 +143,7 @@ class Task(ABC):
         """Updates the memory after a step, in place, before anything is computed from it."""
 
     def command(self, action: ArrayLike) -> Array:
-        """Returns the command (..., C) of an action: (..., C) continuous, or (...) discrete.
-
-        Continuous actions are cut to [-1, 1] and scaled between the limits of the commands.
-        """
+        """Returns the command (..., C) of a discrete action, or one (..., C) cut to [-1, 1]."""
         if self.actions == "discrete":
             return np.asarray(self._commands[np.asarray(action)])
         given = np.ascontiguousarray(action)
@@ -177,10 +155,7 @@ class Task(ABC):
     def step_into(
         self, out: Observation, before: RobotView, after: RobotView, memory: Memory
     ) -> Outcome:
-        """Returns the outcome of a step and writes the observation into `out`.
-
-        Override it if one pass over the scan gives several of these results.
-        """
+        """Returns the outcome of a step and writes the observation, maybe in one pass."""
         self.update(before, after, memory)
         out[...] = self.observation(after, memory)
         terms = self.reward(before, after, memory)
@@ -212,12 +187,12 @@ class Task(ABC):
 
     def _look(self, ranges: NDArray[np.float32]) -> tuple[Observation, Flags]:
         ranges = np.ascontiguousarray(ranges, np.float32)
-        rows = ranges.reshape(-1, ranges.shape[-1])
-        parts, count = rows.shape[-1] if self.scan is None else self.scan.sectors, len(rows)
-        shares, touched = np.empty((count, parts), np.float32), np.empty(count, np.bool_)
-        kernels.looks(shares, touched, rows, self.scale)
-        lead = ranges.shape[:-1]
-        return shares.reshape(*lead, parts), touched.reshape(lead)
+        lead, beams = ranges.shape[:-1], ranges.shape[-1]
+        parts = beams if self.scan is None else self.scan.sectors
+        shares, touched = np.empty((*lead, parts), np.float32), np.empty(lead, np.bool_)
+        rows = shares.reshape(-1, parts), touched.reshape(-1), ranges.reshape(-1, beams)
+        kernels.looks(*rows, self.scale)
+        return shares, touched
 
     def sensor_shares(self, view: RobotView) -> Observation:
         """Returns the shares (..., Q) of `sensors`, in their order."""
@@ -280,10 +255,7 @@ def still(robot: RobotSpec) -> Array:
 
 
 def team_space(space: gymnasium.Space[Any], robots: int) -> gymnasium.Space[Any]:
-    """Joint space of M robots, concatenated to a vector as algorithms expect it.
-
-    Box (L,) becomes Box (M L,), Discrete becomes MultiDiscrete (M,); one robot's is unchanged.
-    """
+    """Joint space of M robots: Box (L,) becomes Box (M L,), Discrete becomes MultiDiscrete (M,)."""
     if robots == 1:
         return space
     several = gymnasium.vector.utils.batch_space(space, robots)
@@ -293,37 +265,20 @@ def team_space(space: gymnasium.Space[Any], robots: int) -> gymnasium.Space[Any]
 
 
 def bearing(pose: ArrayLike, points: ArrayLike) -> Array:
-    """Returns distance [m], cosine and sine of the bearing of points (..., 2) from poses (..., 3).
-
-    The leading dimensions are broadcast. A point at the robot's position lies straight ahead;
-    distances are cut at `kernels.LIMIT`.
-    """
-    poses, places, shape = _rows(pose, points)
-    out = np.empty((len(poses), 1, 1, 3))
-    kernels.bearings(out, poses[:, None], places[:, None])
-    return out.reshape(*shape, 3)
+    """Returns distance [m], cosine, sine of the bearing of points (..., 2) from poses (..., 3)."""
+    poses = np.asarray(pose, np.float64)
+    ways = np.asarray(points, np.float64) - poses[..., :2]
+    out, headings = np.empty((*ways.shape[:-1], 3)), np.empty(ways.shape[:-1])
+    headings[...] = poses[..., 2]
+    kernels.bearings(out.reshape(-1, 3), ways.reshape(-1, 2), headings.reshape(-1))
+    return out
 
 
 def distance(pose: ArrayLike, points: ArrayLike) -> Array:
     """Returns distances (...) [m] from poses (..., 2 or 3) to points (..., 2), broadcast."""
-    poses, places, shape = _rows(pose, points)
-    out = np.empty((len(poses), 1, 1))
-    kernels.distances(out, poses[:, None], places[:, None])
-    return out.reshape(shape)
-
-
-def _rows(pose: ArrayLike, points: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:
-    poses, places = np.asarray(pose, np.float64), np.asarray(points, np.float64)
-    shape = poses.shape[:-1]
-    if places.shape[:-1] != shape:
-        shape = np.broadcast_shapes(shape, places.shape[:-1])
-        poses = np.broadcast_to(poses, (*shape, poses.shape[-1]))
-        places = np.broadcast_to(places, (*shape, 2))
-    return (
-        np.ascontiguousarray(poses).reshape(-1, poses.shape[-1]),
-        np.ascontiguousarray(places).reshape(-1, 2),
-        shape,
-    )
+    offset = np.asarray(points, np.float64) - np.asarray(pose, np.float64)[..., :2]
+    x, y = offset[..., 0], offset[..., 1]
+    return np.asarray(np.sqrt(x * x + y * y))
 
 
 def limited(twist: Array) -> Array:
@@ -340,24 +295,18 @@ def total(values: Array) -> Array:
 
 
 def contact_ranges(robot: RobotSpec, lidar: LidarSpec, margin: float) -> NDArray[np.float32]:
-    """Ranges (B,) at which each beam leaves the footprint, round or a polygon, and a margin [m].
-
-    -inf where a beam does not cross the footprint.
-    """
+    """Ranges (B,) at which each beam leaves the footprint and a margin [m]; else -inf."""
     x, y, heading = lidar.mount
     angles = lidar.angles + heading
     ray = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    if robot.footprint is None:
-        leaves = _leaves_circle(ray, np.array([x, y]), robot.footprint_radius + margin)
-    else:
+    if robot.footprint is not None:
         leaves = _leaves_outline(ray, np.array(robot.footprint) - [x, y]) + margin
+    else:
+        start, radius = np.array([x, y]), robot.footprint_radius + margin
+        along = ray @ start
+        rest = radius * radius - start @ start + along * along
+        leaves = np.where(rest >= 0.0, np.sqrt(np.maximum(rest, 0.0)) - along, -np.inf)
     return leaves.astype(np.float32)
-
-
-def _leaves_circle(ray: Array, start: Array, radius: float) -> Array:
-    along = ray @ start
-    rest = radius * radius - start @ start + along * along
-    return np.where(rest >= 0.0, np.sqrt(np.maximum(rest, 0.0)) - along, -np.inf)
 
 
 def _leaves_outline(ray: Array, corners: Array) -> Array:

@@ -10,43 +10,23 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.env import kernels
+from nics_drl_bridge.env import task
 from nics_drl_bridge.env.kernels import LIMIT
-from nics_drl_bridge.env.task import Episodes, Flags, Memory, Observation, Task, limited, total
+from nics_drl_bridge.env.task import Episodes, Flags, Memory, Observation, Task
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import RobotView
 
 Array = NDArray[np.float64]
 
 
-def seen(pose: Array, points: Array) -> Array:
-    """Bearings (..., M, P, 3) of points (..., P, 2) from each robot (..., M, 3); see `bearing`."""
-    robots, places, shape = _batched(pose, points)
-    out = np.empty((len(robots), robots.shape[1], places.shape[1], 3))
-    kernels.bearings(out, robots, places)
-    return out.reshape(*shape, 3)
-
-
-def distances(pose: Array, points: Array) -> Array:
-    """Distances (..., M, P) [m] from each robot (..., M, 3) to each point (..., P, 2)."""
-    robots, places, shape = _batched(pose, points)
-    out = np.empty((len(robots), robots.shape[1], places.shape[1]))
-    kernels.distances(out, robots, places)
-    return out.reshape(shape)
-
-
-def _batched(pose: Array, points: Array) -> tuple[Array, Array, tuple[int, ...]]:
-    """(R, M, 3) poses and (R, P, 2) points of R worlds, and the shape (..., M, P)."""
-    shape = (*pose.shape[:-1], points.shape[-2])
-    poses = np.ascontiguousarray(pose, np.float64).reshape(-1, *pose.shape[-2:])
-    places = np.ascontiguousarray(points, np.float64).reshape(-1, *points.shape[-2:])
-    return poses, places, shape
+def pairs(pose: Array, points: Array) -> tuple[Array, Array]:
+    """Pairs each robot (..., M, 3) with each point (..., P, 2): broadcast to (..., M, P)."""
+    return pose[..., None, :], points[..., None, :, :]
 
 
 def others(of_all: Array) -> Array:
     """Drops the diagonal of (..., M, M, F): each robot's row of the others, (..., M, M - 1, F)."""
-    count = of_all.shape[-2]
-    lead, width = of_all.shape[:-3], of_all.shape[-1]
+    *lead, count, _, width = of_all.shape
     # Without its first entry, the flat row of pairs has a diagonal one after every `count` others.
     flat = of_all.reshape(*lead, count * count, width)[..., 1:, :]
     kept = flat.reshape(*lead, count - 1, count + 1, width)[..., :-1, :]
@@ -125,52 +105,50 @@ class CooperativeReaching(Task):
 
     def update(self, before: RobotView, after: RobotView, memory: Memory) -> None:
         """Marks the goals that a robot is at."""
-        there = (distances(after.pose, memory["goal"]) < self.goal_radius).any(axis=-2)
+        there = (task.distance(*pairs(after.pose, memory["goal"])) < self.goal_radius).any(axis=-2)
         memory["newly"][...] = there & ~memory["reached"]
         memory["reached"] |= there
 
     def observation(self, view: RobotView, memory: Memory) -> Observation:
         """The observation (..., M, O) of views (..., M)."""
-        goals = seen(view.pose, memory["goal"])
+        goals = task.bearing(*pairs(view.pose, memory["goal"]))
         reached = np.broadcast_to(memory["reached"][..., None, :, None], (*goals.shape[:-1], 1))
         lead = view.pose.shape[:-1]
         parts = [
             self.free_share(view.ranges),
             np.concatenate([goals, reached], axis=-1).reshape(*lead, -1),
-            others(seen(view.pose, view.pose[..., :2])).reshape(*lead, -1),
-            limited(view.twist),
+            others(task.bearing(*pairs(view.pose, view.pose[..., :2]))).reshape(*lead, -1),
+            task.limited(view.twist),
         ]
         return np.concatenate(parts, axis=-1, dtype=np.float32, casting="same_kind")
 
     def reward(self, before: RobotView, after: RobotView, memory: Memory) -> dict[str, Array]:
         """The terms (..., M)."""
         lead = after.pose.shape[:-1]
-        gaps = [distances(view.pose, memory["goal"]).min(axis=-2) for view in (before, after)]
+        gaps = [
+            task.distance(*pairs(view.pose, memory["goal"])).min(axis=-2)
+            for view in (before, after)
+        ]
         # A goal just reached still pays its last approach.
         open_goals = ~memory["reached"] | memory["newly"]
         approach = np.where(open_goals, gaps[0] - gaps[1], 0.0)
-        share = 1.0 / self.robots
-        newly = total(memory["newly"].astype(np.float64))
+        share, nearer = 1.0 / self.robots, task.total(approach)
+        newly = task.total(memory["newly"].astype(np.float64))
         return {
-            "progress": np.broadcast_to(
-                self.progress_reward * share * total(approach)[..., None], lead
-            ).copy(),
+            "progress": np.full(lead, self.progress_reward * share * nearer[..., None]),
             "time": np.full(lead, self.time_reward),
-            "reached": np.broadcast_to(self.reached_reward * share * newly[..., None], lead).copy(),
+            "reached": np.full(lead, self.reached_reward * share * newly[..., None]),
             "collision": self.collision_reward * self.touches(after.ranges),
         }
 
     def end(self, view: RobotView, memory: Memory) -> Flags:
         """Returns True where a robot touches something, or all goals are reached."""
-        done = np.asarray(memory["reached"].all(axis=-1))[..., None]
-        return np.asarray(self.touches(view.ranges) | done)
+        return np.asarray(self.touches(view.ranges) | memory["reached"].all(-1, keepdims=True))
 
     def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
         """Success of the team, contacts, and the goals that have been reached (..., M)."""
-        all_reached = np.asarray(memory["reached"].all(axis=-1))[..., None]
-        done = np.broadcast_to(all_reached, view.pose.shape[:-1])
         return {
-            "is_success": done.copy(),
+            "is_success": np.full(view.pose.shape[:-1], memory["reached"].all(-1, keepdims=True)),
             "collision": self.touches(view.ranges),
             "reached": memory["reached"].copy(),
         }
@@ -273,7 +251,7 @@ class PursuitEvasion(Task):
 
     def _gaps(self, view: RobotView, memory: Memory) -> Array:
         """(..., M) [m] to the nearest robot of the other side that is not out; inf without one."""
-        between = distances(view.pose, view.pose[..., :2])
+        between = task.distance(*pairs(view.pose, view.pose[..., :2]))
         foe = (self.pursues[:, None] != self.pursues) & ~memory["out"][..., None, :]
         return np.asarray(np.where(foe, between, np.inf).min(axis=-1))
 
@@ -282,13 +260,13 @@ class PursuitEvasion(Task):
         lead = view.pose.shape[:-1]
         mates = np.broadcast_to(self.pursues[:, None] == self.pursues, (*lead, self.robots))
         out = np.broadcast_to(memory["out"][..., None, :], (*lead, self.robots))
-        places = seen(view.pose, view.pose[..., :2])
+        places = task.bearing(*pairs(view.pose, view.pose[..., :2]))
         known = np.concatenate([places, mates[..., None], out[..., None]], axis=-1)
         parts: list[NDArray[Any]] = [
             self.free_share(view.ranges),
             others(known).reshape(*lead, -1),
             np.broadcast_to(self.pursues[:, None], (*lead, 1)),
-            limited(view.twist),
+            task.limited(view.twist),
         ]
         return np.concatenate(parts, axis=-1, dtype=np.float32, casting="same_kind")
 
@@ -305,7 +283,7 @@ class PursuitEvasion(Task):
         return {
             "pursuit": self.pursuit_reward * side * nearer,
             "capture": self.capture_reward * newly,
-            "time": np.broadcast_to(self.time_reward * side, nearer.shape).copy(),
+            "time": np.full(nearer.shape, self.time_reward * side),
             "collision": np.multiply(self.collision_reward, self._collided(after, memory)),
         }
 
@@ -316,12 +294,12 @@ class PursuitEvasion(Task):
     def end(self, view: RobotView, memory: Memory) -> Flags:
         """Returns the robots that are out; all of them when one side has none left."""
         out = memory["out"]
-        over = out[..., self.pursues].all(axis=-1) | out[..., ~self.pursues].all(axis=-1)
-        return np.asarray(out | np.asarray(over)[..., None])
+        over = [out[..., side].all(-1, keepdims=True) for side in (self.pursues, ~self.pursues)]
+        return np.asarray(out | over[0] | over[1])
 
     def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
         """Success of each robot's side, contacts, and captures (..., M)."""
-        won = np.asarray(memory["caught"][..., ~self.pursues].all(axis=-1))[..., None]
+        won = memory["caught"][..., ~self.pursues].all(-1, keepdims=True)
         return {
             "is_success": np.asarray(won == self.pursues),
             "collision": self._collided(view, memory),

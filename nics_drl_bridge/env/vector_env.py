@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -74,19 +74,12 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     }
 
     def __init__(
-        self,
-        num_envs: int = 1,
-        model: str | SimulatorModel = "ackermann",
-        world: str | World = "arena",
-        task: str | type[Task] | Task = "navigation",
-        task_options: dict[str, Any] | None = None,
-        max_episode_steps: int = 300,
-        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
-        copy: bool = True,
-        *,
-        render_mode: str | None = None,
-        **simulation: Any,
-    ) -> None:
+        self, num_envs: int = 1, model: str | SimulatorModel = "ackermann",
+        world: str | World = "arena", task: str | type[Task] | Task = "navigation",
+        task_options: dict[str, Any] | None = None, max_episode_steps: int = 300,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP, copy: bool = True, *,
+        render_mode: str | None = None, **simulation: Any,
+    ) -> None:  # fmt: skip
         self._pictures: list[Any] = []  # `close` needs it even if the rest raises
         check_render_mode(render_mode, self.metadata)
         self.num_envs, self.render_mode = num_envs, render_mode
@@ -136,18 +129,10 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         return {**own, **data, "goals": self.simulator.goals}
 
     def reset(
-        self,
-        *,
-        seed: int | Sequence[int | None] | None = None,
+        self, *, seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
-    ) -> tuple[Observation, dict[str, Any]]:
-        """Begins an episode in every world; world i takes its seeds from `seed + i`.
-
-        Raises:
-            ConfigError: wrong number of seeds, one that is negative or too large, a wrong mask, or
-                an option that the task does not have.
-            ResetNeeded: some worlds are reset where all need it: at first and after an exception.
-        """
+    ) -> tuple[Observation, dict[str, Any]]:  # fmt: skip
+        """Begins an episode in every world; world i takes its seeds from `seed + i`."""
         check_reset(seed, options, self.num_envs)
         super().reset(seed=seed if isinstance(seed, int) else None)
         chosen = chosen_worlds(options, self.num_envs)
@@ -159,7 +144,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         if not chosen.all():  # the others keep their observation
             self._out[...] = self.task.observation(self._view(slice(None)), self.memory)
         self._begin(np.flatnonzero(chosen), self._out, options)
-        infos = spread(self._known(chosen) | self._beginnings(chosen), chosen)
+        infos = masked(self._known() | self._beginnings(), chosen, True)
         self.ready = True
         return flat(self._out.copy() if self.copy else self._out), infos
 
@@ -189,7 +174,6 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         out[worlds] = self.task.observation(self._view(worlds), fresh)
 
     def _view(self, rows: Rows) -> RobotView:
-        """View of the robots (n, M) of some worlds, with poses by odometry."""
         data = self.simulator.data
         sensed = {name: each[rows] for name, each in self.simulator.readings.items()}
         scans = data.ranges[rows]
@@ -205,15 +189,20 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self.ready = False
         out = np.empty_like(self._out) if self.copy else self._out
         begun = self._over.copy()  # these ignore their action and are reset
-        outcome = joined(
-            self.simulator.run_parts(lambda part: self._advance(part, given[part], out, begun))
-        )
+        run = self.simulator.run_parts
+        outcome = joined(run(lambda part: self._advance(part, given[part], out, begun)))
         terminated = self.ended.all(axis=1) & ~begun
         truncated = (self.simulator.data.steps >= self._limit) & ~begun
         reward = np.where(begun, 0.0, total(self._reward))
         over = terminated | truncated
         infos: dict[str, Any] = {}
-        facts = self._facts_of_step(outcome)
+        facts = {
+            "stamp_ns": self.simulator.data.steps * self._period_ns,
+            "true_pose": self._row(self.simulator.data.pose).copy(),
+            "true_collision": self._row(self.simulator.data.collided).astype(np.bool_),
+            **{name: self._row(values).copy() for name, values in outcome.info.items()},
+            "reward_terms": {name: self._row(t).copy() for name, t in outcome.terms.items()},
+        }
         if self._mode is AutoresetMode.SAME_STEP:
             self._end_at_once(out, over, facts, infos)
         else:
@@ -225,10 +214,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     def _advance(
         self, part: slice, actions: NDArray[Any], out: Observation, begun: Flags
     ) -> Outcome:
-        """Advances the worlds of a part by one control period and writes their observations.
-
-        Those in `begun` (N,) are reset instead.
-        """
+        """Advances the worlds of a part, or resets those in `begun` (N,); writes observations."""
         data, ended = self.simulator.data, self.ended[part]
         command = self.task.command(actions)
         if self.robots > 1 and ended.any():
@@ -258,8 +244,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             for n in np.flatnonzero(over):  # only those that ended: each needs its own object
                 shown[n] = flat(out)[n].copy()
             infos["final_obs"], infos["_final_obs"] = shown, over.copy()
-            final = self._known(over) | mapped(facts, lambda values: values[over])
-            infos["final_info"], infos["_final_info"] = spread(final, over), over.copy()
+            final = masked(self._known() | facts, over, True)
+            infos["final_info"], infos["_final_info"] = final, over.copy()
             self.simulator.run_parts(
                 lambda part: self._begin(part.start + np.flatnonzero(over[part]), out)
             )
@@ -267,45 +253,32 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
 
     def _tell(self, infos: dict[str, Any], facts: dict[str, Any], begun: Flags) -> None:
         """Adds to `infos` the facts of every world, and the beginnings of those in `begun`."""
-        infos |= masked(self._known(slice(None)), np.ones_like(begun))
-        if not begun.any():
-            infos |= masked(facts, ~begun)
-            return
-        infos |= spread(self._beginnings(begun), begun)
-        if not begun.all():
-            infos |= spread(mapped(facts, lambda values: values[~begun]), ~begun)
+        infos |= masked(self._known(), np.ones_like(begun))
+        some = bool(begun.any())
+        if some:
+            infos |= masked(self._beginnings(), begun, True)
+        if not (some and begun.all()):
+            infos |= masked(facts, ~begun, some)
 
-    # Facts as new arrays (N, ...) of worlds with one robot, or (N, M, ...) of teams.
+    # Facts as arrays (N, ...) of worlds with one robot, or (N, M, ...) of teams.
 
-    def _known(self, rows: Rows) -> dict[str, Any]:
-        """Facts of some worlds that are known at any time."""
-        shown = {name: self._row(self.memory[name][rows]).copy() for name in self.task.shown}
-        pose = self._row(self.simulator.data.odom[rows]).copy()
-        ages = np.zeros(len(pose))
-        return {**shown, "pose": pose, "scan_age_s": ages, "odom_age_s": ages.copy()}
+    def _known(self) -> dict[str, Any]:
+        """Copies of the facts that are known at any time."""
+        shown = {name: self._row(self.memory[name]).copy() for name in self.task.shown}
+        pose, ages = self._row(self.simulator.data.odom).copy(), np.zeros((2, self.num_envs))
+        return {**shown, "pose": pose, "scan_age_s": ages[0], "odom_age_s": ages[1]}
 
-    def _beginnings(self, rows: Flags) -> dict[str, Any]:
+    def _beginnings(self) -> dict[str, Any]:
         """Facts of episodes that begin, with the values that the randomisation drew."""
         drawn = {
-            name: self._row(values[rows]) if values.ndim > 1 else values[rows]
+            name: self._row(values) if values.ndim > 1 else values
             for name, values in self.simulator.drawn.items()
         }
         return {
-            "episode_seed": self.simulator.data.seeds[rows],
-            "start": self._row(self._starts[rows]),
-            "bodies": self._bodies[rows],
+            "episode_seed": self.simulator.data.seeds,
+            "start": self._row(self._starts),
+            "bodies": self._bodies,
             **({"randomisation": drawn} if drawn else {}),
-        }
-
-    def _facts_of_step(self, outcome: Outcome) -> dict[str, Any]:
-        """Facts of a step, for every world."""
-        data = self.simulator.data
-        return {
-            "stamp_ns": data.steps * self._period_ns,
-            "true_pose": self._row(data.pose).copy(),
-            "true_collision": self._row(data.collided).astype(np.bool_),
-            **{name: self._row(values).copy() for name, values in outcome.info.items()},
-            "reward_terms": {name: self._row(t).copy() for name, t in outcome.terms.items()},
         }
 
     def _row(self, rows: NDArray[Any]) -> NDArray[Any]:
@@ -341,7 +314,6 @@ def joined(parts: Sequence[Outcome]) -> Outcome:
     """Joins the outcomes of consecutive parts of the worlds."""
     if len(parts) == 1:
         return parts[0]
-
     terms = {name: np.concatenate([part.terms[name] for part in parts]) for name in parts[0].terms}
     info = {name: np.concatenate([part.info[name] for part in parts]) for name in parts[0].info}
     return Outcome(terms, np.concatenate([part.ended for part in parts]), info)
@@ -367,9 +339,6 @@ def named_seeds(
 
     The seed is that of the first world, or of each (None keeps its present one), or None for all.
     For `chosen` worlds that are `unnamed`, as they never had a seed, one is drawn if none is given.
-
-    Raises:
-        ConfigError: wrong number of seeds, or a negative one.
     """
     count = len(chosen)
     if isinstance(seed, Sequence | np.ndarray):
@@ -389,29 +358,17 @@ def named_seeds(
     return seeds, fresh
 
 
-def mapped(facts: Facts, function: Callable[[NDArray[Any]], NDArray[Any]]) -> dict[str, Any]:
-    """Applies a function to every array of facts."""
-    return {
-        name: mapped(values, function) if isinstance(values, Mapping) else function(values)
-        for name, values in facts.items()
-    }
+def masked(facts: Facts, mask: Flags, alone: bool = False) -> dict[str, Any]:
+    """Pairs each fact (N, ...) with the mask (N,) of its worlds, `_name`, as Gymnasium does.
 
-
-def masked(facts: Facts, mask: Flags) -> dict[str, Any]:
-    """Pairs each fact (N, ...) with the mask (N,) of its worlds, `_name`, as Gymnasium does."""
+    With `alone`, they are new arrays that are zero for the other worlds.
+    """
     paired: dict[str, Any] = {}
     for name, values in facts.items():
-        paired[name] = masked(values, mask) if isinstance(values, Mapping) else values
-        paired[f"_{name}"] = mask.copy()
+        paired[name], paired[f"_{name}"] = values, mask.copy()
+        if isinstance(values, Mapping):
+            paired[name] = masked(values, mask, alone)
+        elif alone:
+            paired[name] = np.zeros(values.shape, values.dtype)
+            paired[name][mask] = values[mask]
     return paired
-
-
-def spread(facts: Facts, mask: Flags) -> dict[str, Any]:
-    """Facts (n, ...) of the worlds of a mask (N,) as rows of all, zero for the others; `masked`."""
-
-    def placed(values: NDArray[Any]) -> NDArray[Any]:
-        rows = np.zeros((len(mask), *values.shape[1:]), values.dtype)
-        rows[mask] = values
-        return rows
-
-    return masked(mapped(facts, placed), mask)

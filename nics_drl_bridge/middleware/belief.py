@@ -13,10 +13,8 @@ from nics_drl_bridge.generator import SimulatorModel
 
 Array = NDArray[np.float64]
 
-JITTER_S = 0.2
-"""Uncertainty of the unobserved time: transmission takes longer now and then [s]."""
-MARGIN = 1.2
-"""Factor by which odometry, through noise or slip, may exceed the greatest speed."""
+JITTER_S = 0.2  # Uncertainty of the unobserved time: transmission takes longer now and then [s]
+MARGIN = 1.2  # Factor by which odometry, through noise or slip, may exceed the greatest speed
 LEVELS, MOST_CORNERS = 3, 4096
 """Values tried per variable for the greatest speed, and greatest number of combinations."""
 
@@ -49,8 +47,7 @@ class Belief(NamedTuple):
 class Foreseen(NamedTuple):
     """Result of a prediction: time [ns], mean, covariance, and the expected twist measurement.
 
-    If computed in advance, `update` is the gain (3 + S, 3) and the covariance after such a
-    measurement, which do not depend on its value.
+    If computed in advance, `update` is the gain (3 + S, 3) and the covariance after it.
     """
 
     time_ns: int
@@ -83,11 +80,9 @@ def greatest_twist(model: SimulatorModel) -> tuple[float, float]:
 class Unseen:
     """Bounds the unobserved motion of a robot, and bridges it by odometry.
 
-    Args:
-        model: of the robot.
-        process: (3 + S, 3 + S) growth of the filter's covariance per second.
-        noise: (3, 3) of the twist that odometry measures.
-        news: (3 + S,) variance of the state after possible news, see `Acceptance`; 0 for the pose.
+    The filter's covariance grows by `process` (3 + S, 3 + S) per second; `noise` (3, 3) is that of
+    the measured twist, `news` (3 + S,) the variance of the state after possible news, see
+    `Acceptance`.
     """
 
     def __init__(self, model: SimulatorModel, process: Array, noise: Array, news: Array) -> None:
@@ -104,10 +99,7 @@ class Unseen:
         return speed * longest, min(rate * longest, np.pi)
 
     def doubted(self, covariance: Array, seconds: float) -> Array:
-        """Covariance (3 + S, 3 + S) after a time in which the robot may have driven anywhere.
-
-        x, y and heading are uniformly distributed within reach.
-        """
+        """Covariance (3 + S, 3 + S) if the robot may now be anywhere within reach."""
         doubted, (far, turned) = parted(covariance), self.reach(seconds)
         variance = np.maximum(self._news, np.diag(doubted))
         variance[:3] = np.diag(doubted)[:3] + np.array([far, far, turned]) ** 2 / 3.0
@@ -115,10 +107,7 @@ class Unseen:
         return doubted
 
     def bridged(self, anchor: Anchor, odom: Array, seconds: float) -> tuple[Array, Array] | None:
-        """Returns the pose (3,) now, of which odometry has `odom`, and its covariance (3, 3).
-
-        None if the motion since the anchor is beyond reach: odometry was restarted, or jumped.
-        """
+        """Returns pose and covariance where odometry has `odom`; None if beyond reach."""
         moved = geometry.between(anchor.odom, odom)
         far, turned = self.reach(seconds)
         if not (np.hypot(*moved[:2]) <= MARGIN * far and abs(moved[2]) <= MARGIN * turned):

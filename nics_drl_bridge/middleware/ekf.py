@@ -10,15 +10,9 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.middleware import kernels
 from nics_drl_bridge.middleware.belief import Anchor, Belief, Foreseen, Unseen, parted
-from nics_drl_bridge.middleware.kernels import CommandLog, MotionModel
-from nics_drl_bridge.middleware.measurement import (
-    Acceptance,
-    Judgement,
-    Kind,
-    Measurement,
-    pose_residual,
-)
-from nics_drl_bridge.robot.kernels import SERIES, term_arrays
+from nics_drl_bridge.middleware.kernels import MotionModel, log_of, logged
+from nics_drl_bridge.middleware.measurement import Acceptance, Judgement, Kind, Measurement
+from nics_drl_bridge.robot.kernels import SERIES, term_arrays, wrap
 
 Array = NDArray[np.float64]
 
@@ -40,8 +34,7 @@ NEWS = 0.5
 """Possible error of the state of a robot that is stuck or pushed, as a share of its range."""
 REACHABLE = 2.0
 """States and commands are limited to this many times their range: the model is invalid beyond."""
-FARTHEST = 1e8
-"""Innovations beyond this [m, rad, m/s, rad/s] are never believed."""
+FARTHEST = 1e8  # Innovations beyond this [m, rad, m/s, rad/s] are never believed
 ANYWHERE = (100.0, 100.0, np.pi)
 """Standard deviation of the pose in the map of a pose sensor, by odometry alone [m, rad]."""
 LONGEST_GAP_S = 10.0
@@ -77,21 +70,17 @@ class Estimator:
         }
         self.unseen = Unseen(model, self._process, self._noise[Kind.TWIST], self._news)
         self._observe_pose = np.eye(3, 3 + size)
-        self._log = CommandLog(len(model.robot.command))
         self._filter, self._trial = (ExtendedKalmanFilter(3 + size, 3) for _ in range(2))
         self._anchor: Anchor | None = None
         self._foreseen: Foreseen | None = None  # of the present belief and commands
         self.reset(0, np.zeros(3))
 
     def reset(self, time_ns: int, pose: ArrayLike, std: ArrayLike = START_STD) -> None:
-        """Begins at a time [ns] and a pose (3,) in `map`, at rest, with a zero command.
-
-        The standard deviation of the pose [m, rad] is one number, or (3,).
-        """
+        """Begins at a time [ns] and a pose (3,) in `map`, of a deviation [m, rad], at rest."""
         mean, deviation = np.zeros(self._filter.dim_x), np.full(self._filter.dim_x, START_STD)
         mean[:3], deviation[:3] = pose, std
         self.belief = Belief(time_ns, mean, np.diag(deviation**2), (0, 0, 0), None, False)
-        self._log.clear()
+        self._log = log_of(np.zeros(len(self._least)))
 
     def anchor(self, odom: Array) -> None:
         """Records the present pose (3,) in `odom`."""
@@ -100,15 +89,15 @@ class Estimator:
     def lose(self, time_ns: int, seconds: float, continuous: bool, command: Array) -> None:
         """Continues from the last odometry, seconds ago, at a time [ns] to which the clock was set.
 
-        The robot may have driven anywhere within reach since, unless odometry is `continuous`: then
-        the next one's pose bridges the motion. The command (C,) is in effect.
+        The robot may be anywhere within reach, unless odometry is `continuous`: then the next one's
+        pose bridges the motion. The command (C,) is in effect.
         """
         anchor = self._anchor or Anchor(0, np.zeros(3), self._filter.x, self._filter.P)
         covariance = self.unseen.doubted(anchor.covariance, seconds)
         known = self._anchor is not None and continuous
         since = anchor._replace(time_ns=time_ns - round(seconds * NS_PER_S)) if known else None
         self.belief = Belief(time_ns, anchor.mean, covariance, (0, 0, 0), since, True)
-        self._log.keep(np.minimum(np.maximum(command, self._least), self._most))
+        self._log = log_of(np.minimum(np.maximum(command, self._least), self._most))
 
     @property
     def belief(self) -> Belief:
@@ -139,24 +128,21 @@ class Estimator:
         return stamp_ns + self._delay_ns
 
     def command(self, stamp_ns: int, command: ArrayLike, needed_ns: int | None = None) -> bool:
-        """Adds a command (C,) sent at a time [ns]; it takes effect one latency later.
+        """Adds a command (C,) sent at a time [ns]; False if there is one of that time.
 
-        The estimate may be set back as far as `needed_ns`, by default not at all. Returns False if
-        there already is a command of exactly that time, which is kept.
+        The estimate may be set back as far as `needed_ns`, by default not at all.
         """
         needed_ns = self.time_ns if needed_ns is None else needed_ns
         self._foreseen = None
         possible = np.minimum(np.maximum(command, self._least), self._most)
-        return self._log.add(self.effective_ns(stamp_ns), possible, needed_ns)
+        log = logged(self._log, self.effective_ns(stamp_ns), possible, needed_ns)
+        self._log = log or self._log
+        return log is not None
 
     def at(self, time_ns: int) -> tuple[Array, Array]:
-        """Predicts pose (3,) and body twist (3,) at a time, without moving the estimate.
-
-        Data that arrive later, with earlier stamps, still count in full. For a time before the
-        estimate's, the estimate itself is returned.
-        """
+        """Predicts pose (3,) and body twist (3,) at a time, without moving the estimate."""
         mean, twist = kernels.look_ahead(
-            self._filter.x, self.time_ns, time_ns, self._motion, self._log.arrays
+            self._filter.x, self.time_ns, time_ns, self._motion, self._log
         )
         return mean[:3], twist
 
@@ -188,33 +174,21 @@ class Estimator:
         return trial.K, trial.P
 
     def _forecast(self, time_ns: int) -> Foreseen:
-        log = self._log.arrays
+        own, motion, log = self._filter, self._motion, self._log
         mean, covariance = kernels.forecast(
-            self._filter.x, self._filter.P, self._process, self.time_ns, time_ns, self._motion, log
+            own.x, own.P, self._process, self.time_ns, time_ns, motion, log
         )
-        if time_ns - self.time_ns > self._motion.longest_ns:
+        if time_ns - self.time_ns > motion.longest_ns:
             covariance = self.unseen.doubted(covariance, (time_ns - self.time_ns) / NS_PER_S)
-        return Foreseen(time_ns, mean, covariance, kernels.expect(mean, time_ns, self._motion, log))
+        return Foreseen(time_ns, mean, covariance, kernels.expect(mean, time_ns, motion, log))
 
-    def update_twist(self, twist: ArrayLike) -> Judgement:
-        """Corrects by a measured body twist (3,) at the time of the estimate."""
-        return self.correct(Measurement(Kind.TWIST, np.array(twist, dtype=np.float64)))
-
-    def update_yaw_rate(self, rate: float, std: float | None = None) -> Judgement:
-        """Corrects by a measured yaw rate [rad/s]."""
-        noise = None if std is None else np.array([[std**2]])
-        return self.correct(Measurement(Kind.YAW_RATE, np.array([rate]), noise))
-
-    def update_pose(self, pose: ArrayLike, std: ArrayLike | None = None) -> Judgement:
-        """Corrects by a pose (3,) in `map`; standard deviations (3,), or the model's sensor's."""
-        noise = None if std is None else np.diag(np.asarray(std, dtype=np.float64) ** 2)
-        return self.correct(Measurement(Kind.POSE, np.array(pose, dtype=np.float64), noise))
+    def update(self, kind: Kind, value: ArrayLike, std: ArrayLike | None = None) -> Judgement:
+        """Corrects by a measured value (n,), with its standard deviations or the model's."""
+        noise = None if std is None else np.diag(np.atleast_1d(std) ** 2.0)
+        return self.correct(Measurement(kind, np.atleast_1d(value).astype(np.float64), noise))
 
     def correct(self, measurement: Measurement) -> Judgement:
-        """Corrects by a measurement at the time of the estimate, unless it is an outlier.
-
-        If the robot may have moved unobserved, the odometry's pose first bridges that motion.
-        """
+        """Corrects by a measurement at this time, after bridging unobserved motion."""
         kind, odom = measurement.kind, measurement.odom
         if self._lost and odom is not None:
             self._bridge(odom)
@@ -239,7 +213,7 @@ class Estimator:
         kind, value, noise, _ = measurement
         noise = self._noise[kind] if noise is None else noise
         expected, derivative = self._expect(kind)
-        residual = pose_residual if kind is Kind.POSE else np.subtract
+        residual = _between_poses if kind is Kind.POSE else np.subtract
         innovation = residual(value, expected)
         distance = kernels.distance(innovation, derivative, self._filter.P, noise)
         outcome = Acceptance.USED
@@ -271,8 +245,8 @@ class Estimator:
         if (here := self._foreseen_here) is not None:
             twist, derivative = here.expected
         else:
-            log = self._log.arrays
-            twist, derivative = kernels.expect(self._filter.x, self.time_ns, self._motion, log)
+            now = self.time_ns
+            twist, derivative = kernels.expect(self._filter.x, now, self._motion, self._log)
         return (twist, derivative) if kind is Kind.TWIST else (twist[2:], derivative[2:])
 
     @property
@@ -299,7 +273,6 @@ class Estimator:
         return Acceptance.JUMP if believed else Acceptance.OUTLIER
 
     def _jump(self, pose: Array, noise: Array) -> None:
-        """Replaces the estimated pose and its covariance."""
         self._filter.P = parted(self._filter.P)
         mean = np.array(self._filter.x)
         mean[:3], self._filter.P[:3, :3] = pose, noise
@@ -310,6 +283,11 @@ class Estimator:
 
 
 def _widened(low: Array, high: Array) -> tuple[Array, Array]:
-    """Returns the limits (n,) widened to the range that the filter accepts."""
     center, half = (high + low) / 2.0, REACHABLE * (high - low) / 2.0
     return center - half, center + half
+
+
+def _between_poses(measured: Array, expected: Array) -> Array:
+    difference = measured - expected
+    difference[2] = wrap(difference[2])
+    return difference

@@ -23,88 +23,41 @@ RUNAWAY = 1e9
 diverged."""
 LEAST_PIVOT = 1e-12
 """Lower bound on a variable's variance given those before it, as a share of its own variance."""
-LEAST_VARIANCE = 1e-18
-"""Absolute lower bound on that variance."""
-ROOM = 128
-"""Number of commands for which a log has room at first."""
+LEAST_VARIANCE = 1e-18  # Absolute lower bound on that variance
 
 
 class MotionModel(NamedTuple):
-    """Model of the motion.
+    """Model of the motion."""
 
-    Attributes:
-        terms, series: see `robot.kernels`.
-        step_ns: the model's step [ns].
-        longest_ns: longest gap that is predicted [ns].
-    """
-
-    terms: Terms
+    terms: Terms  # `terms`, `series`: see `robot.kernels`
     series: Array
-    step_ns: int
-    longest_ns: int
+    step_ns: int  # the model's step [ns]
+    longest_ns: int  # longest gap that is predicted [ns]
 
 
 class Log(NamedTuple):
-    """Commands (K, C) and when they take effect [ns] (K,); the first `used` rows count."""
+    """Commands in the order in which they take effect; the first is in effect before, too."""
 
-    effective: NDArray[np.int64]
-    commands: Array
-    used: int
+    effective: NDArray[np.int64]  # (K,) [ns]
+    commands: Array  # (K, C)
 
 
-class CommandLog:
-    """Commands (C,) in the order in which they take effect; before the first, zero."""
+def log_of(command: ArrayLike) -> Log:
+    """Returns the log of one command (C,), which is always in effect."""
+    return Log(np.full(1, np.iinfo(np.int64).min), np.array([command], np.float64))
 
-    def __init__(self, width: int) -> None:
-        self._effective = np.empty(ROOM, dtype=np.int64)
-        self._commands = np.zeros((ROOM, width))
-        self.clear()
 
-    @property
-    def arrays(self) -> Log:
-        """The commands, for the kernels."""
-        return Log(self._effective, self._commands, self._count)
-
-    def clear(self) -> None:
-        """Forgets all commands."""
-        self.keep(0.0)
-
-    def keep(self, command: ArrayLike) -> None:
-        """Forgets all commands but this one (C,), which counts as always in effect."""
-        self._effective[0], self._commands[0] = np.iinfo(np.int64).min, command
-        self._count = 1
-
-    def add(self, effective_ns: int, command: ArrayLike, needed_ns: int) -> bool:
-        """Adds a command (C,) that takes effect at a time [ns].
-
-        Commands superseded before `needed_ns` may be forgotten. Returns False if there already is
-        a command of exactly that time, which is kept.
-        """
-        if self._count == len(self._effective):
-            self._make_room(needed_ns)
-        place = end = self._count
-        while self._effective[place - 1] >= effective_ns:
-            place -= 1
-        if place < end and self._effective[place] == effective_ns:
-            return False
-        if place < end:
-            self._effective[place + 1 : end + 1] = self._effective[place:end].copy()
-            self._commands[place + 1 : end + 1] = self._commands[place:end].copy()
-        self._effective[place], self._commands[place] = effective_ns, command
-        self._count += 1
-        return True
-
-    def _make_room(self, needed_ns: int) -> None:
-        """Drops commands that are no longer needed; doubles the capacity if that is not enough."""
-        used, size = self._effective[: self._count], len(self._effective)
-        first = max(int(np.searchsorted(used, needed_ns, side="right")) - 1, 0)
-        kept = slice(first, self._count)
-        self._count -= first
-        size *= 2 if self._count > size // 2 else 1
-        self._effective = np.resize(self._effective[kept], size)
-        self._commands = np.resize(self._commands[kept], (size, self._commands.shape[1]))
-        # The first command kept counts as in effect at all earlier times.
-        self._effective[0] = np.iinfo(np.int64).min
+def logged(log: Log, effective_ns: int, command: ArrayLike, needed_ns: int) -> Log | None:
+    """Adds a command (C,), and drops those over before `needed_ns`; None for a duplicate."""
+    effective, commands = log
+    place = int(np.searchsorted(effective, effective_ns))
+    if place < len(effective) and effective[place] == effective_ns:
+        return None
+    first = min(place, max(int(np.searchsorted(effective, needed_ns)) - 1, 0))
+    return Log(
+        np.concatenate([effective[first:place], [effective_ns], effective[place:]]),
+        np.concatenate([commands[first:place], [command], commands[place:]]),
+    )
 
 
 @kernel(allocates=True)
@@ -124,10 +77,7 @@ def rates_jacobian(jacobian, x, terms):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def predict(mean, transition, command, dt, steps, motion):  # type: ignore[no-untyped-def]
-    """Moves the mean by `steps` steps of `dt` [s] under one command (C,), in place.
-
-    The transition is multiplied in place by the Jacobian of the motion.
-    """
+    """Moves the mean by `steps` of `dt` [s] under a command (C,), multiplying the transition."""
     size, width = mean.shape[0] - 3, command.shape[0]
     x, dq = np.ones(size + width + 1), np.zeros(3 + size)
     jacobian, step = np.zeros((3 + size, size + width)), np.eye(3 + size)
@@ -158,7 +108,7 @@ def predict(mean, transition, command, dt, steps, motion):  # type: ignore[no-un
 @kernel(allocates=True)
 def in_effect(log, time):  # type: ignore[no-untyped-def]
     """Index of the command in effect just before a time: the last that took effect earlier."""
-    low, high = 0, log.used
+    low, high = 0, log.effective.shape[0]
     while low < high:
         middle = (low + high) // 2
         if log.effective[middle] < time:
@@ -183,7 +133,7 @@ def carry(mean, transition, begin, end, motion, log):  # type: ignore[no-untyped
     now, k = begin, in_effect(log, begin + 1)
     while now < end:
         until = end
-        if k + 1 < log.used and log.effective[k + 1] < end:
+        if k + 1 < log.effective.shape[0] and log.effective[k + 1] < end:
             until = log.effective[k + 1]
         steps, rest = (until - now) // step, (until - now) % step
         predict(mean, transition, commands[k], step / NS_PER_S, steps, motion)
@@ -236,11 +186,9 @@ def distance(innovation, derivative, covariance, noise):  # type: ignore[no-unty
 
 @kernel(allocates=True)
 def settle(mean, covariance, low, high):  # type: ignore[no-untyped-def]
-    """Restores the constraints of an estimate, in place.
+    """Wraps the heading, clips the state to its limits (S,), makes the covariance symmetric.
 
-    The heading is wrapped to [-pi, pi), the state clipped to its limits (S,), the covariance made
-    symmetric. Where rounding left a pivot of its Cholesky factor too small, the variance is raised
-    to make it positive.
+    Where rounding left a pivot of its Cholesky factor too small, the variance is raised.
     """
     size = mean.shape[0]
     mean[2] = wrap(mean[2])

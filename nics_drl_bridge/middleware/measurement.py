@@ -9,8 +9,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nics_drl_bridge.robot.kernels import wrap
-
 Array = NDArray[np.float64]
 
 SCAN, ODOM, CMD_VEL, POSE, IMU = "scan", "odom", "cmd_vel", "pose", "imu"
@@ -56,23 +54,17 @@ class Acceptance(IntEnum):
 
 
 class Judgement(NamedTuple):
-    """The estimator's verdict on a measurement, with its squared, normalised innovation.
-
-    That distance is close to the number of components of the value if the filter is consistent.
-    """
+    """The estimator's verdict on a measurement, with its squared, normalised innovation."""
 
     distance: float
     outcome: Acceptance
 
 
 def checked_covariance(covariance: ArrayLike | None, size: int, least_std: float) -> Array | None:
-    """Returns a covariance (size, size) that the filter can use; None if it is unknown.
+    """Returns a covariance (size, size) that the filter can use; None if it is unknown (or zeros).
 
-    All zeros means unknown, as in ROS messages. The standard deviation in any direction is raised
-    to `least_std`.
-
-    Raises:
-        ValueError: it is not a covariance.
+    The standard deviation in any direction is raised to `least_std`. Raises ValueError if it is no
+    covariance.
     """
     if covariance is None:
         return None
@@ -88,13 +80,6 @@ def checked_covariance(covariance: ArrayLike | None, size: int, least_std: float
     if least <= 0.0:
         raise ValueError("covariance: not positive definite")
     return given + max(least_std**2 - least, 0.0) * np.eye(size)
-
-
-def pose_residual(measured: Array, expected: Array) -> Array:
-    """Residual of two poses (3,), with the heading in [-pi, pi)."""
-    difference = measured - expected
-    difference[2] = wrap(difference[2])
-    return difference
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, RobotView
 from nics_drl_bridge.lidar.sensor import unread
+from nics_drl_bridge.middleware import timeline
 from nics_drl_bridge.middleware.ekf import LEAST_POSE_STD, LEAST_TWIST_STD, START_STD, Estimator
 from nics_drl_bridge.middleware.measurement import (
     CMD_VEL,
@@ -25,28 +26,17 @@ from nics_drl_bridge.middleware.measurement import (
     TopicHealth,
     checked_covariance,
 )
-from nics_drl_bridge.middleware.timeline import (
-    BEFORE_START,
-    TOO_OLD,
-    ReportedPose,
-    Stamps,
-    Timeline,
-    Trail,
-)
+from nics_drl_bridge.middleware.timeline import ReportedPose, Stamps
 
 Array = NDArray[np.float64]
 
 NOT_FINITE = "NaN or inf"
 LEAST_STD = {Kind.YAW_RATE: LEAST_TWIST_STD, Kind.POSE: LEAST_POSE_STD}
-RATE_OVER = 32
-"""Number of arrivals over which rates are computed."""
+RATE_OVER = 32  # Number of arrivals over which rates are computed
 
 
 class Datum(NamedTuple):
-    """A message as it arrived, with the number of earlier data of its topic.
-
-    The stamp is that of its header, the arrival is on the clock of the receiver.
-    """
+    """A message with its stamp, arrival on the receiver's clock, and number of earlier ones."""
 
     stamp_ns: int
     arrival_ns: int
@@ -59,8 +49,8 @@ class TopicCache:
     """The newest datum, number and latest arrivals [ns] by topic; rejected data by reason."""
 
     newest: dict[str, Datum] = field(default_factory=dict)
-    rejected: dict[str, int] = field(default_factory=dict)
-    received: dict[str, int] = field(default_factory=dict)
+    rejected: Counter[str] = field(default_factory=Counter)
+    received: Counter[str] = field(default_factory=Counter)
     arrivals: dict[str, deque[int]] = field(default_factory=dict)
 
     def put(self, topic: str, stamp_ns: int, arrival_ns: int, value: Any) -> bool:
@@ -74,15 +64,15 @@ class TopicCache:
 
     def take(self, topic: str, stamp_ns: int, arrival_ns: int, value: Any) -> None:
         """Counts a datum, and stores it if it is the newest: late data may be useful, too."""
-        held, count = self.newest.get(topic), self.received.get(topic, 0)
+        held = self.newest.get(topic)
         if held is None or stamp_ns > held.stamp_ns:
-            self.newest[topic] = Datum(stamp_ns, arrival_ns, count, value)
-        self.received[topic] = count + 1
+            self.newest[topic] = Datum(stamp_ns, arrival_ns, self.received[topic], value)
+        self.received[topic] += 1
         self.arrivals.setdefault(topic, deque(maxlen=RATE_OVER)).append(arrival_ns)
 
     def reject(self, reason: str) -> bool:
         """Counts a rejected datum; False."""
-        self.rejected[reason] = self.rejected.get(reason, 0) + 1
+        self.rejected[reason] += 1
         return False
 
     def age_s(self, topic: str, now_ns: int) -> float:
@@ -114,18 +104,13 @@ class Middleware:
         self._beams, self._width = model.lidar.beams, len(model.robot.command)
         self._sensors = model.sensors
         self.estimator = Estimator(model)
-        self._timeline = Timeline(self.estimator)
-        self._trail = Trail(self.estimator.unseen.walk)
+        self._timeline = timeline.Timeline(self.estimator)
+        self._trail = timeline.Trail(self.estimator.unseen.walk)
         self._stamps = Stamps(round(model.control_period * NS_PER_S))
-        self._off_the_clock = (self._stamps.from_the_future, TOO_OLD, BEFORE_START)
         self.reset(0, np.zeros(3))
 
     def reset(self, time_ns: int, pose: ArrayLike, std: ArrayLike = START_STD) -> None:
-        """Forgets everything; the robot is at rest at a pose (3,) in `map`.
-
-        Data that are not newer than `time_ns` correct nothing. The standard deviation of the pose
-        [m, rad] is one number, or (3,).
-        """
+        """Forgets everything; the robot is at rest at a pose (3,) in `map`, with a deviation."""
         self.cache = TopicCache()
         self._clock_jumps = 0
         self._commanded = np.zeros(self._width)
@@ -166,10 +151,6 @@ class Middleware:
             reason = self._stamps.fault(stamp_ns, arrival_ns)
             reason = reason or self._timeline.command(stamp_ns, value)
         return not reason or self.cache.reject(f"{CMD_VEL}: {reason}")
-
-    def foresee(self, stamp_ns: int) -> None:
-        """Prepares for the next expected odometry, of a stamp [ns]."""
-        self.estimator.foresee(stamp_ns)
 
     def scan(self, stamp_ns: int, arrival_ns: int, ranges: NDArray[np.float32]) -> bool:
         """Takes a scan (B,); True if it was used. Only the newest scan is kept."""
@@ -226,7 +207,7 @@ class Middleware:
         reason = self._measure(stamp_ns, arrival_ns, measurement, (pose, twist))
         if not reason:
             self._trail.use(odometry)
-        elif reason in self._off_the_clock:
+        elif reason in (self._stamps.from_the_future, timeline.TOO_OLD, timeline.BEFORE_START):
             if self._stamps.refuse():
                 self._follow_clock(odometry)
             else:
@@ -236,19 +217,13 @@ class Middleware:
     def pose(
         self, stamp_ns: int, arrival_ns: int, pose: ArrayLike, covariance: ArrayLike | None = None
     ) -> bool:
-        """Takes a pose (3,) in `map`, as of motion capture or AMCL; True if it was accepted.
-
-        Its covariance (3, 3) is the model's pose noise if it is None or all zeros.
-        """
+        """Takes a pose (3,) in `map`, by default with the model's covariance; True if used."""
         return self._optional(Kind.POSE, stamp_ns, arrival_ns, pose, covariance)
 
     def imu(
         self, stamp_ns: int, arrival_ns: int, yaw_rate: float, variance: float | None = None
     ) -> bool:
-        """Takes a gyro's yaw rate, counter-clockwise [rad/s]; True if it was accepted.
-
-        Its variance [rad^2/s^2] is that of a cheap gyro if it is None or zero.
-        """
+        """Takes a yaw rate [rad/s], by default with a cheap gyro's variance; True if used."""
         covariance = None if variance is None else [[variance]]
         return self._optional(Kind.YAW_RATE, stamp_ns, arrival_ns, [yaw_rate], covariance)
 
@@ -278,10 +253,9 @@ class Middleware:
         return reason
 
     def _follow_clock(self, odometry: ReportedPose) -> None:
-        """Continues from an odometry to whose stamp the clock was set.
+        """Continues from an odometry to whose stamp the clock was set, by the motion that it shows.
 
-        Starts at the estimate after the last used odometry and adds the motion that odometry
-        shows since; if odometry is not continuous, the robot may be anywhere within reach.
+        If odometry is not continuous, the robot may be anywhere within reach.
         """
         seconds, continuous = self._trail.seconds(odometry), self._trail.continuous(odometry)
         self.estimator.lose(odometry.stamp_ns, seconds, continuous, self._commanded)
@@ -338,10 +312,7 @@ class Middleware:
 
 
 def rehearse(model: SimulatorModel) -> RobotView:
-    """Runs a middleware through two periods of a robot at rest; returns its last view.
-
-    This compiles everything beforehand, which could take seconds while the robot moves.
-    """
+    """Compiles all by two periods of a robot at rest: it could take seconds while a robot moves."""
     middleware, period_ns = Middleware(model), round(model.control_period * 1e9)
     middleware.reset(0, np.zeros(3))
     still, free = np.zeros(3), np.full(model.lidar.beams, np.inf, np.float32)

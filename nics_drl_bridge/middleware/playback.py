@@ -40,18 +40,13 @@ TYPES: Mapping[str, tuple[str, ...]] = {
 }
 ALWAYS = (SCAN, ODOM, CMD_VEL)
 """Roles whose topics are used if the bag has them; the others only on request."""
-APART_S = 1.0
-"""Greatest difference between stamps of one clock at the same time of receipt [s]."""
+APART_S = 1.0  # Greatest difference between stamps of one clock at the same time of receipt [s]
 COLUMNS = ("x", "y", "heading", "vx", "vy", "wz")
 
 
 @dataclass(frozen=True)
 class EstimatedDrive:
-    """Estimates of the middleware over a drive, after each odometry that was the newest.
-
-    T stamps [ns], poses (T, 3) in `map` with their covariances (T, 3, 3), body twists (T, 3), and
-    the number of data that were not used, by reason.
-    """
+    """Estimates of the middleware over a drive, after each odometry that was the newest (T)."""
 
     stamp_ns: NDArray[np.int64]
     pose: Array
@@ -72,9 +67,8 @@ def estimate(path: str | Path, model: SimulatorModel, topics: Mapping[str, str])
     The estimate is identical in every run and on every machine with the same versions. `topics` are
     by role, see `chosen`.
 
-    Raises:
-        RecordingError: the bag is damaged, a topic is missing or of a wrong type, or its data
-            are stamped by several clocks.
+    Raises RecordingError if the bag is damaged, a topic is missing or of a wrong type, or the data
+    are stamped by several clocks.
     """
     messages = played(path, topics)
     playback, rows = Playback(model, POSE in messages), []
@@ -105,13 +99,10 @@ def played(path: str | Path, topics: Mapping[str, str]) -> dict[str, list[Messag
 
 
 def chosen(bag: BagFile, topics: Mapping[str, str]) -> dict[str, str]:
-    """Returns the topic of each role that is played.
+    """Returns the topic of each role that is played; RecordingError if it is missing or wrong.
 
     Those of `scan`, `odom` and `cmd_vel` are by default the topics of these names; `pose` and `imu`
     are left out unless `topics` names them.
-
-    Raises:
-        RecordingError: a topic does not exist or is of a wrong type, or there is no `odom`.
     """
     roles = {}
     for role, kinds in TYPES.items():
@@ -140,7 +131,6 @@ def chosen(bag: BagFile, topics: Mapping[str, str]) -> dict[str, str]:
 def _check_clocks(
     place: str, roles: Mapping[str, str], messages: Mapping[str, list[Message]]
 ) -> None:
-    """Raises RecordingError if the stamps are not of one clock."""
     stamps = {
         role: np.array([(m.receive_ns, stamp(m.content)) for m in some], dtype=np.int64)
         for role, some in messages.items()

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
-from operator import index
+from operator import attrgetter, index
 from typing import NamedTuple
 
 import numpy as np
@@ -20,8 +21,7 @@ from nics_drl_bridge.middleware.measurement import Acceptance, Judgement, Kind, 
 
 Array = NDArray[np.float64]
 
-HISTORY_NS = NS_PER_S
-"""Length of the past that may still change [ns]."""
+HISTORY_NS = NS_PER_S  # Length of the past that may still change [ns]
 BEFORE_START = "not after the reset"
 TOO_OLD = f"older than {HISTORY_NS / NS_PER_S:g} s"
 DUPLICATE = "duplicate"
@@ -41,8 +41,7 @@ a measure of time."""
 SIGMA, LEAST = 6.0, 0.01
 """Greatest difference between odometry's pose and twist, in standard deviations, and the one that
 is always allowed [m, rad]."""
-STILL = 0.02
-"""Slower motion [m/s, rad/s] gives no information about time."""
+STILL = 0.02  # Slower motion [m/s, rad/s] gives no information about time
 
 Moment = tuple[int, int]
 """Stamp [ns] and kind: the order of measurements, whatever the order of their arrival."""
@@ -69,7 +68,6 @@ class Timeline:
 
     def __init__(self, estimator: Estimator) -> None:
         self._estimator = estimator
-        self._entries: deque[_Entry] = deque()
         self.reset()
 
     def reset(self) -> None:
@@ -78,8 +76,7 @@ class Timeline:
         self._past: Counter[tuple[Kind, Acceptance]] = Counter()
         self._distances: dict[Kind, float] = {}
         self.replayed = 0
-        self._entries.clear()
-        self._entries.append(_Entry((self._start_ns, -1), self._estimator.belief))
+        self._entries = deque([_Entry((self._start_ns, -1), self._estimator.belief)])
 
     @property
     def newest_ns(self) -> int:
@@ -93,20 +90,21 @@ class Timeline:
             self._entries[0].belief = self._estimator.belief
 
     def measure(self, stamp_ns: int, measurement: Measurement) -> str:
-        """Takes a measurement; returns the reason if it cannot be used, or an empty string.
-
-        The verdict of the gate is no such reason: it may change with data still to come.
-        """
+        """Takes a measurement; returns the reason if it cannot be used, or an empty string."""
         moment = (stamp_ns, measurement.kind)
-        if moment > self._entries[-1].moment and stamp_ns > self._start_ns:
+        if stamp_ns <= self._start_ns:
+            return BEFORE_START
+        if stamp_ns < self.newest_ns - HISTORY_NS:
+            return TOO_OLD
+        place = bisect_left(self._entries, moment, key=attrgetter("moment"))
+        if place == len(self._entries):
             self._entries.append(self._run(moment, measurement))
             self._forget()
-            return ""
-        place, reason = self._place(moment)
-        if reason:
-            return reason
-        self._entries.insert(place, _Entry(moment, self._entries[0].belief, measurement))
-        self._rerun(place)
+        elif self._entries[place].moment == moment:
+            return DUPLICATE
+        else:
+            self._entries.insert(place, _Entry(moment, self._entries[0].belief, measurement))
+            self._rerun(place)
         return ""
 
     def command(self, stamp_ns: int, command: ArrayLike) -> str:
@@ -119,10 +117,7 @@ class Timeline:
         if not self._estimator.command(stamp_ns, command, self._entries[0].moment[0]):
             return DUPLICATE
         if effective_ns < self.newest_ns:
-            place = len(self._entries)
-            while self._entries[place - 1].moment[0] > effective_ns:
-                place -= 1
-            self._rerun(place)
+            self._rerun(bisect_right(self._entries, effective_ns, key=lambda e: e.moment[0]))
         return ""
 
     def outcomes(self) -> Mapping[tuple[Kind, Acceptance], int]:
@@ -134,26 +129,12 @@ class Timeline:
         """Returns the squared, normalised innovation of the newest measurement of each kind."""
         return self._distances | {kind: each.distance for kind, each in _verdicts(self._entries)}
 
-    def _place(self, moment: Moment) -> tuple[int, str]:
-        """Returns the place of a late measurement, or the reason if it cannot be used."""
-        if moment[0] <= self._start_ns:
-            return 0, BEFORE_START
-        if moment[0] < self.newest_ns - HISTORY_NS:
-            return 0, TOO_OLD
-        place = len(self._entries)
-        while self._entries[place - 1].moment >= moment:
-            place -= 1
-            if self._entries[place].moment == moment:
-                return 0, DUPLICATE
-        return place, ""
-
     def _run(self, moment: Moment, measurement: Measurement) -> _Entry:
         self._estimator.predict(moment[0])
         verdict = self._estimator.correct(measurement)
         return _Entry(moment, self._estimator.belief, measurement, verdict)
 
     def _rerun(self, place: int) -> None:
-        """Re-runs the filter over all entries from a place on."""
         self._estimator.belief = self._entries[place - 1].belief
         for k in range(place, len(self._entries)):
             entry = self._entries[k]
@@ -258,10 +239,7 @@ class Trail:
         self._refused.append(odometry)
 
     def contradicts(self, odometry: ReportedPose) -> bool:
-        """True if an odometry's path and arrival both show that the clock was set by a little.
-
-        Such stamps look like late data, or like data after a gap.
-        """
+        """True if path and arrival of an odometry both show that the clock was set by a little."""
         if len(self._recent) <= IN_STEP:
             return False
         last = self._recent[-1]
@@ -270,12 +248,8 @@ class Trail:
             return False
         if not all(self._in_step(*pair) for pair in pairwise(self._recent)):
             return False
-        seconds, stamped, arrived = (
-            _seconds(last, odometry, 0.0),
-            passed / NS_PER_S,
-            waited / NS_PER_S,
-        )
-        clear = CONTRADICTED_NS / NS_PER_S
+        seconds, clear = _seconds(last, odometry, 0.0), CONTRADICTED_NS / NS_PER_S
+        stamped, arrived = passed / NS_PER_S, waited / NS_PER_S
         return (
             seconds > 0.0
             and abs(seconds - arrived) <= max(0.5 * arrived, 0.5 * clear)

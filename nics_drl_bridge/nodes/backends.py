@@ -210,7 +210,7 @@ class DdsBackend:
             self._link.check_alone()
             self._middleware.command(self._now_ns, self._robot.from_cmd_vel(twist))
             self._now_ns += self._period_ns
-            self._middleware.foresee(self._now_ns)
+            self._middleware.estimator.foresee(self._now_ns)
 
     def receive(self) -> tuple[RobotView, dict[str, Any]]:
         """The second half: waits for the data after the command; returns the view and `info`."""

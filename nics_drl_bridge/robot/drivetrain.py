@@ -48,12 +48,9 @@ def steering_angle(spec: RobotSpec) -> StateVariable:
 
 
 def wheeled(
-    spec: RobotSpec,
-    inverse: Array,
-    forward: Array,
-    fields: tuple[CmdVelField, ...],
+    spec: RobotSpec, inverse: Array, forward: Array, fields: tuple[CmdVelField, ...],
     moves: tuple[str, ...],
-) -> Textbook:
+) -> Textbook:  # fmt: skip
     """Builds the kinematics of a robot whose twist is linear in its wheel speeds, its state.
 
     `inverse` (S, C) gives wheel speeds per command, in the order of `fields`; `forward` (3, S) the
@@ -91,7 +88,6 @@ def _commands(spec: RobotSpec, fields: tuple[CmdVelField, ...]) -> list[int]:
 
 
 def _states(spec: RobotSpec) -> tuple[int, int]:
-    """Returns the indices of speed and steering angle in the state."""
     have = [v.unit for v in spec.state]
     if sorted(have) != ["m/s", "rad"]:
         raise ConfigError(
@@ -102,7 +98,6 @@ def _states(spec: RobotSpec) -> tuple[int, int]:
 
 
 def _actuators(p: dict[str, float], parts: tuple[str, ...]) -> tuple[Array, Array]:
-    """Returns time constants and greatest rates (S,) of actuators, by parameter names."""
     rate = np.array([p.get(f"{part}_rate", np.inf) for part in parts])
     lag = [p[f"{part}_lag"] if f"{part}_rate" not in p else 1.0 for part in parts]
     return np.array(lag), rate

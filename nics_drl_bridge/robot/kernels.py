@@ -33,19 +33,13 @@ GREATEST_ORDER = 4
 
 
 class Terms(NamedTuple):
-    """The kept terms of a model.
+    """The kept terms of a model."""
 
-    Attributes:
-        dof: (T,) degree of freedom of each.
-        coefficient: (T,), or (T, n) of n robots.
-        factors: (T, order) indices into `x`; unused ones point to its last entry, which is 1.
-        degree: (T,) number of factors.
-    """
-
-    dof: NDArray[np.int64]
-    coefficient: Array
+    dof: NDArray[np.int64]  # (T,) degree of freedom of each
+    coefficient: Array  # (T,), or (T, n) of n robots
+    # (T, order) indices into `x`; unused ones point to its last entry, which is 1
     factors: NDArray[np.int64]
-    degree: NDArray[np.int64]
+    degree: NDArray[np.int64]  # (T,) number of factors
 
 
 def term_arrays(model: TaylorModel) -> Terms:
@@ -154,12 +148,9 @@ def _own(value, lane):  # type: ignore[no-untyped-def]
 def run(pose, x, dq, terms, series, dt, steps):  # type: ignore[no-untyped-def]
     """Moves a batch of robots by the same number of steps of dt [s], under constant commands.
 
-    Args:
-        pose: (6, n) x, y [m], cosine and sine of the heading, heading [rad], and an upper bound
-            of the path length [m], updated in place; the heading is not wrapped.
-        x: (S + C + 1, n); the state is updated in place.
-        dq: (3 + S, n) scratch memory; contains the rates of the last step afterwards.
-        terms: coefficients may be (T, n), one per robot.
+    Updated in place are `pose` (6, n), x, y [m], cosine, sine and value of the heading, unwrapped,
+    and an upper bound of the path length [m], and the state in `x` (S + C + 1, n). `dq` (3 + S, n)
+    are the rates of the last step; coefficients may be (T, n).
     """
     for _ in range(steps):
         _rates_of_all(dq, x, terms)
@@ -234,11 +225,7 @@ def _move_widely(pose, dq, dt, series):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def rollout(poses, states, commands, terms, series, dt):  # type: ignore[no-untyped-def]
-    """Rolls out robots open-loop under commands (W, T, C), one per step of dt [s].
-
-    The first of poses (W, T + 1, 3) and states (W, T + 1, S) is given, the others are written;
-    headings are not wrapped.
-    """
+    """Rolls out robots from the first of poses (W, T + 1, 3) under commands (W, T, C)."""
     size, width = states.shape[2], commands.shape[2]
     x, dq = np.ones(size + width + 1), np.zeros(3 + size)
     for w in range(poses.shape[0]):

@@ -18,20 +18,14 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Textbook:
-    """Textbook kinematics of a robot.
+    """Textbook kinematics of a robot."""
 
-    Attributes:
-        twist: gives the body twist (..., 3) for a state (..., S).
-        target: gives the state (..., S) that a command (..., C) requests.
-        lag: (S,) time constants of first-order actuators [s].
-        rate: (S,) greatest rates of rate-limited actuators [its unit/s]; inf for first-order ones.
-        structure: possible products of state variables in each degree of freedom of the twist.
-    """
-
-    twist: Callable[[Array], Array]
-    target: Callable[[Array], Array]
-    lag: Array
+    twist: Callable[[Array], Array]  # gives the body twist (..., 3) for a state (..., S)
+    target: Callable[[Array], Array]  # gives the state (..., S) that a command (..., C) requests
+    lag: Array  # (S,) time constants of first-order actuators [s]
+    # (S,) greatest rates of rate-limited actuators [its unit/s]; inf for first-order ones
     rate: Array
+    # possible products of state variables in each degree of freedom of the twist
     structure: dict[str, tuple[str, ...]]
 
     def respond(self, state: Array, goal: Array, t: Array | float) -> Array:
@@ -48,10 +42,7 @@ class Textbook:
 
 @dataclass(frozen=True)
 class Pivot:
-    """Vertical axis about which a wheel is steered: its link and joint, and the steering angle.
-
-    A joint of another name than the variable's follows the variable's joint.
-    """
+    """Vertical axis about which a wheel is steered; another joint follows the variable's."""
 
     link: str
     joint: str
@@ -74,10 +65,7 @@ class Wheel:
 
 @dataclass(frozen=True)
 class Drawing:
-    """Looks of a robot: its wheels, and a box (length, width) or a cylinder (radius) as body [m].
-
-    `centre` is x and height of the body's centre above `base_link` [m].
-    """
+    """Looks of a robot: wheels, a box (length, width) or cylinder (radius), its x and height."""
 
     body: tuple[float, float] | float
     centre: tuple[float, float]
@@ -95,8 +83,7 @@ class RobotKind:
 def textbook(spec: RobotSpec) -> Textbook:
     """Returns the textbook kinematics of a robot, with the parameters of its spec.
 
-    Raises:
-        ConfigError: the spec names none, lacks a parameter, or has other variables.
+    Raises ConfigError if the spec names none, lacks a parameter, or has other variables.
     """
     return _made(spec, lambda kind: kind.kinematics(spec))
 
@@ -135,9 +122,7 @@ def require_textbook(spec: RobotSpec) -> str:
 def steady_twist(spec: RobotSpec, command: ArrayLike) -> Array:
     """Returns the body twist (..., 3) to which commands (..., C) lead when they are held.
 
-    Raises:
-        ConfigError: the robot steers, and neither its textbook kinematics nor its wheelbase is
-            known.
+    Raises ConfigError if it steers, and neither its kinematics nor its wheelbase is known.
     """
     if spec.steers and spec.textbook is not None:
         book = textbook(spec)

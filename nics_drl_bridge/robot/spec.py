@@ -32,8 +32,7 @@ Unit = Literal["m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N*m", "V", 
 """SI units of a state or a command; 1 for a ratio or a count."""
 MOST_CORNERS, MOST_VARIABLES = 512, 32
 """Greatest number of corners of a footprint, and of variables of a state or a command."""
-FASTEST = 1e6
-"""Greatest absolute value of a variable, in its unit."""
+FASTEST = 1e6  # Greatest absolute value of a variable, in its unit
 
 
 def kind_names() -> list[str]:
@@ -73,10 +72,7 @@ class Variable(Schema):
 
 
 class StateVariable(Variable):
-    """A component of the state.
-
-    If all name the command that they follow with a lag, the recording may lack the state.
-    """
+    """A component of the state, and the command that it follows with a lag, if any."""
 
     follows: str | None = None
 
@@ -103,28 +99,24 @@ class CommandVariable(Variable):
 
 
 class RobotSpec(Schema):
-    """Definition of a robot.
-
-    Attributes:
-        textbook: its kind: the textbook kinematics for its synthetic recordings, whose structure
-            may also be assumed for motion that a drive did not show.
-        parameters: of the textbook kinematics [m, s], see the module of that kind.
-        footprint_radius: of a circle around `base_link` [m]; optional with a `footprint`, which it
-            then circumscribes.
-        footprint: corners of a polygon instead, in `base_link` [m], in either direction.
-        state: S components, in the order of every state vector.
-        command: C components, in the order of every command vector.
-    """
+    """Definition of a robot."""
 
     name: str
     description: str = ""
+    # its kind: the textbook kinematics for its synthetic recordings, whose structure may also be
+    # assumed for motion that a drive did not show
     textbook: str | None = None
+    # of the textbook kinematics [m, s], see the module of that kind
     parameters: dict[str, float] = Field(default_factory=dict)
+    # of a circle around `base_link` [m]; optional with a `footprint`, which it then circumscribes
     footprint_radius: float = Field(ge=1e-3, le=1e3)
+    # corners of a polygon instead, in `base_link` [m], in either direction
     footprint: tuple[tuple[float, float], ...] | None = Field(
         default=None, min_length=3, max_length=MOST_CORNERS
     )
+    # S components, in the order of every state vector
     state: tuple[StateVariable, ...] = Field(default=(), max_length=MOST_VARIABLES)
+    # C components, in the order of every command vector
     command: tuple[CommandVariable, ...] = Field(min_length=1, max_length=MOST_VARIABLES)
 
     @field_validator("textbook")
@@ -250,7 +242,6 @@ class RobotSpec(Schema):
 
 
 def _reach(outline: ArrayLike) -> float:
-    """Radius of the circle around the origin that circumscribes an outline (V, 2)."""
     return float(np.hypot(*np.array(outline, dtype=np.float64).T).max())
 
 
@@ -280,9 +271,5 @@ def _edges_cross(corners: NDArray[np.float64]) -> bool:
 
 
 def load_robot(name: str | Path) -> RobotSpec:
-    """Loads a shipped robot by name (`ackermann`), or any robot by the path of its YAML file.
-
-    Raises:
-        ConfigError: unknown name or wrong key, with the nearest valid one.
-    """
+    """Loads a shipped robot by name (`ackermann`), or any robot by the path of its YAML file."""
     return load_yaml(find_config(name, "robots"), RobotSpec)

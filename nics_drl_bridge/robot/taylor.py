@@ -19,29 +19,21 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TaylorModel:
-    """`dQ/dt = A chi(X)` without the pruned terms (Eq. 1, 2).
+    """`dQ/dt = A chi(X)` without the pruned terms (Eq. 1, 2)."""
 
-    Attributes:
-        variables: V names of X = [state, command].
-        dofs: D = 3 + S names of dQ/dt: vx, vy, wz of the body twist, then the state's rates.
-        powers: (K, V) exponents of the terms that any degree of freedom keeps.
-        coefficients: (D, K); zero where a degree of freedom does not keep a term.
-        dt: the step for which the rates are valid [s]; the simulator's step.
-        low, high: (V,) the box of X that the recording covered.
-        assumed: terms (dof, term) that the drive could not show, of the textbook's structure.
-        std_errors: (D, K) of the coefficients; NaN for a kept one that was not estimated but
-            assumed or fixed by definition. Empty, (0, 0), if none is known.
-    """
-
-    variables: tuple[str, ...]
+    variables: tuple[str, ...]  # V names of X = [state, command]
+    # D = 3 + S names of dQ/dt: vx, vy, wz of the body twist, then the state's rates
     dofs: tuple[str, ...]
     dof_units: tuple[str, ...]
-    powers: NDArray[np.int64]
-    coefficients: Array
-    dt: float
-    low: Array
+    powers: NDArray[np.int64]  # (K, V) exponents of the terms that any degree of freedom keeps
+    coefficients: Array  # (D, K); zero where a degree of freedom does not keep a term
+    dt: float  # the step for which the rates are valid [s]; the simulator's step
+    low: Array  # `low`, `high`: (V,) the box of X that the recording covered
     high: Array
+    # terms (dof, term) that the drive could not show, of the textbook's structure
     assumed: tuple[tuple[str, str], ...] = ()
+    # (D, K) of the coefficients; NaN for a kept one that was not estimated but assumed or fixed by
+    # definition. Empty, (0, 0), if none is known
     std_errors: Array = field(default_factory=lambda: np.zeros((0, 0)))
     quality: Quality | None = None
 
@@ -60,10 +52,7 @@ class TaylorModel:
         return evaluate(x, self.powers) @ self.coefficients.T
 
     def step(self, pose: ArrayLike, state: ArrayLike, command: ArrayLike) -> tuple[Array, Array]:
-        """Returns pose (..., 3) and state (..., S) after a step of `dt` under a command (..., C).
-
-        The pose moves along the exact arc of the body twist: a reference for the kernels.
-        """
+        """Returns pose (..., 3) and state (..., S) after a step of `dt` along the exact arc."""
         state = np.asarray(state, dtype=np.float64)
         x = np.concatenate([state, np.asarray(command, dtype=np.float64)], axis=-1)
         dq = self.rates(x) * self.dt
@@ -181,27 +170,20 @@ def parse_term(text: str, names: tuple[str, ...]) -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class Quality:
-    """Figures of merit, by degree of freedom where they are mappings.
-
-    Attributes:
-        samples: number of rows that the fit used.
-        outliers: share of the rows that were dropped as outliers.
-        condition: condition number of the standardised kept features.
-        rmse, r2: of the rates on the training part.
-        held_out_rmse, held_out_r2: the same on data that the fit never saw; empty if none.
-        open_loop_horizon_s: length of the open-loop predictions on that data; 0 if none. The mean
-            errors at their ends follow, and the mean length of the measured path.
-    """
+    """Figures of merit, by degree of freedom where they are mappings."""
 
     __pydantic_config__ = ConfigDict(extra="forbid")  # a figure of merit may be inf
 
-    samples: int
-    outliers: dict[str, float]
-    condition: dict[str, float]
-    rmse: dict[str, float]
+    samples: int  # number of rows that the fit used
+    outliers: dict[str, float]  # share of the rows that were dropped as outliers
+    condition: dict[str, float]  # condition number of the standardised kept features
+    rmse: dict[str, float]  # `rmse`, `r2`: of the rates on the training part
     r2: dict[str, float]
+    # `held_out_rmse`, `held_out_r2`: the same on data that the fit never saw; empty if none
     held_out_rmse: dict[str, float]
     held_out_r2: dict[str, float]
+    # length of the open-loop predictions on that data; 0 if none. The mean errors at their ends
+    # follow, and the mean length of the measured path
     open_loop_horizon_s: float = 0.0
     open_loop_position_error_m: float = 0.0
     open_loop_heading_error_rad: float = 0.0
@@ -209,10 +191,7 @@ class Quality:
 
 
 class NamedTaylorModel(Schema):
-    """A TaylorModel by names, as `model.yaml` holds it: `terms` by dof and `term_name`.
-
-    `units` are those of the rates by dof, `valid` is the range of each variable in the recording.
-    """
+    """A TaylorModel by names, as `model.yaml` holds it; `valid` is the range of each variable."""
 
     dt: float = Field(gt=0.0)
     units: dict[str, str]

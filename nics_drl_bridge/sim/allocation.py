@@ -22,10 +22,8 @@ from nics_drl_bridge.sim.sensing_kernels import PAST
 from nics_drl_bridge.sim.separation_kernels import MARK
 from nics_drl_bridge.sim.world import World
 
-SLICES = 16
-"""Number of groups of beams in which a skewed scan is rendered."""
-LANES = 256
-"""Number of robots moved side by side: their arrays stay in the L1 cache."""
+SLICES = 16  # Number of groups of beams in which a skewed scan is rendered
+LANES = 256  # Number of robots moved side by side: their arrays stay in the L1 cache
 CROWD = 4096
 """Least number of pairs of a robot and a body for sorting the bodies of a world into cells."""
 FEWEST_OF_A_CROWD = 8
@@ -59,16 +57,15 @@ class Sizes:
 
 def allocate(model: SimulatorModel, sizes: Sizes) -> arrays.State:
     """Allocates the arrays of worlds before their first reset, with the model's parameters."""
-    size, width = len(model.robot.state), len(model.robot.command)
     _, substeps, delay = model.timing
     shape, bodies = (sizes.worlds, sizes.robots), sizes.obstacles + sizes.robots
     noise = [*model.noise.odometry, *model.noise.simulated_drift(model.robot)]
     # One row for the newest; an age within a period needs the end of the period before it, too.
-    rows = -(-sizes.longest_age // substeps) + 1
+    rows, sent = (-(-most // substeps) + 1 for most in (sizes.longest_age, sizes.longest_delay))
     return arrays.State(
         pose=np.zeros((*shape, 3)),
-        state=np.zeros((*shape, size)),
-        history=np.zeros((*shape, -(-sizes.longest_delay // substeps) + 1, width)),
+        state=np.zeros((*shape, len(model.robot.state))),
+        history=np.zeros((*shape, sent, len(model.robot.command))),
         bodies=np.zeros((sizes.worlds, bodies, BODY)),
         odom=np.zeros((*shape, 3)),
         twist=np.zeros((*shape, 3)),
@@ -135,7 +132,6 @@ def part_of(
 
 
 def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int) -> arrays.Scratch:
-    """Returns the scratch memory that one thread needs to step this many worlds."""
     kinematics, robots, count = model.kinematics, sizes.robots, sizes.obstacles
     bodies = count + robots
     blocks = -(-worlds * robots // LANES)

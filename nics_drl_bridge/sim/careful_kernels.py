@@ -20,10 +20,8 @@ from nics_drl_bridge.sim.impact_kernels import AFTER, DEPTH, STOP, TIME, TURN, V
 from nics_drl_bridge.sim.sensing_kernels import drift_of
 from nics_drl_bridge.sim.state import Array, Dynamics, Nearby, Single, State, Surroundings
 
-SHARE = 1e-3
-"""A body that contributes less than this share of the closing speed is not stopped."""
-SMALL = 0.1
-"""Step, in radii, by which an overlapping robot is moved to test whether it gets out."""
+SHARE = 1e-3  # A body that contributes less than this share of the closing speed is not stopped
+SMALL = 0.1  # Step, in radii, by which an overlapping robot is moved to test whether it gets out
 MOST_MOVES = 1000
 
 
@@ -41,7 +39,7 @@ def rates_at(n: int, m: int, j: int, state: State, motion: Dynamics, single: Sin
 
 
 @kernel
-def _put(body: Array, base: Array, flight: Array, time: float, series: Array) -> None:
+def _fly(body: Array, base: Array, flight: Array, time: float, series: Array) -> None:
     """Writes to `body` (7,) a robot that began at `base` (7,), after `time` [s]."""
     turn = flight[TURN] * time
     body[X], body[Y], body[COS], body[SIN] = move(
@@ -56,7 +54,6 @@ def _first_touch(
     m: int, begin: float, until: float, scene: Surroundings, nearby: Nearby, events: Array,
     moving: Moving,
 ) -> None:  # fmt: skip
-    """Finds the first contact of robot m from a time of the substep on."""
     near, world, meets = nearby.near, moving.world, nearby.meets[m]
     event, me = events[m], moving.first + m
     event[TIME] = until
@@ -66,8 +63,10 @@ def _first_touch(
             k = near[m, 1 + i] if listed else i
             if k != me and world[k, RADIUS] > 0.0:
                 impact.touch_body(event, me, k, begin, moving)
-    if meets & contacts.WALLS and event[DEPTH] >= 0.0:
-        impact.touch_walls(event, me, scene.walls, begin, moving)
+    for w in range(scene.walls.shape[0] if meets & contacts.WALLS and event[DEPTH] >= 0.0 else 0):
+        wall = scene.walls[w]
+        side = impact.Edge(wall[0], wall[1], wall[2], wall[3])
+        impact.touch_edge(event, me, -1, side, 0.0, begin, moving)
     if meets & contacts.MAP and event[DEPTH] >= 0.0:
         impact.touch_map(event, me, scene.grid, begin, moving)
 
@@ -84,7 +83,7 @@ def _leave(
     flight[STOP], events[m, AFTER] = 0.0, events[m, DEPTH]
     for i in range(1, moves + 1):
         time = until if i == moves else until * i / moves
-        _put(single.trial, world[me], flight, time, moving.series)
+        _fly(single.trial, world[me], flight, time, moving.series)
         depth, _ = contacts.contact(single.trial, m, world, scene, nearby, single.spare, 0.0)
         if depth < events[m, AFTER]:
             break
@@ -105,10 +104,7 @@ def _within(p: int, b: int, until: float, moving: Moving) -> bool:
 def _settle(
     until: float, scene: Surroundings, nearby: Nearby, events: Array, touched: Array, moving: Moving
 ) -> None:
-    """Stops the bodies of a world at their contacts within a substep, in order of time.
-
-    `events`, `touched` (M,) and the flights of `moving` are updated.
-    """
+    """Stops bodies at their contacts within a substep, in order of time; marks `touched` (M,)."""
     flights, first, meets, robots = moving.flights, moving.first, nearby.meets, events.shape[0]
     for m in range(robots):
         events[m, TIME] = until
@@ -140,30 +136,27 @@ def _settle(
 
 
 @kernel
-def _begin_substep(
-    n: int, time: float, dt: float, any_moves: bool, state: State, single: Single
+def _arrive(
+    n: int, any_moves: bool, motion: Dynamics, state: State, nearby: Nearby, single: Single
 ) -> None:
-    """Places the obstacles at a time of the period and sets their flights from there."""
-    velocity, flights = state.velocity, single.flights
-    if any_moves:
-        contacts.move_obstacles(state.bodies, single.start, velocity, n, time)
-    for k in range(velocity.shape[1]):
-        flights[k, VX], flights[k, VY] = velocity[n, k, 0], velocity[n, k, 1]
-        flights[k, TURN], flights[k, STOP] = velocity[n, k, 2], dt
-
-
-@kernel
-def _hold_obstacles(n: int, dt: float, state: State, single: Single) -> None:
-    """Keeps obstacles at rest that were stopped within the substep."""
-    bodies, velocity, start = state.bodies, state.velocity, single.start
-    for k in range(velocity.shape[1]):
+    """Moves robots to the end of the substep, and rests the obstacles that stopped within it."""
+    bodies, velocity, start = state.bodies[n], state.velocity[n], single.start
+    for m in range(nearby.meets.shape[0]):
+        if nearby.meets[m] != contacts.FREE:
+            body, flight = bodies[velocity.shape[0] + m], single.flights[velocity.shape[0] + m]
+            _fly(single.trial, body, flight, flight[STOP], motion.series)
+            for i in range(5):
+                body[i] = single.trial[i]
+            if single.events[m, DEPTH] < 0.0:
+                single.events[m, DEPTH] = single.events[m, AFTER]
+    for k in range(velocity.shape[0] if any_moves else 0):
         stop = single.flights[k, STOP]
-        if stop < dt:
-            start[k, 0] = bodies[n, k, X] + velocity[n, k, 0] * stop
-            start[k, 1] = bodies[n, k, Y] + velocity[n, k, 1] * stop
-            start[k, 2] = wrap(bodies[n, k, HEADING] + velocity[n, k, 2] * stop)
-            contacts.put_body(bodies, n, k, start[k])
-            velocity[n, k, :] = 0.0
+        if stop < motion.dt:
+            start[k, 0] = bodies[k, X] + velocity[k, 0] * stop
+            start[k, 1] = bodies[k, Y] + velocity[k, 1] * stop
+            start[k, 2] = wrap(bodies[k, HEADING] + velocity[k, 2] * stop)
+            contacts.put_body(state.bodies, n, k, start[k])
+            velocity[k, :] = 0.0
 
 
 @kernel
@@ -171,13 +164,12 @@ def move_carefully(
     n: int, any_moves: bool, state: State, scene: Surroundings, motion: Dynamics, nearby: Nearby,
     single: Single,
 ) -> None:  # fmt: skip
-    """Moves the robots of one world by one period, up to their contacts.
+    """Moves the robots of one world that may meet something by one period, up to their contacts.
 
     A robot in contact is marked and stops for the rest of the substep, and again in the next ones
-    while it would come nearer; it may move away. A robot that already overlaps something gets no
-    deeper. Without a contact it moves exactly as in `step_kernels.move_freely`. An obstacle stopped
-    by a robot is left with its mean velocity over the period. Robots that may meet nothing are not
-    moved; `any_moves` is true if any obstacle does.
+    while it would come nearer. One that already overlaps something gets no deeper. Without a
+    contact it moves exactly as in `step_kernels.move_freely`. An obstacle stopped by a robot is
+    left with its mean velocity over the period; `any_moves` is true if any obstacle does.
     """
     events, touched, dt = single.events, state.collided[n], motion.dt
     first, meets = state.velocity.shape[1], nearby.meets
@@ -188,7 +180,12 @@ def move_carefully(
             contacts.put_body(state.bodies, n, first + m, state.pose[n, m])
             _check_overlap(m, scene, nearby, single, touched, moving)
     for j in range(motion.substeps):
-        _begin_substep(n, j * dt, dt, any_moves, state, single)
+        if any_moves:
+            contacts.move_obstacles(state.bodies, single.start, state.velocity, n, j * dt)
+        for k in range(first):
+            for i in range(3):
+                single.flights[k, VX + i] = state.velocity[n, k, i]
+            single.flights[k, STOP] = dt
         for m in range(meets.shape[0]):
             if meets[m] != contacts.FREE:
                 rates_at(n, m, j, state, motion, single)
@@ -199,9 +196,7 @@ def move_carefully(
                 if events[m, DEPTH] < 0.0:
                     _leave(m, dt, scene, nearby, single, moving)
         _settle(dt, scene, nearby, events, touched, moving)
-        _arrive(nearby, single, moving)
-        if any_moves:
-            _hold_obstacles(n, dt, state, single)
+        _arrive(n, any_moves, motion, state, nearby, single)
     if any_moves:
         period = motion.substeps * dt
         contacts.move_obstacles(state.bodies, single.start, state.velocity, n, period)
@@ -229,22 +224,7 @@ def _check_overlap(
 
 
 @kernel
-def _arrive(nearby: Nearby, single: Single, moving: Moving) -> None:
-    """Moves the robots to their poses at the end of the substep."""
-    events, trial = single.events, single.trial
-    for m in range(nearby.meets.shape[0]):
-        if nearby.meets[m] != contacts.FREE:
-            body, flight = moving.world[moving.first + m], moving.flights[moving.first + m]
-            _put(trial, body, flight, flight[STOP], moving.series)
-            for i in range(5):
-                body[i] = trial[i]
-            if events[m, DEPTH] < 0.0:
-                events[m, DEPTH] = events[m, AFTER]
-
-
-@kernel
 def _average_velocities(n: int, period: float, state: State, single: Single) -> None:
-    """Sets the velocity of stopped obstacles to their mean over the period."""
     bodies, velocity, start, began = state.bodies, state.velocity, single.start, single.began
     for k in range(velocity.shape[1]):
         stopped = start[k, 0] != began[k, 0] or start[k, 1] != began[k, 1]

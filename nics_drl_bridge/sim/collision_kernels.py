@@ -23,10 +23,8 @@ from nics_drl_bridge.sim.state import Array
 
 TOUCHING = 1e-12
 """Outlines within this distance touch; their depth then decides whether they overlap [m]."""
-ON_EDGE = 1e-9
-"""Tolerance beyond the ends of an edge for intersections, as a share of its length."""
-FLOAT32 = 1e-6
-"""Relative rounding error of the distances of a map."""
+ON_EDGE = 1e-9  # Tolerance beyond the ends of an edge for intersections, as a share of its length
+FLOAT32 = 1e-6  # Relative rounding error of the distances of a map
 
 
 class Outline(NamedTuple):
@@ -52,14 +50,20 @@ def is_round(body, outlines):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def from_segment(x, y, ax, ay, bx, by):  # type: ignore[no-untyped-def]
+    """Returns the vector to (x, y) from the nearest point of the segment (ax, ay) to (bx, by)."""
+    ex, ey, dx, dy = bx - ax, by - ay, x - ax, y - ay
+    along = dx * ex + dy * ey
+    if along > 0.0:
+        share = min(along / (ex * ex + ey * ey), 1.0)
+        return dx - share * ex, dy - share * ey
+    return dx, dy
+
+
+@kernel
 def segment_distance2(x, y, ax, ay, bx, by):  # type: ignore[no-untyped-def]
     """Square of the distance from (x, y) to the segment from (ax, ay) to (bx, by) [m^2]."""
-    ex, ey, dx, dy = bx - ax, by - ay, x - ax, y - ay
-    along, length2 = dx * ex + dy * ey, ex * ex + ey * ey
-    if along > 0.0:
-        share = min(along / length2, 1.0)
-        dx -= share * ex
-        dy -= share * ey
+    dx, dy = from_segment(x, y, ax, ay, bx, by)
     return dx * dx + dy * dy
 
 
@@ -69,11 +73,17 @@ def _side(ax, ay, bx, by, x, y):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def cross(ax, ay, bx, by, px, py, qx, qy):  # type: ignore[no-untyped-def]
+    """True if the segments from a to b and from p to q cross."""
+    return (_side(ax, ay, bx, by, px, py) > 0.0) != (_side(ax, ay, bx, by, qx, qy) > 0.0) and (
+        _side(px, py, qx, qy, ax, ay) > 0.0
+    ) != (_side(px, py, qx, qy, bx, by) > 0.0)
+
+
+@kernel
 def _edges_distance2(ax, ay, bx, by, px, py, qx, qy):  # type: ignore[no-untyped-def]
     """Square of the distance between two segments [m^2]; -1 if they cross."""
-    if (_side(ax, ay, bx, by, px, py) > 0.0) != (_side(ax, ay, bx, by, qx, qy) > 0.0) and (
-        _side(px, py, qx, qy, ax, ay) > 0.0
-    ) != (_side(px, py, qx, qy, bx, by) > 0.0):
+    if cross(ax, ay, bx, by, px, py, qx, qy):
         return -1.0
     return min(
         segment_distance2(ax, ay, px, py, qx, qy),
@@ -143,10 +153,7 @@ def _deepest(p, q):  # type: ignore[no-untyped-def]
 
 @kernel
 def _outline_gap(p, x, y, reach, q, limit):  # type: ignore[no-untyped-def]
-    """Signed clearance of two outlines in one frame.
-
-    A circle (x, y, reach) encloses p, preferably the one with fewer corners.
-    """
+    """Signed clearance of two outlines in one frame; a circle (x, y, reach) encloses p."""
     least, crossing, touching = limit * limit, False, False
     ax, ay = q.corners[q.end - 1, 0], q.corners[q.end - 1, 1]
     for v in range(q.begin, q.end):
@@ -222,7 +229,6 @@ def wall_gap(body, wall, outlines, limit, spare):  # type: ignore[no-untyped-def
 
 @kernel
 def _along(x, y, wall):  # type: ignore[no-untyped-def]
-    """Share of a wall's length at which its point nearest to (x, y) lies."""
     ex, ey = wall[2] - wall[0], wall[3] - wall[1]
     length2 = ex * ex + ey * ey
     if length2 > 0.0:
@@ -257,10 +263,7 @@ def in_grid(x, y, grid):  # type: ignore[no-untyped-def]
 
 @kernel
 def cells_near(x, y, far, grid):  # type: ignore[no-untyped-def]
-    """Returns first and last + 1 row, and column, of the cells within a square around a point.
-
-    The point is in the frame of the grid, `far` half the side of the square [m].
-    """
+    """Returns first and last + 1 row and column of the cells up to `far` [m] from a point."""
     rows, columns = grid.distances.shape
     low_i, high_i = math.floor((y - far) / grid.cell), math.floor((y + far) / grid.cell)
     low_j, high_j = math.floor((x - far) / grid.cell), math.floor((x + far) / grid.cell)

@@ -20,8 +20,7 @@ from nics_drl_bridge.robot.kernels import wrap
 from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim.state import Array, Cells, Nearby, State, Surroundings
 
-FREE, BODIES, WALLS, MAP = 0, 1, 2, 4
-"""Bit flags of what a robot may meet."""
+FREE, BODIES, WALLS, MAP = 0, 1, 2, 4  # Bit flags of what a robot may meet
 SEVERAL = 32
 """Greatest number of bodies listed near a robot; if there are more, all bodies are tested."""
 LEFT, BOTTOM, PER_METRE, LARGEST, MOVED, FRAME = range(6)
@@ -31,10 +30,9 @@ bodies in cells [m], greatest distance moved since by any body [m]."""
 
 @kernel
 def reaches(n: int, state: State, nearby: Nearby, period: float) -> tuple[float, bool]:
-    """Bounds how far the circle of each body of world n may reach from its present centre.
+    """Writes to `nearby.reach` how far each body of world n may reach in a period [s]; 0 for none.
 
-    `nearby.reach` is the result, 0 where there is no body, given `nearby.way`; `period` is in [s].
-    Returns the longest path of any body [m], and whether an obstacle moves.
+    Given `nearby.way`; returns the longest path of any body [m], and whether an obstacle moves.
     """
     reach, way, bodies, velocity = nearby.reach, nearby.way, state.bodies, state.velocity
     longest, moving = 0.0, False
@@ -56,16 +54,11 @@ def reaches(n: int, state: State, nearby: Nearby, period: float) -> tuple[float,
 def find_near(
     n: int, m: int, bodies: Array, scene: Surroundings, nearby: Nearby, cells: Cells
 ) -> int:
-    """Returns the flags of what robot m of world n may meet within the period.
-
-    Row m of `nearby.near` is a result too, given `nearby.reach`.
-    """
+    """Returns flags of what robot m of world n may meet; writes row m of `nearby.near`."""
     near, reach, walls = nearby.near, nearby.reach, scene.walls
     me = bodies.shape[1] - near.shape[0] + m
     x, y, own = bodies[n, me, X], bodies[n, me, Y], reach[me]
-    count, several = 0, bodies.shape[1]
-    if scene.crowded:
-        several = bodies_around(x, y, own, cells)
+    count, several = 0, bodies_around(x, y, own, cells) if scene.crowded else bodies.shape[1]
     for i in range(several):
         k = cells.found[i] if scene.crowded else i
         dx, dy, far = bodies[n, k, X] - x, bodies[n, k, Y] - y, own + reach[k]
@@ -80,12 +73,8 @@ def find_near(
         if d2 <= own * own:
             meets |= WALLS
             break
-    grid = scene.grid
-    if (
-        grid.distances.size > 0
-        and collision.map_bound(bodies[n, me], grid) <= own - bodies[n, me, RADIUS]
-    ):
-        meets |= MAP
+    if collision.map_bound(bodies[n, me], scene.grid) <= own - bodies[n, me, RADIUS]:
+        meets |= MAP  # without a map, the bound is inf
     return meets
 
 
@@ -94,18 +83,9 @@ def contact(
     body: Array, m: int, world: Array, scene: Surroundings, nearby: Nearby, spare: Array,
     limit: float,
 ) -> tuple[float, int]:  # fmt: skip
-    """Returns the clearance of robot m, placed as `body` (7,), to all that it may meet.
-
-    Args:
-        body, m: the robot.
-        world: (K + M, 7) bodies of its world.
-        scene, nearby: see `state`.
-        spare, limit: see `collision_kernels`.
-
-    Returns:
-        The clearance, at most `limit` [m], negative where it overlaps something; and the nearest
-        body, or -1.
-    """
+    """Returns the clearance of robot m, placed as `body` (7,), to all that it may meet, at most
+    `limit` [m]; and the nearest body, or -1. `world` (K + M, 7) are the bodies of its world.
+    """  # noqa: D205
     outlines, near, least, whom = scene.outlines, nearby.near, limit, -1
     if nearby.meets[m] & BODIES:
         me = world.shape[0] - near.shape[0] + m
@@ -131,10 +111,7 @@ def contact(
 
 @kernel
 def move_obstacles(bodies: Array, start: Array, velocity: Array, n: int, time: float) -> None:
-    """Moves the obstacles of world n to their poses `time` [s] after the start of the period.
-
-    `bodies` (N, K + M, 7) is the result; `start` (K, 3) and `velocity` (N, K, 3) are in `map`.
-    """
+    """Moves the obstacles of world n to `time` [s] after their poses `start` (K, 3)."""
     for k in range(velocity.shape[1]):
         bodies[n, k, X] = start[k, 0] + velocity[n, k, 0] * time
         bodies[n, k, Y] = start[k, 1] + velocity[n, k, 1] * time
@@ -152,8 +129,8 @@ def put_body(bodies: Array, n: int, k: int, pose: Array) -> None:
 
 
 @kernel
-def _clamp(place: float, side: int) -> int:
-    return int(min(max(place, 0.0), side - 1.0))
+def _cell(way: float, per_metre: float, side: int) -> int:
+    return int(min(max(way * per_metre, 0.0), side - 1.0))
 
 
 @kernel
@@ -174,8 +151,8 @@ def sort_bodies(bodies: Array, n: int, cells: Cells) -> None:
     for k in range(count):
         radius, cell = bodies[n, k, RADIUS], side * side
         if radius * per_metre <= 1.0:
-            i = _clamp((bodies[n, k, Y] - low_y) * per_metre, side)
-            cell = i * side + _clamp((bodies[n, k, X] - low_x) * per_metre, side)
+            i = _cell(bodies[n, k, Y] - low_y, per_metre, side)
+            cell = i * side + _cell(bodies[n, k, X] - low_x, per_metre, side)
             frame[LARGEST] = max(frame[LARGEST], radius)
         cell_of[k] = cell
         begin[cell + 1] += 1
@@ -197,10 +174,10 @@ def bodies_around(x: float, y: float, reach: float, cells: Cells) -> int:
     begin, order, frame, found = cells.begin, cells.order, cells.frame, cells.found
     side = int(math.sqrt(begin.shape[0] - 2))
     reach += frame[LARGEST] + frame[MOVED]
-    left = _clamp((x - reach - frame[LEFT]) * frame[PER_METRE], side)
-    right = _clamp((x + reach - frame[LEFT]) * frame[PER_METRE], side)
-    low = _clamp((y - reach - frame[BOTTOM]) * frame[PER_METRE], side)
-    high = _clamp((y + reach - frame[BOTTOM]) * frame[PER_METRE], side)
+    left = _cell(x - reach - frame[LEFT], frame[PER_METRE], side)
+    right = _cell(x + reach - frame[LEFT], frame[PER_METRE], side)
+    low = _cell(y - reach - frame[BOTTOM], frame[PER_METRE], side)
+    high = _cell(y + reach - frame[BOTTOM], frame[PER_METRE], side)
     count = 0
     for i in range(low, high + 1):
         for k in range(begin[i * side + left], begin[i * side + right + 1]):

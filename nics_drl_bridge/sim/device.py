@@ -42,13 +42,7 @@ class Sensed:
 
 
 class DeviceWorld:
-    """Keeps the command of each of M robots for the next step and the covariance of its odometry.
-
-    Args:
-        simulator: moves the robots.
-        model: of the robots, with the step of the simulator.
-        robots: M.
-    """
+    """Keeps the next command of each of M robots, and the covariance of its odometry."""
 
     def __init__(self, simulator: Simulator, model: SimulatorModel, robots: int) -> None:
         self._simulator, self._period = simulator, model.control_period
@@ -68,11 +62,7 @@ class DeviceWorld:
         return [bool(one) for one in self._simulator.data.collided[0]]
 
     def begin(self, seed: int, starts: Array | None) -> None:
-        """Begins the episode of a seed, at x, y, heading of each robot (3 M,) if given.
-
-        Raises:
-            ConfigError: the starts are for another number of robots.
-        """
+        """Begins the episode of a seed, at x, y, heading of each robot (3 M,) if given."""
         if starts is not None and starts.size != 3 * self.robots:
             raise ConfigError(
                 f"episode_start has {starts.size} numbers; {self.robots} robots need "
@@ -122,9 +112,9 @@ def step_covariance(std: tuple[float, float], period: float) -> Array:
 def propagate(covariance: Array, before: ArrayLike, after: ArrayLike, added: Array) -> Array:
     """Propagates the covariances (M, 3, 3) of poses by odometry (M, 3) from before to after.
 
-    A heading error rotates the motion that follows: P' = F P F^T + Q, with F the derivative of
-    the new pose with respect to the old one (Thrun et al., Probabilistic Robotics, Sec. 5.4) and
-    Q (3, 3) `added` by a period, see `step_covariance`.
+    A heading error rotates the motion that follows: P' = F P F^T + Q, with F the derivative of the
+    new pose with respect to the old one (Thrun et al., Probabilistic Robotics, Sec. 5.4), Q
+    `added`.
     """
     p, (x, y, _) = np.array(covariance, np.float64), np.subtract(before, after).T
     turned = np.stack([y, -x], axis=1)  # F differs from the identity only in its last column
@@ -149,11 +139,8 @@ class DrivenSimulator:
     """One world of the fast simulator whose robots are moved from outside, by other physics.
 
     Scenes, motion of the obstacles, noise, faults and scans are those of the FastSimulator for the
-    same seed. Odometry is the wheel odometry with the model's noise.
-
-    Attributes:
-        fast: holds all data; do not call its `step`.
-        wheels: (M, 3) pose by wheel odometry, beginning at the start pose.
+    same seed. Odometry is the wheel odometry, `wheels` (M, 3) from the start pose, with the model's
+    noise. `fast` holds all data; do not call its `step`.
     """
 
     def __init__(
@@ -176,11 +163,7 @@ class DrivenSimulator:
         step_kernels.begin_period(self.fast.packed[0])
 
     def move_obstacles(self, time: float) -> Array:
-        """Moves the obstacles to their poses `time` [s] after the beginning of the period.
-
-        Returns:
-            (K, 7) see `lidar.shapes.BODY`.
-        """
+        """Moves the obstacles (K, 7) to their poses `time` [s] after the period's beginning."""
         data = self.fast.data
         contact_kernels.move_obstacles(data.bodies, self._start, data.velocity, 0, time)
         return data.bodies[0, : data.velocity.shape[1]]

@@ -32,10 +32,8 @@ TIME, WITH, OWN, OTHERS, DEPTH, AFTER, EVENT = range(7)
 """Columns of `events`: time of a robot's first contact [s]; the other body; the rates of its own
 and of the other's nearest point along the direction between them, negative if approaching [m/s];
 and the clearance, negative where it overlaps something, before and after the substep [m]."""
-SLACK = 1e-7
-"""Bodies touch if they are nearer than this to each other and approach [m]."""
-NOTHING = 1e-12
-"""Distances up to this count as zero [m]."""
+SLACK = 1e-7  # Bodies touch if they are nearer than this to each other and approach [m]
+NOTHING = 1e-12  # Distances up to this count as zero [m]
 MOST_LOOKS = 2000
 """Iterations after which a pair counts as touching: only absurdly fast rotations need more."""
 
@@ -112,41 +110,17 @@ def speed_at(b: int, time: float, flights: Array) -> float:
 
 
 @kernel
-def _from_segment(
-    x: float, y: float, ax: float, ay: float, bx: float, by: float
-) -> tuple[float, float]:
-    """Returns the vector from the nearest point of a segment to (x, y)."""
-    ex, ey, dx, dy = bx - ax, by - ay, x - ax, y - ay
-    along = dx * ex + dy * ey
-    if along > 0.0:
-        share = min(along / (ex * ex + ey * ey), 1.0)
-        return dx - share * ex, dy - share * ey
-    return dx, dy
-
-
-@kernel
 def _between(p: Edge, q: Edge) -> tuple[float, float]:
     """Returns the vector from the nearest point of q to that of p; zero where they cross."""
-    ax, ay, bx, by = p.ax, p.ay, p.bx, p.by
-    cx, cy, dx, dy = q.ax, q.ay, q.bx, q.by
-    nx, ny = _from_segment(ax, ay, cx, cy, dx, dy)
-    if ax == bx and ay == by:
+    nx, ny = collision.from_segment(p.ax, p.ay, q.ax, q.ay, q.bx, q.by)
+    if p.ax == p.bx and p.ay == p.by:
         return nx, ny
-    one = (dx - cx) * (ay - cy) - (dy - cy) * (ax - cx)
-    two = (dx - cx) * (by - cy) - (dy - cy) * (bx - cx)
-    three = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
-    four = (bx - ax) * (dy - ay) - (by - ay) * (dx - ax)
-    if (one > 0.0) != (two > 0.0) and (three > 0.0) != (four > 0.0):
+    if collision.cross(p.ax, p.ay, p.bx, p.by, q.ax, q.ay, q.bx, q.by):
         return 0.0, 0.0
-    ox, oy = _from_segment(bx, by, cx, cy, dx, dy)
-    if ox * ox + oy * oy < nx * nx + ny * ny:
-        nx, ny = ox, oy
-    ox, oy = _from_segment(cx, cy, ax, ay, bx, by)
-    if ox * ox + oy * oy < nx * nx + ny * ny:
-        nx, ny = -ox, -oy
-    ox, oy = _from_segment(dx, dy, ax, ay, bx, by)
-    if ox * ox + oy * oy < nx * nx + ny * ny:
-        nx, ny = -ox, -oy
+    for x, y, edge, sign in ((p.bx, p.by, q, 1.0), (q.ax, q.ay, p, -1.0), (q.bx, q.by, p, -1.0)):
+        ox, oy = collision.from_segment(x, y, edge.ax, edge.ay, edge.bx, edge.by)
+        if ox * ox + oy * oy < nx * nx + ny * ny:
+            nx, ny = sign * ox, sign * oy
     return nx, ny
 
 
@@ -161,14 +135,12 @@ def _root(gap: float, rate: float, bend: float) -> float:
 
 @kernel
 def _in_map(edge: Edge, x: float, y: float, c: float, s: float) -> Edge:
-    """Returns an edge of a body that stands at x, y with a heading."""
     ax, ay, bx, by = edge.ax, edge.ay, edge.bx, edge.by
     return Edge(x + c * ax - s * ay, y + s * ax + c * ay, x + c * bx - s * by, y + s * bx + c * by)
 
 
 @kernel
 def _reach(edge: Edge) -> float:
-    """Distance of the farther end from the origin [m]."""
     ax, ay, bx, by = edge.ax, edge.ay, edge.bx, edge.by
     return math.sqrt(max(ax * ax + ay * ay, bx * bx + by * by))
 
@@ -176,9 +148,7 @@ def _reach(edge: Edge) -> float:
 @kernel
 def _next_stop(b: int, time: float, until: float, flights: Array) -> float:
     """Returns when a body stops, if it does between two times; otherwise the later one."""
-    if b >= 0 and time < flights[b, STOP] < until:
-        return flights[b, STOP]  # type: ignore[no-any-return]
-    return until
+    return flights[b, STOP] if b >= 0 and time < flights[b, STOP] < until else until
 
 
 @kernel
@@ -194,8 +164,7 @@ def _free_time(
 ) -> tuple[float, float, float]:
     """Returns a time in which two edges cannot meet, and the rates of the corners that bound it.
 
-    The surfaces are `gap` [m] apart along n, which points from q to p; `bend` bounds the
-    acceleration between them [m/s^2].
+    They are `gap` [m] apart along n, from q to p; `bend` bounds their acceleration [m/s^2].
     """
     far, far2 = nx * p.edge.ax + ny * p.edge.ay, nx * p.edge.bx + ny * p.edge.by
     near, near2 = nx * q.edge.ax + ny * q.edge.ay, nx * q.edge.bx + ny * q.edge.by
@@ -205,13 +174,9 @@ def _free_time(
     front, beyond = min(far, far2), max(near, near2)
     keep = 0.5 * SLACK if gap > SLACK else 0.25 * gap
     free, own, others = np.inf, 0.0, 0.0
-    for i in range(2):
-        room_p = (far if i == 0 else far2) - front
-        u = rate_p if i == 0 else rate_p2
-        for j in range(2):
-            room_q = beyond - (near if j == 0 else near2)
-            v = rate_q if j == 0 else rate_q2
-            root = _root(gap - keep + room_p + room_q, u + v, bend)
+    for ahead, u in ((far, rate_p), (far2, rate_p2)):
+        for behind, v in ((near, rate_q), (near2, rate_q2)):
+            root = _root(gap - keep + (ahead - front) + (beyond - behind), u + v, bend)
             if root < free:
                 free, own, others = root, u, v
     return free, own, others
@@ -222,13 +187,10 @@ def touch(
     a: int, edge: Edge, round_a: float, b: int, other: Edge, round_b: float,
     begin: float, until: float, moving: Moving,
 ) -> tuple[float, float, float]:  # fmt: skip
-    """Finds the first contact of an edge of body a with an edge of body b.
+    """Returns the time [s] of the first contact of an edge of body a with one of body b, else inf.
 
-    The edges are in the bodies' frames, with a radius [m] around each.
-
-    Returns:
-        The time [s], inf if not before `until`; and the velocities of the nearest points of both
-        along the direction between them, negative if approaching [m/s].
+    With it come the velocities of the nearest points of both along the direction between them
+    [m/s]. The edges are in the bodies' frames, with a radius [m] around each.
     """
     reach_a, reach_b, time, flights = _reach(edge), _reach(other), begin, moving.flights
     for _ in range(MOST_LOOKS):
@@ -254,6 +216,12 @@ def touch(
 
 
 @kernel
+def _edges(outline: collision.Outline) -> int:
+    """Number of edges of an outline: one of a segment, and a circle counts as a single point."""
+    return outline.end - outline.begin if outline.end - outline.begin > 2 else 1
+
+
+@kernel
 def _edge_of(v: int, outline: collision.Outline) -> Edge:
     """Returns edge v of an outline, or the origin of a circle's, which has none."""
     corners, begin, end = outline.corners, outline.begin, outline.end
@@ -264,19 +232,12 @@ def _edge_of(v: int, outline: collision.Outline) -> Edge:
 
 
 @kernel
-def _edges(outline: collision.Outline) -> int:
-    """Number of edges of an outline: one of a segment, and a circle counts as a single point."""
-    return outline.end - outline.begin if outline.end - outline.begin > 2 else 1
-
-
-@kernel
-def _touch_edge(
+def touch_edge(
     event: Array, a: int, b: int, other: Edge, round_b: float, begin: float, moving: Moving
 ) -> None:
     """Makes `event` (EVENT,) the first contact of body a with an edge of body b, if it is sooner.
 
-    The edge is in the frame of body b, with a radius [m] around it; `begin` [s] is the time from
-    which to search.
+    The edge, in the frame of body b, has a radius [m] around it; the search is from `begin` [s] on.
     """
     world, flights = moving.world, moving.flights
     x, y, _, _ = pose_at(a, begin, moving)
@@ -300,7 +261,7 @@ def _touch_edge(
 
 @kernel
 def touch_body(event: Array, a: int, b: int, begin: float, moving: Moving) -> None:
-    """Does the same as `_touch_edge` for all of body b."""
+    """Does the same as `touch_edge` for all of body b."""
     world, flights = moving.world, moving.flights
     x, y, _, _ = pose_at(a, begin, moving)
     ox, oy, _, _ = pose_at(b, begin, moving)
@@ -311,15 +272,7 @@ def touch_body(event: Array, a: int, b: int, begin: float, moving: Moving) -> No
     outline = collision.outline_of(world[b], moving.outlines)
     round_b = world[b, RADIUS] if outline.begin == outline.end else 0.0
     for v in range(_edges(outline)):
-        _touch_edge(event, a, b, _edge_of(v, outline), round_b, begin, moving)
-
-
-@kernel
-def touch_walls(event: Array, a: int, walls: Array, begin: float, moving: Moving) -> None:
-    """Does the same as `_touch_edge` for straight walls (W, 4)."""
-    for w in range(walls.shape[0]):
-        wall = Edge(walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3])
-        _touch_edge(event, a, -1, wall, 0.0, begin, moving)
+        touch_edge(event, a, b, _edge_of(v, outline), round_b, begin, moving)
 
 
 @kernel
@@ -329,18 +282,9 @@ def _solid(distances: Array, i: int, j: int) -> bool:
 
 
 @kernel
-def _side_of_cell(i: int, j: int, side: int, grid: MapField) -> Edge:
-    """Returns a side of cell (i, j) of a map: below, right, above or left, in the map."""
-    size, u, v = grid.cell, (0, 1, 1, 0)[side], (1, 1, 0, 0)[side]
-    u2, v2 = (1, 1, 0, 0)[side], (1, 0, 0, 1)[side]
-    local = Edge((j + u) * size, (i + v) * size, (j + u2) * size, (i + v2) * size)
-    return _in_map(local, grid.x, grid.y, grid.cos, grid.sin)  # type: ignore[no-any-return]
-
-
-@kernel
 def touch_map(event: Array, a: int, grid: MapField, begin: float, moving: Moving) -> None:
-    """Does the same as `_touch_edge` for the sides of the solid cells of a map."""
-    distances, world = grid.distances, moving.world
+    """Does the same as `touch_edge` for the sides of the solid cells of a map."""
+    distances, world, size = grid.distances, moving.world, grid.cell
     if distances.size == 0:
         return
     speed = speed_at(a, begin, moving.flights)
@@ -354,8 +298,11 @@ def touch_map(event: Array, a: int, grid: MapField, begin: float, moving: Moving
         for j in range(low_j, end_j):
             if distances[i, j] > 0.0:
                 continue
-            for side in range(4):
-                # A side between two solid cells is met by nothing.
-                if not _solid(distances, i + (1, 0, -1, 0)[side], j + (0, 1, 0, -1)[side]):
-                    edge = _side_of_cell(i, j, side, grid)
-                    _touch_edge(event, a, -1, edge, 0.0, begin, moving)
+            # Each side from a corner (u, v), with the way to the cell beyond: between two solid
+            # cells nothing meets it.
+            for up, right, u, v in ((1, 0, 0, 1), (0, 1, 1, 1), (-1, 0, 1, 0), (0, -1, 0, 0)):
+                if not _solid(distances, i + up, j + right):
+                    near_x, near_y = (j + u) * size, (i + v) * size
+                    side = Edge(near_x, near_y, (j + u + up) * size, (i + v - right) * size)
+                    edge = _in_map(side, grid.x, grid.y, grid.cos, grid.sin)
+                    touch_edge(event, a, -1, edge, 0.0, begin, moving)

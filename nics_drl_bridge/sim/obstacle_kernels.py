@@ -22,39 +22,20 @@ from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, X, Y
 from nics_drl_bridge.robot.kernels import wrap
 from nics_drl_bridge.sim import separation_kernels as at
 from nics_drl_bridge.sim.collision_kernels import on_wall
-from nics_drl_bridge.sim.separation_kernels import (
-    Traffic,
-    clearance,
-    map_direction,
-    map_distance,
-    restrain,
-)
 from nics_drl_bridge.sim.state import Array, State, Surroundings
 
-DRAWS = 64
-"""Greatest number of draws per obstacle and period."""
-TURN = 2.0
-"""Greatest turn rate of an obstacle [rad/s]."""
-LOOK = 1.0
-"""A wandering obstacle looks ahead by the distance of this time [s], plus its radius."""
-MARGIN = 0.1
-"""Free space that it keeps at its sides [m]."""
-TRIES = 8
-"""Directions that it tries in one period."""
-MOST_CORNERS = 32
-"""Greatest number of waypoints that a patrol passes in a period."""
-NEAREST = 1e-3
-"""Least distance for which a force is computed [m]: at 0 it has no direction."""
-FAR = 8.0
-"""Forces beyond this many ranges are neglected."""
-STRONGEST = 5.0
-"""Greatest acceleration [m/s^2]: people reach no more, and the model's is unbounded."""
-ARRIVED = 0.3
-"""A goal is reached within this distance [m]."""
-ROOM = 0.2
-"""Free space around a walker at a new goal [m]."""
-LEAST_WALK = 1.0
-"""Least distance of a new goal [m], if such a goal is found."""
+DRAWS = 64  # Greatest number of draws per obstacle and period
+TURN = 2.0  # Greatest turn rate of an obstacle [rad/s]
+LOOK = 1.0  # A wandering obstacle looks ahead by the distance of this time [s], plus its radius
+MARGIN = 0.1  # Free space that it keeps at its sides [m]
+TRIES = 8  # Directions that it tries in one period
+MOST_CORNERS = 32  # Greatest number of waypoints that a patrol passes in a period
+NEAREST = 1e-3  # Least distance for which a force is computed [m]: at 0 it has no direction
+FAR = 8.0  # Forces beyond this many ranges are neglected
+STRONGEST = 5.0  # Greatest acceleration [m/s^2]: people reach no more, and the model's is unbounded
+ARRIVED = 0.3  # A goal is reached within this distance [m]
+ROOM = 0.2  # Free space around a walker at a new goal [m]
+LEAST_WALK = 1.0  # Least distance of a new goal [m], if such a goal is found
 PATIENCE = 5.0
 """A walker gives up a goal after twice the time of the straight path plus this time [s]."""
 CANDIDATES = 16
@@ -92,7 +73,7 @@ def steer(n: int, state: State, scene: Surroundings, period: float, speeds: Arra
     """
     velocity, seed, step, movers = state.velocity[n], state.seeds[n], state.steps[n], scene.movers
     count, plans, bodies = velocity.shape[0], movers.plans, state.bodies[n]
-    traffic = Traffic(bodies, count, speeds, plans, scene.walls, movers.half, scene.grid, period)
+    traffic = at.Traffic(bodies, count, speeds, plans, scene.walls, movers.half, scene.grid, period)
     draws = (step + 1) * count
     for k in range(count):  # walkers first: they react to the velocities of the last period
         velocity[k, :] = 0.0
@@ -110,7 +91,7 @@ def steer(n: int, state: State, scene: Surroundings, period: float, speeds: Arra
         elif kind == at.PATROL:
             dx, dy = _follow(mark, body, plans[k], movers.waypoints, period, False)
         wished_x, wished_y = dx, dy
-        dx, dy = restrain(dx, dy, k, traffic, kind != at.PATROL)
+        dx, dy = at.restrain(dx, dy, k, traffic, kind != at.PATROL)
         if kind == at.PATROL and dx == wished_x and dy == wished_y:
             _follow(mark, body, plans[k], movers.waypoints, period, True)
         mark[at.VX], mark[at.VY] = dx / period, dy / period
@@ -125,7 +106,7 @@ def _blocked(x, y, angle, reach, here, room, k, traffic):  # type: ignore[no-unt
     """True if something is near the path ahead, and nearer than at the outset."""
     for part in (0.5, 1.0):
         way = part * reach
-        free, _, _ = clearance(x + way * math.cos(angle), y + way * math.sin(angle), k, traffic)
+        free, _, _ = at.clearance(x + way * math.cos(angle), y + way * math.sin(angle), k, traffic)
         if free < room and free < here:
             return True
     return False
@@ -136,7 +117,7 @@ def _wander(mark, k, traffic, seed, counter):  # type: ignore[no-untyped-def]
     """Displacement of a wandering obstacle: ahead, turning to a free direction if blocked."""
     body, speed, period = traffic.bodies[k], mark[at.SPEED], traffic.period
     x, y, radius = body[X], body[Y], body[RADIUS]
-    here, nx, ny = clearance(x, y, k, traffic)
+    here, nx, ny = at.clearance(x, y, k, traffic)
     reach = LOOK * speed + radius
     aim, near = mark[at.AIM], here < reach + radius + MARGIN
     if near and _blocked(x, y, aim, reach, here, radius + MARGIN, k, traffic):
@@ -181,17 +162,10 @@ def _follow(mark, body, row, waypoints, period, keep):  # type: ignore[no-untype
 
 @kernel
 def repulsion(rx, ry, vx, vy, foresight, strength, reach):  # type: ignore[no-untyped-def]
-    """Computes the force (3, 4) of another walker; 2 b = sqrt((|r| + |r - v dt|)^2 - (v dt)^2).
+    """Returns the force (3, 4) of another walker [m/s^2], - V0 grad exp(-b / sigma).
 
-    Args:
-        rx, ry: from the other to this one [m], not zero.
-        vx, vy: velocity of the other, relative to this one [m/s].
-        foresight: dt [s].
-        strength: V0 [m^2/s^2].
-        reach: sigma [m].
-
-    Returns:
-        Acceleration [m/s^2], - V0 grad exp(-b / sigma).
+    2 b = sqrt((|r| + |r - v dt|)^2 - (v dt)^2), with r [m] from the other to this one, not zero,
+    its relative velocity v [m/s], `foresight` dt, `strength` V0 [m^2/s^2] and `reach` sigma [m].
     """
     sx, sy = vx * foresight, vy * foresight
     qx, qy = rx - sx, ry - sy
@@ -248,9 +222,9 @@ def _from_walls(k, traffic):  # type: ignore[no-untyped-def]
             away = math.sqrt(away2)
             size = row[at.WALL_REPULSION] / reach * math.exp(-max(away - radius, 0.0) / reach)
             ax, ay = ax + size * ox / away, ay + size * oy / away
-    away = map_distance(x, y, traffic.grid)
+    away = at.map_distance(x, y, traffic.grid)
     if away < far:
-        nx, ny = map_direction(x, y, traffic.grid)
+        nx, ny = at.map_direction(x, y, traffic.grid)
         size = row[at.WALL_REPULSION] / reach * math.exp(-max(away - radius, 0.0) / reach)
         ax, ay = ax - size * nx, ay - size * ny
     return ax, ay
@@ -267,7 +241,7 @@ def _new_goal(mark, k, traffic, seed, counter, step):  # type: ignore[no-untyped
         gy = (2.0 * _share(seed, counter + 2 * i + 1) - 1.0) * deep
         mark[at.GOAL_X], mark[at.GOAL_Y] = gx, gy
         if math.hypot(gx - x, gy - y) >= LEAST_WALK:
-            free, _, _ = clearance(gx, gy, k, traffic)
+            free, _, _ = at.clearance(gx, gy, k, traffic)
             if free >= radius + ROOM:
                 break
     way = math.hypot(mark[at.GOAL_X] - x, mark[at.GOAL_Y] - y)
@@ -276,10 +250,7 @@ def _new_goal(mark, k, traffic, seed, counter, step):  # type: ignore[no-untyped
 
 @kernel
 def _walk(marks, k, traffic, seed, counter, step):  # type: ignore[no-untyped-def]
-    """Returns the next velocity of walker k in `map` [m/s]; its row of `marks` gets its goal.
-
-    It takes fewer than `DRAWS` draws from `counter` on; `step` counts periods since the reset.
-    """
+    """Returns the next velocity of walker k in `map` [m/s], after fewer than `DRAWS` draws."""
     mark, row, body, period = marks[k], traffic.plans[k], traffic.bodies[k], traffic.period
     x, y = body[X], body[Y]
     away = math.hypot(mark[at.GOAL_X] - x, mark[at.GOAL_Y] - y)

@@ -20,8 +20,7 @@ __all__ = ["Motion", "Patrol", "Pedestrian", "Wander", "plan_arrays"]
 Array = NDArray[np.float64]
 FASTEST = 10.0
 """Greatest speed of an obstacle [m/s]; beyond it a control period would be too coarse."""
-STRONGEST = 1e3
-"""Upper bound on the parameters of the social force model, each in its unit."""
+STRONGEST = 1e3  # Upper bound on the parameters of the social force model, each in its unit
 
 
 def _fast(speed: tuple[float, float]) -> tuple[float, float]:
@@ -43,22 +42,14 @@ class Wander(Schema):
 
 
 class Patrol(Schema):
-    """Moves from waypoint to waypoint and waits while something is in the way.
-
-    It first moves to the first waypoint, from wherever it stands.
-
-    Attributes:
-        waypoints: x, y in `map` [m].
-        speed: [m/s].
-        loop: continue from the last waypoint to the first; otherwise back and forth.
-        pause: at each waypoint [s].
-    """
+    """Moves from waypoint to waypoint, and waits while something is in the way."""
 
     kind: Literal["patrol"] = "patrol"
+    # x, y in `map` [m]
     waypoints: tuple[tuple[Coordinate, Coordinate], ...] = Field(min_length=2, max_length=1000)
-    speed: float = Field(gt=0.0, le=FASTEST)
-    loop: bool = True
-    pause: float = Field(default=0.0, ge=0.0, le=1e6)
+    speed: float = Field(gt=0.0, le=FASTEST)  # [m/s]
+    loop: bool = True  # continue from the last waypoint to the first; otherwise back and forth
+    pause: float = Field(default=0.0, ge=0.0, le=1e6)  # at each waypoint [s]
 
     @model_validator(mode="after")
     def _apart(self) -> Patrol:
@@ -76,39 +67,32 @@ class Pedestrian(Schema):
     in Johansson, Helbing and Shukla (2007), and distances are between the surfaces of the discs,
     as in Helbing, Farkas and Vicsek (2000). The speeds are the paper's 1.34 m/s, plus or minus one
     standard deviation of 0.26 m/s.
-
-    Attributes:
-        speed: least and greatest desired speed, and the walker's greatest; drawn per episode [m/s].
-        relaxation: tau, the time constant of approaching the desired velocity [s].
-        repulsion, range: V0 [m^2/s^2] and sigma [m], of walkers, obstacles and robots.
-        wall_repulsion, wall_range: U0 [m^2/s^2] and R [m], of walls.
-        foresight: delta t, the time by which the others' motion is extrapolated [s].
-        view: 2 phi, the angle of sight [rad].
-        behind: c, the weight of forces from outside the angle of sight.
-        fluctuation: standard deviation of a random acceleration [m/s^2].
     """
 
     kind: Literal["pedestrian"] = "pedestrian"
+    # least and greatest desired speed, and the walker's greatest; drawn per episode [m/s]
     speed: Speed = (1.08, 1.6)
+    # tau, the time constant of approaching the desired velocity [s]
     relaxation: float = Field(default=0.5, ge=0.1, le=10.0)
+    # `repulsion`, `range`: V0 [m^2/s^2] and sigma [m], of walkers, obstacles and robots
     repulsion: Strength = 2.1
     range: Distance = 0.3
+    # `wall_repulsion`, `wall_range`: U0 [m^2/s^2] and R [m], of walls
     wall_repulsion: Strength = 10.0
     wall_range: Distance = 0.2
-    foresight: Strength = 1.0
+    foresight: Strength = 1.0  # delta t, the time by which the others' motion is extrapolated [s]
+    # 2 phi, the angle of sight [rad]
     view: float = Field(default=math.radians(200.0), ge=0.0, le=2.0 * math.pi)
+    # c, the weight of forces from outside the angle of sight
     behind: float = Field(default=0.5, ge=0.0, le=1.0)
-    fluctuation: Strength = 0.1
+    fluctuation: Strength = 0.1  # standard deviation of a random acceleration [m/s^2]
 
 
 Motion = Annotated[Wander | Patrol | Pedestrian, Field(discriminator="kind")]
 
 
 def plan_arrays(motions: Sequence[Wander | Patrol | Pedestrian | None]) -> tuple[Array, Array]:
-    """Returns the kernels' plans: obstacle k of every world moves by motion k, if not None.
-
-    They are (K, P) rows, columns as in `separation_kernels`, and (Q, 2) waypoints of all patrols.
-    """
+    """Returns the plans (K, P) of obstacles that so move, and waypoints (Q, 2) of all patrols."""
     rows, waypoints = np.zeros((len(motions), at.PLAN)), np.zeros((0, 2))
     for row, motion in zip(rows, motions, strict=True):
         if motion is None:

@@ -7,6 +7,7 @@ another. A column whose bounds are equal takes that value.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -27,7 +28,7 @@ from nics_drl_bridge.robot.kernels import term_arrays
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.seeds import checked_seeds
 
-__all__ = ["Draws", "Label", "LidarRanges", "Randomisation", "Sampler", "load_randomisation"]
+__all__ = ["Draws", "LidarRanges", "Randomisation", "Sampler", "load_randomisation"]
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -40,8 +41,7 @@ SCALED = {
     "drift": (slice(2, None), ("position_drift", "heading_drift")),
 }
 """Columns that a factor scales, and the levels that may be given instead."""
-CORNERS = 256
-"""Number of mixtures of least and greatest factors that are checked for stability."""
+CORNERS = 256  # Number of mixtures of least and greatest factors that are checked for stability
 FAULT_COLUMNS = (
     "noise_std", "noise_proportional", "dropout", "dropout_far", "too_close", "quantisation",
     "skew",
@@ -54,8 +54,7 @@ CHOICES: dict[str, tuple[int, Mapping[Any, int]]] = {
 """Faults that are drawn from several words, with their columns and values."""
 KINEMATICS_GROUP, LATENCY_GROUP, ODOMETRY_GROUP, LIDAR_GROUP, CHOICES_GROUP, SCENE_GROUP = range(6)
 GROUPS = 8
-PLACES = 1 << 20
-"""More than a group has columns; the counters of two groups never collide."""
+PLACES = 1 << 20  # More than a group has columns; the counters of two groups never collide
 UNIT = (np.zeros(1), np.ones(1))
 
 
@@ -75,34 +74,26 @@ AS_IT_IS: Factor = (1.0, 1.0)
 
 
 class KinematicRanges(Schema):
-    """Factors on the coefficients of the Taylor model, drawn independently for each coefficient.
+    """Factors on the coefficients of the Taylor model, drawn independently for each coefficient."""
 
-    Attributes:
-        scale: for every coefficient.
-        dofs: overrides `scale` for the coefficients of a rate, by its name in `model.yaml` (`wz`).
-        terms: overrides both, by rate and term: `{wz: {speed*steering: [0.8, 1.2]}}`.
-    """
-
-    scale: Factor = AS_IT_IS
+    scale: Factor = AS_IT_IS  # for every coefficient
+    # overrides `scale` for the coefficients of a rate, by its name in `model.yaml` (`wz`)
     dofs: dict[str, Factor] = Field(default_factory=dict)
+    # overrides both, by rate and term: `{wz: {speed*steering: [0.8, 1.2]}}`
     terms: dict[str, dict[str, Factor]] = Field(default_factory=dict)
 
 
 class OdometryRanges(Schema):
-    """Errors of odometry and motion: factors on the model's levels, or levels instead.
+    """Errors of odometry and motion: factors on the model's levels, or levels instead."""
 
-    Attributes:
-        noise: factor on the noise of the measured twist.
-        drift: factor on the part of the motion that the model does not explain; only a drift that
-            was found in the recording can be scaled.
-        odom_linear, odom_angular: noise of velocity [m/s] and yaw rate [rad/s].
-        position_drift, heading_drift: of x and y [m/sqrt(s)], and [rad/sqrt(s)].
-    """
-
-    noise: Factor | None = None
+    noise: Factor | None = None  # factor on the noise of the measured twist
+    # factor on the part of the motion that the model does not explain; only a drift that was found
+    # in the recording can be scaled
     drift: Factor | None = None
+    # `odom_linear`, `odom_angular`: noise of velocity [m/s] and yaw rate [rad/s]
     odom_linear: Level | None = None
     odom_angular: Level | None = None
+    # `position_drift`, `heading_drift`: of x and y [m/sqrt(s)], and [rad/sqrt(s)]
     position_drift: Level | None = None
     heading_drift: Level | None = None
 
@@ -116,19 +107,15 @@ class OdometryRanges(Schema):
 
 
 class LidarRanges(Schema):
-    """The lidar's noise and faults, instead of the model's; the fields of `LidarFaults`.
+    """The lidar's noise and faults, instead of the model's; the fields of `LidarFaults`."""
 
-    Attributes:
-        noise_std: see `LidarSpec` [m].
-        noise_proportional, quantisation, dropout, dropout_far: [least, greatest].
-        skew, too_close: the words that may be drawn, all equally likely.
-    """
-
-    noise_std: Level | None = None
+    noise_std: Level | None = None  # see `LidarSpec` [m]
+    # `noise_proportional`, `quantisation`, `dropout`, `dropout_far`: [least, greatest]
     noise_proportional: Level | None = None
     quantisation: Level | None = None
     dropout: Level | None = None
     dropout_far: Level | None = None
+    # `skew`, `too_close`: the words that may be drawn, all equally likely
     skew: tuple[Skew, ...] | None = Field(default=None, min_length=1)
     too_close: tuple[TooClose, ...] | None = Field(default=None, min_length=1)
 
@@ -141,16 +128,11 @@ class LidarRanges(Schema):
 
 
 class ObstacleRanges(Schema):
-    """Number and size of the obstacles of a scene.
+    """Number and size of the obstacles of a scene."""
 
-    Attributes:
-        count: [least, greatest], instead of the world's.
-        size: factor on the size of every obstacle, one per episode.
-        rungs: number of sizes to draw from, evenly spaced: each is baked beforehand.
-    """
-
-    count: tuple[int, int] | None = None
-    size: Factor = AS_IT_IS
+    count: tuple[int, int] | None = None  # [least, greatest], instead of the world's
+    size: Factor = AS_IT_IS  # factor on the size of every obstacle, one per episode
+    # number of sizes to draw from, evenly spaced: each is baked beforehand
     rungs: int = Field(default=5, ge=2, le=100)
 
     @model_validator(mode="after")
@@ -161,17 +143,12 @@ class ObstacleRanges(Schema):
 
 
 class Randomisation(Schema):
-    """Ranges that are drawn from in every episode; all else stays as in model and world.
-
-    Attributes:
-        action_latency: in addition to the model's [control periods].
-        observation_latency: age of scan and odometry [control periods].
-    """
+    """Ranges that are drawn from in every episode; all else stays as in model and world."""
 
     name: str
     kinematics: KinematicRanges = KinematicRanges()
-    action_latency: Latency = (0.0, 0.0)
-    observation_latency: Latency = (0.0, 0.0)
+    action_latency: Latency = (0.0, 0.0)  # in addition to the model's [control periods]
+    observation_latency: Latency = (0.0, 0.0)  # age of scan and odometry [control periods]
     odometry: OdometryRanges = OdometryRanges()
     lidar: LidarRanges = LidarRanges()
     obstacles: ObstacleRanges = ObstacleRanges()
@@ -189,14 +166,8 @@ def load_randomisation(name: str | Path) -> Randomisation:
     return load_yaml(find_config(name, "randomisation"), Randomisation)
 
 
-@dataclass(frozen=True)
-class Label:
-    """Name of a drawn number and its place in `Draws`."""
-
-    name: str  # human-readable: `kinematics.wz.speed*steering`, `action_latency_s`
-    field: str  # of `Draws`
-    column: int | None = None  # index along the last axis; None where there is none
-    unit: float = 1.0  # factor to multiply by, such as seconds per substep
+# Name of a drawn number (`kinematics.wz.speed*steering`), its field of `Draws`, column if any.
+Label = tuple[str, str, int | None]
 
 
 @dataclass(frozen=True)
@@ -210,33 +181,22 @@ class Draws:
     faults: Array  # (n, M, P) of each lidar, columns as in `lidar.fault_kernels`
     count: Integers | None  # (n,) obstacles in the scene; None leaves it to the world
     size: Integers | None  # (n,) index into `Randomisation.sizes`; None where there is only one
-    sizes: Array  # (R,) the sizes of `Randomisation.sizes`
+    scale: Array | None  # (n,) that size
+    latency: Array  # (n, M, 2) `delay` and `age` in seconds
     labels: tuple[Label, ...]  # of the drawn numbers that may differ from episode to episode
 
     def named(self) -> dict[str, NDArray[np.generic]]:
         """Returns the drawn numbers by name: (n, M) per robot, (n,) per scene."""
-        named: dict[str, NDArray[np.generic]] = {}
-        for label in self.labels:
-            value = getattr(self, label.field)
-            if label.field == "size":
-                value = self.sizes[value]
-            elif label.column is not None:
-                value = value[..., label.column]
-            named[label.name] = value if label.unit == 1.0 else value * label.unit
-        return named
+        return {
+            name: getattr(self, field)[() if column is None else (..., column)]
+            for name, field, column in self.labels
+        }
 
 
 class Sampler:
     """Draws the randomised numbers of episodes; a seed is bit-identical in any batch.
 
-    Args:
-        randomisation: the ranges.
-        model: provides the nominal values.
-        robots: M.
-
-    Attributes:
-        longest_delay: greatest latency of a command that may occur [substeps].
-        longest_age: greatest age of an observation that may occur [substeps].
+    `longest_delay` of a command and `longest_age` of an observation are the greatest [substeps].
     """
 
     def __init__(
@@ -271,12 +231,13 @@ class Sampler:
         for column, values in self._choices.items():
             drawn = _between(UNIT, chosen, robots, CHOICES_GROUP, column)[..., 0]
             faults[..., column] = values[(drawn * len(values)).astype(np.int64)]
-        counts = self.randomisation.obstacles.count is not None
+        counts, sizes = self.randomisation.obstacles.count is not None, len(self._sizes) > 1
         return Draws(
             _between(self._coefficient, chosen, robots, KINEMATICS_GROUP),
             timing[..., 0].copy(), timing[..., 1].copy(), noise, faults,
-            scene[:, 0] if counts else None, scene[:, 1] if len(self._sizes) > 1 else None,
-            self._sizes, self._labels,
+            scene[:, 0] if counts else None, scene[:, 1] if sizes else None,
+            self._sizes[scene[:, 1]] if sizes else None, np.multiply(timing, self._step),
+            self._labels,
         )  # fmt: skip
 
     def _name(self, model: SimulatorModel) -> Iterator[Label]:
@@ -285,21 +246,21 @@ class Sampler:
         for column, (d, k) in enumerate(terms):
             if _varies(self._coefficient, column):
                 name = f"kinematics.{kinematics.dofs[d]}.{kinematics.term_names[k]}"
-                yield Label(name, "coefficient", column)
-        for row, name in enumerate(("action", "observation")):
-            if _varies(self._timing, row):
-                yield Label(f"{name}_latency_s", ("delay", "age")[row], None, self._step)
+                yield name, "coefficient", column
+        for column, name in enumerate(("action_latency_s", "observation_latency_s")):
+            if _varies(self._timing, column):
+                yield name, "latency", column
         states = tuple(f"state_drift.{variable.name}" for variable in model.robot.state)
         for column, noise in enumerate((*NOISE_NAMES, *states)):
             if noise and _varies(self._noise, column):
-                yield Label(f"odometry.{noise}", "noise", column)
+                yield f"odometry.{noise}", "noise", column
         for column, fault in enumerate(FAULT_COLUMNS):
             if column in self._choices or _varies(self._faults, column):
-                yield Label(f"lidar.{fault}", "faults", column)
+                yield f"lidar.{fault}", "faults", column
         if self.randomisation.obstacles.count is not None:
-            yield Label("obstacles.count", "count")
+            yield "obstacles.count", "count", None
         if len(self._sizes) > 1:
-            yield Label("obstacles.size", "size")
+            yield "obstacles.size", "scale", None
 
 
 def _between(bounds: Bounds, seeds: Integers, robots: int, group: int, column: int = 0) -> Array:
@@ -337,15 +298,9 @@ def _rate(name: str, model: TaylorModel, where: str) -> int:
 
 
 def _term(d: int, name: str, model: TaylorModel, where: str) -> int:
-    kept = np.flatnonzero(model.coefficients[d])
-    try:
-        row = taylor.parse_term(name, model.variables)
-    except ValueError:
-        row = None
-    for k in kept:
-        if row is not None and np.array_equal(model.powers[k], row):
-            return int(k)
-    known = [model.term_names[k] for k in kept]
+    known = {model.term_names[k]: int(k) for k in np.flatnonzero(model.coefficients[d])}
+    with suppress(ValueError, KeyError):
+        return known[taylor.term_name(taylor.parse_term(name, model.variables), model.variables)]
     raise ConfigError(
         f"{where}: the model has no term {name!r} there; "
         + (nearest(name, known) if known else "it has none at all: remove it.")
@@ -353,10 +308,7 @@ def _term(d: int, name: str, model: TaylorModel, where: str) -> int:
 
 
 def _check_stable(model: TaylorModel, spans: Array, where: str) -> None:
-    """Raises ConfigError if a decaying state would grow for some factors.
-
-    Checks the linear part of the state's step: no eigenvalue may exceed 1 in magnitude.
-    """
+    """Raises ConfigError if the linear part of the state's step would grow for some factors."""
     size = model.state_size
     if not size:
         return
@@ -389,7 +341,6 @@ def _latencies(ranges: Randomisation, model: SimulatorModel) -> Bounds:
 
 
 def _levels(ranges: Randomisation, model: SimulatorModel, where: str) -> Bounds:
-    """Bounds (2 + 3 + S,) of the noise."""
     odometry = ranges.odometry
     base = np.array([*model.noise.odometry, *model.noise.simulated_drift(model.robot)])
     low, high = base.copy(), base.copy()
@@ -411,11 +362,10 @@ def _levels(ranges: Randomisation, model: SimulatorModel, where: str) -> Bounds:
 
 
 def _faults(ranges: Randomisation, lidar: LidarSpec, where: str) -> Bounds:
-    """Bounds (P,) of the lidar's noise and faults."""
     bounds = []
+    spans = {name: span for name, span in ranges.lidar if span is not None and name not in CHOICES}
     for end in range(2):
-        spans = {name: span for name, span in ranges.lidar if span is not None}
-        numbers = {name: span[end] for name, span in spans.items() if name not in CHOICES}
+        numbers = {name: span[end] for name, span in spans.items()}
         std = numbers.pop("noise_std", lidar.noise_std)
         spec = lidar.model_dump() | {"noise_std": std}
         spec["faults"] |= numbers

@@ -19,16 +19,8 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.exact_kernels import (
-    COS,
-    HEADING,
-    RADIUS,
-    SHAPE,
-    SIN,
-    OutlineArrays,
-    X,
-    Y,
-)
+from nics_drl_bridge.lidar import exact_kernels
+from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, X, Y
 from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim.state import Array, Integers, MapField
 
@@ -36,8 +28,7 @@ TRIES = 2000
 RESTARTS = 50
 DETOURS = 4
 """Number of pairs of start and goal without a path after which the obstacles are redrawn."""
-MARGIN = 1e-9
-"""Least distance of obstacles from walls and from each other [m]."""
+MARGIN = 1e-9  # Least distance of obstacles from walls and from each other [m]
 DRAWN, NO_OBSTACLES, NO_ROBOTS = 0, 1, 2
 LEAST, GREATEST, GAP, FIRST_SHAPE, SHAPES, FIXED, MOVING, GROUP = range(8)
 """Columns of a group of obstacles."""
@@ -62,7 +53,7 @@ class ScenePlan(NamedTuple):
     """Basis of the scenes of a world: K obstacles in G groups, of H shapes in S sizes."""
 
     space: FreeSpace
-    outlines: OutlineArrays  # of all shapes, the last of which is a disc
+    outlines: exact_kernels.OutlineArrays  # of all shapes, the last of which is a disc
     radii: Array  # (H,) of the circles around them [m]
     groups: Array  # (G, GROUP)
     group: Integers  # (K,) of each obstacle
@@ -173,26 +164,24 @@ def _clear_of(body, other, room, outlines, spare):  # type: ignore[no-untyped-de
 
 
 @kernel
-def _is_free(disc, x, y, plan, bodies, spare):  # type: ignore[no-untyped-def]
-    """True if a robot with the clearance around it fits at a point."""
+def _is_clear(x, y, room, moving, plan, bodies, scratch):  # type: ignore[no-untyped-def]
+    """True if a robot at a point keeps `room` [m] from all static, or also `moving`, obstacles."""
+    disc = scratch.disc
     disc[X], disc[Y] = x, y
     for k in range(bodies.shape[0]):
-        there = bodies[k, RADIUS] > 0.0
-        if there and not _clear_of(disc, bodies[k], plan.clearance, plan.outlines, spare):
+        counts = moving or plan.groups[plan.group[k], MOVING] == 0.0
+        near = counts and bodies[k, RADIUS] > 0.0
+        if near and not _clear_of(disc, bodies[k], room, plan.outlines, scratch.spare):
             return False
-    return _clear_of_walls(disc, plan.clearance, plan, spare)
+    return True
 
 
 @kernel
-def _may_pass(disc, x, y, plan, bodies, spare):  # type: ignore[no-untyped-def]
-    """True if a robot on its path may be at the centre of a cell, for all static obstacles."""
-    disc[X], disc[Y] = x, y
-    room = plan.space.room - plan.footprint
-    for k in range(bodies.shape[0]):
-        there = bodies[k, RADIUS] > 0.0 and plan.groups[plan.group[k], MOVING] == 0.0
-        if there and not _clear_of(disc, bodies[k], room, plan.outlines, spare):
-            return False
-    return True
+def _is_free(x, y, plan, bodies, scratch):  # type: ignore[no-untyped-def]
+    """True if a robot with the clearance around it fits at a point."""
+    return _is_clear(x, y, plan.clearance, True, plan, bodies, scratch) and _clear_of_walls(
+        scratch.disc, plan.clearance, plan, scratch.spare
+    )
 
 
 @kernel
@@ -202,7 +191,7 @@ def _is_joined(x, y, gx, gy, plan, bodies, scratch):  # type: ignore[no-untyped-
     Searches from both ends, each towards the other first: where there is no path, one end is often
     enclosed and its search ends soon. The cells of both points count as free.
     """
-    cells, label, disc, spare = plan.space.cells, plan.space.area, scratch.disc, scratch.spare
+    cells, label, room = plan.space.cells, plan.space.area, plan.space.room - plan.footprint
     seen, stack, latest = scratch.seen, scratch.stack, scratch.latest
     rows, columns = label.shape
     i, j, _ = cell_of(x, y, cells)
@@ -235,7 +224,7 @@ def _is_joined(x, y, gx, gy, plan, bodies, scratch):  # type: ignore[no-untyped-
             if label[row, column] != area or seen[new] == latest[0] + side:
                 continue
             cx, cy = place_in(row + 0.5, column + 0.5, cells)
-            if _may_pass(disc, cx, cy, plan, bodies, spare):
+            if _is_clear(cx, cy, room, False, plan, bodies, scratch):
                 seen[new] = latest[0] + side
                 stack[side, height] = new
                 height += 1
@@ -377,34 +366,22 @@ def _goal_of(seed, counter, x, y, plan):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _fits(x, y, gx, gy, plan, bodies, scratch):  # type: ignore[no-untyped-def]
-    """True if a start and a goal are free, in one area and neither too near nor too far."""
-    distance2 = (gx - x) * (gx - x) + (gy - y) * (gy - y)
-    if not plan.least * plan.least <= distance2 <= plan.greatest * plan.greatest:
-        return False
-    return area_of(gx, gy, plan.space) == area_of(x, y, plan.space) and _is_free(
-        scratch.disc, gx, gy, plan, bodies, scratch.spare
-    )
-
-
-@kernel
 def _place_robots(seed, counter, plan, bodies, starts, goals, scratch):  # type: ignore[no-untyped-def]
-    """Places starts and goals in pairs, each pair with a path between them."""
     between = 2.0 * plan.footprint + plan.clearance
     for m in range(starts.shape[0]):
         placed, detours = False, 0
         for _ in range(TRIES):
             x, y, heading = _spot(seed, counter, plan.starts, plan.space)
             counter += 4
-            if area_of(x, y, plan.space) == 0:
-                continue
-            if not _is_free(scratch.disc, x, y, plan, bodies, scratch.spare):
+            if area_of(x, y, plan.space) == 0 or not _is_free(x, y, plan, bodies, scratch):
                 continue
             gx, gy = _goal_of(seed, counter, x, y, plan)
             counter += 4
-            if not _fits(x, y, gx, gy, plan, bodies, scratch):
-                continue
-            if not (_apart(x, y, starts, m, between) and _apart(gx, gy, goals, m, between)):
+            distance2 = (gx - x) * (gx - x) + (gy - y) * (gy - y)
+            fits = plan.least * plan.least <= distance2 <= plan.greatest * plan.greatest
+            fits = fits and area_of(gx, gy, plan.space) == area_of(x, y, plan.space)
+            fits = fits and _apart(x, y, starts, m, between) and _apart(gx, gy, goals, m, between)
+            if not (fits and _is_free(gx, gy, plan, bodies, scratch)):
                 continue
             if not _is_joined(x, y, gx, gy, plan, bodies, scratch):
                 detours += 1

@@ -14,18 +14,7 @@ from scipy import ndimage
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
-from nics_drl_bridge.lidar.shapes import (
-    BODY,
-    LARGEST,
-    SMALLEST,
-    Circle,
-    Outlines,
-    Polygon,
-    Rectangle,
-    Segment,
-    Shape,
-    describe,
-)
+from nics_drl_bridge.lidar.shapes import BODY, LARGEST, SMALLEST, Circle, Outlines, Shape, describe
 from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim import scene_kernels as kernels
 from nics_drl_bridge.sim.obstacles import Motion
@@ -72,63 +61,36 @@ class Scenes:
 
 
 class SceneSampler:
-    """Draws scenes of a world.
+    """Draws scenes of a world for M robots of a radius [m].
 
     A start and its goal are free, with the clearance of the world around the robot, and a robot
     that keeps this clearance can move from one to the other among walls, map and all static
-    obstacles. Obstacles overlap neither each other nor walls nor map, and keep their gaps.
-
-    Args:
-        world: the field, its map and its obstacles.
-        footprint_radius: of a robot [m].
-        robots: M.
-        sizes: factors by which obstacles may be scaled.
-        most: greatest number of random obstacles that may be requested from `draw`, if more than
-            the world has.
-
-    Attributes:
-        shapes: every shape that can occur: those of the world in the first size, then in the next.
-        count: K, the greatest number of obstacles.
-        motions: (K) motion of each obstacle, None if it stands still; obstacle k belongs to the
-            same group in every scene.
-
-    Raises:
-        ConfigError: the world has no free space for such a robot.
+    obstacles. Obstacles overlap neither each other nor walls nor map, and keep their gaps. They may
+    be scaled by `sizes`; `most` random ones may be requested if that is more than the world has.
+    ConfigError is raised if the world has no free space for such a robot.
     """
 
     def __init__(
-        self,
-        world: World,
-        footprint_radius: float,
-        robots: int = 1,
-        sizes: Sequence[float] = (1.0,),
-        most: int | None = None,
-    ) -> None:
+        self, world: World, footprint_radius: float, robots: int = 1,
+        sizes: Sequence[float] = (1.0,), most: int | None = None,
+    ) -> None:  # fmt: skip
         self.world = world = world if most is None else _with_room(world, most)
         self.robots, self._sizes = robots, len(sizes)
+        # Every shape that can occur: those of the world in the first size, then in the next.
         self.shapes = tuple(scaled(shape, size) for size in sizes for shape in world.shapes)
         slots = [g for g, group in enumerate(world.obstacles) for _ in range(group.counts[1])]
-        self.count = len(slots)
+        self.count = len(slots)  # K, the greatest number of obstacles
         self.motions: tuple[Motion | None, ...] = tuple(world.obstacles[g].motion for g in slots)
         self._plan = _plan(world, footprint_radius, slots, self.shapes, len(sizes))
         self._scratches: list[SceneScratch] = []
 
     def draw(
-        self,
-        seeds: ArrayLike,
-        count: ArrayLike | None = None,
-        size: ArrayLike | None = None,
+        self, seeds: ArrayLike, count: ArrayLike | None = None, size: ArrayLike | None = None
     ) -> Scenes:
         """Draws the scenes of seeds (n,); identical in every process and batch.
 
-        Args:
-            seeds: of the episodes.
-            count: (n,) number of random obstacles of each scene, at most as many as the world
-                allows; by default that of the world.
-            size: (n,) index of the size of all obstacles of a scene; the first by default.
-
-        Raises:
-            ConfigError: a seed is out of range, or the world has no room for a scene.
+        The `count` (n,) of random obstacles is at most, and by default, that of the world; `size`
+        (n,) is the index of their size. Raises ConfigError if the world has no room for a scene.
         """
         numbers = checked_seeds(seeds)
         n = len(numbers)
@@ -141,7 +103,7 @@ class SceneSampler:
         bodies, starts = np.zeros((n, self.count, BODY)), np.zeros((n, self.robots, 3))
         scenes = Scenes(bodies, starts, np.zeros((n, self.robots, 2)))
         try:
-            scratch = self._scratches.pop()
+            scratch = self._scratches.pop()  # threads may draw at the same time
         except IndexError:
             scratch = _scratch(self._plan)
         row, why = kernels.draw_scenes(
@@ -150,53 +112,41 @@ class SceneSampler:
         )  # fmt: skip
         self._scratches.append(scratch)
         if row < n:
-            raise ConfigError(self._no_room(int(numbers[row]), why))
+            raise self._no_room(int(numbers[row]), why)
         return scenes
 
-    def _no_room(self, seed: int, why: int) -> str:
-        world = self.world
+    def _no_room(self, seed: int, why: int) -> ConfigError:
+        scene, others = f"in the scene of seed {seed}", f" among {self.count} obstacles"
         if why == kernels.NO_OBSTACLES:
-            return (
-                f"{world.source}: key 'obstacles': no free place for {self.count} obstacles in "
-                f"the scene of seed {seed}; lower `count` or `gap`, or enlarge `size`."
+            return ConfigError(
+                f"{self.world.source}: key 'obstacles': no free place for {self.count} obstacles "
+                f"{scene}; lower `count` or `gap`, or enlarge `size`."
             )
-        others = f" among {self.count} obstacles" if self.count else ""
-        least, greatest = world.goal_distance
-        return (
-            f"{world.source}: key 'goal_distance': no free places for {self.robots} start(s) and "
-            f"goal(s) of robots of radius {self._plan.footprint:g} m, {least:g} to {greatest:g} m "
-            f"apart with a way between{others}, in the scene of seed {seed}; change "
-            "`goal_distance`, lower `clearance` or `obstacles`, or enlarge `size`."
+        least, greatest = self.world.goal_distance
+        return ConfigError(
+            f"{self.world.source}: key 'goal_distance': no free places for {self.robots} start(s) "
+            f"and goal(s) of robots of radius {self._plan.footprint:g} m, {least:g} to "
+            f"{greatest:g} m apart with a way between{others if self.count else ''}, {scene}; "
+            "change `goal_distance`, lower `clearance` or `obstacles`, or enlarge `size`."
         )
 
 
 def sample_scene(world: World, footprint: float, seed: int, robots: int = 1) -> Scene:
-    """Draws the scene of a seed for M robots of a radius [m]; identical in every process.
-
-    Raises:
-        ConfigError: the world has no room for it.
-    """
+    """Draws the scene of a seed for M robots of a radius [m]; identical in every process."""
     return _sampler(world, footprint, robots).draw([seed])[0]
 
 
-@lru_cache(maxsize=16)
-def _sampler(world: World, footprint: float, robots: int) -> SceneSampler:
-    return SceneSampler(world, footprint, robots)
+_sampler = lru_cache(maxsize=16)(SceneSampler)
 
 
 def scaled(shape: Shape, factor: float) -> Shape:
     """Returns a shape scaled by a factor."""
     if factor == 1.0:
         return shape
+    lengths = ("radius", "size", "ends", "points")
+    larger = {k: (np.array(v) * factor).tolist() for k, v in shape if k in lengths}
     try:
-        if isinstance(shape, Circle):
-            return Circle(radius=shape.radius * factor)
-        if isinstance(shape, Rectangle):
-            return Rectangle(size=(shape.size[0] * factor, shape.size[1] * factor))
-        if isinstance(shape, Segment):
-            (x1, y1), (x2, y2) = shape.ends
-            return Segment(ends=((x1 * factor, y1 * factor), (x2 * factor, y2 * factor)))
-        return Polygon(points=tuple((x * factor, y * factor) for x, y in shape.points))
+        return type(shape).model_validate(shape.model_dump() | larger)
     except ValidationError:
         raise ConfigError(
             f"the {describe(shape)}, {factor:g} times as large, is beyond {SMALLEST:g} m to "
@@ -215,12 +165,11 @@ def _with_room(world: World, most: int) -> World:
     total = sum(group.counts[1] for group in at_random)
     if total >= most:
         return world
-    groups = list(world.obstacles)
-    for g, group in enumerate(groups):
-        if not group.at:
-            share = group.counts[1] / total if total else 1.0 / len(at_random)
-            count = group.counts[0], math.ceil(share * most)
-            groups[g] = group.model_copy(update={"count": count})
+    groups = []
+    for group in world.obstacles:
+        share = group.counts[1] / total if total else 1.0 / len(at_random)
+        count = group.counts[0], math.ceil(share * most)
+        groups.append(group if group.at else group.model_copy(update={"count": count}))
     return world.model_copy(update={"obstacles": tuple(groups)})
 
 
@@ -241,28 +190,16 @@ def _plan(
             poses[np.flatnonzero(np.equal(slots, g))] = group.at
     least, greatest = world.goal_distance
     ring = math.pi * (greatest * greatest - least * least)
-    cell = space.cells.cell
+    around = world.goals is None and ring < len(space.for_robots) * space.cells.cell**2
     return ScenePlan(
-        space=space,
-        outlines=outlines.arguments,
-        radii=outlines.radii,
-        groups=groups,
-        group=np.array(slots, dtype=np.int64),
-        choices=np.array(choices, dtype=np.int64),
-        variants=np.arange(sizes * len(world.shapes)).reshape(sizes, -1),
-        poses=poses,
-        starts=_places(world.starts),
-        goals=_places(world.goals),
-        footprint=float(footprint),
-        clearance=world.clearance,
-        least=least,
-        greatest=greatest,
-        around=world.goals is None and ring < len(space.for_robots) * cell * cell,
-    )
+        space, outlines.arguments, outlines.radii, groups, np.array(slots, dtype=np.int64),
+        np.array(choices, dtype=np.int64),
+        np.arange(sizes * len(world.shapes)).reshape(sizes, -1), poses, _places(world.starts),
+        _places(world.goals), float(footprint), world.clearance, least, greatest, around,
+    )  # fmt: skip
 
 
 def _places(places: Starts | Goals | None) -> Array:
-    """Returns places (P, PLACE), see `scene_kernels`."""
     if places is None:
         return np.zeros((0, kernels.PLACE))
     rows = np.zeros((len(places.at) + len(places.regions), kernels.PLACE))
@@ -290,10 +227,7 @@ def _free_space(world: World, footprint: float) -> FreeSpace:
     """Finds the free space of a world and the areas within which a robot can move.
 
     A robot moves between the centres of neighbouring cells, with the clearance of the world around
-    it. Areas too small for a start and a goal are dropped.
-
-    Raises:
-        ConfigError: no room for a start and a goal; the message names the key.
+    it. Areas too small for a start and a goal are dropped; if none is left, ConfigError is raised.
     """
     check_places(world)
     grid = NO_FIELD if world.grid is None else _closed(world.grid)
@@ -339,7 +273,6 @@ def _closed(grid: GridMap) -> MapField:
 
 
 def _cells_of(world: World) -> MapField:
-    """Returns the cells of a field without a map."""
     x1, y1, x2, y2 = world.extent
     size = min(CELL, min(x2 - x1, y2 - y1) / FEWEST_CELLS)
     size = max(size, math.sqrt((x2 - x1) * (y2 - y1) / MOST_CELLS))
@@ -348,42 +281,37 @@ def _cells_of(world: World) -> MapField:
 
 
 def _centres(cells: MapField) -> Array:
-    """Returns x, y of the centres of the cells (2, rows, columns) [m]."""
     rows, columns = np.indices(cells.distances.shape) + 0.5
     return np.array(kernels.place_in.py_func(rows, columns, cells))
 
 
 def _large_enough(area: NDArray[np.int32], cell: float, least: float) -> NDArray[np.int32]:
     """Keeps areas whose bounding box has a diagonal >= `least` [m]; zeroes the others."""
-    spans = [
-        cell * math.hypot(*(part.stop - part.start for part in parts))
-        for parts in ndimage.find_objects(area)
-    ]
-    keep = np.array([0, *(i + 1 if span >= least else 0 for i, span in enumerate(spans))], np.int32)
-    return np.asarray(keep[area])
+    keep = [0]
+    for number, parts in enumerate(ndimage.find_objects(area), 1):
+        span = cell * math.hypot(*(part.stop - part.start for part in parts))
+        keep.append(number if span >= least else 0)
+    return np.asarray(np.array(keep, np.int32)[area])
 
 
 def _check(
     world: World, key: str, places: Starts | Goals | None, area: NDArray[np.int32], cells: MapField
 ) -> None:
-    """Raises ConfigError for a region or a place where no robot fits."""
     if places is None:
         return
-    free = np.zeros((2, 0)) if places.at else _centres(cells)[:, area > 0]
-    wrong: dict[str, tuple[float, ...]] = {}
-    for number, (x1, y1, x2, y2) in enumerate(places.regions):
-        within = (free[0] >= min(x1, x2)) & (free[0] <= max(x1, x2))
-        within &= (free[1] >= min(y1, y2)) & (free[1] <= max(y1, y2))
-        if not within.any():
-            wrong[f"{key}.regions.{number}"] = places.regions[number]
+    x, y = _centres(cells)[:, area > 0]
+    fits = {}
+    for number, region in enumerate(places.regions):
+        (x1, x2), (y1, y2) = sorted(region[::2]), sorted(region[1::2])
+        within = (x >= x1) & (x <= x2) & (y >= y1) & (y <= y2)
+        fits[f"{key}.regions.{number}"] = bool(within.any()), list(region)
     for number, at in enumerate(places.at):
         i, j, _ = kernels.cell_of(at[0], at[1], cells)
         inside = 0 <= i < area.shape[0] and 0 <= j < area.shape[1]
-        if not inside or area[i, j] == 0:
-            wrong[f"{key}.at.{number}"] = at
-    if wrong:
-        place, value = next(iter(wrong.items()))
-        raise ConfigError(
-            f"{world.source}: key {place!r}: a robot with {world.clearance:g} m around it does not "
-            f"fit there, at {list(value)}; move it, or lower `clearance`."
-        )
+        fits[f"{key}.at.{number}"] = inside and bool(area[i, j]), list(at)
+    for place, (free, value) in fits.items():
+        if not free:
+            raise ConfigError(
+                f"{world.source}: key {place!r}: a robot with {world.clearance:g} m around it does "
+                f"not fit there, at {value}; move it, or lower `clearance`."
+            )

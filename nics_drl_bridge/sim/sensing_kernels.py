@@ -17,8 +17,7 @@ from nics_drl_bridge.robot.kernels import move, wrap
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim.state import Array, Dynamics, LidarView, Scratch, State, Surroundings
 
-POSE, TWIST, ODOM, MEASURED, PAST = 0, 3, 6, 9, 12
-"""Columns of `past`."""
+POSE, TWIST, ODOM, MEASURED, PAST = 0, 3, 6, 9, 12  # Columns of `past`
 
 
 @kernel
@@ -46,29 +45,22 @@ def at_lag(
     x, y, z = past[n, m, new, column], past[n, m, new, column + 1], past[n, m, new, column + 2]
     if share > 0.0:
         old = (steps - lag // substeps - 1) % rows
-        turn = past[n, m, old, column + 2] - z
-        if column in (POSE, ODOM):
-            turn = wrap(turn)
         x += share * (past[n, m, old, column] - x)
         y += share * (past[n, m, old, column + 1] - y)
-        z += share * turn
-        if column in (POSE, ODOM):
-            z = wrap(z)
+        turn = past[n, m, old, column + 2] - z
+        z = wrap(z + share * wrap(turn)) if column in (POSE, ODOM) else z + share * turn
     return x, y, z
 
 
 @kernel
-def _odometry_noise(n: int, m: int, state: State) -> tuple[float, float, float]:
-    """Draws the noise of the measured twist [m/s, m/s, rad/s]."""
-    std, seed = state.noise, state.seeds[n]
-    counter = state.steps[n] * state.pose.shape[1] + m
-    x = y = turn = 0.0
-    if std[n, m, 0] > 0.0:
-        x = std[n, m, 0] * random.normal(seed, random.ODOMETRY_STREAM, 3 * counter)
-        y = std[n, m, 0] * random.normal(seed, random.ODOMETRY_STREAM, 3 * counter + 1)
-    if std[n, m, 1] > 0.0:
-        turn = std[n, m, 1] * random.normal(seed, random.ODOMETRY_STREAM, 3 * counter + 2)
-    return x, y, turn
+def _odometry_noise(n: int, m: int, axis: int, state: State) -> float:
+    """Draws the noise of one axis of the measured twist [m/s, m/s, rad/s]."""
+    std = state.noise[n, m, axis // 2]
+    if std <= 0.0:
+        return 0.0
+    counter = 3 * (state.steps[n] * state.pose.shape[1] + m) + axis
+    noise: float = std * random.normal(state.seeds[n], random.ODOMETRY_STREAM, counter)
+    return noise
 
 
 @kernel
@@ -83,7 +75,8 @@ def measure(
     steps, rows, substeps = state.steps[n], state.past.shape[2], motion.substeps
     this = steps % rows
     last = state.past[n, m, this - 1 if this > 0 else rows - 1]
-    noise_x, noise_y, noise_turn = _odometry_noise(n, m, state)
+    noise_x, noise_y = _odometry_noise(n, m, 0, state), _odometry_noise(n, m, 1, state)
+    noise_turn = _odometry_noise(n, m, 2, state)
     c, s = math.cos(before[2]), math.sin(before[2])
     dx, dy = pose[n, m, 0] - before[0], pose[n, m, 1] - before[1]
     ahead, aside, turned = c * dx + s * dy, c * dy - s * dx, pose[n, m, 2] - before[2]
@@ -101,28 +94,22 @@ def measure(
     row[MEASURED + 2] = now[2] + noise_turn
     for i in range(3):
         row[POSE + i], row[TWIST + i] = pose[n, m, i], now[i]
-    age = state.age[n, m]
-    lag = lag_of(age, steps, rows, substeps) if age > 0 else 0
     odom, twist = state.odom[n, m], state.twist[n, m]
-    if lag == 0:
+    if state.age[n, m] == 0:  # dividing for each robot takes a thirtieth of a step
         for i in range(3):
             odom[i], twist[i] = row[ODOM + i], row[MEASURED + i]
         return
+    lag = lag_of(state.age[n, m], steps, rows, substeps)
     odom[0], odom[1], odom[2] = at_lag(state.past, n, m, ODOM, lag, steps, substeps)
     twist[0], twist[1], twist[2] = at_lag(state.past, n, m, MEASURED, lag, steps, substeps)
-
-
-@kernel
-def most_drift(std: Array, n: int, m: int, period: float) -> float:
-    """Upper bound on the distance by which `drift_of` can move a robot in a period [m]."""
-    return math.sqrt(3.0 * period) * (std[n, m, 2] + std[n, m, 3])  # type: ignore[no-any-return]
 
 
 @kernel
 def drift_of(n: int, m: int, state: State, period: float) -> tuple[float, float, float]:
     """Draws the motion of a robot in a period [s] that its model does not explain.
 
-    Updates its state; returns the motion ahead and aside [m], and turn [rad].
+    Returns the way ahead and aside [m], at most sqrt(3 period) times the deviation, and turn [rad];
+    updates the state.
     """
     std, counter = state.noise, state.steps[n] * state.pose.shape[1] + m
     # It grows with root time. Uniform draws are cheap, and over some periods they add up to normal.
@@ -143,27 +130,21 @@ def drift_of(n: int, m: int, state: State, period: float) -> tuple[float, float,
     return ahead, aside, turn
 
 
-@kernel
-def _needs_own(n: int, state: State) -> bool:
-    """True if a robot of world n needs a scan that is not of its present pose."""
-    for m in range(state.age.shape[1]):
-        if state.age[n, m] > 0 or state.faults[n, m, fault_kernels.SKEW] != 0.0:
-            return True
-    return False
-
-
 @kernel(inline=True)
 def scan_or_wait(
     n: int, waiting: int, state: State, scene: Surroundings, view: LidarView, motion: Dynamics,
     scratch: Scratch,
 ) -> int:  # fmt: skip
     """Scans world n, unless `scan_together` can; returns how many worlds now wait for it."""
-    if not scene.scattered and not _needs_own(n, state):
-        scratch.scans.waiting[waiting] = n
-        return waiting + 1
-    for m in range(state.pose.shape[1]):
-        _scan_alone(n, m, state, scene, view, motion, scratch)
-    return waiting
+    alone = scene.scattered
+    for m in range(state.age.shape[1]):  # a scan that is not of a robot's present pose
+        alone = alone or state.age[n, m] > 0 or state.faults[n, m, fault_kernels.SKEW] != 0.0
+    if alone:
+        for m in range(state.pose.shape[1]):
+            _scan_alone(n, m, state, scene, view, motion, scratch)
+        return waiting
+    scratch.scans.waiting[waiting] = n
+    return waiting + 1
 
 
 @kernel
@@ -186,26 +167,12 @@ def scan_together(
 @kernel
 def distort(low: int, high: int, state: State, view: LidarView) -> None:
     """Applies the faults of each robot's device to the scans of the worlds [low, high)."""
-    robots = state.ranges.shape[1]
     for n in range(low, high):
-        for m in range(robots):
-            counter = state.steps[n] * robots + m
+        for m in range(state.ranges.shape[1]):
+            counter = state.steps[n] * state.ranges.shape[1] + m
             fault_kernels.distort(
                 state.ranges[n, m], view.limits, state.faults[n, m], state.seeds[n], counter
             )
-
-
-@kernel
-def _place_lidar(n: int, m: int, lag: int, state: State, scratch: Scratch, substeps: int) -> None:
-    """Writes pose and twist of a robot, `lag` substeps ago, to `spot` and `drive`."""
-    spot, drive, steps = scratch.scans.spot[0, 0], scratch.scans.drive, state.steps[n]
-    row = state.past[n, m, steps % state.past.shape[2]]
-    for i in range(3):
-        spot[i] = state.pose[n, m, i]
-        drive[i] = row[TWIST + i] if steps > 0 else 0.0
-    if lag > 0:
-        spot[0], spot[1], spot[2] = at_lag(state.past, n, m, POSE, lag, steps, substeps)
-        drive[0], drive[1], drive[2] = at_lag(state.past, n, m, TWIST, lag, steps, substeps)
 
 
 @kernel
@@ -216,8 +183,10 @@ def _scan_alone(
     """Scans one robot from its own place and time, maybe skewed."""
     scans, beams = scratch.scans, state.ranges.shape[2]
     spot, drive, skew = scans.spot, scans.drive, state.faults[n, m, fault_kernels.SKEW]
-    lag = lag_of(state.age[n, m], state.steps[n], state.past.shape[2], motion.substeps)
-    _place_lidar(n, m, lag, state, scratch, motion.substeps)
+    past, steps, substeps, here = state.past, state.steps[n], motion.substeps, spot[0, 0]
+    lag = lag_of(state.age[n, m], steps, past.shape[2], substeps)
+    here[0], here[1], here[2] = at_lag(past, n, m, POSE, lag, steps, substeps)
+    drive[0], drive[1], drive[2] = at_lag(past, n, m, TWIST, lag, steps, substeps)
     reach = view.limits[1] + math.hypot(view.mount[0], view.mount[1])
     if skew != 0.0:
         reach += math.hypot(drive[0], drive[1]) * view.sweep_time

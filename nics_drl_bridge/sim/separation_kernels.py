@@ -31,14 +31,10 @@ STILL, WANDER, PATROL, PEDESTRIAN = range(4)
 # Memory of an obstacle, a row of marks (N, K, F).
 SPEED, VX, VY, DIRECTION, AIM, GOAL_X, GOAL_Y, UNTIL, INDEX, WAY, REST, MARK = range(12)
 
-SLACK = 1e-6
-"""Margin that is never used [m]: rounding must not make two bodies touch."""
-PASSES = 3
-"""Number of times a displacement is bent before the remaining excess is shortened."""
-FINEST = 0.25
-"""Least step along a path through a static map, in cells."""
-HALVINGS = 8
-"""Number of bisections of its last step to find the end of the free path."""
+SLACK = 1e-6  # Margin that is never used [m]: rounding must not make two bodies touch
+PASSES = 3  # Number of times a displacement is bent before the remaining excess is shortened
+FINEST = 0.25  # Least step along a path through a static map, in cells
+HALVINGS = 8  # Number of bisections of its last step to find the end of the free path
 
 
 class Traffic(NamedTuple):
@@ -115,10 +111,7 @@ def clearance(x, y, k, traffic):  # type: ignore[no-untyped-def]
 
 @kernel
 def _hold(dx, dy, nx, ny, room, bend):  # type: ignore[no-untyped-def]
-    """Limits a displacement to `room` along n.
-
-    Either the excess along n is removed (`bend`), or the whole displacement is shortened.
-    """
+    """Limits a displacement to `room` along n: bends it, or shortens the whole."""
     ahead = dx * nx + dy * ny
     room = max(room - SLACK, 0.0)
     if ahead <= room:
@@ -207,10 +200,7 @@ def _hold_map(dx, dy, body, grid, bend):  # type: ignore[no-untyped-def]
 
 @kernel
 def restrain(dx, dy, k, traffic, bends):  # type: ignore[no-untyped-def]
-    """Returns the part of a displacement [m] that obstacle k can make within the period.
-
-    With `bends`, it slides along obstructions; otherwise it keeps its direction.
-    """
+    """Returns the displacement [m] that obstacle k can make of one; with `bends` it slides."""
     body = traffic.bodies[k]
     for _ in range(PASSES if bends else 0):
         wished_x, wished_y = dx, dy

@@ -30,15 +30,13 @@ from nics_drl_bridge.threads import Crew
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 R = TypeVar("R")
-MOST_ROBOTS = 1_000
-"""Greatest number of robots in one world; each is tested against every other."""
+MOST_ROBOTS = 1_000  # Greatest number of robots in one world; each is tested against every other
 MOST_NUMBERS = 2**30
 """Greatest number of values in all worlds, some GB: beams of robots, states of obstacles."""
 PER_BODY = 64
 TOLERANCE = 0.05
 """Tolerance beyond the range of commands that was recorded, as a share of their limits."""
-EVERY = 16
-"""Commands are checked in the first step after a reset and then at this interval [steps]."""
+EVERY = 16  # Commands are checked in the first step after a reset and then at this interval [steps]
 
 
 class OutsideValidityWarning(UserWarning):
@@ -51,10 +49,7 @@ def warn(message: str) -> None:
 
 
 class CommandBox:
-    """The range of commands that a model was fitted to, save those whose effect was assumed.
-
-    `tell` is called with the message of a warning.
-    """
+    """Range of commands that a model was fitted to, save those whose effect was assumed."""
 
     def __init__(
         self, model: TaylorModel, robot: RobotSpec, tell: Callable[[str], None] = warn
@@ -124,68 +119,46 @@ def _check_memory(model: SimulatorModel, world: World, worlds: int, robots: int)
 class FastSimulator:
     """The simulator that a SimulatorModel describes, in a world.
 
-    A world is bit-identical in a batch of any size and with any number of threads.
+    A world is bit-identical in a batch of any size and with any number of threads. The M robots of
+    a world scan and collide with each other.
 
     Args:
-        model: the robot: motion, lidar, noise.
-        world: the field and its obstacles.
-        worlds: N.
-        robots: M in each world. They scan and collide with each other.
+        model, world: the robot with its lidar and noise, and the field with its obstacles.
+        worlds, robots: N, and M in each world.
         renderer: `auto`, `baked` or `exact`, see `lidar.scanner.Scanner`.
         threads: number of parts of the worlds that are stepped in parallel.
         randomisation: ranges drawn from in each episode: an object, the name of a shipped one, or
             a YAML file.
-        longest_delay: greatest latency of commands that `data.delay` may be set to [substeps]; by
-            default the model's. Raised to the randomisation's greatest.
-        longest_age: greatest age of scan and odometry that `data.age` may be set to [substeps];
-            raised to the randomisation's greatest.
+        longest_delay, longest_age: greatest values that `data.delay` of commands (by default the
+            model's) and `data.age` of scan and odometry may be set to [substeps]; raised to the
+            randomisation's greatest.
         tell: called with a message when commands leave the range that the model was fitted to.
-
-    Attributes:
-        data: all mutable state, see `State`.
-        goals: (N, M, 2) of the episodes [m].
-        parts: the worlds that each thread steps.
-        sampler: draws the scenes.
-        readings: name of a further sensor -> (N, M, S) its readings, see `lidar.sensor`.
-        drawn: name -> draws of the randomisation for the running episodes, (N, M) per robot or
-            (N,) per scene; empty without randomisation.
     """
 
     def __init__(
-        self,
-        model: SimulatorModel,
-        world: World,
-        worlds: int = 1,
-        robots: int = 1,
-        renderer: Renderer = "auto",
-        threads: int = 1,
-        randomisation: str | Randomisation | None = None,
-        longest_delay: int | None = None,
-        longest_age: int = 0,
-        tell: Callable[[str], None] = warn,
-    ) -> None:
-        if worlds < 1 or robots < 1:
+        self, model: SimulatorModel, world: World, worlds: int = 1, robots: int = 1,
+        renderer: Renderer = "auto", threads: int = 1,
+        randomisation: str | Randomisation | None = None, longest_delay: int | None = None,
+        longest_age: int = 0, tell: Callable[[str], None] = warn,
+    ) -> None:  # fmt: skip
+        delay = model.timing[2] if longest_delay is None else longest_delay
+        if min(worlds, robots, threads) < 1 or delay < model.timing[2] or longest_age < 0:
             raise ConfigError(
-                f"a simulator needs at least 1 world and 1 robot, not {worlds} and {robots}."
+                f"a simulator needs at least 1 world, robot and thread, not {worlds}, {robots} and "
+                f"{threads}; a longest_delay of at least the model's {model.timing[2]} substeps "
+                f"and a longest_age of at least 0, not {delay} and {longest_age}."
             )
         _check_memory(model, world, worlds, robots)
         if isinstance(randomisation, str):
             randomisation = load_randomisation(randomisation)
         _check_speed(model.kinematics, model.robot, world)
-        self.model, self.world = model, world
-        self.randomisation = randomisation
+        self.model, self.world, self.randomisation = model, world, randomisation
         self._draws = None if randomisation is None else Sampler(randomisation, model, robots)
-        delay = model.timing[2] if longest_delay is None else longest_delay
-        if threads < 1 or delay < model.timing[2] or longest_age < 0:
-            raise ConfigError(
-                f"a simulator needs at least 1 thread, a longest_delay of at least the model's "
-                f"{model.timing[2]} substeps and a longest_age of at least 0, not {threads}, "
-                f"{delay} and {longest_age}."
-            )
         if self._draws is not None:
             delay = max(delay, self._draws.longest_delay)
             longest_age = max(longest_age, self._draws.longest_age)
-        self.goals: Array = np.zeros((worlds, robots, 2))
+        self.goals: Array = np.zeros((worlds, robots, 2))  # of the episodes [m]
+        # Draws of the randomisation for the running episodes, (N, M) per robot or (N,) per scene.
         self.drawn: dict[str, NDArray[Any]] = {}
         self._footprint = footprint_shape(model.robot)
         sizes = (1.0,) if randomisation is None else randomisation.sizes
@@ -198,11 +171,11 @@ class FastSimulator:
         self._scanner = Scanner(model.lidar, table, renderer, world.grid)
         self._sizes = Sizes(worlds, robots, self.sampler.count, delay, longest_age)
         self.data = allocate(model, self._sizes)
+        # Name of a further sensor -> (N, M, S) its readings, see `lidar.sensor`.
         self.readings = unread(model.sensors, worlds, robots)
-        self.parts = split(worlds, threads)
-        self._boxes = {
-            part.start: CommandBox(model.kinematics, model.robot, tell) for part in self.parts
-        }
+        self.parts = split(worlds, threads)  # the worlds that each thread steps
+        known = model.kinematics, model.robot, tell
+        self._boxes = {part.start: CommandBox(*known) for part in self.parts}
         self._crew = Crew(len(self.parts))
 
     @cached_property
@@ -212,8 +185,7 @@ class FastSimulator:
         of = (self.data, scene, self.model, self._scanner, self._sizes)
         return {part.start: step_kernels.pack(part_of(*of, part)) for part in self.parts}
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Returns the state without what a copy rebuilds."""
+    def __getstate__(self) -> dict[str, Any]:  # a copy rebuilds the rest
         rebuilt = ("packed", "_renders")
         return {name: value for name, value in vars(self).items() if name not in rebuilt}
 
@@ -231,20 +203,13 @@ class FastSimulator:
             render(self.readings[name], worlds)
 
     def reset(
-        self,
-        seeds: ArrayLike,
-        worlds: ArrayLike | None = None,
-        starts: ArrayLike | None = None,
+        self, seeds: ArrayLike, worlds: ArrayLike | None = None, starts: ArrayLike | None = None
     ) -> Scenes:
-        """Begins episodes. Threads may call it in parallel, each for worlds of a different part.
+        """Begins episodes in `worlds` (n,), all by default, at `starts` (n, M, 3) if given.
 
-        Args:
-            seeds: of each episode (n,); a seed fixes scene, start, goal, noise and randomisation.
-            worlds: (n,) indices of the worlds to reset, all by default.
-            starts: (n, M, 3) poses to begin at instead of the scene's.
-
-        Raises:
-            ConfigError: the seeds or starts do not fit, or the world has no room for a scene.
+        A seed (n,) fixes scene, start, goal, noise and randomisation. Threads may call it in
+        parallel, each for worlds of a different part. Raises ConfigError if seeds, starts or a
+        scene do not fit.
         """
         chosen = np.arange(len(self.data.steps)) if worlds is None else np.asarray(worlds, np.int64)
         scenes, draws = self._draw(seeds)
@@ -297,7 +262,6 @@ class FastSimulator:
         self.goals[chosen] = scenes.goals
 
     def _assign(self, chosen: Indices, draws: Draws) -> None:
-        """Assigns the draws to the robots of some worlds."""
         data = self.data
         data.coefficient[chosen], data.noise[chosen] = draws.coefficient, draws.noise
         data.delay[chosen], data.age[chosen] = draws.delay, draws.age
@@ -308,10 +272,7 @@ class FastSimulator:
             self.drawn[name][chosen] = values
 
     def step(self, commands: ArrayLike) -> None:
-        """Moves every world by one control period; the results are in `data`.
-
-        The commands are (N, M, C), in the units and the order of the RobotSpec.
-        """
+        """Moves every world by one control period under commands (N, M, C), see `data`."""
         checked = self._checked(slice(0, len(self.data.steps)), commands)
         self.run_parts(lambda part: self._step(part, checked[part]))
 
@@ -320,10 +281,7 @@ class FastSimulator:
         return self._crew.run(function, self.parts)
 
     def step_part(self, part: slice, commands: ArrayLike) -> None:
-        """Moves the worlds of one of `parts` by one control period, in the calling thread.
-
-        The commands (n, M, C) are of these worlds; different parts may be stepped in parallel.
-        """
+        """Moves the worlds of one of `parts` under commands (n, M, C), in the calling thread."""
         self._step(part, self._checked(part, commands))
 
     def _step(self, part: slice, commands: Array) -> None:

@@ -22,11 +22,7 @@ Integers = NDArray[np.int64]
 
 
 class State(NamedTuple):
-    """All that changes in a simulation.
-
-    `faults`, `coefficient`, `delay`, `age` and `noise` are parameters of each robot: those of the
-    model unless written to, as domain randomisation does. A reset keeps them.
-    """
+    """All that changes in a simulation. A reset keeps the parameters of each robot."""
 
     pose: Array  # (N, M, 3) true pose of `base_link` in `map`
     state: Array  # (N, M, S) true state

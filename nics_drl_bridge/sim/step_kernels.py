@@ -102,15 +102,13 @@ def move_freely(begin: int, end: int, state: State, motion: Dynamics, lanes: Lan
 def _move_world(
     n: int, skip: int, state: State, scene: Surroundings, motion: Dynamics, scratch: Scratch
 ) -> None:
-    """Moves obstacles and robots of world n: freely, and carefully in tight spots.
-
-    `move_freely` has moved its first robot in lane `skip`, the others in those that follow.
-    """
+    """Moves the bodies of world n; `move_freely` has moved its robots in lanes `skip` and on."""
     lanes, nearby, single = scratch.lanes, scratch.nearby, scratch.single
     pose, period = state.pose, motion.dt * motion.substeps
     robots, first = pose.shape[1], state.velocity.shape[1]
     for m in range(robots):
-        nearby.way[m] = lanes.pose[5, skip + m] + sensing.most_drift(state.noise, n, m, period)
+        drift = math.sqrt(3.0 * period) * (state.noise[n, m, 2] + state.noise[n, m, 3])
+        nearby.way[m] = lanes.pose[5, skip + m] + drift
     longest, moving = contacts.reaches(n, state, nearby, period)
     if scene.crowded:
         contacts.sort_bodies(state.bodies, n, scratch.cells)
@@ -139,21 +137,9 @@ def _move_world(
     drift_carefully(n, state, scene, motion, nearby, single)
 
 
-@kernel
-def _note_paths(n: int, skip: int, pose: Array, scratch: Scratch) -> None:
-    """Reports to the cells how far the robots of world n came, drift included."""
-    before, frame = scratch.scans.before, scratch.cells.frame
-    for m in range(pose.shape[1]):
-        dx, dy = pose[n, m, 0] - before[skip + m, 0], pose[n, m, 1] - before[skip + m, 1]
-        frame[contacts.MOVED] = max(frame[contacts.MOVED], math.sqrt(dx * dx + dy * dy))
-
-
 @kernel(allocates=True)
 def step_worlds(packed: Any, commands: Array, begin: int) -> None:
-    """Steps the worlds of a part, from `begin` on, by one control period.
-
-    The commands are (n, M, C).
-    """
+    """Steps the worlds of a part, from `begin` on, under commands (n, M, C) for a period."""
     part = packed.part
     _step(part.state, part.scene, part.lidar, part.motion, part.scratch, commands, begin)
 
@@ -177,24 +163,9 @@ def _step(
             skip = (n - low) * many
             _move_world(n, skip, state, scene, motion, scratch)
             _measure(n, skip, state, motion, scratch)
-            if scene.crowded:
-                _note_paths(n, skip, state.pose, scratch)
             waiting = sensing.scan_or_wait(n, waiting, state, scene, view, motion, scratch)
         sensing.scan_together(waiting, state, scene, view, scratch)
         sensing.distort(low, high, state, view)
-
-
-@kernel
-def _note_speeds(n: int, state: State, speeds: Array) -> None:
-    """Writes the velocities (M, 2) in `map` of the robots of world n, as the period begins."""
-    pose, past, step = state.pose, state.past, state.steps[n]
-    row = step % past.shape[2]
-    for m in range(pose.shape[1]):
-        vx = vy = 0.0
-        if step > 0:
-            vx, vy = past[n, m, row, sensing.TWIST], past[n, m, row, sensing.TWIST + 1]
-        c, s = math.cos(pose[n, m, 2]), math.sin(pose[n, m, 2])
-        speeds[m, 0], speeds[m, 1] = c * vx - s * vy, s * vx + c * vy
 
 
 @kernel(inline=True)
@@ -202,36 +173,39 @@ def _begin_period(
     low: int, high: int, state: State, scene: Surroundings, motion: Dynamics, scratch: Scratch
 ) -> None:
     """Sets the velocities of the obstacles of the worlds [low, high), and notes the poses."""
-    pose, before = state.pose, scratch.scans.before
+    pose, before, speeds = state.pose, scratch.scans.before, scratch.nearby.speeds
     for n in range(low, high):
-        if scene.movers.moves:
-            _note_speeds(n, state, scratch.nearby.speeds)
-            obstacles.steer(n, state, scene, motion.dt * motion.substeps, scratch.nearby.speeds)
         for m in range(pose.shape[1]):
-            i = (n - low) * pose.shape[1] + m
+            i, row = (n - low) * pose.shape[1] + m, state.steps[n] % state.past.shape[2]
             before[i, 0], before[i, 1], before[i, 2] = pose[n, m, 0], pose[n, m, 1], pose[n, m, 2]
             if state.steps[n] == 0:
                 sensing.begin(n, m, state)
+            if scene.movers.moves:
+                twist = state.past[n, m, row, sensing.TWIST : sensing.TWIST + 2]
+                c, s = math.cos(pose[n, m, 2]), math.sin(pose[n, m, 2])
+                speeds[m, 0] = c * twist[0] - s * twist[1]
+                speeds[m, 1] = s * twist[0] + c * twist[1]
+        if scene.movers.moves:
+            obstacles.steer(n, state, scene, motion.dt * motion.substeps, speeds)
 
 
 @kernel(inline=True)
 def _measure(n: int, skip: int, state: State, motion: Dynamics, scratch: Scratch) -> None:
     """Puts the bodies of the robots of world n where they are, and reads their wheels."""
-    single, first = scratch.single, state.velocity.shape[1]
-    for m in range(state.pose.shape[1]):
-        contacts.put_body(state.bodies, n, first + m, state.pose[n, m])
-        rates_at(n, m, motion.substeps - 1, state, motion, single)
+    frame, pose, first = scratch.cells.frame, state.pose, state.velocity.shape[1]
+    for m in range(pose.shape[1]):
+        contacts.put_body(state.bodies, n, first + m, pose[n, m])
+        rates_at(n, m, motion.substeps - 1, state, motion, scratch.single)
         before = scratch.scans.before[skip + m]
-        sensing.measure(n, m, state, state.pose, before, single.dq, motion)
+        sensing.measure(n, m, state, pose, before, scratch.single.dq, motion)
+        # The cells count how far the robots came, drift included.
+        dx, dy = pose[n, m, 0] - before[0], pose[n, m, 1] - before[1]
+        frame[contacts.MOVED] = max(frame[contacts.MOVED], math.sqrt(dx * dx + dy * dy))
 
 
 @kernel(allocates=True)
 def begin(packed: Any, chosen: Integers) -> None:
-    """Begins episodes in the worlds `chosen` (n,), whose robots and obstacles are in place.
-
-    Their moving obstacles draw what they need, and the robots take their first scans: everything
-    stands still, so no scan is older or skewed.
-    """
+    """Begins episodes in the worlds `chosen` (n,): all is in place and stands still."""
     part = packed.part
     state, waiting = part.state, part.scratch.scans.waiting
     for i in range(chosen.shape[0]):

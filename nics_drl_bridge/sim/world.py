@@ -22,8 +22,7 @@ Array = NDArray[np.float64]
 MOST_OBSTACLES = 10_000
 MOST_WALLS = 10_000
 MOST_PLACES = 10_000
-SMALLEST_FIELD = 0.01
-"""Least side of a field [m]."""
+SMALLEST_FIELD = 0.01  # Least side of a field [m]
 Distance = Annotated[float, Field(ge=0.0, le=LARGEST)]
 Side = Annotated[float, Field(ge=SMALLEST_FIELD, le=LARGEST)]
 Pose = tuple[Coordinate, Coordinate, Heading]
@@ -32,21 +31,15 @@ Region = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 
 
 class Obstacles(Schema):
-    """A group of obstacles with common properties.
+    """A group of obstacles with common properties."""
 
-    Attributes:
-        shapes: each obstacle of the group takes one of them at random.
-        count: number of obstacles, or [least, greatest], from which each episode draws.
-        gap: free space between one of them and any other obstacle [m].
-        at: fixed poses, x, y [m], heading [rad], instead of `count` at random.
-        motion: their motion, see `sim.obstacles`; by default they stand still.
-    """
-
+    # each obstacle of the group takes one of them at random
     shapes: tuple[Shape, ...] = Field(min_length=1, max_length=MOST_SHAPES)
+    # number of obstacles, or [least, greatest], from which each episode draws
     count: int | tuple[int, int] | None = None
-    gap: Distance = 0.0
-    at: tuple[Pose, ...] = ()
-    motion: Motion | None = None
+    gap: Distance = 0.0  # free space between one of them and any other obstacle [m]
+    at: tuple[Pose, ...] = ()  # fixed poses, x, y [m], heading [rad], instead of `count` at random
+    motion: Motion | None = None  # their motion, see `sim.obstacles`; by default they stand still
 
     @field_validator("count", mode="before")
     @classmethod
@@ -74,10 +67,7 @@ class Obstacles(Schema):
 
 
 class Places(Schema):
-    """Places anywhere in one of the regions, x1, y1, x2, y2 of opposite corners [m], or at points.
-
-    Of starts these are x, y [m], heading [rad]; of goals x, y [m].
-    """
+    """Places in regions, x1, y1, x2, y2 of opposite corners [m], or at poses or points."""
 
     regions: tuple[Region, ...] = Field(default=(), max_length=MOST_PLACES)
     at: tuple[Pose | Point, ...] = Field(default=(), max_length=MOST_PLACES)
@@ -102,28 +92,22 @@ class Goals(Places):
 
 
 class World(Schema):
-    """World of the episodes; everything is in the frame `map`.
+    """World of the episodes; everything is in the frame `map`."""
 
-    Attributes:
-        name: the name users refer to it by.
-        size: width along x and depth along y of a walled field around the origin [m].
-        walls: further straight walls, x1, y1, x2, y2 [m].
-        map: a static map, the YAML file of Nav2's map_server: the name of a shipped one, or a
-            path relative to the folder of the world file. A world has a `size`, a `map`, or both.
-        obstacles: groups of obstacles, see `Obstacles`.
-        clearance: free space around the footprint at start and goal, and on a path between [m].
-        goal_distance: least and greatest straight-line distance from start to goal [m].
-        starts, goals: by default anywhere.
-    """
-
-    name: str
+    name: str  # the name users refer to it by
+    # width along x and depth along y of a walled field around the origin [m]
     size: tuple[Side, Side] | None = None
+    # further straight walls, x1, y1, x2, y2 [m]
     walls: tuple[Region, ...] = Field(default=(), max_length=MOST_WALLS)
+    # a static map, the YAML file of Nav2's map_server: the name of a shipped one, or a path
+    # relative to the folder of the world file. A world has a `size`, a `map`, or both
     map: str | None = None
-    obstacles: tuple[Obstacles, ...] = ()
+    obstacles: tuple[Obstacles, ...] = ()  # groups of obstacles, see `Obstacles`
+    # free space around the footprint at start and goal, and on a path between [m]
     clearance: Distance = 0.3
+    # least and greatest straight-line distance from start to goal [m]
     goal_distance: tuple[Distance, Distance]
-    starts: Starts | None = None
+    starts: Starts | None = None  # `starts`, `goals`: by default anywhere
     goals: Goals | None = None
     _file: str | None = PrivateAttr(default=None)
 
@@ -149,10 +133,7 @@ class World(Schema):
 
     @property
     def fingerprint(self) -> str:
-        """Identifier: the name, and the first 8 digits of a SHA-256 over the whole content.
-
-        A map enters by its cells and frame, not by its path.
-        """
+        """The name, and 8 digits of a SHA-256 over the content; of a map, not its path."""
         content = self.model_dump_json(exclude={"map"}).encode()
         if self.grid is not None:
             about = repr((self.grid.cells.shape, self.grid.resolution, self.grid.origin))
@@ -175,8 +156,8 @@ class World(Schema):
         rows, columns = self.grid.cells.shape
         corners = [(i - 0.5, j - 0.5) for i in (0, rows) for j in (0, columns)]
         points = self.grid.cell_to_world(corners)
-        (x1, y1), (x2, y2) = points.min(axis=0), points.max(axis=0)
-        return float(x1), float(y1), float(x2), float(y2)
+        (x1, y1), (x2, y2) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
+        return x1, y1, x2, y2
 
     def all_walls(self) -> Array:
         """Returns (W, 4) the four sides of the field, if any, then the further walls [m]."""
@@ -188,11 +169,7 @@ class World(Schema):
 
 
 def load_world(name: str | Path) -> World:
-    """Loads a shipped world by name (`arena`), or any other by the path of its YAML file.
-
-    Raises:
-        ConfigError: the file or its map is missing or invalid.
-    """
+    """Loads a shipped world by name (`arena`), or any other by the path of its YAML file."""
     path = find_config(name, "worlds")
     world = load_yaml(path, World)
     if world.map is not None and Path(world.map).suffix in (".yaml", ".yml"):
@@ -205,29 +182,29 @@ def load_world(name: str | Path) -> World:
 
 def check_places(world: World) -> None:
     """Raises ConfigError for an obstacle outside the world, or that does not fit at a waypoint."""
-    x1, y1, x2, y2 = world.extent
     for g, group in enumerate(world.obstacles):
-        for n, (x, y, heading) in enumerate(group.at):
-            if not (x1 <= x <= x2 and y1 <= y <= y2):
-                raise ConfigError(
-                    f"{world.source}: key 'obstacles.{g}.at.{n}': {[x, y, heading]} is outside of "
-                    "the world; move it."
-                )
-        if not isinstance(group.motion, Patrol):
-            continue
+        where = f"{world.source}: key 'obstacles.{g}"
+        for n, pose in enumerate(group.at):
+            if not _inside(world, *pose[:2]):
+                raise ConfigError(f"{where}.at.{n}': {list(pose)} is outside the world; move it.")
         radius = max(shape.radius for shape in group.shapes)
-        for n, point in enumerate(group.motion.waypoints):
+        waypoints = group.motion.waypoints if isinstance(group.motion, Patrol) else ()
+        for n, point in enumerate(waypoints):
             if _room_at(world, *point) < radius:
                 raise ConfigError(
-                    f"{world.source}: key 'obstacles.{g}.motion.waypoints.{n}': an obstacle of "
-                    f"radius {radius:g} m does not fit there, at {list(point)}; move it."
+                    f"{where}.motion.waypoints.{n}': an obstacle of radius {radius:g} m does not "
+                    f"fit there, at {list(point)}; move it."
                 )
+
+
+def _inside(world: World, x: float, y: float) -> bool:
+    x1, y1, x2, y2 = world.extent
+    return x1 <= x <= x2 and y1 <= y <= y2
 
 
 def _room_at(world: World, x: float, y: float) -> float:
     """Free space around a point among walls and map [m], negative outside the world."""
-    x1, y1, x2, y2 = world.extent
-    if not (x1 <= x <= x2 and y1 <= y <= y2):
+    if not _inside(world, x, y):
         return -1.0
     room = wall_distance(x, y, world.all_walls())
     if world.grid is not None:

@@ -7,7 +7,7 @@ from robots import DIRECT, FOOTPRINT, direct_model, field, lidar
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.task import Episodes, bearing, distance
-from nics_drl_bridge.env.teams import CooperativeReaching, PursuitEvasion, distances, others, seen
+from nics_drl_bridge.env.teams import CooperativeReaching, PursuitEvasion, others, pairs
 from nics_drl_bridge.interface import RobotView
 
 B = 72
@@ -187,9 +187,12 @@ def test_a_team_gets_an_action_for_each_robot():
 def test_pairs_are_seen_as_each_would_be_alone(lead, robots):
     rng = np.random.default_rng(0)
     pose, points = rng.normal(size=(*lead, robots, 3)), rng.normal(size=(*lead, 4, 2))
-    pairs = pose[..., :, None, :], points[..., None, :, :]
-    assert np.array_equal(seen(pose, points), bearing(*pairs))
-    assert np.array_equal(distances(pose, points), distance(*pairs))
+    seen, away = bearing(*pairs(pose, points)), distance(*pairs(pose, points))
+    for m in range(robots):
+        for p in range(4):
+            alone = pose[..., m, :], points[..., p, :]
+            assert np.array_equal(seen[..., m, p, :], bearing(*alone))
+            assert np.array_equal(away[..., m, p], distance(*alone))
     of_all = rng.normal(size=(*lead, robots, robots, 2))
     expected = [np.delete(of_all[..., m, :, :], m, axis=-2) for m in range(robots)]
     assert np.array_equal(others(of_all), np.stack(expected, axis=-3))

@@ -15,7 +15,7 @@ from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.middleware import kernels
 from nics_drl_bridge.middleware.ekf import Estimator
 from nics_drl_bridge.middleware.kernels import Log, MotionModel
-from nics_drl_bridge.middleware.measurement import Acceptance
+from nics_drl_bridge.middleware.measurement import Acceptance, Kind
 from nics_drl_bridge.robot.kernels import SERIES, rates, scratch, term_arrays
 from nics_drl_bridge.robot.noise import Level, Noise
 from nics_drl_bridge.sim.simulator import FastSimulator
@@ -86,7 +86,7 @@ def test_the_expected_twist_has_the_numerical_derivative(robot):
     motion = MotionModel(term_arrays(model.kinematics), SERIES, 0, 0)
     for _ in range(10):
         mean, command = random_mean(model, rng), random_command(model, rng)
-        log = Log(np.zeros(1, np.int64), command[None], 1)
+        log = Log(np.zeros(1, np.int64), command[None])
         twist, derivative = kernels.expect(mean, 0, motion, log)
         x = np.concatenate([mean[3:], command])
         assert twist == pytest.approx(model.kinematics.rates(x)[:3], abs=1e-12)
@@ -151,7 +151,7 @@ def test_a_heading_is_corrected_the_short_way_round(believed, measured):
     estimator.reset(0, [0.0, 0.0, believed])
     estimator.predict(SECOND)
     for _ in range(50):
-        estimator.update_pose([0.0, 0.0, measured], [0.01, 0.01, 0.01])
+        estimator.update(Kind.POSE, [0.0, 0.0, measured], [0.01, 0.01, 0.01])
         heading = estimator.at(SECOND)[0][2]
         assert -np.pi <= heading < np.pi
         assert abs(heading) > 3.12
@@ -174,10 +174,10 @@ def simulated_drive(model, seconds, seed, pose_std=None):
         simulator.step(command[None, None])
         now = (step + 1) * PERIOD
         estimator.predict(now)
-        estimator.update_twist(simulator.data.twist[0, 0])
+        estimator.update(Kind.TWIST, simulator.data.twist[0, 0])
         true = simulator.data.pose[0, 0]
         if pose_std is not None and step % 10 == 9:
-            estimator.update_pose(true + rng.normal(size=3) * pose_std, np.full(3, pose_std))
+            estimator.update(Kind.POSE, true + rng.normal(size=3) * pose_std, np.full(3, pose_std))
         errors.append(geometry.between(true, estimator.at(now)[0]))
         drifts.append(geometry.between(true, simulator.data.odom[0, 0]))
         turn = np.eye(3)
@@ -213,7 +213,7 @@ def test_a_wrong_belief_about_the_pose_is_mended_by_measurements():
     truth = np.array([0.5, -0.3, 2.9])
     for second in range(1, 61):
         estimator.predict(second * SECOND)
-        estimator.update_pose(truth, [0.01, 0.01, 0.01])
+        estimator.update(Kind.POSE, truth, [0.01, 0.01, 0.01])
     assert geometry.between(truth, estimator.at(60 * SECOND)[0]) == pytest.approx(
         np.zeros(3), abs=0.01
     )
@@ -232,9 +232,9 @@ def test_the_covariance_stays_positive_definite_over_thousands_of_random_steps(r
             estimator.command(now, random_command(model, rng))
         estimator.predict(now)
         if kind in (1, 2):
-            estimator.update_twist(rng.normal(size=3))
+            estimator.update(Kind.TWIST, rng.normal(size=3))
         elif kind == 3:
-            estimator.update_pose(rng.normal(size=3), 10.0 ** rng.uniform(-4.0, 1.0, 3))
+            estimator.update(Kind.POSE, rng.normal(size=3), 10.0 ** rng.uniform(-4.0, 1.0, 3))
         if step % 100 == 99:
             covariance = estimator.covariance
             assert np.isfinite(estimator.at(now)[0]).all()
@@ -289,7 +289,7 @@ def test_a_robot_that_is_stuck_is_noticed_at_once():
     estimator.command(0, [0.8, 0.0])
     for step in range(1, 21):
         estimator.predict(step * PERIOD)
-        estimator.update_twist(np.zeros(3))
+        estimator.update(Kind.TWIST, np.zeros(3))
     pose, twist = estimator.at(20 * PERIOD)
     assert abs(twist[0]) < 0.1
     assert abs(pose[0]) < 0.8  # the command alone leads to 1.5 m
@@ -304,7 +304,7 @@ def test_the_noise_of_the_pose_is_that_of_the_model():
         estimator = Estimator(replace(model, noise=noise))
         estimator.reset(0, np.zeros(3))
         estimator.predict(10 * SECOND)
-        estimator.update_pose(np.zeros(3))
+        estimator.update(Kind.POSE, np.zeros(3))
         spread.append(np.sqrt(estimator.covariance[0, 0]))
     assert spread[0] == pytest.approx(0.01, rel=0.2)
     assert spread[1] > 3.0 * spread[0]
@@ -332,7 +332,9 @@ def test_to_foresee_changes_no_bit_whatever_comes_instead(robot):
                 one.reset(time, pose)
             one.predict(moment)
             spreads.append(one.twist_covariance)
-            corrected = one.update_twist(twist) if event < 0.9 else one.update_pose(pose)
+            corrected = (
+                one.update(Kind.TWIST, twist) if event < 0.9 else one.update(Kind.POSE, pose)
+            )
             outcomes.add(corrected.outcome)
         for mine, other in zip(plain.belief, foreseeing.belief, strict=True):
             assert np.array_equal(mine, other)
@@ -345,7 +347,7 @@ def test_what_is_foreseen_is_not_worked_out_again(monkeypatch):
     estimator.foresee(PERIOD)
     monkeypatch.setattr(kernels, "forecast", None)
     monkeypatch.setattr(kernels, "expect", None)
-    estimator.update_pose(np.zeros(3))
+    estimator.update(Kind.POSE, np.zeros(3))
     with pytest.raises(TypeError):
         estimator.predict(PERIOD)  # a correction came between
 
@@ -355,10 +357,10 @@ def test_what_is_foreseen_is_not_worked_out_again(monkeypatch):
     monkeypatch.setattr(kernels, "expect", None)
     estimator.predict(PERIOD)
     monkeypatch.setattr(estimator._filter, "update", None)
-    assert estimator.update_twist(np.zeros(3)).outcome is Acceptance.USED
+    assert estimator.update(Kind.TWIST, np.zeros(3)).outcome is Acceptance.USED
     assert estimator.time_ns == PERIOD
     with pytest.raises(TypeError):
-        estimator.update_twist(np.zeros(3))  # that was for one
+        estimator.update(Kind.TWIST, np.zeros(3))  # that was for one
 
 
 def test_the_same_data_give_the_same_bits():
@@ -370,12 +372,12 @@ def driven(robot="ackermann", seconds=2):
     """An estimator of a robot that drives as it should, at the end."""
     estimator = Estimator(builtin_model(robot))
     estimator.reset(0, np.zeros(3))
-    command = estimator._log.arrays[1][0] * 0.0
+    command = estimator._log.commands[0] * 0.0
     command[0] = 0.5
     estimator.command(0, command)
     for step in range(1, seconds * 10 + 1):
         estimator.predict(step * PERIOD)
-        verdict = estimator.update_twist(estimator.at(step * PERIOD)[1])
+        verdict = estimator.update(Kind.TWIST, estimator.at(step * PERIOD)[1])
         assert verdict.outcome is Acceptance.USED
     return estimator
 
@@ -383,7 +385,7 @@ def driven(robot="ackermann", seconds=2):
 def test_a_twist_that_the_robot_can_not_have_is_refused_and_changes_nothing():
     estimator = driven()
     before = estimator.belief
-    verdict = estimator.update_twist([50.0, 0.0, 0.0])
+    verdict = estimator.update(Kind.TWIST, [50.0, 0.0, 0.0])
     assert verdict.outcome is Acceptance.OUTLIER
     assert verdict.distance > 1000.0
     after = estimator.belief
@@ -394,25 +396,25 @@ def test_a_twist_that_the_robot_can_not_have_is_refused_and_changes_nothing():
 
 def test_a_twist_that_is_slower_than_expected_is_news_at_once():
     estimator = driven()
-    assert estimator.update_twist([0.0, 0.0, 0.0]).outcome is Acceptance.NEWS
+    assert estimator.update(Kind.TWIST, [0.0, 0.0, 0.0]).outcome is Acceptance.NEWS
     assert estimator.belief.outliers == (0, 0, 0)
     assert abs(estimator.at(estimator.time_ns)[1][0]) < 0.01
 
 
 def test_impossible_twists_are_believed_from_the_third_in_a_row_until_one_fits_again():
     estimator = driven()
-    outcomes = [estimator.update_twist([0.5, 0.8, 0.0]).outcome for _ in range(5)]
+    outcomes = [estimator.update(Kind.TWIST, [0.5, 0.8, 0.0]).outcome for _ in range(5)]
     assert outcomes == [Acceptance.OUTLIER] * 2 + [Acceptance.JUMP] * 3
-    assert estimator.update_twist([0.5, 0.0, 0.0]).outcome is not Acceptance.OUTLIER
+    assert estimator.update(Kind.TWIST, [0.5, 0.0, 0.0]).outcome is not Acceptance.OUTLIER
     assert estimator.belief.outliers == (0, 0, 0)
-    assert estimator.update_twist([0.5, 0.8, 0.0]).outcome is Acceptance.OUTLIER
+    assert estimator.update(Kind.TWIST, [0.5, 0.8, 0.0]).outcome is Acceptance.OUTLIER
 
 
 def test_impossible_twists_do_not_move_the_pose():
     estimator = driven()
     before = estimator.at(estimator.time_ns)[0]
     for _ in range(10):
-        estimator.update_twist([500.0, 300.0, -40.0])
+        estimator.update(Kind.TWIST, [500.0, 300.0, -40.0])
     assert np.array_equal(estimator.at(estimator.time_ns)[0], before)
 
 
@@ -421,9 +423,9 @@ def test_what_is_beyond_all_bounds_is_never_believed_however_often_it_comes(valu
     estimator = driven()
     before = estimator.belief
     for _ in range(20):
-        assert estimator.update_twist([value, 0.0, 0.0]).outcome is Acceptance.OUTLIER
-        assert estimator.update_pose([0.0, -value, 0.0]).outcome is Acceptance.OUTLIER
-        assert estimator.update_yaw_rate(value).outcome is Acceptance.OUTLIER
+        assert estimator.update(Kind.TWIST, [value, 0.0, 0.0]).outcome is Acceptance.OUTLIER
+        assert estimator.update(Kind.POSE, [0.0, -value, 0.0]).outcome is Acceptance.OUTLIER
+        assert estimator.update(Kind.YAW_RATE, value).outcome is Acceptance.OUTLIER
     assert np.array_equal(estimator.belief.mean, before.mean)
     assert np.array_equal(estimator.belief.covariance, before.covariance)
 
@@ -434,9 +436,9 @@ def test_absurd_commands_leave_the_filter_sound(robot, value):
     estimator = driven(robot)
     for k in range(1, 60):
         now = estimator.time_ns
-        estimator.command(now, np.full(len(estimator._log.arrays[1][0]), value))
+        estimator.command(now, np.full(len(estimator._log.commands[0]), value))
         estimator.predict(now + k * PERIOD)
-        estimator.update_twist(np.zeros(3))
+        estimator.update(Kind.TWIST, np.zeros(3))
         assert np.isfinite(np.concatenate(estimator.at(now + 90 * SECOND))).all()
         assert np.isfinite(np.concatenate(estimator.at(now + 9 * SECOND))).all()
         np.linalg.cholesky(estimator.covariance)
@@ -446,24 +448,24 @@ def test_a_pose_far_off_is_refused_and_the_fifth_in_a_row_is_taken_as_a_jump():
     estimator = driven()
     before, far = estimator.belief, [30.0, 2.0, -3.0]
     for _ in range(4):
-        assert estimator.update_pose(far, [0.02] * 3).outcome is Acceptance.OUTLIER
+        assert estimator.update(Kind.POSE, far, [0.02] * 3).outcome is Acceptance.OUTLIER
         assert np.array_equal(estimator.belief.mean, before.mean)
         assert np.array_equal(estimator.belief.covariance, before.covariance)
-    assert estimator.update_pose(far, [0.02] * 3).outcome is Acceptance.JUMP
+    assert estimator.update(Kind.POSE, far, [0.02] * 3).outcome is Acceptance.JUMP
     pose, twist = estimator.at(estimator.time_ns)
     assert pose == pytest.approx(far)
     assert twist[0] == pytest.approx(0.5, abs=0.1)  # it still drives
     assert np.sqrt(np.diag(estimator.covariance)[:3]) == pytest.approx(0.02)
     assert (estimator.covariance[:3, 3:] == 0.0).all()  # it says nothing of the state
     assert np.linalg.eigvalsh(estimator.covariance).min() > 0.0
-    assert estimator.update_pose(far, [0.02] * 3).outcome is Acceptance.USED
+    assert estimator.update(Kind.POSE, far, [0.02] * 3).outcome is Acceptance.USED
 
 
 @pytest.mark.parametrize(("believed", "measured"), [(3.13, -3.14), (-3.13, 3.14)])
 def test_a_heading_beyond_the_seam_is_near_and_no_outlier(believed, measured):
     estimator = Estimator(builtin_model("differential"))
     estimator.reset(0, [0.0, 0.0, believed], 0.02)
-    verdict = estimator.update_pose([0.0, 0.0, measured], [0.02] * 3)
+    verdict = estimator.update(Kind.POSE, [0.0, 0.0, measured], [0.02] * 3)
     assert verdict.outcome is Acceptance.USED
     assert verdict.distance == pytest.approx((2.0 * np.pi - 6.27) ** 2 / (2 * 0.02**2))
     assert abs(estimator.at(0)[0][2]) > 3.13
@@ -474,8 +476,8 @@ def test_outliers_are_counted_in_a_row_only():
     good, far = estimator.at(estimator.time_ns)[0], [30.0, 2.0, 1.0]
     for _ in range(5):
         for _ in range(4):
-            assert estimator.update_pose(far, [0.02] * 3).outcome is Acceptance.OUTLIER
-        assert estimator.update_pose(good, [0.02] * 3).outcome is Acceptance.USED
+            assert estimator.update(Kind.POSE, far, [0.02] * 3).outcome is Acceptance.OUTLIER
+        assert estimator.update(Kind.POSE, good, [0.02] * 3).outcome is Acceptance.USED
 
 
 @pytest.mark.parametrize("robot", ["ackermann", "differential"])
@@ -483,12 +485,12 @@ def test_a_gyro_corrects_the_yaw_rate_but_never_against_its_gate(robot):
     estimator = driven(robot)
     before = estimator.at(estimator.time_ns)[1][2]
     spread = estimator.covariance
-    assert estimator.update_yaw_rate(before + 0.03, 0.01).outcome is Acceptance.USED
+    assert estimator.update(Kind.YAW_RATE, before + 0.03, 0.01).outcome is Acceptance.USED
     after = estimator.at(estimator.time_ns)[1][2]
     assert before + 1e-3 < after < before + 0.03
     assert np.trace(estimator.covariance) < np.trace(spread)
     for _ in range(50):
-        assert estimator.update_yaw_rate(9.0).outcome is Acceptance.OUTLIER
+        assert estimator.update(Kind.YAW_RATE, 9.0).outcome is Acceptance.OUTLIER
     assert estimator.at(estimator.time_ns)[1][2] == after
 
 
@@ -499,7 +501,7 @@ def test_a_gate_refuses_one_good_measurement_in_a_thousand():
     for _ in range(20_000):
         estimator.belief = belief
         measured = belief.mean[:3] + spread @ rng.normal(size=3)
-        refused += estimator.update_pose(measured, [0.05] * 3).outcome is Acceptance.OUTLIER
+        refused += estimator.update(Kind.POSE, measured, [0.05] * 3).outcome is Acceptance.OUTLIER
     assert 8 <= refused <= 36  # 20 are expected; 99.9 % of such counts
 
 
@@ -507,7 +509,7 @@ def test_an_unknown_start_is_mended_by_the_first_pose():
     estimator = Estimator(builtin_model("differential"))
     estimator.reset(0, np.zeros(3), [100.0, 100.0, np.pi])
     estimator.predict(SECOND)
-    assert estimator.update_pose([40.0, -70.0, 2.0], [0.01] * 3).outcome is Acceptance.USED
+    assert estimator.update(Kind.POSE, [40.0, -70.0, 2.0], [0.01] * 3).outcome is Acceptance.USED
     assert estimator.at(SECOND)[0] == pytest.approx([40.0, -70.0, 2.0], abs=1e-3)
 
 

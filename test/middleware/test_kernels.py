@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.middleware import kernels
-from nics_drl_bridge.middleware.kernels import ROOM, CommandLog
+from nics_drl_bridge.middleware.kernels import log_of, logged
 
 
 def in_effect(log, time):
-    return log.arrays.commands[kernels.in_effect(log.arrays, time)].tolist()
+    return log.commands[kernels.in_effect(log, time)].tolist()
 
 
 def test_before_the_first_command_there_is_none():
-    log = CommandLog(2)
+    log = log_of([0.0, 0.0])
     assert in_effect(log, 10**18) == [0.0, 0.0]
-    log.add(100, [1.0, 2.0], 0)
+    log = logged(log, 100, [1.0, 2.0], 0)
     assert in_effect(log, 100) == [0.0, 0.0]
     assert in_effect(log, 101) == [1.0, 2.0]
 
@@ -22,12 +22,11 @@ def test_before_the_first_command_there_is_none():
 def test_the_order_of_adding_does_not_matter():
     rng = np.random.default_rng(0)
     times = rng.permutation(1000)[:100] * 10
-    log = CommandLog(1)
+    log = log_of([0.0])
     for time in times:
-        assert log.add(int(time), [float(time)], -1)
-    effective, commands, count = log.arrays
-    assert effective[1:count].tolist() == sorted(times.tolist())
-    assert np.array_equal(commands[1:count, 0], effective[1:count])
+        log = logged(log, int(time), [float(time)], -1)
+    assert log.effective[1:].tolist() == sorted(times.tolist())
+    assert np.array_equal(log.commands[1:, 0], log.effective[1:])
     for now in rng.integers(0, 10_000, 100):
         earlier = times[times < now]
         assert in_effect(log, now) == [float(earlier.max()) if len(earlier) else 0.0]
@@ -35,34 +34,17 @@ def test_the_order_of_adding_does_not_matter():
 
 @pytest.mark.parametrize("time", [10, 20, 30])
 def test_of_two_commands_at_once_the_first_stays(time):
-    log = CommandLog(1)
+    log = log_of([0.0])
     for other in (10, 20, 30):
-        assert log.add(other, [1.0], 0)
-    assert not log.add(time, [2.0], 0)
-    assert in_effect(log, time + 1) == [1.0]
+        log = logged(log, other, [1.0], 0)
+    assert logged(log, time, [2.0], 0) is None
 
 
 def test_what_is_no_longer_needed_is_forgotten_and_all_else_kept():
-    log = CommandLog(1)
-    for k in range(100 * ROOM):
-        log.add(k, [float(k)], k - 50)
-        for back in (0, 1, 49):
+    log = log_of([0.0])
+    for k in range(1000):
+        log = logged(log, k, [float(k)], k - 50)
+        for back in (0, 1, 49, 50):  # just before the time that is needed, too
             assert in_effect(log, k - back + 1) == [float(max(k - back, 0))]
-    assert len(log.arrays.effective) == ROOM
-
-
-def test_it_grows_with_what_is_needed():
-    log = CommandLog(1)
-    for k in range(10 * ROOM):
-        log.add(k, [float(k)], 0)
-    assert [in_effect(log, k + 1) for k in range(10 * ROOM)] == [
-        [float(k)] for k in range(10 * ROOM)
-    ]
-
-
-def test_clearing_forgets_all():
-    log = CommandLog(1)
-    log.add(5, [1.0], 0)
-    log.clear()
-    assert in_effect(log, 100) == [0.0]
-    assert log.add(5, [2.0], 0)
+        assert in_effect(log, k - 50) == [float(max(k - 51, 0))]
+    assert len(log.effective) == 52

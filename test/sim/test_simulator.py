@@ -290,7 +290,7 @@ def test_goals_are_those_of_the_scene():
 
 @pytest.mark.parametrize(("worlds", "robots"), [(0, 1), (1, 0)])
 def test_a_simulator_of_nothing_is_refused(worlds, robots):
-    with pytest.raises(ConfigError, match="at least 1 world and 1 robot"):
+    with pytest.raises(ConfigError, match="at least 1 world, robot"):
         FastSimulator(direct_model(), field(), worlds, robots)
 
 

@@ -395,5 +395,5 @@ def test_commands_of_another_shape_are_refused():
 
 @pytest.mark.parametrize("changes", [{"threads": 0}, {"longest_delay": 2}, {"longest_age": -1}])
 def test_a_simulator_without_threads_or_room_is_refused(changes):
-    with pytest.raises(ConfigError, match="at least 1 thread"):
+    with pytest.raises(ConfigError, match="at least 1 world, robot and thread"):
         FastSimulator(model(), field(), 3, **changes)
