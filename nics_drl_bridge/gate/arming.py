@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 
 from nics_drl_bridge.gate import stops
 from nics_drl_bridge.gate.frozen import stands_still
@@ -12,28 +11,17 @@ from nics_drl_bridge.gate.state import Arrivals, GateConfig, GateState
 from nics_drl_bridge.gate.stops import ODOM, SCAN
 from nics_drl_bridge.interface import S_PER_NS
 
-BEHIND_S = 0.2
-"""Stamps may fall behind by this much while the gate settles, because they are irregular [s]."""
-Check = Callable[[GateConfig, GateState, Arm, float], str]
-"""Returns what is wrong; empty if nothing is."""
+BEHIND_S = 0.2  # by which irregular stamps may fall behind while the gate settles
+Check = Callable[[GateConfig, GateState, Arm, float], str]  # what is wrong; empty if nothing is
 
 
-def _topic(config: GateConfig, state: GateState, topic: str) -> tuple[Arrivals, float, float]:
-    """Returns a topic's arrivals, greatest age [s] and declared rate [Hz]."""
-    if topic == SCAN:
-        return state.scans, config.scan_age_s, config.scan_rate
-    return state.odometries, config.odom_age_s, config.odom_rate
-
-
-def _fresh(topic: str, config: GateConfig, state: GateState, request: Arm, now: float) -> str:
-    arrivals, age_s, _ = _topic(config, state, topic)
-    fresh = stops.gap_free(arrivals, now, config.settle_s, age_s)
+def _fresh(topic: str, arrivals: Arrivals, limit_s: float, config: GateConfig, now: float) -> str:
+    fresh = stops.gap_free(arrivals, now, config.settle_s, limit_s)
     return "" if fresh else f"{topic} has not been fresh for {config.settle_s} s"
 
 
-def _rate(topic: str, config: GateConfig, state: GateState, request: Arm, now: float) -> str:
+def _rate(topic: str, arrivals: Arrivals, declared: float, config: GateConfig, now: float) -> str:
     """Judges a rate: by stamps too few and too many data are wrong, by arrival only too few."""
-    arrivals, _, declared = _topic(config, state, topic)
     arriving, stamped = stops.rate(arrivals, now, config.settle_s)
     low = declared * (1.0 - config.rate_tolerance)
     high = declared * (1.0 + config.rate_tolerance)
@@ -67,14 +55,14 @@ def _clocks(config: GateConfig, state: GateState, request: Arm, now: float) -> s
 
 def _estimator(config: GateConfig, state: GateState, request: Arm, now: float) -> str:
     """The middleware knows where the robot is, and that it stands still."""
+    estimate = state.estimate
     if not config.estimate_required:
         return ""
-    if state.estimate is None or now - state.estimate_s > config.estimate_silence_s:
+    if estimate is None or now - state.estimate_s > config.estimate_silence_s:
         return "odometry/filtered is silent, start the middleware_node"
-    if state.estimate.std.max() > config.estimate_std:
-        worst = float(state.estimate.std.max())
+    if (worst := float(estimate.std.max())) > config.estimate_std:
         return f"odometry/filtered is uncertain by {worst:.2f}, the limit is {config.estimate_std}"
-    return "" if stands_still(config, state.estimate.twist) else "odometry/filtered shows motion"
+    return "" if stands_still(config, estimate.twist) else "odometry/filtered shows motion"
 
 
 def _publishers(config: GateConfig, state: GateState, request: Arm, now: float) -> str:
@@ -91,23 +79,23 @@ def _limits(config: GateConfig, state: GateState, request: Arm, now: float) -> s
     return "" if config.limits is not None else "no limits are set, name their file in `limits`"
 
 
+def _latched(config: GateConfig, state: GateState, request: Arm, now: float) -> str:
+    return "" if state.latched is None else f"call ~/reset first: {state.latched.line}"
+
+
 def _e_stop(config: GateConfig, state: GateState, request: Arm, now: float) -> str:
     cause = stops.e_stop_pressed(config, state, now) or stops.e_stop_silent(config, state, now)
     return "" if cause is None else cause.line
-
-
-def _latched(config: GateConfig, state: GateState, request: Arm, now: float) -> str:
-    return "" if state.latched is None else f"call ~/reset first: {state.latched.line}"
 
 
 CHECKS: tuple[tuple[str, Check], ...] = (
     ("limits_set", _limits),
     ("nothing_latched", _latched),
     ("e_stop_released", _e_stop),
-    ("scan_fresh", partial(_fresh, SCAN)),
-    ("scan_rate", partial(_rate, SCAN)),
-    ("odom_fresh", partial(_fresh, ODOM)),
-    ("odom_rate", partial(_rate, ODOM)),
+    ("scan_fresh", lambda c, s, _, now: _fresh(SCAN, s.scans, c.scan_age_s, c, now)),
+    ("scan_rate", lambda c, s, _, now: _rate(SCAN, s.scans, c.scan_rate, c, now)),
+    ("odom_fresh", lambda c, s, _, now: _fresh(ODOM, s.odometries, c.odom_age_s, c, now)),
+    ("odom_rate", lambda c, s, _, now: _rate(ODOM, s.odometries, c.odom_rate, c, now)),
     ("clocks_agree", _clocks),
     ("estimator_converged", _estimator),
     ("one_publisher", _publishers),

@@ -52,7 +52,11 @@ def decide(
             cause = Cause("motion_unfit", "", motion.fault)
             state = _stopped(config, replace(state, latched=cause), now, disarm=True)
         else:
-            state, shielded = _moved(config, state, motion, now), motion.shielded
+            recent = _recent(config, state, motion.value, now)
+            state = replace(
+                state, value=motion.value, slope=motion.slope, moved_s=now, recent=recent
+            )
+            state, shielded = frozen.watch_motion(config, state, now), motion.shielded
     twist = np.zeros(3)
     twist[list(config.fields)] = state.value
     return state, Decision(twist, publish, cause, refused, answer, granted, shielded)
@@ -63,14 +67,12 @@ def _serve(
 ) -> tuple[GateState, str, bool]:
     """Arms or resets, if requested; returns also the answer, and whether it was granted."""
     if isinstance(given, Arm):
-        failed = arming.failures(config, state, given, now)
-        if failed:
+        if failed := arming.failures(config, state, given, now):
             return state, "; ".join(failed), False
-        scans, odometries = stops.settled(state.scans), stops.settled(state.odometries)
-        state = replace(
-            state, armed=True, scans=scans, odometries=odometries, seen=(), frozen="", push=None
-        )
-        return state, "armed", True
+        return replace(
+            state, armed=True, scans=stops.settled(state.scans),
+            odometries=stops.settled(state.odometries), seen=(), frozen="", push=None,
+        ), "armed", True  # fmt: skip
     if isinstance(given, Reset):
         # The latch is cleared, unless the emergency stop is still pressed.
         stop = replace(state.e_stop, latched=state.e_stop.held)
@@ -93,23 +95,12 @@ def _stopped(config: GateConfig, state: GateState, moved_s: float, disarm: bool)
 def _recent(
     config: GateConfig, state: GateState, value: Array, now: float
 ) -> tuple[tuple[float, Array], ...]:
-    """Returns the commands that the newest scan may not show yet, and a new one.
-
-    Those are the ones since the scan was taken, or within the latency before.
-    """
+    """Returns a new command after those since the newest scan, or within the latency before it."""
     if config.shield is None:
         return ()
-    since = now - config.shield.latency_s - config.scan_age_s
-    sent = (*state.recent, (now, value))
+    since, sent = now - config.shield.latency_s - config.scan_age_s, (*state.recent, (now, value))
     # A command from before `since` was in force until the next one.
     return tuple(one for one, after in pairwise((*sent, sent[-1])) if after[0] >= since)
-
-
-def _moved(config: GateConfig, state: GateState, motion: Motion, now: float) -> GateState:
-    """Returns the state after a motion is published."""
-    recent = _recent(config, state, motion.value, now)
-    state = replace(state, value=motion.value, slope=motion.slope, moved_s=now, recent=recent)
-    return frozen.watch_motion(config, state, now)
 
 
 class Rule(NamedTuple):
@@ -160,14 +151,13 @@ def first_cause(config: GateConfig, state: GateState, now: float) -> tuple[Cause
 
 
 def _wish(config: GateConfig, state: GateState) -> Motion:
-    """Returns the motion that the policy requests."""
-    size = len(config.fields)
-    wish = np.zeros(size) if state.command is None else state.command.twist[list(config.fields)]
-    return Motion(wish.astype(np.float64), np.zeros(size))
+    still = np.zeros(len(config.fields))
+    wish = still if state.command is None else state.command.twist[list(config.fields)]
+    return Motion(wish.astype(np.float64), still)
 
 
 def saturate(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
-    """Brings the value within its limits, see `limits.saturate`."""
+    """Brings the value within its limits, see `limits.saturate`; without limits it is zero."""
     if config.limits is None:
         return Motion(np.zeros_like(motion.value), np.zeros_like(motion.slope))
     return replace(motion, value=limits.saturate(motion.value, config.limits))
@@ -188,10 +178,12 @@ def bounded(config: GateConfig, state: GateState, motion: Motion, now: float) ->
     if good and np.isfinite(motion.value).all() and np.isfinite(motion.slope).all():
         return motion
     zero = np.zeros_like(motion.value)
-    fault = f"a motion of {motion.value.tolist()} came out"
-    return replace(motion, value=zero, slope=zero, fault=fault)
+    return replace(
+        motion, value=zero, slope=zero, fault=f"a motion of {motion.value.tolist()} came out"
+    )
 
 
-Shaper = Callable[[GateConfig, GateState, Motion, float], Motion]
-SHAPERS: tuple[Shaper, ...] = (saturate, follow, shield, bounded)
-"""Stages that a passing command goes through."""
+# Stages that a passing command goes through.
+SHAPERS: tuple[Callable[[GateConfig, GateState, Motion, float], Motion], ...] = (
+    saturate, follow, shield, bounded,
+)  # fmt: skip

@@ -14,26 +14,21 @@ from nics_drl_bridge.gate.state import EStopState, GateConfig, GateState, replac
 from nics_drl_bridge.geometry import between
 from nics_drl_bridge.interface import S_PER_NS
 
-GREATEST_SPEED = 100.0
-"""Greatest speed that the odometry of a mobile robot can show [m/s, rad/s]."""
+GREATEST_SPEED = 100.0  # greatest speed that the odometry of a mobile robot can show [m/s, rad/s]
 SLIP, SLIP_SPEED, SLIP_TURN = 2.0, 0.5, 1.0
 """A robot may exceed its limits by this factor, downhill or pushed, plus [m/s] and [rad/s]."""
-CAR_TURN = 4.0
-"""Greatest turn rate of a robot that is commanded by steering angle [rad/s]."""
-LEAP, LEAP_TURN = 0.1, 0.2
-"""Jump of an odometry pose that may come from imprecision [m, rad]."""
-ANGLE_TOLERANCE = 1e-3
-"""Greatest deviation of the last beam from its declared angle [rad]."""
+CAR_TURN = 4.0  # greatest turn rate of a robot that is commanded by steering angle [rad/s]
+LEAP, LEAP_TURN = 0.1, 0.2  # jump of an odometry pose that may come from imprecision [m, rad]
+ANGLE_TOLERANCE = 1e-3  # greatest deviation of the last beam from its declared angle [rad]
 
 
 def scan_malformed(config: GateConfig, scan: Scan) -> str:
     """The scan is from another lidar than the declared one, or every range is NaN."""
-    beams, angles = len(config.beam_angles), config.beam_angles
-    if scan.ranges.shape != (beams,):
-        return f"scan: {scan.ranges.size} beams, not {beams}"
-    first, step = scan.angles
-    increment = float(angles[1] - angles[0]) if beams > 1 else step
-    last_off = abs(first - angles[0]) + abs(step - increment) * (beams - 1)
+    angles, (first, step) = config.beam_angles, scan.angles
+    if scan.ranges.shape != angles.shape:
+        return f"scan: {scan.ranges.size} beams, not {len(angles)}"
+    increment = float(angles[1] - angles[0]) if len(angles) > 1 else step
+    last_off = abs(first - angles[0]) + abs(step - increment) * (len(angles) - 1)
     if not last_off <= ANGLE_TOLERANCE:
         return "scan: its angles are not those of the declared lidar"
     return "scan: every range is NaN" if np.isnan(scan.ranges).all() else ""

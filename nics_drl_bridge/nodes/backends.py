@@ -30,8 +30,7 @@ from nics_drl_bridge.sim.world import World
 Array = NDArray[np.float64]
 T = TypeVar("T")
 SCAN, ODOM, TRUTH = "scan", "odom", "ground_truth"
-AGAIN_S = 0.05
-"""Data that do not arrive within this time are requested again [s]."""
+AGAIN_S = 0.05  # data that do not arrive within this time are requested again [s]
 ADVICE = "start `simulator_node` with mode:=lockstep in the same ROS_DOMAIN_ID and namespace."
 
 

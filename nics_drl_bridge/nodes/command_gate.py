@@ -39,12 +39,10 @@ from nics_drl_bridge.nodes.qos import QosWatch
 from nics_drl_bridge.nodes.runner import declare
 from nics_drl_bridge.nodes.wire import UNREADABLE, TwistWriter
 
-STALE_S = 0.05
-"""A motion that was decided on longer ago than this is decided on again [s]."""
+STALE_S = 0.05  # a motion that was decided on longer ago than this is decided on again [s]
 SCAN_PERIODS = 1.75
 """For a slow lidar, the default age limit of a command's scan, in periods of the lidar."""
-ROTATION = slice(3, 7)
-"""Position of an odometry's quaternion among its numbers."""
+ROTATION = slice(3, 7)  # position of an odometry's quaternion among its numbers
 VARIANCES = [wire.POSE_COVARIANCE, wire.POSE_COVARIANCE + 7, wire.POSE_COVARIANCE + 35]
 """Positions of the variances of x, y and heading."""
 HIGHEST = 99

@@ -32,12 +32,10 @@ from nics_drl_bridge.recording.messages import POSITION_UNITS
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
-QUATERNION_TOLERANCE = 0.1
-"""Tolerance of the squared length of a quaternion about 1."""
+QUATERNION_TOLERANCE = 0.1  # tolerance of the squared length of a quaternion about 1
 PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 """Indices of x, y and heading in the 6 x 6 covariance of a message."""
-UNUSED_VARIANCE = 1e6
-"""Variance of z, roll and pitch, which a planar robot does not measure."""
+UNUSED_VARIANCE = 1e6  # variance of z, roll and pitch, which a planar robot does not measure
 FIELD = re.compile(r"^\s*([A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z0-9_/]+)?)")
 """The type at the start of a line of a `.msg` file."""
 

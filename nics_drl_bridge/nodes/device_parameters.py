@@ -24,10 +24,8 @@ MODES = ("realtime", LOCKSTEP, "as_fast_as_possible")
 MODELS_OWN = -1.0
 GREATEST_FLEET = 256
 NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
-SLACK = 0.1
-"""A step may be early by this share of it, because timers are no more precise."""
-PATIENCE_NS = NS_PER_S // 2
-"""Steps missed for longer than this are not made up for [ns]."""
+SLACK = 0.1  # a step may be early by this share of it, because timers are no more precise
+PATIENCE_NS = NS_PER_S // 2  # steps missed for longer than this are not made up for [ns]
 
 
 class DeviceTiming(NamedTuple):

@@ -24,8 +24,7 @@ from nics_drl_bridge.interface import NS_PER_S
 
 PARTS_MISSING = (AttributeError, TypeError)
 """Raised by Python if rclpy differs from what is known here."""
-Received = tuple[Callable[..., Any], tuple[Any, ...]]
-"""A callback and its arguments."""
+Received = tuple[Callable[..., Any], tuple[Any, ...]]  # a callback and its arguments
 HANDED_OVER, REST_S = object(), 1e-4
 """Returned by a callback that has woken another thread of this process. The executor then rests,
 for less than an exchange of messages takes, to keep out of that thread's way."""

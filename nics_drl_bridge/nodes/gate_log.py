@@ -23,14 +23,10 @@ from nics_drl_bridge.nodes.runner import Condition
 FILES_KEPT = 20
 BURST_S = 3.0
 """Time for which commands must pass before a stop counts as new, not as part of a burst [s]."""
-LINE_S = 2.0
-"""Time between two log lines of a kind [s]; those in between are counted."""
-CLOSING_S = 0.7
-"""Longest wait at the end for files that are being written [s]."""
-MOST_AT_WORK = 3
-"""Greatest number of writers at work; each keeps a copy of this process's memory."""
-PATIENCE_S = 20.0
-"""A writer that takes longer gives up [s]."""
+LINE_S = 2.0  # time between two log lines of a kind [s]; those in between are counted
+CLOSING_S = 0.7  # longest wait at the end for files that are being written [s]
+MOST_AT_WORK = 3  # greatest number of writers at work; each keeps a copy of this process's memory
+PATIENCE_S = 20.0  # a writer that takes longer gives up [s]
 OVERDUE_S = PATIENCE_S + 5.0
 """A writer that still runs after this never gives up [s]: another thread may have held a lock
 during the fork, or the disk blocks it."""

@@ -36,8 +36,7 @@ from nics_drl_bridge.nodes.wire import TwistWriter
 from nics_drl_bridge.sim.world import World
 
 SPIN_S, POLL_S = 0.2, 0.002
-LOST_S = 1.0
-"""A request to repeat data that stays unanswered for longer was itself lost [s]."""
+LOST_S = 1.0  # a request to repeat data that stays unanswered for longer was itself lost [s]
 
 
 @contextlib.contextmanager
@@ -123,7 +122,7 @@ class Link:
     def call(self, client: Any, request: Any, timeout_s: float) -> Any:
         """Calls a service; the executor's thread completes the future. Raises BackendError."""
         done, deadline = threading.Event(), time.monotonic() + timeout_s
-        # A server that hung for long was dropped, and has to be discovered again.
+        # a server that hung for long was dropped, and has to be discovered again.
         while not client.service_is_ready() and time.monotonic() < deadline:
             time.sleep(POLL_S)
         future = client.call_async(request)
@@ -171,7 +170,7 @@ class Link:
                     f"after {patience_s:g} s there is still no {', no '.join(missing)}; {advice}"
                 )
             time.sleep(POLL_S)
-        # A publisher that was killed stays in the graph for a while.
+        # a publisher that was killed stays in the graph for a while.
         while self.others_command() and time.monotonic() < deadline:
             time.sleep(POLL_S)
         self.check_alone()

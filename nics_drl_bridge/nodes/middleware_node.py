@@ -15,8 +15,7 @@ from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.lifecycle import ACTIVE, UNCONFIGURED, ManagedNode
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
 
-SILENCE_S = 5.0
-"""Diagnostics warn of a topic that has been silent for this long [s]."""
+SILENCE_S = 5.0  # diagnostics warn of a topic that has been silent for this long [s]
 
 
 class MiddlewareNode(ManagedNode):
@@ -52,7 +51,7 @@ class MiddlewareNode(ManagedNode):
         if self.state != ACTIVE:
             return
         estimator = self._topics.middleware.estimator
-        # A pose or a yaw rate may have been newer.
+        # a pose or a yaw rate may have been newer.
         stamp_ns = max(stamp_ns, estimator.time_ns)
         view = self._topics.middleware.view(stamp_ns)
         frames = [str(self.get_parameter(f"{name}_frame").value) for name in ("map", "base")]

@@ -25,10 +25,8 @@ from nics_drl_bridge.nodes.runner import declare
 from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
 from nics_drl_bridge.policy.policies import open_policy
 
-POLLS = 0.1
-"""Time between two checks whether to act, as a share of the control period."""
-LONGEST_REASON = 300
-"""Greatest length of a policy's error text, in characters."""
+POLLS = 0.1  # time between two checks whether to act, as a share of the control period
+LONGEST_REASON = 300  # greatest length of a policy's error text, in characters
 
 
 class PolicyNode(ManagedNode):

@@ -64,8 +64,7 @@ EVERY_COMMAND = profile_of(Offer(10))
 """Commands in lock-step: each moves the world, and a second publisher must not replace the
 first one's unnoticed. Also `e_stop`, of which no press may be overwritten."""
 
-COMMAND = profile_of(Offer(1))
-"""Commands and goals: only the newest counts, and it has to arrive."""
+COMMAND = profile_of(Offer(1))  # commands and goals: only the newest counts, and it has to arrive
 
 TRANSFORMS = profile_of(Offer(100))
 """`/tf`: like tf2's own broadcasters, whose listeners request reliable."""

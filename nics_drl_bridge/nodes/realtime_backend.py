@@ -25,12 +25,10 @@ from nics_drl_bridge.sim.world import World
 Array = NDArray[np.float64]
 RAW = "cmd_vel_raw"
 POLL_S, SAY_EVERY_S = 0.01, 2.0
-SERVICES_S = 0.5
-"""A peer that shows no services this long after its topics is a vehicle [s]."""
+SERVICES_S = 0.5  # a peer that shows no services this long after its topics is a vehicle [s]
 COMMAND_S, PERIODS = 0.5, 2
 """A command lasts this long, and at least this many periods; then a zero follows by itself."""
-STILL = (0.02, 0.05)
-"""A slower robot is at rest [m/s, rad/s]."""
+STILL = (0.02, 0.05)  # a slower robot is at rest [m/s, rad/s]
 ADVICE = (
     "start the robot, or `simulator_node` with mode:=realtime, in the same ROS_DOMAIN_ID and "
     "namespace."
@@ -102,7 +100,7 @@ class RealtimeBackend:
                 "use_imu": chosen.use_imu,
                 "enable_stamped_cmd_vel": chosen.stamped,
             },
-            # A gate has its own timeout.
+            # a gate has its own timeout.
             command_timeout_s=math.inf
             if chosen.gated
             else max(COMMAND_S, PERIODS * self._period_ns / NS_PER_S),
@@ -114,7 +112,7 @@ class RealtimeBackend:
             self._link.begin()
             clients = self._episodes.clients if chosen.vehicle is False else []
             self._link.wait_for_peers(self._topics.expected, clients, chosen.timeout_s, ADVICE)
-            # A simulator's services may be found later than its topics.
+            # a simulator's services may be found later than its topics.
             deadline = time.monotonic() + SERVICES_S
             while self._is_vehicle() and chosen.vehicle is None and time.monotonic() < deadline:
                 time.sleep(POLL_S)

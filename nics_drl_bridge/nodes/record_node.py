@@ -37,8 +37,7 @@ from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 Array = NDArray[np.float64]
 PATIENCE_S = 10.0
 POLL_S = 0.01
-HALT_S = 0.5
-"""Zero is repeated for this long [s]: a best-effort subscriber may miss one."""
+HALT_S = 0.5  # zero is repeated for this long [s]: a best-effort subscriber may miss one
 PERIOD_NS = round(PERIOD_S * NS_PER_S)
 PLACE = "recording"
 FEWEST = 2

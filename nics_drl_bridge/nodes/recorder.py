@@ -23,8 +23,7 @@ from nics_drl_bridge.report.pictures import drive_picture
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 NODE = "nics_drl_bridge.nodes.record_node"
-ARGUMENTS = ("namespace", "remap")
-"""Options that are no parameters of the node."""
+ARGUMENTS = ("namespace", "remap")  # options that are no parameters of the node
 
 
 @dataclass(frozen=True)

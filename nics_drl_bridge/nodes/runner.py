@@ -35,8 +35,7 @@ from nics_drl_bridge.nodes.transport import OF_THIS_PROCESS
 SPIN_S = 0.1
 DELIVERY_S = 0.5
 EXIT_BAD_INPUT = 2
-SETTLE_S, POLL_S = 0.3, 0.02
-"""Time until the graph shows all nodes [s]."""
+SETTLE_S, POLL_S = 0.3, 0.02  # time until the graph shows all nodes [s]
 ANSWER_S = 1.5
 """A node that does not answer within this time is dead; the graph shows it for some 20 s more."""
 DIAGNOSTICS_S = 1.0

@@ -30,8 +30,7 @@ from nics_drl_bridge.sim.world import World, load_world
 Array = NDArray[np.float64]
 CLOCK = "/clock"
 WATCH_S = 2.0
-LONGEST_TICK_S = 0.005
-"""Longest time between two checks for delayed data that are due [s]."""
+LONGEST_TICK_S = 0.005  # longest time between two checks for delayed data that are due [s]
 
 MakeSimulator = Callable[[Node, SimulatorModel, World, int], Simulator]
 """Makes the simulator of a number of robots; may declare its own parameters at the node. Its
@@ -105,7 +104,7 @@ class DeviceNode(QosWatch):
         self._soon = self.create_guard_condition(self._on_time)
         if self._time.mode == "realtime":
             period = step_ns / NS_PER_S / self._time.rate
-            # A tick that divides the step, if data are published later than they are measured.
+            # a tick that divides the step, if data are published later than they are measured.
             late = any((*self._time.scan_late_ns, *self._time.odom_late_ns))
             ticks = max(1.0, np.ceil(period / LONGEST_TICK_S)) if late else 1.0
             self._timer = runner.steadily(self, period / ticks, self._on_time)

@@ -33,10 +33,8 @@ from nics_drl_bridge.errors import BackendError
 
 RANGE, LOCAL, ONLY_LOCAL = "ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST", "ROS_LOCALHOST_ONLY"
 SELF_MADE = "SYSTEM_DEFAULT"
-OTHER_RANGES = ("SUBNET", "OFF", SELF_MADE, "")
-"""rcl treats any other value as LOCALHOST."""
-OLDEST_DISTRIBUTION = "humble"
-"""It has no discovery ranges."""
+OTHER_RANGES = ("SUBNET", "OFF", SELF_MADE, "")  # rcl treats any other value as LOCALHOST
+OLDEST_DISTRIBUTION = "humble"  # it has no discovery ranges
 TRANSPORTS, UDP = "FASTDDS_BUILTIN_TRANSPORTS", "UDPv4"
 PROFILE = Path(__file__).with_name("this_machine.xml")
 PROFILES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")

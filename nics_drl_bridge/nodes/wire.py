@@ -26,16 +26,13 @@ Array = NDArray[np.float64]
 Bytes = bytes | bytearray
 HEAD = 4
 """Bytes of the header, which do not count for alignment; the second one gives the byte order."""
-STAMP, FRAME = 4, 12
-"""Offsets of stamp and frame of a message's header."""
+STAMP, FRAME = 4, 12  # offsets of stamp and frame of a message's header
 UNREADABLE = (ValueError, struct.error)
 """Raised by all readers for bytes that are not a message of the type."""
-PLAIN = (0, 1)
-"""Big-endian and little-endian plain CDR."""
+PLAIN = (0, 1)  # big-endian and little-endian plain CDR
 POSE_COVARIANCE, TWIST, DOUBLES = 7, 7 + 36, 7 + 36 + 6 + 36
 """Numbers of an odometry before each: pose, its covariance, twist, its covariance."""
-SCAN_FIELDS = 7
-"""Floats of a scan between its header and its ranges."""
+SCAN_FIELDS = 7  # floats of a scan between its header and its ranges
 
 
 def _order(content: Bytes) -> str:
