@@ -72,12 +72,12 @@ class ManagedNode(QosWatch, LifecycleNode):
         late = sorted(self.fixed & {parameter.name for parameter in parameters})
         if not late or self.state == UNCONFIGURED:
             return SetParametersResult(successful=True)
-        reason = (
-            f"parameter {late[0]!r} is read when the node is configured; lead it to unconfigured "
-            f"first: `ros2 lifecycle set {self.get_fully_qualified_name()} deactivate`, then "
-            "`cleanup`."
+        return SetParametersResult(
+            successful=False,
+            reason=f"parameter {late[0]!r} is read when the node is configured; lead it to "
+            f"unconfigured first: `ros2 lifecycle set {self.get_fully_qualified_name()} "
+            "deactivate`, then `cleanup`.",
         )
-        return SetParametersResult(successful=False, reason=reason)
 
     def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Configures; a failure leaves it unconfigured."""
@@ -120,8 +120,8 @@ class ManagedNode(QosWatch, LifecycleNode):
             self._failure = error
             expected = isinstance(error, BridgeError)
             if not self._starting:
-                said = str(error) if expected else f"{type(error).__name__}: {error}"
-                self.get_logger().error(said)
+                kind = "" if expected else f"{type(error).__name__}: "
+                self.get_logger().error(f"{kind}{error}")
             if not expected:
                 raise
             return FAILURE

@@ -53,11 +53,9 @@ def open_context(args: Sequence[str] | None = None, domain_id: int | None = None
 
     A robot that others should see sets `ROS_AUTOMATIC_DISCOVERY_RANGE` (on Humble
     `ROS_LOCALHOST_ONLY=0`); by default a simulator in a lab can't move another robot. Fast DDS
-    sends by UDP, unless the environment chooses otherwise (`transport`).
-
-    Raises:
-        BackendError: the arguments are wrong, no ROS 2 middleware is there, or discovery should
-            reach further than that of an earlier context of this process.
+    sends by UDP, unless the environment chooses otherwise (`transport`). Raises BackendError if the
+    arguments are wrong, no ROS 2 middleware is there, or discovery should reach further than that
+    of an earlier context of this process.
     """
 
     def make() -> Context:
@@ -109,12 +107,12 @@ def run_node(
             node.get_logger().warning(sentence)
         starting.clear()
         spin(node, stopping)
-    except (BridgeError, ParameterException) as error:
-        sys.stderr.write(f"{' '.join(str(error).split())}\n")
-        raise SystemExit(EXIT_BAD_INPUT) from None
-    except OSError as error:
-        place = f"{error.filename}: " if error.filename else ""
-        sys.stderr.write(f"{place}{error.strerror or error}; choose another place.\n")
+    except (BridgeError, ParameterException, OSError) as error:
+        sentence = " ".join(str(error).split())
+        if isinstance(error, OSError):
+            place = f"{error.filename}: " if error.filename else ""
+            sentence = f"{place}{error.strerror or error}; choose another place."
+        sys.stderr.write(f"{sentence}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
     finally:
         starting.clear()
@@ -141,44 +139,35 @@ def spin(node: Node, stopping: threading.Event) -> None:
 def sole(context: Context, name: str) -> Iterator[None]:
     """Ensures a single instance while a node runs: if its name is taken, it does not start.
 
-    Two that start at the same moment on one machine are told apart by the name of a socket, which
-    only one of them gets, and which ends with its process. Others, and nodes of other packages, are
-    found in the graph and asked whether they are alive. The arguments of the context may set
-    another name or a namespace. Raises BackendError if another instance is running.
+    Two that start at the same moment on one machine (and network namespace) are told apart by the
+    name of a socket, which only one of them gets, and which ends with its process. Others, and
+    nodes of other packages, are found in the graph and asked whether they are alive. The arguments
+    of the context may set another name or a namespace. Raises BackendError if another is running.
     """
-    probe = Node(
-        name, context=context, start_parameter_services=False, enable_rosout=False
-    )  # resolves its name as the node will
-    claim = None
-    try:
-        whole = probe.get_fully_qualified_name()
-        claim = _claimed(f"{context.get_domain_id()} {whole}")
-        if claim is None or (_seen(probe, whole) and _lives(probe, whole)):
-            raise BackendError(
-                f"a node {whole!r} runs already in ROS domain {context.get_domain_id()}; end it, "
-                "or give this one another namespace: `--ros-args -r __ns:=/robot_2`."
-            )
-    except BaseException:
-        if claim is not None:
-            claim.close()
-        raise
-    finally:
-        probe.destroy_node()
-    with claim:
+    # The probe resolves its name as the node will.
+    probe = Node(name, context=context, start_parameter_services=False, enable_rosout=False)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as claim:
+        try:
+            whole, domain = probe.get_fully_qualified_name(), context.get_domain_id()
+            taken = not _claims(claim, f"{domain} {whole}")
+            if taken or (_seen(probe, whole) and _lives(probe, whole)):
+                raise BackendError(
+                    f"a node {whole!r} runs already in ROS domain {domain}; end it, or give this "
+                    "one another namespace: `--ros-args -r __ns:=/robot_2`."
+                )
+        finally:
+            probe.destroy_node()
         yield
 
 
-def _claimed(key: str) -> socket.socket | None:
-    """Returns what only one process per machine (and network namespace) can have, or None."""
-    claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-    if sys.platform != "linux":
-        return claim
-    try:
-        claim.bind(b"\0nics_drl_bridge " + hashlib.sha256(key.encode()).hexdigest().encode())
-    except OSError:
-        claim.close()
-        return None
-    return claim
+def _claims(claim: socket.socket, key: str) -> bool:
+    """Binds a socket to a name, on Linux; False if another has it."""
+    name = b"\0nics_drl_bridge " + hashlib.sha256(key.encode()).hexdigest().encode()
+    with contextlib.suppress(OSError):
+        if sys.platform == "linux":
+            claim.bind(name)
+        return True
+    return False
 
 
 def _seen(probe: Node, whole: str) -> bool:
@@ -265,11 +254,7 @@ def declare(
 
 
 def _given_values(node: Node) -> dict[str, Parameter]:
-    """Returns the initial values given to the node, by name; the node's own dictionary.
-
-    The only public access in rclpy is to accept undeclared parameters, which would accept misspelt
-    ones.
-    """
+    """Returns the node's own dictionary of initial values, to which rclpy has no public access."""
     found: dict[str, Parameter] = getattr(node, "_parameter_overrides", {})
     return found
 
@@ -294,10 +279,7 @@ class Condition(NamedTuple):
 
 
 class Diagnostics:
-    """Publishes a node's finding about itself once a second, in the format of the aggregator.
-
-    The name of the status is that of the node, with a part; `look` returns the finding.
-    """
+    """Publishes a node's finding about itself, which `look` returns, once a second."""
 
     def __init__(self, node: Node, part: str, look: Callable[[], Condition]) -> None:
         self._node, self._look = node, look

@@ -104,7 +104,7 @@ class DeviceNode(QosWatch):
         self._soon = self.create_guard_condition(self._on_time)
         if self._time.mode == "realtime":
             period = step_ns / NS_PER_S / self._time.rate
-            # a tick that divides the step, if data are published later than they are measured.
+            # A tick that divides the step, if data are published later than they are measured.
             late = any((*self._time.scan_late_ns, *self._time.odom_late_ns))
             ticks = max(1.0, np.ceil(period / LONGEST_TICK_S)) if late else 1.0
             self._timer = runner.steadily(self, period / ticks, self._on_time)
