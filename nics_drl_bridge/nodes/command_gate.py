@@ -63,21 +63,14 @@ def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
     file = str(declare(node, "limits", "", about, read_only=True))
     limits = load_limits(file, robot) if file else None
     config = GateConfig(
-        fields=tuple(int(i) for i in np.flatnonzero(robot.to_cmd_vel(np.ones(len(robot.command))))),
-        limits=limits,
-        beam_angles=lidar.angles,
-        mount=lidar.mount,
-        range_min=lidar.range_min,
-        range_max=lidar.range_max,
-        scan_rate=lidar.rate,
+        fields=tuple(np.flatnonzero(robot.to_cmd_vel(np.ones(len(robot.command)))).tolist()),
+        limits=limits, beam_angles=lidar.angles, mount=lidar.mount, range_min=lidar.range_min,
+        range_max=lidar.range_max, scan_rate=lidar.rate, odom_std=model.noise.odometry,
         simulated=bool(node.get_parameter("use_sim_time").value),
-        odom_std=model.noise.odometry,
-        shield=_declare_shield(node, model, limits, file),
-        **_declare_rules(node, model),
-    )
+        shield=_declare_shield(node, model, limits, file), **_declare_rules(node, model),
+    )  # fmt: skip
     require_possible(config)
-    doubt = doubtful(config, model.control_period)
-    if doubt:
+    if doubt := doubtful(config, model.control_period):
         node.get_logger().warning(doubt)
     return config
 
@@ -174,9 +167,8 @@ def e_stop(content: bytes) -> inputs.EStop:
 def take_priority(priority: int) -> str:
     """Gives all threads of this process priority over every ordinary one (SCHED_FIFO), if not 0.
 
-    This includes the threads of the middleware: a gate that waits for them gains nothing by its own
-    priority alone. Threads created later have the priority of their creator. Returns a sentence
-    with the reason and the fix if it fails, otherwise an empty one.
+    Those of the middleware, too, for which the gate waits. Threads created later have the priority
+    of their creator. Returns a sentence with the reason and the fix if it fails, otherwise "".
     """
     if priority == 0:
         return ""
@@ -220,8 +212,7 @@ class CommandGate(QosWatch):
         runner.Diagnostics(self, "gate", self._look)
         about = "Real-time priority (SCHED_FIFO) of its process, 1 to 99; 0 for none."
         priority = declare(self, "priority", 0, about, (0, HIGHEST), read_only=True)
-        refused = take_priority(priority)  # once all threads exist
-        if refused:
+        if refused := take_priority(priority):  # once all threads exist
             logger.warning(refused)
 
     def _listen(self) -> None:
@@ -243,8 +234,8 @@ class CommandGate(QosWatch):
             given = read(content)
         except UNREADABLE as error:  # of a middleware with another encoding
             self._log.refuse(f"{topic}: {error}")
-            return
-        self._decide(given)
+        else:
+            self._decide(given)
 
     def _arm(self) -> tuple[bool, str]:
         return self._answer(inputs.Arm(self.count_publishers(self._out.topic_name)))
@@ -269,11 +260,10 @@ class CommandGate(QosWatch):
         return decision
 
     def _say(self, decision: Decision, now: float) -> inputs.Input | None:
-        """Publishes a decision; the only path to the robot except `stop`.
+        """Publishes a decision, the only path to the robot except `stop`, or returns another input.
 
-        Returns an input to decide on instead, or None. What is not finite is sent as zero and
-        presses the e-stop. A motion that was decided on too long ago, in a process frozen since, is
-        not sent at all; so the clock is read immediately before.
+        What is not finite is sent as zero and presses the e-stop. A motion that was decided on too
+        long ago, in a process frozen since, is not sent; so the clock is read immediately before.
         """
         content = self._twists.write(decision.twist)
         if not np.isfinite(decision.twist).all():
@@ -306,9 +296,7 @@ def main(args: list[str] | None = None) -> None:
     runner.run_node(CommandGate, args, "command_gate")
     sys.stdout.flush()
     sys.stderr.flush()
-    # Everything is closed. Tearing down the interpreter as well takes half a second of a core, and
-    # several where others need it too.
-    os._exit(0)
+    os._exit(0)  # all is closed; to tear down the interpreter, too, takes seconds on a busy machine
 
 
 if __name__ == "__main__":

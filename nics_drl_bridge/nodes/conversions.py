@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import array
+import contextlib
 import math
 import re
 import sys
@@ -93,10 +94,7 @@ def twist_from_ros(message: Twist) -> Array:
 def scan_to_ros(
     spec: LidarSpec, ranges: NDArray[np.float32], time_ns: int, frame: str
 ) -> LaserScan:
-    """Returns ranges (B,) as the device's LaserScan; every header field follows from the spec.
-
-    Its `intensities` stay empty, as the message provides for.
-    """
+    """Returns ranges (B,) as the device's LaserScan; every header field follows from the spec."""
     message = LaserScan()
     message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
     for field, value in spec.header._asdict().items():
@@ -208,12 +206,10 @@ def message_texts(kind: str) -> dict[str, str]:
         if each in texts or file is None:
             continue
         texts[each] = file.read_text(encoding="utf-8")
-        package = each.split("/")[0]
-        for line in texts[each].splitlines():
-            found = FIELD.match(line.partition("#")[0])
-            if found is not None and ("/" in found[1] or found[1][0].isupper()):
-                inner = found[1].split("/")
-                waiting.append(f"{inner[0] if len(inner) > 1 else package}/msg/{inner[-1]}")
+        for name in filter(None, map(FIELD.match, texts[each].splitlines())):
+            package, _, inner = name[1].rpartition("/")
+            if package or inner[0].isupper():
+                waiting.append(f"{package.split('/')[0] or each.split('/')[0]}/msg/{inner}")
     return texts
 
 
@@ -221,9 +217,8 @@ def _message_file(kind: str) -> Path | None:
     from ament_index_python.search_paths import get_search_paths
 
     package, _, name = kind.split("/")
-    try:
+    prefixes = [sys.prefix]
+    with contextlib.suppress(OSError):  # if ROS 2 comes from wheels, the variable is not set
         prefixes = [*get_search_paths(), sys.prefix]
-    except OSError:  # if ROS 2 comes from wheels, the variable is not set
-        prefixes = [sys.prefix]
     files = (Path(prefix) / "share" / package / "msg" / f"{name}.msg" for prefix in prefixes)
     return next((file for file in files if file.is_file()), None)

@@ -92,11 +92,12 @@ def declare_device(node: Node, laser_frame: str) -> None:
         declare(node, name, value, about, (low, high), read_only=True)
     silence = "Stops after this silence on cmd_vel [simulated s]; not in lockstep."
     declare(node, "command_timeout", 0.5, silence, span=(0.0, 3600.0))
-    declare(node, "episode_seed", 0, "Seed of the episode that ~/reset begins.")
-    start = "Start x, y, heading of that episode, of each robot."
-    declare(node, "episode_start", [0.0, 0.0, 0.0], start)
-    given = "Whether episode_start holds, or the seed's own."
-    declare(node, "episode_start_given", False, given)
+    for name, fixed, about in (
+        ("episode_seed", 0, "Seed of the episode that ~/reset begins."),
+        ("episode_start", [0.0, 0.0, 0.0], "Start x, y, heading of that episode, of each robot."),
+        ("episode_start_given", False, "Whether episode_start holds, or the seed's own."),
+    ):
+        declare(node, name, fixed, about)
 
 
 def number(node: Node, name: str) -> float:
@@ -124,16 +125,15 @@ def _late_ns(node: Node, topic: str, model: SimulatorModel) -> tuple[int, int]:
     """Returns least delay and jitter of a topic [ns]: as requested, otherwise as in the model."""
     own = model.latency.measured.get(topic, Delay(least=0.0, jitter=0.0))
     least, jitter = number(node, f"{topic}_latency"), number(node, "latency_jitter")
-    least, jitter = (least if least >= 0.0 else own.least, jitter if jitter >= 0.0 else own.jitter)
-    return round(least * NS_PER_S), round(jitter * NS_PER_S)
+    chosen = least if least >= 0.0 else own.least, jitter if jitter >= 0.0 else own.jitter
+    return round(chosen[0] * NS_PER_S), round(chosen[1] * NS_PER_S)
 
 
 def timed_model(node: Node, model: SimulatorModel, time: DeviceTiming) -> SimulatorModel:
     """Returns the model with the step of the world and the requested latency."""
     if time.lockstep:
         return model
-    latency = number(node, "command_latency")
-    if latency >= 0.0:
+    if (latency := number(node, "command_latency")) >= 0.0:
         calibration = replace(model.calibration, command_latency_s=latency)
         model = replace(model, calibration=calibration)
     dt = model.timing[0]
@@ -180,24 +180,19 @@ def frames(node: Node, namespace: str) -> Frames:
 
 
 def _check_episode(parameters: list[Parameter]) -> SetParametersResult:
+    reason = ""
     for parameter in parameters:
-        reason = ""
         if parameter.name == "episode_start":
             values = np.array(parameter.value, dtype=np.float64)
             if not values.size or values.size % 3 or not np.isfinite(values).all():
                 reason = "episode_start must be three finite numbers: x, y, heading; of each robot."
         elif parameter.name == "episode_seed" and parameter.value < 0:
             reason = "episode_seed must be 0 or more."
-        if reason:
-            return SetParametersResult(successful=False, reason=reason)
-    return SetParametersResult(successful=True)
+    return SetParametersResult(successful=not reason, reason=reason)
 
 
 class TopicPace:
-    """Decides when a topic is due, so that its mean rate is the requested one with any step.
-
-    If the step between two calls of `due` divides the period, the messages are regular.
-    """
+    """Decides when a topic is due, so that its mean rate is the requested one with any step."""
 
     def __init__(self, period_ns: int, step_ns: int) -> None:
         self._period_ns, self._slack_ns = period_ns, step_ns // 2 if period_ns > step_ns else 0
@@ -216,10 +211,7 @@ class TopicPace:
 
 
 def common_step(dt: float, periods: tuple[float, ...]) -> int:
-    """Returns the longest step, in steps of the model [s], that suits all periods [s] best.
-
-    It is a divisor of all periods if `dt` divides them.
-    """
+    """Returns the longest step, in steps of the model [s], that suits all periods [s] best."""
     return math.gcd(*(max(1, round(period / dt)) for period in periods))
 
 

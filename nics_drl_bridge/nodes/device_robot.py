@@ -30,8 +30,6 @@ from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, Sensed, variances
 
 Array = NDArray[np.float64]
-PLANAR = np.array([0, 1, 5])
-DIAGONAL = np.arange(0, 36, 7)
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 SWITCH = {STAMPED: "enable_stamped_cmd_vel:=false", TWIST: "enable_stamped_cmd_vel:=true"}
 """By the expected type: the setting that selects the other type."""
@@ -59,29 +57,34 @@ class RobotPort:
         # Beam 0 of a device that turns counter-clockwise was measured first.
         sweep_s = max(0.0, scan.time_increment) * (model.lidar.beams - 1)
         self._sweep_ns = 0 if time.lockstep else round(sweep_s * NS_PER_S)
-        odom, truth = (planar_message(parent, frames.base) for parent in (frames.odom, frames.map))
-        odom.twist.covariance[DIAGONAL[PLANAR]] = variances(model.noise.odometry)
-        truth.pose.covariance[DIAGONAL[PLANAR]] = LEAST_VARIANCE
-        truth.twist.covariance[DIAGONAL[PLANAR]] = LEAST_VARIANCE
-        self._scan, self._odom = wire.ScanWriter(scan), wire.OdometryWriter(odom)
-        self._truth = wire.OdometryWriter(truth)
-        self._moving = [transform_message(frames.odom, frames.base)]
-        if node.get_parameter("publish_map_to_odom").value:
-            self._moving.append(transform_message(frames.map, frames.odom))
+        self._scan = wire.ScanWriter(scan)
+        linear, _, turn = variances(model.noise.odometry)
+        self._odom, self._truth = (
+            wire.OdometryWriter(
+                conversions.odometry_to_ros(
+                    np.zeros(3), np.zeros(3), 0, (parent, frames.base), variance
+                )
+            )
+            for parent, variance in (
+                (frames.odom, (LEAST_VARIANCE, LEAST_VARIANCE, linear, turn)),
+                (frames.map, (LEAST_VARIANCE,) * 4),
+            )
+        )
+        self._locates = bool(node.get_parameter("publish_map_to_odom").value)
 
     def mount(self) -> TransformStamped:
         """Returns the transform base_link -> laser."""
-        message = transform_message(self.frames.base, self.frames.laser)
-        return fill(message, self._model.lidar.mount, Time())
+        frames = self.frames
+        return transform_to_ros(frames.base, frames.laser, self._model.lidar.mount, Time())
 
     def moving(self, now: Time, sensed: Sensed) -> list[TransformStamped]:
         """Returns the transforms odom -> base_link, and map -> odom if requested."""
-        fill(self._moving[0], sensed.odom, now)
-        for message in self._moving[1:]:
-            # The transform from the odometry pose to the true one.
-            home = geometry.between(sensed.odom, np.zeros(3))
-            fill(message, geometry.compose(sensed.pose, home), now)
-        return self._moving
+        frames = self.frames
+        moving = [transform_to_ros(frames.odom, frames.base, sensed.odom, now)]
+        if self._locates:
+            home = geometry.compose(sensed.pose, geometry.between(sensed.odom, np.zeros(3)))
+            moving.append(transform_to_ros(frames.map, frames.odom, home, now))
+        return moving
 
     def publish_odometry(self, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
         """Publishes odometry, and joints and true pose if they have subscribers."""
@@ -101,22 +104,12 @@ class RobotPort:
         outbox.send(self._scans, message, now_ns, self._time.scan_late_ns)
 
 
-def planar_message(parent: str, child: str) -> Odometry:
-    """Returns an odometry to be filled in; its out-of-plane values are marked as unknown."""
-    message = Odometry(child_frame_id=child)
-    message.header.frame_id = parent
-    for covariance in (message.pose.covariance, message.twist.covariance):
-        covariance[DIAGONAL] = conversions.UNUSED_VARIANCE
-    return message
-
-
 class CommandInlet:
     """Listens to `cmd_vel`, and to `ackermann_cmd` if the robot steers and the message exists.
 
     The node's parameter `enable_stamped_cmd_vel` selects the type. A stamped command is treated as
-    by ros2_control's drive controllers: a stamp of zero counts as now, and a command older than the
-    command timeout is ignored. `take` is called with each command (C,) whose stamp [ns] is not
-    `too_old`.
+    by ros2_control's drive controllers: a stamp of zero counts as now, and one older than the
+    command timeout is ignored. `take` gets each command (C,) whose stamp [ns] is not `too_old`.
     """
 
     def __init__(
@@ -164,13 +157,13 @@ class CommandInlet:
 
     def _is_fresh(self, stamp: Any) -> bool:
         stamp_ns = conversions.stamp_from_ros(stamp)
-        if stamp_ns and self._too_old(stamp_ns):
-            self._complain(
-                "a command is ignored, because its stamp is older than command_timeout; do both "
-                "ends take their time from the same clock (use_sim_time)?"
-            )
-            return False
-        return True
+        if not stamp_ns or not self._too_old(stamp_ns):
+            return True
+        self._complain(
+            "a command is ignored, because its stamp is older than command_timeout; do both ends "
+            "take their time from the same clock (use_sim_time)?"
+        )
+        return False
 
     def _complain(self, what: str) -> None:
         self._node.get_logger().warning(f"{self._topic}: {what}", throttle_duration_sec=QUIET_S)
@@ -190,11 +183,7 @@ class CommandInlet:
 
 
 class Outbox:
-    """Publishes messages after a latency and a jitter, each topic in order.
-
-    Without either, a message is published at once. Otherwise its bytes are kept, so that the
-    caller may reuse it.
-    """
+    """Publishes messages after a latency and a jitter, each topic in order, or at once."""
 
     def __init__(self) -> None:
         self._random = np.random.default_rng(0)
@@ -232,17 +221,11 @@ class Outbox:
         self._latest.clear()
 
 
-def transform_message(parent: str, child: str) -> TransformStamped:
-    """Returns a transform between two frames that is still to be filled in."""
-    message = TransformStamped(child_frame_id=child)
-    message.header.frame_id = parent
-    return message
-
-
-def fill(message: TransformStamped, pose: ArrayLike, stamp: Any) -> TransformStamped:
-    """Writes a pose (3,) of the child in the parent into a transform."""
+def transform_to_ros(parent: str, child: str, pose: ArrayLike, stamp: Time) -> TransformStamped:
+    """Returns a pose (3,) of a child frame in its parent as a transform."""
     x, y, heading = np.asarray(pose, np.float64).tolist()
-    message.header.stamp = stamp
+    message = TransformStamped(child_frame_id=child)
+    message.header.frame_id, message.header.stamp = parent, stamp
     message.transform.translation.x, message.transform.translation.y = x, y
     message.transform.rotation = conversions.heading_to_ros(heading)
     return message
@@ -260,7 +243,7 @@ class Transforms:
                 "is published; install it with your ROS 2 distribution."
             )
             return
-        self._kind, self._message = kind, kind()
+        self._kind = kind
         self._moving = node.create_publisher(kind, "/tf", qos.TRANSFORMS)
         self._fixed = node.create_publisher(kind, "/tf_static", qos.FIXED_TRANSFORMS)
 
@@ -273,5 +256,4 @@ class Transforms:
         self, moving: list[TransformStamped], outbox: Outbox, now_ns: int, late_ns: tuple[int, int]
     ) -> None:
         """Publishes what changes, with the delay of the odometry that it comes from."""
-        self._message.transforms = moving
-        outbox.send(self._moving, self._message, now_ns, late_ns)
+        outbox.send(self._moving, self._kind(transforms=moving), now_ns, late_ns)

@@ -10,7 +10,7 @@ import sys
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
@@ -21,37 +21,16 @@ from nics_drl_bridge.gate.state import Cause, GateConfig, GateState
 from nics_drl_bridge.nodes.runner import Condition
 
 FILES_KEPT = 20
-BURST_S = 3.0
-"""Time for which commands must pass before a stop counts as new, not as part of a burst [s]."""
+BURST_S = 3.0  # for which commands must pass before a stop is not of the same burst
 LINE_S = 2.0  # time between two log lines of a kind [s]; those in between are counted
 CLOSING_S = 0.7  # longest wait at the end for files that are being written [s]
 MOST_AT_WORK = 3  # greatest number of writers at work; each keeps a copy of this process's memory
 PATIENCE_S = 20.0  # a writer that takes longer gives up [s]
-OVERDUE_S = PATIENCE_S + 5.0
-"""A writer that still runs after this never gives up [s]: another thread may have held a lock
-during the fork, or the disk blocks it."""
+OVERDUE_S = PATIENCE_S + 5.0  # then a writer never gives up [s]: a lock or the disk blocks it
 GRACE_S, POLL_S = 0.5, 0.005
 NICENESS = 5
 MOST_TOLD = 500
 ENDING = (signal.SIGTERM, signal.SIGALRM)
-
-
-class _Lines:
-    """Log lines, at most one of a kind within `LINE_S`."""
-
-    def __init__(self) -> None:
-        self._said: dict[str, float] = {}
-        self._kept: Counter[str] = Counter()
-
-    def count(self, kind: str) -> None:
-        self._kept[kind] += 1
-
-    def due(self, kind: str, now: float) -> str | None:
-        """Returns a suffix about lines that were not logged; None if one has just been logged."""
-        if now - self._said.get(kind, float("-inf")) < LINE_S:
-            return None
-        kept, self._said[kind] = self._kept.pop(kind, 1) - 1, now
-        return f" ({kept} more since the last such line)" if kept else ""
 
 
 class GateLog:
@@ -67,13 +46,12 @@ class GateLog:
         self._folder, self._hardware = folder, robot
         self._cause: Cause | None = None
         self._now = self._since = float("-inf")
-        self._rule: str | None = None
-        """Rule that stops the robot; empty while commands pass, None at first."""
-        self._burst: set[str] = set()
-        """Rules with a written stop since commands last passed for long."""
-        self._lines, self._owed = _Lines(), False
+        self._rule: str | None = None  # that stops the robot; "" while commands pass, None at first
+        self._burst: set[str] = set()  # with a written stop since commands last passed for long
+        self._said: dict[str, float] = {}  # time of the last line of a kind
+        self._kept: Counter[str] = Counter()  # events of a kind since then
+        self._owed, self._writer = False, BoxWriter()
         self._names: list[str] = []
-        self._writer = BoxWriter()
 
     def note(self, entry: Entry) -> None:
         """Accounts for a decision."""
@@ -102,42 +80,41 @@ class GateLog:
     def no_number(self, twist: Sequence[float]) -> None:
         """Counts and logs a decision that is not finite, which must never happen."""
         if (more := self._counted("not finite, sent as zero")) is not None:
-            self._logger.error(
-                f"decided on {list(twist)}, which is not finite: zero is sent, and the e-stop is "
-                f"pressed{more}"
-            )
+            nonsense = f"decided on {list(twist)}, which is not finite"
+            self._logger.error(f"{nonsense}: zero is sent, and the e-stop is pressed{more}")
 
     def _counted(self, kind: str) -> str | None:
-        """Counts an event; returns what to append to its line, or None if it is not logged now."""
         self.counters[kind] += 1
-        self._lines.count(kind)
-        return self._lines.due(kind, self._now)
+        self._kept[kind] += 1
+        return self._due(kind)
+
+    def _due(self, kind: str) -> str | None:
+        """Returns what to append to a line; None if one of its kind was logged within `LINE_S`."""
+        if self._now - self._said.get(kind, float("-inf")) < LINE_S:
+            return None
+        kept, self._said[kind] = self._kept.pop(kind, 1) - 1, self._now
+        return f" ({kept} more since the last such line)" if kept else ""
 
     def _changed(self, rule: str) -> None:
-        """Handles a change of the rule that stops the robot."""
         was_passing = self._rule == ""
         self._rule, self._since, self._owed = rule, self._now, True
-        self._lines.count(rule)
+        self._kept[rule] += 1
         if not rule:
             return
         self.counters[f"stopped, {rule}"] += 1
-        if not was_passing:
-            return
-        if rule in self._burst:
+        if was_passing and rule in self._burst:
             self.counters["stops of a burst, not in the black box"] += 1
-            return
-        self._burst.add(rule)
-        self._write(rule)
+        elif was_passing:
+            self._burst.add(rule)
+            self._write(rule)
 
     def _tell(self, rule: str) -> None:
         """Logs the present state; later, if it was logged a moment ago."""
-        more = self._lines.due(rule, self._now)
+        more = self._due(rule)
         self._owed = more is None
-        if more is None:
-            return
-        if self._cause is None:
+        if more is not None and self._cause is None:
             self._logger.info(f"commands pass{more}")
-        else:
+        elif more is not None and self._cause is not None:
             self._logger.warning(f"stopped by {self._cause.line}{more}")
 
     def _write(self, rule: str) -> None:
@@ -162,11 +139,8 @@ class GateLog:
         """Returns the finding for `/diagnostics`."""
         for failure in self._writer.failures():
             self._failed(failure)
-        facts = {
-            "armed": state.armed,
-            "latched": state.latched is not None,
-            **dict(sorted(self.counters.items())),
-        }
+        facts: dict[str, object] = {"armed": state.armed, "latched": state.latched is not None}
+        facts |= dict(sorted(self.counters.items()))
         message = self._cause.line if self._cause else "commands pass"
         return Condition(message, self._cause is not None, facts, self._hardware)
 
@@ -197,11 +171,10 @@ class _Writer(NamedTuple):
 class BoxWriter:
     """Writes files, each in its own process, which starts as a copy of this one.
 
-    The copy (`fork`, which shares memory until it is modified) is the snapshot: it takes this
-    process some milliseconds, however much there is to write, and later changes here are not in
-    it. A disk that hangs blocks the copy and nothing else, not even the end of this process, as a
-    waiting thread would. The copy has no other thread, closes all sockets, and runs at ordinary
-    priority.
+    The copy (`fork`, which shares memory until it is modified) is the snapshot: it takes some
+    milliseconds, and later changes are not in it. A disk that hangs blocks the copy and nothing
+    else, not even the end of this process, as a waiting thread would. The copy has no other thread,
+    closes all sockets, and runs at ordinary priority.
     """
 
     def __init__(self) -> None:
@@ -214,13 +187,15 @@ class BoxWriter:
         If an exception ends `write`, it has to clean up after itself. Raises OSError if the system
         can't make another process.
         """
-        self._look()
+        self._failed = self.failures()
         if len(self._writers) >= MOST_AT_WORK:
             return False
         heard, told = os.pipe()
         os.set_blocking(heard, False)
+        # The copy must not run the handlers of the original.
+        signals = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, *ENDING))
         try:
-            with _no_signals(), warnings.catch_warnings():
+            with warnings.catch_warnings():
                 # Of Python 3.12: locks that other threads hold stay locked in the copy. It needs
                 # none of theirs, and a copy that hangs nevertheless gives up.
                 warnings.simplefilter("ignore", DeprecationWarning)
@@ -231,18 +206,13 @@ class BoxWriter:
             os.close(heard)
             raise
         finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, signals)
             os.close(told)
         self._writers.append(_Writer(pid, heard, time.monotonic()))
         return True
 
     def failures(self) -> list[str]:
-        """Returns the failures of the writers that have ended since the last call."""
-        self._look()
-        failed, self._failed = self._failed, []
-        return failed
-
-    def _look(self) -> None:
-        """Removes the writers that have ended, and kills those that are overdue."""
+        """Returns the failures since the last call; kills the writers that are overdue."""
         for writer in tuple(self._writers):
             status = _ended(writer.pid)
             if status is None:
@@ -253,6 +223,8 @@ class BoxWriter:
             if status != 0:
                 self._failed.append(_read(writer.told) or f"its writer ended with {status}")
             os.close(writer.told)
+        failed, self._failed = self._failed, []
+        return failed
 
     def close(self, seconds: float) -> list[str]:
         """Waits for the writers, and makes those give up that take longer; returns the failures."""
@@ -271,16 +243,6 @@ class BoxWriter:
             time.sleep(POLL_S)
             failed += self.failures()
         return failed
-
-
-@contextlib.contextmanager
-def _no_signals() -> Iterator[None]:
-    """Defers signals, so that the copy does not run the handlers of the original."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, *ENDING))
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _ended(pid: int) -> int | None:

@@ -40,9 +40,8 @@ class MiddlewareNode(ManagedNode):
         model = open_model(str(self.get_parameter("model").value))
         self._hardware = model.robot.name
         rehearse(model)
-        self._filtered = self.create_lifecycle_publisher(
-            Odometry, "odometry/filtered", qos.SENSOR_RELIABLE
-        )
+        topic = "odometry/filtered"
+        self._filtered = self.create_lifecycle_publisher(Odometry, topic, qos.SENSOR_RELIABLE)
         self.undo.callback(self.destroy_lifecycle_publisher, self._filtered)
         self._topics = RobotTopics(self, model, on_odometry=self._publish)
         self.undo.callback(self._topics.close)
@@ -51,8 +50,7 @@ class MiddlewareNode(ManagedNode):
         if self.state != ACTIVE:
             return
         estimator = self._topics.middleware.estimator
-        # A pose or a yaw rate may have been newer.
-        stamp_ns = max(stamp_ns, estimator.time_ns)
+        stamp_ns = max(stamp_ns, estimator.time_ns)  # a pose or a yaw rate may have been newer
         view = self._topics.middleware.view(stamp_ns)
         frames = [str(self.get_parameter(f"{name}_frame").value) for name in ("map", "base")]
         message = conversions.odometry_to_ros(view.pose, view.twist, stamp_ns, frames, (0.0,) * 4)

@@ -25,6 +25,7 @@ from nics_drl_bridge.nodes.runner import declare
 from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
 from nics_drl_bridge.policy.policies import open_policy
 
+Array = NDArray[np.float64]
 POLLS = 0.1  # time between two checks whether to act, as a share of the control period
 LONGEST_REASON = 300  # greatest length of a policy's error text, in characters
 
@@ -44,18 +45,16 @@ class PolicyNode(ManagedNode):
         runner.declare_model_name(self)
         declare_sensors(self)
         declare(self, "base_frame", "base_link", "Frame id of the robot.")
-        rate = (
-            "Actions per second of the steady clock; NaN: of the control period; 0: one for each "
-            "scan, for a simulator that is not in real time."
-        )
-        policy = "A policy file (*.onnx), or the name of a shipped one or of a baseline."
-        deadline = "Longest time of an inference [s]; NaN: half the control period."
         for name, default, about in (
-            ("policy", "dynamic_window", policy),
+            ("policy", "dynamic_window",
+             "A policy file (*.onnx), or the name of a shipped one or of a baseline."),
             ("goal", [math.nan] * 2, "x, y in map [m]; NaN waits for goal_pose."),
-            ("rate", math.nan, rate),
-            ("deadline", math.nan, deadline),
-        ):
+            ("rate", math.nan,
+             "Actions per second of the steady clock; NaN: of the control period; 0: one for each "
+             "scan, for a simulator that is not in real time."),
+            ("deadline", math.nan,
+             "Longest time of an inference [s]; NaN: half the control period."),
+        ):  # fmt: skip
             declare(self, name, default, about, read_only=True)
         about = "So many late inferences in a row command zero."
         declare(self, "late_limit", 3, about, span=(1, 1000), read_only=True)
@@ -66,7 +65,9 @@ class PolicyNode(ManagedNode):
         """Opens model and policy, and subscribes."""
         model = self._model = open_model(str(self.get_parameter("model").value))
         self._open_policy(model)
-        self._goal: NDArray[np.float64] = self._declared_goal()
+        self._goal: Array = np.array(self.get_parameter("goal").value, dtype=np.float64)
+        if len(self._goal) != 2:
+            raise ConfigError(f"parameter 'goal': must be [x, y], not {self._goal.tolist()}")
         self._pace, self._deadline = self._declared_pace(model.control_period)
         self._acted_ns = 0
         self._raw = self.create_lifecycle_publisher(TwistStamped, "cmd_vel_raw", qos.COMMAND)
@@ -94,9 +95,8 @@ class PolicyNode(ManagedNode):
                 "least 0, more than 0, and at least 1."
             )
         period = control_period if np.isnan(rate) else 1.0 / rate if rate > 0.0 else 0.0
-        return ActionPace(period), Deadline(
-            0.5 * control_period if np.isnan(limit) else limit, patience
-        )
+        limit = 0.5 * control_period if np.isnan(limit) else limit
+        return ActionPace(period), Deadline(limit, patience)
 
     def _open_policy(self, model: SimulatorModel) -> None:
         """Opens the policy for a model, and runs it once, so that it compiles now."""
@@ -115,12 +115,6 @@ class PolicyNode(ManagedNode):
             f"scans of {lidar.beams} beams from {begin:.4g} to {end:.4g} deg are {done}"
         )
 
-    def _declared_goal(self) -> NDArray[np.float64]:
-        goal = self.get_parameter("goal").value
-        if len(goal) != 2:
-            raise ConfigError(f"parameter 'goal': must be [x, y], not {list(goal)}")
-        return np.array(goal, dtype=np.float64)
-
     def _on_goal(self, message: PoseStamped) -> None:
         self._goal = np.array([message.pose.position.x, message.pose.position.y])
         self.get_logger().info(f"new goal ({self._goal[0]:.2f}, {self._goal[1]:.2f}) m")
@@ -129,13 +123,12 @@ class PolicyNode(ManagedNode):
         """Acts when due, once per scan, with an odometry at least as new."""
         if self.state != ACTIVE:
             return
-        newest = self._topics.middleware.cache.newest
+        newest, begin_s = self._topics.middleware.cache.newest, time.monotonic()
         if SCAN not in newest or ODOM not in newest:
             return
-        scan_ns, begin_s = newest[SCAN].stamp_ns, time.monotonic()
-        if newest[ODOM].stamp_ns < scan_ns or scan_ns <= self._acted_ns:
-            return
-        if not self._pace.due(begin_s):
+        scan_ns = newest[SCAN].stamp_ns
+        fresh = newest[ODOM].stamp_ns >= scan_ns > self._acted_ns
+        if not fresh or not self._pace.due(begin_s):
             return
         self._pace.acted(begin_s)
         self._acted_ns = scan_ns
@@ -153,12 +146,11 @@ class PolicyNode(ManagedNode):
     def _look(self) -> runner.Condition:
         if self.state == UNCONFIGURED:
             return runner.Condition(self.state, warns=False, facts={})
-        late, longest = self._deadline.late, f"{1e3 * self._deadline.longest_s:.2f}"
-        answered = self._deadline.answered
-        facts = {"answered": answered, "late": late, "longest inference [ms]": longest}
-        return runner.Condition(f"{self.state}; {late} late inferences", late > 0, facts)
+        done, longest = self._deadline, f"{1e3 * self._deadline.longest_s:.2f}"
+        facts = {"answered": done.answered, "late": done.late, "longest inference [ms]": longest}
+        return runner.Condition(f"{self.state}; {done.late} late inferences", done.late > 0, facts)
 
-    def _twist(self) -> NDArray[np.float64]:
+    def _twist(self) -> Array:
         """Returns the command (3,) for the present view; zero without a goal, at it, or on contact.
 
         With a pose sensor, it is also zero before the first pose.
@@ -174,7 +166,7 @@ class PolicyNode(ManagedNode):
             return np.zeros(3)
         return self._asked(view, self._goal)
 
-    def _asked(self, view: RobotView, goal: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _asked(self, view: RobotView, goal: Array) -> Array:
         """Returns the policy's command (3,). Its errors become BridgeError, which ends the node."""
         try:
             action = self._policy.act(self._task.observation(view, {"goal": goal}))
@@ -190,7 +182,7 @@ class PolicyNode(ManagedNode):
                 f"line {place.lineno}); the robot is stopped, mend the policy."
             ) from error
 
-    def _message(self, twist: NDArray[np.float64], stamp_ns: int) -> TwistStamped:
+    def _message(self, twist: Array, stamp_ns: int) -> TwistStamped:
         frame = str(self.get_parameter("base_frame").value)
         return conversions.stamped_to_ros(twist, stamp_ns, frame)
 

@@ -59,32 +59,27 @@ class DeviceNode(QosWatch):
         model = device_parameters.timed_model(self, model, self._time)
         simulator = make(self, model, world, len(self._names))
         self._world = DeviceWorld(simulator, model, len(self._names))
-        self._now_ns = 0
         self._command_ns = np.zeros(len(self._names), np.int64)
         self._heard = np.zeros(len(self._names), np.bool_)
-        self._paused = False
+        self._paused, self._lags, self._hardware = False, 0, model.robot.name
         self._world.advance()  # compiles before anything waits for it
-        self._lags, self._hardware = 0, model.robot.name
+        self._now_ns = time.time_ns() // self._time.step_ns * self._time.step_ns
         self._open_topics(model)
         self._start_time()
-        self._now_ns = time.time_ns() // self._time.step_ns * self._time.step_ns
         self._begin()
 
     def _open_topics(self, model: SimulatorModel) -> None:
         self._outbox = Outbox()
         self._clock_topic = self.create_publisher(Clock, CLOCK, qos.SENSOR_RELIABLE)
         self._clocks = {self.get_fully_qualified_name()}
-        self._clock_message = Clock()
         self._transforms = Transforms(self)
         self._ports, self._inlets = [], []
         commands = qos.EVERY_COMMAND if self._time.lockstep else qos.COMMAND
         for k, name in enumerate(self._names):
             space, frames = f"{name}/" if name else "", device_parameters.frames(self, name)
             self._ports.append(RobotPort(self, space, model, frames, self._time))
-            take = partial(self._on_command, k)
-            self._inlets.append(
-                CommandInlet(self, space, model.robot, commands, take, self._too_old)
-            )
+            given = model.robot, commands, partial(self._on_command, k), self._too_old
+            self._inlets.append(CommandInlet(self, space, *given))
         self._transforms.publish_fixed([port.mount() for port in self._ports])
         runner.serve(self, "~/reset", self._reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
@@ -126,13 +121,10 @@ class DeviceNode(QosWatch):
 
     def _look(self) -> runner.Condition:
         facts = {
-            "mode": self._time.mode,
-            "rate": self._time.rate,
-            "robots": len(self._names),
+            "mode": self._time.mode, "rate": self._time.rate, "robots": len(self._names),
             "simulated time [s]": f"{self._now_ns / NS_PER_S:.3f}",
-            "times it fell behind real time": self._lags,
-            **self._identity,
-        }
+            "times it fell behind real time": self._lags, **self._identity,
+        }  # fmt: skip
         message = "paused" if self._paused else "running"
         return runner.Condition(message, False, facts, self._hardware)
 
@@ -228,8 +220,7 @@ class DeviceNode(QosWatch):
         """Publishes what is due at present."""
         now_ns = self._now_ns
         if self._clock_topic.get_subscription_count():
-            self._clock_message.clock = conversions.stamp_to_ros(now_ns)
-            self._clock_topic.publish(self._clock_message)
+            self._clock_topic.publish(Clock(clock=conversions.stamp_to_ros(now_ns)))
         odom_due, scan_due = self._odom_pace.due(now_ns), self._scan_pace.due(now_ns)
         if odom_due or scan_due:
             self._publish_data(odom_due, scan_due)
