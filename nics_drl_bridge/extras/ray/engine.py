@@ -56,8 +56,7 @@ from nics_drl_bridge.sim.world import World, load_world
 Array = NDArray[np.float64]
 FORMAT = "nics_drl_bridge/ray_checkpoint/1"
 VALUE_WEIGHT, GRADIENT_LIMIT = 0.5, 0.5  # parameters of the loss, as in Stable-Baselines3
-SILENCE_S = 600.0
-"""A run ends after this time without a step from any env runner [s]; it can be resumed."""
+SILENCE_S = 600.0  # without a step from any env runner, after which a run ends; it can be resumed
 TRIED_S = 5.0  # timeout of an attempt to connect to an address [s]
 PROBE_S = 1.0  # time that a roll-out waits for a lost env runner [s]; later ones try again
 
@@ -73,11 +72,10 @@ def learner(
 
 @contextmanager
 def connected(address: str | None, runners: int | None, worlds: int) -> Iterator[int]:
-    """Connects this process to a cluster, and yields the number of env runners.
+    """Connects with a cluster, and yields the number of env runners, by default its CPUs.
 
     The address is `auto` (the cluster that this machine is part of) or `HOST:PORT`; None starts one
-    on this machine, which ends with the training. By default there is an env runner, a process that
-    shares the worlds, for each CPU of the cluster. Raises ConfigError if no cluster answers there,
+    on this machine, which ends with the training. Raises ConfigError if no cluster answers there,
     or it is too small.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
