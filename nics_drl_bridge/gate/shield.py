@@ -203,8 +203,8 @@ def _family(
         twists = np.concatenate([twists, odometry[None]])
     low, high = twists.min(axis=0), twists.max(axis=0)
     axes = [
-        np.linspace(*ends, most if ends[1] > ends[0] else 1)
-        for *ends, most in zip(low, high, (SPEEDS, SPEEDS, TURNS), strict=True)
+        np.linspace(least, greatest, most if greatest > least else 1)
+        for least, greatest, most in zip(low, high, (SPEEDS, SPEEDS, TURNS), strict=True)
     ]
     return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
 

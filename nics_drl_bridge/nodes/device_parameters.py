@@ -92,12 +92,12 @@ def declare_device(node: Node, laser_frame: str) -> None:
         declare(node, name, value, about, (low, high), read_only=True)
     silence = "Stops after this silence on cmd_vel [simulated s]; not in lockstep."
     declare(node, "command_timeout", 0.5, silence, span=(0.0, 3600.0))
-    for name, fixed, about in (
+    for name, default, about in (
         ("episode_seed", 0, "Seed of the episode that ~/reset begins."),
         ("episode_start", [0.0, 0.0, 0.0], "Start x, y, heading of that episode, of each robot."),
         ("episode_start_given", False, "Whether episode_start holds, or the seed's own."),
     ):
-        declare(node, name, fixed, about)
+        declare(node, name, default, about)
 
 
 def number(node: Node, name: str) -> float:
