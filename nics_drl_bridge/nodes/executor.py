@@ -83,15 +83,15 @@ class StandingExecutor(SingleThreadedExecutor):
 
     def _others_ready(self) -> tuple[list[Any], bool]:
         """Returns the timers that are due, and whether anything that is left to rclpy was ready."""
-        if self._entities is None or not self.context.ok():  # a callback may have shut it down
-            return [], False
+        due: list[Any] = []
+        left = False
         with self._falling_back():
-            due = self._entities.due()
-            woken, others = self._entities.others_ready(self._guard)
-            self._changed |= woken or others  # adding an entity to a node wakes the executor
-            # So does rclpy itself, after each callback; then there is nothing to handle.
-            return due, others or (woken and bool(self._tasks))
-        return [], False
+            if self._entities is not None and self.context.ok():  # a callback may have shut it down
+                woken, others = self._entities.others_ready(self._guard)
+                self._changed |= woken or others  # adding an entity to a node wakes the executor
+                # So does rclpy itself, after each callback; then there is nothing to handle.
+                due, left = self._entities.due(), others or (woken and bool(self._tasks))
+        return due, left
 
     def _tick(self, timer: Any) -> None:
         """Calls a timer back, unless an earlier callback has ended the context or the timer."""
