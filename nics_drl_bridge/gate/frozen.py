@@ -10,12 +10,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.gate.state import Cause, GateConfig, GateState, Push, Sameness, replace
+from nics_drl_bridge.gate.state import Cause, GateConfig, GateState, Push, Ranges, Sameness, replace
 from nics_drl_bridge.gate.stops import ODOM, SCAN
 from nics_drl_bridge.geometry import between, compose
+from nics_drl_bridge.interface import Array
 
-Array = NDArray[np.float64]
-Ranges = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 IDENTICAL = 3  # least number of scans that show a frozen picture
 PICTURES = 16  # number of remembered pictures: a lidar may repeat several in turn

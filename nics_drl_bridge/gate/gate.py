@@ -12,15 +12,13 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.gate import arming, frozen, limits, stops
 from nics_drl_bridge.gate.inputs import Arm, Input, Reset, Tick
 from nics_drl_bridge.gate.intake import take
 from nics_drl_bridge.gate.shield import shield
 from nics_drl_bridge.gate.state import Cause, Decision, GateConfig, GateState, Motion, replace
-
-Array = NDArray[np.float64]
+from nics_drl_bridge.interface import Array
 
 
 def decide(

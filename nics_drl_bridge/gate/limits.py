@@ -12,9 +12,9 @@ from pydantic import Field, model_validator
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.interface import Array
 from nics_drl_bridge.robot.spec import CommandVariable, RobotSpec
 
-Array = NDArray[np.float64]
 IMPLAUSIBLE = 10.0  # a command beyond this multiple of its limit is a fault, and refused
 LEAST_STEP_S = 1e-3
 """Motions closer in time than this are not published: their derivatives would be noise."""

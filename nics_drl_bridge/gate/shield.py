@@ -21,12 +21,18 @@ from numpy.typing import NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.gate import shield_kernels
 from nics_drl_bridge.gate.inputs import Scan
-from nics_drl_bridge.gate.state import GateConfig, GateState, Motion, ShieldConfig, View, replace
+from nics_drl_bridge.gate.state import (
+    GateConfig,
+    GateState,
+    Motion,
+    Ranges,
+    ShieldConfig,
+    View,
+    replace,
+)
 from nics_drl_bridge.gate.stops import age
-from nics_drl_bridge.interface import S_PER_NS
+from nics_drl_bridge.interface import S_PER_NS, Array
 
-Array = NDArray[np.float64]
-Ranges = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 FINEST = 6  # bisections of the scale
 SPEEDS, TURNS = 3, 9

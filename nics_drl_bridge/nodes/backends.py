@@ -11,13 +11,20 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 from nav_msgs.msg import Odometry
-from numpy.typing import NDArray
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.env.guard import halts_on_error
 from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError, nearest
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import NS_PER_S, Backend, BackendFacts, RobotView, Start, stacked
+from nics_drl_bridge.interface import (
+    NS_PER_S,
+    Array,
+    Backend,
+    BackendFacts,
+    RobotView,
+    Start,
+    stacked,
+)
 from nics_drl_bridge.lidar.spec import from_device
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import qos, wire
@@ -28,7 +35,6 @@ from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.nodes.robot_topics import data_facts
 from nics_drl_bridge.sim.world import World
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 SCAN, ODOM, TRUTH = "scan", "odom", "ground_truth"
 AGAIN_S = 0.05  # data that do not arrive within this time are requested again [s]

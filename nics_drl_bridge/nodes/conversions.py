@@ -26,13 +26,12 @@ from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike, NDArray
 from sensor_msgs.msg import Imu, JointState, LaserScan
 
-from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.sectors import Reader, reader_beside
 from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader, from_device, to_device
 from nics_drl_bridge.recording.messages import POSITION_UNITS
 from nics_drl_bridge.robot.spec import RobotSpec
 
-Array = NDArray[np.float64]
 QUATERNION_TOLERANCE = 0.1  # tolerance of the squared length of a quaternion about 1
 PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 """Indices of x, y and heading in the 6 x 6 covariance of a message."""

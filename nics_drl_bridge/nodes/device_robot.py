@@ -12,7 +12,7 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -21,7 +21,7 @@ from sensor_msgs.msg import JointState, LaserScan
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.spec import to_device
 from nics_drl_bridge.nodes import conversions, qos, wire
 from nics_drl_bridge.nodes.device_parameters import DeviceTiming, Frames
@@ -29,7 +29,6 @@ from nics_drl_bridge.nodes.qos import owner
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, Sensed, variances
 
-Array = NDArray[np.float64]
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 SWITCH = {STAMPED: "enable_stamped_cmd_vel:=false", TWIST: "enable_stamped_cmd_vel:=true"}
 """By the expected type: the setting that selects the other type."""

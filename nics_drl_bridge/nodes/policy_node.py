@@ -9,12 +9,11 @@ from dataclasses import replace
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, TwistStamped
-from numpy.typing import NDArray
 from rclpy.context import Context
 
 from nics_drl_bridge.errors import BridgeError, ConfigError, shortened
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.interface import Array, RobotView
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
@@ -25,7 +24,6 @@ from nics_drl_bridge.nodes.runner import declare
 from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
 from nics_drl_bridge.policy.policies import open_policy
 
-Array = NDArray[np.float64]
 POLLS = 0.1  # time between two checks whether to act, as a share of the control period
 LONGEST_REASON = 300  # greatest length of a policy's error text, in characters
 

@@ -7,8 +7,6 @@ import time
 from collections.abc import Callable
 from typing import Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from nics_drl_bridge import geometry
@@ -16,14 +14,13 @@ from nics_drl_bridge.config import Schema, validate
 from nics_drl_bridge.env.guard import halts_on_error
 from nics_drl_bridge.errors import BackendError, StaleDataError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import NS_PER_S, BackendFacts, RobotView, Start
+from nics_drl_bridge.interface import NS_PER_S, Array, BackendFacts, RobotView, Start
 from nics_drl_bridge.middleware.measurement import SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes.link import EpisodeServices, Link
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, data_facts, declare_sensors
 from nics_drl_bridge.sim.world import World
 
-Array = NDArray[np.float64]
 RAW = "cmd_vel_raw"
 POLL_S, SAY_EVERY_S = 0.01, 2.0
 SERVICES_S = 0.5  # a peer that shows no services this long after its topics is a vehicle [s]

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -21,7 +20,7 @@ from sensor_msgs.msg import Imu, JointState
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, BridgeError, RecordingError
-from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.qos import QosWatch
 from nics_drl_bridge.nodes.runner import EXIT_BAD_INPUT, declare, last_word, run_node, steadily
@@ -34,7 +33,6 @@ from nics_drl_bridge.recording.topic_roles import TopicRoles, topic_roles
 from nics_drl_bridge.recording.write import check_out, write_drive
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
-Array = NDArray[np.float64]
 PATIENCE_S = 10.0
 POLL_S = 0.01
 HALT_S = 0.5  # zero is repeated for this long [s]: a best-effort subscriber may miss one

@@ -9,7 +9,6 @@ from functools import partial
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
@@ -17,7 +16,7 @@ from std_srvs.srv import SetBool
 
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import NS_PER_S, Simulator
+from nics_drl_bridge.interface import NS_PER_S, Array, Simulator
 from nics_drl_bridge.lidar.scanner import RENDERERS, Renderer
 from nics_drl_bridge.nodes import conversions, device_parameters, qos, runner
 from nics_drl_bridge.nodes.device_parameters import RealTime, TopicPace, declare_device, number
@@ -27,7 +26,6 @@ from nics_drl_bridge.sim.device import DeviceWorld
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World, load_world
 
-Array = NDArray[np.float64]
 CLOCK = "/clock"
 WATCH_S = 2.0
 LONGEST_TICK_S = 0.005  # longest time between two checks for delayed data that are due [s]

@@ -19,10 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import LaserScan
 
-from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes.conversions import PLANAR, heading_of
 
-Array = NDArray[np.float64]
 Bytes = bytes | bytearray
 HEAD = 4
 """Bytes of the header, which do not count for alignment; the second one gives the byte order."""

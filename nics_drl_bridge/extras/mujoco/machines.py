@@ -14,14 +14,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.interface import Array
 from nics_drl_bridge.robot.ackermann import track_and_radius
 from nics_drl_bridge.robot.kinds import require_textbook
 from nics_drl_bridge.robot.spec import RobotSpec
 
-Array = NDArray[np.float64]
 Parameters = dict[str, float]
 
 TORQUE_RESERVE = 1.5  # torque limit of a motor, relative to that for the maximum acceleration

@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.extras.mujoco.machines import Machine, Physics
+from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import Circle, Rectangle, Segment, Shape, convex_hull
-
-Array = NDArray[np.float64]
 
 HEIGHT = 0.5  # height of walls and obstacles [m]
 THICKNESS = 0.002  # thickness of walls, which have none for the lidar [m]

@@ -7,13 +7,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.extras.mujoco import scenery
 from nics_drl_bridge.extras.mujoco.machines import Machine, Physics, build_machine, load_mujoco
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
+from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.kinds import textbook
@@ -22,8 +23,6 @@ from nics_drl_bridge.sim.device import Driven, DrivenSimulator
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.state import State
 from nics_drl_bridge.sim.world import World
-
-Array = NDArray[np.float64]
 
 ENCODER_PERIOD_S = 0.01  # approximate period of encoder readings and of updates of moving obstacles
 LARGEST_TILT_RAD = 0.5

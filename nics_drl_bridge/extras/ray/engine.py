@@ -22,7 +22,6 @@ import gymnasium
 import numpy as np
 import ray
 import torch
-from numpy.typing import NDArray
 from ray.rllib.algorithms.ppo import PPO, PPOConfig
 from ray.rllib.core import DEFAULT_MODULE_ID
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
@@ -39,6 +38,7 @@ from nics_drl_bridge.extras.ray.runner import (
     WorldsRunner,
 )
 from nics_drl_bridge.generator import SimulatorModel, open_model
+from nics_drl_bridge.interface import Array
 from nics_drl_bridge.policy.train import (
     CHECKPOINT,
     SEEDS,
@@ -53,7 +53,6 @@ from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 from nics_drl_bridge.sim.world import World, load_world
 
-Array = NDArray[np.float64]
 FORMAT = "nics_drl_bridge/ray_checkpoint/1"
 VALUE_WEIGHT, GRADIENT_LIMIT = 0.5, 0.5  # parameters of the loss, as in Stable-Baselines3
 SILENCE_S = 600.0  # without a step from any env runner, after which a run ends; it can be resumed
