@@ -122,11 +122,15 @@ class Link:
             )
         return future.result()
 
+    def others_command(self) -> bool:
+        """True if another node publishes commands too."""
+        return bool(self.node.count_publishers(self.commands.topic_name) > 1)
+
     def check_alone(self) -> None:
         """Raises BackendError with the names of any other publishers of commands."""
-        topic = self.commands.topic_name
-        if self.node.count_publishers(topic) <= 1:
+        if not self.others_command():
             return
+        topic = self.commands.topic_name
         ends = self.node.get_publishers_info_by_topic(topic)
         names = sorted(name for end in ends if (name := owner(end)) is not None)
         with contextlib.suppress(ValueError):
@@ -154,7 +158,7 @@ class Link:
                 )
             time.sleep(POLL_S)
         # A publisher that was killed stays in the graph for a while.
-        while node.count_publishers(commands.topic_name) > 1 and time.monotonic() < deadline:
+        while self.others_command() and time.monotonic() < deadline:
             time.sleep(POLL_S)
         self.check_alone()
 
