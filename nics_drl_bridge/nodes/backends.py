@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -113,13 +114,8 @@ class _Mailbox:
             return {t: (message, self._arrivals[t]) for t, message in self._messages.items()}
 
 
-def _worker(middleware: Middleware) -> Callable[[int, int, bytes], None]:
-    """Returns the callback for odometry, without a reference to the backend (it may be garbage)."""
-
-    def work(stamp_ns: int, arrival_ns: int, message: bytes) -> None:
-        middleware.odometry(stamp_ns, arrival_ns, *_read(ODOM, wire.odometry_of, message))
-
-    return work
+def _take_odometry(middleware: Middleware, stamp_ns: int, arrival_ns: int, message: bytes) -> None:
+    middleware.odometry(stamp_ns, arrival_ns, *_read(ODOM, wire.odometry_of, message))
 
 
 class DdsBackend:
@@ -149,7 +145,9 @@ class DdsBackend:
         self._middleware = Middleware(model)
         self._period_ns = round(model.control_period * NS_PER_S)
         self.timeout_s, self._topics = timeout_s, (ODOM, SCAN, *((TRUTH,) if truth else ()))
-        self._now_ns, self._mail = 0, _Mailbox(self._topics, _worker(self._middleware))
+        # No reference to the backend, which may be garbage.
+        take = partial(_take_odometry, self._middleware)
+        self._now_ns, self._mail = 0, _Mailbox(self._topics, take)
         self._known: BackendFacts = {}
         self._link = Link(namespace, domain_id)
         for topic in self._topics:
