@@ -132,15 +132,10 @@ class DdsBackend:
     """
 
     def __init__(
-        self,
-        model: SimulatorModel,
-        world: World,
-        namespace: str = "",
-        simulator: str = "simulator_node",
-        timeout_s: float = 30.0,
-        truth: bool = False,
+        self, model: SimulatorModel, world: World, namespace: str = "",
+        simulator: str = "simulator_node", timeout_s: float = 30.0, truth: bool = False,
         domain_id: int | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._robot, self._lidar = model.robot, model.lidar
         self._middleware = Middleware(model)
         self._period_ns = round(model.control_period * NS_PER_S)
@@ -270,13 +265,9 @@ class FleetBackend:
     """
 
     def __init__(
-        self,
-        model: SimulatorModel,
-        world: World,
-        namespaces: Sequence[str],
-        simulator: str = "/simulator_node",
-        **options: Any,
-    ) -> None:
+        self, model: SimulatorModel, world: World, namespaces: Sequence[str],
+        simulator: str = "/simulator_node", **options: Any,
+    ) -> None:  # fmt: skip
         if len(set(namespaces)) < max(2, len(namespaces)):
             raise ConfigError(
                 f"backend_options: namespaces {list(namespaces)!r} must be those of at least two "
@@ -336,14 +327,9 @@ MODES = {"lockstep": DdsBackend, "realtime": RealtimeBackend}
 
 
 def dds_backend(
-    model: SimulatorModel,
-    world: World,
-    mode: str = "lockstep",
-    robots: int = 1,
-    estimator: bool = True,
-    randomisation: None = None,
-    **options: Any,
-) -> Backend:
+    model: SimulatorModel, world: World, mode: str = "lockstep", robots: int = 1,
+    estimator: bool = True, randomisation: None = None, **options: Any,
+) -> Backend:  # fmt: skip
     """Returns the backend of a robot behind ROS 2 topics, or of a team in lock-step.
 
     In mode `lockstep` it is a `DdsBackend`, or for a team a `FleetBackend` with the option

@@ -117,12 +117,9 @@ def reader_from_ros(message: LaserScan, like: LidarSpec, upside_down: bool = Fal
 
 
 def odometry_to_ros(
-    pose: ArrayLike,
-    twist: ArrayLike,
-    time_ns: int,
-    frames: Sequence[str],
+    pose: ArrayLike, twist: ArrayLike, time_ns: int, frames: Sequence[str],
     variance: tuple[float, float, float, float],
-) -> Odometry:
+) -> Odometry:  # fmt: skip
     """Returns pose (3,) and body twist (3,), in a fixed and a body frame, as an Odometry message.
 
     The variances are of position [m^2], heading [rad^2], linear [m^2/s^2], angular [rad^2/s^2].
@@ -155,9 +152,7 @@ def covariance_to_ros(planar: Array) -> Array:
     return whole.ravel()
 
 
-def pose_from_ros(
-    message: PoseStamped | PoseWithCovarianceStamped,
-) -> tuple[Array, Array | None]:
+def pose_from_ros(message: PoseStamped | PoseWithCovarianceStamped) -> tuple[Array, Array | None]:
     """Returns the pose (3,) of a message and its covariance (3, 3); None if it carries none."""
     if isinstance(message, PoseWithCovarianceStamped):
         return _planar(message.pose.pose), np.reshape(message.pose.covariance, (6, 6))[PLANAR]

@@ -112,14 +112,9 @@ class CommandInlet:
     """
 
     def __init__(
-        self,
-        node: Node,
-        namespace: str,
-        robot: RobotSpec,
-        quality: QoSProfile,
-        take: Callable[[Array], None],
-        too_old: Callable[[int], bool],
-    ) -> None:
+        self, node: Node, namespace: str, robot: RobotSpec, quality: QoSProfile,
+        take: Callable[[Array], None], too_old: Callable[[int], bool],
+    ) -> None:  # fmt: skip
         self._node, self._robot, self._take, self._too_old = node, robot, take, too_old
         stamped = bool(node.get_parameter("enable_stamped_cmd_vel").value)
         self._kind = STAMPED if stamped else TWIST

@@ -50,14 +50,10 @@ class Link:
     """
 
     def __init__(
-        self,
-        namespace: str = "",
-        domain_id: int | None = None,
-        command_topic: str = "cmd_vel",
-        stamped: bool = False,
-        parameters: Mapping[str, Any] | None = None,
+        self, namespace: str = "", domain_id: int | None = None, command_topic: str = "cmd_vel",
+        stamped: bool = False, parameters: Mapping[str, Any] | None = None,
         command_timeout_s: float = math.inf,
-    ) -> None:
+    ) -> None:  # fmt: skip
         _end_orderly_on_sigterm()
         self._context = open_context(domain_id=domain_id)
         overrides = [Parameter(name, value=value) for name, value in (parameters or {}).items()]

@@ -76,15 +76,9 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
     """
 
     def __init__(
-        self,
-        node: str,
-        folder: Path,
-        parameters: Mapping[str, Any],
-        domain_id: int,
-        namespace: str = "",
-        remap: Mapping[str, str] | None = None,
-        discovery: str = "LOCALHOST",
-    ) -> None:
+        self, node: str, folder: Path, parameters: Mapping[str, Any], domain_id: int,
+        namespace: str = "", remap: Mapping[str, str] | None = None, discovery: str = "LOCALHOST",
+    ) -> None:  # fmt: skip
         self.node = node
         folder.mkdir(parents=True, exist_ok=True)
         self.log = folder / f"{node}.log"

@@ -56,14 +56,11 @@ class RobotTopics:
     """
 
     def __init__(
-        self,
-        node: Node,
-        model: SimulatorModel,
-        on_odometry: Callable[[int], None] | None = None,
+        self, node: Node, model: SimulatorModel, on_odometry: Callable[[int], None] | None = None,
         on_scan: Callable[[int], None] | None = None,
         on_lidar: Callable[[LidarSpec], None] | None = None,
         now_ns: Callable[[], int] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._node, self._robot, self._lidar = node, model.robot, model.lidar
         self._model = model
         self.now_ns = now_ns or (lambda: int(node.get_clock().now().nanoseconds))

@@ -39,10 +39,7 @@ SETTLE_S, POLL_S = 0.3, 0.02  # time until the graph shows all nodes [s]
 ANSWER_S = 1.5
 """A node that does not answer within this time is dead; the graph shows it for some 20 s more."""
 DIAGNOSTICS_S = 1.0
-RANGES = {
-    int: (IntegerRange, "integer_range"),
-    float: (FloatingPointRange, "floating_point_range"),
-}
+RANGES = {int: (IntegerRange, "integer_range"), float: (FloatingPointRange, "floating_point_range")}
 QOS, SHARED = "qos_overrides.", "model"
 """Names of parameters that rclpy reads itself, if a publisher or subscription requests it; and one
 that a file sets for all nodes at once, including those that have no model."""
@@ -225,13 +222,9 @@ def declare_model_name(node: Node) -> str:
 
 
 def declare(
-    node: Node,
-    name: str,
-    default: Any,
-    description: str,
-    span: tuple[float, float] | None = None,
+    node: Node, name: str, default: Any, description: str, span: tuple[float, float] | None = None,
     read_only: bool = False,
-) -> Any:
+) -> Any:  # fmt: skip
     """Declares a parameter of the default's type, and returns its value, which lies in a span.
 
     In a managed node `read_only` applies from configure to cleanup. `rate:=2` may be given for a

@@ -156,13 +156,9 @@ class MujocoSimulator:
     """
 
     def __init__(
-        self,
-        model: SimulatorModel,
-        world: World,
-        robots: int = 1,
-        renderer: Renderer = "auto",
+        self, model: SimulatorModel, world: World, robots: int = 1, renderer: Renderer = "auto",
         physics: Physics | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._mujoco = load_mujoco()
         self.model, self.world = model, world
         physics = physics or Physics()
@@ -286,12 +282,9 @@ def divide(period: float, longest: float) -> tuple[int, int, float]:
 
 
 def record(
-    robot: MujocoRobot,
-    rng: np.random.Generator,
-    duration: float = 60.0,
-    dt: float = 0.01,
+    robot: MujocoRobot, rng: np.random.Generator, duration: float = 60.0, dt: float = 0.01,
     hold: float = 0.5,
-) -> Recording:
+) -> Recording:  # fmt: skip
     """Drives at random from the origin and records, as `textbook.record` does.
 
     New commands are drawn, uniform within their limits, every `hold` seconds; the sample period

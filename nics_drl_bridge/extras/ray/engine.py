@@ -116,13 +116,9 @@ def _runners(runners: int | None, cpus: int, worlds: int) -> int:
 
 
 def train_on_ray(
-    settings: TrainingSettings,
-    seed: int,
-    folder: Path,
-    tell: Tell = lambda _: None,
-    resumed: bool = False,
-    runners: int = 1,
-) -> Trained:
+    settings: TrainingSettings, seed: int, folder: Path, tell: Tell = lambda _: None,
+    resumed: bool = False, runners: int = 1,
+) -> Trained:  # fmt: skip
     """Trains one policy on the cluster that this process is connected to.
 
     An env runner whose process or machine is lost is restarted, if necessary on another machine;
@@ -281,12 +277,9 @@ def _algorithm(settings: TrainingSettings, seed: int, done: int, runners: int) -
 
 
 def share_of_worlds(
-    settings: TrainingSettings,
-    model: SimulatorModel,
-    scenes: Mapping[str, World],
-    runner: int,
+    settings: TrainingSettings, model: SimulatorModel, scenes: Mapping[str, World], runner: int,
     runners: int,
-) -> TrainVecEnv:
+) -> TrainVecEnv:  # fmt: skip
     """The worlds of env runner number `runner`: every `runners`-th."""
     names = [name for name, count in settings.worlds.items() for _ in range(count)]
     share = dict(Counter(names[runner::runners]))
@@ -294,12 +287,9 @@ def share_of_worlds(
 
 
 def _config(
-    settings: TrainingSettings,
-    seed: int,
-    done: int,
-    normaliser: tuple[Array, Array],
+    settings: TrainingSettings, seed: int, done: int, normaliser: tuple[Array, Array],
     spaces: tuple[gymnasium.Space[Any], gymnasium.Space[Any]],
-) -> PPOConfig:
+) -> PPOConfig:  # fmt: skip
     """Translates the settings into RLlib's configuration."""
     chosen, left = settings.ppo, max(settings.steps - done, 1)
     rate = chosen.learning_rate
