@@ -297,7 +297,3 @@ def main(args: list[str] | None = None) -> None:
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(0)  # all is closed; to tear down the interpreter, too, takes seconds on a busy machine
-
-
-if __name__ == "__main__":
-    main()

@@ -41,9 +41,11 @@ class ManagedNode(QosWatch, LifecycleNode):
         self.add_on_set_parameters_callback(self._check_fixed)
 
     def create_lifecycle_publisher(self, kind: Any, topic: str, qos: Any) -> Publisher:
-        """Creates a publisher that is silent unless the node is active."""
+        """Creates a publisher that is silent unless the node is active, until clean-up."""
         events = self.publisher_events(topic, qos)
-        return super().create_lifecycle_publisher(kind, topic, qos, event_callbacks=events)
+        made = super().create_lifecycle_publisher(kind, topic, qos, event_callbacks=events)
+        self.undo.callback(self.destroy_lifecycle_publisher, made)
+        return made
 
     def configure(self) -> None:
         """Makes what the parameters request. Raises BridgeError if one can't be used."""

@@ -32,7 +32,7 @@ from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.qos import QosWatch, owner
-from nics_drl_bridge.nodes.runner import last_word, open_context
+from nics_drl_bridge.nodes.runner import holds, last_word, open_context
 from nics_drl_bridge.nodes.wire import TwistWriter
 from nics_drl_bridge.sim.world import World
 
@@ -106,8 +106,7 @@ class Link:
         """Calls a service; the executor's thread completes the future. Raises BackendError."""
         done, deadline = threading.Event(), time.monotonic() + timeout_s
         # A server that hung for long was dropped, and has to be discovered again.
-        while not client.service_is_ready() and time.monotonic() < deadline:
-            time.sleep(POLL_S)
+        holds(client.service_is_ready, timeout_s, POLL_S)
         future = client.call_async(request)
         future.add_done_callback(lambda _: done.set())
         if not done.wait(max(0.0, deadline - time.monotonic())):
@@ -147,15 +146,11 @@ class Link:
             service = node.resolve_service_name(client.srv_name)
             needed[f"service {service}"] = client.service_is_ready
         deadline = time.monotonic() + patience_s
-        while missing := [name for name, there in needed.items() if not there()]:
-            if time.monotonic() > deadline:
-                raise BackendError(
-                    f"after {patience_s:g} s there is still no {', no '.join(missing)}; {advice}"
-                )
-            time.sleep(POLL_S)
+        if not holds(lambda: all(there() for there in needed.values()), patience_s, POLL_S):
+            missing = ", no ".join(name for name, there in needed.items() if not there())
+            raise BackendError(f"after {patience_s:g} s there is still no {missing}; {advice}")
         # A publisher that was killed stays in the graph for a while.
-        while self.others_command() and time.monotonic() < deadline:
-            time.sleep(POLL_S)
+        holds(lambda: not self.others_command(), deadline - time.monotonic(), POLL_S)
         self.check_alone()
 
     def close(self) -> None:

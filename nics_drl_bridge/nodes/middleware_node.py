@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 from nav_msgs.msg import Odometry
 from rclpy.context import Context
@@ -42,7 +43,6 @@ class MiddlewareNode(ManagedNode):
         rehearse(model)
         topic = "odometry/filtered"
         self._filtered = self.create_lifecycle_publisher(Odometry, topic, qos.SENSOR_RELIABLE)
-        self.undo.callback(self.destroy_lifecycle_publisher, self._filtered)
         self._topics = RobotTopics(self, model, on_odometry=self._publish)
         self.undo.callback(self._topics.close)
 
@@ -96,10 +96,4 @@ def facts(health: Health) -> dict[str, str]:
     return found | {"late and put in place": str(health.replayed)}
 
 
-def main(args: list[str] | None = None) -> None:
-    """Entry point of the executable."""
-    runner.run_node(MiddlewareNode, args, "middleware_node")
-
-
-if __name__ == "__main__":
-    main()
+main = partial(runner.run_node, MiddlewareNode, sole_name="middleware_node")

@@ -6,6 +6,7 @@ import math
 import time
 import traceback
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, TwistStamped
@@ -20,7 +21,6 @@ from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.lifecycle import ACTIVE, UNCONFIGURED, ManagedNode
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
-from nics_drl_bridge.nodes.runner import declare
 from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
 from nics_drl_bridge.policy.policies import open_policy
 
@@ -42,7 +42,7 @@ class PolicyNode(ManagedNode):
         super().__init__("policy_node", context)
         runner.declare_model_name(self)
         declare_sensors(self)
-        declare(self, "base_frame", "base_link", "Frame id of the robot.")
+        runner.declare(self, "base_frame", "base_link", "Frame id of the robot.")
         for name, default, about in (
             ("policy", "dynamic_window",
              "A policy file (*.onnx), or the name of a shipped one or of a baseline."),
@@ -53,9 +53,9 @@ class PolicyNode(ManagedNode):
             ("deadline", math.nan,
              "Longest time of an inference [s]; NaN: half the control period."),
         ):  # fmt: skip
-            declare(self, name, default, about, read_only=True)
+            runner.declare(self, name, default, about, read_only=True)
         about = "So many late inferences in a row command zero."
-        declare(self, "late_limit", 3, about, span=(1, 1000), read_only=True)
+        runner.declare(self, "late_limit", 3, about, span=(1, 1000), read_only=True)
         self._acted_ns = 0
         runner.Diagnostics(self, "policy", self._look)
 
@@ -69,7 +69,6 @@ class PolicyNode(ManagedNode):
         self._pace, self._deadline = self._declared_pace(model.control_period)
         self._acted_ns = 0
         self._raw = self.create_lifecycle_publisher(TwistStamped, "cmd_vel_raw", qos.COMMAND)
-        self.undo.callback(self.destroy_lifecycle_publisher, self._raw)
         goals = self.create_subscription(PoseStamped, "goal_pose", self._on_goal, qos.COMMAND)
         self.undo.callback(self.destroy_subscription, goals)
         self._topics = RobotTopics(
@@ -185,10 +184,4 @@ class PolicyNode(ManagedNode):
         return conversions.stamped_to_ros(twist, stamp_ns, frame)
 
 
-def main(args: list[str] | None = None) -> None:
-    """Entry point of the executable."""
-    runner.run_node(PolicyNode, args, "policy_node")
-
-
-if __name__ == "__main__":
-    main()
+main = partial(runner.run_node, PolicyNode, sole_name="policy_node")

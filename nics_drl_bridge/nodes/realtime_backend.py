@@ -19,6 +19,7 @@ from nics_drl_bridge.middleware.measurement import SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes.link import EpisodeServices, Link
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, data_facts, declare_sensors
+from nics_drl_bridge.nodes.runner import holds
 from nics_drl_bridge.sim.world import World
 
 RAW = "cmd_vel_raw"
@@ -106,9 +107,8 @@ class RealtimeBackend:
             clients = self._episodes.clients if chosen.vehicle is False else []
             self._link.wait_for_peers(self._topics.expected, clients, chosen.timeout_s, ADVICE)
             # A simulator's services may be found later than its topics.
-            deadline = time.monotonic() + SERVICES_S
-            while self._is_vehicle() and chosen.vehicle is None and time.monotonic() < deadline:
-                time.sleep(POLL_S)
+            known = chosen.vehicle is not None
+            holds(lambda: known or not self._is_vehicle(), SERVICES_S, POLL_S)
         except BaseException:
             self.close()
             raise
@@ -141,11 +141,8 @@ class RealtimeBackend:
         stamp_ns = self._episodes.begin(timeout_s)
         with self._topics.lock:
             self._topics.begin(stamp_ns, start.pose)
-        deadline = time.monotonic() + timeout_s
-        while math.isinf((late := self._oldest())[1]):
-            if time.monotonic() > deadline:
-                raise StaleDataError(*late, timeout_s)
-            time.sleep(POLL_S)
+        if not holds(lambda: math.isfinite(self._oldest()[1]), timeout_s, POLL_S):
+            raise StaleDataError(*self._oldest(), timeout_s)
 
     def _await_start(self, start: Start) -> None:
         """Waits until a vehicle stands at its start, and reports what is missing.

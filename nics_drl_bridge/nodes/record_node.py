@@ -404,7 +404,3 @@ def main(args: list[str] | None = None) -> None:
     sys.stderr.write(f"record_node: {outcome.line}\n")
     if outcome.failure is not None:
         raise SystemExit(EXIT_BAD_INPUT)
-
-
-if __name__ == "__main__":
-    main()

@@ -14,7 +14,7 @@ from sensor_msgs.msg import Imu, LaserScan
 
 from nics_drl_bridge.errors import BridgeError, ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.interface import Array, RobotView
 from nics_drl_bridge.lidar.sectors import Reader
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
 from nics_drl_bridge.middleware.ekf import ANYWHERE
@@ -107,7 +107,7 @@ class RobotTopics:
         self._started, self._since_ns = False, 0
         self.middleware.reset(0, np.zeros(3))
 
-    def begin(self, stamp_ns: int, pose: conversions.Array) -> None:
+    def begin(self, stamp_ns: int, pose: Array) -> None:
         """Clears all state before a stamp [ns], at which the robot stands at a pose (3,)."""
         self._started, self._since_ns = True, stamp_ns
         self.middleware.reset(stamp_ns, pose)

@@ -122,6 +122,16 @@ def run_node(
         alone.close()
 
 
+def holds(condition: Callable[[], Any], seconds: float, poll_s: float) -> bool:
+    """Waits until a condition holds; False if it does not within the time."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(poll_s)
+    return True
+
+
 def spin(node: Node, stopping: threading.Event) -> None:
     """Spins a node until it is to stop, or its context has been shut down."""
     executor = StandingExecutor(node.context)
@@ -169,14 +179,12 @@ def _claims(claim: socket.socket, key: str) -> bool:
 
 def _seen(probe: Node, whole: str) -> bool:
     """True if the graph shows another node of the probe's name within `SETTLE_S`."""
-    deadline = time.monotonic() + SETTLE_S
-    while True:
+
+    def shows() -> bool:
         nodes = probe.get_node_names_and_namespaces()
-        if [f"{space.rstrip('/')}/{name}" for name, space in nodes].count(whole) > 1:
-            return True
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(POLL_S)
+        return [f"{space.rstrip('/')}/{name}" for name, space in nodes].count(whole) > 1
+
+    return holds(shows, SETTLE_S, POLL_S)
 
 
 def _lives(probe: Node, whole: str) -> bool:
@@ -186,8 +194,7 @@ def _lives(probe: Node, whole: str) -> bool:
     executor.add_node(probe)
     deadline = time.monotonic() + ANSWER_S
     try:
-        while not client.service_is_ready() and time.monotonic() < deadline:
-            time.sleep(POLL_S)
+        holds(client.service_is_ready, ANSWER_S, POLL_S)
         answer = client.call_async(GetParameters.Request())
         executor.spin_until_future_complete(answer, max(0.1, deadline - time.monotonic()))
         return bool(answer.done())

@@ -251,10 +251,4 @@ def simulator_node(context: Context) -> DeviceNode:
     return DeviceNode("simulator_node", context, fast_simulator)
 
 
-def main(args: list[str] | None = None) -> None:
-    """Entry point of the executable."""
-    runner.run_node(simulator_node, args, "simulator_node")
-
-
-if __name__ == "__main__":
-    main()
+main = partial(runner.run_node, simulator_node, sole_name="simulator_node")
