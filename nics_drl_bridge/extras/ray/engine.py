@@ -439,22 +439,14 @@ def _config(
         .training(
             lr=[[0, now], [left, rate * train_algorithms.LEAST_RATE]],
             train_batch_size_per_learner=chosen.rollout * settings.num_envs,
-            minibatch_size=chosen.batch,
-            num_epochs=chosen.epochs,
-            gamma=chosen.discount,
-            lambda_=chosen.gae_lambda,
-            clip_param=chosen.clip,
-            entropy_coeff=chosen.entropy,
-            vf_loss_coeff=VALUE_WEIGHT,
-            vf_clip_param=np.inf,
-            use_kl_loss=False,
-            grad_clip=GRADIENT_LIMIT,
-            grad_clip_by="global_norm",
+            minibatch_size=chosen.batch, num_epochs=chosen.epochs, gamma=chosen.discount,
+            lambda_=chosen.gae_lambda, clip_param=chosen.clip, entropy_coeff=chosen.entropy,
+            vf_loss_coeff=VALUE_WEIGHT, vf_clip_param=np.inf, use_kl_loss=False,
+            grad_clip=GRADIENT_LIMIT, grad_clip_by="global_norm",
         )
         .fault_tolerance(
-            restart_failed_env_runners=True,
-            delay_between_env_runner_restarts_s=PROBE_S,
+            restart_failed_env_runners=True, delay_between_env_runner_restarts_s=PROBE_S,
             env_runner_health_probe_timeout_s=PROBE_S,
         )
         .debugging(seed=seed, log_level="ERROR")
-    )
+    )  # fmt: skip
