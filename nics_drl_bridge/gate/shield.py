@@ -21,18 +21,11 @@ from numpy.typing import NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.gate import shield_kernels
 from nics_drl_bridge.gate.inputs import Scan
-from nics_drl_bridge.gate.state import (
-    GateConfig,
-    GateState,
-    Motion,
-    Ranges,
-    ShieldConfig,
-    View,
-    replace,
-)
+from nics_drl_bridge.gate.state import GateConfig, GateState, Motion, ShieldConfig, View, replace
 from nics_drl_bridge.gate.stops import age
 from nics_drl_bridge.interface import S_PER_NS, Array
 
+Ranges = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 FINEST = 6  # bisections of the scale
 SPEEDS, TURNS = 3, 9
@@ -116,9 +109,8 @@ def unknown(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Fla
     return np.stack([*wall, np.zeros_like(blocked)], axis=1)
 
 
-EVIDENCE: tuple[Callable[[GateConfig, ShieldConfig, Ranges, Flags], Array], ...] = (
-    returns, too_close, unknown,
-)  # fmt: skip
+Evidence = Callable[[GateConfig, ShieldConfig, Ranges, Flags], Array]
+EVIDENCE: tuple[Evidence, ...] = (returns, too_close, unknown)
 
 
 def _ends(config: GateConfig, angles: Array, ranges: Array, speeds: Array | float) -> Array:
