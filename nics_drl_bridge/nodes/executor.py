@@ -152,8 +152,15 @@ class _Entities:
     def __init__(self, nodes: Sequence[Node], guards: Sequence[Any], context: Context) -> None:
         self.all = _entities_of(nodes)
         subscriptions, others, timers, clients, services, self._waitables = self.all
-        self._subscriptions = [(one, _arguments(one.callback)) for one in subscriptions]
-        self._timers = [(i, one) for i, one in enumerate(timers) if _plain(one.callback)]
+        # A subscription's callback takes the message, or also its info.
+        self._subscriptions = [
+            (one, 1 if _takes(one.callback, None) else 2) for one in subscriptions
+        ]
+        self._timers = [
+            (i, one)
+            for i, one in enumerate(timers)
+            if _takes(one.callback) and not inspect.iscoroutinefunction(one.callback)
+        ]
         self._own = {one.handle.pointer for _, one in self._timers}
         kinds = subscriptions, (*guards, *others), timers, clients, services
         self.opened = ExitStack()
@@ -231,22 +238,13 @@ def _call(received: Iterable[Received]) -> None:
         time.sleep(REST_S)
 
 
-def _arguments(callback: Callable[..., Any]) -> int:
-    """Returns how many arguments a subscription's callback takes: the message, or also its info."""
+def _takes(callback: Any, *arguments: Any) -> bool:
+    """True if a callback can be called with these arguments."""
     try:
-        inspect.signature(callback).bind(None)
-    except TypeError:
-        return 2
-    return 1
-
-
-def _plain(callback: Callable[..., Any] | None) -> bool:
-    """True if a timer's callback takes no arguments and is no coroutine."""
-    try:
-        inspect.signature(callback).bind()  # type: ignore[arg-type]
+        inspect.signature(callback).bind(*arguments)
     except TypeError:
         return False
-    return not inspect.iscoroutinefunction(callback)
+    return True
 
 
 def _entities_of(nodes: Sequence[Node]) -> tuple[tuple[Any, ...], ...]:

@@ -12,7 +12,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import NoReturn
 
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
@@ -153,19 +153,12 @@ class GateLog:
 def prune(folder: Path, own: Sequence[str]) -> None:
     """Removes the files of stops beyond `FILES_KEPT`, oldest first.
 
-    This gate's own, by name, oldest first, count as the newest: the names of the others may come
-    from a clock that has been set back since.
+    This gate's own, oldest first, count as the newest: the clock may have been set back since.
     """
     place = {name: i for i, name in enumerate(own, 1)}
     files = sorted(folder.glob("*.jsonl"), key=lambda file: (place.get(file.name, 0), file.name))
     for old in files[:-FILES_KEPT]:
         old.unlink(missing_ok=True)
-
-
-class _Writer(NamedTuple):
-    pid: int
-    told: int  # pipe with the reason of a failure
-    begun_s: float
 
 
 class BoxWriter:
@@ -178,7 +171,7 @@ class BoxWriter:
     """
 
     def __init__(self) -> None:
-        self._writers: list[_Writer] = []
+        self._writers: dict[int, tuple[int, float]] = {}  # pid: pipe with its failure, begin [s]
         self._failed: list[str] = []
 
     def begin(self, write: Callable[[], object]) -> bool:
@@ -208,32 +201,32 @@ class BoxWriter:
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, signals)
             os.close(told)
-        self._writers.append(_Writer(pid, heard, time.monotonic()))
+        self._writers[pid] = heard, time.monotonic()
         return True
 
     def failures(self) -> list[str]:
         """Returns the failures since the last call; kills the writers that are overdue."""
-        for writer in tuple(self._writers):
-            status = _ended(writer.pid)
+        for pid, (heard, begun_s) in tuple(self._writers.items()):
+            status = _ended(pid)
             if status is None:
-                if time.monotonic() - writer.begun_s > OVERDUE_S:
-                    os.kill(writer.pid, signal.SIGKILL)
+                if time.monotonic() - begun_s > OVERDUE_S:
+                    os.kill(pid, signal.SIGKILL)
                 continue
-            self._writers.remove(writer)
+            del self._writers[pid]
             if status != 0:
-                self._failed.append(_read(writer.told) or f"its writer ended with {status}")
-            os.close(writer.told)
+                self._failed.append(_read(heard) or f"its writer ended with {status}")
+            os.close(heard)
         failed, self._failed = self._failed, []
         return failed
 
     def close(self, seconds: float) -> list[str]:
         """Waits for the writers, and makes those give up that take longer; returns the failures."""
         failed = self._wait(seconds)
-        for writer in self._writers:
-            os.kill(writer.pid, signal.SIGTERM)
+        for pid in self._writers:
+            os.kill(pid, signal.SIGTERM)
         failed += self._wait(GRACE_S)
-        for writer in self._writers:  # blocked by the disk; it ends when that releases it
-            os.kill(writer.pid, signal.SIGKILL)
+        for pid in self._writers:  # blocked by the disk; it ends when that releases it
+            os.kill(pid, signal.SIGKILL)
             failed.append("the disk does not answer")
         return failed
 
