@@ -35,9 +35,6 @@ from nics_drl_bridge.lidar.spec import LidarSpec, from_device
 from nics_drl_bridge.nodes import qos, runner, wire
 from nics_drl_bridge.nodes.conversions import is_rotation
 from nics_drl_bridge.nodes.gate_log import GateLog
-from nics_drl_bridge.nodes.qos import QosWatch
-from nics_drl_bridge.nodes.runner import declare
-from nics_drl_bridge.nodes.wire import UNREADABLE, TwistWriter
 
 STALE_S = 0.05  # a motion that was decided on longer ago than this is decided on again [s]
 SCAN_PERIODS = 1.75
@@ -60,7 +57,7 @@ def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
     """
     lidar, robot = model.lidar, model.robot
     about = "Limits of the robot: a shipped file, or a YAML file; no default."
-    file = str(declare(node, "limits", "", about, read_only=True))
+    file = str(runner.declare(node, "limits", "", about, read_only=True))
     limits = load_limits(file, robot) if file else None
     config = GateConfig(
         fields=tuple(np.flatnonzero(robot.to_cmd_vel(np.ones(len(robot.command)))).tolist()),
@@ -93,7 +90,7 @@ def _declare_rules(node: Node, model: SimulatorModel) -> dict[str, Any]:
         ("estimate_std", default.estimate_std, "Greatest [m, rad].", (1e-3, 1e3)),
     )
     return {
-        field: declare(node, field.removesuffix("_s"), value, about, span, read_only=True)
+        field: runner.declare(node, field.removesuffix("_s"), value, about, span, read_only=True)
         for field, value, about, span in rows
     }
 
@@ -101,7 +98,7 @@ def _declare_rules(node: Node, model: SimulatorModel) -> dict[str, Any]:
 def declare_black_box(node: Node) -> Path:
     """Declares the folder of the recordings of stops, and returns that of the node's namespace."""
     about = "Where a stop's last 30 s are written, by namespace; ~/.ros/black_box if empty."
-    given = str(declare(node, "black_box", "", about, read_only=True))
+    given = str(runner.declare(node, "black_box", "", about, read_only=True))
     home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
     # So that no gate of another namespace removes its files.
     namespace = str(node.get_namespace()).strip("/")
@@ -112,7 +109,7 @@ def _declare_shield(
     node: Node, model: SimulatorModel, limits: Limits | None, file: str
 ) -> ShieldConfig | None:
     """Returns the shield, None if it is off, and logs a sentence about it."""
-    on = declare(node, "shield", True, "Whether to stop before obstacles.", read_only=True)
+    on = runner.declare(node, "shield", True, "Whether to stop before obstacles.", read_only=True)
     values = {}
     for name, about in (
         ("latency", "Until the robot has taken up a command, measured [s]"),
@@ -121,7 +118,7 @@ def _declare_shield(
         ("obstacle_speed", "At which what moves may come on [m/s]"),
     ):
         about = f"{about}; .nan: by the limits' file, or derived from the model."
-        value = float(declare(node, f"shield_{name}", math.nan, about, read_only=True))
+        value = float(runner.declare(node, f"shield_{name}", math.nan, about, read_only=True))
         if not math.isnan(value):
             values[name] = value
     if not on:
@@ -183,7 +180,7 @@ def take_priority(priority: int) -> str:
     return ""
 
 
-class CommandGate(QosWatch):
+class CommandGate(qos.QosWatch):
     """Stands between `cmd_vel_raw` and `cmd_vel`, in its own process.
 
     It starts disarmed. `~/arm` lets commands pass if all checks succeed, `~/e_stop` presses the
@@ -205,13 +202,13 @@ class CommandGate(QosWatch):
         if self._config.shield is not None:
             shield.rehearse()
         self._out = self.create_publisher(Twist, "cmd_vel", qos.COMMAND)
-        self._twists = TwistWriter()
+        self._twists = wire.TwistWriter()
         self._zero = self._twists.write(np.zeros(3))
         self._listen()
         runner.steadily(self, PERIOD_S, lambda: self._decide(inputs.Tick()))
         runner.Diagnostics(self, "gate", self._look)
         about = "Real-time priority (SCHED_FIFO) of its process, 1 to 99; 0 for none."
-        priority = declare(self, "priority", 0, about, (0, HIGHEST), read_only=True)
+        priority = runner.declare(self, "priority", 0, about, (0, HIGHEST), read_only=True)
         if refused := take_priority(priority):  # once all threads exist
             logger.warning(refused)
 
@@ -232,7 +229,7 @@ class CommandGate(QosWatch):
     def _take(self, topic: str, read: Callable[[bytes], inputs.Input], content: bytes) -> None:
         try:
             given = read(content)
-        except UNREADABLE as error:  # of a middleware with another encoding
+        except wire.UNREADABLE as error:  # of a middleware with another encoding
             self._log.refuse(f"{topic}: {error}")
         else:
             self._decide(given)

@@ -31,7 +31,6 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.executor import StandingExecutor
-from nics_drl_bridge.nodes.qos import QosWatch, owner
 from nics_drl_bridge.nodes.runner import holds, last_word, open_context
 from nics_drl_bridge.nodes.wire import TwistWriter
 from nics_drl_bridge.sim.world import World
@@ -57,7 +56,7 @@ class Link:
         _end_orderly_on_sigterm()
         self._context = open_context(domain_id=domain_id)
         overrides = [Parameter(name, value=value) for name, value in (parameters or {}).items()]
-        self.node = QosWatch(
+        self.node = qos.QosWatch(
             "bridge_env", namespace=namespace, context=self._context,
             start_parameter_services=False, parameter_overrides=overrides,
         )  # fmt: skip
@@ -127,7 +126,7 @@ class Link:
             return
         topic = self.commands.topic_name
         ends = self.node.get_publishers_info_by_topic(topic)
-        names = sorted(name for end in ends if (name := owner(end)) is not None)
+        names = sorted(name for end in ends if (name := qos.owner(end)) is not None)
         with contextlib.suppress(ValueError):
             names.remove(self.node.get_fully_qualified_name())
         raise BackendError(f"{', '.join(names) or 'somebody'} publishes {topic} too; stop it.")

@@ -22,7 +22,6 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, BridgeError, RecordingError
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.qos import QosWatch
 from nics_drl_bridge.nodes.runner import EXIT_BAD_INPUT, declare, last_word, run_node, steadily
 from nics_drl_bridge.recording.bag_reader import JointMessage, gather, state_of, wheels_of
 from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S, DrivePlan
@@ -221,7 +220,7 @@ class DriveResult:
     line: str  # one sentence about it
 
 
-class RecordNode(QosWatch):
+class RecordNode(qos.QosWatch):
     """Sends `cmd_vel` at 20 Hz; writes `odom`, `joint_states`, `imu` and `pose` to a recording.
 
     The centre of the circle is the robot's place at the start; each segment of the drive is chosen

@@ -32,7 +32,6 @@ from nics_drl_bridge.interface import NS_PER_S, Array, Simulator
 from nics_drl_bridge.lidar.scanner import RENDERERS, Renderer
 from nics_drl_bridge.lidar.spec import to_device
 from nics_drl_bridge.nodes import conversions, device_parameters, qos, runner, wire
-from nics_drl_bridge.nodes.qos import QosWatch, owner
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, variances
 from nics_drl_bridge.sim.simulator import FastSimulator
@@ -185,7 +184,7 @@ class CommandInlet:
     def watch(self) -> None:
         """Warns once of each node that publishes the other type, which is never received."""
         for end in self._node.get_publishers_info_by_topic(self._topic):
-            kind, who = end.topic_type, owner(end)
+            kind, who = end.topic_type, qos.owner(end)
             if kind == self._kind or who is None or f"{who} {kind}" in self._warned:
                 continue
             self._warned.add(f"{who} {kind}")
@@ -273,7 +272,7 @@ class Transforms:
         outbox.send(self._moving, self._kind(transforms=moving), now_ns, late_ns)
 
 
-class DeviceNode(QosWatch):
+class DeviceNode(qos.QosWatch):
     """Takes `cmd_vel`; publishes `scan`, `odom`, `joint_states`, `ground_truth`, `/clock`, `/tf`.
 
     With the parameter `robots` it is a fleet in one world, each robot in a namespace below the
@@ -348,7 +347,7 @@ class DeviceNode(QosWatch):
         for inlet in self._inlets:
             inlet.watch()
         ends = self.get_publishers_info_by_topic(CLOCK)
-        names = {name for end in ends if (name := owner(end)) is not None}
+        names = {name for end in ends if (name := qos.owner(end)) is not None}
         for name in names - self._clocks:
             self.get_logger().warning(
                 f"{name} publishes {CLOCK} too, and nodes with use_sim_time hear both; give each "
