@@ -21,7 +21,7 @@ from nics_drl_bridge.robot.noise import Delay
 
 LOCKSTEP = "lockstep"
 MODES = ("realtime", LOCKSTEP, "as_fast_as_possible")
-MODELS_OWN = -1.0
+OWN = -1.0  # as in the model
 GREATEST_FLEET = 256
 NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 SLACK = 0.1  # a step may be early by this share of it, because timers are no more precise
@@ -75,18 +75,17 @@ def declare_device(node: Node, laser_frame: str) -> None:
          "Whether to publish the true map -> odom on /tf, in place of a localiser."),
     ):  # fmt: skip
         declare(node, name, fixed, about, read_only=True)
-    own = MODELS_OWN
     for name, value, low, high, about in (
         ("rate", 1.0, 0.01, 1000.0, "Simulated seconds per second in realtime."),
         ("odom_rate", 0.0, 0.0, 1000.0, "Of odom [Hz]; 0 for one per control period."),
         ("scan_rate", 0.0, 0.0, 1000.0, "Of scan [Hz]; 0 for the lidar's own."),
-        ("scan_latency", own, own, 10.0,
+        ("scan_latency", OWN, OWN, 10.0,
          "From the end of a scan to its publication [s]; -1 for the measured one of the model."),
-        ("odom_latency", own, own, 10.0,
+        ("odom_latency", OWN, OWN, 10.0,
          "From the stamp of odom to its publication [s]; -1 for the measured one of the model."),
-        ("latency_jitter", own, own, 10.0,
+        ("latency_jitter", OWN, OWN, 10.0,
          "Greatest further delay of both, drawn evenly [s]; -1 for the measured ones."),
-        ("command_latency", own, own, 10.0,
+        ("command_latency", OWN, OWN, 10.0,
          "From a command to its effect [s]; -1 for the measured one of the model."),
     ):  # fmt: skip
         declare(node, name, value, about, (low, high), read_only=True)
