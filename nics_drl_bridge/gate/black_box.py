@@ -25,12 +25,10 @@ from nics_drl_bridge.gate.state import Decision, GateConfig, GateState
 FORMAT = "nics_drl_bridge/black_box/3"
 KEPT_S = 30.0
 LATEST_S = 1e12
-MOST_BYTES = 64 * 2**20
-"""Greatest size of a file that is replayed."""
+MOST_BYTES = 64 * 2**20  # greatest size of a file that is replayed
 MOST_VALUES = 1_000_000
 """Greatest number of values in such a file; 30 s of a gate have some 100,000."""
-MOST_INPUTS = 20_000
-"""Greatest number of inputs that are decided on again; each takes some 30 us."""
+MOST_INPUTS = 20_000  # greatest number of inputs that are decided on again; each takes some 30 us
 
 
 class Entry(NamedTuple):
@@ -67,21 +65,17 @@ def write(config: GateConfig, entries: tuple[Entry, ...], path: str | Path) -> N
 
 def _lines_of(config: GateConfig, entries: tuple[Entry, ...]) -> Iterator[bytes]:
     """Yields the lines, the last with a checksum, one by one: memory must not grow at a stop."""
-    records: Iterator[dict[str, Any]] = (
-        {"now": entry.now, "given": entry.given, "decision": entry.decision} for entry in entries
-    )
-    head = {"format": FORMAT, "config": config, "state": entries[0].before}
+    head: dict[str, Any] = {"format": FORMAT, "config": config, "state": entries[0].before}
+    records = ({"now": one.now, "given": one.given, "decision": one.decision} for one in entries)
     digest = hashlib.sha256()
     for record in chain([head], records):
-        plain = {key: to_plain(part) for key, part in record.items()}
-        line = (json.dumps(plain) + "\n").encode()
+        line = json.dumps({key: to_plain(part) for key, part in record.items()}).encode() + b"\n"
         digest.update(line)
         yield line
     yield _seal(digest.hexdigest()).encode()
 
 
 def _seal(digest: str) -> str:
-    """Returns the last line of a file."""
     return json.dumps({"sha256": digest}) + "\n"
 
 
@@ -104,10 +98,11 @@ class Replay(NamedTuple):
                 line = "commands pass" if cause is None else f"stopped by {cause.line}"
                 lines.append(f"{entry.now - end:+8.3f} s  {line}")
             before = rule
-        total, other = len(self.entries), len(self.differing)
-        same = "all decided the same again"
-        verdict = same if not other else f"{other} decided otherwise, first {self.differing[0]}"
-        return [*lines, f"{total} inputs over {end - self.entries[0].now:.3f} s: {verdict}"]
+        verdict = "all decided the same again"
+        if self.differing:
+            verdict = f"{len(self.differing)} decided otherwise, first {self.differing[0]}"
+        spent = f"{len(self.entries)} inputs over {end - self.entries[0].now:.3f} s"
+        return [*lines, f"{spent}: {verdict}"]
 
 
 def replay(path: str | Path) -> Replay:
@@ -174,15 +169,11 @@ def _lines(path: str | Path) -> list[dict[str, Any]]:
 
 KIND = "kind"
 KINDS: dict[str, type] = {
-    kind.__name__: kind
-    for kind in (
-        inputs.Scan, inputs.SensorReading, inputs.Odometry, inputs.Estimate, inputs.Command,
-        inputs.EStop, inputs.Press, inputs.Arm, inputs.Reset, inputs.Tick, limits.Limits,
-        state.ShieldConfig, state.GateConfig, state.Cause, state.Arrivals, state.Sameness,
-        state.Push, state.View, state.EStopState, state.SensorState, state.GateState,
-        state.Decision,
-    )
-}  # fmt: skip
+    name: kind
+    for module in (inputs, limits, state)
+    for name, kind in vars(module).items()
+    if isinstance(kind, type) and is_dataclass(kind)
+}
 
 
 def to_plain(value: Any) -> Any:

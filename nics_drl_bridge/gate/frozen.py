@@ -10,30 +10,24 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.gate.state import Cause, GateConfig, GateState, Push, Sameness, replace
+from nics_drl_bridge.gate.state import Cause, GateConfig, GateState, Push, Ranges, Sameness, replace
 from nics_drl_bridge.gate.stops import ODOM, SCAN
 from nics_drl_bridge.geometry import between, compose
+from nics_drl_bridge.interface import Array
 
-Array = NDArray[np.float64]
-Ranges = NDArray[np.float32]
 Flags = NDArray[np.bool_]
-IDENTICAL = 3
-"""Least number of scans that show a frozen picture."""
-PICTURES = 16
-"""Number of remembered pictures: a lidar may repeat several in turn."""
-RESPONSE = 0.1
-"""Least share of the commanded distance or angle that a robot covers."""
+IDENTICAL = 3  # least number of scans that show a frozen picture
+PICTURES = 16  # number of remembered pictures: a lidar may repeat several in turn
+RESPONSE = 0.1  # least share of the commanded distance or angle that a robot covers
 LEAST_PATH, LEAST_TURN = 0.03, 0.25
 """Least motion commanded within the window for the robot to be judged [m, rad]."""
-WINDOW = 0.75
-"""Length of the window as a share of `stuck_s`; the rest is for the delay of odometry."""
+WINDOW = 0.75  # length of the window as a share of `stuck_s`; the rest is for the delay of odometry
 MARK_S = 0.05
 PAUSE_S = 0.2
 """Time between two marks, and least time without commanded motion between two pushes [s]."""
 STILL_LINEAR, STILL_TURN = 0.05, 0.1
 """A robot slower than this, plus the noise of its odometry, stands still [m/s, rad/s]."""
-NOISE = 3.0
-"""Noise of odometry that is allowed for, in standard deviations."""
+NOISE = 3.0  # noise of odometry that is allowed for, in standard deviations
 
 
 def look(
@@ -129,12 +123,10 @@ SAME_SHARE = 0.99
 """Two scans with this share of equal beams are the same; of few beams, one may differ."""
 TELLING_SHARE = 0.9
 """A scan with this share unchanged, of the beams that must have changed, is an old one."""
-CHANGE = 0.02
-"""Least change of a beam that must have changed [m]."""
+CHANGE = 0.02  # least change of a beam that must have changed [m]
 HEADINGS = (-0.03, 0.0, 0.03)
 """Errors of odometry's heading for all of which the beam must have changed [rad]."""
-NEIGHBOURS = 1.5
-"""An old beam is compared with beams at most this many beam spacings away."""
+NEIGHBOURS = 1.5  # an old beam is compared with beams at most this many beam spacings away
 LEAST_BEAMS = 3
 
 

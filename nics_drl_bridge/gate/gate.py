@@ -1,7 +1,9 @@
 """The gate: one pure function from (time, state, input) to (state, decision).
 
 It reads no clock, uses no random numbers and has no side effects, so that a recording of its
-inputs replays to bit-identical decisions. It does nothing that is not in the tables of rules.
+inputs replays to bit-identical decisions. It does nothing that is not in the tables of rules:
+`REFUSALS` of malformed data, which feed no watchdog; `CHECKS` before it is armed; `STOPS`; and
+`SHAPERS` of a motion. Their functions stand before each, or in `stops`, `frozen` and `shield`.
 """
 
 from __future__ import annotations
@@ -9,23 +11,40 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from itertools import pairwise
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from nics_drl_bridge.gate import arming, frozen, limits, stops
-from nics_drl_bridge.gate.inputs import Arm, Input, Reset, Tick
-from nics_drl_bridge.gate.intake import take
-from nics_drl_bridge.gate.shield import shield
-from nics_drl_bridge.gate.state import Cause, Decision, GateConfig, GateState, Motion, replace
-from nics_drl_bridge.gate.stops import settled
+from nics_drl_bridge.gate import frozen, inputs, limits, shield, stops
+from nics_drl_bridge.gate.inputs import (
+    Command,
+)  # fmt: skip
+from nics_drl_bridge.gate.state import (
+    Arrivals,
+    Cause,
+    Decision,
+    GateConfig,
+    GateState,
+    Motion,
+    SensorState,
+    replace,
+)  # fmt: skip
+from nics_drl_bridge.gate.stops import ODOM, SCAN, settled
+from nics_drl_bridge.geometry import between
+from nics_drl_bridge.interface import S_PER_NS, Array
 
-Array = NDArray[np.float64]
+GREATEST_SPEED = 100.0  # greatest speed that the odometry of a mobile robot can show [m/s, rad/s]
+SLIP, SLIP_SPEED, SLIP_TURN = 2.0, 0.5, 1.0
+"""A robot may exceed its limits by this factor, downhill or pushed, plus [m/s] and [rad/s]."""
+CAR_TURN = 4.0  # greatest turn rate of a robot that is commanded by steering angle [rad/s]
+LEAP, LEAP_TURN = 0.1, 0.2  # jump of an odometry pose that may come from imprecision [m, rad]
+ANGLE_TOLERANCE = 1e-3  # greatest deviation of the last beam from its declared angle [rad]
+BEHIND_S = 0.2  # by which irregular stamps may fall behind while the gate settles
+Check = Callable[[GateConfig, GateState, inputs.Arm, float], str]  # what is wrong; or empty
 
 
 def decide(
-    config: GateConfig, state: GateState, given: Input, now: float
+    config: GateConfig, state: GateState, given: inputs.Input, now: float
 ) -> tuple[GateState, Decision]:
     """Decides on an input at a steady time [s]; returns the state after it, and the decision.
 
@@ -43,9 +62,9 @@ def decide(
     if cause is not None:
         if latches and state.armed:
             state = replace(state, latched=cause)
-        publish = was_moving or isinstance(given, Tick)
+        publish = was_moving or isinstance(given, inputs.Tick)
         state = _stopped(config, state, now if publish else state.moved_s, disarm=latches)
-    elif isinstance(given, Tick) and not now - state.moved_s < limits.LEAST_STEP_S:
+    elif isinstance(given, inputs.Tick) and not now - state.moved_s < limits.LEAST_STEP_S:
         publish, motion = True, _wish(config, state)
         for shape in SHAPERS:
             motion = shape(config, state, motion, now)
@@ -53,27 +72,29 @@ def decide(
             cause = Cause("motion_unfit", "", motion.fault)
             state = _stopped(config, replace(state, latched=cause), now, disarm=True)
         else:
-            state, shielded = _moved(config, state, motion, now), motion.shielded
+            recent = _recent(config, state, motion.value, now)
+            state = replace(
+                state, value=motion.value, slope=motion.slope, moved_s=now, recent=recent
+            )
+            state, shielded = frozen.watch_motion(config, state, now), motion.shielded
     twist = np.zeros(3)
     twist[list(config.fields)] = state.value
     return state, Decision(twist, publish, cause, refused, answer, granted, shielded)
 
 
 def _serve(
-    config: GateConfig, state: GateState, given: Input, now: float
+    config: GateConfig, state: GateState, given: inputs.Input, now: float
 ) -> tuple[GateState, str, bool]:
     """Arms or resets, if requested; returns also the answer, and whether it was granted."""
-    if isinstance(given, Arm):
-        failed = arming.failures(config, state, given, now)
-        if failed:
+    if isinstance(given, inputs.Arm):
+        if failed := failures(config, state, given, now):
             return state, "; ".join(failed), False
         sensors = tuple(replace(each, arrivals=settled(each.arrivals)) for each in state.sensors)
-        state = replace(
-            state, armed=True, scans=settled(state.scans), odometries=settled(state.odometries),
-            sensors=sensors, seen=(), frozen="", push=None,
-        )  # fmt: skip
-        return state, "armed", True
-    if isinstance(given, Reset):
+        return replace(
+            state, armed=True, scans=settled(state.scans),
+            odometries=settled(state.odometries), sensors=sensors, seen=(), frozen="", push=None,
+        ), "armed", True  # fmt: skip
+    if isinstance(given, inputs.Reset):
         # The latch is cleared, unless the emergency stop is still pressed.
         stop = replace(state.e_stop, latched=state.e_stop.held)
         state = replace(state, e_stop=stop, latched=None, armed=False)
@@ -95,23 +116,284 @@ def _stopped(config: GateConfig, state: GateState, moved_s: float, disarm: bool)
 def _recent(
     config: GateConfig, state: GateState, value: Array, now: float
 ) -> tuple[tuple[float, Array], ...]:
-    """Returns the commands that the newest scan may not show yet, and a new one.
-
-    Those are the ones since the scan was taken, or within the latency before.
-    """
+    """Returns a new command after those since the newest scan, or within the latency before it."""
     if config.shield is None:
         return ()
-    since = now - config.shield.latency_s - config.scan_age_s
-    sent = (*state.recent, (now, value))
+    since, sent = now - config.shield.latency_s - config.scan_age_s, (*state.recent, (now, value))
     # A command from before `since` was in force until the next one.
     return tuple(one for one, after in pairwise((*sent, sent[-1])) if after[0] >= since)
 
 
-def _moved(config: GateConfig, state: GateState, motion: Motion, now: float) -> GateState:
-    """Returns the state after a motion is published."""
-    recent = _recent(config, state, motion.value, now)
-    state = replace(state, value=motion.value, slope=motion.slope, moved_s=now, recent=recent)
-    return frozen.watch_motion(config, state, now)
+def scan_malformed(config: GateConfig, scan: inputs.Scan) -> str:
+    """The scan is from another lidar than the declared one, or every range is NaN."""
+    angles, (first, step) = config.beam_angles, scan.angles
+    if scan.ranges.shape != angles.shape:
+        return f"scan: {scan.ranges.size} beams, not {len(angles)}"
+    increment = float(angles[1] - angles[0]) if len(angles) > 1 else step
+    last_off = abs(first - angles[0]) + abs(step - increment) * (len(angles) - 1)
+    if not last_off <= ANGLE_TOLERANCE:
+        return "scan: its angles are not those of the declared lidar"
+    return "scan: every range is NaN" if np.isnan(scan.ranges).all() else ""
+
+
+def reading_malformed(config: GateConfig, reading: inputs.SensorReading) -> str:
+    """The reading is of an unknown sensor, or not finite."""
+    if reading.name not in config.sensors:
+        return f"{reading.name}: there is no such sensor"
+    return "" if np.isfinite(reading.points).all() else f"{reading.name}: NaN or inf"
+
+
+def odom_malformed(config: GateConfig, odometry: inputs.Odometry) -> str:
+    """The odometry is not finite, or too fast for a mobile robot."""
+    if not (np.isfinite(odometry.pose).all() and np.isfinite(odometry.twist).all()):
+        return "odom: NaN, inf, or no rotation"
+    fast = np.abs(odometry.twist).max() > GREATEST_SPEED
+    return f"odom: faster than {GREATEST_SPEED:g} m/s or rad/s" if fast else ""
+
+
+def estimate_malformed(config: GateConfig, estimate: inputs.Estimate) -> str:
+    """The estimate is not finite."""
+    finite = np.isfinite(estimate.twist).all() and np.isfinite(estimate.std).all()
+    return "" if finite else "odometry/filtered: NaN or inf"
+
+
+def command_not_finite(config: GateConfig, command: inputs.Command) -> str:
+    """The command is not finite."""
+    return "" if np.isfinite(command.twist).all() else "cmd_vel_raw: NaN or inf"
+
+
+def command_implausible(config: GateConfig, command: inputs.Command) -> str:
+    """The command is so far out of range that the policy must be broken."""
+    bounds, twist = config.limits, command.twist
+    if bounds is None or not limits.implausible(twist[list(config.fields)], bounds):
+        return ""
+    return f"cmd_vel_raw: {twist.tolist()} is far out of range"
+
+
+REFUSALS: tuple[tuple[type, Callable[[GateConfig, Any], str]], ...] = (
+    (inputs.Scan, scan_malformed),
+    (inputs.Odometry, odom_malformed),
+    (inputs.SensorReading, reading_malformed),
+    (inputs.Estimate, estimate_malformed),
+    (inputs.Command, command_not_finite),
+    (inputs.Command, command_implausible),
+)
+"""By the type of the input, in order: what is wrong with it; empty if nothing is."""
+
+
+def take(
+    config: GateConfig, state: GateState, given: inputs.Input, now: float
+) -> tuple[GateState, str]:
+    """Takes an input into the state, or returns the reason why not."""
+    state = replace(state, jumped="", leap="")
+    for kind, judge in REFUSALS:
+        reason = judge(config, given) if isinstance(given, kind) else ""
+        if reason:
+            return replace(state, malformed=reason) if kind is Command else state, reason
+    if isinstance(given, inputs.Scan):
+        return _take_scan(config, state, given, now)
+    if isinstance(given, inputs.Odometry):
+        return _take_odometry(config, state, given, now)
+    if isinstance(given, inputs.SensorReading):
+        return _take_reading(config, state, given, now)
+    if isinstance(given, inputs.Estimate):
+        state = replace(state, estimate=given, estimate_s=now)
+    elif isinstance(given, inputs.Command):
+        state = _take_command(state, given, now)
+    elif isinstance(given, inputs.EStop):
+        pressed, known = given.pressed, state.e_stop
+        stop = replace(known, latched=known.latched or pressed, held=pressed, heard_s=now)
+        state = replace(state, e_stop=stop)
+    elif isinstance(given, inputs.Press):
+        state = replace(state, e_stop=replace(state.e_stop, latched=True))
+    return state, ""
+
+
+def _take_command(state: GateState, command: inputs.Command, now: float) -> GateState:
+    """Takes a command once its scan has arrived; until then the previous one stays in force."""
+    scans = state.scans
+    if command.stamp_ns not in scans.stamps_ns:
+        since = now if state.pending_s is None else state.pending_s
+        return replace(state, pending=command, pending_s=since)
+    behind = scans.stamps_ns.index(command.stamp_ns)
+    return replace(
+        state, command=command, command_s=now, behind_s=scans.times[behind] - scans.late[behind],
+        malformed="", pending=None, pending_s=None,
+    )  # fmt: skip
+
+
+def _take_scan(
+    config: GateConfig, state: GateState, scan: inputs.Scan, now: float
+) -> tuple[GateState, str]:
+    arrivals, fault = stops.arrived(
+        config, state.scans, scan.stamp_ns, now, config.scan_age_s, state.armed
+    )
+    if fault:
+        jumped = stops.SCAN if fault == "jumped" else ""
+        return replace(state, scans=arrivals, jumped=jumped), f"scan: its stamp {fault}"
+    pose = None if state.odometry is None else state.odometry.pose
+    seen, why = frozen.look(config, state.seen, scan.ranges, pose)
+    views = shield.remember(config, state, scan)
+    state = replace(
+        state, scans=arrivals, scan=scan, seen=seen, frozen=why, views=views,
+        obstacles=shield.obstacles(config, scan.ranges, views),
+    )  # fmt: skip
+    if state.pending is not None and state.pending.stamp_ns == scan.stamp_ns:
+        state = _take_command(state, state.pending, now)
+    return state, ""
+
+
+def _take_odometry(
+    config: GateConfig, state: GateState, odometry: inputs.Odometry, now: float
+) -> tuple[GateState, str]:
+    arrivals, fault = stops.arrived(
+        config, state.odometries, odometry.stamp_ns, now, config.odom_age_s, state.armed
+    )
+    if fault:
+        jumped = stops.ODOM if fault == "jumped" else ""
+        return replace(state, odometries=arrivals, jumped=jumped), f"odom: its stamp {fault}"
+    leap = _leap(config, state, odometry, now)
+    if leap:  # later poses are judged relative to this one
+        return replace(state, odometry=odometry, leap=leap, push=None, seen=()), f"odom: {leap}"
+    restless = state.restless_s if frozen.stands_still(config, odometry.twist) else now
+    return replace(state, odometries=arrivals, odometry=odometry, restless_s=restless), ""
+
+
+def _take_reading(
+    config: GateConfig, state: GateState, reading: inputs.SensorReading, now: float
+) -> tuple[GateState, str]:
+    place = config.sensors.index(reading.name)
+    before, after = state.sensors[:place], state.sensors[place + 1 :]
+    arrivals, fault = stops.arrived(
+        config, state.sensors[place].arrivals, reading.stamp_ns, now, config.scan_age_s, state.armed
+    )
+    points = state.sensors[place].points if fault else reading.points
+    state = replace(state, sensors=(*before, SensorState(arrivals, points), *after))
+    if fault:
+        jumped = reading.name if fault == "jumped" else ""
+        return replace(state, jumped=jumped), f"{reading.name}: its stamp {fault}"
+    return state, ""
+
+
+def _leap(config: GateConfig, state: GateState, odometry: inputs.Odometry, now: float) -> str:
+    """Returns what is wrong with a pose that the robot can't have reached; empty if nothing is."""
+    before, bounds = state.odometry, config.limits
+    if before is None or bounds is None:
+        return ""
+    stamped = (odometry.stamp_ns - before.stamp_ns) * S_PER_NS
+    passed = max(stamped, now - state.odometries.times[-1])  # either of them may jitter
+    slip, turned = (frozen.NOISE * std * passed for std in config.odom_std)
+    turn = CAR_TURN if not bounds.turn.any() else limits.greatest(bounds, bounds.turn)
+    speed = float(np.hypot.reduce(np.maximum(-bounds.low, bounds.high)[bounds.linear]))
+    far = LEAP + (SLIP * speed + SLIP_SPEED) * passed + slip
+    round_ = LEAP_TURN + (SLIP * turn + SLIP_TURN) * passed + turned
+    x, y, heading = between(before.pose, odometry.pose)
+    path = float(np.hypot(x, y))
+    if path <= far and abs(heading) <= round_:
+        return ""
+    return f"its pose jumped by {path:.2f} m and {abs(heading):.2f} rad in {passed:.3f} s"
+
+
+def _fresh(topic: str, arrivals: Arrivals, limit_s: float, config: GateConfig, now: float) -> str:
+    fresh = stops.gap_free(arrivals, now, config.settle_s, limit_s)
+    return "" if fresh else f"{topic} has not been fresh for {config.settle_s} s"
+
+
+def _sensors(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
+    """All further sensors are fresh."""
+    both = zip(config.sensors, state.sensors, strict=True)
+    wrong = (_fresh(name, each.arrivals, config.scan_age_s, config, now) for name, each in both)
+    return next(filter(None, wrong), "")
+
+
+def _rate(topic: str, arrivals: Arrivals, declared: float, config: GateConfig, now: float) -> str:
+    """Judges a rate: by stamps too few and too many data are wrong, by arrival only too few."""
+    arriving, stamped = stops.rate(arrivals, now, config.settle_s)
+    low = declared * (1.0 - config.rate_tolerance)
+    high = declared * (1.0 + config.rate_tolerance)
+    if arriving >= low and low <= stamped <= high:
+        return ""
+    return (
+        f"{topic} comes at {arriving:.1f} Hz, by its stamps {stamped:.1f} Hz, declared are "
+        f"{declared:.1f} Hz"
+    )
+
+
+def _clocks(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
+    """The clocks that stamp scan and odometry agree, and keep pace with this machine's clock."""
+    scans, odometries = state.scans, state.odometries
+    if not (scans.times and odometries.times):
+        return "scan and odom have not both come"
+    stamped = (scans.stamps_ns[-1] - odometries.stamps_ns[-1]) * S_PER_NS / config.clock_rate
+    apart = stamped - (scans.times[-1] - odometries.times[-1])
+    if abs(apart) > config.clock_jump_s:
+        return f"the stamps of scan are {apart:.3f} s ahead of those of odom"
+    for topic, arrivals in ((SCAN, scans), (ODOM, odometries)):
+        ahead = stops.creep(arrivals)
+        behind = 0.0 if config.simulated else -ahead
+        if ahead > stops.AHEAD_S or behind > BEHIND_S:
+            return (
+                f"the stamps of {topic} run away from this machine's clock, by {ahead:+.3f} s in a "
+                "moment; a simulation that is not in real time needs the parameter 'clock_rate'"
+            )
+    return ""
+
+
+def _estimator(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
+    """The middleware knows where the robot is, and that it stands still."""
+    estimate = state.estimate
+    if not config.estimate_required:
+        return ""
+    if estimate is None or now - state.estimate_s > config.estimate_silence_s:
+        return "odometry/filtered is silent, start the middleware_node"
+    if (worst := float(estimate.std.max())) > config.estimate_std:
+        return f"odometry/filtered is uncertain by {worst:.2f}, the limit is {config.estimate_std}"
+    return "" if frozen.stands_still(config, estimate.twist) else "odometry/filtered shows motion"
+
+
+def _publishers(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
+    count = request.publishers
+    return "" if count == 1 else f"cmd_vel has {count} publishers, not this gate alone"
+
+
+def _standing(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
+    still = state.odometry is not None and now - state.restless_s >= config.settle_s
+    return "" if still else f"the robot has not stood still for {config.settle_s} s"
+
+
+def _limits(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
+    return "" if config.limits is not None else "no limits are set, name their file in `limits`"
+
+
+def _latched(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
+    return "" if state.latched is None else f"call ~/reset first: {state.latched.line}"
+
+
+def _e_stop(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
+    cause = stops.e_stop_pressed(config, state, now) or stops.e_stop_silent(config, state, now)
+    return "" if cause is None else cause.line
+
+
+CHECKS: tuple[tuple[str, Check], ...] = (
+    ("limits_set", _limits),
+    ("nothing_latched", _latched),
+    ("e_stop_released", _e_stop),
+    ("scan_fresh", lambda c, s, _, now: _fresh(SCAN, s.scans, c.scan_age_s, c, now)),
+    ("scan_rate", lambda c, s, _, now: _rate(SCAN, s.scans, c.scan_rate, c, now)),
+    ("sensors_fresh", _sensors),
+    ("odom_fresh", lambda c, s, _, now: _fresh(ODOM, s.odometries, c.odom_age_s, c, now)),
+    ("odom_rate", lambda c, s, _, now: _rate(ODOM, s.odometries, c.odom_rate, c, now)),
+    ("clocks_agree", _clocks),
+    ("estimator_converged", _estimator),
+    ("one_publisher", _publishers),
+    ("standing_still", _standing),
+)
+
+
+def failures(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> list[str]:
+    """Returns a sentence for each failed check, with the check's name in front."""
+    answers = ((name, check(config, state, request, now)) for name, check in CHECKS)
+    return [f"{name}: {answer}" for name, answer in answers if answer]
 
 
 class Rule(NamedTuple):
@@ -163,14 +445,13 @@ def first_cause(config: GateConfig, state: GateState, now: float) -> tuple[Cause
 
 
 def _wish(config: GateConfig, state: GateState) -> Motion:
-    """Returns the motion that the policy requests."""
-    size = len(config.fields)
-    wish = np.zeros(size) if state.command is None else state.command.twist[list(config.fields)]
-    return Motion(wish.astype(np.float64), np.zeros(size))
+    still = np.zeros(len(config.fields))
+    wish = still if state.command is None else state.command.twist[list(config.fields)]
+    return Motion(wish.astype(np.float64), still)
 
 
 def saturate(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
-    """Brings the value within its limits, see `limits.saturate`."""
+    """Brings the value within its limits, see `limits.saturate`; without limits it is zero."""
     if config.limits is None:
         return Motion(np.zeros_like(motion.value), np.zeros_like(motion.slope))
     return replace(motion, value=limits.saturate(motion.value, config.limits))
@@ -191,10 +472,12 @@ def bounded(config: GateConfig, state: GateState, motion: Motion, now: float) ->
     if good and np.isfinite(motion.value).all() and np.isfinite(motion.slope).all():
         return motion
     zero = np.zeros_like(motion.value)
-    fault = f"a motion of {motion.value.tolist()} came out"
-    return replace(motion, value=zero, slope=zero, fault=fault)
+    return replace(
+        motion, value=zero, slope=zero, fault=f"a motion of {motion.value.tolist()} came out"
+    )
 
 
-Shaper = Callable[[GateConfig, GateState, Motion, float], Motion]
-SHAPERS: tuple[Shaper, ...] = (saturate, follow, shield, bounded)
-"""Stages that a passing command goes through."""
+# Stages that a passing command goes through.
+SHAPERS: tuple[Callable[[GateConfig, GateState, Motion, float], Motion], ...] = (
+    saturate, follow, shield.shield, bounded,
+)  # fmt: skip

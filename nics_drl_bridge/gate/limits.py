@@ -12,22 +12,18 @@ from pydantic import Field, model_validator
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.interface import Array
 from nics_drl_bridge.robot.spec import CommandVariable, RobotSpec
 
-Array = NDArray[np.float64]
-IMPLAUSIBLE = 10.0
-"""A command beyond this multiple of its limit is a fault, and refused."""
+IMPLAUSIBLE = 10.0  # a command beyond this multiple of its limit is a fault, and refused
 LEAST_STEP_S = 1e-3
 """Motions closer in time than this are not published: their derivatives would be noise."""
 PERIOD_S = 0.02
 """Period of the gate's ticks [s]. A limit that allows the whole range within one is a typo."""
-SNAP = 1e-12
-"""A value this close to its target, as a share of the greatest value, has reached it."""
-GREATEST = 1e300
-"""Numbers are clipped to this before a multiplication: inf times 0 would be NaN."""
+SNAP = 1e-12  # a value this close to its target, as a share of the greatest value, has reached it
+GREATEST = 1e300  # numbers are clipped to this before a multiplication: inf times 0 would be NaN
 STILL = 1e-9
-LEAST_MOTION = 0.01
-"""If no speed may exceed this, the robot can't be driven [m/s or rad/s]."""
+LEAST_MOTION = 0.01  # if no speed may exceed this, the robot can't be driven [m/s or rad/s]
 LONGEST_START_S, STARTED = 10.0, 0.01
 """Within the first [s] a command must be able to reach the second (share of its greatest value)."""
 SPEED, TURN = "m/s", "rad/s"
@@ -67,12 +63,12 @@ class LimitsFile(Schema):
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of a robot's commands (C,), in the order of the commands."""
+    """Limits of a robot's commands (C,), in the order of the commands; see `CommandLimit`."""
 
-    low: Array  # least value
-    high: Array  # greatest value
-    rate: Array  # greatest change per second
-    jerk: Array  # greatest change of the rate per second
+    low: Array
+    high: Array
+    rate: Array
+    jerk: Array
     linear: NDArray[np.bool_]  # True for a speed [m/s]
     turn: NDArray[np.bool_]  # True for a turn rate [rad/s]; the rest are angles
 
@@ -95,15 +91,15 @@ def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
     for given in file.commands:
         if given not in names:
             raise ConfigError(f"{path}: unknown key 'commands.{given}'; {nearest(given, names)}")
-    for wanted in names:
-        if wanted not in file.commands:
-            raise ConfigError(f"{path}: the key 'commands.{wanted}' is missing; add it.")
     for variable in robot.command:
+        if variable.name not in file.commands:
+            raise ConfigError(f"{path}: the key 'commands.{variable.name}' is missing; add it.")
         _check(f"{path}: key 'commands.{variable.name}", file.commands[variable.name], variable)
-    each = [file.commands[wanted] for wanted in names]
+    low, high, rate, jerk = (
+        np.array([getattr(file.commands[each], bound) for each in names])
+        for bound in ("min", "max", "rate", "jerk")
+    )
     units = np.array([variable.unit for variable in robot.command])
-    bounds = np.array([(limit.min, limit.max, limit.rate, limit.jerk) for limit in each])
-    low, high, rate, jerk = bounds.T.copy()
     limits = Limits(low, high, rate, jerk, linear=units == SPEED, turn=units == TURN)
     if greatest(limits, limits.linear | limits.turn) < LEAST_MOTION:
         raise ConfigError(
@@ -183,11 +179,11 @@ def follow(
     limits; `dt` is the time since the last command [s]. Returns the next value and its slope.
     """
     wanted, after, change = target.copy(), value.copy(), slope.copy()
+    given = (value, slope, wanted, limits.low, limits.high, limits.rate, limits.jerk)
     for turning in (False, True):
         if turning:
             wanted[limits.turn] *= _progress(after[limits.linear], target[limits.linear])
         for i in np.flatnonzero(limits.turn == turning):
-            given = (value, slope, wanted, limits.low, limits.high, limits.rate, limits.jerk)
             after[i], change[i] = _follow_one(dt, *(float(each[i]) for each in given))
     return after, change
 

@@ -19,25 +19,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.gate import moving_kernels, shield_kernels
+from nics_drl_bridge.gate import shield_kernels
 from nics_drl_bridge.gate.inputs import Scan
 from nics_drl_bridge.gate.state import GateConfig, GateState, Motion, ShieldConfig, View, replace
 from nics_drl_bridge.gate.stops import age
-from nics_drl_bridge.interface import S_PER_NS
+from nics_drl_bridge.interface import S_PER_NS, Array
 
-Array = NDArray[np.float64]
 Ranges = NDArray[np.float32]
 Flags = NDArray[np.bool_]
-FINEST = 6
-"""Bisections of the scale."""
+FINEST = 6  # bisections of the scale
 SPEEDS, TURNS = 3, 9
 """Arcs of the family: number of speeds along each axis, and number of turn rates."""
-MOVING = 0.1
-"""Above this speed the ratio of turn rate to speed gives the curvature [m/s]."""
-CALM = 0.5
-"""Share of its deceleration with which the robot should stop when nothing is sudden."""
-STEP = 0.02
-"""Distance between two checked places of the footprint on an arc [m]."""
+MOVING = 0.1  # above this speed the ratio of turn rate to speed gives the curvature [m/s]
+CALM = 0.5  # share of its deceleration with which the robot should stop when nothing is sudden
+STEP = 0.02  # distance between two checked places of the footprint on an arc [m]
 MEMORY_S, SPACING_S = 0.45, 0.09
 """Greatest age of a scan that the newest is compared with, and least time between them [s]."""
 TOLERANCE_M, DEVIATIONS = 0.03, 3.0
@@ -67,13 +62,12 @@ def movers(config: GateConfig, shield: ShieldConfig, views: tuple[View, ...]) ->
     marked = np.zeros(len(newest.ranges), np.bool_)
     if len(angles) < 2 or shield.obstacle_speed == 0.0:
         return marked
-    lidar = moving_kernels.MountedBeams(
-        float(angles[0]), float(angles[1] - angles[0]), *config.mount
-    )
+    step = float(angles[1] - angles[0])
+    lidar = shield_kernels.MountedBeams(float(angles[0]), step, *config.mount)
     noise, share = (DEVIATIONS * std for std in shield.range_noise)
     for view in views[:-1]:
         moved = geometry.between(view.pose, newest.pose)
-        moving_kernels.entered(
+        shield_kernels.entered(
             marked, newest.ranges, view.ranges, lidar, moved, shield.range_max,
             (TOLERANCE_M + noise, share),
         )  # fmt: skip
@@ -142,8 +136,8 @@ def obstacles(config: GateConfig, ranges: Ranges, views: tuple[View, ...]) -> Ar
 def rehearse() -> None:
     """Compiles what `shield` calls: that takes seconds, which a moving robot does not have."""
     shield_kernels.free(np.zeros((1, 3)), np.zeros((1, 3)), 0.0, 1.0, 0.0, STEP)
-    lidar, scan = moving_kernels.MountedBeams(0.0, 0.1, 0.0, 0.0, 0.0), np.ones(1, np.float32)
-    moving_kernels.entered(np.zeros(1, np.bool_), scan, scan, lidar, np.zeros(3), 1.0, (0.0, 0.0))
+    lidar, scan = shield_kernels.MountedBeams(0.0, 0.1, 0.0, 0.0, 0.0), np.ones(1, np.float32)
+    shield_kernels.entered(np.zeros(1, np.bool_), scan, scan, lidar, np.zeros(3), 1.0, (0.0, 0.0))
 
 
 def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
@@ -210,8 +204,8 @@ def _family(
         twists = np.concatenate([twists, odometry[None]])
     low, high = twists.min(axis=0), twists.max(axis=0)
     axes = [
-        np.linspace(low[i], high[i], most if high[i] > low[i] else 1)
-        for i, most in enumerate((SPEEDS, SPEEDS, TURNS))
+        np.linspace(least, greatest, most if greatest > least else 1)
+        for least, greatest, most in zip(low, high, (SPEEDS, SPEEDS, TURNS), strict=True)
     ]
     return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
 

@@ -1,12 +1,15 @@
-"""Compiled sweep of a round footprint along arcs."""
+"""Compiled: sweep of a round footprint along arcs, and obstacles where the view was free before."""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
+
+WIDTH = 0.02  # old beams within this angle of a bearing are compared [rad]
 
 
 @kernel(allocates=True)
@@ -26,14 +29,9 @@ def free(points, twists, blind, deceleration, room, step):  # type: ignore[no-un
 
     A point that is already that near must not come nearer, so that the robot can leave it. A moving
     point may be nearer by all that it can have moved, even one that the robot drives away from.
-
-    Args:
-        points: (P, 3) x, y [m], and greatest speed of each [m/s].
-        twists: (K, 3) body twists of the arcs.
-        blind: time for which the robot keeps its twist before it brakes [s].
-        deceleration: of the braking [m/s^2].
-        room: distance to keep [m].
-        step: distance between the places that are checked [m].
+    Points (P, 3) are x, y [m] and greatest speed [m/s], twists (K, 3) those of the arcs; the robot
+    keeps its twist for the time `blind` [s], then brakes with a deceleration [m/s^2]. Places are
+    checked at each `step` of the path [m].
     """
     longest, rest = 0.0, 0.0
     for k in range(twists.shape[0]):
@@ -73,3 +71,43 @@ def _reached(part, speed, blind, deceleration):  # type: ignore[no-untyped-def]
         return part
     left = speed * speed - 2.0 * deceleration * speed * (part - blind)
     return blind + (speed - math.sqrt(max(left, 0.0))) / deceleration
+
+
+class MountedBeams(NamedTuple):
+    """Angle of beam 0 and between beams [rad], and the mount: x, y [m], heading [rad]."""
+
+    first: float
+    step: float
+    x: float
+    y: float
+    heading: float
+
+
+@kernel(allocates=True)
+def entered(out, ranges, old, lidar, moved, far, tolerance):  # type: ignore[no-untyped-def]
+    """Marks, in `out` (B,), the beams of a scan (B,) that end where an old one (B,) saw free space.
+
+    The robot's own motion since, `moved` (3,), is compensated. Places hidden or unknown then are
+    not marked; other flags in `out` stay. `far` is the greatest range [m]; the tolerance for noise
+    is in metres and as a share of the range.
+    """
+    beams, circle = len(ranges), 2.0 * math.pi / abs(lidar.step)
+    whole, wide = round(circle), math.ceil(WIDTH / abs(lidar.step))
+    cosine, sine = math.cos(moved[2]), math.sin(moved[2])
+    for b in range(beams):
+        if out[b] or not np.isfinite(ranges[b]):
+            continue
+        angle = lidar.first + b * lidar.step + lidar.heading
+        x, y = lidar.x + ranges[b] * math.cos(angle), lidar.y + ranges[b] * math.sin(angle)
+        dx = moved[0] + cosine * x - sine * y - lidar.x
+        dy = moved[1] + sine * x + cosine * y - lidar.y
+        away = math.hypot(dx, dy)
+        at = (math.atan2(dy, dx) - lidar.heading - lidar.first) / lidar.step
+        middle, seen = round(at - circle * math.floor(at / circle)), far
+        for i in range(middle - wide, middle + wide + 1):
+            index = i % whole
+            beyond = old[index] if index < beams else np.nan
+            # Not `min`: with NaN, or an old beam that was too close, the beam must stay unmarked.
+            seen = beyond if not beyond >= seen else seen
+        if away < seen - tolerance[0] - tolerance[1] * away:
+            out[b] = True

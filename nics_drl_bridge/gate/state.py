@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.gate.inputs import Command, Estimate, Odometry, Scan
 from nics_drl_bridge.gate.limits import Limits
+from nics_drl_bridge.interface import Array
 
-Array = NDArray[np.float64]
 Ranges = NDArray[np.float32]
 Record = TypeVar("Record")
 INF = float("inf")

@@ -16,12 +16,9 @@ from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel, term_name
 
 ANGLE = "rad"
-UNKNOWN_LAG_S = 0.5
-"""Lag of a robot whose model shows none [s]."""
-SLOWEST_LAG_S = 5.0
-"""Slower modes are not lags but combinations that no command moves [s]."""
-UNKNOWN_DECELERATION = 0.5
-"""Deceleration of a robot whose limits are not known [m/s^2]."""
+UNKNOWN_LAG_S = 0.5  # lag of a robot whose model shows none [s]
+SLOWEST_LAG_S = 5.0  # slower modes are not lags but combinations that no command moves [s]
+UNKNOWN_DECELERATION = 0.5  # deceleration of a robot whose limits are not known [m/s^2]
 LEAST_DATA = 2
 """Least number of data that must arrive while the gate settles, for their rate to be known."""
 
@@ -41,7 +38,7 @@ def shield_config(
         ConfigError: a value can't be used, or the shield does not know the robot's commands.
     """
     path = find_config(file, "limits") if file else None
-    measured = None if path is None else load_yaml(path, LimitsFile).shield
+    measured = load_yaml(path, LimitsFile).shield if path else None
     values = (measured or _derived(model, limits)).model_copy(update=dict(given or {}))
     for name, value in values.model_dump().items():
         least = "greater than 0" if name == "deceleration" else "at least 0"
@@ -68,9 +65,8 @@ def shield_config(
 
 def _derived(model: SimulatorModel, limits: Limits | None) -> Stopping:
     """Assumes that a base takes up one command per period, and brakes no harder than its limits."""
-    deceleration = UNKNOWN_DECELERATION
-    if limits is not None and limits.linear.any():
-        deceleration = float(limits.rate[limits.linear].min())
+    rates = [] if limits is None else limits.rate[limits.linear].tolist()
+    deceleration = min(rates, default=UNKNOWN_DECELERATION)
     latency = model.calibration.command_latency_s + lag(model.kinematics) + model.control_period
     return Stopping(latency=max(0.0, latency), deceleration=deceleration)
 

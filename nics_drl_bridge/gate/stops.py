@@ -16,18 +16,13 @@ from nics_drl_bridge.gate.state import Arrivals, Cause, GateConfig, GateState, M
 from nics_drl_bridge.interface import S_PER_NS
 
 SCAN, ODOM, RAW, E_STOP = "scan", "odom", "cmd_vel_raw", "e_stop"
-KEPT = 64
-"""Number of remembered stamps; a command on an older scan is on an unknown one."""
-MARK_S = 0.05
-"""Time between two marks [s]."""
-DRIFT = 1e-3
-"""Greatest drift between two clocks [s/s]; that of real machines is 1e-4."""
-SIMULATED_LAG = 0.2
-"""Share of real time that a simulator may lose."""
+KEPT = 64  # number of remembered stamps; a command on an older scan is on an unknown one
+MARK_S = 0.05  # time between two marks [s]
+DRIFT = 1e-3  # greatest drift between two clocks [s/s]; that of real machines is 1e-4
+SIMULATED_LAG = 0.2  # share of real time that a simulator may lose
 AHEAD_S = 0.1
 """Data of an armed gate whose lead exceeds the envelope by this are from the future [s]."""
-FROZEN_INPUTS = 20
-"""A running clock does not give this many inputs in a row the same time."""
+FROZEN_INPUTS = 20  # a running clock does not give this many inputs in a row the same time
 
 
 def arrived(
@@ -53,29 +48,26 @@ def arrived(
     if lead - arrivals.envelope > (AHEAD_S if armed else config.clock_jump_s):
         return fresh, "jumped"
     marks = _marked(arrivals, stamp_ns, now, lead, config.settle_s)
+    passed, envelope = now - arrivals.times[-1], _envelope(marks)
     if armed:
-        passed = now - arrivals.times[-1]
         fall = SIMULATED_LAG if config.simulated else DRIFT
         lowest, highest = arrivals.envelope - fall * passed, arrivals.envelope + DRIFT * passed
         envelope = min(max(lead, lowest), highest)
-    else:
-        envelope = _envelope(marks)
-    return replace(
-        arrivals,
-        stamps_ns=(*arrivals.stamps_ns[1 - KEPT :], stamp_ns),
-        times=(*arrivals.times[1 - KEPT :], now),
-        late=(*arrivals.late[1 - KEPT :], max(0.0, envelope - lead)),
-        count=arrivals.count + 1,
-        envelope=envelope,
-        unbroken_s=now if now - arrivals.times[-1] > gap_s else arrivals.unbroken_s,
-        marks=marks,
+    return Arrivals(
+        (*arrivals.stamps_ns[1 - KEPT :], stamp_ns),
+        (*arrivals.times[1 - KEPT :], now),
+        (*arrivals.late[1 - KEPT :], max(0.0, envelope - lead)),
+        arrivals.origin,
+        arrivals.count + 1,
+        envelope,
+        now if passed > gap_s else arrivals.unbroken_s,
+        marks,
     ), ""
 
 
 def _marked(
     arrivals: Arrivals, stamp_ns: int, now: float, lead: float, settle_s: float
 ) -> tuple[Mark, ...]:
-    """Returns the marks, with a datum merged into the last of them or as a new one."""
     *before, (time, stamp, number, greatest) = arrivals.marks
     if now - time < MARK_S:
         return (*before, (time, stamp, number, max(lead, greatest)))
@@ -98,35 +90,33 @@ def age(arrivals: Arrivals, now: float) -> float:
     return now - arrivals.times[-1] + arrivals.late[-1] if arrivals.times else math.inf
 
 
-def _silence(rule: str, topic: str, arrivals: Arrivals, now: float, limit: float) -> Cause | None:
-    old = age(arrivals, now)
-    return Cause(rule, topic, "no fresh data", old, limit) if not old <= limit else None
+def _too_old(rule: str, topic: str, detail: str, old: float, limit: float) -> Cause | None:
+    return None if old <= limit else Cause(rule, topic, detail, old, limit)
 
 
 def scan_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The newest scan is too old: the lidar has stopped."""
-    return _silence("scan_silent", SCAN, state.scans, now, config.scan_age_s)
+    old = age(state.scans, now)
+    return _too_old("scan_silent", SCAN, "no fresh data", old, config.scan_age_s)
 
 
 def sensor_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The newest reading of a further sensor is too old: it has stopped."""
-    for name, sensor in zip(config.sensors, state.sensors, strict=True):
-        cause = _silence("sensor_silent", name, sensor.arrivals, now, config.scan_age_s)
-        if cause is not None:
-            return cause
-    return None
+    both = zip(config.sensors, state.sensors, strict=True)
+    old, name = max(((age(each.arrivals, now), name) for name, each in both), default=(0.0, ""))
+    return _too_old("sensor_silent", name, "no fresh data", old, config.scan_age_s)
 
 
 def odom_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The newest odometry is too old: it has stopped."""
-    return _silence("odom_silent", ODOM, state.odometries, now, config.odom_age_s)
+    old = age(state.odometries, now)
+    return _too_old("odom_silent", ODOM, "no fresh data", old, config.odom_age_s)
 
 
 def stamps_jumped(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """A sensor's clock has jumped or runs ahead: its stamps lie in the future, or far back."""
-    if not state.jumped:
-        return None
-    return Cause("stamps_jumped", state.jumped, "its stamps have jumped, or run ahead of time")
+    detail = "its stamps have jumped, or run ahead of time"
+    return Cause("stamps_jumped", state.jumped, detail) if state.jumped else None
 
 
 def gap_free(arrivals: Arrivals, now: float, settle_s: float, limit: float) -> bool:
@@ -141,19 +131,15 @@ def rate(arrivals: Arrivals, now: float, settle_s: float) -> tuple[float, float]
     first = next((mark for mark in arrivals.marks if mark[0] >= now - settle_s), None)
     if first is None or arrivals.count <= first[2]:
         return 0.0, 0.0
-    count = arrivals.count - first[2]
-    passed = arrivals.times[-1] - first[0]
+    count, passed = arrivals.count - first[2], arrivals.times[-1] - first[0]
     stamped = (arrivals.stamps_ns[-1] - first[1]) * S_PER_NS
     return (count / passed if passed > 0.0 else math.inf), count / stamped
 
 
 def creep(arrivals: Arrivals) -> float:
     """Returns by how much the later half of the marks is further ahead of the steady clock [s]."""
-    half = len(arrivals.marks) // 2
-    if half == 0:
-        return 0.0
-    early, late = arrivals.marks[:half], arrivals.marks[half:]
-    return _envelope(late) - _envelope(early)
+    marks, half = arrivals.marks, len(arrivals.marks) // 2
+    return _envelope(marks[half:]) - _envelope(marks[:half]) if half else 0.0
 
 
 def take_time(config: GateConfig, state: GateState, given: Input, now: float) -> GateState:
@@ -161,19 +147,16 @@ def take_time(config: GateConfig, state: GateState, given: Input, now: float) ->
     if not math.isfinite(now) or now < state.now_s:
         return replace(state, clock_fault=f"the steady clock went from {state.now_s} to {now} s")
     still = state.still_ticks + 1 if now == state.now_s else 0
-    fault = ""
-    if still >= FROZEN_INPUTS:
-        fault = f"the steady clock stands still at {now} s"
+    fault = f"the steady clock stands still at {now} s" if still >= FROZEN_INPUTS else ""
     ticked, awake = state.tick_s, state.awake_s
     if ticked is not None and now - ticked > config.gap_s:  # at whatever input wakes it up
         fault, awake = f"no decision for {now - ticked:.3f} s, the limit is {config.gap_s} s", now
     elif now - awake <= config.gap_s:  # a single zero may be lost: only the newest command counts
         fault = f"awake again for only {now - awake:.3f} s"
-    if isinstance(given, Tick):
-        ticked = now
     return replace(
-        state, now_s=now, tick_s=ticked, awake_s=awake, still_ticks=still, clock_fault=fault
-    )
+        state, now_s=now, tick_s=now if isinstance(given, Tick) else ticked, awake_s=awake,
+        still_ticks=still, clock_fault=fault,
+    )  # fmt: skip
 
 
 def own_clock(config: GateConfig, state: GateState, now: float) -> Cause | None:
@@ -188,17 +171,16 @@ def command_malformed(config: GateConfig, state: GateState, now: float) -> Cause
 
 def command_missing(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """No command has arrived yet."""
-    if state.command is not None or state.pending is not None:
-        return None
-    return Cause("command_missing", RAW, "no command yet")
+    heard = state.command is not None or state.pending is not None
+    return None if heard else Cause("command_missing", RAW, "no command yet")
 
 
 def command_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The policy has stopped, or hangs."""
-    old, limit = now - state.command_s, config.command_age_s
-    if old <= limit or state.command is None:
+    if state.command is None:
         return None
-    return Cause("command_silent", RAW, "no fresh command", old, limit)
+    old = now - state.command_s
+    return _too_old("command_silent", RAW, "no fresh command", old, config.command_age_s)
 
 
 def scan_behind_unknown(config: GateConfig, state: GateState, now: float) -> Cause | None:
@@ -215,17 +197,14 @@ def scan_behind_old(config: GateConfig, state: GateState, now: float) -> Cause |
     """The scan behind the command is old, however fresh the command: a republisher, or a hang."""
     if state.command is None:
         return None
-    old, limit = now - state.behind_s, config.scan_age_s
-    if old <= limit:
-        return None
-    return Cause("scan_behind_old", SCAN, f"the scan behind {RAW} is old", old, limit)
+    detail, old = f"the scan behind {RAW} is old", now - state.behind_s
+    return _too_old("scan_behind_old", SCAN, detail, old, config.scan_age_s)
 
 
 def e_stop_pressed(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The emergency stop was pressed."""
-    if not state.e_stop.latched:
-        return None
-    return Cause("e_stop_pressed", E_STOP, "pressed" if state.e_stop.held else "was pressed")
+    detail = "pressed" if state.e_stop.held else "was pressed"
+    return Cause("e_stop_pressed", E_STOP, detail) if state.e_stop.latched else None
 
 
 def e_stop_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
@@ -234,6 +213,4 @@ def e_stop_silent(config: GateConfig, state: GateState, now: float) -> Cause | N
     if heard is None and not config.e_stop_required:
         return None
     old, limit = math.inf if heard is None else now - heard, config.e_stop_silence_s
-    if old <= limit:
-        return None
-    return Cause("e_stop_silent", E_STOP, "its heartbeat is silent, as if pressed", old, limit)
+    return _too_old("e_stop_silent", E_STOP, "its heartbeat is silent, as if pressed", old, limit)

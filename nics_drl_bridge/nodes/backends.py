@@ -12,28 +12,34 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 from nav_msgs.msg import Odometry
-from numpy.typing import NDArray
 from sensor_msgs.msg import LaserScan
 
+from nics_drl_bridge.env.guard import halts_on_error
 from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError, nearest
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import NS_PER_S, Backend, BackendFacts, RobotView, Start, stacked
+from nics_drl_bridge.interface import (
+    NS_PER_S,
+    Array,
+    Backend,
+    BackendFacts,
+    RobotView,
+    Start,
+    stacked,
+)
 from nics_drl_bridge.lidar.spec import from_device
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import qos, wire
 from nics_drl_bridge.nodes.conversions import sensor_from_ros, sensor_type
 from nics_drl_bridge.nodes.device_parameters import default_namespaces
 from nics_drl_bridge.nodes.executor import HANDED_OVER
-from nics_drl_bridge.nodes.link import EpisodeServices, Link, halted_after_an_error
+from nics_drl_bridge.nodes.link import EpisodeServices, Link
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.nodes.robot_topics import data_facts
 from nics_drl_bridge.sim.world import World
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 SCAN, ODOM, TRUTH = "scan", "odom", "ground_truth"
-AGAIN_S = 0.05
-"""Data that do not arrive within this time are requested again [s]."""
+AGAIN_S = 0.05  # data that do not arrive within this time are requested again [s]
 ADVICE = "start `simulator_node` with mode:=lockstep in the same ROS_DOMAIN_ID and namespace."
 
 
@@ -69,7 +75,6 @@ class _Mailbox:
         return None
 
     def _work_in(self) -> None:
-        """Processes the awaited odometry, once."""
         awaited = self._awaited_ns
         if self._stamps[ODOM] == awaited != self._worked_ns:
             self._worked_ns = awaited
@@ -89,7 +94,7 @@ class _Mailbox:
         return math.inf if arrival_ns is None else (time.monotonic_ns() - arrival_ns) * 1e-9
 
     def wait(self, stamp_ns: int, timeout_s: float) -> dict[str, tuple[bytes, int]]:
-        """Returns message and arrival [ns] of each topic, once each is at least as new as a stamp.
+        """Waits until each topic is at least as new as a stamp; returns messages and arrivals [ns].
 
         Raises StaleDataError if a message does not arrive.
         """
@@ -110,51 +115,37 @@ class _Mailbox:
             return {t: (message, self._arrivals[t]) for t, message in self._messages.items()}
 
 
-def _worker(middleware: Middleware) -> Callable[[int, int, bytes], None]:
-    """Returns the callback for odometry, without a reference to the backend (it may be garbage)."""
-
-    def work(stamp_ns: int, arrival_ns: int, message: bytes) -> None:
-        middleware.odometry(stamp_ns, arrival_ns, *_read(ODOM, wire.odometry_of, message))
-
-    return work
+def _take_odometry(middleware: Middleware, stamp_ns: int, arrival_ns: int, message: bytes) -> None:
+    middleware.odometry(stamp_ns, arrival_ns, *_read(ODOM, wire.odometry_of, message))
 
 
 class DdsBackend:
     """One robot behind `cmd_vel`, `scan` and `odom`, in lock-step with a simulator node.
 
     Each step publishes one command and returns exactly the data that are stamped one control
-    period later. Its own node in its own context listens in one executor thread; nothing spins
-    inside `step`. `close`, an error in `step` and garbage collection leave a zero command behind,
-    see `Link`. A vehicle, or a simulator in real time, needs `RealtimeBackend`, selected by
-    `mode="realtime"` in `backend_options`.
+    period later. Its own node in its own context listens in one executor thread. `close`, an error
+    and garbage collection leave a zero command behind, see `Link`.
 
-    Model and world must be those that the simulator node runs. `truth` waits for `ground_truth`
-    too, and puts the true pose into `info`; `timeout_s` bounds each wait for a peer or an answer.
-
-    Raises:
-        BackendError: no simulator is there, it refuses or does not answer, another node moved it,
-            or it is not in lock-step.
-        ModelError: it runs another model or world.
-        StaleDataError: its data do not arrive.
+    `truth` waits for `ground_truth` too, and puts the true pose into `info`; `timeout_s` bounds
+    each wait for a peer or an answer. Raises BackendError if no simulator is there, it refuses,
+    does not answer or is not in lock-step, or another node moved it; ModelError if it runs another
+    model or world; StaleDataError if its data do not arrive.
     """
 
     def __init__(
-        self,
-        model: SimulatorModel,
-        world: World,
-        namespace: str = "",
-        simulator: str = "simulator_node",
-        timeout_s: float = 30.0,
-        truth: bool = False,
+        self, model: SimulatorModel, world: World, namespace: str = "",
+        simulator: str = "simulator_node", timeout_s: float = 30.0, truth: bool = False,
         domain_id: int | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._robot, self._lidar = model.robot, model.lidar
         self._sensors = {sensor.name: sensor for sensor in model.sensors}
         self._middleware = Middleware(model)
         self._period_ns = round(model.control_period * NS_PER_S)
         further = (*self._sensors, *((TRUTH,) if truth else ()))
         self.timeout_s, self._topics = timeout_s, (ODOM, SCAN, *further)
-        self._now_ns, self._mail = 0, _Mailbox(self._topics, _worker(self._middleware))
+        # No reference to the backend, which may be garbage.
+        take = partial(_take_odometry, self._middleware)
+        self._now_ns, self._mail = 0, _Mailbox(self._topics, take)
         self._known: BackendFacts = {}
         self._link = Link(namespace, domain_id)
         for topic in self._topics:
@@ -171,54 +162,43 @@ class DdsBackend:
             self.close()
             raise
 
+    @halts_on_error
     def reset(self, start: Start) -> RobotView:
         """Begins the episode of a seed in the simulator; see `interface.Backend`."""
-        with halted_after_an_error(self._link):
-            self.choose(start)
-            return self.first(self.begin(), start.pose)
+        return self.first(self.begin(start), start.pose)
 
-    def choose(self, start: Start) -> None:
-        """The first part of a reset: chooses the episode for `begin`."""
+    def begin(self, start: Start) -> int:
+        """Begins an episode, the first part of a reset; returns the stamp of its data [ns]."""
         self._link.check_open()
         self._link.check_alone()
         self._episodes.choose(start, self.timeout_s)
-
-    def begin(self) -> int:
-        """The second part: begins it, and returns the stamp of its first data [ns]."""
         return self._episodes.begin(self.timeout_s)
 
     def first(self, stamp_ns: int, pose: Array) -> RobotView:
-        """The last part: waits for the data of a stamp, of a robot that stands at a pose (3,)."""
+        """The second part: waits for the data of a stamp, of a robot that stands at a pose (3,)."""
         self._now_ns = stamp_ns
         self._middleware.reset(stamp_ns, pose)
-        return self._measure()[0]
+        return self.receive()[0]
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
         """Publishes a command and waits for the data after it; see `interface.Backend`."""
         self.send(command)
         return self.receive()
 
+    @halts_on_error
     def send(self, command: Array) -> None:
         """The first half of a step: checks and publishes a command (C,)."""
         self._link.check_open()
-        with halted_after_an_error(self._link):
-            # Data that arrived before the command would be taken for its answer.
-            self._check_stamps()
-            twist = self._robot.to_cmd_vel(command)
-            self._link.send(twist)
-            # Checked while the simulator is at work.
-            self._link.check_alone()
-            self._middleware.command(self._now_ns, self._robot.from_cmd_vel(twist))
-            self._now_ns += self._period_ns
-            self._middleware.estimator.foresee(self._now_ns)
-
-    def receive(self) -> tuple[RobotView, dict[str, Any]]:
-        """The second half: waits for the data after the command; returns the view and `info`."""
-        with halted_after_an_error(self._link):
-            return self._measure()
+        # Data that arrived before the command would be taken for its answer.
+        self._check_stamps()
+        twist = self._robot.to_cmd_vel(command)
+        self._link.send(twist)
+        self._link.check_alone()  # while the simulator is at work
+        self._middleware.command(self._now_ns, self._robot.from_cmd_vel(twist))
+        self._now_ns += self._period_ns
+        self._middleware.estimator.foresee(self._now_ns)
 
     def _check_stamps(self) -> None:
-        """Raises BackendError if a newest datum is not stamped with the present step."""
         for topic in self._topics:
             off_ns = self._mail.stamp_ns(topic) - self._now_ns
             if off_ns:
@@ -228,8 +208,9 @@ class DdsBackend:
                     "the simulator with mode:=lockstep, and move it from here alone."
                 )
 
-    def _measure(self) -> tuple[RobotView, dict[str, Any]]:
-        """Returns the view at the present stamp. Raises BackendError if the data have another."""
+    @halts_on_error
+    def receive(self) -> tuple[RobotView, dict[str, Any]]:
+        """The second half: waits for the data after the command; returns the view and `info`."""
         now = self._now_ns
         messages = self._await(now)
         self._check_stamps()
@@ -247,10 +228,7 @@ class DdsBackend:
         return self._middleware.view(now), facts
 
     def _await(self, stamp_ns: int) -> dict[str, tuple[bytes, int]]:
-        """Returns the mailbox's data for a stamp; what does not arrive is requested again.
-
-        Data may be lost, and those sent before the simulator discovered a subscription always are.
-        """
+        """Returns the mailbox's data for a stamp; what does not arrive is requested again."""
         deadline = time.monotonic() + self.timeout_s
         while True:
             try:
@@ -291,19 +269,15 @@ def _putter(mail: _Mailbox, topic: str) -> Callable[[bytes], object]:
 class FleetBackend:
     """M robots in lock-step with one simulator node, which moves when all have their commands.
 
-    Views and commands have a leading (M,). Each robot has its own `DdsBackend`, which takes the
-    options, in a namespace, in the order of the simulator's parameter `robots`. The simulator is
-    named in full. Raises BackendError if no simulator is there, or a robot is missing.
+    Views and commands have a leading (M,). Each robot has a `DdsBackend`, which takes the options,
+    in a namespace, in the order of the simulator's parameter `robots`; the simulator is named in
+    full. Raises BackendError if no simulator is there, or a robot is missing.
     """
 
     def __init__(
-        self,
-        model: SimulatorModel,
-        world: World,
-        namespaces: Sequence[str],
-        simulator: str = "/simulator_node",
-        **options: Any,
-    ) -> None:
+        self, model: SimulatorModel, world: World, namespaces: Sequence[str],
+        simulator: str = "/simulator_node", **options: Any,
+    ) -> None:  # fmt: skip
         if len(set(namespaces)) < max(2, len(namespaces)):
             raise ConfigError(
                 f"backend_options: namespaces {list(namespaces)!r} must be those of at least two "
@@ -317,21 +291,19 @@ class FleetBackend:
             self.close()
             raise
 
+    @halts_on_error
     def reset(self, start: Start) -> RobotView:
         """Begins one episode for all robots, at poses (M, 3); see `DdsBackend.reset`."""
-        leader = self._robots[0]
-        with halted_after_an_error(self):
-            leader.choose(start)
-            stamp_ns = leader.begin()
-            both = zip(self._robots, start.pose, strict=True)
-            return stacked([robot.first(stamp_ns, pose) for robot, pose in both])
+        stamp_ns = self._robots[0].begin(start)
+        both = zip(self._robots, start.pose, strict=True)
+        return stacked([robot.first(stamp_ns, pose) for robot, pose in both])
 
+    @halts_on_error
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
         """Publishes all commands (M, C) and waits for all data after them."""
-        with halted_after_an_error(self):
-            for robot, one in zip(self._robots, command, strict=True):
-                robot.send(one)
-            views, facts = zip(*(robot.receive() for robot in self._robots), strict=True)
+        for robot, one in zip(self._robots, command, strict=True):
+            robot.send(one)
+        views, facts = zip(*(robot.receive() for robot in self._robots), strict=True)
         return stacked(views), together(facts)
 
     def facts(self) -> BackendFacts:
@@ -365,24 +337,15 @@ MODES = {"lockstep": DdsBackend, "realtime": RealtimeBackend}
 
 
 def dds_backend(
-    model: SimulatorModel,
-    world: World,
-    mode: str = "lockstep",
-    robots: int = 1,
-    estimator: bool = True,
-    randomisation: None = None,
-    **options: Any,
-) -> Backend:
+    model: SimulatorModel, world: World, mode: str = "lockstep", robots: int = 1,
+    estimator: bool = True, randomisation: None = None, **options: Any,
+) -> Backend:  # fmt: skip
     """Returns the backend of a robot behind ROS 2 topics, or of a team in lock-step.
 
     In mode `lockstep` it is a `DdsBackend`, or for a team a `FleetBackend` with the option
     `namespaces` (robot1, robot2, ... by default); in mode `realtime` a `RealtimeBackend`, with a
-    simulator or a vehicle. It always estimates and is never randomised.
-
-    Raises:
-        ConfigError: there is no such mode, or not for a team; or it should not estimate, or
-            should randomise.
-        BackendError: no peer is there.
+    simulator or a vehicle. Raises ConfigError for an unknown mode, one that a team does not have,
+    `estimator=False` and a randomisation; BackendError if no peer is there.
     """
     if not estimator or randomisation is not None:
         raise ConfigError(

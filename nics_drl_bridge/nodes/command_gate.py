@@ -36,16 +36,11 @@ from nics_drl_bridge.lidar.spec import LidarSpec, from_device
 from nics_drl_bridge.nodes import qos, runner, wire
 from nics_drl_bridge.nodes.conversions import is_rotation, sensor_from_ros, sensor_type
 from nics_drl_bridge.nodes.gate_log import GateLog
-from nics_drl_bridge.nodes.qos import QosWatch
-from nics_drl_bridge.nodes.runner import declare
-from nics_drl_bridge.nodes.wire import UNREADABLE, TwistWriter
 
-STALE_S = 0.05
-"""A motion that was decided on longer ago than this is decided on again [s]."""
+STALE_S = 0.05  # a motion that was decided on longer ago than this is decided on again [s]
 SCAN_PERIODS = 1.75
 """For a slow lidar, the default age limit of a command's scan, in periods of the lidar."""
-ROTATION = slice(3, 7)
-"""Position of an odometry's quaternion among its numbers."""
+ROTATION = slice(3, 7)  # position of an odometry's quaternion among its numbers
 VARIANCES = [wire.POSE_COVARIANCE, wire.POSE_COVARIANCE + 7, wire.POSE_COVARIANCE + 35]
 """Positions of the variances of x, y and heading."""
 HIGHEST = 99
@@ -63,25 +58,18 @@ def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
     """
     lidar, robot = model.lidar, model.robot
     about = "Limits of the robot: a shipped file, or a YAML file; no default."
-    file = str(declare(node, "limits", "", about, read_only=True))
+    file = str(runner.declare(node, "limits", "", about, read_only=True))
     limits = load_limits(file, robot) if file else None
     config = GateConfig(
-        fields=tuple(int(i) for i in np.flatnonzero(robot.to_cmd_vel(np.ones(len(robot.command))))),
-        limits=limits,
-        beam_angles=lidar.angles,
-        mount=lidar.mount,
-        range_min=lidar.range_min,
-        range_max=lidar.range_max,
-        scan_rate=lidar.rate,
-        sensors=tuple(sensor.name for sensor in model.sensors),
+        fields=tuple(np.flatnonzero(robot.to_cmd_vel(np.ones(len(robot.command)))).tolist()),
+        limits=limits, beam_angles=lidar.angles, mount=lidar.mount, range_min=lidar.range_min,
+        range_max=lidar.range_max, scan_rate=lidar.rate,
+        sensors=tuple(sensor.name for sensor in model.sensors), odom_std=model.noise.odometry,
         simulated=bool(node.get_parameter("use_sim_time").value),
-        odom_std=model.noise.odometry,
-        shield=_declare_shield(node, model, limits, file),
-        **_declare_rules(node, model),
-    )
+        shield=_declare_shield(node, model, limits, file), **_declare_rules(node, model),
+    )  # fmt: skip
     require_possible(config)
-    doubt = doubtful(config, model.control_period)
-    if doubt:
+    if doubt := doubtful(config, model.control_period):
         node.get_logger().warning(doubt)
     return config
 
@@ -104,7 +92,7 @@ def _declare_rules(node: Node, model: SimulatorModel) -> dict[str, Any]:
         ("estimate_std", default.estimate_std, "Greatest [m, rad].", (1e-3, 1e3)),
     )
     return {
-        field: declare(node, field.removesuffix("_s"), value, about, span, read_only=True)
+        field: runner.declare(node, field.removesuffix("_s"), value, about, span, read_only=True)
         for field, value, about, span in rows
     }
 
@@ -112,7 +100,7 @@ def _declare_rules(node: Node, model: SimulatorModel) -> dict[str, Any]:
 def declare_black_box(node: Node) -> Path:
     """Declares the folder of the recordings of stops, and returns that of the node's namespace."""
     about = "Where a stop's last 30 s are written, by namespace; ~/.ros/black_box if empty."
-    given = str(declare(node, "black_box", "", about, read_only=True))
+    given = str(runner.declare(node, "black_box", "", about, read_only=True))
     home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
     # So that no gate of another namespace removes its files.
     namespace = str(node.get_namespace()).strip("/")
@@ -123,7 +111,7 @@ def _declare_shield(
     node: Node, model: SimulatorModel, limits: Limits | None, file: str
 ) -> ShieldConfig | None:
     """Returns the shield, None if it is off, and logs a sentence about it."""
-    on = declare(node, "shield", True, "Whether to stop before obstacles.", read_only=True)
+    on = runner.declare(node, "shield", True, "Whether to stop before obstacles.", read_only=True)
     values = {}
     for name, about in (
         ("latency", "Until the robot has taken up a command, measured [s]"),
@@ -132,7 +120,7 @@ def _declare_shield(
         ("obstacle_speed", "At which what moves may come on [m/s]"),
     ):
         about = f"{about}; .nan: by the limits' file, or derived from the model."
-        value = float(declare(node, f"shield_{name}", math.nan, about, read_only=True))
+        value = float(runner.declare(node, f"shield_{name}", math.nan, about, read_only=True))
         if not math.isnan(value):
             values[name] = value
     if not on:
@@ -184,9 +172,8 @@ def e_stop(content: bytes) -> inputs.EStop:
 def take_priority(priority: int) -> str:
     """Gives all threads of this process priority over every ordinary one (SCHED_FIFO), if not 0.
 
-    This includes the threads of the middleware: a gate that waits for them gains nothing by its own
-    priority alone. Threads created later have the priority of their creator. Returns a sentence
-    with the reason and the fix if it fails, otherwise an empty one.
+    Those of the middleware, too, for which the gate waits. Threads created later have the priority
+    of their creator. Returns a sentence with the reason and the fix if it fails, otherwise "".
     """
     if priority == 0:
         return ""
@@ -201,7 +188,7 @@ def take_priority(priority: int) -> str:
     return ""
 
 
-class CommandGate(QosWatch):
+class CommandGate(qos.QosWatch):
     """Stands between `cmd_vel_raw` and `cmd_vel`, in its own process.
 
     It starts disarmed. `~/arm` lets commands pass if all checks succeed, `~/e_stop` presses the
@@ -224,15 +211,14 @@ class CommandGate(QosWatch):
         if self._config.shield is not None:
             shield.rehearse()
         self._out = self.create_publisher(Twist, "cmd_vel", qos.COMMAND)
-        self._twists = TwistWriter()
+        self._twists = wire.TwistWriter()
         self._zero = self._twists.write(np.zeros(3))
         self._listen()
         runner.steadily(self, PERIOD_S, lambda: self._decide(inputs.Tick()))
         runner.Diagnostics(self, "gate", self._look)
         about = "Real-time priority (SCHED_FIFO) of its process, 1 to 99; 0 for none."
-        priority = declare(self, "priority", 0, about, (0, HIGHEST), read_only=True)
-        refused = take_priority(priority)  # once all threads exist
-        if refused:
+        priority = runner.declare(self, "priority", 0, about, (0, HIGHEST), read_only=True)
+        if refused := take_priority(priority):  # once all threads exist
             logger.warning(refused)
 
     def _listen(self) -> None:
@@ -256,10 +242,10 @@ class CommandGate(QosWatch):
     def _take(self, topic: str, read: Callable[[bytes], inputs.Input], content: bytes) -> None:
         try:
             given = read(content)
-        except UNREADABLE as error:  # of a middleware with another encoding
+        except wire.UNREADABLE as error:  # of a middleware with another encoding
             self._log.refuse(f"{topic}: {error}")
-            return
-        self._decide(given)
+        else:
+            self._decide(given)
 
     def _arm(self) -> tuple[bool, str]:
         return self._answer(inputs.Arm(self.count_publishers(self._out.topic_name)))
@@ -284,11 +270,10 @@ class CommandGate(QosWatch):
         return decision
 
     def _say(self, decision: Decision, now: float) -> inputs.Input | None:
-        """Publishes a decision; the only path to the robot except `stop`.
+        """Publishes a decision, the only path to the robot except `stop`, or returns another input.
 
-        Returns an input to decide on instead, or None. What is not finite is sent as zero and
-        presses the e-stop. A motion that was decided on too long ago, in a process frozen since, is
-        not sent at all; so the clock is read immediately before.
+        What is not finite is sent as zero and presses the e-stop. A motion that was decided on too
+        long ago, in a process frozen since, is not sent; so the clock is read immediately before.
         """
         content = self._twists.write(decision.twist)
         if not np.isfinite(decision.twist).all():
@@ -321,10 +306,4 @@ def main(args: list[str] | None = None) -> None:
     runner.run_node(CommandGate, args, "command_gate")
     sys.stdout.flush()
     sys.stderr.flush()
-    # Everything is closed. Tearing down the interpreter as well takes half a second of a core, and
-    # several where others need it too.
-    os._exit(0)
-
-
-if __name__ == "__main__":
-    main()
+    os._exit(0)  # all is closed; to tear down the interpreter, too, takes seconds on a busy machine

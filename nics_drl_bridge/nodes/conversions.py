@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import array
+import contextlib
 import math
 import re
 import sys
@@ -27,20 +28,17 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, JointState, LaserScan
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.sectors import Reader, reader_beside
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader, from_device, to_device
 from nics_drl_bridge.recording.messages import POSITION_UNITS
 from nics_drl_bridge.robot.spec import RobotSpec
 
-Array = NDArray[np.float64]
-QUATERNION_TOLERANCE = 0.1
-"""Tolerance of the squared length of a quaternion about 1."""
+QUATERNION_TOLERANCE = 0.1  # tolerance of the squared length of a quaternion about 1
 PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
 """Indices of x, y and heading in the 6 x 6 covariance of a message."""
-UNUSED_VARIANCE = 1e6
-"""Variance of z, roll and pitch, which a planar robot does not measure."""
+UNUSED_VARIANCE = 1e6  # variance of z, roll and pitch, which a planar robot does not measure
 FIELD = re.compile(r"^\s*([A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z0-9_/]+)?)")
 """The type at the start of a line of a `.msg` file."""
 
@@ -98,10 +96,7 @@ def twist_from_ros(message: Twist) -> Array:
 def scan_to_ros(
     spec: LidarSpec, ranges: NDArray[np.float32], time_ns: int, frame: str
 ) -> LaserScan:
-    """Returns ranges (B,) as the device's LaserScan; every header field follows from the spec.
-
-    Its `intensities` stay empty, as the message provides for.
-    """
+    """Returns ranges (B,) as the device's LaserScan; every header field follows from the spec."""
     message = LaserScan()
     message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
     for field, value in spec.header._asdict().items():
@@ -125,12 +120,9 @@ def reader_from_ros(message: LaserScan, like: LidarSpec, upside_down: bool = Fal
 
 
 def odometry_to_ros(
-    pose: ArrayLike,
-    twist: ArrayLike,
-    time_ns: int,
-    frames: Sequence[str],
+    pose: ArrayLike, twist: ArrayLike, time_ns: int, frames: Sequence[str],
     variance: tuple[float, float, float, float],
-) -> Odometry:
+) -> Odometry:  # fmt: skip
     """Returns pose (3,) and body twist (3,), in a fixed and a body frame, as an Odometry message.
 
     The variances are of position [m^2], heading [rad^2], linear [m^2/s^2], angular [rad^2/s^2].
@@ -163,9 +155,7 @@ def covariance_to_ros(planar: Array) -> Array:
     return whole.ravel()
 
 
-def pose_from_ros(
-    message: PoseStamped | PoseWithCovarianceStamped,
-) -> tuple[Array, Array | None]:
+def pose_from_ros(message: PoseStamped | PoseWithCovarianceStamped) -> tuple[Array, Array | None]:
     """Returns the pose (3,) of a message and its covariance (3, 3); None if it carries none."""
     if isinstance(message, PoseWithCovarianceStamped):
         return _planar(message.pose.pose), np.reshape(message.pose.covariance, (6, 6))[PLANAR]
@@ -242,12 +232,10 @@ def message_texts(kind: str) -> dict[str, str]:
         if each in texts or file is None:
             continue
         texts[each] = file.read_text(encoding="utf-8")
-        package = each.split("/")[0]
-        for line in texts[each].splitlines():
-            found = FIELD.match(line.partition("#")[0])
-            if found is not None and ("/" in found[1] or found[1][0].isupper()):
-                inner = found[1].split("/")
-                waiting.append(f"{inner[0] if len(inner) > 1 else package}/msg/{inner[-1]}")
+        for name in filter(None, map(FIELD.match, texts[each].splitlines())):
+            package, _, inner = name[1].rpartition("/")
+            if package or inner[0].isupper():
+                waiting.append(f"{package.split('/')[0] or each.split('/')[0]}/msg/{inner}")
     return texts
 
 
@@ -255,9 +243,8 @@ def _message_file(kind: str) -> Path | None:
     from ament_index_python.search_paths import get_search_paths
 
     package, _, name = kind.split("/")
-    try:
+    prefixes = [sys.prefix]
+    with contextlib.suppress(OSError):  # if ROS 2 comes from wheels, the variable is not set
         prefixes = [*get_search_paths(), sys.prefix]
-    except OSError:  # if ROS 2 comes from wheels, the variable is not set
-        prefixes = [sys.prefix]
     files = (Path(prefix) / "share" / package / "msg" / f"{name}.msg" for prefix in prefixes)
     return next((file for file in files if file.is_file()), None)

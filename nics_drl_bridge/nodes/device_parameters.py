@@ -21,13 +21,11 @@ from nics_drl_bridge.robot.noise import Delay
 
 LOCKSTEP = "lockstep"
 MODES = ("realtime", LOCKSTEP, "as_fast_as_possible")
-MODELS_OWN = -1.0
+OWN = -1.0  # as in the model
 GREATEST_FLEET = 256
 NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
-SLACK = 0.1
-"""A step may be early by this share of it, because timers are no more precise."""
-PATIENCE_NS = NS_PER_S // 2
-"""Steps missed for longer than this are not made up for [ns]."""
+SLACK = 0.1  # a step may be early by this share of it, because timers are no more precise
+PATIENCE_NS = NS_PER_S // 2  # steps missed for longer than this are not made up for [ns]
 
 
 class DeviceTiming(NamedTuple):
@@ -78,28 +76,28 @@ def declare_device(node: Node, laser_frame: str) -> None:
          "Whether to publish the true map -> odom on /tf, in place of a localiser."),
     ):  # fmt: skip
         declare(node, name, fixed, about, read_only=True)
-    own = MODELS_OWN
     for name, value, low, high, about in (
         ("rate", 1.0, 0.01, 1000.0, "Simulated seconds per second in realtime."),
         ("odom_rate", 0.0, 0.0, 1000.0, "Of odom [Hz]; 0 for one per control period."),
         ("scan_rate", 0.0, 0.0, 1000.0, "Of scan [Hz]; 0 for the lidar's own."),
-        ("scan_latency", own, own, 10.0,
+        ("scan_latency", OWN, OWN, 10.0,
          "From the end of a scan to its publication [s]; -1 for the measured one of the model."),
-        ("odom_latency", own, own, 10.0,
+        ("odom_latency", OWN, OWN, 10.0,
          "From the stamp of odom to its publication [s]; -1 for the measured one of the model."),
-        ("latency_jitter", own, own, 10.0,
+        ("latency_jitter", OWN, OWN, 10.0,
          "Greatest further delay of both, drawn evenly [s]; -1 for the measured ones."),
-        ("command_latency", own, own, 10.0,
+        ("command_latency", OWN, OWN, 10.0,
          "From a command to its effect [s]; -1 for the measured one of the model."),
     ):  # fmt: skip
         declare(node, name, value, about, (low, high), read_only=True)
     silence = "Stops after this silence on cmd_vel [simulated s]; not in lockstep."
     declare(node, "command_timeout", 0.5, silence, span=(0.0, 3600.0))
-    declare(node, "episode_seed", 0, "Seed of the episode that ~/reset begins.")
-    start = "Start x, y, heading of that episode, of each robot."
-    declare(node, "episode_start", [0.0, 0.0, 0.0], start)
-    given = "Whether episode_start holds, or the seed's own."
-    declare(node, "episode_start_given", False, given)
+    for name, default, about in (
+        ("episode_seed", 0, "Seed of the episode that ~/reset begins."),
+        ("episode_start", [0.0, 0.0, 0.0], "Start x, y, heading of that episode, of each robot."),
+        ("episode_start_given", False, "Whether episode_start holds, or the seed's own."),
+    ):
+        declare(node, name, default, about)
 
 
 def number(node: Node, name: str) -> float:
@@ -127,16 +125,15 @@ def _late_ns(node: Node, topic: str, model: SimulatorModel) -> tuple[int, int]:
     """Returns least delay and jitter of a topic [ns]: as requested, otherwise as in the model."""
     own = model.latency.measured.get(topic, Delay(least=0.0, jitter=0.0))
     least, jitter = number(node, f"{topic}_latency"), number(node, "latency_jitter")
-    least, jitter = (least if least >= 0.0 else own.least, jitter if jitter >= 0.0 else own.jitter)
-    return round(least * NS_PER_S), round(jitter * NS_PER_S)
+    chosen = least if least >= 0.0 else own.least, jitter if jitter >= 0.0 else own.jitter
+    return round(chosen[0] * NS_PER_S), round(chosen[1] * NS_PER_S)
 
 
 def timed_model(node: Node, model: SimulatorModel, time: DeviceTiming) -> SimulatorModel:
     """Returns the model with the step of the world and the requested latency."""
     if time.lockstep:
         return model
-    latency = number(node, "command_latency")
-    if latency >= 0.0:
+    if (latency := number(node, "command_latency")) >= 0.0:
         calibration = replace(model.calibration, command_latency_s=latency)
         model = replace(model, calibration=calibration)
     dt = model.timing[0]
@@ -184,24 +181,19 @@ def frames(node: Node, namespace: str) -> Frames:
 
 
 def _check_episode(parameters: list[Parameter]) -> SetParametersResult:
+    reason = ""
     for parameter in parameters:
-        reason = ""
         if parameter.name == "episode_start":
             values = np.array(parameter.value, dtype=np.float64)
             if not values.size or values.size % 3 or not np.isfinite(values).all():
                 reason = "episode_start must be three finite numbers: x, y, heading; of each robot."
         elif parameter.name == "episode_seed" and parameter.value < 0:
             reason = "episode_seed must be 0 or more."
-        if reason:
-            return SetParametersResult(successful=False, reason=reason)
-    return SetParametersResult(successful=True)
+    return SetParametersResult(successful=not reason, reason=reason)
 
 
 class TopicPace:
-    """Decides when a topic is due, so that its mean rate is the requested one with any step.
-
-    If the step between two calls of `due` divides the period, the messages are regular.
-    """
+    """Decides when a topic is due, so that its mean rate is the requested one with any step."""
 
     def __init__(self, period_ns: int, step_ns: int) -> None:
         self._period_ns, self._slack_ns = period_ns, step_ns // 2 if period_ns > step_ns else 0
@@ -220,10 +212,7 @@ class TopicPace:
 
 
 def common_step(dt: float, periods: tuple[float, ...]) -> int:
-    """Returns the longest step, in steps of the model [s], that suits all periods [s] best.
-
-    It is a divisor of all periods if `dt` divides them.
-    """
+    """Returns the longest step, in steps of the model [s], that suits all periods [s] best."""
     return math.gcd(*(max(1, round(period / dt)) for period in periods))
 
 

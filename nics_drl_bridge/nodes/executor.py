@@ -9,7 +9,7 @@ import contextlib
 import inspect
 import itertools
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from typing import Any
 
@@ -24,8 +24,7 @@ from nics_drl_bridge.interface import NS_PER_S
 
 PARTS_MISSING = (AttributeError, TypeError)
 """Raised by Python if rclpy differs from what is known here."""
-Received = tuple[Callable[..., Any], tuple[Any, ...]]
-"""A callback and its arguments."""
+Received = tuple[Callable[..., Any], tuple[Any, ...]]  # a callback and its arguments
 HANDED_OVER, REST_S = object(), 1e-4
 """Returned by a callback that has woken another thread of this process. The executor then rests,
 for less than an exchange of messages takes, to keep out of that thread's way."""
@@ -37,16 +36,13 @@ class StandingExecutor(SingleThreadedExecutor):
     """Waits for all entities of its nodes; handles subscriptions and timers, and leaves the rest.
 
     rclpy's executors gather the entities of all nodes, open their handles and build a new wait set
-    each time they wait, and they wait three times for one message, woken by their own guard
-    condition. Here that is done only when an entity is added or removed. Services, clients, events
-    and tasks are left to rclpy's own executor.
+    each time they wait, and they wait three times for one message. Here that is done only when an
+    entity is added or removed. Services, clients, events and tasks are left to rclpy's executor.
 
     Callbacks are called in the spinning thread, one after the other: those of subscriptions with
     the message, or the message and its info, and may return `HANDED_OVER`; those of timers without
-    arguments, others are left to rclpy, too.
-
-    This needs parts of rclpy that are not public. If one of them is missing, it logs that once, and
-    is rclpy's own executor from then on.
+    arguments, others are left to rclpy, too. This needs parts of rclpy that are not public. If one
+    is missing, it logs that once, and is rclpy's own executor from then on.
     """
 
     def __init__(self, context: Context) -> None:
@@ -57,11 +53,8 @@ class StandingExecutor(SingleThreadedExecutor):
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Waits for an event and handles it; raises ExternalShutdownException, see rclpy."""
         received: list[Received] = []
-        if self.stands:
-            try:
-                received = self._wait(timeout_sec)
-            except PARTS_MISSING as error:
-                self._fall_back(error)
+        with self._falling_back():
+            received = self._wait(timeout_sec) if self.stands else []
         if not self.stands:
             super().spin_once(timeout_sec)
             return
@@ -90,36 +83,37 @@ class StandingExecutor(SingleThreadedExecutor):
 
     def _others_ready(self) -> tuple[list[Any], bool]:
         """Returns the timers that are due, and whether anything that is left to rclpy was ready."""
-        if self._entities is None or not self.context.ok():  # a callback may have shut it down
-            return [], False
-        try:
-            due = self._entities.due()
-            woken, others = self._entities.others_ready(self._guard)
-            self._changed |= woken or others  # adding an entity to a node wakes the executor
-            # So does rclpy itself, after each callback; then there is nothing to handle.
-            return due, others or (woken and bool(self._tasks))
-        except PARTS_MISSING as error:
-            self._fall_back(error)
-            return [], False
+        due: list[Any] = []
+        left = False
+        with self._falling_back():
+            if self._entities is not None and self.context.ok():  # a callback may have shut it down
+                woken, others = self._entities.others_ready(self._guard)
+                self._changed |= woken or others  # adding an entity to a node wakes the executor
+                # So does rclpy itself, after each callback; then there is nothing to handle.
+                due, left = self._entities.due(), others or (woken and bool(self._tasks))
+        return due, left
 
     def _tick(self, timer: Any) -> None:
         """Calls a timer back, unless an earlier callback has ended the context or the timer."""
         if not self.context.ok() or not any(timer in node.timers for node in self.get_nodes()):
             return
-        try:
-            if not timer.handle.is_timer_ready():
-                return
-            timer.handle.call_timer()  # it is due again after another period
-        except PARTS_MISSING as error:
-            self._fall_back(error)
-            return
-        timer.callback()
+        ready = False
+        with self._falling_back():
+            ready = timer.handle.is_timer_ready()
+            if ready:
+                timer.handle.call_timer()  # it is due again after another period
+        if ready and self.stands:
+            timer.callback()
 
-    def _fall_back(self, error: Exception) -> None:
-        """Continues as rclpy's own executor."""
-        self.stands = False
-        self._release()
-        get_logger("executor").warning(f"this rclpy needs its own, slower executor ({error})")
+    @contextlib.contextmanager
+    def _falling_back(self) -> Iterator[None]:
+        """Continues as rclpy's own executor if a part of rclpy is missing."""
+        try:
+            yield
+        except PARTS_MISSING as error:
+            self.stands = False
+            self._release()
+            get_logger("executor").warning(f"this rclpy needs its own, slower executor ({error})")
 
     def _handle_others(self) -> None:
         """Lets rclpy handle everything that is ready now."""
@@ -133,18 +127,17 @@ class StandingExecutor(SingleThreadedExecutor):
 
     def _gathered(self) -> _Entities:
         """Returns the entities, in a new wait set if they have changed."""
-        if self._entities is None or self._changed:
-            self._changed = False
-            nodes = self.get_nodes()
-            if self._entities is None or self._entities.all != _entities_of(nodes):
-                self._release()
-                guards = [guard for guard in (self._guard, self._sigint_gc) if guard]
-                self._entities = _Entities(nodes, guards, self.context)
-        return self._entities
+        nodes, now = self.get_nodes() if self._changed else [], self._entities
+        if now is None or (self._changed and now.all != _entities_of(nodes)):
+            self._release()
+            guards = [guard for guard in (self._guard, self._sigint_gc) if guard]
+            now = self._entities = _Entities(self.get_nodes(), guards, self.context)
+        self._changed = False
+        return now
 
     def _release(self) -> None:
         if self._entities is not None:
-            self._entities.close()
+            self._entities.opened.close()
             self._entities = None
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
@@ -159,14 +152,21 @@ class _Entities:
     def __init__(self, nodes: Sequence[Node], guards: Sequence[Any], context: Context) -> None:
         self.all = _entities_of(nodes)
         subscriptions, others, timers, clients, services, self._waitables = self.all
-        self._subscriptions = [(one, _arguments(one.callback)) for one in subscriptions]
-        self._timers = [(i, one) for i, one in enumerate(timers) if _plain(one.callback)]
+        # A subscription's callback takes the message, or also its info.
+        self._subscriptions = [
+            (one, 1 if _takes(one.callback, None) else 2) for one in subscriptions
+        ]
+        self._timers = [
+            (i, one)
+            for i, one in enumerate(timers)
+            if _takes(one.callback) and not inspect.iscoroutinefunction(one.callback)
+        ]
         self._own = {one.handle.pointer for _, one in self._timers}
         kinds = subscriptions, (*guards, *others), timers, clients, services
-        self._open = ExitStack()
-        for held in (*(one.handle for one in itertools.chain(*kinds)), *self._waitables):
-            self._open.enter_context(held)
-        self._open.enter_context(context.handle)
+        self.opened = ExitStack()
+        handles = (one.handle for one in itertools.chain(*kinds))
+        for held in (*handles, *self._waitables, context.handle):
+            self.opened.enter_context(held)
         room = NumberOfEntities(*(len(each) for each in kinds))
         for waitable in self._waitables:
             room += waitable.get_num_entities()
@@ -174,13 +174,11 @@ class _Entities:
             room.num_subscriptions, room.num_guard_conditions, room.num_timers,
             room.num_clients, room.num_services, room.num_events, context.handle,
         )  # fmt: skip
-        add: Any = self._wait_set
-        adders = (
-            add.add_subscription, add.add_guard_condition, add.add_timer, add.add_client,
-            add.add_service,
-        )  # fmt: skip
+        names = ("subscription", "guard_condition", "timer", "client", "service")
         self._adding = [
-            (adder, one.handle) for adder, each in zip(adders, kinds, strict=True) for one in each
+            (getattr(self._wait_set, f"add_{name}"), one.handle)
+            for name, each in zip(names, kinds, strict=True)
+            for one in each
         ]
 
     def wait(self, timeout_ns: int) -> None:
@@ -220,9 +218,6 @@ class _Entities:
             waitable.is_ready(self._wait_set) for waitable in self._waitables
         )
 
-    def close(self) -> None:
-        self._open.close()
-
 
 def _take(subscriptions: Iterable[tuple[Any, int]]) -> list[Received]:
     """Takes one message of each subscription that has one, with its callback's arguments."""
@@ -243,22 +238,13 @@ def _call(received: Iterable[Received]) -> None:
         time.sleep(REST_S)
 
 
-def _arguments(callback: Callable[..., Any]) -> int:
-    """Returns the arguments that a subscription's callback takes: the message, or also its info."""
+def _takes(callback: Any, *arguments: Any) -> bool:
+    """True if a callback can be called with these arguments."""
     try:
-        inspect.signature(callback).bind(None)
-    except TypeError:
-        return 2
-    return 1
-
-
-def _plain(callback: Callable[..., Any] | None) -> bool:
-    """True if a timer's callback takes no arguments and is no coroutine."""
-    try:
-        inspect.signature(callback).bind()  # type: ignore[arg-type]
+        inspect.signature(callback).bind(*arguments)
     except TypeError:
         return False
-    return not inspect.iscoroutinefunction(callback)
+    return True
 
 
 def _entities_of(nodes: Sequence[Node]) -> tuple[tuple[Any, ...], ...]:

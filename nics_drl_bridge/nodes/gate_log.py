@@ -10,9 +10,9 @@ import sys
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import NoReturn
 
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
@@ -21,41 +21,16 @@ from nics_drl_bridge.gate.state import Cause, GateConfig, GateState
 from nics_drl_bridge.nodes.runner import Condition
 
 FILES_KEPT = 20
-BURST_S = 3.0
-"""Time for which commands must pass before a stop counts as new, not as part of a burst [s]."""
-LINE_S = 2.0
-"""Time between two log lines of a kind [s]; those in between are counted."""
-CLOSING_S = 0.7
-"""Longest wait at the end for files that are being written [s]."""
-MOST_AT_WORK = 3
-"""Greatest number of writers at work; each keeps a copy of this process's memory."""
-PATIENCE_S = 20.0
-"""A writer that takes longer gives up [s]."""
-OVERDUE_S = PATIENCE_S + 5.0
-"""A writer that still runs after this never gives up [s]: another thread may have held a lock
-during the fork, or the disk blocks it."""
+BURST_S = 3.0  # for which commands must pass before a stop is not of the same burst
+LINE_S = 2.0  # time between two log lines of a kind [s]; those in between are counted
+CLOSING_S = 0.7  # longest wait at the end for files that are being written [s]
+MOST_AT_WORK = 3  # greatest number of writers at work; each keeps a copy of this process's memory
+PATIENCE_S = 20.0  # a writer that takes longer gives up [s]
+OVERDUE_S = PATIENCE_S + 5.0  # then a writer never gives up [s]: a lock or the disk blocks it
 GRACE_S, POLL_S = 0.5, 0.005
 NICENESS = 5
 MOST_TOLD = 500
 ENDING = (signal.SIGTERM, signal.SIGALRM)
-
-
-class _Lines:
-    """Log lines, at most one of a kind within `LINE_S`."""
-
-    def __init__(self) -> None:
-        self._said: dict[str, float] = {}
-        self._kept: Counter[str] = Counter()
-
-    def count(self, kind: str) -> None:
-        self._kept[kind] += 1
-
-    def due(self, kind: str, now: float) -> str | None:
-        """Returns a suffix about lines that were not logged; None if one has just been logged."""
-        if now - self._said.get(kind, float("-inf")) < LINE_S:
-            return None
-        kept, self._said[kind] = self._kept.pop(kind, 1) - 1, now
-        return f" ({kept} more since the last such line)" if kept else ""
 
 
 class GateLog:
@@ -71,13 +46,12 @@ class GateLog:
         self._folder, self._hardware = folder, robot
         self._cause: Cause | None = None
         self._now = self._since = float("-inf")
-        self._rule: str | None = None
-        """Rule that stops the robot; empty while commands pass, None at first."""
-        self._burst: set[str] = set()
-        """Rules with a written stop since commands last passed for long."""
-        self._lines, self._owed = _Lines(), False
+        self._rule: str | None = None  # that stops the robot; "" while commands pass, None at first
+        self._burst: set[str] = set()  # with a written stop since commands last passed for long
+        self._said: dict[str, float] = {}  # time of the last line of a kind
+        self._kept: Counter[str] = Counter()  # events of a kind since then
+        self._owed, self._writer = False, BoxWriter()
         self._names: list[str] = []
-        self._writer = BoxWriter()
 
     def note(self, entry: Entry) -> None:
         """Accounts for a decision."""
@@ -106,42 +80,41 @@ class GateLog:
     def no_number(self, twist: Sequence[float]) -> None:
         """Counts and logs a decision that is not finite, which must never happen."""
         if (more := self._counted("not finite, sent as zero")) is not None:
-            self._logger.error(
-                f"decided on {list(twist)}, which is not finite: zero is sent, and the e-stop is "
-                f"pressed{more}"
-            )
+            nonsense = f"decided on {list(twist)}, which is not finite"
+            self._logger.error(f"{nonsense}: zero is sent, and the e-stop is pressed{more}")
 
     def _counted(self, kind: str) -> str | None:
-        """Counts an event; returns what to append to its line, or None if it is not logged now."""
         self.counters[kind] += 1
-        self._lines.count(kind)
-        return self._lines.due(kind, self._now)
+        self._kept[kind] += 1
+        return self._due(kind)
+
+    def _due(self, kind: str) -> str | None:
+        """Returns what to append to a line; None if one of its kind was logged within `LINE_S`."""
+        if self._now - self._said.get(kind, float("-inf")) < LINE_S:
+            return None
+        kept, self._said[kind] = self._kept.pop(kind, 1) - 1, self._now
+        return f" ({kept} more since the last such line)" if kept else ""
 
     def _changed(self, rule: str) -> None:
-        """Handles a change of the rule that stops the robot."""
         was_passing = self._rule == ""
         self._rule, self._since, self._owed = rule, self._now, True
-        self._lines.count(rule)
+        self._kept[rule] += 1
         if not rule:
             return
         self.counters[f"stopped, {rule}"] += 1
-        if not was_passing:
-            return
-        if rule in self._burst:
+        if was_passing and rule in self._burst:
             self.counters["stops of a burst, not in the black box"] += 1
-            return
-        self._burst.add(rule)
-        self._write(rule)
+        elif was_passing:
+            self._burst.add(rule)
+            self._write(rule)
 
     def _tell(self, rule: str) -> None:
         """Logs the present state; later, if it was logged a moment ago."""
-        more = self._lines.due(rule, self._now)
+        more = self._due(rule)
         self._owed = more is None
-        if more is None:
-            return
-        if self._cause is None:
+        if more is not None and self._cause is None:
             self._logger.info(f"commands pass{more}")
-        else:
+        elif more is not None and self._cause is not None:
             self._logger.warning(f"stopped by {self._cause.line}{more}")
 
     def _write(self, rule: str) -> None:
@@ -166,11 +139,8 @@ class GateLog:
         """Returns the finding for `/diagnostics`."""
         for failure in self._writer.failures():
             self._failed(failure)
-        facts = {
-            "armed": state.armed,
-            "latched": state.latched is not None,
-            **dict(sorted(self.counters.items())),
-        }
+        facts: dict[str, object] = {"armed": state.armed, "latched": state.latched is not None}
+        facts |= dict(sorted(self.counters.items()))
         message = self._cause.line if self._cause else "commands pass"
         return Condition(message, self._cause is not None, facts, self._hardware)
 
@@ -183,8 +153,7 @@ class GateLog:
 def prune(folder: Path, own: Sequence[str]) -> None:
     """Removes the files of stops beyond `FILES_KEPT`, oldest first.
 
-    This gate's own, by name, oldest first, count as the newest: the names of the others may come
-    from a clock that has been set back since.
+    This gate's own, oldest first, count as the newest: the clock may have been set back since.
     """
     place = {name: i for i, name in enumerate(own, 1)}
     files = sorted(folder.glob("*.jsonl"), key=lambda file: (place.get(file.name, 0), file.name))
@@ -192,24 +161,17 @@ def prune(folder: Path, own: Sequence[str]) -> None:
         old.unlink(missing_ok=True)
 
 
-class _Writer(NamedTuple):
-    pid: int
-    told: int  # pipe with the reason of a failure
-    begun_s: float
-
-
 class BoxWriter:
     """Writes files, each in its own process, which starts as a copy of this one.
 
-    The copy (`fork`, which shares memory until it is modified) is the snapshot: it takes this
-    process some milliseconds, however much there is to write, and later changes here are not in
-    it. A disk that hangs blocks the copy and nothing else, not even the end of this process, as a
-    waiting thread would. The copy has no other thread, closes all sockets, and runs at ordinary
-    priority.
+    The copy (`fork`, which shares memory until it is modified) is the snapshot: it takes some
+    milliseconds, and later changes are not in it. A disk that hangs blocks the copy and nothing
+    else, not even the end of this process, as a waiting thread would. The copy has no other thread,
+    closes all sockets, and runs at ordinary priority.
     """
 
     def __init__(self) -> None:
-        self._writers: list[_Writer] = []
+        self._writers: dict[int, tuple[int, float]] = {}  # pid: pipe with its failure, begin [s]
         self._failed: list[str] = []
 
     def begin(self, write: Callable[[], object]) -> bool:
@@ -218,13 +180,15 @@ class BoxWriter:
         If an exception ends `write`, it has to clean up after itself. Raises OSError if the system
         can't make another process.
         """
-        self._look()
+        self._failed = self.failures()
         if len(self._writers) >= MOST_AT_WORK:
             return False
         heard, told = os.pipe()
         os.set_blocking(heard, False)
+        # The copy must not run the handlers of the original.
+        signals = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, *ENDING))
         try:
-            with _no_signals(), warnings.catch_warnings():
+            with warnings.catch_warnings():
                 # Of Python 3.12: locks that other threads hold stay locked in the copy. It needs
                 # none of theirs, and a copy that hangs nevertheless gives up.
                 warnings.simplefilter("ignore", DeprecationWarning)
@@ -235,37 +199,34 @@ class BoxWriter:
             os.close(heard)
             raise
         finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, signals)
             os.close(told)
-        self._writers.append(_Writer(pid, heard, time.monotonic()))
+        self._writers[pid] = heard, time.monotonic()
         return True
 
     def failures(self) -> list[str]:
-        """Returns the failures of the writers that have ended since the last call."""
-        self._look()
+        """Returns the failures since the last call; kills the writers that are overdue."""
+        for pid, (heard, begun_s) in tuple(self._writers.items()):
+            status = _ended(pid)
+            if status is None:
+                if time.monotonic() - begun_s > OVERDUE_S:
+                    os.kill(pid, signal.SIGKILL)
+                continue
+            del self._writers[pid]
+            if status != 0:
+                self._failed.append(_read(heard) or f"its writer ended with {status}")
+            os.close(heard)
         failed, self._failed = self._failed, []
         return failed
-
-    def _look(self) -> None:
-        """Removes the writers that have ended, and kills those that are overdue."""
-        for writer in tuple(self._writers):
-            status = _ended(writer.pid)
-            if status is None:
-                if time.monotonic() - writer.begun_s > OVERDUE_S:
-                    os.kill(writer.pid, signal.SIGKILL)
-                continue
-            self._writers.remove(writer)
-            if status != 0:
-                self._failed.append(_read(writer.told) or f"its writer ended with {status}")
-            os.close(writer.told)
 
     def close(self, seconds: float) -> list[str]:
         """Waits for the writers, and makes those give up that take longer; returns the failures."""
         failed = self._wait(seconds)
-        for writer in self._writers:
-            os.kill(writer.pid, signal.SIGTERM)
+        for pid in self._writers:
+            os.kill(pid, signal.SIGTERM)
         failed += self._wait(GRACE_S)
-        for writer in self._writers:  # blocked by the disk; it ends when that releases it
-            os.kill(writer.pid, signal.SIGKILL)
+        for pid in self._writers:  # blocked by the disk; it ends when that releases it
+            os.kill(pid, signal.SIGKILL)
             failed.append("the disk does not answer")
         return failed
 
@@ -275,16 +236,6 @@ class BoxWriter:
             time.sleep(POLL_S)
             failed += self.failures()
         return failed
-
-
-@contextlib.contextmanager
-def _no_signals() -> Iterator[None]:
-    """Defers signals, so that the copy does not run the handlers of the original."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, *ENDING))
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _ended(pid: int) -> int | None:

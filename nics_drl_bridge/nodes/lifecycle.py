@@ -41,9 +41,11 @@ class ManagedNode(QosWatch, LifecycleNode):
         self.add_on_set_parameters_callback(self._check_fixed)
 
     def create_lifecycle_publisher(self, kind: Any, topic: str, qos: Any) -> Publisher:
-        """Creates a publisher that is silent unless the node is active."""
+        """Creates a publisher that is silent unless the node is active, until clean-up."""
         events = self.publisher_events(topic, qos)
-        return super().create_lifecycle_publisher(kind, topic, qos, event_callbacks=events)
+        made = super().create_lifecycle_publisher(kind, topic, qos, event_callbacks=events)
+        self.undo.callback(self.destroy_lifecycle_publisher, made)
+        return made
 
     def configure(self) -> None:
         """Makes what the parameters request. Raises BridgeError if one can't be used."""
@@ -72,12 +74,12 @@ class ManagedNode(QosWatch, LifecycleNode):
         late = sorted(self.fixed & {parameter.name for parameter in parameters})
         if not late or self.state == UNCONFIGURED:
             return SetParametersResult(successful=True)
-        reason = (
-            f"parameter {late[0]!r} is read when the node is configured; lead it to unconfigured "
-            f"first: `ros2 lifecycle set {self.get_fully_qualified_name()} deactivate`, then "
-            "`cleanup`."
+        return SetParametersResult(
+            successful=False,
+            reason=f"parameter {late[0]!r} is read when the node is configured; lead it to "
+            f"unconfigured first: `ros2 lifecycle set {self.get_fully_qualified_name()} "
+            "deactivate`, then `cleanup`.",
         )
-        return SetParametersResult(successful=False, reason=reason)
 
     def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Configures; a failure leaves it unconfigured."""
@@ -120,8 +122,8 @@ class ManagedNode(QosWatch, LifecycleNode):
             self._failure = error
             expected = isinstance(error, BridgeError)
             if not self._starting:
-                said = str(error) if expected else f"{type(error).__name__}: {error}"
-                self.get_logger().error(said)
+                kind = "" if expected else f"{type(error).__name__}: "
+                self.get_logger().error(f"{kind}{error}")
             if not expected:
                 raise
             return FAILURE

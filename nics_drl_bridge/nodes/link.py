@@ -6,10 +6,11 @@ import contextlib
 import json
 import math
 import signal
+import sys
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -30,48 +31,32 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.executor import StandingExecutor
-from nics_drl_bridge.nodes.qos import QosWatch, owner
-from nics_drl_bridge.nodes.runner import last_word, open_context
+from nics_drl_bridge.nodes.runner import holds, last_word, open_context
 from nics_drl_bridge.nodes.wire import TwistWriter
 from nics_drl_bridge.sim.world import World
 
 SPIN_S, POLL_S = 0.2, 0.002
-LOST_S = 1.0
-"""A request to repeat data that stays unanswered for longer was itself lost [s]."""
-
-
-@contextlib.contextmanager
-def halted_after_an_error(robot: Any) -> Iterator[None]:
-    """Calls a robot's `halt`, which publishes a zero command, if the body ends by any exception."""
-    try:
-        yield
-    except BaseException:
-        robot.halt()
-        raise
+LOST_S = 1.0  # a request to repeat data that stays unanswered for longer was itself lost [s]
 
 
 class Link:
     """A node in its own context, one executor thread, and the command topic.
 
-    `close`, an error inside `halted_after_an_error`, garbage collection and the end of the process,
-    SIGTERM included, leave a zero command behind. SIGKILL can't be handled: `command_gate` and the
-    base's own timeout are for that. Commands are TwistStamped if `stamped`; one without a successor
-    within the timeout [s] is followed by a zero.
+    `close`, garbage collection and the end of the process, SIGTERM included, leave a zero command
+    behind. SIGKILL can't be handled: `command_gate` and the base's own timeout are for that.
+    Commands are TwistStamped if `stamped`; one without a successor within the timeout [s] is
+    followed by a zero.
     """
 
     def __init__(
-        self,
-        namespace: str = "",
-        domain_id: int | None = None,
-        command_topic: str = "cmd_vel",
-        stamped: bool = False,
-        parameters: Mapping[str, Any] | None = None,
+        self, namespace: str = "", domain_id: int | None = None, command_topic: str = "cmd_vel",
+        stamped: bool = False, parameters: Mapping[str, Any] | None = None,
         command_timeout_s: float = math.inf,
-    ) -> None:
+    ) -> None:  # fmt: skip
         _end_orderly_on_sigterm()
         self._context = open_context(domain_id=domain_id)
         overrides = [Parameter(name, value=value) for name, value in (parameters or {}).items()]
-        self.node = QosWatch(
+        self.node = qos.QosWatch(
             "bridge_env", namespace=namespace, context=self._context,
             start_parameter_services=False, parameter_overrides=overrides,
         )  # fmt: skip
@@ -83,14 +68,10 @@ class Link:
 
     def begin(self) -> None:
         """Starts the executor's thread; call it once all subscriptions exist."""
-        thread = threading.Thread(
-            target=_spin, args=(self._context, self.node, self._timeout), daemon=True,
-            name="dds_backend",
-        )  # fmt: skip
+        given = (self._context, self.node, self._timeout)
+        thread = threading.Thread(target=_spin, args=given, daemon=True, name="dds_backend")
         thread.start()
-        self._closing = weakref.finalize(
-            self, _shut_down, self._context, self.commands, self._kind, thread
-        )
+        self._closing = weakref.finalize(self, _shut_down, self._context, self._timeout, thread)
 
     def send(self, twist: NDArray[np.float64], stamp_ns: int = 0) -> None:
         """Publishes linear.x, linear.y, angular.z (3,), stamped if the topic is.
@@ -124,8 +105,7 @@ class Link:
         """Calls a service; the executor's thread completes the future. Raises BackendError."""
         done, deadline = threading.Event(), time.monotonic() + timeout_s
         # A server that hung for long was dropped, and has to be discovered again.
-        while not client.service_is_ready() and time.monotonic() < deadline:
-            time.sleep(POLL_S)
+        holds(client.service_is_ready, timeout_s, POLL_S)
         future = client.call_async(request)
         future.add_done_callback(lambda _: done.set())
         if not done.wait(max(0.0, deadline - time.monotonic())):
@@ -146,7 +126,7 @@ class Link:
             return
         topic = self.commands.topic_name
         ends = self.node.get_publishers_info_by_topic(topic)
-        names = sorted(name for end in ends if (name := owner(end)) is not None)
+        names = sorted(name for end in ends if (name := qos.owner(end)) is not None)
         with contextlib.suppress(ValueError):
             names.remove(self.node.get_fully_qualified_name())
         raise BackendError(f"{', '.join(names) or 'somebody'} publishes {topic} too; stop it.")
@@ -165,15 +145,11 @@ class Link:
             service = node.resolve_service_name(client.srv_name)
             needed[f"service {service}"] = client.service_is_ready
         deadline = time.monotonic() + patience_s
-        while missing := [name for name, there in needed.items() if not there()]:
-            if time.monotonic() > deadline:
-                raise BackendError(
-                    f"after {patience_s:g} s there is still no {', no '.join(missing)}; {advice}"
-                )
-            time.sleep(POLL_S)
+        if not holds(lambda: all(there() for there in needed.values()), patience_s, POLL_S):
+            missing = ", no ".join(name for name, there in needed.items() if not there())
+            raise BackendError(f"after {patience_s:g} s there is still no {missing}; {advice}")
         # A publisher that was killed stays in the graph for a while.
-        while self.others_command() and time.monotonic() < deadline:
-            time.sleep(POLL_S)
+        holds(lambda: not self.others_command(), deadline - time.monotonic(), POLL_S)
         self.check_alone()
 
     def close(self) -> None:
@@ -199,11 +175,11 @@ def _spin(context: Context, node: Node, timeout: CommandTimeout) -> None:
         node.destroy_node()
 
 
-def _shut_down(context: Context, commands: Publisher, kind: Any, thread: threading.Thread) -> None:
+def _shut_down(context: Context, timeout: CommandTimeout, thread: threading.Thread) -> None:
     """Leaves a zero command behind and ends the thread; holds no reference to the link."""
     with uninterrupted():  # else Python may exit with a thread inside the middleware's library
         if context.ok():
-            last_word(commands, kind())
+            timeout.end()
             context.try_shutdown()
         # Garbage may be collected in any thread, including that one.
         if thread is not threading.current_thread():
@@ -214,11 +190,7 @@ def _end_orderly_on_sigterm() -> None:
     """Makes SIGTERM end Python like an exception, unless the program handles it itself."""
     in_main = threading.current_thread() is threading.main_thread()
     if in_main and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
-        signal.signal(signal.SIGTERM, _end)
-
-
-def _end(number: int, _: Any) -> None:
-    raise SystemExit(128 + number)
+        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
 
 
 class CommandTimeout:
@@ -254,11 +226,10 @@ class EpisodeServices:
     def __init__(self, link: Link, simulator: str, model: SimulatorModel, world: World) -> None:
         self._link = link
         self._identity = {"model": model.fingerprint, "world": world.fingerprint}
-        self._parameters = link.node.create_client(
-            SetParametersAtomically, f"{simulator}/set_parameters_atomically"
-        )
-        self._reset = link.node.create_client(Trigger, f"{simulator}/reset")
-        self._repeat = link.node.create_client(Trigger, f"{simulator}/repeat")
+        client, setting = link.node.create_client, f"{simulator}/set_parameters_atomically"
+        self._parameters = client(SetParametersAtomically, setting)
+        self._reset = client(Trigger, f"{simulator}/reset")
+        self._repeat = client(Trigger, f"{simulator}/repeat")
         self._repeating: Any = None
         self._asked_s = 0.0
         self.clients = [self._reset, self._parameters]
@@ -293,8 +264,7 @@ class EpisodeServices:
     def begin(self, timeout_s: float) -> int:
         """Begins the chosen episode; returns the stamp of its first data [ns].
 
-        Raises BackendError if the simulator refuses or does not answer, ModelError if it runs
-        another model or world.
+        Raises BackendError if the simulator refuses, ModelError if it runs another model or world.
         """
         response = self._link.call(self._reset, Trigger.Request(), timeout_s)
         if not response.success:

@@ -8,23 +8,16 @@ from typing import Any
 
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from nics_drl_bridge.nodes.conversions import message_type
-from nics_drl_bridge.nodes.qos import offer_of
+from nics_drl_bridge.nodes.qos import offer_of, profile_of
 from nics_drl_bridge.nodes.runner import open_context
+from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.report.doctor_facts import KINDS, Endpoints, Facts, names_in
 
 NAME = "nics_doctor"
-SPIN_S = 0.1
-LOOK_S = 0.5
-DISCOVERY_S = 10.0
-QUEUE = 100
-
-ANY_PUBLISHER = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=QUEUE, reliability=ReliabilityPolicy.BEST_EFFORT
-)
-"""Matches any offer, so that a topic is never silent because of the doctor."""
+SPIN_S, LOOK_S, DISCOVERY_S = 0.1, 0.5, 10.0
+ANY_PUBLISHER = profile_of(Offer(100, reliable=False))  # matches any offer, so hears every topic
 
 
 def listen(seconds: float, namespace: str = "", domain_id: int | None = None) -> Facts:

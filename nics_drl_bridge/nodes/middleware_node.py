@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 from nav_msgs.msg import Odometry
 from rclpy.context import Context
@@ -15,8 +16,7 @@ from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.lifecycle import ACTIVE, UNCONFIGURED, ManagedNode
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
 
-SILENCE_S = 5.0
-"""Diagnostics warn of a topic that has been silent for this long [s]."""
+SILENCE_S = 5.0  # diagnostics warn of a topic that has been silent for this long [s]
 
 
 class MiddlewareNode(ManagedNode):
@@ -41,10 +41,8 @@ class MiddlewareNode(ManagedNode):
         model = open_model(str(self.get_parameter("model").value))
         self._hardware = model.robot.name
         rehearse(model)
-        self._filtered = self.create_lifecycle_publisher(
-            Odometry, "odometry/filtered", qos.SENSOR_RELIABLE
-        )
-        self.undo.callback(self.destroy_lifecycle_publisher, self._filtered)
+        topic = "odometry/filtered"
+        self._filtered = self.create_lifecycle_publisher(Odometry, topic, qos.SENSOR_RELIABLE)
         self._topics = RobotTopics(self, model, on_odometry=self._publish)
         self.undo.callback(self._topics.close)
 
@@ -52,8 +50,7 @@ class MiddlewareNode(ManagedNode):
         if self.state != ACTIVE:
             return
         estimator = self._topics.middleware.estimator
-        # A pose or a yaw rate may have been newer.
-        stamp_ns = max(stamp_ns, estimator.time_ns)
+        stamp_ns = max(stamp_ns, estimator.time_ns)  # a pose or a yaw rate may have been newer
         view = self._topics.middleware.view(stamp_ns)
         frames = [str(self.get_parameter(f"{name}_frame").value) for name in ("map", "base")]
         message = conversions.odometry_to_ros(view.pose, view.twist, stamp_ns, frames, (0.0,) * 4)
@@ -99,10 +96,4 @@ def facts(health: Health) -> dict[str, str]:
     return found | {"late and put in place": str(health.replayed)}
 
 
-def main(args: list[str] | None = None) -> None:
-    """Entry point of the executable."""
-    runner.run_node(MiddlewareNode, args, "middleware_node")
-
-
-if __name__ == "__main__":
-    main()
+main = partial(runner.run_node, MiddlewareNode, sole_name="middleware_node")

@@ -6,29 +6,26 @@ import math
 import time
 import traceback
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, TwistStamped
-from numpy.typing import NDArray
 from rclpy.context import Context
 
 from nics_drl_bridge.errors import BridgeError, ConfigError, shortened
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.interface import Array, RobotView
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.lifecycle import ACTIVE, UNCONFIGURED, ManagedNode
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
-from nics_drl_bridge.nodes.runner import declare
 from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
 from nics_drl_bridge.policy.policies import open_policy
 
-POLLS = 0.1
-"""Time between two checks whether to act, as a share of the control period."""
-LONGEST_REASON = 300
-"""Greatest length of a policy's error text, in characters."""
+POLLS = 0.1  # time between two checks whether to act, as a share of the control period
+LONGEST_REASON = 300  # greatest length of a policy's error text, in characters
 
 
 class PolicyNode(ManagedNode):
@@ -45,22 +42,20 @@ class PolicyNode(ManagedNode):
         super().__init__("policy_node", context)
         runner.declare_model_name(self)
         declare_sensors(self)
-        declare(self, "base_frame", "base_link", "Frame id of the robot.")
-        rate = (
-            "Actions per second of the steady clock; NaN: of the control period; 0: one for each "
-            "scan, for a simulator that is not in real time."
-        )
-        policy = "A policy file (*.onnx), or the name of a shipped one or of a baseline."
-        deadline = "Longest time of an inference [s]; NaN: half the control period."
+        runner.declare(self, "base_frame", "base_link", "Frame id of the robot.")
         for name, default, about in (
-            ("policy", "dynamic_window", policy),
+            ("policy", "dynamic_window",
+             "A policy file (*.onnx), or the name of a shipped one or of a baseline."),
             ("goal", [math.nan] * 2, "x, y in map [m]; NaN waits for goal_pose."),
-            ("rate", math.nan, rate),
-            ("deadline", math.nan, deadline),
-        ):
-            declare(self, name, default, about, read_only=True)
+            ("rate", math.nan,
+             "Actions per second of the steady clock; NaN: of the control period; 0: one for each "
+             "scan, for a simulator that is not in real time."),
+            ("deadline", math.nan,
+             "Longest time of an inference [s]; NaN: half the control period."),
+        ):  # fmt: skip
+            runner.declare(self, name, default, about, read_only=True)
         about = "So many late inferences in a row command zero."
-        declare(self, "late_limit", 3, about, span=(1, 1000), read_only=True)
+        runner.declare(self, "late_limit", 3, about, span=(1, 1000), read_only=True)
         self._acted_ns = 0
         runner.Diagnostics(self, "policy", self._look)
 
@@ -68,11 +63,12 @@ class PolicyNode(ManagedNode):
         """Opens model and policy, and subscribes."""
         model = self._model = open_model(str(self.get_parameter("model").value))
         self._open_policy(model)
-        self._goal: NDArray[np.float64] = self._declared_goal()
+        self._goal: Array = np.array(self.get_parameter("goal").value, dtype=np.float64)
+        if len(self._goal) != 2:
+            raise ConfigError(f"parameter 'goal': must be [x, y], not {self._goal.tolist()}")
         self._pace, self._deadline = self._declared_pace(model.control_period)
         self._acted_ns = 0
         self._raw = self.create_lifecycle_publisher(TwistStamped, "cmd_vel_raw", qos.COMMAND)
-        self.undo.callback(self.destroy_lifecycle_publisher, self._raw)
         goals = self.create_subscription(PoseStamped, "goal_pose", self._on_goal, qos.COMMAND)
         self.undo.callback(self.destroy_subscription, goals)
         self._topics = RobotTopics(
@@ -96,9 +92,8 @@ class PolicyNode(ManagedNode):
                 "least 0, more than 0, and at least 1."
             )
         period = control_period if np.isnan(rate) else 1.0 / rate if rate > 0.0 else 0.0
-        return ActionPace(period), Deadline(
-            0.5 * control_period if np.isnan(limit) else limit, patience
-        )
+        limit = 0.5 * control_period if np.isnan(limit) else limit
+        return ActionPace(period), Deadline(limit, patience)
 
     def _open_policy(self, model: SimulatorModel) -> None:
         """Opens the policy for a model, and runs it once, so that it compiles now."""
@@ -117,12 +112,6 @@ class PolicyNode(ManagedNode):
             f"scans of {lidar.beams} beams from {begin:.4g} to {end:.4g} deg are {done}"
         )
 
-    def _declared_goal(self) -> NDArray[np.float64]:
-        goal = self.get_parameter("goal").value
-        if len(goal) != 2:
-            raise ConfigError(f"parameter 'goal': must be [x, y], not {list(goal)}")
-        return np.array(goal, dtype=np.float64)
-
     def _on_goal(self, message: PoseStamped) -> None:
         self._goal = np.array([message.pose.position.x, message.pose.position.y])
         self.get_logger().info(f"new goal ({self._goal[0]:.2f}, {self._goal[1]:.2f}) m")
@@ -131,14 +120,13 @@ class PolicyNode(ManagedNode):
         """Acts when due, once per scan, with an odometry at least as new."""
         if self.state != ACTIVE:
             return
-        newest = self._topics.middleware.cache.newest
+        newest, begin_s = self._topics.middleware.cache.newest, time.monotonic()
         needed = (SCAN, ODOM, *(sensor.name for sensor in self._task.sensors))
         if not newest.keys() >= set(needed):
             return
-        scan_ns, begin_s = newest[SCAN].stamp_ns, time.monotonic()
-        if newest[ODOM].stamp_ns < scan_ns or scan_ns <= self._acted_ns:
-            return
-        if not self._pace.due(begin_s):
+        scan_ns = newest[SCAN].stamp_ns
+        fresh = newest[ODOM].stamp_ns >= scan_ns > self._acted_ns
+        if not fresh or not self._pace.due(begin_s):
             return
         self._pace.acted(begin_s)
         self._acted_ns = scan_ns
@@ -156,12 +144,11 @@ class PolicyNode(ManagedNode):
     def _look(self) -> runner.Condition:
         if self.state == UNCONFIGURED:
             return runner.Condition(self.state, warns=False, facts={})
-        late, longest = self._deadline.late, f"{1e3 * self._deadline.longest_s:.2f}"
-        answered = self._deadline.answered
-        facts = {"answered": answered, "late": late, "longest inference [ms]": longest}
-        return runner.Condition(f"{self.state}; {late} late inferences", late > 0, facts)
+        done, longest = self._deadline, f"{1e3 * self._deadline.longest_s:.2f}"
+        facts = {"answered": done.answered, "late": done.late, "longest inference [ms]": longest}
+        return runner.Condition(f"{self.state}; {done.late} late inferences", done.late > 0, facts)
 
-    def _twist(self) -> NDArray[np.float64]:
+    def _twist(self) -> Array:
         """Returns the command (3,) for the present view; zero without a goal, at it, or on contact.
 
         With a pose sensor, it is also zero before the first pose.
@@ -177,7 +164,7 @@ class PolicyNode(ManagedNode):
             return np.zeros(3)
         return self._asked(view, self._goal)
 
-    def _asked(self, view: RobotView, goal: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _asked(self, view: RobotView, goal: Array) -> Array:
         """Returns the policy's command (3,). Its errors become BridgeError, which ends the node."""
         try:
             action = self._policy.act(self._task.observation(view, {"goal": goal}))
@@ -193,15 +180,9 @@ class PolicyNode(ManagedNode):
                 f"line {place.lineno}); the robot is stopped, mend the policy."
             ) from error
 
-    def _message(self, twist: NDArray[np.float64], stamp_ns: int) -> TwistStamped:
+    def _message(self, twist: Array, stamp_ns: int) -> TwistStamped:
         frame = str(self.get_parameter("base_frame").value)
         return conversions.stamped_to_ros(twist, stamp_ns, frame)
 
 
-def main(args: list[str] | None = None) -> None:
-    """Entry point of the executable."""
-    runner.run_node(PolicyNode, args, "policy_node")
-
-
-if __name__ == "__main__":
-    main()
+main = partial(runner.run_node, PolicyNode, sole_name="policy_node")

@@ -28,13 +28,10 @@ from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.runner import open_context, spin
 from nics_drl_bridge.nodes.transport import domains_in_use
 
-LAST_DOMAIN_ID, GREATEST_DOMAIN_ID = 101, 232
-"""Above the first, DDS ports may collide with Linux's ephemeral ports; above the other there
-are none."""
-PR_SET_PDEATHSIG = 1
-PATIENCE_S = 5.0
-LOG_LINES = 5
-ASK_AGAIN_S, ANSWER_S = 0.2, 2.0
+LAST_DOMAIN_ID = 101  # above it DDS ports may collide with Linux's ephemeral ports
+GREATEST_DOMAIN_ID = 232  # above it there are no ports
+PR_SET_PDEATHSIG, LOG_LINES = 1, 5
+PATIENCE_S, ASK_AGAIN_S, ANSWER_S = 5.0, 0.2, 2.0
 
 
 def free_domain_id() -> int:
@@ -44,9 +41,8 @@ def free_domain_id() -> int:
     """
     given = os.environ.get("ROS_DOMAIN_ID")
     if not given:
-        all_of_them = range(1, LAST_DOMAIN_ID + 1)
-        unused = sorted(set(all_of_them) - domains_in_use())
-        return random.SystemRandom().choice(unused or all_of_them)
+        every = range(1, LAST_DOMAIN_ID + 1)
+        return random.SystemRandom().choice(sorted(set(every) - domains_in_use()) or every)
     if not given.isdecimal() or int(given) > GREATEST_DOMAIN_ID:
         raise ConfigError(
             f"the environment variable ROS_DOMAIN_ID is {given!r}; it must be a number from 0 to "
@@ -80,35 +76,23 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
     """
 
     def __init__(
-        self,
-        node: str,
-        folder: Path,
-        parameters: Mapping[str, Any],
-        domain_id: int,
-        namespace: str = "",
-        remap: Mapping[str, str] | None = None,
-        discovery: str = "LOCALHOST",
-    ) -> None:
+        self, node: str, folder: Path, parameters: Mapping[str, Any], domain_id: int,
+        namespace: str = "", remap: Mapping[str, str] | None = None, discovery: str = "LOCALHOST",
+    ) -> None:  # fmt: skip
         self.node = node
         folder.mkdir(parents=True, exist_ok=True)
         self.log = folder / f"{node}.log"
         file = folder / f"{node}.yaml"
         file.write_text(dump_yaml({"/**": {"ros__parameters": dict(parameters)}}), encoding="utf-8")
+        space = {"__ns": f"/{namespace.strip('/')}"} if namespace else {}
+        rules = [f"{old}:={new}" for old, new in {**space, **(remap or {})}.items()]
         command = [sys.executable, "-m", "nics_drl_bridge.nodes.start", node, "--ros-args"]
-        command += ["--params-file", str(file)]
-        if namespace:
-            command += ["-r", f"__ns:=/{namespace.strip('/')}"]
-        for old, new in (remap or {}).items():
-            command += ["-r", f"{old}:={new}"]
-        environment = os.environ | {
-            "ROS_DOMAIN_ID": str(domain_id),
-            "ROS_AUTOMATIC_DISCOVERY_RANGE": discovery,
-        }
+        command += ["--params-file", str(file), *(word for rule in rules for word in ("-r", rule))]
+        chosen = {"ROS_DOMAIN_ID": str(domain_id), "ROS_AUTOMATIC_DISCOVERY_RANGE": discovery}
         with self.log.open("wb") as log:
-            # Its own session: Ctrl-C in the terminal reaches the parent alone, which then ends its
-            # children in order.
+            # Its own session: Ctrl-C in the terminal reaches the parent alone, which then ends it.
             self._process = subprocess.Popen(
-                command, env=environment, stdin=subprocess.DEVNULL, stdout=log,
+                command, env=os.environ | chosen, stdin=subprocess.DEVNULL, stdout=log,
                 stderr=subprocess.STDOUT, start_new_session=True, preexec_fn=_dies_with_parent(),
             )  # fmt: skip
 
@@ -122,9 +106,9 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
         code = self._process.poll()
         if code is not None:
             lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+            last = " | ".join(lines[-LOG_LINES:]) or "no output"
             raise BackendError(
-                f"{self.node} ended with code {code}: "
-                f"{' | '.join(lines[-LOG_LINES:]) or 'no output'} (its log is {self.log})."
+                f"{self.node} ended with code {code}: {last} (its log is {self.log})."
             )
 
     def close(self) -> int:
@@ -173,15 +157,13 @@ class Witness(AbstractContextManager["Witness", None]):
 
     def arrives(self, goal: ArrayLike, radius: float, timeout_s: float) -> bool:
         """Waits until the robot is within `radius` of a goal (2,); False after the time [s]."""
-        deadline = time.monotonic() + timeout_s
-        goal = np.asarray(goal)
+
+        def there() -> bool:
+            poses = self._poses[-1:]
+            return bool(poses) and bool(np.linalg.norm(poses[0][:2] - np.asarray(goal)) < radius)
+
         with self._changed:
-            while True:
-                if self._poses and np.linalg.norm(self._poses[-1][:2] - goal) < radius:
-                    return True
-                if time.monotonic() > deadline:
-                    return False
-                self._changed.wait(0.2)
+            return self._changed.wait_for(there, timeout_s)
 
     def arms(self, gate: str, timeout_s: float) -> str:
         """Requests a gate to let commands pass, repeatedly until it does.

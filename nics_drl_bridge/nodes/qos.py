@@ -64,8 +64,7 @@ EVERY_COMMAND = profile_of(Offer(10))
 """Commands in lock-step: each moves the world, and a second publisher must not replace the
 first one's unnoticed. Also `e_stop`, of which no press may be overwritten."""
 
-COMMAND = profile_of(Offer(1))
-"""Commands and goals: only the newest counts, and it has to arrive."""
+COMMAND = profile_of(Offer(1))  # commands and goals: only the newest counts, and it has to arrive
 
 TRANSFORMS = profile_of(Offer(100))
 """`/tf`: like tf2's own broadcasters, whose listeners request reliable."""
@@ -111,34 +110,28 @@ class QosWatch(Node):
 
         def say() -> None:
             self.destroy_timer(timer)
-            self.get_logger().warning(self._sentence(resolved, qos, policy, publishing))
+            ours = qos if isinstance(qos, QoSProfile) else QoSProfile(depth=qos)
+            name, theirs = self._misfit(resolved, ours, publishing)
+            own, other = (_value(profile, policy) for profile in (ours, theirs))
+            offered, asked, cure = (
+                (own, other, f"{name} ask for {own}")
+                if publishing
+                else (other, own, f"{name} offer {own}, or put a relay between")
+            )
+            self.get_logger().warning(
+                f"{resolved}: no message passes between this node and {name}: the {policy.lower()} "
+                f"that the publisher offers ({offered}) is less than what the subscription asks "
+                f"for ({asked}); let {cure}."
+            )
 
         timer = self.create_timer(MOMENT_S, say, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
-    def _sentence(self, topic: str, qos: Any, policy: str, publishing: bool) -> str:
-        """Returns what does not fit at a resolved topic; the policy is named as in rclpy."""
-        ours = qos if isinstance(qos, QoSProfile) else QoSProfile(depth=qos)
-        name, theirs = self._misfit(topic, ours, publishing)
-        own, other = (_value(profile, policy) for profile in (ours, theirs))
-        offered, asked, cure = (
-            (own, other, f"{name} ask for {own}")
-            if publishing
-            else (other, own, f"{name} offer {own}, or put a relay between")
-        )
-        return (
-            f"{topic}: no message passes between this node and {name}: the {policy.lower()} that "
-            f"the publisher offers ({offered}) is less than what the subscription asks for "
-            f"({asked}); let {cure}."
-        )
-
     def _misfit(self, topic: str, ours: QoSProfile, publishing: bool) -> tuple[str, Any]:
         """Returns name and profile of the last peer that does not fit, as far as known."""
-        peers = (
-            self.get_subscriptions_info_by_topic(topic)
-            if publishing
-            else self.get_publishers_info_by_topic(topic)
-        )
-        for peer in reversed(peers):
+        subscriptions, publishers = (
+            self.get_subscriptions_info_by_topic, self.get_publishers_info_by_topic
+        )  # fmt: skip
+        for peer in reversed((subscriptions if publishing else publishers)(topic)):
             pair = (ours, peer.qos_profile) if publishing else (peer.qos_profile, ours)
             if qos_check_compatible(*pair)[0] == QoSCompatibility.ERROR:
                 return owner(peer) or "a peer", peer.qos_profile

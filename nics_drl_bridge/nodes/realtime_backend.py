@@ -7,30 +7,27 @@ import time
 from collections.abc import Callable
 from typing import Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.config import Schema, validate
+from nics_drl_bridge.env.guard import halts_on_error
 from nics_drl_bridge.errors import BackendError, StaleDataError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import NS_PER_S, BackendFacts, RobotView, Start
+from nics_drl_bridge.interface import NS_PER_S, Array, BackendFacts, RobotView, Start
 from nics_drl_bridge.middleware.measurement import SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
-from nics_drl_bridge.nodes.link import EpisodeServices, Link, halted_after_an_error
+from nics_drl_bridge.nodes.link import EpisodeServices, Link
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, data_facts, declare_sensors
+from nics_drl_bridge.nodes.runner import holds
 from nics_drl_bridge.sim.world import World
 
-Array = NDArray[np.float64]
 RAW = "cmd_vel_raw"
 POLL_S, SAY_EVERY_S = 0.01, 2.0
-SERVICES_S = 0.5
-"""A peer that shows no services this long after its topics is a vehicle [s]."""
+SERVICES_S = 0.5  # a peer that shows no services this long after its topics is a vehicle [s]
 COMMAND_S, PERIODS = 0.5, 2
 """A command lasts this long, and at least this many periods; then a zero follows by itself."""
-STILL = (0.02, 0.05)
-"""A slower robot is at rest [m/s, rad/s]."""
+STILL = (0.02, 0.05)  # a slower robot is at rest [m/s, rad/s]
 ADVICE = (
     "start the robot, or `simulator_node` with mode:=realtime, in the same ROS_DOMAIN_ID and "
     "namespace."
@@ -79,12 +76,9 @@ class RealtimeBackend:
     ends on the grid of periods. Data feed the middleware as they arrive, in one executor thread;
     late and unordered ones are put in their place there.
 
-    Raises:
-        ConfigError: an option can't be used.
-        BackendError: no peer is there, a simulator refuses, or a vehicle does not come to rest at
-            its start.
-        ModelError: a simulator runs another model or world.
-        StaleDataError: the newest datum of a topic is older than `stale_after_s`.
+    Raises ConfigError if an option can't be used; BackendError if no peer is there, a simulator
+    refuses, or a vehicle does not come to rest at its start; ModelError if a simulator runs another
+    model or world; StaleDataError if a topic's newest datum is older than `stale_after_s`.
     """
 
     def __init__(self, model: SimulatorModel, world: World, **options: Any) -> None:
@@ -98,12 +92,10 @@ class RealtimeBackend:
             chosen.namespace, chosen.domain_id, chosen.command_topic,
             stamped=chosen.stamped or chosen.gated,
             parameters={
-                "pose_type": chosen.pose_type,
-                "use_imu": chosen.use_imu,
+                "pose_type": chosen.pose_type, "use_imu": chosen.use_imu,
                 "enable_stamped_cmd_vel": chosen.stamped,
             },
-            # A gate has its own timeout.
-            command_timeout_s=math.inf
+            command_timeout_s=math.inf  # a gate has its own timeout
             if chosen.gated
             else max(COMMAND_S, PERIODS * self._period_ns / NS_PER_S),
         )  # fmt: skip
@@ -115,24 +107,23 @@ class RealtimeBackend:
             clients = self._episodes.clients if chosen.vehicle is False else []
             self._link.wait_for_peers(self._topics.expected, clients, chosen.timeout_s, ADVICE)
             # A simulator's services may be found later than its topics.
-            deadline = time.monotonic() + SERVICES_S
-            while self._is_vehicle() and chosen.vehicle is None and time.monotonic() < deadline:
-                time.sleep(POLL_S)
+            known = chosen.vehicle is not None
+            holds(lambda: known or not self._is_vehicle(), SERVICES_S, POLL_S)
         except BaseException:
             self.close()
             raise
 
+    @halts_on_error
     def reset(self, start: Start) -> RobotView:
         """Begins an episode: by a simulator's service, or when a vehicle stands at the start."""
         self._link.check_open()
-        with halted_after_an_error(self._link):
-            self._link.halt()
-            if self._is_vehicle():
-                self._await_start(start)
-            if not self._is_vehicle():
-                self._begin(start)
-            self._misses, self._deadline_ns = 0, time.monotonic_ns() + self._period_ns
-            return self._fresh_view()[0]
+        self._link.halt()
+        if self._is_vehicle():
+            self._await_start(start)
+        if not self._is_vehicle():
+            self._begin(start)
+        self._misses, self._deadline_ns = 0, time.monotonic_ns() + self._period_ns
+        return self._fresh_view()[0]
 
     def _is_vehicle(self) -> bool:
         """True for a vehicle: by the options, otherwise if it shows no services of a simulator.
@@ -150,11 +141,8 @@ class RealtimeBackend:
         stamp_ns = self._episodes.begin(timeout_s)
         with self._topics.lock:
             self._topics.begin(stamp_ns, start.pose)
-        deadline = time.monotonic() + timeout_s
-        while math.isinf((late := self._oldest())[1]):
-            if time.monotonic() > deadline:
-                raise StaleDataError(*late, timeout_s)
-            time.sleep(POLL_S)
+        if not holds(lambda: math.isfinite(self._oldest()[1]), timeout_s, POLL_S):
+            raise StaleDataError(*self._oldest(), timeout_s)
 
     def _await_start(self, start: Start) -> None:
         """Waits until a vehicle stands at its start, and reports what is missing.
@@ -215,24 +203,24 @@ class RealtimeBackend:
         oldest = max(ages, key=lambda topic: ages[topic])
         return oldest, ages[oldest]
 
+    @halts_on_error
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
         """Publishes a command, waits for the end of the period; see `interface.Backend`."""
         self._link.check_open()
-        with halted_after_an_error(self._link):
-            stamp_ns = 0
-            if self._options.stamped or self._options.gated:
-                with self._topics.lock:
-                    stamp_ns = self._topics.middleware.cache.newest[SCAN].stamp_ns
-            self._link.send(self._robot.to_cmd_vel(command), stamp_ns)
-            late_ns = time.monotonic_ns() - self._deadline_ns
-            if late_ns > 0:
-                missed = late_ns // self._period_ns + 1
-                self._misses += missed
-                self._deadline_ns += missed * self._period_ns
-            while (left_ns := self._deadline_ns - time.monotonic_ns()) > 0:
-                time.sleep(left_ns / NS_PER_S)
-            self._deadline_ns += self._period_ns
-            return self._fresh_view()
+        stamp_ns = 0
+        if self._options.stamped or self._options.gated:
+            with self._topics.lock:
+                stamp_ns = self._topics.middleware.cache.newest[SCAN].stamp_ns
+        self._link.send(self._robot.to_cmd_vel(command), stamp_ns)
+        late_ns = time.monotonic_ns() - self._deadline_ns
+        if late_ns > 0:
+            missed = late_ns // self._period_ns + 1
+            self._misses += missed
+            self._deadline_ns += missed * self._period_ns
+        while (left_ns := self._deadline_ns - time.monotonic_ns()) > 0:
+            time.sleep(left_ns / NS_PER_S)
+        self._deadline_ns += self._period_ns
+        return self._fresh_view()
 
     def _fresh_view(self) -> tuple[RobotView, dict[str, Any]]:
         """Returns the newest view, with facts. Raises StaleDataError if it is too old."""

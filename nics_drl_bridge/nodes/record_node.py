@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from numpy.typing import NDArray
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -21,9 +20,8 @@ from sensor_msgs.msg import Imu, JointState
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, BridgeError, RecordingError
-from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.qos import QosWatch
 from nics_drl_bridge.nodes.runner import EXIT_BAD_INPUT, declare, last_word, run_node, steadily
 from nics_drl_bridge.recording.bag_file import Message
 from nics_drl_bridge.recording.bag_reader import joint_streams
@@ -35,11 +33,9 @@ from nics_drl_bridge.recording.topic_roles import TopicRoles, topic_roles
 from nics_drl_bridge.recording.write import check_out, write_drive
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
-Array = NDArray[np.float64]
 PATIENCE_S = 10.0
 POLL_S = 0.01
-HALT_S = 0.5
-"""Zero is repeated for this long [s]: a best-effort subscriber may miss one."""
+HALT_S = 0.5  # zero is repeated for this long [s]: a best-effort subscriber may miss one
 PERIOD_NS = round(PERIOD_S * NS_PER_S)
 PLACE = "recording"
 FEWEST = 2
@@ -72,14 +68,9 @@ def declare_drive(node: Node) -> DriveParameters:
         seed=get("seed", 0, "Of the pattern."),
     )
     topics = get("topics", "", "YAML file that names joints; none if empty.")
-    silence = "Stops after this silence of odom [s]."
-    return DriveParameters(
-        plan,
-        out,
-        odom_timeout=get("odom_timeout", 0.5, silence, span=(0.05, 10.0)),
-        stamped=get("stamped", False, "Whether cmd_vel is a TwistStamped."),
-        roles=topic_roles(Path(topics) if topics else None),
-    )
+    silence = get("odom_timeout", 0.5, "Stops after this silence of odom [s].", span=(0.05, 10.0))
+    stamped = get("stamped", False, "Whether cmd_vel is a TwistStamped.")
+    return DriveParameters(plan, out, silence, stamped, topic_roles(topics or None))
 
 
 class _Rows:
@@ -113,9 +104,9 @@ class _Rows:
 
     @property
     def pace(self) -> float:
-        """Seconds by stamp per second of receipt; 1 if it can't be determined.
+        """Seconds by stamp per second of receipt, by the least delayed message of each half.
 
-        It is determined by the least delayed message of each half, because delays vary.
+        It is 1 if it can't be determined.
         """
         heard, stamped = self.spans
         if heard <= 0 or stamped <= 0:
@@ -169,10 +160,9 @@ class DriveLog:
         self._joints.append(Message(self._now(), message))
 
     def check(self) -> None:
-        """Checks, before the robot moves, that the recording will be usable.
+        """Raises BackendError or RecordingError, before the robot moves, for an unusable recording.
 
-        Raises BackendError or RecordingError if a state that has to be measured is not, or stamps
-        run at another rate than the time of receipt.
+        A state that has to be measured is not, or stamps run at another rate than receipt.
         """
         measured = [v.name for v in self._spec.state if v.follows is None]
         if self._joints:
@@ -186,9 +176,9 @@ class DriveLog:
         pace, heard = self._odom.pace, self._odom.spans[0] / NS_PER_S
         if not SAME_PACE[0] <= pace <= SAME_PACE[1]:
             raise BackendError(
-                f"topic 'odom': its stamps went on by {pace * heard:.2f} s within "
-                f"{heard:.2f} s; where a simulator is the robot, take its time: "
-                "--use-sim-time, or -p use_sim_time:=true."
+                f"topic 'odom': its stamps went on by {pace * heard:.2f} s within {heard:.2f} s; "
+                "where a simulator is the robot, take its time: --use-sim-time, or "
+                "-p use_sim_time:=true."
             )
 
     def recording(self) -> Recording:
@@ -197,25 +187,24 @@ class DriveLog:
         In addition to such a pose, the twist of the odometry is kept, to determine its noise.
         Raises RecordingError if too little was received.
         """
-        pose = self._pose if len(self._pose) >= FEWEST else self._odom
-        if len(pose) < FEWEST or len(self._commands) < FEWEST:
+        posed = len(self._pose) >= FEWEST
+        rows = {"pose": self._pose if posed else self._odom, "imu": self._imu}
+        if posed:
+            rows["odometry"] = self._twist
+        if min(len(rows["pose"]), len(self._commands)) < FEWEST:
             raise RecordingError("recording: nothing was received that could be saved.")
-        commands = self._commands.data()
-        data = {
-            "command": TopicData(commands.topic, commands.receive_ns, None, commands.values),
-            "pose": pose.data(),
+        data: dict[str, TopicData | None] = {
+            "command": replace(self._commands.data(), header_ns=None),
+            **{name: each.data() for name, each in rows.items() if len(each) >= FEWEST},
         }
-        if pose is self._pose and len(self._twist) >= FEWEST:
-            data["odometry"] = self._twist.data()
-        if len(self._imu) >= FEWEST:
-            data["imu"] = self._imu.data()
         if len(self._joints) >= FEWEST:
             data |= joint_streams("joint_states", self._joints, self._spec, self._roles, PLACE)
+        known = {name: each for name, each in data.items() if each is not None}
         try:
-            found: dict[str, Any] = dict(streams(data, self._roles.stamps, PLACE))
+            found: dict[str, Any] = dict(streams(known, self._roles.stamps, PLACE))
         except RecordingError:
             # Poorer stamps are better than no recording of a drive that is over.
-            found = dict(streams(data, "receive", PLACE))
+            found = dict(streams(known, "receive", PLACE))
         return Recording(**found, source=PLACE, variables=self._spec.variable_names)
 
 
@@ -229,7 +218,7 @@ class DriveResult:
     line: str  # one sentence about it
 
 
-class RecordNode(QosWatch):
+class RecordNode(qos.QosWatch):
     """Sends `cmd_vel` at 20 Hz; writes `odom`, `joint_states`, `imu` and `pose` to a recording.
 
     The centre of the circle is the robot's place at the start; each segment of the drive is chosen
@@ -286,9 +275,9 @@ class RecordNode(QosWatch):
                 self._go_on()
         except BridgeError as error:
             self._end(error)
-            return
-        if self._drive.done:
-            self._end(None, complete=True)
+        else:
+            if self._drive.done:
+                self._end(None, complete=True)
 
     def _ready(self) -> bool:
         """True if the robot listens and reports its pose; raises BackendError after 10 s."""
@@ -303,11 +292,8 @@ class RecordNode(QosWatch):
             self._start, self._origin_ns = self._pose, self._now_ns()
             return True
         if time.monotonic() - self._began > PATIENCE_S:
-            name, missing = (
-                ("odom", "nothing arrived")
-                if self._pose is None
-                else ("cmd_vel", "nobody listened")
-            )
+            odom, command = ("odom", "nothing arrived"), ("cmd_vel", "nobody listened")
+            name, missing = odom if self._pose is None else command
             raise BackendError(
                 f"topic {self._place(name)}: {missing} within {PATIENCE_S:g} s; start the robot, "
                 "or correct namespace, ROS_DOMAIN_ID or remapping."
@@ -315,11 +301,8 @@ class RecordNode(QosWatch):
         return False
 
     def _place(self, topic: str) -> str:
-        """Returns a topic's full name, with namespace and domain, for messages."""
-        return (
-            f"{self.resolve_topic_name(topic)!r} (namespace {self.get_namespace()!r}, ROS domain "
-            f"{self.context.get_domain_id()})"
-        )
+        place = f"namespace {self.get_namespace()!r}, ROS domain {self.context.get_domain_id()}"
+        return f"{self.resolve_topic_name(topic)!r} ({place})"
 
     def _go_on(self) -> None:
         """Sends the command if one is due."""
@@ -336,11 +319,11 @@ class RecordNode(QosWatch):
 
     def _guard(self) -> None:
         """Raises BackendError if the robot must not continue."""
-        age = time.monotonic() - self._heard
-        if age > self._order.odom_timeout:
+        age, limit = time.monotonic() - self._heard, self._order.odom_timeout
+        if age > limit:
             raise BackendError(
                 f"topic {self._place('odom')}: nothing new for {age:.2f} s, which may be "
-                f"{self._order.odom_timeout:g} s; find out why odometry stopped."
+                f"{limit:g} s; find out why odometry stopped."
             )
         bound, radius = self._order.plan.bound, self._order.plan.robot.footprint_radius
         x, y, _ = geometry.between(self._start, self._start if self._pose is None else self._pose)
@@ -356,9 +339,8 @@ class RecordNode(QosWatch):
         self._log.command(command)
 
     def _message(self, twist: Array) -> Twist | TwistStamped:
-        if self._order.stamped:
-            return conversions.stamped_to_ros(twist, self._now_ns(), "")
-        return conversions.twist_to_ros(twist)
+        stamped = conversions.stamped_to_ros(twist, self._now_ns(), "")
+        return stamped if self._order.stamped else stamped.twist
 
     def stop(self) -> None:
         """Leaves the robot at rest, and saves what was recorded."""
@@ -419,7 +401,3 @@ def main(args: list[str] | None = None) -> None:
     sys.stderr.write(f"record_node: {outcome.line}\n")
     if outcome.failure is not None:
         raise SystemExit(EXIT_BAD_INPUT)
-
-
-if __name__ == "__main__":
-    main()

@@ -23,8 +23,7 @@ from nics_drl_bridge.report.pictures import drive_picture
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 NODE = "nics_drl_bridge.nodes.record_node"
-ARGUMENTS = ("namespace", "remap")
-"""Options that are no parameters of the node."""
+ARGUMENTS = ("namespace", "remap")  # options that are no parameters of the node
 
 
 @dataclass(frozen=True)
@@ -104,8 +103,7 @@ def drive(order: RecordOrder) -> tuple[tuple[str, ...], bool]:
 def summary(recording: Recording, robot: RobotSpec, order: RecordOrder) -> tuple[str, ...]:
     """Returns lines about the robot's path, the coverage of each command, and the next step."""
     place = recording.pose.values[:, :2] - recording.pose.values[0, :2]
-    path = float(np.hypot(*np.diff(place, axis=0).T).sum())
-    reach = float(np.hypot(*place.T).max())
+    path, reach = np.hypot(*np.diff(place, axis=0).T).sum(), np.hypot(*place.T).max()
     return (
         f"measured: a path of {path:.1f} m, up to {reach:.2f} m from the start",
         *(each.line() for each in coverage(recording, robot)),

@@ -15,7 +15,7 @@ from sensor_msgs.msg import Imu, LaserScan
 
 from nics_drl_bridge.errors import BridgeError, ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.interface import Array, RobotView
 from nics_drl_bridge.lidar.sectors import Reader
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
@@ -26,54 +26,47 @@ from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.runner import declare
 
 NO_POSE = "none"
-POSE_TYPES = {
-    "PoseStamped": PoseStamped,
-    "PoseWithCovarianceStamped": PoseWithCovarianceStamped,
-}
+POSE_TYPES = {each.__name__: each for each in (PoseStamped, PoseWithCovarianceStamped)}
 
 
 def declare_sensors(node: Node) -> None:
     """Declares the sensors that a robot has in addition to scan and odometry."""
-    pose_types = f"Type of `{POSE}`, in the map frame: {NO_POSE}, {', '.join(POSE_TYPES)}."
     upside_down = "Whether the lidar hangs with its z axis down, so that its beams come clockwise."
     for name, default, about in (
-        ("pose_type", NO_POSE, pose_types),
+        ("pose_type", NO_POSE,
+         f"Type of `{POSE}`, in the map frame: {NO_POSE}, {', '.join(POSE_TYPES)}."),
         ("lidar_upside_down", False, upside_down),
         ("use_imu", False, "Whether to use the yaw rate of `imu`."),
         ("enable_stamped_cmd_vel", False, f"Whether `{CMD_VEL}` is a TwistStamped."),
-    ):
+    ):  # fmt: skip
         declare(node, name, default, about, read_only=True)
 
 
 class RobotTopics:
     """Subscribes to a robot's topics and keeps the middleware up to date.
 
-    These are `scan`, `odom`, `cmd_vel` and those of the model's further sensors, and, as the node's
-    parameters `pose_type` and `use_imu` request, `pose` and `imu`. `declare_sensors` has to be
-    called before, for these parameters and whether `cmd_vel` is stamped. A reader in another thread
-    than the spinning one holds `lock`.
+    These are `scan`, `odom`, `cmd_vel` and those of the model's further sensors, and `pose` and
+    `imu` as requested by the parameters that `declare_sensors` has declared. A reader in another
+    thread than the spinning one holds `lock`.
     Data are used at their own stamps; a command, which has none, at the stamp of the newest datum
-    before it. The first odometry fixes `map`, unless there is a pose sensor: then the first pose
-    does.
+    before it. The first odometry fixes `map`, unless there is a pose sensor: then the first pose.
 
     `on_odometry` and `on_scan` are called with the stamp [ns] after each odometry that is the
-    newest, and each scan that was used. `on_lidar` is called with the lidar of scans with a header
-    other than the model's; if it raises ConfigError, they are rejected. Without it only scans
-    with another number of beams are rejected. `now_ns` is the clock of arrivals, the node's by
-    default. Raises ConfigError if `pose_type` is unknown.
+    newest, and each scan that was used; `on_lidar` with the lidar of scans with a header other than
+    the model's, which are rejected if it raises ConfigError. Without it only scans with another
+    number of beams are rejected. `now_ns` is the clock of arrivals, the node's by default. Raises
+    ConfigError if `pose_type` is unknown.
     """
 
     def __init__(
-        self,
-        node: Node,
-        model: SimulatorModel,
-        on_odometry: Callable[[int], None] | None = None,
+        self, node: Node, model: SimulatorModel, on_odometry: Callable[[int], None] | None = None,
         on_scan: Callable[[int], None] | None = None,
         on_lidar: Callable[[LidarSpec], None] | None = None,
         now_ns: Callable[[], int] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._node, self._robot, self._lidar = node, model.robot, model.lidar
-        self._model, self._clock_ns = model, now_ns
+        self._model = model
+        self.now_ns = now_ns or (lambda: int(node.get_clock().now().nanoseconds))
         self.lock = threading.RLock()
         self.middleware = Middleware(model)
         self.restart()
@@ -82,8 +75,8 @@ class RobotTopics:
         self._header, self._told = b"", ""
         self._subscriptions: list[Any] = []
         stamped = bool(node.get_parameter("enable_stamped_cmd_vel").value)
-        command = (TwistStamped, self._take_stamped) if stamped else (Twist, self._take_command)
-        self._subscribe(CMD_VEL, *command, qos.COMMAND)
+        command = TwistStamped if stamped else Twist
+        self._subscribe(CMD_VEL, command, self._take_command, qos.COMMAND)
         sensors: dict[str, tuple[Any, Callable[[Any], None]]] = {
             SCAN: (LaserScan, self._take_scan),
             ODOM: (Odometry, self._take_odometry),
@@ -123,7 +116,7 @@ class RobotTopics:
         self._started, self._since_ns = False, 0
         self.middleware.reset(0, np.zeros(3))
 
-    def begin(self, stamp_ns: int, pose: conversions.Array) -> None:
+    def begin(self, stamp_ns: int, pose: Array) -> None:
         """Clears all state before a stamp [ns], at which the robot stands at a pose (3,)."""
         self._started, self._since_ns = True, stamp_ns
         self.middleware.reset(stamp_ns, pose)
@@ -141,12 +134,6 @@ class RobotTopics:
     def view(self) -> RobotView:
         """Returns the view at the stamp of the newest datum."""
         return self.middleware.view(self.newest_ns)
-
-    def now_ns(self) -> int:
-        """Returns the time on the clock of arrivals [ns]."""
-        if self._clock_ns is not None:
-            return self._clock_ns()
-        return int(self._node.get_clock().now().nanoseconds)
 
     def _take_scan(self, message: LaserScan) -> None:
         stamp = conversions.stamp_from_ros(message.header.stamp)
@@ -218,19 +205,13 @@ class RobotTopics:
             return
         self.middleware.sense(sensor.name, stamp, self.now_ns(), reading)
 
-    def _take_stamped(self, message: TwistStamped) -> None:
-        self._take_command(message.twist)
-
-    def _take_command(self, message: Twist) -> None:
-        command = self._robot.from_cmd_vel(conversions.twist_from_ros(message))
-        self.middleware.command(None, command)
+    def _take_command(self, message: Twist | TwistStamped) -> None:
+        twist = message.twist if isinstance(message, TwistStamped) else message
+        self.middleware.command(None, self._robot.from_cmd_vel(conversions.twist_from_ros(twist)))
 
 
 def data_facts(middleware: Middleware, now_ns: int) -> dict[str, Any]:
-    """Returns facts for `info`: number, stamp [ns] and silence [s] of each topic's newest datum.
-
-    The silence is the time since its arrival, on the receiver's clock, which also gives `now_ns`.
-    """
+    """Returns facts for `info`: number, stamp [ns] and silence [s] of each topic's newest datum."""
     facts: dict[str, Any] = {}
     for topic, datum in middleware.cache.newest.items():
         facts[f"{topic}_sequence"] = datum.sequence

@@ -35,15 +35,11 @@ from nics_drl_bridge.nodes.transport import OF_THIS_PROCESS
 SPIN_S = 0.1
 DELIVERY_S = 0.5
 EXIT_BAD_INPUT = 2
-SETTLE_S, POLL_S = 0.3, 0.02
-"""Time until the graph shows all nodes [s]."""
+SETTLE_S, POLL_S = 0.3, 0.02  # time until the graph shows all nodes [s]
 ANSWER_S = 1.5
 """A node that does not answer within this time is dead; the graph shows it for some 20 s more."""
 DIAGNOSTICS_S = 1.0
-RANGES = {
-    int: (IntegerRange, "integer_range"),
-    float: (FloatingPointRange, "floating_point_range"),
-}
+RANGES = {int: (IntegerRange, "integer_range"), float: (FloatingPointRange, "floating_point_range")}
 QOS, SHARED = "qos_overrides.", "model"
 """Names of parameters that rclpy reads itself, if a publisher or subscription requests it; and one
 that a file sets for all nodes at once, including those that have no model."""
@@ -54,11 +50,9 @@ def open_context(args: Sequence[str] | None = None, domain_id: int | None = None
 
     A robot that others should see sets `ROS_AUTOMATIC_DISCOVERY_RANGE` (on Humble
     `ROS_LOCALHOST_ONLY=0`); by default a simulator in a lab can't move another robot. Fast DDS
-    sends by UDP, unless the environment chooses otherwise (`transport`).
-
-    Raises:
-        BackendError: the arguments are wrong, no ROS 2 middleware is there, or discovery should
-            reach further than that of an earlier context of this process.
+    sends by UDP, unless the environment chooses otherwise (`transport`). Raises BackendError if the
+    arguments are wrong, no ROS 2 middleware is there, or discovery should reach further than that
+    of an earlier context of this process.
     """
 
     def make() -> Context:
@@ -110,12 +104,12 @@ def run_node(
             node.get_logger().warning(sentence)
         starting.clear()
         spin(node, stopping)
-    except (BridgeError, ParameterException) as error:
-        sys.stderr.write(f"{' '.join(str(error).split())}\n")
-        raise SystemExit(EXIT_BAD_INPUT) from None
-    except OSError as error:
-        place = f"{error.filename}: " if error.filename else ""
-        sys.stderr.write(f"{place}{error.strerror or error}; choose another place.\n")
+    except (BridgeError, ParameterException, OSError) as error:
+        sentence = " ".join(str(error).split())
+        if isinstance(error, OSError):
+            place = f"{error.filename}: " if error.filename else ""
+            sentence = f"{place}{error.strerror or error}; choose another place."
+        sys.stderr.write(f"{sentence}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
     finally:
         starting.clear()
@@ -126,6 +120,16 @@ def run_node(
         if context is not None:
             context.try_shutdown()
         alone.close()
+
+
+def holds(condition: Callable[[], Any], seconds: float, poll_s: float) -> bool:
+    """Waits until a condition holds; False if it does not within the time."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(poll_s)
+    return True
 
 
 def spin(node: Node, stopping: threading.Event) -> None:
@@ -142,56 +146,45 @@ def spin(node: Node, stopping: threading.Event) -> None:
 def sole(context: Context, name: str) -> Iterator[None]:
     """Ensures a single instance while a node runs: if its name is taken, it does not start.
 
-    Two that start at the same moment on one machine are told apart by the name of a socket, which
-    only one of them gets, and which ends with its process. Others, and nodes of other packages, are
-    found in the graph and asked whether they are alive. The arguments of the context may set
-    another name or a namespace. Raises BackendError if another instance is running.
+    Two that start at the same moment on one machine (and network namespace) are told apart by the
+    name of a socket, which only one of them gets, and which ends with its process. Others, and
+    nodes of other packages, are found in the graph and asked whether they are alive. The arguments
+    of the context may set another name or a namespace. Raises BackendError if another is running.
     """
-    probe = Node(
-        name, context=context, start_parameter_services=False, enable_rosout=False
-    )  # resolves its name as the node will
-    claim = None
-    try:
-        whole = probe.get_fully_qualified_name()
-        claim = _claimed(f"{context.get_domain_id()} {whole}")
-        if claim is None or (_seen(probe, whole) and _lives(probe, whole)):
-            raise BackendError(
-                f"a node {whole!r} runs already in ROS domain {context.get_domain_id()}; end it, "
-                "or give this one another namespace: `--ros-args -r __ns:=/robot_2`."
-            )
-    except BaseException:
-        if claim is not None:
-            claim.close()
-        raise
-    finally:
-        probe.destroy_node()
-    with claim:
+    # The probe resolves its name as the node will.
+    probe = Node(name, context=context, start_parameter_services=False, enable_rosout=False)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as claim:
+        try:
+            whole, domain = probe.get_fully_qualified_name(), context.get_domain_id()
+            taken = not _claims(claim, f"{domain} {whole}")
+            if taken or (_seen(probe, whole) and _lives(probe, whole)):
+                raise BackendError(
+                    f"a node {whole!r} runs already in ROS domain {domain}; end it, or give this "
+                    "one another namespace: `--ros-args -r __ns:=/robot_2`."
+                )
+        finally:
+            probe.destroy_node()
         yield
 
 
-def _claimed(key: str) -> socket.socket | None:
-    """Returns what only one process per machine (and network namespace) can have, or None."""
-    claim = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-    if sys.platform != "linux":
-        return claim
-    try:
-        claim.bind(b"\0nics_drl_bridge " + hashlib.sha256(key.encode()).hexdigest().encode())
-    except OSError:
-        claim.close()
-        return None
-    return claim
+def _claims(claim: socket.socket, key: str) -> bool:
+    """Binds a socket to a name, on Linux; False if another has it."""
+    name = b"\0nics_drl_bridge " + hashlib.sha256(key.encode()).hexdigest().encode()
+    with contextlib.suppress(OSError):
+        if sys.platform == "linux":
+            claim.bind(name)
+        return True
+    return False
 
 
 def _seen(probe: Node, whole: str) -> bool:
     """True if the graph shows another node of the probe's name within `SETTLE_S`."""
-    deadline = time.monotonic() + SETTLE_S
-    while True:
+
+    def shows() -> bool:
         nodes = probe.get_node_names_and_namespaces()
-        if [f"{space.rstrip('/')}/{name}" for name, space in nodes].count(whole) > 1:
-            return True
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(POLL_S)
+        return [f"{space.rstrip('/')}/{name}" for name, space in nodes].count(whole) > 1
+
+    return holds(shows, SETTLE_S, POLL_S)
 
 
 def _lives(probe: Node, whole: str) -> bool:
@@ -201,8 +194,7 @@ def _lives(probe: Node, whole: str) -> bool:
     executor.add_node(probe)
     deadline = time.monotonic() + ANSWER_S
     try:
-        while not client.service_is_ready() and time.monotonic() < deadline:
-            time.sleep(POLL_S)
+        holds(client.service_is_ready, ANSWER_S, POLL_S)
         answer = client.call_async(GetParameters.Request())
         executor.spin_until_future_complete(answer, max(0.1, deadline - time.monotonic()))
         return bool(answer.done())
@@ -237,13 +229,9 @@ def declare_model_name(node: Node) -> str:
 
 
 def declare(
-    node: Node,
-    name: str,
-    default: Any,
-    description: str,
-    span: tuple[float, float] | None = None,
+    node: Node, name: str, default: Any, description: str, span: tuple[float, float] | None = None,
     read_only: bool = False,
-) -> Any:
+) -> Any:  # fmt: skip
     """Declares a parameter of the default's type, and returns its value, which lies in a span.
 
     In a managed node `read_only` applies from configure to cleanup. `rate:=2` may be given for a
@@ -266,11 +254,7 @@ def declare(
 
 
 def _given_values(node: Node) -> dict[str, Parameter]:
-    """Returns the initial values given to the node, by name; the node's own dictionary.
-
-    The only public access in rclpy is to accept undeclared parameters, which would accept misspelt
-    ones.
-    """
+    """Returns the node's own dictionary of initial values, to which rclpy has no public access."""
     found: dict[str, Parameter] = getattr(node, "_parameter_overrides", {})
     return found
 
@@ -295,10 +279,7 @@ class Condition(NamedTuple):
 
 
 class Diagnostics:
-    """Publishes a node's finding about itself once a second, in the format of the aggregator.
-
-    The name of the status is that of the node, with a part; `look` returns the finding.
-    """
+    """Publishes a node's finding about itself, which `look` returns, once a second."""
 
     def __init__(self, node: Node, part: str, look: Callable[[], Condition]) -> None:
         self._node, self._look = node, look

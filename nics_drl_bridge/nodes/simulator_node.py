@@ -2,43 +2,292 @@
 
 from __future__ import annotations
 
+import heapq
+import itertools
 import json
+import math
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import TransformStamped, Twist, TwistStamped
+from nav_msgs.msg import Odometry
+from numpy.typing import ArrayLike
 from rclpy.context import Context
 from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import JointState, LaserScan
 from std_srvs.srv import SetBool
 
+from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import NS_PER_S, Simulator
+from nics_drl_bridge.interface import NS_PER_S, Array, Simulator
 from nics_drl_bridge.lidar.scanner import RENDERERS, Renderer
-from nics_drl_bridge.nodes import conversions, device_parameters, qos, runner
-from nics_drl_bridge.nodes.device_parameters import RealTime, TopicPace, declare_device, number
-from nics_drl_bridge.nodes.device_robot import CommandInlet, Outbox, RobotPort, Transforms
-from nics_drl_bridge.nodes.qos import QosWatch, owner
-from nics_drl_bridge.sim.device import DeviceWorld
+from nics_drl_bridge.lidar.sensor import Sensor
+from nics_drl_bridge.lidar.spec import to_device
+from nics_drl_bridge.nodes import conversions, device_parameters, qos, runner, wire
+from nics_drl_bridge.nodes.conversions import sensor_to_ros, sensor_type
+from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, variances
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World, load_world
 
-Array = NDArray[np.float64]
 CLOCK = "/clock"
-WATCH_S = 2.0
-LONGEST_TICK_S = 0.005
-"""Longest time between two checks for delayed data that are due [s]."""
+WATCH_S, QUIET_S = 2.0, 5.0
+LONGEST_TICK_S = 0.005  # longest time between two checks for delayed data that are due [s]
 
+# Makes the simulator of some robots; may declare its own parameters at the node. Its control
+# period is that of the given model.
 MakeSimulator = Callable[[Node, SimulatorModel, World, int], Simulator]
-"""Makes the simulator of a number of robots; may declare its own parameters at the node. Its
-control period is that of the given model."""
+TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+# The setting that selects the other type.
+SWITCH = {STAMPED: "enable_stamped_cmd_vel:=false", TWIST: "enable_stamped_cmd_vel:=true"}
 
 
-class DeviceNode(QosWatch):
+class RobotPort:
+    """Publishes `scan`, `odom`, further sensors, `joint_states`, `ground_truth` of one robot.
+
+    The last two cost nothing without subscribers. The namespace is empty or ends with a slash.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        namespace: str,
+        model: SimulatorModel,
+        frames: device_parameters.Frames,
+        time: device_parameters.DeviceTiming,
+    ) -> None:
+        self._model, self._time, self.frames = model, time, frames
+        quality = qos.SENSOR_RELIABLE
+        self._scans = node.create_publisher(LaserScan, f"{namespace}scan", quality)
+        self._odoms = node.create_publisher(Odometry, f"{namespace}odom", quality)
+        self._truths = node.create_publisher(Odometry, f"{namespace}ground_truth", quality)
+        self._joints = node.create_publisher(JointState, f"{namespace}joint_states", quality)
+        self._sensors = [
+            (each, node.create_publisher(sensor_type(each), f"{namespace}{each.name}", quality))
+            for each in model.sensors
+        ]
+        free = np.full(model.lidar.beams, np.inf, np.float32)
+        scan = conversions.scan_to_ros(model.lidar, free, 0, frames.laser)
+        scan.scan_time = time.scan_ns / NS_PER_S
+        # Beam 0 of a device that turns counter-clockwise was measured first.
+        sweep_s = max(0.0, scan.time_increment) * (model.lidar.beams - 1)
+        self._sweep_ns = 0 if time.lockstep else round(sweep_s * NS_PER_S)
+        self._scan = wire.ScanWriter(scan)
+        linear, _, turn = variances(model.noise.odometry)
+        self._odom, self._truth = (
+            wire.OdometryWriter(
+                conversions.odometry_to_ros(
+                    np.zeros(3), np.zeros(3), 0, (parent, frames.base), variance
+                )
+            )
+            for parent, variance in (
+                (frames.odom, (LEAST_VARIANCE, LEAST_VARIANCE, linear, turn)),
+                (frames.map, (LEAST_VARIANCE,) * 4),
+            )
+        )
+        self._locates = bool(node.get_parameter("publish_map_to_odom").value)
+
+    def mounts(self) -> list[TransformStamped]:
+        """Returns the transforms base_link -> laser, and to each further sensor."""
+        mounted = [(self.frames.laser, self._model.lidar.mount)]
+        mounted += [(self._frame_of(sensor), sensor.mount) for sensor, _ in self._sensors]
+        base = self.frames.base
+        return [transform_to_ros(base, frame, place, Time()) for frame, place in mounted]
+
+    def _frame_of(self, sensor: Sensor) -> str:
+        return self.frames.prefix + sensor.frame
+
+    def moving(self, now: Time, sensed: Sensed) -> list[TransformStamped]:
+        """Returns the transforms odom -> base_link, and map -> odom if requested."""
+        frames = self.frames
+        moving = [transform_to_ros(frames.odom, frames.base, sensed.odom, now)]
+        if self._locates:
+            home = geometry.compose(sensed.pose, geometry.between(sensed.odom, np.zeros(3)))
+            moving.append(transform_to_ros(frames.map, frames.odom, home, now))
+        return moving
+
+    def publish_odometry(self, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
+        """Publishes odometry, and joints and true pose if they have subscribers."""
+        late_ns = self._time.odom_late_ns
+        odometry = self._odom.write(now_ns, sensed.odom, sensed.twist, sensed.covariance)
+        outbox.send(self._odoms, odometry, now_ns, late_ns)
+        if self._joints.get_subscription_count():
+            joints = conversions.joints_to_ros(self._model.robot, sensed.state, now_ns)
+            outbox.send(self._joints, joints, now_ns, late_ns)
+        if self._truths.get_subscription_count():
+            self._truths.publish(self._truth.write(now_ns, sensed.pose, sensed.true_twist))
+
+    def publish_scan(self, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
+        """Publishes the scan, stamped with the time of beam 0, and readings of further sensors."""
+        ranges = to_device(sensed.ranges, self._model.lidar)
+        message = self._scan.write(now_ns - self._sweep_ns, ranges)
+        outbox.send(self._scans, message, now_ns, self._time.scan_late_ns)
+        for sensor, publisher in self._sensors:
+            reading = sensed.readings[sensor.name]
+            late_ns, frame = self._time.scan_late_ns, self._frame_of(sensor)
+            outbox.send(publisher, sensor_to_ros(sensor, reading, now_ns, frame), now_ns, late_ns)
+
+
+class CommandInlet:
+    """Listens to `cmd_vel`, and to `ackermann_cmd` if the robot steers and the message exists.
+
+    The node's parameter `enable_stamped_cmd_vel` selects the type. A stamped command is treated as
+    by ros2_control's drive controllers: a stamp of zero counts as now, and one older than the
+    command timeout is ignored. `take` gets each command (C,) whose stamp [ns] is not `too_old`.
+    """
+
+    def __init__(
+        self, node: Node, namespace: str, robot: RobotSpec, quality: QoSProfile,
+        take: Callable[[Array], None], too_old: Callable[[int], bool],
+    ) -> None:  # fmt: skip
+        self._node, self._robot, self._take, self._too_old = node, robot, take, too_old
+        stamped = bool(node.get_parameter("enable_stamped_cmd_vel").value)
+        self._kind = STAMPED if stamped else TWIST
+        kind, hear = (TwistStamped, self._on_stamped) if stamped else (Twist, self._on_bytes)
+        self._topic: str = node.create_subscription(
+            kind, f"{namespace}cmd_vel", hear, quality, raw=not stamped
+        ).topic_name
+        self._warned: set[str] = set()
+        kind = conversions.message_type("ackermann_msgs/msg/AckermannDriveStamped")
+        if robot.steers and kind is not None:  # its package is optional
+            topic = f"{namespace}ackermann_cmd"
+            node.create_subscription(kind, topic, self._on_ackermann, quality)
+
+    def _on_bytes(self, content: bytes) -> None:
+        try:
+            self._obey(wire.twist_of(content))
+        except wire.UNREADABLE as error:
+            self._complain(f"a message that can't be read ({error}) is ignored")
+
+    def _obey(self, twist: tuple[float, float, float]) -> None:
+        if all(map(math.isfinite, twist)):
+            self._take(self._robot.from_cmd_vel(twist))
+        else:
+            self._complain("NaN or inf ignored")
+
+    def _on_stamped(self, message: TwistStamped) -> None:
+        if self._is_fresh(message.header.stamp):
+            twist = message.twist
+            self._obey((twist.linear.x, twist.linear.y, twist.angular.z))
+
+    def _on_ackermann(self, message: Any) -> None:
+        if self._is_fresh(message.header.stamp):
+            self._obey((message.drive.speed, 0.0, message.drive.steering_angle))
+
+    def _is_fresh(self, stamp: Any) -> bool:
+        stamp_ns = conversions.stamp_from_ros(stamp)
+        if not stamp_ns or not self._too_old(stamp_ns):
+            return True
+        self._complain(
+            "a command is ignored, because its stamp is older than command_timeout; do both ends "
+            "take their time from the same clock (use_sim_time)?"
+        )
+        return False
+
+    def _complain(self, what: str) -> None:
+        self._node.get_logger().warning(f"{self._topic}: {what}", throttle_duration_sec=QUIET_S)
+
+    def watch(self) -> None:
+        """Warns once of each node that publishes the other type, which is never received."""
+        for end in self._node.get_publishers_info_by_topic(self._topic):
+            kind, who = end.topic_type, qos.owner(end)
+            if kind == self._kind or who is None or f"{who} {kind}" in self._warned:
+                continue
+            self._warned.add(f"{who} {kind}")
+            switch = SWITCH[self._kind] if kind in SWITCH else "another type there"
+            self._node.get_logger().warning(
+                f"{self._topic}: {who} publishes {kind}, but {self._kind} is expected here, so "
+                f"that its commands are not heard; let it publish that, or set {switch}."
+            )
+
+
+class Outbox:
+    """Publishes messages after a latency and a jitter, each topic in order, or at once."""
+
+    def __init__(self) -> None:
+        self._random = np.random.default_rng(0)
+        self._waiting: list[tuple[int, int, Publisher, bytes]] = []
+        self._latest: dict[Publisher, int] = {}
+        self._numbers = itertools.count()
+
+    def send(
+        self, publisher: Publisher, message: Any, now_ns: int, late_ns: tuple[int, int]
+    ) -> None:
+        """Publishes a message, or its bytes, now, or schedules it.
+
+        `late_ns` is the least delay, and the greatest additional one, drawn uniformly for each.
+        """
+        delay, jitter = late_ns
+        if jitter:
+            delay += int(self._random.integers(jitter + 1))
+        if not delay:
+            publisher.publish(message)
+            return
+        due = max(now_ns + delay, self._latest.get(publisher, 0))
+        self._latest[publisher] = due
+        content = message if isinstance(message, bytes) else serialize_message(message)
+        heapq.heappush(self._waiting, (due, next(self._numbers), publisher, content))
+
+    def flush(self, now_ns: int) -> None:
+        """Publishes what is due."""
+        while self._waiting and self._waiting[0][0] <= now_ns:
+            _, _, publisher, content = heapq.heappop(self._waiting)
+            publisher.publish(content)
+
+    def clear(self) -> None:
+        """Drops the waiting messages: they are from an episode that is over."""
+        self._waiting.clear()
+        self._latest.clear()
+
+
+def transform_to_ros(parent: str, child: str, pose: ArrayLike, stamp: Time) -> TransformStamped:
+    """Returns a pose (3,) of a child frame in its parent as a transform."""
+    x, y, heading = np.asarray(pose, np.float64).tolist()
+    message = TransformStamped(child_frame_id=child)
+    message.header.frame_id, message.header.stamp = parent, stamp
+    message.transform.translation.x, message.transform.translation.y = x, y
+    message.transform.rotation = conversions.heading_to_ros(heading)
+    return message
+
+
+class Transforms:
+    """Publishes transforms; if tf2_msgs is not installed, it logs that once."""
+
+    def __init__(self, node: Node) -> None:
+        kind = conversions.message_type("tf2_msgs/msg/TFMessage")
+        self.published = kind is not None
+        if kind is None:
+            node.get_logger().warning(
+                "the message package tf2_msgs is not installed, so that neither /tf nor /tf_static "
+                "is published; install it with your ROS 2 distribution."
+            )
+            return
+        self._kind = kind
+        self._moving = node.create_publisher(kind, "/tf", qos.TRANSFORMS)
+        self._fixed = node.create_publisher(kind, "/tf_static", qos.FIXED_TRANSFORMS)
+
+    def publish_fixed(self, transforms: list[TransformStamped]) -> None:
+        """Publishes once what never changes; late joiners get it, too."""
+        if self.published:
+            self._fixed.publish(self._kind(transforms=transforms))
+
+    def publish(
+        self, moving: list[TransformStamped], outbox: Outbox, now_ns: int, late_ns: tuple[int, int]
+    ) -> None:
+        """Publishes what changes, with the delay of the odometry that it comes from."""
+        outbox.send(self._moving, self._kind(transforms=moving), now_ns, late_ns)
+
+
+class DeviceNode(qos.QosWatch):
     """Takes `cmd_vel`; publishes `scan`, `odom`, `joint_states`, `ground_truth`, `/clock`, `/tf`.
 
     With the parameter `robots` it is a fleet in one world, each robot in a namespace below the
@@ -52,7 +301,7 @@ class DeviceNode(QosWatch):
     def __init__(self, name: str, context: Context, make: MakeSimulator) -> None:
         super().__init__(name, context=context)
         model = runner.declare_model(self)
-        declare_device(self, model.lidar.frame)
+        device_parameters.declare_device(self, model.lidar.frame)
         self._time = device_parameters.timing(self, model)
         self._names = device_parameters.namespaces(self)
         world = load_world(str(self.get_parameter("world").value))
@@ -60,32 +309,27 @@ class DeviceNode(QosWatch):
         model = device_parameters.timed_model(self, model, self._time)
         simulator = make(self, model, world, len(self._names))
         self._world = DeviceWorld(simulator, model, len(self._names))
-        self._now_ns = 0
         self._command_ns = np.zeros(len(self._names), np.int64)
         self._heard = np.zeros(len(self._names), np.bool_)
-        self._paused = False
+        self._paused, self._lags, self._hardware = False, 0, model.robot.name
         self._world.advance()  # compiles before anything waits for it
-        self._lags, self._hardware = 0, model.robot.name
+        self._now_ns = time.time_ns() // self._time.step_ns * self._time.step_ns
         self._open_topics(model)
         self._start_time()
-        self._now_ns = time.time_ns() // self._time.step_ns * self._time.step_ns
         self._begin()
 
     def _open_topics(self, model: SimulatorModel) -> None:
         self._outbox = Outbox()
         self._clock_topic = self.create_publisher(Clock, CLOCK, qos.SENSOR_RELIABLE)
         self._clocks = {self.get_fully_qualified_name()}
-        self._clock_message = Clock()
         self._transforms = Transforms(self)
         self._ports, self._inlets = [], []
         commands = qos.EVERY_COMMAND if self._time.lockstep else qos.COMMAND
         for k, name in enumerate(self._names):
             space, frames = f"{name}/" if name else "", device_parameters.frames(self, name)
             self._ports.append(RobotPort(self, space, model, frames, self._time))
-            take = partial(self._on_command, k)
-            self._inlets.append(
-                CommandInlet(self, space, model.robot, commands, take, self._too_old)
-            )
+            given = model.robot, commands, partial(self._on_command, k), self._too_old
+            self._inlets.append(CommandInlet(self, space, *given))
         self._transforms.publish_fixed([each for port in self._ports for each in port.mounts()])
         runner.serve(self, "~/reset", self._reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
@@ -98,9 +342,10 @@ class DeviceNode(QosWatch):
         runner.steadily(self, WATCH_S, self._watch)
         step_ns = self._time.step_ns
         self._odom_pace, self._scan_pace = (
-            TopicPace(period_ns, step_ns) for period_ns in (self._time.odom_ns, self._time.scan_ns)
+            device_parameters.TopicPace(period_ns, step_ns)
+            for period_ns in (self._time.odom_ns, self._time.scan_ns)
         )
-        self._real_time = RealTime(step_ns, self._time.rate)
+        self._real_time = device_parameters.RealTime(step_ns, self._time.rate)
         self._timer = None
         self._soon = self.create_guard_condition(self._on_time)
         if self._time.mode == "realtime":
@@ -117,7 +362,7 @@ class DeviceNode(QosWatch):
         for inlet in self._inlets:
             inlet.watch()
         ends = self.get_publishers_info_by_topic(CLOCK)
-        names = {name for end in ends if (name := owner(end)) is not None}
+        names = {name for end in ends if (name := qos.owner(end)) is not None}
         for name in names - self._clocks:
             self.get_logger().warning(
                 f"{name} publishes {CLOCK} too, and nodes with use_sim_time hear both; give each "
@@ -127,18 +372,15 @@ class DeviceNode(QosWatch):
 
     def _look(self) -> runner.Condition:
         facts = {
-            "mode": self._time.mode,
-            "rate": self._time.rate,
-            "robots": len(self._names),
+            "mode": self._time.mode, "rate": self._time.rate, "robots": len(self._names),
             "simulated time [s]": f"{self._now_ns / NS_PER_S:.3f}",
-            "times it fell behind real time": self._lags,
-            **self._identity,
-        }
+            "times it fell behind real time": self._lags, **self._identity,
+        }  # fmt: skip
         message = "paused" if self._paused else "running"
         return runner.Condition(message, False, facts, self._hardware)
 
     def _timeout_ns(self) -> int:
-        return int(number(self, "command_timeout") * NS_PER_S)
+        return int(device_parameters.number(self, "command_timeout") * NS_PER_S)
 
     def _too_old(self, stamp_ns: int) -> bool:
         return not self._time.lockstep and self._now_ns - stamp_ns > self._timeout_ns()
@@ -189,7 +431,9 @@ class DeviceNode(QosWatch):
         """Begins an episode. Raises BridgeError if the parameters do not fit the world."""
         given = bool(self.get_parameter("episode_start_given").value)
         start = np.array(self.get_parameter("episode_start").value, dtype=np.float64)
-        self._world.begin(int(number(self, "episode_seed")), start if given else None)
+        self._world.begin(
+            int(device_parameters.number(self, "episode_seed")), start if given else None
+        )
         self._outbox.clear()
         self._heard[:] = False
         self._now_ns += self._time.step_ns
@@ -229,8 +473,7 @@ class DeviceNode(QosWatch):
         """Publishes what is due at present."""
         now_ns = self._now_ns
         if self._clock_topic.get_subscription_count():
-            self._clock_message.clock = conversions.stamp_to_ros(now_ns)
-            self._clock_topic.publish(self._clock_message)
+            self._clock_topic.publish(Clock(clock=conversions.stamp_to_ros(now_ns)))
         odom_due, scan_due = self._odom_pace.due(now_ns), self._scan_pace.due(now_ns)
         if odom_due or scan_due:
             self._publish_data(odom_due, scan_due)
@@ -263,10 +506,4 @@ def simulator_node(context: Context) -> DeviceNode:
     return DeviceNode("simulator_node", context, fast_simulator)
 
 
-def main(args: list[str] | None = None) -> None:
-    """Entry point of the executable."""
-    runner.run_node(simulator_node, args, "simulator_node")
-
-
-if __name__ == "__main__":
-    main()
+main = partial(runner.run_node, simulator_node, sole_name="simulator_node")

@@ -33,23 +33,18 @@ from nics_drl_bridge.errors import BackendError
 
 RANGE, LOCAL, ONLY_LOCAL = "ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST", "ROS_LOCALHOST_ONLY"
 SELF_MADE = "SYSTEM_DEFAULT"
-OTHER_RANGES = ("SUBNET", "OFF", SELF_MADE, "")
-"""rcl treats any other value as LOCALHOST."""
-OLDEST_DISTRIBUTION = "humble"
-"""It has no discovery ranges."""
+OTHER_RANGES = ("SUBNET", "OFF", SELF_MADE, "")  # rcl treats any other value as LOCALHOST
+OLDEST_DISTRIBUTION = "humble"  # it has no discovery ranges
 TRANSPORTS, UDP = "FASTDDS_BUILTIN_TRANSPORTS", "UDPv4"
 PROFILE = Path(__file__).with_name("this_machine.xml")
+# The same variable in Fast DDS 3 and 2 (the library's name tells), and files that it reads here.
 PROFILES = ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE")
-"""The same variable in Fast DDS 3 and in Fast DDS 2; the library's name shows which one applies."""
 PROFILES_HERE = ("DEFAULT_FASTDDS_PROFILES.xml", "DEFAULT_FASTRTPS_PROFILES.xml")
-"""Fast DDS reads them in the working directory."""
 FAST_DDS_2, FAST_DDS_2_DISTRIBUTIONS = b"libfastrtps.so", (OLDEST_DISTRIBUTION, "iron", "jazzy")
-PEERS = ("ROS_DISCOVERY_SERVER", "ROS_STATIC_PEERS")
-"""With one of these set, discovery also looks elsewhere, which the profile does not."""
+PEERS = ("ROS_DISCOVERY_SERVER", "ROS_STATIC_PEERS")  # discovery that the profile does not do
 SEGMENTS = (b"shm/fastdds_", b"shm/fastrtps_")
 TABLE = Path("/proc/net/udp")
-FIRST_PORT, PORTS_OF_A_DOMAIN = 7400, 250
-"""RTPS: the first port of a domain is that of its multicast."""
+FIRST_PORT, PORTS_OF_A_DOMAIN = 7400, 250  # RTPS: a domain's first is that of its multicast
 
 
 def stays_here(environment: Mapping[str, str]) -> bool:
@@ -94,7 +89,8 @@ class Transport:
                     "its discovery on this machine; set it before the first, or use another "
                     "process."
                 )
-            if not _is_fast_dds() or chosen(os.environ):
+            fast_dds = str(get_rmw_implementation_identifier()).startswith("rmw_fast")
+            if sys.platform != "linux" or not fast_dds or chosen(os.environ):
                 return make()
             if not here:
                 os.environ[TRANSPORTS] = UDP
@@ -128,23 +124,14 @@ class Transport:
 @contextlib.contextmanager
 def _changed(environment: MutableMapping[str, str], words: Mapping[str, str]) -> Iterator[None]:
     """Sets variables for a while, without the older discovery variable, which overrides them."""
-    kept = {key: environment.get(key) for key in (ONLY_LOCAL, *words)}
-    environment.pop(ONLY_LOCAL, None)
+    kept = {key: environment.pop(key, None) for key in (ONLY_LOCAL, *words)}
     environment.update(words)
     try:
         yield
     finally:
         for key, value in kept.items():
-            if value is None:
-                environment.pop(key, None)
-            else:
-                environment[key] = value
-
-
-def _is_fast_dds() -> bool:
-    """True for Fast DDS on Linux, the only case that is handled here."""
-    name = str(get_rmw_implementation_identifier())
-    return sys.platform == "linux" and name.startswith("rmw_fast")
+            environment.pop(key, None)
+            environment.update({} if value is None else {key: value})
 
 
 def _maps() -> bytes:
@@ -183,20 +170,17 @@ def ports_of(process: int | str = "self") -> set[int]:
     for file in Path(f"/proc/{process}/fd").iterdir():
         with contextlib.suppress(OSError):  # another thread has closed it
             names.add(os.readlink(file))
-    return {port for inode, port in _sockets() if f"socket:[{inode}]" in names}
+    return {port for name, port in _sockets() if name in names}
 
 
 def domains_in_use() -> set[int]:
     """Returns the DDS domains with a participant on this machine."""
-    first = (port - FIRST_PORT for _, port in _sockets())
-    return {offset // PORTS_OF_A_DOMAIN for offset in first if offset >= 0}
+    ports = {port for _, port in _sockets() if port >= FIRST_PORT}
+    return {(port - FIRST_PORT) // PORTS_OF_A_DOMAIN for port in ports}
 
 
 def _sockets() -> list[tuple[str, int]]:
-    """Returns inode and port of each UDP socket; empty where Linux does not report them."""
-    try:
-        lines = TABLE.read_text(encoding="ascii").splitlines()[1:]
-    except OSError:
-        return []
+    """Returns name and port of each UDP socket; none where Linux does not report them."""
+    lines = TABLE.read_text(encoding="ascii").splitlines()[1:] if TABLE.is_file() else []
     rows = [line.split() for line in lines]
-    return [(row[9], int(row[1].split(":")[1], 16)) for row in rows]
+    return [(f"socket:[{row[9]}]", int(row[1].split(":")[1], 16)) for row in rows]

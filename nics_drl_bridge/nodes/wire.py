@@ -19,23 +19,19 @@ from numpy.typing import ArrayLike, NDArray
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import LaserScan
 
-from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes.conversions import PLANAR, heading_of
 
-Array = NDArray[np.float64]
 Bytes = bytes | bytearray
 HEAD = 4
 """Bytes of the header, which do not count for alignment; the second one gives the byte order."""
-STAMP, FRAME = 4, 12
-"""Offsets of stamp and frame of a message's header."""
+STAMP, FRAME = 4, 12  # offsets of stamp and frame of a message's header
 UNREADABLE = (ValueError, struct.error)
 """Raised by all readers for bytes that are not a message of the type."""
-PLAIN = (0, 1)
-"""Big-endian and little-endian plain CDR."""
+PLAIN = (0, 1)  # big-endian and little-endian plain CDR
 POSE_COVARIANCE, TWIST, DOUBLES = 7, 7 + 36, 7 + 36 + 6 + 36
 """Numbers of an odometry before each: pose, its covariance, twist, its covariance."""
-SCAN_FIELDS = 7
-"""Floats of a scan between its header and its ranges."""
+SCAN_FIELDS = 7  # floats of a scan between its header and its ranges
 
 
 def _order(content: Bytes) -> str:
@@ -57,11 +53,6 @@ def _aligned(place: int, size: int) -> int:
     return place + (HEAD - place) % size
 
 
-def _doubles(content: Bytes, order: str) -> int:
-    """Returns the offset of the numbers of an odometry."""
-    return _aligned(_after_text(content, _after_text(content, FRAME, order), order), 8)
-
-
 def _floats(content: Bytes, order: str) -> int:
     """Returns the offset of the floats of a scan."""
     return _aligned(_after_text(content, FRAME, order), 4)
@@ -76,7 +67,8 @@ def stamp_of(content: Bytes) -> int:
 def numbers_of(content: Bytes) -> Array:
     """Returns all numbers (85,) of a serialised Odometry, in order."""
     order = _order(content)
-    return np.frombuffer(content, f"{order}f8", DOUBLES, _doubles(content, order))
+    names_end = _after_text(content, _after_text(content, FRAME, order), order)
+    return np.frombuffer(content, f"{order}f8", DOUBLES, _aligned(names_end, 8))
 
 
 def odometry_of(content: Bytes) -> tuple[Array, Array]:
@@ -102,18 +94,15 @@ def angles_of(content: Bytes) -> tuple[float, float]:
     return first, step
 
 
-def twist_of(content: Bytes) -> tuple[float, float, float]:
-    """Returns linear.x, linear.y, angular.z of a serialised Twist."""
-    x, y, _, _, _, w = struct.unpack_from(f"{_order(content)}6d", content, HEAD)
+def twist_of(content: Bytes, place: int = HEAD) -> tuple[float, float, float]:
+    """Returns linear.x, linear.y, angular.z of a serialised Twist, which begins at an offset."""
+    x, y, _, _, _, w = struct.unpack_from(f"{_order(content)}6d", content, place)
     return x, y, w
 
 
 def stamped_twist_of(content: Bytes) -> tuple[float, float, float]:
     """Returns linear.x, linear.y, angular.z of a serialised TwistStamped."""
-    order = _order(content)
-    place = _aligned(_after_text(content, FRAME, order), 8)
-    x, y, _, _, _, w = struct.unpack_from(f"{order}6d", content, place)
-    return x, y, w
+    return twist_of(content, _aligned(_after_text(content, FRAME, _order(content)), 8))
 
 
 def truth_of(content: Bytes) -> bool:
@@ -127,32 +116,22 @@ class OdometryWriter:
 
     def __init__(self, message: Odometry) -> None:
         self._content = bytearray(serialize_message(message))
-        order = _order(self._content)
-        place = _doubles(self._content, order)
-        numbers = np.frombuffer(self._content, f"{order}f8", DOUBLES, place)
-        self._covariance = numbers[POSE_COVARIANCE:TWIST].reshape(6, 6)
-        self._stamp = struct.Struct(f"{order}iI")
-        self._two, self._place = struct.Struct(f"{order}2d"), place
-        self._angular = place + 8 * (TWIST + 5)
-        self._one = struct.Struct(f"{order}d")
+        self._stamp = struct.Struct(f"{_order(self._content)}iI")
+        self._numbers = numbers_of(self._content)  # writable, because it is a view of a bytearray
+        self._covariance = self._numbers[POSE_COVARIANCE:TWIST].reshape(6, 6)
 
     def write(
         self, stamp_ns: int, pose: Array, twist: Array, covariance: Array | None = None
     ) -> bytes:
         """Returns a message with pose (3,), body twist (3,), and covariance (3, 3) of the pose."""
-        content, place = self._content, self._place
-        x, y, heading = pose.tolist()
-        vx, vy, wz = twist.tolist()
-        self._stamp.pack_into(content, STAMP, *divmod(stamp_ns, NS_PER_S))
-        self._two.pack_into(content, place, x, y)
-        self._two.pack_into(
-            content, place + 8 * 5, math.sin(heading / 2.0), math.cos(heading / 2.0)
-        )
-        self._two.pack_into(content, place + 8 * TWIST, vx, vy)
-        self._one.pack_into(content, self._angular, wz)
+        numbers, heading = self._numbers, float(pose[2])
+        self._stamp.pack_into(self._content, STAMP, *divmod(stamp_ns, NS_PER_S))
+        numbers[0], numbers[1] = pose[0], pose[1]
+        numbers[5], numbers[6] = math.sin(heading / 2.0), math.cos(heading / 2.0)
+        numbers[TWIST], numbers[TWIST + 1], numbers[TWIST + 5] = twist
         if covariance is not None:
             self._covariance[PLANAR] = covariance
-        return bytes(content)
+        return bytes(self._content)
 
 
 class ScanWriter:

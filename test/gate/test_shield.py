@@ -9,10 +9,9 @@ from shapely.geometry import LineString, Point
 
 from gate.rig import LIDAR, Rig, config
 from nics_drl_bridge import geometry
-from nics_drl_bridge.gate import moving_kernels, shield_kernels
+from nics_drl_bridge.gate import shield_kernels
 from nics_drl_bridge.gate.gate import decide
 from nics_drl_bridge.gate.inputs import Odometry, Scan, Tick
-from nics_drl_bridge.gate.moving_kernels import entered
 from nics_drl_bridge.gate.shield import (
     MEMORY_S,
     SPACING_S,
@@ -21,7 +20,7 @@ from nics_drl_bridge.gate.shield import (
     rehearse,
     remember,
 )
-from nics_drl_bridge.gate.shield_kernels import free, place
+from nics_drl_bridge.gate.shield_kernels import entered, free, place
 from nics_drl_bridge.gate.state import ShieldConfig, View, begin
 from nics_drl_bridge.interface import NS_PER_S
 
@@ -74,7 +73,7 @@ def test_without_a_shield_nothing_is_cut():
 def test_nothing_remains_to_be_compiled_after_a_rehearsal(wheelbase, monkeypatch):
     fresh = {"free": njit(free.py_func), "entered": njit(entered.py_func)}
     monkeypatch.setattr(shield_kernels, "free", fresh["free"])
-    monkeypatch.setattr(moving_kernels, "entered", fresh["entered"])
+    monkeypatch.setattr(shield_kernels, "entered", fresh["entered"])
     rehearse()
     known = {name: list(kernel.signatures) for name, kernel in fresh.items()}
     assert all(known.values())

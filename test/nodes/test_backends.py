@@ -310,7 +310,7 @@ def test_an_error_in_a_step_leaves_a_zero_command_and_wants_a_reset(
 
     def interrupted():
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):  # noqa: PT012
-            patch.setattr(env._backend, "_measure", fails)
+            patch.setattr(env._backend, "_await", fails)
             env.step(action)
 
     def fails(*_):

@@ -325,7 +325,7 @@ def test_those_that_have_ended_make_room_before_anybody_asks_what_failed(tmp_pat
     for number in range(2 * MOST_AT_WORK):
         assert writer.begin(lambda name=str(number): (tmp_path / name / "file").write_text(""))
         with contextlib.suppress(ChildProcessError):
-            os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOWAIT)
+            os.waitid(os.P_PID, list(writer._writers)[-1], os.WEXITED | os.WNOWAIT)
     assert len(writer.close(DEADLINE_S)) == 2 * MOST_AT_WORK
 
 

@@ -14,18 +14,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.interface import Array
 from nics_drl_bridge.robot.ackermann import track_and_radius
 from nics_drl_bridge.robot.kinds import require_textbook
 from nics_drl_bridge.robot.spec import RobotSpec
 
-Array = NDArray[np.float64]
 Parameters = dict[str, float]
 
-TORQUE_RESERVE = 1.5
-"""Torque limit of a motor, as a multiple of the torque for the maximum acceleration."""
+TORQUE_RESERVE = 1.5  # torque limit of a motor, relative to that for the maximum acceleration
 SERVO_LAG_S = 0.005  # lag of a motor behind its set point
 STEERING_STIFFNESS = 1.0  # torque of a steering servo per error [N m/rad]
 STEERING_TORQUE = 1.0  # torque limit of a steering servo [N m], that of a small hobby servo
@@ -80,9 +78,9 @@ class Motor:
 def _motor(inertia: float, lag: float, radius: float, step: float, physics: Physics) -> Motor:
     """Motor that makes a wheel follow its target with a lag [s], within the limits of friction.
 
-    Spinning or locked wheels do not steer, so the lag is longer than requested if the maximum step
-    [m/s] of the command would accelerate the robot by more than `physics.acceleration`. The inertia
-    is that at the motor's shaft, including the share of the moving robot [kg m^2].
+    Spinning or locked wheels do not steer, so the lag is longer if the maximum step [m/s] of the
+    command would accelerate the robot too much. The inertia is that at the motor's shaft, including
+    the share of the moving robot [kg m^2].
     """
     lag = max(lag, step / physics.acceleration)
     limit = TORQUE_RESERVE * physics.acceleration
@@ -90,7 +88,6 @@ def _motor(inertia: float, lag: float, radius: float, step: float, physics: Phys
 
 
 def _document(name: str, physics: Physics, height: float, robot: str, actuators: str) -> str:
-    """MJCF of a robot on an infinite floor: contents of its `base_link`, and its actuators."""
     return f"""
 <mujoco model="{name}">
   <compiler angle="radian" autolimits="true"/>
@@ -114,7 +111,6 @@ def _document(name: str, physics: Physics, height: float, robot: str, actuators:
 
 
 def _chassis(mass: float, centre: tuple[float, float, float], size: tuple[float, ...]) -> str:
-    """MJCF of a box: mass [kg], centre in `base_link` [m], full size [m]."""
     half = " ".join(f"{0.5 * s:.6g}" for s in size)
     x, y, z = centre
     return f"""
@@ -143,11 +139,10 @@ def load_mujoco() -> Any:
 
 
 def build_machine(spec: RobotSpec, physics: Physics | None = None) -> Machine:
-    """Builds the machine of a robot.
+    """Builds the machine of a robot; an Ackermann spec may also have `wheel_radius` and `track`.
 
-    In addition to those of the textbook kinematics, the parameters `wheel_radius` and `track` of an
-    Ackermann robot are used if the spec has them. Raises ConfigError if the spec names no textbook
-    kinematics or a kind without a machine, or lacks a parameter.
+    Raises ConfigError if the spec names no textbook kinematics or a kind without a machine, or
+    lacks a parameter.
     """
     kind = require_textbook(spec)
     if kind not in _BUILDERS:
@@ -177,9 +172,9 @@ def _ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
     engine = _motor(
         (total + 2 * physics.wheel_mass) * radius**2, p["speed_lag"], radius, step, physics
     )
-    robot = _chassis(
-        physics.mass, (0.45 * wheelbase, 0.0, 0.0), (1.3 * wheelbase, 0.7 * track, 0.04)
-    ) + "".join(_car_wheels(wheelbase, track, radius, p["steering_lag"], physics))
+    centre, size = (0.45 * wheelbase, 0.0, 0.0), (1.3 * wheelbase, 0.7 * track, 0.04)
+    wheels = _car_wheels(wheelbase, track, radius, p["steering_lag"], physics)
+    robot = _chassis(physics.mass, centre, size) + wheels
     xml = _document("ackermann", physics, radius, robot, _car_actuators(engine))
     half_ratio = 0.5 * track / wheelbase
 
@@ -199,14 +194,12 @@ def _ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
     return Machine(xml, joints, controls, measured)
 
 
-def _car_wheels(
-    wheelbase: float, track: float, radius: float, lag: float, physics: Physics
-) -> list[str]:
-    parts = []
+def _car_wheels(wheelbase: float, track: float, radius: float, lag: float, physics: Physics) -> str:
+    parts = ""
     for side, y in (("left", 0.5 * track), ("right", -0.5 * track)):
         rear = _wheel(f"rear_{side}", radius, 0.4 * radius, physics)
         front = _wheel(f"front_{side}", radius, 0.4 * radius, physics, physics.bearing)
-        parts.append(f"""
+        parts += f"""
       <body pos="0 {y:.6g} 0">{rear}
       </body>
       <body pos="{wheelbase:.6g} {y:.6g} 0">
@@ -215,7 +208,7 @@ def _car_wheels(
         <geom type="sphere" size="0.005" mass="0.02"/>
         <body>{front}
         </body>
-      </body>""")
+      </body>"""
     return parts
 
 
@@ -244,12 +237,11 @@ def _differential(p: Parameters, step: float, physics: Physics) -> Machine:
         0.5 * (total + physics.wheel_mass) * radius**2,
         p["wheel_lag"], radius, step, physics,
     )  # fmt: skip
-    sides = (("left", 0.5 * track), ("right", -0.5 * track))
     wheels = "".join(
         f"""
       <body pos="0 {y:.6g} 0">{_wheel(side, radius, 0.4 * radius, physics)}
       </body>"""
-        for side, y in sides
+        for side, y in (("left", 0.5 * track), ("right", -0.5 * track))
     )
     # Low and just behind the axle: braking must not tip the robot over its wheels, and a mass far
     # behind would push it further into every turn.
@@ -266,9 +258,8 @@ def _differential(p: Parameters, step: float, physics: Physics) -> Machine:
 def _mecanum(p: Parameters, step: float, physics: Physics) -> Machine:
     """Builds a robot of four wheels with real rollers, which carry it in turn.
 
-    Friction that differs by direction would be simpler, but MuJoCo aligns it with the world or
-    with a geom, not with the roller at the bottom of a turning wheel; free rollers are robust,
-    and reproduce the slight vibration of real ones.
+    MuJoCo can't align a friction that differs by direction with the roller at the bottom of a
+    turning wheel; free rollers are robust, and reproduce the slight vibration of real ones.
     """
     radius = p["wheel_radius"]
     total = physics.mass + 4 * physics.wheel_mass
@@ -277,14 +268,12 @@ def _mecanum(p: Parameters, step: float, physics: Physics) -> Machine:
         p["wheel_lag"], radius, step, physics,
     )  # fmt: skip
     x, y = p["half_length"], p["half_width"]
-    names = tuple(f"{place}_{side}" for place in ("front", "rear") for side in ("left", "right"))
+    names = ("front_left", "front_right", "rear_left", "rear_right")
     places = ((x, y, -1), (x, -y, 1), (-x, y, 1), (-x, -y, -1))
-    wheels = "".join(
-        _roller_wheel(name, (px, py), lean, radius, physics)
-        for name, (px, py, lean) in zip(names, places, strict=True)
-    )
     body = _chassis(physics.mass, (0, 0, 0), (2.2 * x, 1.4 * y, 0.04))
-    xml = _document("mecanum", physics, radius, body + wheels, _motors(names, servo))
+    for name, (px, py, lean) in zip(names, places, strict=True):
+        body += _roller_wheel(name, (px, py), lean, radius, physics)
+    xml = _document("mecanum", physics, radius, body, _motors(names, servo))
     return Machine(xml, names, lambda state: state, lambda _, speed: speed)
 
 
@@ -318,25 +307,24 @@ def roller_size(radius: float, rollers: int) -> tuple[float, float]:
 def _roller_wheel(
     name: str, place: tuple[float, float], lean: int, radius: float, physics: Physics
 ) -> str:
-    """MJCF of a wheel's body: a driven hub, and free rollers at 45 degrees to its axle.
+    """MJCF of a wheel at x, y [m]: a driven hub, and free rollers at 45 degrees to its axle.
 
-    The wheel is at a place (x, y) in `base_link` [m]; it leans by +1 if the axle of the roller on
-    the floor points forward and left, by -1 if it points forward and right.
+    It leans by +1 if the axle of the roller on the floor points forward and left, else by -1.
     """
     a, b = roller_size(radius, physics.rollers)
     hub = physics.wheel_mass - physics.rollers * ROLLER_MASS
-    rows = []
+    rows = ""
     for angle in 2.0 * np.pi * np.arange(physics.rollers) / physics.rollers:
         s, c = np.sin(angle), np.cos(angle)
         x, z = -(radius - a) * s, -(radius - a) * c
-        rows.append(f"""
+        rows += f"""
         <body pos="{x:.8g} 0 {z:.8g}" zaxis="{c:.8g} {lean} {-s:.8g}">
           <joint axis="0 0 1" damping="{physics.bearing}" armature="2e-7"/>
           <geom class="tread" type="ellipsoid" mass="{ROLLER_MASS}" size="{a:.8g} {a:.8g} {b:.8g}"/>
-        </body>""")
+        </body>"""
     return f"""
       <body pos="{place[0]:.6g} {place[1]:.6g} 0">
         <joint name="{name}" axis="0 1 0"/>
         <geom type="cylinder" mass="{hub:.6g}" size="{0.7 * radius:.6g} {0.3 * radius:.6g}"
-              zaxis="0 1 0"/>{"".join(rows)}
+              zaxis="0 1 0"/>{rows}
       </body>"""

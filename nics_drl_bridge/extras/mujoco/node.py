@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import cast
 
 from rclpy.context import Context
@@ -33,10 +34,4 @@ def mujoco_node(context: Context) -> DeviceNode:
     return DeviceNode("mujoco_node", context, mujoco_simulator)
 
 
-def main(args: list[str] | None = None) -> None:
-    """Entry point of the executable."""
-    run_node(mujoco_node, args, "mujoco_node")
-
-
-if __name__ == "__main__":
-    main()
+main = partial(run_node, mujoco_node, sole_name="mujoco_node")

@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.extras.mujoco.machines import Machine, Physics
+from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import Circle, Rectangle, Segment, Shape, convex_hull
-
-Array = NDArray[np.float64]
 
 HEIGHT = 0.5  # height of walls and obstacles [m]
 THICKNESS = 0.002  # thickness of walls, which have none for the lidar [m]
@@ -78,8 +77,8 @@ def compile_scene(
 def bumpers(model: Any, robots: int) -> NDArray[np.int64]:
     """(geoms,) index of the robot whose bumper each geom of a scene belongs to; -1 for none."""
     names = [model.geom(i).name for i in range(model.ngeom)]
-    own = {f"{prefix_of(m)}{BUMPER_NAME}": m for m in range(robots)}
-    found = [next((m for head, m in own.items() if n.startswith(head)), -1) for n in names]
+    heads = [f"{prefix_of(m)}{BUMPER_NAME}" for m in range(robots)]
+    found = [next((m for m, head in enumerate(heads) if n.startswith(head)), -1) for n in names]
     return np.array(found, dtype=np.int64)
 
 
@@ -92,16 +91,14 @@ class _Maker:
 
     def bumper(self, base: Any, footprint: Shape) -> None:
         """Adds the footprint of a robot, without mass, which belongs to the chassis."""
-        half = 0.5 * float(base.pos[2])
-        own = {"contype": BUMPER, "mass": 0.0}
+        half, own = 0.5 * float(base.pos[2]), {"contype": BUMPER, "mass": 0.0}
         if isinstance(footprint, Circle):
             # Its round edge touches a wall in one point, at the height of the axles.
-            size = [footprint.radius, footprint.radius, half]
-            kind = self._kinds.mjGEOM_ELLIPSOID
+            size, kind = [footprint.radius, footprint.radius, half], self._kinds.mjGEOM_ELLIPSOID
             self._add(base, type=kind, size=size, name=f"{BUMPER_NAME}0", **own)
-            return
-        for i, part in enumerate(convex_parts(footprint.outline)):
-            self._prism(base, part, (-half, half), name=f"{BUMPER_NAME}{i}", **own)
+        else:
+            for i, part in enumerate(convex_parts(footprint.outline)):
+                self._prism(base, part, (-half, half), name=f"{BUMPER_NAME}{i}", **own)
 
     def wall(self, body: Any, start: Array, end: Array) -> None:
         """Adds a straight wall between two points (2,) [m]."""
@@ -135,8 +132,7 @@ class _Maker:
                 self._prism(body, part, (0.0, HEIGHT))
 
     def _box(self, body: Any, middle: Array, heading: float, size: Sequence[float]) -> None:
-        pos = [middle[0], middle[1], 0.5 * HEIGHT]
-        turned = quaternion(heading)
+        pos, turned = [middle[0], middle[1], 0.5 * HEIGHT], quaternion(heading)
         self._add(body, type=self._kinds.mjGEOM_BOX, size=size, pos=pos, quat=turned)
 
     def _prism(self, body: Any, corners: Array, z: tuple[float, float], **others: Any) -> None:
@@ -160,8 +156,7 @@ def quaternion(heading: float) -> list[float]:
 def convex_parts(outline: Array) -> list[Array]:
     """Splits an outline (V, 2), counter-clockwise, into convex outlines (v, 2) that fill it.
 
-    A convex outline is its only part; others are cut into triangles by ear clipping (Meisters
-    1975).
+    One that is not convex is cut into triangles by ear clipping (Meisters 1975).
     """
     if len(convex_hull(outline)) == len(outline):
         return [outline]
@@ -200,16 +195,12 @@ def rectangles(blocked: NDArray[np.bool_]) -> NDArray[np.int64]:
     """
     done: list[tuple[int, int, int, int]] = []
     open_runs: dict[tuple[int, int], int] = {}
-    for row in range(len(blocked) + 1):
-        runs = _runs(blocked[row]) if row < len(blocked) else set()
-        for run in [run for run in open_runs if run not in runs]:
+    framed = np.pad(blocked, ((0, 1), (1, 1)))
+    for row, cells in enumerate(framed):
+        edges = np.flatnonzero(cells[1:] != cells[:-1]).reshape(-1, 2)
+        runs = {(int(first), int(after)) for first, after in edges}
+        for run in open_runs.keys() - runs:
             done.append((open_runs.pop(run), run[0], row, run[1]))
         for run in runs:
             open_runs.setdefault(run, row)
     return np.array(sorted(done), dtype=np.int64).reshape(-1, 4)
-
-
-def _runs(row: NDArray[np.bool_]) -> set[tuple[int, int]]:
-    """First column of each run of blocked cells, and the one after its last."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], row, [False]]).astype(np.int8)))
-    return {(int(a), int(b)) for a, b in edges.reshape(-1, 2)}

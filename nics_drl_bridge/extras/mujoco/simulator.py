@@ -14,6 +14,7 @@ from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.extras.mujoco import scenery
 from nics_drl_bridge.extras.mujoco.machines import Machine, Physics, build_machine, load_mujoco
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
+from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.kinds import textbook
@@ -22,8 +23,6 @@ from nics_drl_bridge.sim.device import Driven, DrivenSimulator
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.state import State
 from nics_drl_bridge.sim.world import World
-
-Array = NDArray[np.float64]
 
 ENCODER_PERIOD_S = 0.01  # approximate period of encoder readings and of updates of moving obstacles
 LARGEST_TILT_RAD = 0.5
@@ -41,16 +40,11 @@ class Reading:
 
 
 class Rig:
-    """Access to one machine in the arrays of a MuJoCo model.
+    """Access to one machine, of a number, in the arrays of a MuJoCo model."""
 
-    `prefix` is that of the names of its parts, `number` that of machines of its kind before it.
-    """
-
-    def __init__(
-        self, spec: RobotSpec, machine: Machine, model: Any, prefix: str = "", number: int = 0
-    ) -> None:
+    def __init__(self, spec: RobotSpec, machine: Machine, model: Any, number: int = 0) -> None:
         self.spec, self.machine = spec, machine
-        self._target = textbook(spec).target
+        self._target, prefix = textbook(spec).target, scenery.prefix_of(number)
         base = model.joint(int(model.body(f"{prefix}base_link").jntadr[0]))
         joints = [model.joint(f"{prefix}{name}") for name in machine.joints]
         self._place, self._drift = int(base.qposadr[0]), int(base.dofadr[0])
@@ -94,10 +88,6 @@ class Rig:
         """(J,) positions of the joints that have encoders [rad]."""
         return np.array(data.qpos[self._positions])
 
-    def mean_state(self, before: Array, after: Array, duration: float) -> Array:
-        """Mean state (S,) between two encoder readings (J,), `duration` [s] apart."""
-        return self.machine.state(0.5 * (before + after), (after - before) / duration)
-
     def require_upright(self, data: Any) -> None:
         """Raises BackendError if the robot has fallen over."""
         x, y = data.qpos[self._place + 4 : self._place + 6]
@@ -111,11 +101,7 @@ class Rig:
 class MujocoRobot:
     """A robot on an infinite floor, moved only by its motors and by contact.
 
-    Attributes:
-        rest: (nq,) positions in MuJoCo at rest at the origin.
-
-    Raises:
-        ConfigError: MuJoCo is not installed, or the spec lacks a parameter of the machine.
+    Raises ConfigError if MuJoCo is not installed, or the spec lacks a parameter of the machine.
     """
 
     def __init__(self, spec: RobotSpec, physics: Physics | None = None) -> None:
@@ -127,7 +113,7 @@ class MujocoRobot:
         self._rig = Rig(spec, self.machine, self._model)
         self.timestep = float(self._model.opt.timestep)
         self._advance(SETTLING_S)
-        self.rest = self._data.qpos.copy()
+        self.rest = self._data.qpos.copy()  # (nq,) positions in MuJoCo at rest at the origin
         self.reset(np.zeros(3))
 
     def reset(self, pose: ArrayLike) -> Reading:
@@ -162,23 +148,17 @@ class MujocoSimulator:
     Scenes, moving obstacles, lidar and odometry noise are those of the FastSimulator for the same
     seed; only the robots move differently. Whatever their footprint touches blocks them. Odometry
     integrates the turns of the wheels, so it drifts if they slip. A command acts at once, on motors
-    with their own lag: the model's latency is not added.
-
-    The textbook kinematics of the model's robot select the machine; the fitted ones are not used.
-    The M robots see and touch each other. The time step of `physics` is shortened so that a control
-    period is a whole number of steps. Raises ConfigError if MuJoCo is not installed, the robot
-    names no textbook kinematics or lacks a parameter of its machine, or the world has no free space
-    left.
+    with their own lag: the model's latency is not added. The textbook kinematics of the robot
+    select the machine; the fitted ones are not used. The time step of `physics` is shortened so
+    that a control period is a whole number of steps. Raises ConfigError if MuJoCo is not installed,
+    the robot names no textbook kinematics or lacks a parameter of its machine, or the world has no
+    free space left.
     """
 
     def __init__(
-        self,
-        model: SimulatorModel,
-        world: World,
-        robots: int = 1,
-        renderer: Renderer = "auto",
+        self, model: SimulatorModel, world: World, robots: int = 1, renderer: Renderer = "auto",
         physics: Physics | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._mujoco = load_mujoco()
         self.model, self.world = model, world
         physics = physics or Physics()
@@ -215,29 +195,19 @@ class MujocoSimulator:
         return self._driven.fast.scenes(seeds)
 
     def reset(self, seeds: ArrayLike, starts: ArrayLike | None = None) -> Scenes:
-        """Begins an episode, the same one as in a FastSimulator of this model and world.
-
-        Takes one seed (1,), and start poses (1, M, 3) instead of the scene's. Raises ConfigError:
-        see `FastSimulator.reset`.
-        """
+        """Begins the episode of a seed (1,), at poses (1, M, 3); see `FastSimulator.reset`."""
         scenes = self._driven.reset(seeds, starts)
         sampler = self._driven.fast.sampler
         moving = np.array([motion is not None for motion in sampler.motions], np.bool_)
         bodies = scenes.bodies[0]
-        place = scenery.Scenery(
-            self.world.all_walls(), self.world.grid, sampler.shapes, bodies, moving
+        walls, grid = self.world.all_walls(), self.world.grid
+        place = scenery.Scenery(walls, grid, sampler.shapes, bodies, moving)
+        spec, robots = self.model.robot, self.data.pose.shape[1]
+        compiled = self._simulation = scenery.compile_scene(
+            self._mujoco, self._machine, footprint_shape(spec), robots, place, self._physics
         )
-        robots = self.data.pose.shape[1]
-        footprint = footprint_shape(self.model.robot)
-        self._simulation = scenery.compile_scene(
-            self._mujoco, self._machine, footprint, robots, place, self._physics
-        )
-        self._data = self._mujoco.MjData(self._simulation)
-        compiled = self._simulation
-        self._rigs = [
-            Rig(self.model.robot, self._machine, compiled, scenery.prefix_of(m), m)
-            for m in range(robots)
-        ]
+        self._data = self._mujoco.MjData(compiled)
+        self._rigs = [Rig(spec, self._machine, compiled, m) for m in range(robots)]
         self._mocap = [
             (k, int(compiled.body(scenery.obstacle_name(k)).mocapid[0]))
             for k in np.flatnonzero(moving & (bodies[:, 5] > 0.0)).tolist()
@@ -251,9 +221,7 @@ class MujocoSimulator:
     def step(self, commands: ArrayLike) -> None:
         """Moves the world by one control period; commands (1, M, C) are clipped to their limits.
 
-        Raises:
-            ConfigError: the commands have a wrong shape.
-            BackendError: a command is NaN, or a robot has fallen over.
+        Raises ConfigError for a wrong shape; BackendError for NaN, or a robot that has fallen over.
         """
         commands = np.asarray(commands, dtype=np.float64)
         shape = (1, self.data.pose.shape[1], len(self.model.robot.command))
@@ -278,8 +246,8 @@ class MujocoSimulator:
             touched[bumped[bumped >= 0]] = True
             before, turned = turned, [rig.encoders(data) for rig in rigs]
             means = [
-                rig.mean_state(first, last, part_s)
-                for rig, first, last in zip(rigs, before, turned, strict=True)
+                self._machine.state(0.5 * (first + last), (last - first) / part_s)
+                for first, last in zip(before, turned, strict=True)
             ]
             counted = self._twist(np.array(means))
             wheels = geometry.compose(wheels, geometry.exp(counted * part_s))
@@ -319,17 +287,14 @@ def divide(period: float, longest: float) -> tuple[int, int, float]:
 
 
 def record(
-    robot: MujocoRobot,
-    rng: np.random.Generator,
-    duration: float = 60.0,
-    dt: float = 0.01,
+    robot: MujocoRobot, rng: np.random.Generator, duration: float = 60.0, dt: float = 0.01,
     hold: float = 0.5,
-) -> Recording:
-    """Drives at random and records, as `textbook.record` does with the textbook kinematics.
+) -> Recording:  # fmt: skip
+    """Drives at random from the origin and records, as `textbook.record` does.
 
-    The robot is reset to the origin first. New commands are drawn, uniform within their limits,
-    every `hold` seconds; the sample period `dt` [s] is a whole number of the robot's time steps.
-    Raises BackendError if the robot fell over.
+    New commands are drawn, uniform within their limits, every `hold` seconds; the sample period
+    `dt` [s] is a whole number of the robot's time steps. Raises BackendError if the robot fell
+    over.
     """
     spec = robot.spec
     per_hold, holds = round(hold / dt), int(np.ceil(duration / hold))

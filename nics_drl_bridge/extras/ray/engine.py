@@ -1,10 +1,13 @@
 """Training on a Ray cluster, or on one of this machine: RLlib's PPO, with the worlds spread out.
 
 Settings, normaliser, network, evaluation and policy file are those of training on one machine.
+RLlib's own env runner iterates over its worlds in Python in every step, which takes many times
+longer than the simulator. This one keeps arrays, and cuts them into episodes at the end.
 """
 
 from __future__ import annotations
 
+import copy
 import functools
 import json
 import logging
@@ -25,47 +28,177 @@ import torch
 from numpy.typing import NDArray
 from ray.rllib.algorithms.ppo import PPO, PPOConfig
 from ray.rllib.core import DEFAULT_MODULE_ID
+from ray.rllib.core.columns import Columns
+from ray.rllib.core.rl_module.apis import InferenceOnlyAPI, ValueFunctionAPI
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
+from ray.rllib.core.rl_module.torch import TorchRLModule
+from ray.rllib.env import INPUT_ENV_SINGLE_SPACES, INPUT_ENV_SPACES
+from ray.rllib.env.single_agent_env_runner import SingleAgentEnvRunner
+from ray.rllib.env.single_agent_episode import SingleAgentEpisode
 from ray.rllib.utils.metrics import ENV_RUNNER_RESULTS, NUM_ENV_STEPS_SAMPLED
 from stable_baselines3.common.logger import configure
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.extras.ray.runner import (
-    COLLISION,
-    ENDED,
-    STEPPING,
-    SUCCESS,
-    ActorCritic,
-    WorldsRunner,
-)
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.policy.train import (
-    CHECKPOINT,
-    SEEDS,
-    Tell,
-    Trained,
-    check_same,
-    make_train_env,
-)
-from nics_drl_bridge.policy.train_algorithms import LEAST_RATE, RECENT, check_serves, observed
+from nics_drl_bridge.interface import Array
+from nics_drl_bridge.policy import train, train_algorithms
 from nics_drl_bridge.policy.train_checkpoint import Progress, read_checkpoint, write_content
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 from nics_drl_bridge.sim.world import World, load_world
 
-Array = NDArray[np.float64]
 FORMAT = "nics_drl_bridge/ray_checkpoint/1"
 VALUE_WEIGHT, GRADIENT_LIMIT = 0.5, 0.5  # parameters of the loss, as in Stable-Baselines3
-SILENCE_S = 600.0
-"""A run ends after this time without a step from any env runner [s]; it can be resumed."""
+SILENCE_S = 600.0  # without a step from any env runner, after which a run ends; it can be resumed
 TRIED_S = 5.0  # timeout of an attempt to connect to an address [s]
 PROBE_S = 1.0  # time that a roll-out waits for a lost env runner [s]; later ones try again
+ENDED, SUCCESS, COLLISION, STEPPING = "ended", "success", "collision", "stepping_s"
+"""Names of a runner's metrics: numbers of episodes, and time in the simulator [s]."""
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """T steps of N worlds."""
+
+    seen: NDArray[np.float32]  # (T + 1, N, O); after an episode, the first of the next one
+    actions: NDArray[Any]  # (T, N, ...)
+    logits: NDArray[np.float32]  # (T, N, ...) parameters of the distribution of actions
+    logp: NDArray[np.float32]  # (T, N) log probabilities of the actions
+    rewards: NDArray[np.float32]  # (T, N)
+    final: dict[tuple[int, int], tuple[NDArray[np.float32], bool]]
+    """(t, n) -> last observation (O,) of the episode that ended in step t of world n, and True if
+    it only ran out of time."""
+
+    def episodes(self) -> Iterator[SingleAgentEpisode]:
+        """Yields the pieces of episodes in the roll-out, each of one world."""
+        steps, worlds = self.rewards.shape
+        cuts: list[list[int]] = [[] for _ in range(worlds)]
+        for t, n in sorted(self.final):
+            cuts[n].append(t + 1)
+        for n, ends in enumerate(cuts):
+            begins = [0, *ends]
+            for begin, end in zip(begins, [*ends, steps], strict=True):
+                if begin < end:
+                    yield self._piece(n, begin, end)
+
+    def _piece(self, n: int, begin: int, end: int) -> SingleAgentEpisode:
+        last, out_of_time = self.final.get((end - 1, n), (self.seen[end, n], None))
+        rows = slice(begin, end)
+        return SingleAgentEpisode(
+            observations=[*self.seen[rows, n], last],
+            actions=list(self.actions[rows, n]),
+            rewards=list(self.rewards[rows, n]),
+            terminated=out_of_time is False,
+            truncated=out_of_time is True,
+            extra_model_outputs={
+                Columns.ACTION_DIST_INPUTS: list(self.logits[rows, n]),
+                Columns.ACTION_LOGP: list(self.logp[rows, n]),
+            },
+            len_lookback_buffer=0,
+        ).to_numpy()
+
+
+class WorldsRunner(SingleAgentEnvRunner):
+    """Steps its share of the worlds of a training.
+
+    `env_config` contains `make` (a reference to a function of runner and number of runners that
+    makes a TrainVecEnv), `rollout` (T), `seed` (two numbers) and `threads`.
+    """
+
+    def make_env(self) -> None:
+        """Makes the worlds of this runner; each runner draws different episodes."""
+        chosen = self.config.env_config
+        torch.set_num_threads(chosen["threads"])
+        # Arrays shared by Ray are read-only; the kernels would be compiled again for them.
+        make = copy.deepcopy(ray.get(chosen["make"]))
+        self.env: TrainVecEnv = make(self.worker_index - 1, self.num_workers)
+        self.num_envs = self.env.num_envs
+        rng = np.random.default_rng([*chosen["seed"], self.worker_index])
+        self.env.seed(int(rng.integers(train.SEEDS)))
+        self._seen = self.env.reset()
+
+    def get_spaces(self) -> dict[str, Any]:
+        """Spaces of observations and actions, as RLlib names them."""
+        pair = self.config.observation_space, self.config.action_space
+        return dict.fromkeys((INPUT_ENV_SPACES, INPUT_ENV_SINGLE_SPACES, DEFAULT_MODULE_ID), pair)
+
+    def _sample(self, **kwargs: Any) -> list[SingleAgentEpisode]:
+        """Runs one roll-out; its length is fixed, whatever RLlib requests."""
+        steps, busy = int(self.config.env_config["rollout"]), self.env.stepping_s
+        parts = [self._step(t) for t in range(steps)]
+        *arrays, finals = zip(*parts, strict=True)
+        seen, actions, logits, logp, rewards = (np.stack(one) for one in arrays)
+        final = {place: end for one in finals for place, end in one.items()}
+        whole = np.concatenate([seen, self._seen[None]])
+        ended, count = len(final), steps * self.num_envs
+        self.metrics.log_value(ENDED, ended, reduce="sum")
+        self.metrics.log_value(STEPPING, self.env.stepping_s - busy, reduce="sum")
+        self._log_env_steps(self._metrics_num_env_steps_sampled, count)
+        self._increase_sampled_metrics(count, ended)
+        return list(Rollout(whole, actions, logits, logp, rewards, final).episodes())
+
+    def _step(self, t: int) -> tuple[Any, ...]:
+        """Steps every world once; returns a row of `Rollout`."""
+        seen = self._seen
+        out = self.module.forward_exploration({Columns.OBS: torch.as_tensor(seen)})
+        logits = out[Columns.ACTION_DIST_INPUTS]
+        distribution = self.module.get_exploration_action_dist_cls().from_logits(logits)
+        chosen = distribution.sample()
+        logp, actions = distribution.logp(chosen).numpy(), chosen.numpy()
+        space, bounded = self.env.action_space, actions
+        if isinstance(space, gymnasium.spaces.Box):
+            bounded = np.clip(actions, space.low, space.high)
+        self._seen, rewards, done, infos = self.env.step(bounded)
+        final = {}
+        for n in np.flatnonzero(done):
+            info = infos[n]
+            for name, metric in (("is_success", SUCCESS), ("collision", COLLISION)):
+                self.metrics.log_value(metric, int(info.get(name, False)), reduce="sum")
+            final[t, int(n)] = info["terminal_observation"], info["TimeLimit.truncated"]
+        return seen, actions, logits.numpy(), logp, rewards, final
+
+
+Batch = dict[str, Any]
+
+
+class ActorCritic(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
+    """`Actor` and a critic of the same widths, as a module of RLlib.
+
+    `model_config` contains `hidden`, `normaliser` and `log_std`, see `Actor` and `PpoSettings`.
+    """
+
+    def setup(self) -> None:
+        """Builds the layers."""
+        chosen, size = self.model_config, int(self.observation_space.shape[0])
+        hidden, normaliser = list(chosen["hidden"]), chosen["normaliser"]
+        self.actor = train_algorithms.Actor(
+            self.observation_space, self.action_space, hidden, normaliser
+        )
+        self.critic = train_algorithms.layers_of([size, *hidden, 1], 1.0)
+        if not self.actor.discrete:
+            spread = torch.full(self.action_space.shape, float(chosen["log_std"]))
+            self.log_std = torch.nn.Parameter(spread)
+
+    def get_non_inference_attributes(self) -> list[str]:
+        """Names of the attributes that env runners do not need."""
+        return ["critic"]
+
+    def _forward(self, batch: Batch, **kwargs: Any) -> Batch:
+        raw = self.actor(batch[Columns.OBS])
+        if not self.actor.discrete:
+            raw = torch.cat([raw, self.log_std.expand_as(raw)], dim=-1)
+        return {Columns.ACTION_DIST_INPUTS: raw}
+
+    def compute_values(self, batch: Batch, embeddings: Any = None) -> torch.Tensor:
+        """Values (n,) of observations (n, O)."""
+        values: torch.Tensor = self.critic(self.actor.normaliser(batch[Columns.OBS]))
+        return values.squeeze(-1)
 
 
 @contextmanager
 def learner(
     address: str | None, env_runners: int | None, worlds: int
-) -> Iterator[Callable[..., Trained]]:
+) -> Iterator[Callable[..., train.Trained]]:
     """Connects with a cluster, see `connected`; gives the function that trains one policy on it."""
     with connected(address, env_runners, worlds) as runners:
         yield functools.partial(train_on_ray, runners=runners)
@@ -73,11 +206,10 @@ def learner(
 
 @contextmanager
 def connected(address: str | None, runners: int | None, worlds: int) -> Iterator[int]:
-    """Connects this process to a cluster, and yields the number of env runners.
+    """Connects with a cluster, and yields the number of env runners, by default its CPUs.
 
     The address is `auto` (the cluster that this machine is part of) or `HOST:PORT`; None starts one
-    on this machine, which ends with the training. By default there is an env runner, a process that
-    shares the worlds, for each CPU of the cluster. Raises ConfigError if no cluster answers there,
+    on this machine, which ends with the training. Raises ConfigError if no cluster answers there,
     or it is too small.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -119,13 +251,9 @@ def _runners(runners: int | None, cpus: int, worlds: int) -> int:
 
 
 def train_on_ray(
-    settings: TrainingSettings,
-    seed: int,
-    folder: Path,
-    tell: Tell = lambda _: None,
-    resumed: bool = False,
-    runners: int = 1,
-) -> Trained:
+    settings: TrainingSettings, seed: int, folder: Path, tell: train.Tell = lambda _: None,
+    resumed: bool = False, runners: int = 1,
+) -> train.Trained:  # fmt: skip
     """Trains one policy on the cluster that this process is connected to.
 
     An env runner whose process or machine is lost is restarted, if necessary on another machine;
@@ -137,11 +265,11 @@ def train_on_ray(
     if settings.algorithm != "ppo":
         given = settings.algorithm
         raise ConfigError(f"--engine ray learns with ppo, not {given!r}; leave it out.")
-    begin, path = time.perf_counter(), folder / CHECKPOINT
+    begin, path = time.perf_counter(), folder / train.CHECKPOINT
     about: dict[str, Any] = {"seed": seed, "settings": settings.model_dump(mode="json")}
     content = read_checkpoint(path, FORMAT) if resumed else None
     if content is not None:
-        check_same(content["about"], about, path)
+        train.check_same(content["about"], about, path)
     algorithm = _algorithm(settings, seed, 0 if content is None else content["steps"], runners)
     try:
         learning = Learning(algorithm, settings, seed, path, runners)
@@ -151,7 +279,7 @@ def train_on_ray(
         actor = learning.module.actor.eval().cpu()
     finally:
         algorithm.stop()
-    return Trained(actor, learning.steps, time.perf_counter() - begin, learning.stepping_s)
+    return train.Trained(actor, learning.steps, time.perf_counter() - begin, learning.stepping_s)
 
 
 @dataclass
@@ -181,7 +309,7 @@ class Learning:
         network: ActorCritic = self.learner.module[DEFAULT_MODULE_ID].unwrapped()
         return network
 
-    def run(self, tell: Tell, about: dict[str, Any]) -> None:
+    def run(self, tell: train.Tell, about: dict[str, Any]) -> None:
         """Learns until all steps are done, and saves checkpoints."""
         logger = configure(str(self.path.parent), ["tensorboard"])
         begin = heard = time.perf_counter()
@@ -213,7 +341,7 @@ class Learning:
         self.stepping_s += float(found.get(STEPPING, 0.0)) / self.runners
         ended, success, collision = (int(found.get(n, 0)) for n in (ENDED, SUCCESS, COLLISION))
         self.recent.append((ended, success, collision))
-        while sum(one[0] for one in self.recent) - self.recent[0][0] >= RECENT:
+        while sum(one[0] for one in self.recent) - self.recent[0][0] >= train_algorithms.RECENT:
             self.recent.popleft()
 
     def _check_silence(self, silent_s: float, about: dict[str, Any]) -> None:
@@ -263,10 +391,10 @@ def _algorithm(settings: TrainingSettings, seed: int, done: int, runners: int) -
     model = open_model(settings.robot)
     scenes = {name: load_world(name) for name in settings.worlds}
     rng = np.random.default_rng(seed)
-    env = make_train_env(settings, model, scenes)
-    check_serves(settings, env)
-    env.seed(int(rng.integers(SEEDS)))
-    normaliser = observed(env, rng)
+    env = train.make_train_env(settings, model, scenes)
+    train_algorithms.check_serves(settings, env)
+    env.seed(int(rng.integers(train.SEEDS)))
+    normaliser = train_algorithms.observed(env, rng)
     spaces = env.observation_space, env.action_space
     env.close()
     make = ray.put(functools.partial(share_of_worlds, settings, model, scenes))
@@ -284,29 +412,23 @@ def _algorithm(settings: TrainingSettings, seed: int, done: int, runners: int) -
 
 
 def share_of_worlds(
-    settings: TrainingSettings,
-    model: SimulatorModel,
-    scenes: Mapping[str, World],
-    runner: int,
+    settings: TrainingSettings, model: SimulatorModel, scenes: Mapping[str, World], runner: int,
     runners: int,
-) -> TrainVecEnv:
+) -> TrainVecEnv:  # fmt: skip
     """The worlds of env runner number `runner`: every `runners`-th."""
     names = [name for name, count in settings.worlds.items() for _ in range(count)]
     share = dict(Counter(names[runner::runners]))
-    return make_train_env(settings.model_copy(update={"worlds": share}), model, scenes)
+    return train.make_train_env(settings.model_copy(update={"worlds": share}), model, scenes)
 
 
 def _config(
-    settings: TrainingSettings,
-    seed: int,
-    done: int,
-    normaliser: tuple[Array, Array],
+    settings: TrainingSettings, seed: int, done: int, normaliser: tuple[Array, Array],
     spaces: tuple[gymnasium.Space[Any], gymnasium.Space[Any]],
-) -> PPOConfig:
+) -> PPOConfig:  # fmt: skip
     """Translates the settings into RLlib's configuration."""
     chosen, left = settings.ppo, max(settings.steps - done, 1)
     rate = chosen.learning_rate
-    now = rate * max(1.0 - done / settings.steps, LEAST_RATE)
+    now = rate * max(1.0 - done / settings.steps, train_algorithms.LEAST_RATE)
     network = {"hidden": settings.hidden, "normaliser": normaliser, "log_std": chosen.log_std}
     return (
         PPOConfig()
@@ -315,24 +437,16 @@ def _config(
         .rl_module(rl_module_spec=RLModuleSpec(module_class=ActorCritic, model_config=network))
         .learners(num_learners=0)
         .training(
-            lr=[[0, now], [left, rate * LEAST_RATE]],
+            lr=[[0, now], [left, rate * train_algorithms.LEAST_RATE]],
             train_batch_size_per_learner=chosen.rollout * settings.num_envs,
-            minibatch_size=chosen.batch,
-            num_epochs=chosen.epochs,
-            gamma=chosen.discount,
-            lambda_=chosen.gae_lambda,
-            clip_param=chosen.clip,
-            entropy_coeff=chosen.entropy,
-            vf_loss_coeff=VALUE_WEIGHT,
-            vf_clip_param=np.inf,
-            use_kl_loss=False,
-            grad_clip=GRADIENT_LIMIT,
-            grad_clip_by="global_norm",
+            minibatch_size=chosen.batch, num_epochs=chosen.epochs, gamma=chosen.discount,
+            lambda_=chosen.gae_lambda, clip_param=chosen.clip, entropy_coeff=chosen.entropy,
+            vf_loss_coeff=VALUE_WEIGHT, vf_clip_param=np.inf, use_kl_loss=False,
+            grad_clip=GRADIENT_LIMIT, grad_clip_by="global_norm",
         )
         .fault_tolerance(
-            restart_failed_env_runners=True,
-            delay_between_env_runner_restarts_s=PROBE_S,
+            restart_failed_env_runners=True, delay_between_env_runner_restarts_s=PROBE_S,
             env_runner_health_probe_timeout_s=PROBE_S,
         )
         .debugging(seed=seed, log_level="ERROR")
-    )
+    )  # fmt: skip
