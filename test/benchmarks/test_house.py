@@ -6,14 +6,14 @@ from .runs import asked, fails
 
 # No change makes these worse; the bars of the benchmark are where they are to end.
 AT_MOST = {
-    "modules": 229,
-    "lines": 45_600,
-    "single_importers": 66,
+    "modules": 176,
+    "lines": 37_000,
+    "single_importers": 38,
     "circles": 0,
-    "max_arguments": 14,
-    "max_body": 52,
+    "max_arguments": 10,
+    "max_body": 40,
     "duplicate_class_names": 0,
-    "positional_unpacks": 47,
+    "positional_unpacks": 0,
     "what_docstrings": 0,
 }
 
