@@ -20,7 +20,7 @@ from domains import claimed_domain
 DEADLINE_S = 300.0
 campaign = pytest.mark.campaign
 LAST_LINE = r"demo: in process ([0-2])/2, over DDS ([0-2])/2, report (.+/report\.html)"
-READY_MADE = ("--policy", "dynamic_window")
+READY_MADE = ("--policy", "differential")
 DEVIATION = r"<td>([0-9.e+-]+)</td></tr>"
 
 

@@ -28,7 +28,7 @@ def test_every_example_runs_in_a_process_of_its_own(example, tmp_path):
         "import gymnasium, nics_drl_bridge",
         pytest.param(
             "import gymnasium; gymnasium.make('nics_drl_bridge:NicsBridge/Navigation-v0').close()",
-            marks=pytest.mark.slow,
+            marks=(pytest.mark.slow, pytest.mark.campaign),
         ),
         pytest.param(
             "from nics_drl_bridge import make; import gymnasium; make().close()",

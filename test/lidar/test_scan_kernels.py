@@ -43,8 +43,11 @@ for shape in shapes:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="forbids pages as Linux does")
+@pytest.mark.process
 @pytest.mark.parametrize("side", ["before", "behind"])
-@pytest.mark.parametrize("beams", [36, 48, 180, 360, 720])
+@pytest.mark.parametrize(
+    "beams", [48, *(pytest.param(n, marks=pytest.mark.campaign) for n in (36, 180, 360, 720))]
+)
 def test_a_look_up_reads_nothing_outside_of_its_table(beams, side):
     command = [sys.executable, "-c", BETWEEN_FORBIDDEN_PAGES, str(beams), side]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)

@@ -196,6 +196,7 @@ def test_the_doctor_finds_nothing_at_the_simulator_and_a_second_driver_beside_it
     assert (finding["check"], finding["where"]) == ("publishers", "/cmd_vel")
 
 
+@pytest.mark.campaign
 def test_the_doctor_says_what_a_silent_robot_lacks(domain_id):
     out, _, code = ended(nics(domain_id, "doctor", "--json"))
     assert code == 1

@@ -377,6 +377,7 @@ def test_every_stop_is_in_the_black_box_and_replays(robot, black_box):
 
 
 @pytest.mark.process
+@pytest.mark.campaign
 def test_after_a_burst_of_stops_it_ends_at_once_and_the_first_of_them_is_in_the_black_box(
     launch_process, meet, domain_id, model, tmp_path
 ):

@@ -18,6 +18,11 @@ CAR = load_robot("ackermann")
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
+def many(*row: object) -> object:
+    """A row of a table for the long campaign."""
+    return pytest.param(*row, marks=pytest.mark.campaign)
+
+
 def nics(*words, cwd, **environment):
     command = [sys.executable, "-m", "nics_drl_bridge.commands.cli", "record", *map(str, words)]
     return subprocess.run(
@@ -64,10 +69,10 @@ def test_without_ros_it_is_one_sentence(tmp_path):
     ("words", "hint"),
     [
         (("--out", "drive.csv"), "unknown kind of recording '.csv'"),
-        (("--out", "taken.npz"), "taken.npz: is there already"),
-        (("--out", "drive.npz", "--robot", "ackerman"), "did you mean 'ackermann'?"),
-        (("--out", "drive.npz", "--bound", "0.5"), "too small for robot 'ackermann'"),
-        (("--out", "drive.npz", "--speed", "2"), "speed 2: must be from 0.05 to 1"),
+        many(("--out", "taken.npz"), "taken.npz: is there already"),
+        many(("--out", "drive.npz", "--robot", "ackerman"), "did you mean 'ackermann'?"),
+        many(("--out", "drive.npz", "--bound", "0.5"), "too small for robot 'ackermann'"),
+        many(("--out", "drive.npz", "--speed", "2"), "speed 2: must be from 0.05 to 1"),
     ],
 )
 def test_what_can_not_be_done_is_one_sentence(tmp_path, words, hint):

@@ -195,6 +195,7 @@ def test_the_environment_is_left_as_it_was_found(domain_id, tmp_path):
 
 
 @pytest.mark.process
+@pytest.mark.campaign
 def test_the_environment_is_left_as_it_was_found_by_arguments_that_are_wrong(domain_id, tmp_path):
     code = "before = dict(os.environ)\ntry:\n    open_context(['node', '--ros-args', '-r', 'x'])\n"
     code += "except BackendError:\n    assert os.environ == before\n"
@@ -214,6 +215,7 @@ def test_after_a_node_of_somebody_else_discovery_stays_here_with_a_warning(
 
 
 @pytest.mark.process
+@pytest.mark.campaign
 def test_after_a_subnet_discovery_stays_here_with_a_warning(domain_id, tmp_path):
     code = "first = ours('SUBNET')\nassert multicast() and not shared()\n"
     code += f"end(first)\nsecond = ours('{LOCAL}')\nassert not multicast()"
@@ -241,6 +243,7 @@ def test_the_older_word_for_this_machine_is_heeded(domain_id, tmp_path, distribu
 
 
 @pytest.mark.process
+@pytest.mark.campaign
 def test_who_chooses_shared_memory_gets_it(domain_id, tmp_path):
     code = "first = ours()\nassert shared() and not multicast()"
     run(IN_ORDER + code, domain_id, tmp_path, **{TRANSPORTS: "DEFAULT"})

@@ -181,19 +181,25 @@ def test_many_at_once_end_as_one_after_the_other(worlds):
     assert len({one.result for one in episodes}) > 1
 
 
-def test_arrived_is_who_truly_is_there(monkeypatch):
-    env = BridgeVectorEnv(8, MODEL, WORLD, max_episode_steps=LIMIT)
-    policy = make_policy("straight", env.task)
-    honest = drive_worlds(env, policy.act, range(8))
+class Aside(BridgeVectorEnv):
+    """Tells that robots are half a metre from where they are."""
+
+    def step(self, actions):
+        *rest, infos = super().step(actions)
+        for told in (infos, infos.get("final_info", {})):
+            if "true_pose" in told:
+                told["true_pose"] = told["true_pose"] + [0.5, 0.0, 0.0]
+        return *rest, infos
+
+
+def test_arrived_is_who_truly_is_there():
+    honest, lied = (
+        drive_worlds(env, make_policy("straight", env.task).act, range(8))
+        for env in (
+            kind(8, MODEL, WORLD, max_episode_steps=LIMIT) for kind in (BridgeVectorEnv, Aside)
+        )
+    )
     assert honest.success.any()
-    of_step = BridgeVectorEnv._facts_of_step
-
-    def aside(self, outcome):
-        facts = of_step(self, outcome)
-        return facts | {"true_pose": facts["true_pose"] + [0.5, 0.0, 0.0]}
-
-    monkeypatch.setattr(BridgeVectorEnv, "_facts_of_step", aside)
-    lied = drive_worlds(env, policy.act, range(8))
     assert lied.success.sum() < honest.success.sum()
     assert lied.collision.tolist() == honest.collision.tolist()
 

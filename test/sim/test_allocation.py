@@ -94,7 +94,9 @@ def test_a_simulator_allocates_nothing_per_step_however_many_worlds_it_has(scene
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", ["navigation", "cooperative_reaching"])
+@pytest.mark.parametrize(
+    "task", ["navigation", pytest.param("cooperative_reaching", marks=pytest.mark.campaign)]
+)
 def test_the_memory_of_a_vector_env_does_not_grow_with_its_steps(task):
     env = BridgeVectorEnv(
         16, noisy_model(), field(8.0, 5), task, max_episode_steps=20, autoreset_mode="SameStep"
