@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from nics_drl_bridge.commands.console import one_sentence
+
+if TYPE_CHECKING:
+    from nics_drl_bridge.generator import SimulatorModel
 
 ROBOT, WORLD = "differential", "arena"
 
@@ -20,12 +24,13 @@ def warmup(
 ) -> None:
     """Compiles what generating, training and driving need, on two cores, once on a machine."""
     with one_sentence():
-        begin, done = time.monotonic(), list[tuple[int, float]]()
+        begin = time.monotonic()
         typer.echo("compiling the kernels, once on this machine: about a minute", err=True)
         # Fresh processes: what a fork shares with its parent's threads may be locked for ever.
         with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-            for stage in STAGES:
-                done += pool.map(_compiled_by, stage)
+            *first, model = pool.submit(_compiled_by, _model).result()
+            others = [pool.submit(_compiled_by, part, model) for part in (_simulate, _drive)]
+            done = [first, *(each.result()[:2] for each in others)]
         count, cpu_s = sum(each[0] for each in done), sum(each[1] for each in done)
         took = time.monotonic() - begin
         if as_json:
@@ -34,68 +39,42 @@ def warmup(
             typer.echo(f"compiled {count} kernels in {took:.0f} s ({cpu_s:.0f} s of CPU)", err=True)
 
 
-def _compiled_by(part: str) -> tuple[int, float]:
-    """Runs a part of `PARTS`; returns how many kernels that compiled, and its CPU time [s]."""
+def _compiled_by(part: Callable[..., Any], *given: Any) -> tuple[int, float, Any]:
+    """Runs a part; returns how many kernels that compiled, its CPU time [s], and its result."""
     from nics_drl_bridge.kernels import COMPILING
 
     COMPILING.quiet = True
     count, cpu_s = COMPILING.count, COMPILING.cpu_s
-    PARTS[part]()
-    return COMPILING.count - count, COMPILING.cpu_s - cpu_s
+    result = part(*given)
+    return COMPILING.count - count, COMPILING.cpu_s - cpu_s, result
 
 
-def _model() -> None:
+def _model() -> SimulatorModel:
     """Fits the kinematics of a drive and bakes a lidar table."""
     from nics_drl_bridge.generator import builtin_model
 
-    builtin_model(ROBOT)
+    return builtin_model(ROBOT)
 
 
-def _reset() -> None:
-    """Draws scenes and scans them."""
-    from nics_drl_bridge.generator import builtin_model
-    from nics_drl_bridge.sim.simulator import FastSimulator
-    from nics_drl_bridge.sim.world import load_world
+def _simulate(model: SimulatorModel) -> None:
+    """Begins episodes and steps, alone and in many worlds at once."""
+    from nics_drl_bridge.env.bridge_env import BridgeEnv
+    from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 
-    FastSimulator(builtin_model(ROBOT), load_world(WORLD), 2, 1).reset(range(2))
+    for env in (BridgeVectorEnv(2, model, WORLD), BridgeEnv(model=model, world=WORLD)):
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        env.close()
 
 
-def _step() -> None:
-    """Moves everything for a period."""
+def _drive(model: SimulatorModel) -> None:
+    """Estimates, plans and shields."""
     import numpy as np
 
-    from nics_drl_bridge.generator import builtin_model
-    from nics_drl_bridge.sim.simulator import FastSimulator
-    from nics_drl_bridge.sim.world import load_world
-
-    FastSimulator(builtin_model(ROBOT), load_world(WORLD), 2, 1).step(np.zeros((2, 1, 2)))
-
-
-def _train() -> None:
-    """Observes and rewards many worlds at once."""
-    from nics_drl_bridge.env.vector_env import BridgeVectorEnv
-    from nics_drl_bridge.generator import builtin_model
-
-    env = BridgeVectorEnv(2, builtin_model(ROBOT), WORLD)
-    env.reset(seed=0)
-    env.step(env.action_space.sample())
-    env.close()
-
-
-def _drive() -> None:
-    """Estimates, plans and shields."""
-    from nics_drl_bridge.env.bridge_env import BridgeEnv
     from nics_drl_bridge.gate import shield
+    from nics_drl_bridge.middleware.middleware import rehearse
     from nics_drl_bridge.policy.policies import open_policy
 
-    env = BridgeEnv(model=ROBOT, world=WORLD, estimator=True)
-    policy, _ = open_policy("dynamic_window", env.model)
-    observation, _ = env.reset(seed=0)
-    env.step(policy.act(observation))
-    env.close()
+    policy, task = open_policy("dynamic_window", model)
+    policy.act(task.observation(rehearse(model), {"goal": np.ones(2)}))
     shield.rehearse()
-
-
-PARTS = {each.__name__[1:]: each for each in (_model, _reset, _step, _train, _drive)}
-STAGES = ("model",), ("step", "reset"), ("train", "drive")
-"""Parts that are compiled side by side; each stage needs what those before it compiled."""

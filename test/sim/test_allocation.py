@@ -76,7 +76,10 @@ def compiled(step, steps=100):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize("several", [False, True], ids=["one", "many"])
+@pytest.mark.parametrize(
+    "several",
+    [pytest.param(False, marks=pytest.mark.campaign, id="one"), pytest.param(True, id="many")],
+)
 def test_a_simulator_allocates_nothing_per_step_however_many_worlds_it_has(scene, several):
     world, robots, worlds = SCENES[scene]
     worlds = worlds if several else 1
