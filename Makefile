@@ -8,10 +8,8 @@ SHELL := /bin/bash
 PYTHON ?= python3
 RECORDING ?=
 PYTEST_ARGS ?=
-# Half as many tests more than cores: those of nodes mostly wait. The tests of one file run one after
-# the other; PARALLEL= runs all of them so.
-WORKERS := $(shell echo $$(( ($$(nproc 2>/dev/null || echo 2) * 3 + 1) / 2 )))
-PARALLEL ?= -n $(WORKERS) --dist loadfile
+# Tests of one file run one after the other; PARALLEL= runs all of them so.
+PARALLEL ?= -n auto --dist loadfile
 BENCHMARKS ?=
 QUICK ?=
 OUT ?=
