@@ -166,17 +166,15 @@ def free_starts(rng, footprint, scenes, size, number):
 
 
 SHAPES = [CIRCLE, PLATE, HOOK, SEGMENT]
-SLOW, CAMPAIGN = pytest.mark.slow, pytest.mark.campaign
+SLOW = pytest.mark.slow
 FOOTPRINTS = [0.01, 0.1, 0.5, BAR, DART]
 
 
 @pytest.mark.parametrize("footprint", FOOTPRINTS, ids=["1cm", "10cm", "50cm", "bar", "dart"])
-@pytest.mark.parametrize(
-    "number", [pytest.param(40, marks=SLOW), pytest.param(160, marks=CAMPAIGN)]
-)
+@SLOW
 @pytest.mark.timeout(600)  # a cold start compiles
-def test_a_robot_ends_where_its_arc_first_touches_at_any_size_and_speed(footprint, number):
-    rng = np.random.default_rng(5)
+def test_a_robot_ends_where_its_arc_first_touches_at_any_size_and_speed(footprint):
+    number, rng = 160, np.random.default_rng(5)
     walls = random_walls(rng, 8, 3.4)
     groups = [{"shapes": [shape], "count": 1} for shape in SHAPES]
     world = field(7.0, obstacles=groups, walls=[tuple(wall) for wall in walls])
@@ -214,7 +212,7 @@ def test_a_robot_ends_where_its_arc_first_touches_at_any_size_and_speed(footprin
             at = robot.poses(np.array([touch]))[0]
             # Where it touches at a slant the time is less sharp than the clearance.
             assert np.hypot(*(end - at)[:2]) < 1e-3
-    assert touched > 0
+    assert touched > 5
 
 
 def test_a_robot_of_a_centimetre_does_not_pass_a_wall_at_50_m_per_s():
@@ -229,7 +227,7 @@ def test_a_robot_of_a_centimetre_does_not_pass_a_wall_at_50_m_per_s():
 
 @pytest.mark.parametrize("shape", [CIRCLE, PLATE, HOOK], ids=["circle", "plate", "hook"])
 def test_a_robot_and_a_moving_obstacle_stop_where_they_touch(shape):
-    number, rng = 40, np.random.default_rng(7)
+    number, rng = 100, np.random.default_rng(7)
     world = field(10.0, obstacles=[{"shapes": [shape], "count": 1}])
     simulator = FastSimulator(fast_model(0.05), world, number, tell=silent)
     simulator.reset(range(number), starts=np.tile([0.0, 0.0, 0.3], (number, 1, 1)))
@@ -268,11 +266,11 @@ def test_a_robot_and_a_moving_obstacle_stop_where_they_touch(shape):
         there = Mover(*edges, simulator.data.bodies[n, 0, :3], np.zeros(3), in_map=True)
         assert clearance(here, there, np.zeros(1))[0] >= -OVERLAP
         touched += flagged
-    assert 5 < touched < number
+    assert 10 < touched < number
 
 
 def test_robots_that_run_into_each_other_stop_there_and_are_marked():
-    number, rng = 60, np.random.default_rng(9)
+    number, rng = 200, np.random.default_rng(9)
     simulator = FastSimulator(fast_model(0.03), field(10.0), number, 2, tell=silent)
     starts = np.zeros((number, 2, 3))
     starts[:, 1, :2] = rng.uniform(-0.05, 0.05, (number, 2)) + np.array([0.0, 0.2])
@@ -289,7 +287,7 @@ def test_robots_that_run_into_each_other_stop_there_and_are_marked():
         apart = np.hypot(*(simulator.data.pose[n, 1] - simulator.data.pose[n, 0])[:2])
         assert apart >= 0.06 - OVERLAP
         touched += sum(flags)
-    assert touched > 5
+    assert touched > 10
 
 
 def test_robots_that_follow_each_other_at_any_speed_do_not_touch():
