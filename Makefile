@@ -26,6 +26,9 @@ unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH
 CLEAN_ENV := env -u _ROS_WHEELS_BOOTSTRAP_COMPLETE -u LD_LIBRARY_PATH
 endif
 
+# Containers often set it; but then each of the hundreds of processes compiles its libraries anew.
+unexport PYTHONDONTWRITEBYTECODE
+
 # The interpreter below PYTHON, so that an activated .venv is not taken for the base of itself.
 BASE := $(shell $(CLEAN_ENV) $(PYTHON) -c 'import sys; print(getattr(sys, "_base_executable", sys.executable))' 2>/dev/null)
 VERSION := $(if $(BASE),$(shell $(BASE) -c 'import sys; print("%d.%d" % sys.version_info[:2])'))

@@ -106,6 +106,7 @@ def test_generate_makes_a_model_of_a_recording_and_replaces_it(drive, tmp_path):
     assert load_model(tmp_path / "models" / "car").fingerprint != model.fingerprint
 
 
+@pytest.mark.slow
 def test_a_recording_too_coarse_for_a_useful_model_is_one_sentence(tmp_path):
     spec = load_robot("differential")
     fine = textbook.record(spec, np.random.default_rng(0), duration=60.0, dt=0.01)
@@ -132,6 +133,7 @@ def test_replay_of_something_else_is_one_sentence(tmp_path):
     assert "no such file" in refused(nics("replay", "none.jsonl", cwd=tmp_path))
 
 
+@pytest.mark.slow
 def test_generate_reads_the_folder_of_a_real_drive(shared_recordings, tmp_path):
     folder = shared_recordings / "xtark_ackermann" / "random_drive_45s"
     done = nics("generate", folder, "--out", "car", "--assume-textbook", cwd=tmp_path)

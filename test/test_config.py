@@ -271,6 +271,7 @@ def test_a_tag_of_a_key_or_of_another_name_is_found(text):
     assert "the tag" in refused_soon(text)
 
 
+@pytest.mark.slow
 def test_very_many_values_are_refused_before_they_are_all_read():
     assert "more than" in refused_soon(f"a: [{'1,' * (MAX_BYTES // 2 - 10)}]")
 
@@ -289,6 +290,7 @@ def test_a_long_key_or_alias_is_not_told_whole():
     assert "line 1" in refused_soon(f"a: *{'n' * 5000}")
 
 
+@pytest.mark.slow
 def test_many_short_values_are_read_as_before():
     pairs = "[0.125, -1.5], " * 16_000
     assert len(parse_yaml(f"points: [{pairs}]", "a.yaml")["points"]) == 16_000

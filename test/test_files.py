@@ -313,6 +313,7 @@ def test_a_manifest_is_that_of_sha256sum(listed):
     check_sums(listed, NAMES)
 
 
+@pytest.mark.slow
 def test_any_flipped_bit_of_a_manifest_is_noticed(listed):
     whole = (listed / SUMS).read_bytes()
     for place in range(8 * len(whole)):

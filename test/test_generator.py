@@ -58,6 +58,7 @@ def contents(folder):
     return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_a_saved_model_is_the_same_to_the_bit(robot, tmp_path):
     model = builtin_model(robot)

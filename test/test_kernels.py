@@ -71,11 +71,13 @@ def ask(package: Path) -> tuple[list[float], list[int]]:
     return [float(word) for word in values.split()], [int(word) for word in compiled.split()]
 
 
+@pytest.mark.slow
 def test_a_second_process_compiles_nothing_and_a_division_by_zero_is_inf(package):
     assert ask(package) == ([20.0, -1.0, float("inf")], [1, 1])
     assert ask(package) == ([20.0, -1.0, float("inf")], [0, 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("file", "old", "new", "expected"),
     [
@@ -97,6 +99,7 @@ def test_an_edit_of_what_a_kernel_is_made_of_compiles_it_anew_and_no_other(
     assert ask(package)[1] == [0, 0]
 
 
+@pytest.mark.slow
 def test_a_class_of_arguments_may_get_another_name(package):
     named = "from typing import NamedTuple\n\nclass Pair(NamedTuple):\n    one: float\n"
     call = LOW.replace("x + STEP", "x.one + STEP") + "\nlow(Pair(1.0))\n"
@@ -107,6 +110,7 @@ def test_a_class_of_arguments_may_get_another_name(package):
         subprocess.run([sys.executable, "-c", code], cwd=package.parent, check=True)
 
 
+@pytest.mark.slow
 def test_a_kernel_that_moves_within_its_file_leaves_nothing_behind(package):
     ask(package)
     before = len(list(package.rglob("*.nbi")))

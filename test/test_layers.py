@@ -126,10 +126,12 @@ def test_the_page_on_architecture_shows_the_order():
     assert ORDER in (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_imports_run_one_way():
     assert wrong_directions(ROOT / PACKAGE) == []
 
 
+@pytest.mark.slow
 def test_each_library_is_imported_at_its_home_only():
     assert strangers(ROOT / PACKAGE) == []
 

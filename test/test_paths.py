@@ -54,6 +54,7 @@ def test_a_model_is_saved_and_opened_at_either(tmp_path, kind):
     assert (tmp_path / "table" / "rows.npy").is_file()
 
 
+@pytest.mark.slow
 @KINDS
 @pytest.mark.parametrize("name", ["drive.npz", "drive"])
 def test_a_drive_is_written_and_read_at_either(tmp_path, kind, name):
@@ -72,6 +73,7 @@ def test_a_recording_is_saved_and_loaded_at_either(tmp_path, kind):
     assert np.array_equal(load_recording(place).pose.values, drive.pose.values)
 
 
+@pytest.mark.slow
 @KINDS
 def test_a_bag_is_saved_told_and_looked_through_at_either(tmp_path, kind):
     pytest.importorskip("rosbags")

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from numba import njit
 from scipy import stats
 
@@ -25,6 +26,7 @@ def test_uniform_draws_are_uniform_in_the_half_open_unit_interval():
     assert len(np.unique(sample)) == sample.size
 
 
+@pytest.mark.slow
 def test_normal_draws_are_standard_normal():
     sample = draws(random.normal, np.arange(10), np.arange(4), np.arange(5000)).ravel()
     assert np.isfinite(sample).all()

@@ -8,6 +8,7 @@ pytest.importorskip("torch", reason="needs the extra 'train'")
 pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_what_an_attacker_hands_in_is_refused_in_a_sentence_and_what_is_good_is_taken():
     code, found = asked("abuse.py", "--only", "files", "--rounds", "12", "--seed", "5")

@@ -18,11 +18,13 @@ AT_MOST = {
 }
 
 
+@pytest.mark.slow
 def test_the_house_gets_no_harder_to_find_ones_way_in():
     _, result = asked("house.py")
     assert {name: result[name] for name in AT_MOST if result[name] > AT_MOST[name]} == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("control", "names"),
     [

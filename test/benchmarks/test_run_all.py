@@ -71,6 +71,7 @@ def test_bars_that_are_met_end_with_0_and_stand_in_the_file_with_machine_commit_
     assert {"commit", "dirty"} < set(entry)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("content", "state", "told"),
     [

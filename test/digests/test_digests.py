@@ -12,6 +12,7 @@ from .digests import DIGESTS, FILE
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(DIGESTS))
 def test_what_the_package_computes_is_what_it_computed_before(name, monkeypatch):
     monkeypatch.setattr(sys, "path", [str(BENCHMARKS), *sys.path])

@@ -52,6 +52,7 @@ def random_actions(env, count, seed=0):
     return np.random.default_rng(seed).uniform(-1.0, 1.0, (count, size)).astype(np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ["ackermann", "differential", "mecanum"])
 def test_gymnasiums_checker_finds_nothing_to_warn_of(robot):
     with warnings.catch_warnings():

@@ -169,6 +169,7 @@ PLANS = st.one_of(st.lists(CALLS, max_size=8), st.just([*STEPS, ("render", (), {
 WHENS = st.one_of(st.integers(0, 12), st.integers(0, 80))
 
 
+@pytest.mark.slow
 @settings(max_examples=400, deadline=None)
 @given(
     st.sampled_from(sorted(ENVS)), st.sampled_from([Robot, RobotWithoutHalt]), st.booleans(),

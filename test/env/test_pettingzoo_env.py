@@ -36,6 +36,7 @@ def sampled(env, seed=0):
         yield {name: env.action_space(name).sample() for name in env.agents}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "options"), TASKS)
 def test_pettingzoos_checkers_find_nothing_to_warn_of(task, options):
     with warnings.catch_warnings():

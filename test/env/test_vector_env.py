@@ -82,6 +82,7 @@ def assert_alike(ours, theirs, path="info"):
             assert np.array_equal(mine, value), here
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("task", TASKS, ids=IDS)
 def test_it_steps_as_gymnasiums_own_vector_env_of_single_envs(task, mode):
@@ -154,6 +155,7 @@ def test_steps_give_the_same_digest_in_fresh_processes_with_any_number_of_thread
     assert len(found[0]) == 64
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("task", TASKS, ids=IDS)
 def test_threads_change_no_bit(task, mode):

@@ -133,6 +133,7 @@ def huge(**changes):
     return {"kind": "array", "type": "<f8", "shape": [10**15], "data": ""} | changes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "change",
     [

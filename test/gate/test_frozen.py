@@ -207,6 +207,7 @@ def test_a_robot_that_never_starts_is_stopped_a_second_after_it_was_told_to():
         assert rig.now - began < 1.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lag_s", [0.3, 0.7])
 def test_a_robot_that_follows_late_is_not_taken_for_stuck(lag_s):
     rig = Rig(config("mecanum"))

@@ -29,6 +29,7 @@ def test_a_textbook_recording_needs_no_correction_and_is_taken_digit_by_digit(na
         assert np.array_equal(getattr(samples, field), getattr(plain, field))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ackermann", "differential", "mecanum"])
 def test_latency_is_found_from_the_measured_state(name):
     spec = load_robot(name)
@@ -37,6 +38,7 @@ def test_latency_is_found_from_the_measured_state(name):
     assert found.clock_offset_s == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ackermann", "differential"])
 @pytest.mark.parametrize(("ahead", "rotation"), [(0.31, 2.5), (-1.7, -1.48)])
 def test_clock_offset_rotation_lever_arm_and_noise_are_found_together(name, ahead, rotation):
@@ -59,6 +61,7 @@ def test_clock_offset_rotation_lever_arm_and_noise_are_found_together(name, ahea
     assert abs(found.clock_offset_s + ahead) < 5 * found.uncertainty["clock_offset_s"] + 1e-3
 
 
+@pytest.mark.slow
 def test_offset_is_found_between_clocks_that_share_no_epoch(differential):
     recording = drive(differential, pose_clock_ahead=1.7e9)
     assert calibrate(recording, differential).clock_offset_s == pytest.approx(-1.7e9, abs=0.01)
@@ -105,6 +108,7 @@ def test_gaps_of_the_pose_do_not_spoil_the_calibration(car):
     assert not ((samples.t > 11.32) & (samples.t < 11.68)).any()
 
 
+@pytest.mark.slow
 def test_lags_and_latency_of_a_state_that_was_not_measured_are_found(car):
     recording = drive(car, latency=0.06, noise=(5e-4, 1e-3), measured_state=False)
     found = calibrate(recording, car)
@@ -115,6 +119,7 @@ def test_lags_and_latency_of_a_state_that_was_not_measured_are_found(car):
     assert steering.lag_s == pytest.approx(0.1, abs=0.01)
 
 
+@pytest.mark.slow
 def test_without_wheels_offset_and_latency_are_said_to_be_one_sum(car):
     recording = drive(
         car, latency=0.06, pose_clock_ahead=0.4, noise=(5e-4, 1e-3), measured_state=False
@@ -125,6 +130,7 @@ def test_without_wheels_offset_and_latency_are_said_to_be_one_sum(car):
     assert any("Only the sum" in note for note in found.notes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("swapped", [True, False])
 def test_wheels_tell_latency_from_clock_offset_and_whether_they_are_swapped(car, swapped):
     truth = drive(car)
@@ -156,6 +162,7 @@ def test_streams_that_do_not_overlap_are_refused(car):
         align(Drive(replace(recording, command=moved, state=None), car), Calibration())
 
 
+@pytest.mark.slow
 def test_a_calibration_survives_plain_data(car):
     found = calibrate(drive(car, latency=0.05, duration=20.0, measured_state=False), car)
     plain = json.loads(json.dumps(asdict(found)))

@@ -83,6 +83,7 @@ def test_straight_only_of_a_differential_robot_names_the_turn_command(differenti
     assert harmless(found, differential)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("column", "constant", "name", "advice"),
     [

@@ -58,6 +58,7 @@ def test_an_exact_recording_is_fitted_to_nine_digits_and_not_refined(differentia
     assert found.held_out.mean_position_error_m < 1e-4
 
 
+@pytest.mark.slow
 def test_the_held_out_part_is_not_used_for_the_model(car):
     recording = drive(car, noise=(5e-4, 1e-3), measured_state=False)
     spoiled = recording.pose.values.copy()
@@ -68,6 +69,7 @@ def test_the_held_out_part_is_not_used_for_the_model(car):
     assert a.calibration == b.calibration
 
 
+@pytest.mark.slow
 def test_a_prediction_knows_no_pose_after_its_start(car):
     recording = drive(car, noise=(5e-4, 1e-3), measured_state=False)
     found = identify(recording, car)
@@ -79,6 +81,7 @@ def test_a_prediction_knows_no_pose_after_its_start(car):
     assert np.array_equal(seen, predict(found.model, found.calibration, blind, chosen))
 
 
+@pytest.mark.slow
 def test_a_noisy_drive_in_bursts_without_state_still_gives_the_textbook_terms(car):
     recording = drive(
         car,
@@ -98,6 +101,7 @@ def test_a_noisy_drive_in_bursts_without_state_still_gives_the_textbook_terms(ca
     assert found.held_out.mean_position_error_m < 0.05
 
 
+@pytest.mark.slow
 def test_a_noisy_drive_with_measured_wheels_gives_the_textbook_terms(differential):
     recording = drive(
         differential, latency=0.08, rotation=2.5, lever=(-0.05, 0.0), noise=(0.001, 0.002)
@@ -115,6 +119,7 @@ def test_a_short_drive_says_that_it_was_not_tried(car):
     assert any("too short for a prediction over 5 s" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_steering_that_never_moved_has_no_terms_and_a_sentence(car):
     spec, recording = constant_steering(car, -0.4)
     found = identify(recording, spec)
@@ -125,6 +130,7 @@ def test_steering_that_never_moved_has_no_terms_and_a_sentence(car):
     assert found.model.assumed == ()
 
 
+@pytest.mark.slow
 def test_on_request_the_textbook_completes_what_was_measured_at_a_constant(car):
     spec, recording = constant_steering(car, -0.4)
     plain, completed = identify(recording, spec), identify(recording, spec, assume=True)
@@ -135,6 +141,7 @@ def test_on_request_the_textbook_completes_what_was_measured_at_a_constant(car):
     assert any(note.startswith("Assumed, not learnt: wz") for note in completed.notes)
 
 
+@pytest.mark.slow
 def test_at_the_same_steering_the_completed_model_moves_like_the_learnt_one(car):
     spec, recording = constant_steering(car, -0.4)
     plain, completed = identify(recording, spec).model, identify(recording, spec, assume=True).model

@@ -101,6 +101,7 @@ def test_the_uncertainty_of_a_level_covers_its_error(differential):
         assert all(0.0 < level.uncertainty < 0.3 * known for level in found_levels)
 
 
+@pytest.mark.slow
 def test_noise_of_the_pose_is_no_drift_of_the_robot(differential):
     found = identify(drive(differential, duration=90.0, noise=(0.005, 0.01)), differential).noise
     assert found.pose_position.std == pytest.approx(0.005, rel=TOLERANCE)
@@ -109,6 +110,7 @@ def test_noise_of_the_pose_is_no_drift_of_the_robot(differential):
     assert found.heading_drift.std < 0.009
 
 
+@pytest.mark.slow
 def test_the_drift_of_a_model_that_runs_away_is_assumed(car):
     recording = drive(car, noise=(5e-4, 1e-3), measured_state=False)
     found = identify(recording, car)

@@ -24,6 +24,7 @@ def found(real_drives, car):
     return identify(read_recording(real_drives / "random_drive_45s"), car, assume=True)
 
 
+@pytest.mark.slow
 def test_its_recordings_show_bursts_offset_rotation_and_swapped_wheels(real_drives, car):
     calibration = calibrate(read_recording(real_drives / "random_drive_45s"), car)
     assert calibration.burst_period_s == pytest.approx(0.1, abs=0.005)
@@ -35,6 +36,7 @@ def test_its_recordings_show_bursts_offset_rotation_and_swapped_wheels(real_driv
     assert any("steering_command never changed" in note for note in calibration.notes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "until", [*(pytest.param(t, marks=CAMPAIGN) for t in (10.0, 20.0, 38.0)), 30.0]
 )
@@ -49,6 +51,7 @@ def test_its_model_predicts_five_seconds_of_unseen_drive_to_three_centimetres(
     assert held_out.mean_position_error_m < 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["constant_drive_51s", "constant_drive_214s"])
 def test_its_model_predicts_other_drives_too(real_drives, car, found, name):
     other = Drive(read_recording(real_drives / name), car)
@@ -89,6 +92,7 @@ def test_the_benchmark_prints_one_json_object(real_drives):
     assert {"mean_heading_error_rad", "mean_path_m"} <= set(result)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ahead", [*(pytest.param(t, marks=CAMPAIGN) for t in (7.0, -7.0)), 1.7e9])
 def test_its_errors_do_not_depend_on_what_the_motion_capture_calls_zero(real_drives, car, ahead):
     recording = read_recording(real_drives / "random_drive_45s")
@@ -98,6 +102,7 @@ def test_its_errors_do_not_depend_on_what_the_motion_capture_calls_zero(real_dri
     assert held_out.mean_position_error_m < 0.03
 
 
+@pytest.mark.slow
 def test_gaps_and_a_start_in_the_middle_do_not_spoil_its_model(real_drives, car):
     recording = read_recording(real_drives / "random_drive_45s")
     for gap in (12.0, 15.5, 19.0, 26.0, 33.0):

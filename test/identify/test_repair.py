@@ -59,6 +59,7 @@ def test_a_recording_without_faults_is_not_touched(name, noise):
     assert found is whole
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 def test_an_exact_fit_survives_jumps_in_five_per_cent_of_the_rows(name):
     spec = load_robot(name)
@@ -69,6 +70,7 @@ def test_an_exact_fit_survives_jumps_in_five_per_cent_of_the_rows(name):
     assert faulty.held_out.mean_position_error_m < clean.held_out.mean_position_error_m + 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ackermann", "differential"])
 def test_a_noisy_fit_survives_jumps_in_five_per_cent_of_the_rows(name):
     spec = load_robot(name)
@@ -78,6 +80,7 @@ def test_a_noisy_fit_survives_jumps_in_five_per_cent_of_the_rows(name):
     assert faulty.held_out.mean_position_error_m < clean.held_out.mean_position_error_m + 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 @pytest.mark.parametrize("apart", [False, True])
 def test_an_exact_fit_survives_ten_per_cent_of_the_rows_missing(name, apart):
@@ -95,6 +98,7 @@ def test_an_exact_fit_survives_ten_per_cent_of_the_rows_missing(name, apart):
     assert gappy.fit.rmse == pytest.approx(clean.fit.rmse, rel=0.3, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_noisy_fit_survives_both(differential):
     rng = np.random.default_rng(2)
     plain = drive(differential, noise=(5e-4, 1e-3), latency=0.05)
@@ -148,6 +152,7 @@ def test_a_stream_that_is_mixed_of_two_is_refused(car):
         identify(replace(recording, pose=replace(recording.pose, values=values)), car)
 
 
+@pytest.mark.slow
 def test_noise_of_the_measured_state_does_not_bend_its_lag(differential):
     plain = drive(differential, noise=(5e-4, 1e-3))
     noise = np.random.default_rng(0).normal(size=plain.state.values.shape) * 0.2

@@ -66,6 +66,7 @@ def road(disturbed) -> list[Findings]:
     return found
 
 
+@pytest.mark.slow
 def test_a_stage_adds_what_it_says_and_leaves_the_rest(road):
     for name, before, after in zip(NAMES, road, road[1:], strict=False):
         names = {f.name for f in fields(Findings)}
@@ -73,6 +74,7 @@ def test_a_stage_adds_what_it_says_and_leaves_the_rest(road):
         assert changed == ADDED[name]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "missing"),
     [
@@ -101,6 +103,7 @@ def inferred(car) -> tuple[Drive, Findings]:
     return driven, run(STAGES[: NAMES.index("responses")], driven)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [

@@ -60,6 +60,7 @@ def noisy_samples(spec, seed, alike=0.9, size=0.05):
     return Samples(drive.pose.t, np.zeros_like(dq), x, dq, 0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(KNOWN))
 def test_known_coefficients_lie_within_three_standard_errors(name):
     spec, inside, short = load_robot(name), [], []
@@ -77,6 +78,7 @@ def test_known_coefficients_lie_within_three_standard_errors(name):
     assert 0.4 < np.mean(short) < 0.95  # nor are they wide for nothing
 
 
+@pytest.mark.slow
 def test_the_known_product_of_a_car_lies_within_three_standard_errors():
     spec, inside = load_robot("ackermann"), []
     for seed in range(30):

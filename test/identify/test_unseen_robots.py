@@ -82,6 +82,7 @@ def test_a_car_of_another_wheelbase_with_its_steering_first(noise):
     assert found.model.quality.held_out_r2["wz"] > 0.99
 
 
+@pytest.mark.slow
 def test_the_same_car_without_its_state_measured():
     spec = robot("long_car")
     recording = recorded(spec, lambda c: c, car_twist, (5e-4, 1e-3), latency=0.06)
@@ -101,6 +102,7 @@ def test_a_skid_steer_shows_its_slip(noise):
     assert found.held_out.mean_position_error_m < 0.03
 
 
+@pytest.mark.slow
 def test_a_robot_without_any_state_but_three_commands():
     spec = robot("stateless")
     recording = recorded(spec, lambda c: c, omni_twist, (5e-4, 1e-3))
@@ -110,6 +112,7 @@ def test_a_robot_without_any_state_but_three_commands():
         assert terms(found)[dof][name] == pytest.approx(1.0, abs=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("latency", [0.0, 0.15])
 def test_the_latency_of_a_robot_without_state_is_exact(latency):
     spec = robot("stateless")
@@ -126,6 +129,7 @@ def test_the_latency_of_a_robot_without_state_is_exact(latency):
     assert found.held_out.mean_position_error_m < 1e-6
 
 
+@pytest.mark.slow
 def test_the_uncertainty_of_the_latency_covers_the_step_of_the_model():
     spec = robot("long_car")
     recording = recorded(spec, lambda c: c, car_twist, (5e-4, 1e-3), latency=0.15)

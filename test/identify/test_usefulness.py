@@ -79,6 +79,7 @@ def test_standing_still_is_off_by_the_way_from_start_to_end(car):
     assert result.mean_path_m == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["car", "differential", "mecanum"])
 def test_rows_too_far_apart_are_named(name, request):
     spec = request.getfixturevalue(name)
@@ -89,6 +90,7 @@ def test_rows_too_far_apart_are_named(name, request):
     assert sentence.endswith("between rows that are 0.3 s apart, so record at a higher rate.")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["car", "differential", "mecanum"])
 def test_a_good_drive_gives_a_useful_model(name, request):
     spec = request.getfixturevalue(name)
@@ -100,6 +102,7 @@ def test_a_drive_too_short_to_try_the_model_is_not_judged(car):
     assert verdict_on(drive(car, duration=9.0), car) == ""
 
 
+@pytest.mark.slow
 def test_a_robot_held_up_is_not_put_down_to_the_rate(differential):
     free = record(differential, np.random.default_rng(0), 60.0, dt=0.01)
     sentence = verdict_on(held_up(free, 20.0, 30.0), differential)
@@ -142,6 +145,7 @@ def test_a_model_of_too_few_terms_is_not_put_down_to_the_recording(car):
     assert sentence.endswith("it may lack terms, so leave the order at 2 and alpha at `auto`.")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["car", "mecanum"])
 def test_a_model_that_predicts_nothing_is_told_of_in_one_sentence(name, request):
     spec = request.getfixturevalue(name)

@@ -71,6 +71,7 @@ def places(shape, high, number, rng):
     return gap, np.stack([away * np.cos(bearing), away * np.sin(bearing), heading], axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["paper", "paper_12m", "rplidar_a1", "hokuyo_ust_10lx"])
 @pytest.mark.timeout(600)  # a cold start compiles
 def test_auto_is_right_within_a_centimetre_in_every_band_for_every_shape(name):
@@ -105,6 +106,7 @@ def test_a_long_segment_near_the_lidar_is_scanned_exactly():
     assert np.abs(found[both] - true[both]).max() < 1e-4
 
 
+@pytest.mark.slow
 def test_a_star_that_the_lidar_all_but_touches_is_right_where_few_places_err():
     corners = np.arange(6) * np.pi / 3.0
     star = np.where(np.arange(6) % 2, 0.176, 0.402)[:, None] * np.stack(

@@ -80,6 +80,7 @@ def by_shapely(grid, pose):
     return np.nanmin(np.where(np.isnan(hits), np.inf, hits), axis=1), clear
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kernel", KERNELS)
 def test_scans_of_random_maps_agree_with_plane_geometry(kernel):
     seen, solid, outside = 0, 0, 0
@@ -98,6 +99,7 @@ def test_scans_of_random_maps_agree_with_plane_geometry(kernel):
     assert min(solid, outside) > 20
 
 
+@pytest.mark.slow
 def test_the_baked_way_finds_what_the_exact_one_does_on_thousands_of_maps():
     rays = directions(97)
     different = beams = 0

@@ -48,6 +48,7 @@ def finite(ranges, spec):
     return np.nan_to_num(ranges, posinf=spec.range_max, neginf=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SOME)
 def test_exact_scans_of_random_scenes_agree_with_plane_geometry(name):
     spec, compared = SENSORS[name], 0
@@ -62,6 +63,7 @@ def test_exact_scans_of_random_scenes_agree_with_plane_geometry(name):
     assert compared > 10 * spec.beams
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("renderer", RENDERERS)
 def test_a_lidar_inside_or_beside_any_shape_sees_what_plane_geometry_says(renderer):
     spec, compared = lidar(beams=90, range_min=0.0), 0
@@ -79,6 +81,7 @@ def test_a_lidar_inside_or_beside_any_shape_sees_what_plane_geometry_says(render
     assert compared > 1000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SOME)
 def test_baked_scans_of_random_scenes_are_near_the_exact_ones(name):
     spec = SENSORS[name]
@@ -102,6 +105,7 @@ def test_baked_scans_of_random_scenes_are_near_the_exact_ones(name):
     assert returns > 0.1 * np.size(errors)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("density", [Density(), Density(distances=20, rotations=24, phases=1)])
 @pytest.mark.parametrize("corners", [3, 8, 200])
 @pytest.mark.parametrize("make", POLYGONS)
@@ -207,6 +211,7 @@ def test_the_nearest_of_several_objects_is_returned_whatever_their_order(rendere
     assert scanner.scan(HERE, far, wall)[0, 2] == pytest.approx(1.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("renderer", RENDERERS)
 def test_a_scan_in_a_batch_is_the_scan_alone_to_the_bit(renderer):
     spec = lidar(beams=180)
@@ -224,6 +229,7 @@ def test_a_scan_in_a_batch_is_the_scan_alone_to_the_bit(renderer):
     assert np.array_equal(into, batch)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("beams", [7, 20, 40, 720])
 def test_a_world_of_more_bodies_than_lanes_is_the_minimum_of_its_parts_to_the_bit(beams):
     scanner = make_scanner(lidar(beams=beams), random_shapes(5), "baked")

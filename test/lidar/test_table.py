@@ -95,6 +95,7 @@ def test_a_loaded_table_is_mapped_and_writing_to_it_leaves_the_files(folder):
     assert contents(folder) == before
 
 
+@pytest.mark.slow
 def test_two_processes_share_the_pages_of_a_table(tmp_path):
     big = bake(lidar(beams=720), (SQUARE,), Density(distances=100, rotations=240))
     big.save(tmp_path / "table")

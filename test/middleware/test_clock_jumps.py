@@ -57,6 +57,7 @@ BROKEN = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pose", BROKEN)
 def test_where_odometry_does_not_tell_the_way_the_robot_may_be_anywhere_in_reach(pose):
     settings = [Setting(jump, pose=BROKEN[pose]) for jump in FAR]
@@ -65,6 +66,7 @@ def test_where_odometry_does_not_tell_the_way_the_robot_may_be_anywhere_in_reach
     assert max(nees) < CHI2_999
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("jump_s", [*FAR, *SMALL])
 def test_the_same_drive_gives_the_same_bits(jump_s):
     model = noisy_model("ackermann")

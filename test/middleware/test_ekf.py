@@ -186,6 +186,7 @@ def simulated_drive(model, seconds, seed, pose_std=None):
     return np.array(errors), np.array(drifts), np.array(covariances)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_with_measured_poses_the_estimate_stays_at_the_truth(robot):
     model = builtin_model(robot)
@@ -196,6 +197,7 @@ def test_with_measured_poses_the_estimate_stays_at_the_truth(robot):
         assert np.linalg.eigvalsh(covariances).min() > 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ROBOTS)
 def test_the_estimate_by_odometry_alone_errs_no_more_than_it_claims(robot):
     model = builtin_model(robot)
@@ -219,6 +221,7 @@ def test_a_wrong_belief_about_the_pose_is_mended_by_measurements():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ["ackermann", "mecanum"])
 def test_the_covariance_stays_positive_definite_over_thousands_of_random_steps(robot):
     model, rng = builtin_model(robot), np.random.default_rng(3)
@@ -494,6 +497,7 @@ def test_a_gyro_corrects_the_yaw_rate_but_never_against_its_gate(robot):
     assert estimator.at(estimator.time_ns)[1][2] == after
 
 
+@pytest.mark.slow
 def test_a_gate_refuses_one_good_measurement_in_a_thousand():
     estimator, rng, refused = driven(), np.random.default_rng(0), 0
     belief = estimator.belief

@@ -92,6 +92,7 @@ def numbers(middleware):
     return belief.time_ns, np.concatenate([belief.mean, belief.covariance.ravel(), pose, twist])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("robot", "seed"), [(robot, k) for k, robot in enumerate(ROBOTS)])
 def test_data_that_arrive_out_of_order_give_the_estimate_of_the_right_order(robot, seed):
     model, rng = builtin_model(robot), np.random.default_rng(seed)
@@ -111,6 +112,7 @@ def test_data_that_arrive_out_of_order_give_the_estimate_of_the_right_order(robo
     assert other.replayed > 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_any_order_of_one_seconds_data_gives_the_same_estimate(seed):
     model, rng = builtin_model("ackermann"), np.random.default_rng(100 + seed)

@@ -106,6 +106,7 @@ def hang(*_):
     time.sleep(LONG_S)
 
 
+@pytest.mark.slow
 def test_a_stop_is_written_whole_and_replays(tmp_path, recorded, log, logger):
     for entry in recorded.entries:
         log.note(entry)
@@ -186,6 +187,7 @@ def test_what_is_the_case_is_said_in_the_end_though_it_was_kept_back_at_first(lo
     assert logger.info_lines == ["commands pass (1 more since the last such line)"]
 
 
+@pytest.mark.slow
 def test_a_disk_that_hangs_delays_neither_a_decision_nor_the_end(log, logger, monkeypatch):
     monkeypatch.setattr(gate_log, "write", hang)
     rig = Recorded(log).drive()
@@ -233,6 +235,7 @@ def test_a_clock_that_was_set_back_does_not_make_the_newest_file_the_oldest(tmp_
     assert "202600_rule.jsonl" not in names
 
 
+@pytest.mark.slow
 def test_writing_a_stop_needs_little_more_memory_than_one_of_its_lines(tmp_path, recorded):
     path = tmp_path / "stop.jsonl"
     tracemalloc.start()
@@ -284,6 +287,7 @@ def test_a_disk_that_hangs_holds_up_neither_the_start_nor_the_end(writer):
     assert time.monotonic() - began < LONG_S / 4
 
 
+@pytest.mark.slow
 def test_one_that_does_not_even_hear_that_it_is_to_give_up_is_left_behind(writer):
     def deaf():
         signal.pthread_sigmask(signal.SIG_BLOCK, gate_log.ENDING)

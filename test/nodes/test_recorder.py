@@ -31,6 +31,7 @@ def nics(*words, cwd, **environment):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_preview_tells_and_draws_the_drive_and_does_no_more(tmp_path):
     # A module path without ROS 2: a preview needs none.
     (tmp_path / "rclpy.py").write_text("raise ModuleNotFoundError('no', name='rclpy')")
@@ -52,6 +53,7 @@ def test_it_asks_before_the_robot_moves(tmp_path):
     assert done.stdout.endswith("Drive the robot now? [y/N]: nothing was driven or recorded.\n")
 
 
+@pytest.mark.slow
 def test_without_ros_it_is_one_sentence(tmp_path):
     (tmp_path / "rclpy").mkdir()
     for module in ("rclpy", "nav_msgs", "geometry_msgs"):
@@ -65,6 +67,7 @@ def test_without_ros_it_is_one_sentence(tmp_path):
     assert "source your ROS 2" in sentence
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "hint"),
     [

@@ -40,6 +40,7 @@ def file(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_a_policy_acts_as_its_network_alone_and_in_batches(file):
     policy = load_policy(file)
     rows = np.random.default_rng(0).uniform(0.0, 1.0, (5, SECTORS + 6)).astype(np.float32)
@@ -288,6 +289,7 @@ def test_a_file_cut_anywhere_is_refused(file, tmp_path, share):
         load_policy(path)
 
 
+@pytest.mark.slow
 def test_a_flipped_bit_anywhere_is_refused(file, tmp_path):
     whole, rng = file.read_bytes(), np.random.default_rng(4)
     path = tmp_path / "flipped.onnx"

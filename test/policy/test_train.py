@@ -99,6 +99,7 @@ def test_a_little_training_reaches_more_goals_than_none(tmp_path):
     assert successes(40_000) > successes(1024) + 0.2
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_another_training_or_a_damaged_one_is_refused(tmp_path):
     train(settings(steps=128), 0, tmp_path)
     with pytest.raises(ConfigError, match=r"was trained with hidden \[16\], not \[8\]"):

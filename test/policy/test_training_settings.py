@@ -14,6 +14,7 @@ from nics_drl_bridge.policy.training_settings import (
 SHIPPED = sorted(path.stem for path in (share_folder() / "config" / "training").glob("*.yaml"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SHIPPED)
 def test_shipped_settings_name_worlds_and_a_task_that_there_are(name):
     settings = load_training(name)

@@ -75,6 +75,7 @@ def test_the_folder_its_file_and_the_file_alone_give_the_same_drive(bag, tmp_pat
     assert same(whole, read_recording(tmp_path / "alone", CAR))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("storage", "compression"),
     [("mcap", "file"), ("mcap", "message"), ("mcap", "storage"),

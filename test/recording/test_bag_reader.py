@@ -64,6 +64,7 @@ def test_every_kind_of_command_is_read(tmp_path, kind, storage):
     assert np.allclose(recording.command.t - recording.command.t[0], bags.times(0.1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 @pytest.mark.parametrize("kind", POSES)
 def test_every_kind_of_pose_is_read(tmp_path, kind, storage):

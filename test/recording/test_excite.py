@@ -38,6 +38,7 @@ def preview(robot, duration=60.0, speed=1.0, seed=0) -> Pattern:
     return PREVIEWS[key]
 
 
+@pytest.mark.slow
 @robots
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_whole_robot_keeps_within_its_circle(robot, seed):
@@ -66,6 +67,7 @@ def test_commands_stay_within_a_share_of_the_limits_that_leaves_angles_alone(rob
     assert (np.ptp(command, axis=0) > 0.8 * width).all()
 
 
+@pytest.mark.slow
 @robots
 @pytest.mark.parametrize("duration", [20.0, 60.0])
 def test_every_command_is_moved_by_the_rules_that_a_fit_judges_a_drive_by(robot, duration):
@@ -135,6 +137,7 @@ def test_without_being_watched_such_a_robot_would_leave(monkeypatch):
     assert any(drive_another(robot, really, np.array([1.1, 1.0]), seed) > 2.0 for seed in range(3))
 
 
+@pytest.mark.slow
 def test_what_is_seen_moves_the_expected_pose():
     drive = DrivePlan(ROBOTS[1]).begin()
     while not np.hypot(*drive.pose[:2]) > 0.1:
@@ -206,6 +209,7 @@ def test_its_lines_hold_what_somebody_has_to_know(quarter_circle):
 PERIOD_S = 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ackermann", "differential", "mecanum"])
 def test_it_is_the_textbook_but_for_a_centimetre(name):
     spec = load_robot(name)

@@ -72,6 +72,7 @@ def test_files_of_another_writer_are_whole_and_salvaged(tmp_path, form):
     check_mcap(tmp_path / "kept" / "kept.mcap")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS)
 def test_a_file_that_is_cut_off_anywhere_is_refused(tmp_path, form):
     path = written(tmp_path / "drive.mcap", **FORMS[form])

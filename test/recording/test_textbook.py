@@ -18,6 +18,7 @@ def steady(spec, command):
     return textbook(spec).target(np.array(command))
 
 
+@pytest.mark.slow
 def test_a_car_on_a_constant_steer_drives_a_circle_of_the_textbook_radius():
     car = load_robot("ackermann")
     book, command = textbook(car), np.array([0.8, 0.3])

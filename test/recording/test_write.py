@@ -68,6 +68,7 @@ def test_a_bag_that_could_not_be_finished_leaves_nothing(tmp_path):
     assert os.listdir(tmp_path) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["drive.npz", "drive", "new/drive"])
 def test_a_drive_comes_back_from_a_file_and_from_a_bag(tmp_path, name):
     if not name.endswith(".npz"):

@@ -113,6 +113,7 @@ def decoded(png):
     return np.asarray(image.convert("RGB"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 4])
 def test_there_is_one_panel_per_episode(count):
     episodes = [episode(seed) for seed in range(count)]
@@ -127,6 +128,7 @@ def test_another_path_gives_another_picture():
     assert not np.array_equal(decoded(pictures[0]), decoded(pictures[2]))
 
 
+@pytest.mark.slow
 def test_a_run_that_ended_early_is_drawn_as_far_as_it_went():
     runs = {"all": [episode(0), episode(1)], "short": [episode(0)]}
     drawn_short = decoded(trajectories(runs, WORLD, 0.2))
@@ -171,6 +173,7 @@ def test_a_map_is_drawn_where_it_lies():
     assert [dark(x, y) for x, y in middle] == solid.tolist()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["mecanum"])
 def test_a_drive_is_drawn(name):
     robot = load_robot(name)

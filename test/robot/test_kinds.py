@@ -47,6 +47,7 @@ def comparisons(path):
                 yield f"{path.relative_to(PACKAGE)}:{node.lineno}"
 
 
+@pytest.mark.slow
 def test_nobody_but_the_spec_asks_for_a_field_of_cmd_vel():
     found = [place for path in sorted(PACKAGE.rglob("*.py")) for place in comparisons(path)]
     assert found
@@ -69,6 +70,7 @@ def test_the_spec_tells_what_its_commands_mean(name, steers, moves_sideways, tur
     assert all(command.is_twist for command in robot.command) == (not steers)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_held_command_leads_to_its_steady_twist(name):
     robot = load_robot(name)

@@ -225,6 +225,7 @@ def test_a_robot_of_a_centimetre_does_not_pass_a_wall_at_50_m_per_s():
         assert simulator.data.pose[0, 0, 0] == pytest.approx(0.29, abs=OVERLAP)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", [CIRCLE, PLATE, HOOK], ids=["circle", "plate", "hook"])
 def test_a_robot_and_a_moving_obstacle_stop_where_they_touch(shape):
     number, rng = 100, np.random.default_rng(7)
@@ -269,6 +270,7 @@ def test_a_robot_and_a_moving_obstacle_stop_where_they_touch(shape):
     assert 10 < touched < number
 
 
+@pytest.mark.slow
 def test_robots_that_run_into_each_other_stop_there_and_are_marked():
     number, rng = 200, np.random.default_rng(9)
     simulator = FastSimulator(fast_model(0.03), field(10.0), number, 2, tell=silent)

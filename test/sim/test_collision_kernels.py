@@ -56,6 +56,7 @@ def gap(one, other, limit=np.inf):
     return kernels.body_gap(one, other, ARRAYS, limit, SPARE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("one", "other"), combinations_with_replacement(range(len(SHAPES)), 2))
 def test_the_clearance_of_two_bodies_is_that_of_shapely(one, other):
     rng = np.random.default_rng(10 * one + other)
@@ -78,6 +79,7 @@ def test_the_clearance_of_two_bodies_is_that_of_shapely(one, other):
     assert overlaps > 8 or lines
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("one", range(len(SHAPES) - 1))
 @pytest.mark.parametrize("other", range(len(SHAPES)))
 def test_who_comes_in_gets_deeper_and_who_leaves_gets_less_deep(one, other):

@@ -28,6 +28,7 @@ def end_of(fast: FastSimulator) -> Driven:
     return Driven(pose, twist, data.state[0].copy(), pose, twist, data.collided[0] == 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["crowd", "room"])
 @pytest.mark.parametrize("skew", ["none", "counter_clockwise"])
 def test_robots_moved_from_outside_sense_what_those_of_the_fast_simulator_do(name, skew):

@@ -30,6 +30,7 @@ class Mover(Schema):
     motion: Motion
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize(
     "motions", [[WANDER] * 6, [WALKER] * 6, MIXED], ids=["wander", "walk", "mixed"]

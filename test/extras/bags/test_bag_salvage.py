@@ -56,6 +56,7 @@ def test_a_whole_bag_is_saved_whole(sealed, tmp_path):
     assert "0 of" in kept.lines()[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("storage", STORAGES)
 @pytest.mark.parametrize("share", [0.5, 0.6, 0.8])
 def test_what_is_in_front_of_a_cut_is_saved_and_the_rest_is_counted(tmp_path, storage, share):
