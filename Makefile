@@ -115,7 +115,8 @@ $(READY_FOR_DEMO): $(DESCRIBED_BY)
 demo: $(or $(wildcard $(READY)),$(READY_FOR_DEMO)) ## run the whole chain on a recording: make demo [RECORDING=folder]
 	$(BIN)/nics demo $(if $(RECORDING),--recording "$(RECORDING)") --out runs/demo
 
-test: ros-status setup lint types pytest ## lint, types and tests: make test [PYTEST_ARGS="-k lidar"]
+test: ros-status setup lint ## lint, types and tests: make test [PYTEST_ARGS="-k lidar"]
+	@$(MAKE) --no-print-directory types & types=$$!; $(MAKE) --no-print-directory pytest; wait $$types
 
 test-quick: setup ## under a minute, after each edit: no processes, no training
 	$(BIN)/python -m pytest -q $(PARALLEL) -m "not (ros or process or slow or campaign)" $(PYTEST_ARGS)

@@ -62,8 +62,9 @@ def package(tmp_path):
 
 def ask(package: Path) -> tuple[list[float], list[int]]:
     """What the kernels give in a fresh process, and how many were compiled there."""
+    # Not kept as bytecode, which an edit within the same second would leave as it was.
     done = subprocess.run(
-        [sys.executable, "-c", ASK], cwd=package.parent, capture_output=True, text=True,
+        [sys.executable, "-B", "-c", ASK], cwd=package.parent, capture_output=True, text=True,
         check=False, env={k: v for k, v in os.environ.items() if k != "PYTHONPATH"},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

@@ -166,12 +166,15 @@ def free_starts(rng, footprint, scenes, size, number):
 
 
 SHAPES = [CIRCLE, PLATE, HOOK, SEGMENT]
-SLOW = pytest.mark.slow
-FOOTPRINTS = [0.01, 0.1, 0.5, BAR, DART]
+MORE = {"marks": pytest.mark.campaign}
+FOOTPRINTS = [
+    pytest.param(0.01, **MORE, id="1cm"), pytest.param(0.1, id="10cm"),
+    pytest.param(0.5, **MORE, id="50cm"), pytest.param(BAR, id="bar"), pytest.param(DART, id="dart"),
+]  # fmt: skip
 
 
-@pytest.mark.parametrize("footprint", FOOTPRINTS, ids=["1cm", "10cm", "50cm", "bar", "dart"])
-@SLOW
+@pytest.mark.parametrize("footprint", FOOTPRINTS)
+@pytest.mark.slow
 @pytest.mark.timeout(600)  # a cold start compiles
 def test_a_robot_ends_where_its_arc_first_touches_at_any_size_and_speed(footprint):
     number, rng = 160, np.random.default_rng(5)
