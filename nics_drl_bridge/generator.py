@@ -86,14 +86,12 @@ class SimulatorModel:
     def text(self) -> str:
         """The content of `model.yaml`."""
         data = {
-            "format": FORMAT,
-            "control_period": self.control_period,
+            "format": FORMAT, "control_period": self.control_period,
             "robot": self.robot.model_dump(mode="json"),
             "kinematics": self.kinematics.named.model_dump(exclude_none=True),
-            "calibration": asdict(self.calibration),
-            "lidar": self.lidar.model_dump(mode="json"),
+            "calibration": asdict(self.calibration), "lidar": self.lidar.model_dump(mode="json"),
             "noise": self.noise.model_dump(mode="json"),
-        }
+        }  # fmt: skip
         if self.latency.measured:
             data["latency"] = self.latency.model_dump(mode="json")
         if self.sensors:
@@ -119,17 +117,10 @@ class _File(Schema):
 
 
 def generate(
-    recording: Recording,
-    robot: RobotSpec,
-    lidar: LidarSpec,
-    shapes: Sequence[Shape],
-    order: int = fit.ORDER,
-    alpha: fit.Alpha = "auto",
-    assume: bool = False,
-    strict: bool = False,
-    anyway: bool = False,
-    sensors: Sequence[Sensor] = (),
-) -> tuple[SimulatorModel, Identified]:
+    recording: Recording, robot: RobotSpec, lidar: LidarSpec, shapes: Sequence[Shape],
+    order: int = fit.ORDER, alpha: fit.Alpha = "auto", assume: bool = False, strict: bool = False,
+    anyway: bool = False, sensors: Sequence[Sensor] = (),
+) -> tuple[SimulatorModel, Identified]:  # fmt: skip
     """Calibrates, fits and prunes the kinematics, and bakes the lidar table.
 
     The shapes of obstacles are baked, and the robot's own footprint. `order` is that of the Taylor

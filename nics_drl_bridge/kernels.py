@@ -55,12 +55,9 @@ def kernel(
 
 
 def kernel(
-    function: Callable[..., Any] | None = None,
-    *,
-    allocates: bool = False,
-    contracts: bool = False,
+    function: Callable[..., Any] | None = None, *, allocates: bool = False, contracts: bool = False,
     inline: bool = False,
-) -> Any:
+) -> Any:  # fmt: skip
     """Compiles a function with numba when it is first called, or loads what was compiled before.
 
     It runs without the interpreter's lock; a division by zero gives inf or NaN, as with arrays.

@@ -124,11 +124,9 @@ COOPERATIVE_REACHING = "NicsBridge/CooperativeReaching-v0"
 PURSUIT_EVASION = "NicsBridge/PursuitEvasion-v0"
 TASK = "NicsBridge/Task-v0"
 ENVIRONMENTS = {
-    NAVIGATION: {"task": "navigation"},
-    COOPERATIVE_REACHING: {"task": "cooperative_reaching"},
-    PURSUIT_EVASION: {"task": "pursuit_evasion"},
-    TASK: {},
-}
+    NAVIGATION: {"task": "navigation"}, COOPERATIVE_REACHING: {"task": "cooperative_reaching"},
+    PURSUIT_EVASION: {"task": "pursuit_evasion"}, TASK: {},
+}  # fmt: skip
 """Id -> arguments that define the environment."""
 MAX_EPISODE_STEPS = 300
 
@@ -138,12 +136,10 @@ def register_envs() -> None:
     for name, arguments in ENVIRONMENTS.items():
         if name not in gymnasium.registry:
             gymnasium.register(
-                name,
-                entry_point="nics_drl_bridge.env.bridge_env:BridgeEnv",
+                name, entry_point="nics_drl_bridge.env.bridge_env:BridgeEnv",
                 vector_entry_point="nics_drl_bridge.env.vector_env:BridgeVectorEnv",
-                max_episode_steps=MAX_EPISODE_STEPS,
-                kwargs=dict(arguments),
-            )
+                max_episode_steps=MAX_EPISODE_STEPS, kwargs=dict(arguments),
+            )  # fmt: skip
 
 
 register_envs()

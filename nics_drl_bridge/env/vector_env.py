@@ -275,11 +275,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             for name, values in self.simulator.drawn.items()
         }
         return {
-            "episode_seed": self.simulator.data.seeds,
-            "start": self._row(self._starts),
-            "bodies": self._bodies,
-            **({"randomisation": drawn} if drawn else {}),
-        }
+            "episode_seed": self.simulator.data.seeds, "start": self._row(self._starts),
+            "bodies": self._bodies, **({"randomisation": drawn} if drawn else {}),
+        }  # fmt: skip
 
     def _row(self, rows: NDArray[Any]) -> NDArray[Any]:
         return rows[:, 0] if self.robots == 1 else rows

@@ -44,12 +44,9 @@ class Grid:
 
 
 def bake(
-    spec: LidarSpec,
-    shapes: Sequence[Shape],
-    density: Density | None = None,
-    sensor_model: Function | Sequence[SensorModel] | None = None,
-    progress: Progress | None = None,
-) -> LidarTable:
+    spec: LidarSpec, shapes: Sequence[Shape], density: Density | None = None,
+    sensor_model: Function | Sequence[SensorModel] | None = None, progress: Progress | None = None,
+) -> LidarTable:  # fmt: skip
     """Scans shapes straight ahead, on a grid of distances and rotations, with the exact scanner.
 
     Equal shapes are baked once, by default at `Density.for_beams`. The sensor model is that of the
@@ -189,12 +186,9 @@ def _miss(
 
 
 def _fill(
-    kernel: Callable[..., None],
-    out: NDArray[np.float32],
-    table: LidarTable,
-    grids: Sequence[Grid],
+    kernel: Callable[..., None], out: NDArray[np.float32], table: LidarTable, grids: Sequence[Grid],
     progress: Progress | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Computes values laid out as the table's rows (R,), one rotation after the other."""
     outlines, distances = table.outlines, table.density.distances
     total, done = sum(len(grid.turns) for grid in grids), 0

@@ -117,12 +117,9 @@ class Scanner:
         return place(poses, self.table.outlines.radii[index], index)
 
     def scan(
-        self,
-        poses: ArrayLike,
-        bodies: ArrayLike,
-        walls: ArrayLike = NO_WALLS,
+        self, poses: ArrayLike, bodies: ArrayLike, walls: ArrayLike = NO_WALLS,
         out: NDArray[np.float32] | None = None,
-    ) -> NDArray[np.float32]:
+    ) -> NDArray[np.float32]:  # fmt: skip
         """Scans (N, B) [m], REP-117, from poses (N, 3) of robots, each in a separate world.
 
         The bodies (N, K, 7) are from `place`; walls (W, 4) x1, y1, x2, y2 [m] are the same in every
@@ -172,11 +169,9 @@ class Scanner:
 
 
 def make_scanner(
-    spec: LidarSpec,
-    shapes: Sequence[Shape],
-    renderer: Renderer = "auto",
+    spec: LidarSpec, shapes: Sequence[Shape], renderer: Renderer = "auto",
     grid: GridMap | None = None,
-) -> Scanner:
+) -> Scanner:  # fmt: skip
     """Returns a scanner with a table for the shapes, baked now if needed, and a static map.
 
     Raises ConfigError if the renderer is unknown, or the table would be too large.

@@ -106,11 +106,9 @@ def load_sensor_models(path: str | Path) -> tuple[SensorModel, ...]:
 
 
 def returned(
-    models: Sequence[SensorModel],
-    ranges: Ranges,
-    incidence: NDArray[np.float64],
+    models: Sequence[SensorModel], ranges: Ranges, incidence: NDArray[np.float64],
     reflectivity: float | None,
-) -> Ranges:
+) -> Ranges:  # fmt: skip
     """Returns ranges (P,) with `inf` where any model loses the return; see `Intensity.lost`."""
     for model in models:
         ranges = np.where(model.lost(ranges, incidence, reflectivity), np.float32(np.inf), ranges)

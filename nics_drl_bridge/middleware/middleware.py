@@ -154,27 +154,27 @@ class Middleware:
 
     def scan(self, stamp_ns: int, arrival_ns: int, ranges: NDArray[np.float32]) -> bool:
         """Takes a scan (B,); True if it was used. Only the newest scan is kept."""
-        fault = self._stamps.fault(stamp_ns, arrival_ns)
-        if ranges.shape != (self._beams,):
-            fault = f"shape {ranges.shape}, not ({self._beams},)"
-        if fault:
-            return self.cache.reject(f"{SCAN}: {fault}")
-        if not self.cache.put(SCAN, stamp_ns, arrival_ns, ranges):
-            return False
-        self._stamps.accept(stamp_ns, arrival_ns)
-        return True
+        taken = self._keep(SCAN, stamp_ns, arrival_ns, ranges, self._beams)
+        if taken:
+            self._stamps.accept(stamp_ns, arrival_ns)
+        return taken
 
     def sense(
         self, name: str, stamp_ns: int, arrival_ns: int, reading: NDArray[np.float32]
     ) -> bool:
         """Takes a reading (S,) of a further sensor; True if it was used. The newest is kept."""
-        fault = self._stamps.fault(stamp_ns, arrival_ns)
         size = next(sensor.size for sensor in self._sensors if sensor.name == name)
-        if reading.shape != (size,):
-            fault = f"shape {reading.shape}, not ({size},)"
+        return self._keep(name, stamp_ns, arrival_ns, reading, size)
+
+    def _keep(
+        self, topic: str, stamp_ns: int, arrival_ns: int, values: NDArray[np.float32], size: int
+    ) -> bool:
+        fault = self._stamps.fault(stamp_ns, arrival_ns)
+        if values.shape != (size,):
+            fault = f"shape {values.shape}, not ({size},)"
         if fault:
-            return self.cache.reject(f"{name}: {fault}")
-        return self.cache.put(name, stamp_ns, arrival_ns, reading)
+            return self.cache.reject(f"{topic}: {fault}")
+        return self.cache.put(topic, stamp_ns, arrival_ns, values)
 
     def odometry(self, stamp_ns: int, arrival_ns: int, pose: ArrayLike, twist: ArrayLike) -> bool:
         """Takes an odometry: pose (3,) in `odom`, body twist (3,); True if it was accepted.

@@ -32,12 +32,9 @@ Array = NDArray[np.float64]
 
 SCAN_TYPE = "sensor_msgs/msg/LaserScan"
 TYPES: Mapping[str, tuple[str, ...]] = {
-    SCAN: (SCAN_TYPE,),
-    ODOM: (topic_roles.ODOMETRY,),
-    CMD_VEL: topic_roles.TYPES["cmd_vel"],
-    POSE: (topic_roles.POSE, topic_roles.POSE_COVARIANCE),
-    IMU: (topic_roles.IMU,),
-}
+    SCAN: (SCAN_TYPE,), ODOM: (topic_roles.ODOMETRY,), CMD_VEL: topic_roles.TYPES["cmd_vel"],
+    POSE: (topic_roles.POSE, topic_roles.POSE_COVARIANCE), IMU: (topic_roles.IMU,),
+}  # fmt: skip
 ALWAYS = (SCAN, ODOM, CMD_VEL)
 """Roles whose topics are used if the bag has them; the others only on request."""
 APART_S = 1.0  # Greatest difference between stamps of one clock at the same time of receipt [s]

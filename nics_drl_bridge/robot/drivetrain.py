@@ -35,11 +35,9 @@ def steered(spec: RobotSpec, twist: Callable[[Array, Array], Array]) -> Textbook
     lag, rate = _actuators(spec.parameters, ("speed", "steering"))
     return Textbook(
         twist=lambda state: twist(state[..., v], state[..., phi]),
-        target=lambda given: given[..., command][..., order],
-        lag=lag[order],
-        rate=rate[order],
+        target=lambda given: given[..., command][..., order], lag=lag[order], rate=rate[order],
         structure={"vx": (names[0],), "vy": (), "wz": ("*".join(names),)},
-    )
+    )  # fmt: skip
 
 
 def steering_angle(spec: RobotSpec) -> StateVariable:
@@ -65,12 +63,9 @@ def wheeled(
     names = tuple(v.name for v in spec.state)
     lag, rate = _actuators(spec.parameters, ("wheel",) * len(inverse))
     return Textbook(
-        twist=lambda state: state @ forward.T,
-        target=lambda given: given[..., command] @ inverse.T,
-        lag=lag,
-        rate=rate,
-        structure={dof: names if dof in moves else () for dof in POSE_RATES},
-    )
+        twist=lambda state: state @ forward.T, target=lambda given: given[..., command] @ inverse.T,
+        lag=lag, rate=rate, structure={dof: names if dof in moves else () for dof in POSE_RATES},
+    )  # fmt: skip
 
 
 def _commands(spec: RobotSpec, fields: tuple[CmdVelField, ...]) -> list[int]:

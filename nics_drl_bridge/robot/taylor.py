@@ -107,14 +107,11 @@ class TaylorModel:
         }
         box = zip(self.low.tolist(), self.high.tolist(), strict=True)
         return NamedTaylorModel.model_construct(
-            dt=self.dt,
-            units=dict(zip(self.dofs, self.dof_units, strict=True)),
-            terms=terms,
-            valid=dict(zip(self.variables, box, strict=True)),
-            assumed=self.assumed,
+            dt=self.dt, units=dict(zip(self.dofs, self.dof_units, strict=True)), terms=terms,
+            valid=dict(zip(self.variables, box, strict=True)), assumed=self.assumed,
             standard_errors=self.named_errors if self.std_errors.size else None,
             quality=self.quality,
-        )
+        )  # fmt: skip
 
 
 def exponents(variables: int, order: int) -> NDArray[np.int64]:

@@ -17,12 +17,9 @@ BODY_HEIGHT = 0.04
 
 
 def urdf_of(
-    spec: RobotSpec,
-    mount: Place = (0.0, 0.0, 0.0),
-    laser: str = "laser",
-    base: str = "base_link",
+    spec: RobotSpec, mount: Place = (0.0, 0.0, 0.0), laser: str = "laser", base: str = "base_link",
     further: Mapping[str, Place] | None = None,
-) -> str:
+) -> str:  # fmt: skip
     """Returns the text of a robot's URDF.
 
     `base_link` lies on the ground, where its pose is measured; wheels stand on the ground and

@@ -25,7 +25,7 @@ from nics_drl_bridge.sim.allocation import Sizes, allocate, part_of, split, surr
 from nics_drl_bridge.sim.randomisation import Draws, Randomisation, Sampler, load_randomisation
 from nics_drl_bridge.sim.scenes import Scenes, SceneSampler
 from nics_drl_bridge.sim.world import World
-from nics_drl_bridge.threads import Crew
+from nics_drl_bridge.threads import run_parts
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -176,7 +176,6 @@ class FastSimulator:
         self.parts = split(worlds, threads)  # the worlds that each thread steps
         known = model.kinematics, model.robot, tell
         self._boxes = {part.start: CommandBox(*known) for part in self.parts}
-        self._crew = Crew(len(self.parts))
 
     @cached_property
     def packed(self) -> dict[int, Any]:
@@ -278,7 +277,7 @@ class FastSimulator:
 
     def run_parts(self, function: Callable[[slice], R]) -> list[R]:
         """Runs a function for each of `parts`, one thread per part; returns the results."""
-        return self._crew.run(function, self.parts)
+        return run_parts(function, self.parts)
 
     def step_part(self, part: slice, commands: ArrayLike) -> None:
         """Moves the worlds of one of `parts` under commands (n, M, C), in the calling thread."""
