@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.env import kernels
 from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.seeds import GREATEST_SEED, checked_seeds
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -51,19 +52,11 @@ def uninterrupted() -> Iterator[None]:
             signal.raise_signal(signal.SIGINT)
 
 
-SEEDS = 2**63
-"""Exclusive upper bound of seeds: signed 64-bit integers over ROS 2 and in the kernels."""
-
-
 def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
     """Raises ConfigError for a wrong seed, of all worlds or one each, or wrong options."""
-    last = SEEDS - worlds if isinstance(seed, int | np.integer) else SEEDS - 1
-    for one in seed if isinstance(seed, list | tuple | np.ndarray) else [seed]:
-        if not (one is None or isinstance(one, int | np.integer)):
-            raise ConfigError(f"seed of type {type(one).__name__}: must be an integer, or None.")
-        if one is not None and one > last:
-            shown = int(one) if one < SEEDS**2 else f"of {int(one).bit_length()} bits"
-            raise ConfigError(f"seed {shown}: must be at most 2**63 - {SEEDS - last}.")
+    several = isinstance(seed, list | tuple | np.ndarray)
+    given = [one for one in (seed if several else [seed]) if one is not None]
+    checked_seeds(given, GREATEST_SEED if several else GREATEST_SEED + 1 - worlds)
     if options is not None and not isinstance(options, Mapping):
         raise ConfigError(
             f"reset options of type {type(options).__name__}: must be a dict, as {{'start': "

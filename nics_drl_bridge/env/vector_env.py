@@ -350,10 +350,7 @@ def named_seeds(
     new = chosen & unnamed & ~given
     if new.any():
         seeds = np.where(new, int(rng.integers(2**31)) + np.arange(count), seeds)
-    fresh = given | new
-    if (seeds[fresh] < 0).any():
-        raise ConfigError("a seed must not be negative.")
-    return seeds, fresh
+    return seeds, given | new
 
 
 def masked(facts: Facts, mask: Flags, alone: bool = False) -> dict[str, Any]:

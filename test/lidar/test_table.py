@@ -258,5 +258,5 @@ def test_memory_is_the_sum_of_the_arrays(table):
 
 @pytest.mark.parametrize("phases", [0, 3, 16])
 def test_phases_are_a_power_of_two(phases):
-    with pytest.raises(ValueError, match="phases must be 1, 2, 4 or 8"):
+    with pytest.raises(ValueError, match="Input should be 1, 2, 4 or 8"):
         Density(phases=phases)
