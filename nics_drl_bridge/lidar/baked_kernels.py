@@ -22,10 +22,10 @@ ABOVE_ZERO = 2.0**24
 """Added before truncation to an integer, so that numbers are rounded down."""
 PER_TURN = 0.5 / math.pi
 UNSEEN, LOOKED_UP, COMPUTED = range(3)
-ATAN = tuple(np.float32([
+ATAN = tuple(map(np.float32, (
     0.999999881, -0.333319604, 0.199692354, -0.140165851, 0.0990609676, -0.0593671016,
     0.0241661891, -0.00466877315,
-]))  # fmt: skip
+)))  # fmt: skip
 TABLE_SHAPE = np.dtype([
     ("per_metre", np.float64),  # grid distances per metre
     ("rotations", np.float64),  # in a full turn, 0 for a circle
