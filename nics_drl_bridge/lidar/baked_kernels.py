@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import exact_kernels
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE, Beams, OutlineArrays, X, Y
+from nics_drl_bridge.lidar.map_kernels import GridArrays
 
 ABOVE_ZERO = 2.0**24
 """Added before truncation to an integer, so that numbers are rounded down."""
@@ -53,15 +54,18 @@ class TableArrays(NamedTuple):
 
 
 class LidarArrays(NamedTuple):
-    """A lidar with its table for the kernels."""
+    """A lidar with its table, and the static map that it sees, for the kernels."""
 
     mount: NDArray[np.float64]  # (3,) pose on the robot
     beams: Beams
     range_min: float  # [m]
     range_max: float
+    sweep_time: float  # duration of a sweep [s]
     between: NDArray[np.float64]  # (H, 2) squares of the distances of a look-up [m^2]
     outlines: OutlineArrays  # `outlines`, `table`: of the shapes
     table: TableArrays
+    grid: GridArrays
+    exact: bool  # True if the map is scanned exactly, from cell to cell
 
 
 @kernel(inline=True)

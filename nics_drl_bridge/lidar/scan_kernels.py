@@ -92,6 +92,8 @@ def scan_worlds(ranges, poses, chosen, bodies, first, walls, lidar, lanes):  # t
                 here = LidarPose(x, y, math.cos(heading), math.sin(heading))
                 baked.compute(out, here, bodies[n], me, computed > 0, walls, lidar)
     look_up(found, ranges, lidar, lanes)
+    if lidar.grid.squares.size > 0:
+        add_map(ranges, poses, chosen, lidar, lanes)
 
 
 @kernel(contracts=True, inline=True)
@@ -286,12 +288,12 @@ def fuse(flat, k, lidar, lanes):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def add_map(ranges, poses, chosen, lidar, grid, exact, lanes):  # type: ignore[no-untyped-def]
-    """Fuses a static map into the scans of some worlds, see `scan_worlds` and `map_into`."""
+def add_map(ranges, poses, chosen, lidar, lanes):  # type: ignore[no-untyped-def]
+    """Fuses the static map into the scans of some worlds, see `scan_worlds`."""
     for n in chosen:
         for m in range(poses.shape[1]):
             x, y, heading = baked.sensor_pose(poses[n, m], lidar.mount)
             here = LidarPose(x, y, math.cos(heading), math.sin(heading))
-            out = ranges[n, m]
-            map_kernels.map_into(out, lidar.beams, here, lidar.range_max, grid, exact, lanes)
+            out, far = ranges[n, m], lidar.range_max
+            map_kernels.map_into(out, lidar.beams, here, far, lidar.grid, lidar.exact, lanes)
             exact_kernels.finish(out, lidar.range_min, lidar.range_max)

@@ -17,7 +17,7 @@ from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.exact_kernels import SHAPE, Beams
 from nics_drl_bridge.lidar.lookup_error import lookup_distances
-from nics_drl_bridge.lidar.maps import GridMap
+from nics_drl_bridge.lidar.maps import NO_MAP, GridMap
 from nics_drl_bridge.lidar.shapes import BODY, Shape, place
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import LidarTable
@@ -79,8 +79,9 @@ class Scanner:
         return LidarArrays(
             np.array(spec.mount),
             Beams(directions, spec.angle_min, spec.angle_increment, spec.full_circle),
-            spec.range_min, spec.range_max, self._looked_up(), table.outlines.arguments,
-            table.arrays,
+            spec.range_min, spec.range_max, spec.sweep_time, self._looked_up(),
+            table.outlines.arguments, table.arrays,
+            NO_MAP if self.grid is None else self.grid.arrays, self.renderer == "exact",
         )  # fmt: skip
 
     def _looked_up(self) -> Array:
@@ -138,11 +139,6 @@ class Scanner:
         scan_kernels.scan_worlds(
             out[:, None], poses[:, None], worlds, bodies, -1, walls, self.arguments, lanes
         )
-        if self.grid is not None:
-            scan_kernels.add_map(
-                out[:, None], poses[:, None], worlds, self.arguments, self.grid.arrays,
-                self.renderer == "exact", lanes,
-            )  # fmt: skip
         return out
 
     def _scene(self, poses: ArrayLike, bodies: ArrayLike, walls: ArrayLike) -> tuple[Array, ...]:

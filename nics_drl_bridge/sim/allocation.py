@@ -10,7 +10,7 @@ import numpy as np
 
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar import scan_kernels
-from nics_drl_bridge.lidar.maps import NO_MAP, GridMap
+from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.robot.kernels import SERIES, scratch, term_arrays
@@ -110,16 +110,10 @@ def part_of(
     sizes: Sizes, part: slice,
 ) -> arrays.Part:  # fmt: skip
     """Returns the arguments of the kernels for one part of the worlds, with scratch of its own."""
-    lidar, grid = model.lidar, scanner.grid
     dt, substeps, _ = model.timing
-    view = arrays.LidarView(
-        scanner.arguments, NO_MAP if grid is None else grid.arrays, scanner.renderer == "exact",
-        np.array(lidar.mount, dtype=np.float64),
-        np.array([lidar.range_min, lidar.range_max], dtype=np.float64), float(lidar.sweep_time),
-    )  # fmt: skip
     motion = arrays.Dynamics(term_arrays(model.kinematics), SERIES, float(dt), int(substeps))
     own = _scratch(model, scanner, sizes, part.stop - part.start)
-    return arrays.Part(state, scene, view, motion, own)
+    return arrays.Part(state, scene, scanner.arguments, motion, own)
 
 
 def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int) -> arrays.Scratch:
