@@ -178,21 +178,17 @@ class Playback:
 
     def _scan(self, arrival_ns: int, message: Any) -> bool:
         values = np.asarray(message.ranges, np.float32)
-        if self._any_lidar:
-            values = self._followed(message).ordered(values)
-            if len(values) != self.lidar.beams:
-                return self.middleware.cache.reject(f"{SCAN}: another lidar")
-        ranges = from_device(np.ascontiguousarray(values), self.lidar)
-        return self.middleware.scan(stamp(message), arrival_ns, ranges)
-
-    def _followed(self, message: Any) -> Reader:
-        """Returns the reader of the scans, which the lidar of the first scan determines."""
-        if self._reader is None:
+        if self._any_lidar and self._reader is None:
             header = ScanHeader(*(float(getattr(message, name)) for name in ScanHeader._fields))
             self._reader = reader_beside(header, len(message.ranges), self._model.lidar)
             self.lidar = self._reader.lidar
             self.middleware.expect_beams(self.lidar.beams)
-        return self._reader
+        if self._reader is not None:
+            values = self._reader.ordered(values)
+            if len(values) != self.lidar.beams:
+                return self.middleware.cache.reject(f"{SCAN}: another lidar")
+        ranges = from_device(np.ascontiguousarray(values), self.lidar)
+        return self.middleware.scan(stamp(message), arrival_ns, ranges)
 
     def _odometry(self, arrival_ns: int, message: Any) -> bool:
         stamp_ns, pose = stamp(message), np.array(pose_row(message))
