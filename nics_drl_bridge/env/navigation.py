@@ -82,7 +82,9 @@ class Navigation(Task):
         self._see(out, view.pose, view, memory)
         return out
 
-    def judge(self, view: RobotView, memory: Memory, before: RobotView | None = None) -> GoalProgress:
+    def judge(
+        self, view: RobotView, memory: Memory, before: RobotView | None = None
+    ) -> GoalProgress:
         """Judges which robots are at their goals, and which touch something."""
         out = np.empty((*view.pose.shape[:-1], *self.observation_space.shape), np.float32)
         return self._see(out, (before or view).pose, view, memory)
@@ -108,7 +110,9 @@ class Navigation(Task):
         over = progress.reached | progress.touched
         return Outcome(self._terms(progress), over, self._facts(progress))
 
-    def _see(self, out: Observation, before: Array, view: RobotView, memory: Memory) -> GoalProgress:
+    def _see(
+        self, out: Observation, before: Array, view: RobotView, memory: Memory
+    ) -> GoalProgress:
         """Writes the observations; returns the progress to the goals."""
         lead = view.pose.shape[:-1]
         reached, touched = np.empty(lead, np.bool_), np.empty(lead, np.bool_)
