@@ -10,17 +10,9 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
+from nics_drl_bridge import files
 from nics_drl_bridge.config import Schema, dump_yaml, parse_yaml, read_text, validate
 from nics_drl_bridge.errors import ConfigError, FitError, ModelError
-from nics_drl_bridge.files import (
-    SUMS,
-    check_folder,
-    check_sums,
-    sha256,
-    whole_folder,
-    write_sums,
-    write_text,
-)
 from nics_drl_bridge.identify import fit
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.identify import Identified, identify
@@ -38,7 +30,8 @@ from nics_drl_bridge.robot.taylor import NamedTaylorModel, TaylorModel
 
 FORMAT = "nics_drl_bridge/simulator_model/4"
 MODEL_FILE, TABLE_FOLDER, REPORT_FILE = "model.yaml", "lidar_table", "report.txt"
-MODEL_FILES = (MODEL_FILE, REPORT_FILE, *(f"{TABLE_FOLDER}/{n}" for n in (SUMS, *TABLE_FILES)))
+_OF_TABLE = (f"{TABLE_FOLDER}/{name}" for name in (files.SUMS, *TABLE_FILES))
+MODEL_FILES = (MODEL_FILE, REPORT_FILE, *_OF_TABLE)
 """The files of a model, in addition to its manifest."""
 CONTROL_PERIOD_S = 0.1
 DEFAULT_LIDAR = "paper"
@@ -101,7 +94,7 @@ class SimulatorModel:
     @property
     def fingerprint(self) -> str:
         """Identifies the model: 16 digits of the SHA-256 of `text` and of the table's."""
-        return sha256(f"{self.text}{self.table.fingerprint}".encode())[:16]
+        return files.sha256(f"{self.text}{self.table.fingerprint}".encode())[:16]
 
 
 class _File(Schema):
@@ -174,16 +167,16 @@ def open_model(name: str | Path) -> SimulatorModel:
 
 def check_place(folder: str | Path) -> None:
     """Raises ConfigError, before the work of a fit, if `save_model` can't write to a folder."""
-    check_folder(folder, MODEL_FILE)
+    files.check_folder(folder, MODEL_FILE)
 
 
 def save_model(model: SimulatorModel, folder: str | Path) -> None:
     """Writes a model as a folder, completely or not at all; see `check_place`."""
-    with whole_folder(folder, MODEL_FILE) as temporary:
-        write_text(temporary / MODEL_FILE, model.text)
-        write_text(temporary / REPORT_FILE, model.report)
+    with files.whole_folder(folder, MODEL_FILE) as temporary:
+        files.write_text(temporary / MODEL_FILE, model.text)
+        files.write_text(temporary / REPORT_FILE, model.report)
         model.table.save(temporary / TABLE_FOLDER)
-        write_sums(temporary)
+        files.write_sums(temporary)
 
 
 def load_model(folder: str | Path) -> SimulatorModel:
@@ -200,7 +193,7 @@ def load_model(folder: str | Path) -> SimulatorModel:
     if data.get("format") != FORMAT:
         reason = f"key 'format' is {data.get('format')!r}, not {FORMAT!r}"
         raise ModelError(f"{path}: {reason}; generate the model anew.")
-    check_sums(folder, MODEL_FILES, editable=MODEL_FILE)
+    files.check_sums(folder, MODEL_FILES, editable=MODEL_FILE)
     file = validate(data, _File, str(path))
     for key in fields(Calibration):  # its defaults are those of a robot that needs none
         if key.name not in data["calibration"]:

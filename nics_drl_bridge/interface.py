@@ -35,13 +35,13 @@ class RobotView:
 
 def stacked(views: Sequence[RobotView]) -> RobotView:
     """Stacks the views of M robots into one with a leading (M,); stamp and ages are the maxima."""
-    return RobotView(
-        np.stack([view.pose for view in views]), np.stack([view.twist for view in views]),
-        np.stack([view.ranges for view in views]), max(view.stamp_s for view in views),
-        max(view.scan_age_s for view in views), max(view.odom_age_s for view in views),
-        {name: np.stack([view.sensed[name] for view in views]) for name in views[0].sensed},
-        max(view.sensed_age_s for view in views),
-    )  # fmt: skip
+    sensed = {name: np.stack([view.sensed[name] for view in views]) for name in views[0].sensed}
+    known: dict[str, Any] = {"sensed": sensed}
+    for name in ("pose", "twist", "ranges"):
+        known[name] = np.stack([getattr(view, name) for view in views])
+    for name in ("stamp_s", "scan_age_s", "odom_age_s", "sensed_age_s"):
+        known[name] = max(getattr(view, name) for view in views)
+    return RobotView(**known)
 
 
 @dataclass(frozen=True)

@@ -45,15 +45,17 @@ _ALIAS = re.compile(r"\bas\s+\w+")
 
 
 @overload
-def kernel(function: Callable[..., Any], **options: bool) -> Any: ...
+def kernel(function: Callable[..., Any]) -> Any: ...
 
 
 @overload
-def kernel(**options: bool) -> Callable[[Callable[..., Any]], Any]: ...
+def kernel(
+    *, allocates: bool = ..., contracts: bool = ..., inline: bool = ...
+) -> Callable[[Callable[..., Any]], Any]: ...
 
 
 def kernel(
-    function: Callable[..., Any] | None = None, allocates: bool = False, contracts: bool = False,
+    function: Callable[..., Any] | None = None, *, allocates: bool = False, contracts: bool = False,
     inline: bool = False,
 ) -> Any:  # fmt: skip
     """Compiles a function with numba when it is first called, or loads what was compiled before.

@@ -115,20 +115,21 @@ class Navigation(Task):
     ) -> GoalProgress:
         """Writes the observations; returns the progress to the goals."""
         lead = view.pose.shape[:-1]
+        approach: Array = np.empty(lead)
         reached, touched = np.empty(lead, np.bool_), np.empty(lead, np.bool_)
-        progress = GoalProgress(np.empty(lead), reached, touched)
         own = out
         if self.sensors:
             own = np.empty((*lead, self.scan_parts + 6), np.float32)
         kernels.navigate(
-            own.reshape(-1, own.shape[-1]), GoalProgress(*(each.reshape(-1) for each in progress)),
+            own.reshape(-1, own.shape[-1]),
+            GoalProgress(approach.reshape(-1), reached.reshape(-1), touched.reshape(-1)),
             before.reshape(-1, 3), view.pose.reshape(-1, 3), view.twist.reshape(-1, 3),
             view.ranges.reshape(-1, view.ranges.shape[-1]), memory["goal"].reshape(-1, 2),
             self.scale, self.goal_radius,
         )  # fmt: skip
         if self.sensors:
             np.concatenate([own, self.sensor_shares(view)], axis=-1, out=out)
-        return progress
+        return GoalProgress(approach, reached, touched)
 
     def _terms(self, progress: GoalProgress) -> dict[str, Array]:
         return {

@@ -86,28 +86,21 @@ class Scanner:
 
     def _looked_up(self) -> Array:
         """(H, 2) squares of the distances between which a shape is looked up [m^2]."""
-        radii = self.table.outlines.radii
+        spec, table, radii = self.spec, self.table, self.table.outlines.radii
         between = np.full((len(radii), 2), np.inf)
         if self.renderer == "baked":
             between[:, 0] = radii
-        elif self.renderer == "auto" and self.spec.angle_increment <= WIDEST_BEAMS:
-            for h in np.flatnonzero(radii < self.spec.range_max):
-                between[h] = self._lookup_distances(int(h))
+        elif self.renderer == "auto" and spec.angle_increment <= WIDEST_BEAMS:
+            for h in np.flatnonzero(radii < spec.range_max).tolist():
+                farthest = float(table.grid[h, 0])
+                key = spec.model_dump_json(), table.shapes[h], table.density, farthest
+                if key not in _MEASURED:  # once per process
+                    ways = (replace(self, renderer=way, grid=None) for way in ("exact", "baked"))
+                    exact, baked = (way.arguments for way in ways)
+                    found = lookup_distances(exact, baked, h, float(radii[h]), GREATEST_ERROR)
+                    _MEASURED[key] = found
+                between[h] = _MEASURED[key]
         return np.asarray(np.square(between))
-
-    def _lookup_distances(self, shape: int) -> tuple[float, float]:
-        """Distances of one shape [m], see `lookup_distances`; measured once per process."""
-        radius, table = float(self.table.outlines.radii[shape]), self.table
-        key = (
-            self.spec.model_dump_json(), table.shapes[shape], table.density,
-            float(table.grid[shape, 0]),
-        )  # fmt: skip
-        if key not in _MEASURED:
-            exact, baked = (replace(self, renderer=way, grid=None) for way in ("exact", "baked"))
-            _MEASURED[key] = lookup_distances(
-                exact.arguments, baked.arguments, shape, radius, GREATEST_ERROR
-            )
-        return _MEASURED[key]
 
     def place(self, shapes: Sequence[Shape], poses: ArrayLike) -> NDArray[np.float64]:
         """Returns bodies (..., K, 7) of K shapes at poses (..., K, 3): x, y [m], heading [rad].
