@@ -50,21 +50,14 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
 
     ## Arguments
 
-    Args:
-        num_envs: N.
-        model, world, task, task_options: see `BridgeEnv`.
-        max_episode_steps: an episode is truncated after this many steps.
-        autoreset_mode: `NextStep` (an ended world is reset in the next step, whose action it
-            ignores) or `SameStep` (at once; the last observation is in `info["final_obs"]`).
-        copy: True if the caller may keep what `step` returns. False reuses the array of the
-            observation in the next step.
-        render_mode: `rgb_array`, of every world, or None.
-        simulation: further arguments of the FastSimulator: `renderer` (`baked` by default, or
-            `exact`), `threads`, on which the numbers do not depend, and `randomisation`, the
-            quantities drawn in each episode, see `BridgeEnv`.
-
-    Raises:
-        ConfigError, ModelError: an unknown name or a wrong file.
+    `num_envs` is N; `model`, `world`, `task`, `task_options` are those of `BridgeEnv`. An episode
+    is truncated after `max_episode_steps`. `autoreset_mode` is `NextStep` (an ended world is reset
+    in the next step, whose action it ignores) or `SameStep` (at once; the last observation is in
+    `info["final_obs"]`). With `copy` the caller may keep what `step` returns; False reuses the
+    array of the observation in the next step. `render_mode` is `rgb_array`, of every world, or
+    None. Further arguments are those of the FastSimulator: `renderer` (`baked` by default, or
+    `exact`), `threads`, on which the numbers do not depend, and `randomisation`, see `BridgeEnv`.
+    Raises ConfigError, ModelError for an unknown name or a wrong file.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's own declaration

@@ -290,8 +290,8 @@ class Middleware:
 
     def health(self, arrival_ns: int) -> Health:
         """Returns the health of all topics at a time of the receiver's clock [ns]."""
-        cache, outcomes = self.cache, self._timeline.outcomes()
-        distances = {kind.topic: d for kind, d in self._timeline.distances().items()}
+        cache, outcomes = self.cache, +self._timeline.outcomes  # those that are not 0
+        distances = {kind.topic: d for kind, d in self._timeline.distances.items()}
         topics = {
             topic: TopicHealth(
                 received,

@@ -122,17 +122,12 @@ class FastSimulator:
     A world is bit-identical in a batch of any size and with any number of threads. The M robots of
     a world scan and collide with each other.
 
-    Args:
-        model, world: the robot with its lidar and noise, and the field with its obstacles.
-        worlds, robots: N, and M in each world.
-        renderer: `auto`, `baked` or `exact`, see `lidar.scanner.Scanner`.
-        threads: number of parts of the worlds that are stepped in parallel.
-        randomisation: ranges drawn from in each episode: an object, the name of a shipped one, or
-            a YAML file.
-        longest_delay, longest_age: greatest values that `data.delay` of commands (by default the
-            model's) and `data.age` of scan and odometry may be set to [substeps]; raised to the
-            randomisation's greatest.
-        tell: called with a message when commands leave the range that the model was fitted to.
+    The renderer is `auto`, `baked` or `exact`, see `lidar.scanner.Scanner`; `threads` parts of the
+    worlds are stepped in parallel. The randomisation, drawn from in each episode, may be the name
+    of a shipped one, or a YAML file. `longest_delay` and `longest_age` are the greatest values that
+    `data.delay` of commands (by default the model's) and `data.age` of scan and odometry may be set
+    to [substeps], raised to the randomisation's. `tell` is called with a message when commands
+    leave the range that the model was fitted to.
     """
 
     def __init__(
