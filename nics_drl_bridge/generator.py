@@ -54,16 +54,13 @@ class SimulatorModel:
     sensors: tuple[Sensor, ...] = ()  # that the robot has beside its lidar
 
     def __post_init__(self) -> None:
-        robot, kinematics = self.robot, self.kinematics
-        for known, given, needed in (
-            ("are of", kinematics.variables, robot.variable_names),
-            ("give the rates", kinematics.dofs, robot.dof_names),
-        ):
-            if given != needed:
-                reason = f"the robot {robot.name!r} needs {needed}; generate the model anew."
-                raise ModelError(f"the kinematics {known} {given}, {reason}")
+        robot, known = self.robot, (self.kinematics.variables, self.kinematics.dofs)
+        needed = robot.variable_names, robot.dof_names
+        if known != needed:
+            reason = f"the robot {robot.name!r} needs {needed}; generate the model anew."
+            raise ModelError(f"the kinematics have variables and rates {known}, {reason}")
         check_sensors(self.sensors, (self.lidar.frame,))
-        period, dt = self.control_period, kinematics.dt
+        period, dt = self.control_period, self.kinematics.dt
         if not 0.5 < period / dt < np.inf or abs(period / dt - round(period / dt)) > 1e-6:
             reason = f"is no multiple of the model's step {dt} s; change one of them."
             raise ModelError(f"control_period {period} s {reason}")

@@ -54,9 +54,8 @@ def _sensor(name: Any, model: SimulatorModel) -> Sensor:
     known = {sensor.name: sensor for sensor in model.sensors}
     given = name.name if isinstance(name, Sensor) else str(name)
     if given not in known:
-        raise ConfigError(
-            f"task option sensors: the model has no sensor {given!r}; {nearest(given, known)}"
-        )
+        hint = nearest(given, known)
+        raise ConfigError(f"task option sensors: the model has no sensor {given!r}; {hint}")
     return known[given]
 
 

@@ -316,10 +316,8 @@ def chosen_worlds(options: dict[str, Any] | None, count: int) -> Flags:
         return np.ones(count, np.bool_)
     chosen = np.asarray(options["reset_mask"])
     if chosen.shape != (count,) or chosen.dtype != np.bool_ or not chosen.any():
-        raise ConfigError(
-            f"options['reset_mask'] of shape {chosen.shape}, {chosen.dtype}: must be ({count},) "
-            "bool with at least one True."
-        )
+        given = f"options['reset_mask'] of shape {chosen.shape}, {chosen.dtype}"
+        raise ConfigError(f"{given}: must be ({count},) bool with at least one True.")
     return chosen.copy()
 
 

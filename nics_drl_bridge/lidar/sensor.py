@@ -143,10 +143,8 @@ def check_sensors(sensors: tuple[Sensor, ...], frames: tuple[str, ...]) -> None:
     names, used = list(TAKEN), list(frames)
     for sensor in sensors:
         if sensor.name in names or sensor.frame in used:
-            raise ConfigError(
-                f"sensor {sensor.name!r} with frame {sensor.frame!r}: another has that name or "
-                "frame already; choose others."
-            )
+            reason = "another has that name or frame already; choose others."
+            raise ConfigError(f"sensor {sensor.name!r} with frame {sensor.frame!r}: {reason}")
         names.append(sensor.name)
         used.append(sensor.frame)
 

@@ -45,10 +45,8 @@ def term_arrays(model: TaylorModel) -> Terms:
     one = len(model.variables)
     order = max(1, int(model.powers.sum(axis=1).max(initial=1)))
     if order > GREATEST_ORDER:
-        raise ModelError(
-            f"the kinematics have a term of order {order}; the greatest is {GREATEST_ORDER}: "
-            "generate the model anew."
-        )
+        most = f"the greatest is {GREATEST_ORDER}: generate the model anew."
+        raise ModelError(f"the kinematics have a term of order {order}; {most}")
     dofs, places = np.nonzero(model.coefficients)
     factors = np.full((len(dofs), order), one, dtype=np.int64)
     for row, k in enumerate(places):

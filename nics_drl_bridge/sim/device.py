@@ -83,10 +83,8 @@ class DeviceWorld:
     def begin(self, seed: int, starts: Array | None) -> None:
         """Begins the episode of a seed, at x, y, heading of each robot (3 M,) if given."""
         if starts is not None and starts.size != 3 * self.robots:
-            raise ConfigError(
-                f"episode_start has {starts.size} numbers; {self.robots} robots need "
-                f"{3 * self.robots}: x, y, heading of each."
-            )
+            needed = f"{self.robots} robots need {3 * self.robots}: x, y, heading of each."
+            raise ConfigError(f"episode_start has {starts.size} numbers; {needed}")
         placed = None if starts is None else starts.reshape(1, self.robots, 3)
         self._simulator.reset([seed], starts=placed)
         self.commands[:] = 0.0

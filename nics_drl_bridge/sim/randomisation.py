@@ -294,10 +294,8 @@ def _term(d: int, name: str, model: TaylorModel, where: str) -> int:
     known = {model.term_names[k]: int(k) for k in np.flatnonzero(model.coefficients[d])}
     with suppress(ValueError, KeyError):
         return known[taylor.term_name(taylor.parse_term(name, model.variables), model.variables)]
-    raise ConfigError(
-        f"{where}: the model has no term {name!r} there; "
-        + (nearest(name, known) if known else "it has none at all: remove it.")
-    )
+    hint = nearest(name, known) if known else "it has none at all: remove it."
+    raise ConfigError(f"{where}: the model has no term {name!r} there; {hint}")
 
 
 def _check_stable(model: TaylorModel, spans: Array, where: str) -> None:
@@ -338,10 +336,9 @@ def _levels(ranges: Randomisation, model: SimulatorModel, where: str) -> Bounds:
         if (factor := getattr(odometry, key)) is None:
             continue
         if not base[part].any():
-            raise ConfigError(
-                f"{where}: key 'odometry.{key}': the model of {model.robot.name!r} has no "
-                f"measured {key} to scale; give {one!r} and {other!r} instead."
-            )
+            lacks = f"the model of {model.robot.name!r} has no measured {key} to scale"
+            fix = f"give {one!r} and {other!r} instead."
+            raise ConfigError(f"{where}: key 'odometry.{key}': {lacks}; {fix}")
         low[part], high[part] = base[part] * factor[0], base[part] * factor[1]
     for column, name in enumerate(NOISE_NAMES):
         if name and (level := getattr(odometry, name)) is not None:

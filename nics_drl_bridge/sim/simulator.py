@@ -209,10 +209,8 @@ class FastSimulator:
         scenes, draws = self._draw(seeds)
         begin = scenes.starts if starts is None else np.asarray(starts, dtype=np.float64)
         if len(scenes) != len(chosen) or begin.shape != scenes.starts.shape:
-            raise ConfigError(
-                f"{len(scenes)} seeds and starts {begin.shape} must be of {len(chosen)} worlds "
-                f"with {self.data.pose.shape[1]} robots each."
-            )
+            needed = f"{len(chosen)} worlds with {self.data.pose.shape[1]} robots each."
+            raise ConfigError(f"{len(scenes)} seeds and starts {begin.shape} must be of {needed}")
         self._place(chosen, np.asarray(seeds, dtype=np.int64), scenes, begin)
         if draws is not None:
             self._assign(chosen, draws)
@@ -289,9 +287,7 @@ class FastSimulator:
         robots, _, width = self.data.history.shape[1:]
         expected = (part.stop - part.start, robots, width)
         if checked.shape != expected:
-            raise ConfigError(
-                f"commands are {checked.shape}; they must be {expected}: worlds, robots, and a "
-                "robot's commands."
-            )
+            needed = f"they must be {expected}: worlds, robots, and a robot's commands."
+            raise ConfigError(f"commands are {checked.shape}; {needed}")
         self._boxes[part.start].check(checked)
         return checked
