@@ -113,7 +113,6 @@ class Navigation(Task):
     def _see(
         self, out: Observation, before: Array, view: RobotView, memory: Memory
     ) -> GoalProgress:
-        """Writes the observations; returns the progress to the goals."""
         lead = view.pose.shape[:-1]
         approach: Array = np.empty(lead)
         reached, touched = np.empty(lead, np.bool_), np.empty(lead, np.bool_)

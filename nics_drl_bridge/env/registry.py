@@ -50,7 +50,6 @@ def make_task(
 
 
 def _sensor(name: Any, model: SimulatorModel) -> Sensor:
-    """Returns a sensor of a model, by its name or as it was there."""
     known = {sensor.name: sensor for sensor in model.sensors}
     given = name.name if isinstance(name, Sensor) else str(name)
     if given not in known:
@@ -60,7 +59,6 @@ def _sensor(name: Any, model: SimulatorModel) -> Sensor:
 
 
 def _check_options(found: type[Task], options: dict[str, Any]) -> None:
-    """Raises ConfigError for an option that the class does not have, or of the wrong type."""
     known = signature(found).parameters
     free = any(one.kind is Parameter.VAR_KEYWORD for one in known.values())
     for name, value in options.items():

@@ -256,7 +256,6 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     # Facts as arrays (N, ...) of worlds with one robot, or (N, M, ...) of teams.
 
     def _known(self) -> dict[str, Any]:
-        """Copies of the facts that are known at any time."""
         shown = {name: self._row(self.memory[name]).copy() for name in self.task.shown}
         pose, ages = self._row(self.simulator.data.odom).copy(), np.zeros((2, self.num_envs))
         return {**shown, "pose": pose, "scan_age_s": ages[0], "odom_age_s": ages[1]}

@@ -241,7 +241,6 @@ class Estimator:
 
     @property
     def _foreseen_here(self) -> Foreseen | None:
-        """The last prediction if it is the present belief."""
         foreseen = self._foreseen
         return foreseen if foreseen is not None and foreseen.mean is self._filter.x else None
 

@@ -274,7 +274,6 @@ class Trail:
         )
 
     def _fits(self, before: ReportedPose, after: ReportedPose, seconds: float) -> bool:
-        """True if the twists lead from one pose to the other in a time [s]."""
         mean, change = (before.twist + after.twist) / 2.0, np.abs(after.twist - before.twist)
         moved = geometry.between(before.pose, after.pose)
         off = np.abs(geometry.between(geometry.exp(mean * seconds), moved))

@@ -91,7 +91,6 @@ def move(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
 
 @kernel
 def _move_little(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
-    """Does the same as `move` for turns up to `WIDE_TURN`."""
     t2 = turn * turn
     a = series[0] - t2 * (series[1] - t2 * series[2])
     a = (series[3] + series[3]) - t2 * a

@@ -113,10 +113,9 @@ class SceneSampler:
     def _no_room(self, seed: int, why: int) -> ConfigError:
         where, scene = self.world.source, f"in the scene of seed {seed}"
         if why == kernels.NO_OBSTACLES:
-            return ConfigError(
-                f"{where}: key 'obstacles': no free place for {self.count} obstacles {scene}; "
-                "lower `count` or `gap`, or enlarge `size`."
-            )
+            reason = f"no free place for {self.count} obstacles {scene}"
+            fix = "lower `count` or `gap`, or enlarge `size`."
+            return ConfigError(f"{where}: key 'obstacles': {reason}; {fix}")
         least, greatest = self.world.goal_distance
         return ConfigError(
             f"{where}: key 'goal_distance': no free places for {self.robots} start(s) and goal(s) "
@@ -302,7 +301,6 @@ def _check(
         fits[f"{key}.at.{number}"] = inside and bool(area[i, j]), list(at)
     for place, (free, value) in fits.items():
         if not free:
-            raise ConfigError(
-                f"{world.source}: key {place!r}: a robot with {world.clearance:g} m around it does "
-                f"not fit there, at {value}; move it, or lower `clearance`."
-            )
+            robot = f"a robot with {world.clearance:g} m around it does not fit there, at {value}"
+            fix = "move it, or lower `clearance`."
+            raise ConfigError(f"{world.source}: key {place!r}: {robot}; {fix}")

@@ -77,13 +77,12 @@ class CommandBox:
         least, most = flat.min(axis=0), flat.max(axis=0)
         outside = (least < self._low) | (most > self._high)
         if outside.any():
-            self._armed = False
-            i = int(np.argmax(outside))
+            self._armed, i = False, int(np.argmax(outside))
             value = least[i] if least[i] < self._low[i] else most[i]
+            fitted = f"{self._range[0][i]:.4g} to {self._range[1][i]:.4g} only"
+            fix = "its motion there is extrapolated; record a drive that covers it."
             self._tell(
-                f"{self._names[i]} is {value:.4g}, but the model was fitted to "
-                f"{self._range[0][i]:.4g} to {self._range[1][i]:.4g} only: its motion there is "
-                "extrapolated; record a drive that covers it."
+                f"{self._names[i]} is {value:.4g}, but the model was fitted to {fitted}: {fix}"
             )
 
 
@@ -96,13 +95,10 @@ def _check_speed(model: TaylorModel, robot: RobotSpec, world: World) -> None:
     products = np.prod(most**model.powers, axis=1)
     step = float((np.abs(model.coefficients[:2]) @ products).max() * model.dt)
     x1, y1, x2, y2 = world.extent
-    least = min(x2 - x1, y2 - y1)
-    if not step < least:
-        raise ConfigError(
-            f"the robot {robot.name!r} could drive {step:.3g} m in a step of {model.dt:g} s, "
-            f"across a world of {least:.3g} m; lower the limits of its commands, or generate its "
-            "model with a shorter step."
-        )
+    if not step < (least := min(x2 - x1, y2 - y1)):
+        drives = f"could drive {step:.3g} m in a step of {model.dt:g} s, across {least:.3g} m"
+        fix = "lower the limits of its commands, or generate its model with a shorter step."
+        raise ConfigError(f"the robot {robot.name!r} {drives} of world; {fix}")
 
 
 def _check_memory(model: SimulatorModel, world: World, worlds: int, robots: int) -> None:
