@@ -167,10 +167,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         out[worlds] = self.task.observation(self._view(worlds), fresh)
 
     def _view(self, rows: Rows) -> RobotView:
-        data = self.simulator.data
-        sensed = {name: each[rows] for name, each in self.simulator.readings.items()}
-        scans = data.ranges[rows]
-        return RobotView(data.odom[rows], data.twist[rows], scans, 0.0, 0.0, 0.0, sensed)
+        data, readings = self.simulator.data, self.simulator.readings
+        seen = data.odom[rows], data.twist[rows], data.ranges[rows]
+        return RobotView(*seen, 0.0, 0.0, 0.0, {name: readings[name][rows] for name in readings})
 
     def step(
         self, actions: NDArray[Any]
@@ -236,9 +235,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             shown = np.full(self.num_envs, None, dtype=object)
             for n in np.flatnonzero(over):  # only those that ended: each needs its own object
                 shown[n] = flat(out)[n].copy()
-            infos["final_obs"], infos["_final_obs"] = shown, over.copy()
-            final = masked(self._known() | facts, over, True)
-            infos["final_info"], infos["_final_info"] = final, over.copy()
+            infos |= masked({"final_obs": shown}, over)
+            infos |= masked({"final_info": self._known() | facts}, over, True)
             self.simulator.run_parts(
                 lambda part: self._begin(part.start + np.flatnonzero(over[part]), out)
             )
@@ -247,10 +245,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     def _tell(self, infos: dict[str, Any], facts: dict[str, Any], begun: Flags) -> None:
         """Adds to `infos` the facts of every world, and the beginnings of those in `begun`."""
         infos |= masked(self._known(), np.ones_like(begun))
-        some = bool(begun.any())
-        if some:
+        if some := bool(begun.any()):
             infos |= masked(self._beginnings(), begun, True)
-        if not (some and begun.all()):
+        if not begun.all():
             infos |= masked(facts, ~begun, some)
 
     # Facts as arrays (N, ...) of worlds with one robot, or (N, M, ...) of teams.

@@ -59,17 +59,17 @@ class Scanner:
             raise ConfigError(f"unknown renderer {self.renderer!r}; {known}")
         if self.renderer == "exact" or not table.shapes:
             return
+        reach, reason = float((table.grid[:, 0] - table.outlines.radii).min()), ""
         if not table.has_rows:
             reason = f"has no rows to look up with the renderer {self.renderer!r}"
-            raise ModelError(f"the lidar table {reason}; scan with `exact`, or bake one.")
-        bake_one = f"; bake one for the lidar {spec.name!r}."
-        if not math.isclose(table.beam_angle, spec.angle_increment, rel_tol=1e-9):
+        elif not math.isclose(table.beam_angle, spec.angle_increment, rel_tol=1e-9):
             apart = f"{table.beam_angle:.6g} rad apart, not {spec.angle_increment:.6g} rad"
-            raise ModelError(f"the lidar table is for beams that are {apart}{bake_one}")
-        reach = float((table.grid[:, 0] - table.outlines.radii).min())
-        if reach < spec.range_max * (1.0 - 1e-9):
-            reaches = f"reaches {reach:g} m, not {spec.range_max:g} m"
-            raise ModelError(f"the lidar table {reaches}{bake_one}")
+            reason = f"is for beams that are {apart}"
+        elif reach < spec.range_max * (1.0 - 1e-9):
+            reason = f"reaches {reach:g} m, not {spec.range_max:g} m"
+        if reason:
+            fix = f"bake one for the lidar {spec.name!r}, or scan with `exact`."
+            raise ModelError(f"the lidar table {reason}; {fix}")
 
     @cached_property
     def arguments(self) -> LidarArrays:

@@ -200,10 +200,9 @@ class LidarTable:
     def _check(self) -> None:
         """Raises ValueError if the kernels would read beyond an array."""
         arrays: tuple[NDArray[Any], ...] = (self.grid, self.start, self.cell, self.rows)
-        if [array.dtype for array in arrays] != [np.float64, np.int32, np.int16, np.float32]:
-            raise ValueError("an array has another type of number")
-        if not all(array.flags.c_contiguous for array in arrays):
-            raise ValueError("an array has another order of its axes")
+        types = [array.dtype for array in arrays if array.flags.c_contiguous]
+        if types != [np.float64, np.int32, np.int16, np.float32]:
+            raise ValueError("an array has another type of number, or order of its axes")
         if self.grid.shape != (len(self.shapes), 3) or not np.isfinite(self.grid).all():
             raise ValueError("the grid does not fit the shapes")
         counts = self.grid[:, 1] * self.density.distances
