@@ -186,9 +186,10 @@ class Task(ABC):
         return self._look(ranges)[1]
 
     def _look(self, ranges: NDArray[np.float32]) -> tuple[Observation, Flags]:
-        lead, parts = ranges.shape[:-1], self.scan_parts
+        lead, beams = ranges.shape[:-1], ranges.shape[-1]
+        parts = beams if self.scan is None else self.scan.sectors
         shares, touched = np.empty((*lead, parts), np.float32), np.empty(lead, np.bool_)
-        rows = np.ascontiguousarray(ranges, np.float32).reshape(-1, ranges.shape[-1])
+        rows = np.ascontiguousarray(ranges, np.float32).reshape(-1, beams)
         kernels.looks(shares.reshape(-1, parts), touched.reshape(-1), rows, self.scale)
         return shares, touched
 
