@@ -75,10 +75,9 @@ class Scanner:
     def arguments(self) -> LidarArrays:
         """Lidar and table for the kernels."""
         spec, table = self.spec, self.table
-        directions = np.stack([np.cos(spec.angles), np.sin(spec.angles)], axis=1)
         return LidarArrays(
             np.array(spec.mount),
-            Beams(directions, spec.angle_min, spec.angle_increment, spec.full_circle),
+            Beams(spec.directions, spec.angle_min, spec.angle_increment, spec.full_circle),
             spec.range_min, spec.range_max, spec.sweep_time, self._looked_up(),
             table.outlines.arguments, table.arrays,
             NO_MAP if self.grid is None else self.grid.arrays, self.renderer == "exact",

@@ -97,9 +97,9 @@ class LidarSpec(Schema):
         return np.asarray(self.angle_min + self.angle_increment * np.arange(self.beams))
 
     @cached_property
-    def directions(self) -> NDArray[np.float32]:
+    def directions(self) -> NDArray[np.float64]:
         """(B, 2) cosine and sine of each beam's direction."""
-        return np.stack([np.cos(self.angles), np.sin(self.angles)], axis=1).astype(np.float32)
+        return np.stack([np.cos(self.angles), np.sin(self.angles)], axis=1)
 
     @property
     def scan_time(self) -> float:
