@@ -35,21 +35,17 @@ __all__ = [
     "save_recording",
 ]  # fmt: skip
 
-_HOMES = {
-    "FastSimulator": "sim.simulator",
-    "generate": "generator",
-    "load_model": "generator",
-    "load_policy": "policy.policy_file",
-    "load_recording": "recording.recording",
-    "load_robot": "robot.spec",
-    "load_world": "sim.world",
-    "make": "env.registry",
-    "make_vec": "env.registry",
-    "open_model": "generator",
-    "read_recording": "recording.readers",
-    "save_model": "generator",
-    "save_recording": "recording.recording",
+_NAMES = {
+    "env.registry": ("make", "make_vec"),
+    "generator": ("generate", "load_model", "open_model", "save_model"),
+    "policy.policy_file": ("load_policy",),
+    "recording.readers": ("read_recording",),
+    "recording.recording": ("load_recording", "save_recording"),
+    "robot.spec": ("load_robot",),
+    "sim.simulator": ("FastSimulator",),
+    "sim.world": ("load_world",),
 }
+_HOMES = {name: home for home, names in _NAMES.items() for name in names}
 
 
 def __getattr__(name: str) -> Any:

@@ -94,7 +94,6 @@ def _load(path: Path, what: str) -> Any:
 
 
 def _unfit(path: Path, what: str, error: Exception) -> str:
-    """Error message for a user's file that can't be imported, with the line."""
     frames = extract_tb(error.__traceback__)
     lines = [frame.lineno for frame in frames if Path(frame.filename) == path.absolute()]
     line = error.lineno if isinstance(error, SyntaxError) else (lines or [None])[-1]

@@ -10,17 +10,9 @@ from pathlib import Path
 import numpy as np
 from pydantic import Field
 
+from nics_drl_bridge import files
 from nics_drl_bridge.config import Schema, dump_yaml, parse_yaml, read_text, validate
 from nics_drl_bridge.errors import ConfigError, FitError, ModelError
-from nics_drl_bridge.files import (
-    SUMS,
-    check_folder,
-    check_sums,
-    sha256,
-    whole_folder,
-    write_sums,
-    write_text,
-)
 from nics_drl_bridge.identify import fit
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.identify import Identified, identify
@@ -38,7 +30,8 @@ from nics_drl_bridge.robot.taylor import NamedTaylorModel, TaylorModel
 
 FORMAT = "nics_drl_bridge/simulator_model/4"
 MODEL_FILE, TABLE_FOLDER, REPORT_FILE = "model.yaml", "lidar_table", "report.txt"
-MODEL_FILES = (MODEL_FILE, REPORT_FILE, *(f"{TABLE_FOLDER}/{n}" for n in (SUMS, *TABLE_FILES)))
+_OF_TABLE = (f"{TABLE_FOLDER}/{name}" for name in (files.SUMS, *TABLE_FILES))
+MODEL_FILES = (MODEL_FILE, REPORT_FILE, *_OF_TABLE)
 """The files of a model, in addition to its manifest."""
 CONTROL_PERIOD_S = 0.1
 DEFAULT_LIDAR = "paper"
@@ -61,16 +54,13 @@ class SimulatorModel:
     sensors: tuple[Sensor, ...] = ()  # that the robot has beside its lidar
 
     def __post_init__(self) -> None:
-        robot, kinematics = self.robot, self.kinematics
-        for known, given, needed in (
-            ("are of", kinematics.variables, robot.variable_names),
-            ("give the rates", kinematics.dofs, robot.dof_names),
-        ):
-            if given != needed:
-                reason = f"the robot {robot.name!r} needs {needed}; generate the model anew."
-                raise ModelError(f"the kinematics {known} {given}, {reason}")
+        robot, known = self.robot, (self.kinematics.variables, self.kinematics.dofs)
+        needed = robot.variable_names, robot.dof_names
+        if known != needed:
+            reason = f"the robot {robot.name!r} needs {needed}; generate the model anew."
+            raise ModelError(f"the kinematics have variables and rates {known}, {reason}")
         check_sensors(self.sensors, (self.lidar.frame,))
-        period, dt = self.control_period, kinematics.dt
+        period, dt = self.control_period, self.kinematics.dt
         if not 0.5 < period / dt < np.inf or abs(period / dt - round(period / dt)) > 1e-6:
             reason = f"is no multiple of the model's step {dt} s; change one of them."
             raise ModelError(f"control_period {period} s {reason}")
@@ -86,14 +76,12 @@ class SimulatorModel:
     def text(self) -> str:
         """The content of `model.yaml`."""
         data = {
-            "format": FORMAT,
-            "control_period": self.control_period,
+            "format": FORMAT, "control_period": self.control_period,
             "robot": self.robot.model_dump(mode="json"),
             "kinematics": self.kinematics.named.model_dump(exclude_none=True),
-            "calibration": asdict(self.calibration),
-            "lidar": self.lidar.model_dump(mode="json"),
+            "calibration": asdict(self.calibration), "lidar": self.lidar.model_dump(mode="json"),
             "noise": self.noise.model_dump(mode="json"),
-        }
+        }  # fmt: skip
         if self.latency.measured:
             data["latency"] = self.latency.model_dump(mode="json")
         if self.sensors:
@@ -103,7 +91,7 @@ class SimulatorModel:
     @property
     def fingerprint(self) -> str:
         """Identifies the model: 16 digits of the SHA-256 of `text` and of the table's."""
-        return sha256(f"{self.text}{self.table.fingerprint}".encode())[:16]
+        return files.sha256(f"{self.text}{self.table.fingerprint}".encode())[:16]
 
 
 class _File(Schema):
@@ -119,17 +107,10 @@ class _File(Schema):
 
 
 def generate(
-    recording: Recording,
-    robot: RobotSpec,
-    lidar: LidarSpec,
-    shapes: Sequence[Shape],
-    order: int = fit.ORDER,
-    alpha: fit.Alpha = "auto",
-    assume: bool = False,
-    strict: bool = False,
-    anyway: bool = False,
-    sensors: Sequence[Sensor] = (),
-) -> tuple[SimulatorModel, Identified]:
+    recording: Recording, robot: RobotSpec, lidar: LidarSpec, shapes: Sequence[Shape],
+    order: int = fit.ORDER, alpha: fit.Alpha = "auto", assume: bool = False, strict: bool = False,
+    anyway: bool = False, sensors: Sequence[Sensor] = (),
+) -> tuple[SimulatorModel, Identified]:  # fmt: skip
     """Calibrates, fits and prunes the kinematics, and bakes the lidar table.
 
     The shapes of obstacles are baked, and the robot's own footprint. `order` is that of the Taylor
@@ -183,16 +164,16 @@ def open_model(name: str | Path) -> SimulatorModel:
 
 def check_place(folder: str | Path) -> None:
     """Raises ConfigError, before the work of a fit, if `save_model` can't write to a folder."""
-    check_folder(folder, MODEL_FILE)
+    files.check_folder(folder, MODEL_FILE)
 
 
 def save_model(model: SimulatorModel, folder: str | Path) -> None:
     """Writes a model as a folder, completely or not at all; see `check_place`."""
-    with whole_folder(folder, MODEL_FILE) as temporary:
-        write_text(temporary / MODEL_FILE, model.text)
-        write_text(temporary / REPORT_FILE, model.report)
+    with files.whole_folder(folder, MODEL_FILE) as temporary:
+        files.write_text(temporary / MODEL_FILE, model.text)
+        files.write_text(temporary / REPORT_FILE, model.report)
         model.table.save(temporary / TABLE_FOLDER)
-        write_sums(temporary)
+        files.write_sums(temporary)
 
 
 def load_model(folder: str | Path) -> SimulatorModel:
@@ -209,7 +190,7 @@ def load_model(folder: str | Path) -> SimulatorModel:
     if data.get("format") != FORMAT:
         reason = f"key 'format' is {data.get('format')!r}, not {FORMAT!r}"
         raise ModelError(f"{path}: {reason}; generate the model anew.")
-    check_sums(folder, MODEL_FILES, editable=MODEL_FILE)
+    files.check_sums(folder, MODEL_FILES, editable=MODEL_FILE)
     file = validate(data, _File, str(path))
     for key in fields(Calibration):  # its defaults are those of a robot that needs none
         if key.name not in data["calibration"]:

@@ -1,4 +1,4 @@
-"""Interfaces: RobotView and Backend for what learns, Simulator for what moves robots."""
+"""Interfaces of what learns: RobotView, and Backend for whatever moves the robot."""
 
 from __future__ import annotations
 
@@ -35,16 +35,13 @@ class RobotView:
 
 def stacked(views: Sequence[RobotView]) -> RobotView:
     """Stacks the views of M robots into one with a leading (M,); stamp and ages are the maxima."""
-    return RobotView(
-        np.stack([view.pose for view in views]),
-        np.stack([view.twist for view in views]),
-        np.stack([view.ranges for view in views]),
-        max(view.stamp_s for view in views),
-        max(view.scan_age_s for view in views),
-        max(view.odom_age_s for view in views),
-        {name: np.stack([view.sensed[name] for view in views]) for name in views[0].sensed},
-        max(view.sensed_age_s for view in views),
-    )
+    sensed = {name: np.stack([view.sensed[name] for view in views]) for name in views[0].sensed}
+    known: dict[str, Any] = {"sensed": sensed}
+    for name in ("pose", "twist", "ranges"):
+        known[name] = np.stack([getattr(view, name) for view in views])
+    for name in ("stamp_s", "scan_age_s", "odom_age_s", "sensed_age_s"):
+        known[name] = max(getattr(view, name) for view in views)
+    return RobotView(**known)
 
 
 @dataclass(frozen=True)
@@ -91,53 +88,3 @@ class Backend(Protocol):
 
     def close(self) -> None:
         """Stops the robot with a zero command and frees all resources."""
-
-
-class RobotStates(Protocol):
-    """State of a simulator's M robots after a step; the leading 1 is its one world."""
-
-    @property
-    def pose(self) -> Array:
-        """(1, M, 3) true pose of `base_link` in `map`."""
-
-    @property
-    def twist(self) -> Array:
-        """(1, M, 3) measured body twist."""
-
-    @property
-    def state(self) -> Array:
-        """(1, M, S) true state, in the order of the RobotSpec."""
-
-    @property
-    def odom(self) -> Array:
-        """(1, M, 3) pose by odometry, which starts at the start pose and drifts."""
-
-    @property
-    def ranges(self) -> NDArray[np.float32]:
-        """(1, M, B) scan, REP-117."""
-
-    @property
-    def collided(self) -> NDArray[np.uint8]:
-        """(1, M) 1 once a robot has touched something."""
-
-    @property
-    def steps(self) -> NDArray[np.int64]:
-        """(1,) control periods since the reset."""
-
-
-class Simulator(Protocol):
-    """One world of M robots, whatever implements it; `FastSimulator` does."""
-
-    @property
-    def data(self) -> RobotStates:
-        """The current states; a step may overwrite the same arrays."""
-
-    @property
-    def readings(self) -> Mapping[str, NDArray[np.float32]]:
-        """Name of a further sensor -> (1, M, S) its readings."""
-
-    def reset(self, seeds: ArrayLike, *, starts: ArrayLike | None = None) -> Any:
-        """Begins the episode of a seed (1,), at poses (1, M, 3) if they are given."""
-
-    def step(self, commands: ArrayLike) -> None:
-        """Moves the robots by one control period; commands (1, M, C) as in the RobotSpec."""

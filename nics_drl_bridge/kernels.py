@@ -19,7 +19,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, overload
 
@@ -55,39 +55,25 @@ def kernel(
 
 
 def kernel(
-    function: Callable[..., Any] | None = None,
-    *,
-    allocates: bool = False,
-    contracts: bool = False,
+    function: Callable[..., Any] | None = None, *, allocates: bool = False, contracts: bool = False,
     inline: bool = False,
-) -> Any:
+) -> Any:  # fmt: skip
     """Compiles a function with numba when it is first called, or loads what was compiled before.
 
-    It runs without the interpreter's lock; a division by zero gives inf or NaN, as with arrays.
-
-    Args:
-        function: to compile.
-        allocates: it makes arrays or other objects, or calls what does.
-        contracts: products and sums may be fused, which rounds once instead of twice.
-        inline: it is always compiled into its callers; for the few where that was measured to pay.
-
-    Returns:
-        numba's dispatcher; without `function`, a decorator.
+    It runs without the interpreter's lock; a division by zero gives inf or NaN, as with arrays. It
+    `allocates` if it makes arrays or other objects, or calls what does; with `contracts`, products
+    and sums may be fused, which rounds once instead of twice; `inline` compiles it into its callers
+    always, for the few where that was measured to pay. Without a function, returns a decorator.
     """
+    if function is None:
+        return partial(kernel, allocates=allocates, contracts=contracts, inline=inline)
     options: dict[str, Any] = {"nopython": True, "nogil": True, "error_model": "numpy"}
     options |= {"boundscheck": None, "no_cfunc_wrapper": True}
     options |= {} if allocates else {"_nrt": False}
     options |= {"fastmath": {"contract"}} if contracts else {}
     options |= {"forceinline": True} if inline else {}
-
-    def compiled(function: Callable[..., Any]) -> Any:
-        dispatcher = _Kernel(
-            function, targetoptions=options | {"nopython": True, "boundscheck": None}
-        )
-        KERNELS.append(dispatcher)
-        return dispatcher
-
-    return compiled if function is None else compiled(function)
+    KERNELS.append(_Kernel(function, targetoptions=options))
+    return KERNELS[-1]
 
 
 class _InnerLibrary(JITCodeLibrary):  # type: ignore[misc]
@@ -245,19 +231,14 @@ def imports_of(file: Path) -> tuple[Path, ...]:
 
 
 class _Compiling(event.Listener):  # type: ignore[misc]
-    """Counts what this process compiles, and says so once to whoever waits for it.
-
-    Attributes:
-        count: specialisations of kernels, and of what they call.
-        cpu_s: CPU time that compiling took [s].
-        quiet: nothing is to be said, or it has been.
-    """
+    """Counts what this process compiles, and says so once to whoever waits for it."""
 
     def __init__(self) -> None:
-        self.count, self.cpu_s = 0, 0.0
-        self.quiet, self._lock, self._depth = False, threading.Lock(), 0
-        self._begun, self._begun_cpu, self._spent = 0.0, 0.0, 0.0
-        self._collects = True
+        self.count = 0  # specialisations of kernels, and of what they call
+        self.cpu_s = 0.0  # CPU time that compiling took
+        self.quiet = False  # True: nothing is to be said, or it has been
+        self._lock, self._depth, self._collects = threading.Lock(), 0, True
+        self._begun = self._begun_cpu = self._spent = 0.0
 
     def on_start(self, event: event.Event) -> None:
         """A function begins to be compiled, maybe for another that is."""

@@ -8,6 +8,8 @@ import numpy as np
 import shapely
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.lidar import fault_kernels
+from nics_drl_bridge.lidar.faults import SKEW
 from nics_drl_bridge.lidar.shapes import Circle, Polygon, Rectangle, Segment, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec
 
@@ -140,6 +142,14 @@ def by_plane_geometry(spec: LidarSpec, scene: Scene) -> tuple[np.ndarray, np.nda
     ranges[ranges > spec.range_max] = np.inf
     ranges[ranges < spec.range_min] = -np.inf
     return ranges, clear
+
+
+def slice_poses(pose, twist, sweep_time: float, slices: int, skew: str) -> np.ndarray:
+    """Poses (G, 3) of a robot during a sweep that ends at `pose`, with a body twist (3,)."""
+    out = np.empty((slices, 3))
+    fault_kernels.slice_poses(out, np.asarray(pose), np.asarray(twist), sweep_time, SKEW[skew])
+    out[:, 2] = geometry.wrap_angle(out[:, 2])
+    return out
 
 
 def scan_skewed(render, poses: np.ndarray) -> np.ndarray:

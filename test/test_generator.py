@@ -176,8 +176,8 @@ def test_a_model_that_is_replaced_while_it_is_read_is_refused(saved, monkeypatch
         save_model(builtin_model("mecanum"), saved)
         check_sums(*given, **named)
 
-    check_sums = generator.check_sums
-    monkeypatch.setattr(generator, "check_sums", meanwhile)
+    check_sums = generator.files.check_sums
+    monkeypatch.setattr(generator.files, "check_sums", meanwhile)
     with pytest.raises(ModelError, match="was replaced while it was read; open it again"):
         load_model(saved)
 
@@ -308,7 +308,7 @@ def test_a_crash_while_saving_leaves_the_old_model(saved, monkeypatch):
     def crash(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(generator, "write_sums", crash)
+    monkeypatch.setattr(generator.files, "write_sums", crash)
     with pytest.raises(KeyboardInterrupt):
         save_model(builtin_model("mecanum"), saved)
     assert contents(saved) == before

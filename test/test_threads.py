@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -10,7 +8,7 @@ from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.identify.fit import fit
 from nics_drl_bridge.identify.identify import calibrate, identify
 from nics_drl_bridge.report.fit_pictures import timing_curves
-from nics_drl_bridge.threads import Crew, one_blas_thread
+from nics_drl_bridge.threads import one_blas_thread, run_parts
 
 
 def blas_threads() -> set[int]:
@@ -58,11 +56,10 @@ def test_whatever_solves_many_small_systems_is_limited(function):
     assert seen[0] == {1}
 
 
-@pytest.mark.parametrize("threads", [1, 2, 3])
-def test_a_crew_gives_what_each_part_gave_in_their_order(threads):
-    crew = Crew(threads)
+@pytest.mark.parametrize("parts", [1, 2, 7])
+def test_parts_give_their_results_in_order(parts):
     for _ in range(3):
-        assert crew.run(lambda part: part * part, range(7)) == [n * n for n in range(7)]
+        assert run_parts(lambda part: part * part, range(parts)) == [n * n for n in range(parts)]
 
 
 @pytest.mark.parametrize("broken", [0, 1])
@@ -75,11 +72,5 @@ def test_an_error_in_a_part_is_raised_after_all_have_ended(broken):
         ended.append(part)
 
     with pytest.raises(ValueError, match=f"part {broken}"):
-        Crew(2).run(work, range(2))
+        run_parts(work, range(2))
     assert ended == [1 - broken]
-
-
-def test_a_copied_crew_has_threads_of_its_own():
-    crew = Crew(2)
-    crew.run(str, range(2))
-    assert copy.deepcopy(crew).run(str, range(2)) == ["0", "1"]

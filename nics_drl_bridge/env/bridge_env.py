@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import reduce
 from operator import add
 from typing import Any
@@ -148,7 +149,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         if options and "start" in options:
             give(starts[None], "start", options["start"])
         episodes = Episodes(np.array([episode]), starts[None], self.scene.goals[None])
-        self._rehearse(episodes)
+        if not self._rehearsed:
+            self._rehearse(episodes)
         memory = self.task.reset(episodes)
         guard.override(memory, options, "start")
         self._view = self._lifted(self._backend.reset(Start(episode, self._row(starts))))
@@ -165,39 +167,33 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
 
     def _rehearse(self, episodes: Episodes) -> None:
         """Runs the task once without a step: it may compile for seconds, and the robot be real."""
-        if self._rehearsed:
-            return
         free = np.full((1, self.robots, self.model.lidar.beams), np.inf, np.float32)
-        sensed = unread(self.model.sensors, 1, self.robots)
-        starts = episodes.starts
+        sensed, starts = unread(self.model.sensors, 1, self.robots), episodes.starts
         view = RobotView(starts.copy(), 0.0 * starts, free, 0.0, 0.0, 0.0, sensed)
         memory = self.task.reset(episodes)
         self.task.step_into(np.empty(self._shape, np.float32), view, view, memory)
         self._rehearsed = True
 
     def _scene_of(self, episode: int) -> Scene:
-        draw = self._backend.facts().get("scenes")
-        if draw is None:
-            return sample_scene(self.world, self.model.robot.footprint_radius, episode, self.robots)
-        scene: Scene = draw([episode])[0]
-        return scene
+        if draw := self._backend.facts().get("scenes"):
+            return draw([episode])[0]  # type: ignore[no-any-return]
+        return sample_scene(self.world, self.model.robot.footprint_radius, episode, self.robots)
 
     @halts_on_error
     def step(
         self, action: NDArray[Any]
     ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Applies an action for one control period; see Gymnasium."""
-        observation, terms, info = self._advance(action)
+        observation, terms, info = self.advance(action)
         values = {name: term.tolist() for name, term in terms.items()}
-        each = [0.0] * self.robots
-        for term in values.values():  # in the order of the vector env's sum
-            each = [one + another for one, another in zip(each, term, strict=True)]
-        reward = reduce(add, each)
+        # In the order of the vector env's sum.
+        each = [reduce(add, own, 0.0) for own in zip(*values.values(), strict=True)]
         alone = self.robots == 1
         info["reward_terms"] = {name: v[0] for name, v in values.items()} if alone else terms
         if self.render_mode == "human":
             self.render()
-        return observation.reshape(-1), reward, bool(self.ended.all()), False, info
+        over = bool(self.ended.all())
+        return observation.reshape(-1), reduce(add, each, 0.0), over, False, info
 
     @halts_on_error
     def advance(
@@ -208,11 +204,6 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         `ended` (M,) marks the robots whose episode is over; in a team they get the command nearest
         to zero and no further reward.
         """
-        return self._advance(action)
-
-    def _advance(
-        self, action: NDArray[Any]
-    ) -> tuple[NDArray[np.float32], dict[str, Array], dict[str, Any]]:
         before = self._view
         if before is None:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
@@ -231,7 +222,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self.ended = (self.ended & waiting) | outcome.ended[0]
         self._view = view
         for name, values in outcome.info.items():
-            facts[name] = self._fact(values[0])
+            row = self._row(values[0])
+            facts[name] = row.item() if row.ndim == 0 else row.copy()
         return out[0], terms, self._info(view, facts)
 
     def halt(self) -> None:
@@ -242,30 +234,18 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     def _lifted(self, view: RobotView) -> RobotView:
         """A view as a batch of one, as the task expects it: leading (1, M)."""
         lead = (1, self.robots, -1)
-        return RobotView(
-            view.pose.reshape(lead), view.twist.reshape(lead), view.ranges.reshape(lead),
-            view.stamp_s, view.scan_age_s, view.odom_age_s,
-            {name: reading.reshape(lead) for name, reading in view.sensed.items()},
-            view.sensed_age_s,
-        )  # fmt: skip
+        arrays = {name: getattr(view, name).reshape(lead) for name in ("pose", "twist", "ranges")}
+        sensed = {name: reading.reshape(lead) for name, reading in view.sensed.items()}
+        return replace(view, **arrays, sensed=sensed)
 
     def _row(self, rows: NDArray[Any]) -> NDArray[Any]:
         return rows[0] if self.robots == 1 else rows
 
-    def _fact(self, values: NDArray[Any]) -> Any:
-        row = self._row(values)
-        return row.item() if row.ndim == 0 else row.copy()
-
     def _info(self, view: RobotView, facts: dict[str, Any]) -> dict[str, Any]:
-        info: dict[str, Any] = {
-            name: self._row(self.memory[name][0]).copy() for name in self.task.shown
-        }
-        info["pose"] = self._row(view.pose[0]).copy()
-        info["scan_age_s"], info["odom_age_s"] = view.scan_age_s, view.odom_age_s
-        if view.sensed:
-            info["sensed_age_s"] = view.sensed_age_s
-        info.update(facts)
-        return info
+        shown = {name: self._row(self.memory[name][0]).copy() for name in self.task.shown}
+        ages = {"scan_age_s": view.scan_age_s, "odom_age_s": view.odom_age_s}
+        ages |= {"sensed_age_s": view.sensed_age_s} if view.sensed else {}
+        return {**shown, "pose": self._row(view.pose[0]).copy(), **ages, **facts}
 
     @halts_on_error
     def render(self) -> Any:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.env import kernels
 from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.seeds import GREATEST_SEED, checked_seeds
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -51,24 +52,14 @@ def uninterrupted() -> Iterator[None]:
             signal.raise_signal(signal.SIGINT)
 
 
-SEEDS = 2**63
-"""Exclusive upper bound of seeds: signed 64-bit integers over ROS 2 and in the kernels."""
-
-
 def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
     """Raises ConfigError for a wrong seed, of all worlds or one each, or wrong options."""
-    last = SEEDS - worlds if isinstance(seed, int | np.integer) else SEEDS - 1
-    for one in seed if isinstance(seed, list | tuple | np.ndarray) else [seed]:
-        if not (one is None or isinstance(one, int | np.integer)):
-            raise ConfigError(f"seed of type {type(one).__name__}: must be an integer, or None.")
-        if one is not None and one > last:
-            shown = int(one) if one < SEEDS**2 else f"of {int(one).bit_length()} bits"
-            raise ConfigError(f"seed {shown}: must be at most 2**63 - {SEEDS - last}.")
+    several = isinstance(seed, list | tuple | np.ndarray)
+    given = [one for one in (seed if several else [seed]) if one is not None]
+    checked_seeds(given, GREATEST_SEED if several else GREATEST_SEED + 1 - worlds)
     if options is not None and not isinstance(options, Mapping):
-        raise ConfigError(
-            f"reset options of type {type(options).__name__}: must be a dict, as {{'start': "
-            "(x, y, heading)}, or None."
-        )
+        needed = "must be a dict, as {'start': (x, y, heading)}, or None."
+        raise ConfigError(f"reset options of type {type(options).__name__}: {needed}")
 
 
 def override(
@@ -89,15 +80,14 @@ def give(rows: NDArray[Any], name: str, value: Any) -> None:
         given = np.asarray(value)
     except ValueError:  # a ragged list
         given = np.asarray(None)
+    option = f"reset option {name!r}, {value!r}"
     fits = given.shape in [rows.shape[k:] for k in range(max(2, rows.ndim))]
     if not fits or given.dtype.kind not in "fiub":
-        raise ConfigError(
-            f"reset option {name!r}, {value!r}: must be numbers of shape {rows.shape[1:]}, or of "
-            "its last dimensions."
-        )
+        shape = f"{rows.shape[1:]}, or of its last dimensions"
+        raise ConfigError(f"{option}: must be numbers of shape {shape}.")
     rows[...] = given
     if not np.isfinite(rows).all():
-        raise ConfigError(f"reset option {name!r}, {value!r}: must be finite.")
+        raise ConfigError(f"{option}: must be finite.")
 
 
 def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray[Any]:
@@ -109,9 +99,8 @@ def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray
     if given.dtype.kind not in "fiub":
         raise gymnasium.error.InvalidAction(f"{name} of {given.dtype}: must be real numbers.")
     if given.shape != space.shape:
-        raise gymnasium.error.InvalidAction(
-            f"{name} of shape {given.shape}: must be of shape {space.shape}."
-        )
+        needed = f"must be of shape {space.shape}."
+        raise gymnasium.error.InvalidAction(f"{name} of shape {given.shape}: {needed}")
     if isinstance(space, gymnasium.spaces.Box) and space.dtype == np.float32:
         if given.dtype.char not in "fd":
             given = given.astype(np.float64)  # the kernels are compiled for these two
@@ -126,8 +115,6 @@ def check_command(command: Any, like: NDArray[np.float64]) -> NDArray[np.float64
     """Returns a command as an array. Raises ConfigError unless finite, of the shape of `like`."""
     made = np.asarray(command, np.float64)
     if made.shape != like.shape or not kernels.finite(made.reshape(1, -1)):
-        raise ConfigError(
-            f"the task's command {made}: must be finite, of shape {like.shape}; look at its "
-            "`command`."
-        )
+        needed = f"must be finite, of shape {like.shape}; look at its `command`."
+        raise ConfigError(f"the task's command {made}: {needed}")
     return made

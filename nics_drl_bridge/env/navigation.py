@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -12,17 +12,10 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.env import kernels
 from nics_drl_bridge.env.kernels import LIMIT, GoalProgress
-from nics_drl_bridge.env.task import Episodes, Flags, Memory, Observation, Outcome, Task, distance
+from nics_drl_bridge.env.task import Episodes, Flags, Memory, Observation, Outcome, Task
 from nics_drl_bridge.interface import RobotView
 
 Array = NDArray[np.float64]
-
-
-class NavigationVerdict(NamedTuple):
-    """Robots (...,) at their goals, and those whose scan shows a contact with the footprint."""
-
-    reached: Flags
-    touched: Flags
 
 
 @dataclass(frozen=True)
@@ -89,20 +82,21 @@ class Navigation(Task):
         self._see(out, view.pose, view, memory)
         return out
 
-    def judge(self, view: RobotView, memory: Memory) -> NavigationVerdict:
+    def judge(
+        self, view: RobotView, memory: Memory, before: RobotView | None = None
+    ) -> GoalProgress:
         """Judges which robots are at their goals, and which touch something."""
-        near = distance(view.pose, memory["goal"])
-        return NavigationVerdict(np.asarray(near < self.goal_radius), self.touches(view.ranges))
+        out = np.empty((*view.pose.shape[:-1], *self.observation_space.shape), np.float32)
+        return self._see(out, (before or view).pose, view, memory)
 
     def reward(self, before: RobotView, after: RobotView, memory: Memory) -> dict[str, Array]:
         """The terms (...,) of the reward for a step; their sum is the reward."""
-        approach = distance(before.pose, memory["goal"]) - distance(after.pose, memory["goal"])
-        return self._terms(approach, self.judge(after, memory))
+        return self._terms(self.judge(after, memory, before))
 
     def end(self, view: RobotView, memory: Memory) -> Flags:
         """Returns True where a robot is at its goal or touches something."""
-        verdict = self.judge(view, memory)
-        return np.asarray(verdict.reached | verdict.touched)
+        progress = self.judge(view, memory)
+        return progress.reached | progress.touched
 
     def info(self, view: RobotView, memory: Memory) -> dict[str, NDArray[Any]]:
         """Success and contact of each robot."""
@@ -112,39 +106,38 @@ class Navigation(Task):
         self, out: Observation, before: RobotView, after: RobotView, memory: Memory
     ) -> Outcome:
         """Computes all of the above in one pass over each scan; `out` is contiguous."""
-        approach, verdict = self._see(out, before.pose, after, memory)
-        terms = self._terms(approach, verdict)
-        return Outcome(terms, verdict.reached | verdict.touched, self._facts(verdict))
+        progress = self._see(out, before.pose, after, memory)
+        over = progress.reached | progress.touched
+        return Outcome(self._terms(progress), over, self._facts(progress))
 
     def _see(
         self, out: Observation, before: Array, view: RobotView, memory: Memory
-    ) -> tuple[Array, NavigationVerdict]:
-        """Writes the observations; returns the approach to the goals [m] and the verdict."""
+    ) -> GoalProgress:
         lead = view.pose.shape[:-1]
-        approach = np.empty(lead)
+        approach: Array = np.empty(lead)
         reached, touched = np.empty(lead, np.bool_), np.empty(lead, np.bool_)
-        progress = GoalProgress(approach.reshape(-1), reached.reshape(-1), touched.reshape(-1))
         own = out
         if self.sensors:
             own = np.empty((*lead, self.scan_parts + 6), np.float32)
         kernels.navigate(
-            own.reshape(-1, own.shape[-1]), progress, before.reshape(-1, 3),
-            view.pose.reshape(-1, 3), view.twist.reshape(-1, 3),
+            own.reshape(-1, own.shape[-1]),
+            GoalProgress(approach.reshape(-1), reached.reshape(-1), touched.reshape(-1)),
+            before.reshape(-1, 3), view.pose.reshape(-1, 3), view.twist.reshape(-1, 3),
             view.ranges.reshape(-1, view.ranges.shape[-1]), memory["goal"].reshape(-1, 2),
             self.scale, self.goal_radius,
         )  # fmt: skip
         if self.sensors:
             np.concatenate([own, self.sensor_shares(view)], axis=-1, out=out)
-        return approach, NavigationVerdict(reached, touched)
+        return GoalProgress(approach, reached, touched)
 
-    def _terms(self, approach: Array, verdict: NavigationVerdict) -> dict[str, Array]:
+    def _terms(self, progress: GoalProgress) -> dict[str, Array]:
         return {
-            "progress": self.progress_reward * approach,
-            "time": np.full_like(approach, self.time_reward),
-            "success": np.multiply(self.success_reward, verdict.reached & ~verdict.touched),
-            "collision": np.multiply(self.collision_reward, verdict.touched),
+            "progress": self.progress_reward * progress.approach,
+            "time": np.full_like(progress.approach, self.time_reward),
+            "success": np.multiply(self.success_reward, progress.reached & ~progress.touched),
+            "collision": np.multiply(self.collision_reward, progress.touched),
         }
 
     @staticmethod
-    def _facts(verdict: NavigationVerdict) -> dict[str, NDArray[Any]]:
-        return {"is_success": verdict.reached & ~verdict.touched, "collision": verdict.touched}
+    def _facts(progress: GoalProgress) -> dict[str, NDArray[Any]]:
+        return {"is_success": progress.reached & ~progress.touched, "collision": progress.touched}

@@ -50,18 +50,15 @@ def make_task(
 
 
 def _sensor(name: Any, model: SimulatorModel) -> Sensor:
-    """Returns a sensor of a model, by its name or as it was there."""
     known = {sensor.name: sensor for sensor in model.sensors}
     given = name.name if isinstance(name, Sensor) else str(name)
     if given not in known:
-        raise ConfigError(
-            f"task option sensors: the model has no sensor {given!r}; {nearest(given, known)}"
-        )
+        hint = nearest(given, known)
+        raise ConfigError(f"task option sensors: the model has no sensor {given!r}; {hint}")
     return known[given]
 
 
 def _check_options(found: type[Task], options: dict[str, Any]) -> None:
-    """Raises ConfigError for an option that the class does not have, or of the wrong type."""
     known = signature(found).parameters
     free = any(one.kind is Parameter.VAR_KEYWORD for one in known.values())
     for name, value in options.items():
@@ -124,11 +121,9 @@ COOPERATIVE_REACHING = "NicsBridge/CooperativeReaching-v0"
 PURSUIT_EVASION = "NicsBridge/PursuitEvasion-v0"
 TASK = "NicsBridge/Task-v0"
 ENVIRONMENTS = {
-    NAVIGATION: {"task": "navigation"},
-    COOPERATIVE_REACHING: {"task": "cooperative_reaching"},
-    PURSUIT_EVASION: {"task": "pursuit_evasion"},
-    TASK: {},
-}
+    NAVIGATION: {"task": "navigation"}, COOPERATIVE_REACHING: {"task": "cooperative_reaching"},
+    PURSUIT_EVASION: {"task": "pursuit_evasion"}, TASK: {},
+}  # fmt: skip
 """Id -> arguments that define the environment."""
 MAX_EPISODE_STEPS = 300
 
@@ -138,12 +133,10 @@ def register_envs() -> None:
     for name, arguments in ENVIRONMENTS.items():
         if name not in gymnasium.registry:
             gymnasium.register(
-                name,
-                entry_point="nics_drl_bridge.env.bridge_env:BridgeEnv",
+                name, entry_point="nics_drl_bridge.env.bridge_env:BridgeEnv",
                 vector_entry_point="nics_drl_bridge.env.vector_env:BridgeVectorEnv",
-                max_episode_steps=MAX_EPISODE_STEPS,
-                kwargs=dict(arguments),
-            )
+                max_episode_steps=MAX_EPISODE_STEPS, kwargs=dict(arguments),
+            )  # fmt: skip
 
 
 register_envs()

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE
-from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.sim.world import World
 
 Array = NDArray[np.float64]
@@ -100,23 +99,16 @@ class WorldPicture:
 
 def draw_world(axes: Axes, world: World, bodies: NDArray[np.float64]) -> None:
     """Draws map, walls and obstacles (K, 7), see `sim.scenes.Scene`; x and y in `map` [m]."""
-    if world.grid is not None:
-        _draw_map(axes, world.grid)
+    if (grid := world.grid) is not None:
+        edges = np.indices((grid.cells.shape[0] + 1, grid.cells.shape[1] + 1)) - 0.5
+        x, y = np.moveaxis(grid.cell_to_world(np.moveaxis(edges, 0, -1)), -1, 0)
+        shade = np.where(grid.free, 1.0, np.where(grid.blocked, 0.2, 0.8))
+        axes.pcolormesh(x, y, shade, cmap="gray", vmin=0.0, vmax=1.0, rasterized=True)
     for x1, y1, x2, y2 in world.all_walls():
         axes.plot([x1, x2], [y1, y2], color=WALL, linewidth=2)
     for body in bodies:
         if body[RADIUS] > 0.0:
             axes.add_patch(_patch(world, body))
-
-
-def _draw_map(axes: Axes, grid: GridMap) -> None:
-    rows, columns = grid.cells.shape
-    i, j = np.indices((rows + 1, columns + 1)) - 0.5
-    corners = grid.cell_to_world(np.stack([i, j], axis=-1))
-    shade = np.where(grid.free, 1.0, np.where(grid.blocked, 0.2, 0.8))
-    axes.pcolormesh(
-        corners[..., 0], corners[..., 1], shade, cmap="gray", vmin=0.0, vmax=1.0, rasterized=True
-    )
 
 
 def _patch(world: World, body: NDArray[np.float64]) -> Patch:

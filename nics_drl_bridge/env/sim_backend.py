@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from inspect import signature
 from typing import Any
 
@@ -86,10 +85,8 @@ class SimBackend:
 
     def _of_episode(self, draws: NDArray[Any]) -> Any:
         """Returns a draw of the scene (1,), or of its robots (1, M), as it is for `info`."""
-        if draws.ndim == 1:
-            return draws[0]
-        drawn = draws[self._row]
-        return drawn.item() if drawn.ndim == 0 else drawn.copy()
+        drawn = draws[0] if draws.ndim == 1 else draws[self._row]
+        return drawn.copy() if drawn.ndim else drawn.item()
 
     def _measure(self) -> RobotView:
         data, now, row = self.simulator.data, self._now_ns, self._row
@@ -116,18 +113,19 @@ class SimBackend:
 class CompletedBackend:
     """Wraps a user's backend without `halt`, for which it steps by `still`, or without `facts`."""
 
-    def __init__(self, backend: Any, still: NDArray[np.float64]) -> None:
+    def __init__(self, backend: Any, still: Array) -> None:
         self._backend, self._still = backend, still
-        self._halt, self._facts = _method(backend, "halt"), _method(backend, "facts")
         self._moved, self._known = False, BackendFacts()
+        for name in ("halt", "facts"):  # the backend's own, if it has one
+            if callable(method := getattr(backend, name, None)):
+                setattr(self, name, method)
 
     def reset(self, start: Start) -> RobotView:
         """Calls the backend's."""
         self._known = {}
-        view: RobotView = self._backend.reset(start)
-        return view
+        return self._backend.reset(start)  # type: ignore[no-any-return]
 
-    def step(self, command: NDArray[np.float64]) -> tuple[RobotView, dict[str, Any]]:
+    def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
         """Calls the backend's."""
         self._moved = True
         view, facts = self._backend.step(command)
@@ -136,17 +134,14 @@ class CompletedBackend:
         return view, facts
 
     def halt(self) -> None:
-        """Calls the backend's, or steps at a standstill if there was a step since the last halt."""
-        if self._halt is not None:
-            self._halt()
-        elif self._moved:
+        """Steps at a standstill if there was a step since the last halt."""
+        if self._moved:
             self._backend.step(self._still.copy())
             self._moved = False
 
     def facts(self) -> BackendFacts:
-        """Calls the backend's, or returns the true pose of the last step if that had it."""
-        known: BackendFacts = self._known if self._facts is None else self._facts()
-        return known
+        """Returns the true pose of the last step if that had it."""
+        return self._known
 
     def close(self) -> None:
         """Closes the backend, which sends a zero command itself."""
@@ -154,21 +149,14 @@ class CompletedBackend:
         self._moved = False
 
 
-def _method(backend: Any, name: str) -> Callable[..., Any] | None:
-    method = getattr(backend, name, None)
-    return method if callable(method) else None
-
-
-def completed(backend: Any, still: NDArray[np.float64]) -> Backend:
+def completed(backend: Any, still: Array) -> Backend:
     """Returns a backend with all methods. Raises ConfigError if it is none."""
     if isinstance(backend, Backend):
         return backend
-    missing = [name for name in ("reset", "step", "close") if _method(backend, name) is None]
-    if missing:
-        raise ConfigError(
-            f"backend of type {type(backend).__name__}: has no {', no '.join(missing)}; see "
-            "interface.Backend."
-        )
+    needed = ("reset", "step", "close")
+    if missing := [name for name in needed if not callable(getattr(backend, name, None))]:
+        kind, lacks = type(backend).__name__, ", no ".join(missing)
+        raise ConfigError(f"backend of type {kind}: has no {lacks}; see interface.Backend.")
     return CompletedBackend(backend, still)
 
 

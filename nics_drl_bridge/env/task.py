@@ -169,7 +169,7 @@ class Task(ABC):
 
     def box(self, low: ArrayLike, high: ArrayLike) -> gymnasium.spaces.Box:
         """Space of a scan in shares (P), parts with these limits, and shares of `sensors` (Q)."""
-        parts, further = self.scan_parts, self.sensor_parts
+        parts, further = self.scan_parts, sum(sensor.parts for sensor in self.sensors)
         low, high = np.asarray(low, np.float32), np.asarray(high, np.float32)
         return gymnasium.spaces.Box(
             np.concatenate([np.zeros(parts, np.float32), low, np.zeros(further, np.float32)]),
@@ -186,23 +186,17 @@ class Task(ABC):
         return self._look(ranges)[1]
 
     def _look(self, ranges: NDArray[np.float32]) -> tuple[Observation, Flags]:
-        ranges = np.ascontiguousarray(ranges, np.float32)
         lead, beams = ranges.shape[:-1], ranges.shape[-1]
         parts = beams if self.scan is None else self.scan.sectors
         shares, touched = np.empty((*lead, parts), np.float32), np.empty(lead, np.bool_)
-        rows = shares.reshape(-1, parts), touched.reshape(-1), ranges.reshape(-1, beams)
-        kernels.looks(*rows, self.scale)
+        rows = np.ascontiguousarray(ranges, np.float32).reshape(-1, beams)
+        kernels.looks(shares.reshape(-1, parts), touched.reshape(-1), rows, self.scale)
         return shares, touched
 
     def sensor_shares(self, view: RobotView) -> Observation:
         """Returns the shares (..., Q) of `sensors`, in their order."""
         shares = [sensor.shares(view.sensed[sensor.name]) for sensor in self.sensors]
         return np.concatenate(shares, axis=-1)
-
-    @property
-    def sensor_parts(self) -> int:
-        """Q, the number of parts of an observation from `sensors`."""
-        return sum(sensor.parts for sensor in self.sensors)
 
     @property
     def scan_parts(self) -> int:

@@ -263,11 +263,9 @@ class PursuitEvasion(Task):
         places = task.bearing(*pairs(view.pose, view.pose[..., :2]))
         known = np.concatenate([places, mates[..., None], out[..., None]], axis=-1)
         parts: list[NDArray[Any]] = [
-            self.free_share(view.ranges),
-            others(known).reshape(*lead, -1),
-            np.broadcast_to(self.pursues[:, None], (*lead, 1)),
-            task.limited(view.twist),
-        ]
+            self.free_share(view.ranges), others(known).reshape(*lead, -1),
+            np.broadcast_to(self.pursues[:, None], (*lead, 1)), task.limited(view.twist),
+        ]  # fmt: skip
         return np.concatenate(parts, axis=-1, dtype=np.float32, casting="same_kind")
 
     def reward(self, before: RobotView, after: RobotView, memory: Memory) -> dict[str, Array]:

@@ -50,21 +50,14 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
 
     ## Arguments
 
-    Args:
-        num_envs: N.
-        model, world, task, task_options: see `BridgeEnv`.
-        max_episode_steps: an episode is truncated after this many steps.
-        autoreset_mode: `NextStep` (an ended world is reset in the next step, whose action it
-            ignores) or `SameStep` (at once; the last observation is in `info["final_obs"]`).
-        copy: True if the caller may keep what `step` returns. False reuses the array of the
-            observation in the next step.
-        render_mode: `rgb_array`, of every world, or None.
-        simulation: further arguments of the FastSimulator: `renderer` (`baked` by default, or
-            `exact`), `threads`, on which the numbers do not depend, and `randomisation`, the
-            quantities drawn in each episode, see `BridgeEnv`.
-
-    Raises:
-        ConfigError, ModelError: an unknown name or a wrong file.
+    `num_envs` is N; `model`, `world`, `task`, `task_options` are those of `BridgeEnv`. An episode
+    is truncated after `max_episode_steps`. `autoreset_mode` is `NextStep` (an ended world is reset
+    in the next step, whose action it ignores) or `SameStep` (at once; the last observation is in
+    `info["final_obs"]`). With `copy` the caller may keep what `step` returns; False reuses the
+    array of the observation in the next step. `render_mode` is `rgb_array`, of every world, or
+    None. Further arguments are those of the FastSimulator: `renderer` (`baked` by default, or
+    `exact`), `threads`, on which the numbers do not depend, and `randomisation`, see `BridgeEnv`.
+    Raises ConfigError, ModelError for an unknown name or a wrong file.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's own declaration
@@ -174,10 +167,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         out[worlds] = self.task.observation(self._view(worlds), fresh)
 
     def _view(self, rows: Rows) -> RobotView:
-        data = self.simulator.data
-        sensed = {name: each[rows] for name, each in self.simulator.readings.items()}
-        scans = data.ranges[rows]
-        return RobotView(data.odom[rows], data.twist[rows], scans, 0.0, 0.0, 0.0, sensed)
+        data, readings = self.simulator.data, self.simulator.readings
+        seen = data.odom[rows], data.twist[rows], data.ranges[rows]
+        return RobotView(*seen, 0.0, 0.0, 0.0, {name: readings[name][rows] for name in readings})
 
     def step(
         self, actions: NDArray[Any]
@@ -243,9 +235,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             shown = np.full(self.num_envs, None, dtype=object)
             for n in np.flatnonzero(over):  # only those that ended: each needs its own object
                 shown[n] = flat(out)[n].copy()
-            infos["final_obs"], infos["_final_obs"] = shown, over.copy()
-            final = masked(self._known() | facts, over, True)
-            infos["final_info"], infos["_final_info"] = final, over.copy()
+            infos |= masked({"final_obs": shown}, over)
+            infos |= masked({"final_info": self._known() | facts}, over, True)
             self.simulator.run_parts(
                 lambda part: self._begin(part.start + np.flatnonzero(over[part]), out)
             )
@@ -254,16 +245,14 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     def _tell(self, infos: dict[str, Any], facts: dict[str, Any], begun: Flags) -> None:
         """Adds to `infos` the facts of every world, and the beginnings of those in `begun`."""
         infos |= masked(self._known(), np.ones_like(begun))
-        some = bool(begun.any())
-        if some:
+        if some := bool(begun.any()):
             infos |= masked(self._beginnings(), begun, True)
-        if not (some and begun.all()):
+        if not begun.all():
             infos |= masked(facts, ~begun, some)
 
     # Facts as arrays (N, ...) of worlds with one robot, or (N, M, ...) of teams.
 
     def _known(self) -> dict[str, Any]:
-        """Copies of the facts that are known at any time."""
         shown = {name: self._row(self.memory[name]).copy() for name in self.task.shown}
         pose, ages = self._row(self.simulator.data.odom).copy(), np.zeros((2, self.num_envs))
         return {**shown, "pose": pose, "scan_age_s": ages[0], "odom_age_s": ages[1]}
@@ -275,11 +264,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             for name, values in self.simulator.drawn.items()
         }
         return {
-            "episode_seed": self.simulator.data.seeds,
-            "start": self._row(self._starts),
-            "bodies": self._bodies,
-            **({"randomisation": drawn} if drawn else {}),
-        }
+            "episode_seed": self.simulator.data.seeds, "start": self._row(self._starts),
+            "bodies": self._bodies, **({"randomisation": drawn} if drawn else {}),
+        }  # fmt: skip
 
     def _row(self, rows: NDArray[Any]) -> NDArray[Any]:
         return rows[:, 0] if self.robots == 1 else rows
@@ -325,10 +312,8 @@ def chosen_worlds(options: dict[str, Any] | None, count: int) -> Flags:
         return np.ones(count, np.bool_)
     chosen = np.asarray(options["reset_mask"])
     if chosen.shape != (count,) or chosen.dtype != np.bool_ or not chosen.any():
-        raise ConfigError(
-            f"options['reset_mask'] of shape {chosen.shape}, {chosen.dtype}: must be ({count},) "
-            "bool with at least one True."
-        )
+        given = f"options['reset_mask'] of shape {chosen.shape}, {chosen.dtype}"
+        raise ConfigError(f"{given}: must be ({count},) bool with at least one True.")
     return chosen.copy()
 
 
@@ -352,10 +337,7 @@ def named_seeds(
     new = chosen & unnamed & ~given
     if new.any():
         seeds = np.where(new, int(rng.integers(2**31)) + np.arange(count), seeds)
-    fresh = given | new
-    if (seeds[fresh] < 0).any():
-        raise ConfigError("a seed must not be negative.")
-    return seeds, fresh
+    return seeds, given | new
 
 
 def masked(facts: Facts, mask: Flags, alone: bool = False) -> dict[str, Any]:

@@ -30,7 +30,6 @@ MOST_NUMBERS = 2**31 - 2**20
 FIRST_BEAM = -(2**15)  # least first beam of a row, relative to the bearing
 MISS = 0.02
 """An edge that two corners would miss by more than this [beams] is found by climbing the hull."""
-Progress = Callable[[int, int], None]  # called with the number of rotations done and their total
 
 
 @dataclass(frozen=True)
@@ -44,12 +43,9 @@ class Grid:
 
 
 def bake(
-    spec: LidarSpec,
-    shapes: Sequence[Shape],
-    density: Density | None = None,
+    spec: LidarSpec, shapes: Sequence[Shape], density: Density | None = None,
     sensor_model: Function | Sequence[SensorModel] | None = None,
-    progress: Progress | None = None,
-) -> LidarTable:
+) -> LidarTable:  # fmt: skip
     """Scans shapes straight ahead, on a grid of distances and rotations, with the exact scanner.
 
     Equal shapes are baked once, by default at `Density.for_beams`. The sensor model is that of the
@@ -74,7 +70,7 @@ def bake(
         (np.cumsum(sizes) - sizes).astype(np.int32), cells.astype(np.int16),
         np.zeros(int(sizes.sum()) + padding(spec.angle_increment), np.float32),
     )  # fmt: skip
-    _fill(bake_kernels.rows_of_turn, table.rows, table, grids, progress)
+    _fill(bake_kernels.rows_of_turn, table.rows, table, grids)
     model = spec.sensor_model if sensor_model is None else sensor_model
     return apply_model(table, grids, model) if callable(model) or model else table
 
@@ -189,15 +185,10 @@ def _miss(
 
 
 def _fill(
-    kernel: Callable[..., None],
-    out: NDArray[np.float32],
-    table: LidarTable,
-    grids: Sequence[Grid],
-    progress: Progress | None = None,
+    kernel: Callable[..., None], out: NDArray[np.float32], table: LidarTable, grids: Sequence[Grid]
 ) -> None:
     """Computes values laid out as the table's rows (R,), one rotation after the other."""
-    outlines, distances = table.outlines, table.density.distances
-    total, done = sum(len(grid.turns) for grid in grids), 0
+    outlines, distances, done = table.outlines, table.density.distances, 0
     for h, grid in enumerate(grids):
         shape = outlines.corners[outlines.corner[h] : outlines.corner[h + 1]], outlines.radii[h]
         for t, turn in enumerate(grid.turns):
@@ -208,8 +199,6 @@ def _fill(
                 table.density.phases,
             )  # fmt: skip
             done += 1
-            if progress is not None:
-                progress(done, total)
 
 
 def apply_model(

@@ -1,4 +1,4 @@
-"""Compiled scans: each body is looked up (Eq. 3) or computed; fused by the minimum (Eq. 4).
+"""Compiled look-up of one body (Eq. 3), step by step; `scan_kernels` takes each for many bodies.
 
 A plain look-up takes the nearest row of the table. Here the rows of the two grid distances around
 the true one are blended, and in each the two points around a beam; and the beams that hit follow
@@ -16,93 +16,56 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import exact_kernels
-from nics_drl_bridge.lidar.exact_kernels import (
-    COS,
-    HEADING,
-    RADIUS,
-    SHAPE,
-    SIN,
-    Beams,
-    LidarPose,
-    OutlineArrays,
-    X,
-    Y,
-)
+from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE, Beams, OutlineArrays, X, Y
+from nics_drl_bridge.lidar.map_kernels import GridArrays
 
 ABOVE_ZERO = 2.0**24
 """Added before truncation to an integer, so that numbers are rounded down."""
 PER_TURN = 0.5 / math.pi
 UNSEEN, LOOKED_UP, COMPUTED = range(3)
-ATAN = tuple(
-    np.float32(factor)
-    for factor in (
-        0.999999881,
-        -0.333319604,
-        0.199692354,
-        -0.140165851,
-        0.0990609676,
-        -0.0593671016,
-        0.0241661891,
-        -0.00466877315,
-    )
-)
-TABLE_SHAPE = np.dtype(
-    [
-        ("per_metre", np.float64),  # grid distances per metre
-        ("rotations", np.float64),  # in a full turn, 0 for a circle
-        ("parts_per_rotation", np.float64),  # periods of the rotational symmetry
-        ("first_cell", np.int64),
-        ("cells_per_part", np.int64),
-        ("hull_end", np.int64),  # the corner after its last
-        ("corners_per_part", np.int64),
-        ("corners", np.int64),
-        ("round_radius", np.float64),  # of a circle [m], 0 for others
-    ]
-)
+ATAN = tuple(map(np.float32, (
+    0.999999881, -0.333319604, 0.199692354, -0.140165851, 0.0990609676, -0.0593671016,
+    0.0241661891, -0.00466877315,
+)))  # fmt: skip
+TABLE_SHAPE = np.dtype([
+    ("per_metre", np.float64),  # grid distances per metre
+    ("rotations", np.float64),  # in a full turn, 0 for a circle
+    ("parts_per_rotation", np.float64),  # periods of the rotational symmetry
+    ("first_cell", np.int64), ("cells_per_part", np.int64),
+    ("hull_end", np.int64),  # the corner after its last
+    ("corners_per_part", np.int64), ("corners", np.int64),
+    ("round_radius", np.float64),  # of a circle [m], 0 for others
+])  # fmt: skip
 """Parameters of a shape in the table."""
 
 
 class TableArrays(NamedTuple):
-    """A `table.LidarTable` for the kernels.
+    """A `table.LidarTable` for the kernels."""
 
-    Attributes:
-        shapes: (H,) of `TABLE_SHAPE`.
-        distances: grid distances of each shape.
-        cells: (cells, 4) of each grid distance at each rotation: begin of its row; its first beam,
-            relative to the bearing, and its width; the other and the first corner of the hull that
-            may be its right silhouette; those of the left one. Pairs are 16 bits each.
-        rows: (R,) ranges [m], one phase of the points after the other.
-        shift: log2 of the phases.
-        hulls: (sum V, 2) corners, see `shapes.Outlines`.
-    """
-
-    shapes: Any
-    distances: int
+    shapes: Any  # (H,) of `TABLE_SHAPE`
+    distances: int  # grid distances of each shape
+    # (cells, 4) of each grid distance at each rotation: begin of its row; its first beam, relative
+    # to the bearing, and its width; the other and the first corner of the hull that may be its
+    # right silhouette; those of the left one. Pairs are 16 bits each
     cells: NDArray[np.int32]
-    rows: NDArray[np.float32]
-    shift: int
-    hulls: NDArray[np.float64]
+    rows: NDArray[np.float32]  # (R,) ranges [m], one phase of the points after the other
+    shift: int  # log2 of the phases
+    hulls: NDArray[np.float64]  # (sum V, 2) corners, see `shapes.Outlines`
 
 
 class LidarArrays(NamedTuple):
-    """A lidar with its table for the kernels.
+    """A lidar with its table, and the static map that it sees, for the kernels."""
 
-    Attributes:
-        mount: (3,) pose on the robot.
-        beams: their directions.
-        range_min, range_max: [m].
-        between: (H, 2) squares of the distances between which a shape is looked up [m^2].
-        outlines: of the shapes.
-        table: of the shapes.
-    """
-
-    mount: NDArray[np.float64]
+    mount: NDArray[np.float64]  # (3,) pose on the robot
     beams: Beams
-    range_min: float
+    range_min: float  # [m]
     range_max: float
-    between: NDArray[np.float64]
-    outlines: OutlineArrays
+    sweep_time: float  # duration of a sweep [s]
+    between: NDArray[np.float64]  # (H, 2) squares of the distances of a look-up [m^2]
+    outlines: OutlineArrays  # `outlines`, `table`: of the shapes
     table: TableArrays
+    grid: GridArrays
+    exact: bool  # True if the map is scanned exactly, from cell to cell
 
 
 @kernel(inline=True)
@@ -113,22 +76,6 @@ def sensor_pose(pose, mount):  # type: ignore[no-untyped-def]
         c, s = math.cos(heading), math.sin(heading)
         x, y = x + c * mount[0] - s * mount[1], y + s * mount[0] + c * mount[1]
     return x, y, heading + mount[2]
-
-
-@kernel
-def scan_robot(out, pose, bodies, me, walls, lidar):  # type: ignore[no-untyped-def]
-    """One scan (B,): the minimum over all bodies (K, 7) but the robot's own, and walls (Eq. 4)."""
-    for i in range(out.shape[0]):
-        out[i] = np.float32(np.inf)
-    x, y, heading = sensor_pose(pose, lidar.mount)
-    computed = False
-    for k in range(bodies.shape[0]):
-        way = way_of(bodies[k], x, y, lidar) if k != me else UNSEEN
-        if way == LOOKED_UP:
-            look_up(out, x, y, heading, bodies[k], lidar)
-        computed |= way == COMPUTED
-    here = LidarPose(x, y, math.cos(heading), math.sin(heading))
-    compute(out, here, bodies, me, computed, walls, lidar)
 
 
 @kernel
@@ -156,25 +103,6 @@ def way_of(body, x, y, lidar):  # type: ignore[no-untyped-def]
 
 
 @kernel(contracts=True, inline=True)
-def look_up(out, x, y, heading, body, lidar):  # type: ignore[no-untyped-def]
-    """Fuses one body into a scan (B,) by the table row of its nearest relative pose (Eq. 3)."""
-    table = lidar.table
-    shape = table.shapes[np.uintp(np.int32(body[SHAPE]))]
-    dx, dy = body[X] - x, body[Y] - y
-    distance, bearing = polar(dx, dy)
-    cell, hull, blend = nearest_cell(distance, bearing, body[RADIUS], body[HEADING], shape, table)
-    near, far = table.cells[np.uintp(cell)], table.cells[np.uintp(cell + 1)]
-    seen = seen_at(dx, dy, body[COS], body[SIN])
-    right = silhouette(near[2], hull, shape, table.hulls, seen, 1.0)
-    left = silhouette(near[3], hull, shape, table.hulls, seen, -1.0)
-    middle, low, high = in_beams(right, left, bearing, heading, lidar.beams)
-    fuse(out, middle, low, high, near, far, blend, lidar)
-    turn = 2.0 * math.pi / lidar.beams.step
-    if high >= turn:  # across the seam of the circle
-        fuse(out, middle - turn, low - turn, high - turn, near, far, blend, lidar)
-
-
-@kernel(contracts=True, inline=True)
 def polar(dx, dy):  # type: ignore[no-untyped-def]
     """Returns distance [m] and bearing [rad] of a place, in single precision."""
     distance = math.sqrt(np.float32(dx * dx + dy * dy))
@@ -199,15 +127,10 @@ def nearest_cell(distance, bearing, radius, heading, shape, table):  # type: ign
 
 
 class Seen(NamedTuple):
-    """A shape as seen from the lidar.
+    """A shape as seen from the lidar."""
 
-    Attributes:
-        d2: square of its distance [m^2].
-        cos, sin: of its heading relative to its bearing, times the distance [m].
-    """
-
-    d2: float
-    cos: float
+    d2: float  # square of its distance [m^2]
+    cos: float  # of its heading relative to its bearing, times the distance [m]
     sin: float
 
 
@@ -221,14 +144,8 @@ def seen_at(dx, dy, c, s):  # type: ignore[no-untyped-def]
 def silhouette(pair, hull, shape, hulls, seen, side):  # type: ignore[no-untyped-def]
     """Direction of the right (side 1) or left (-1) silhouette of a shape from its bearing [rad].
 
-    Args:
-        pair: the two corners of the hull that it may be; a negative one is minus the stride of
-            climbing the hull from the other.
-        hull: index of the hull's first corner.
-        shape: row of `TABLE_SHAPE`.
-        hulls: see `TableArrays`.
-        seen: the shape.
-        side: 1 or -1.
+    It may be either corner of a pair, from the first one `hull` on; a negative one is minus the
+    stride of climbing the hull from the other.
     """
     first, other = hull + (pair & 0xFFFF), pair >> 16
     if other < 0:
@@ -269,34 +186,11 @@ def in_beams(right, left, bearing, heading, beams):  # type: ignore[no-untyped-d
 
 
 @kernel(contracts=True, inline=True)
-def fuse(out, middle, low, high, near, far, blend, lidar):  # type: ignore[no-untyped-def]
-    """Lowers the beams from `low` to `high` to two blended rows (Eq. 4).
-
-    Args:
-        out: (B,).
-        middle, low, high: bearing and silhouettes [beams].
-        near, far: (4,) cells of the two rows.
-        blend: share of the farther.
-        lidar: `LidarArrays`.
-    """
-    rows, shift = lidar.table.rows, lidar.table.shift
-    begin, hits, point, share = beams_between(middle, low, high, out.shape[0], shift)
-    one, two = points_of(near[0], near[1], point, shift, hits)
-    other, other2 = points_of(far[0], far[1], point, shift, hits)
-    range_min, range_max = np.float32(lidar.range_min), np.float32(lidar.range_max)
-    for j in range(hits):
-        value = blended(rows, one + j, two + j, other + j, other2 + j, share, blend)
-        value = limited(value, range_min, range_max)
-        out[begin + j] = min(out[begin + j], value)
-
-
-@kernel(contracts=True, inline=True)
 def beams_between(middle, low, high, count, shift):  # type: ignore[no-untyped-def]
-    """Finds the beams of a scan of `count` between two silhouettes [beams].
+    """Returns the first beam of `count` between two silhouettes [beams], and how many there are.
 
-    Returns:
-        The first and their number; the point of a row before the first one, counted from the
-        bearing, and the share of the point after it.
+    With them come the point of a row before the first beam, counted from the bearing, and the share
+    of the point after it.
     """
     begin = np.int32(low)  # conversion is faster than rounding up
     begin = np.int32(max(np.int32(begin + np.int32(low > begin)), np.int32(0)))

@@ -5,23 +5,19 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from nics_drl_bridge.config import Schema
-from nics_drl_bridge.geometry import wrap_angle
 from nics_drl_bridge.lidar import fault_kernels as kernels
 
-Array = NDArray[np.float64]
 TooClose = Literal["minus_inf", "range_min", "no_return", "ghost"]
 Skew = Literal["none", "counter_clockwise", "clockwise"]
 
 TOO_CLOSE: dict[TooClose, int] = {
-    "minus_inf": kernels.AS_MINUS_INF,
-    "range_min": kernels.AS_RANGE_MIN,
-    "no_return": kernels.AS_NO_RETURN,
-    "ghost": kernels.AS_GHOST,
-}
+    "minus_inf": kernels.AS_MINUS_INF, "range_min": kernels.AS_RANGE_MIN,
+    "no_return": kernels.AS_NO_RETURN, "ghost": kernels.AS_GHOST,
+}  # fmt: skip
 SKEW: dict[Skew, int] = {
     "none": kernels.AT_ONCE,
     "counter_clockwise": kernels.COUNTER_CLOCKWISE,
@@ -53,43 +49,10 @@ class LidarFaults(Schema):
             raise ValueError("dropout and dropout_far must add up to at most 1")
         return self
 
-    def parameters(self, noise_std: float) -> Array:
-        """Returns the kernels' row (P,), see `fault_kernels`."""
-        row = np.zeros(kernels.PARAMETERS)
-        row[kernels.NOISE_STD] = noise_std
-        row[kernels.NOISE_PROPORTIONAL] = self.noise_proportional
-        row[kernels.DROPOUT] = self.dropout
-        row[kernels.DROPOUT_FAR] = self.dropout_far
-        row[kernels.TOO_CLOSE] = TOO_CLOSE[self.too_close]
-        row[kernels.QUANTISATION] = self.quantisation
-        row[kernels.SKEW] = SKEW[self.skew]
-        return row
-
-
-def distort(
-    ranges: ArrayLike, limits: tuple[float, float], parameters: ArrayLike, seed: int, counter: int
-) -> NDArray[np.float32]:
-    """Returns one exact scan (B,) as the device reports it, without skew.
-
-    The limits are range_min and range_max [m], the parameters (P,) those of
-    `LidarFaults.parameters`. The seed is the episode's; each scan takes the next counter.
-    """
-    out = np.array(ranges, np.float32)
-    row = np.asarray(parameters, dtype=np.float64)
-    kernels.distort(out, np.asarray(limits, dtype=np.float64), row, seed, counter)
-    return out
-
-
-def slice_poses(
-    pose: ArrayLike, twist: ArrayLike, sweep_time: float, slices: int, skew: Skew
-) -> Array:
-    """Returns the poses (G, 3) of the robot at which G equal groups of beams were measured.
-
-    The robot has a body twist (3,) during the sweep, which takes `LidarSpec.sweep_time` [s] and
-    ends at `pose`.
-    """
-    out = np.empty((slices, 3))
-    start, rate = (np.asarray(value, dtype=np.float64) for value in (pose, twist))
-    kernels.slice_poses(out, start, rate, sweep_time, SKEW[skew])
-    out[:, 2] = wrap_angle(out[:, 2])
-    return out
+    def parameters(self, noise_std: float) -> NDArray[np.float64]:
+        """Returns the kernels' row (P,), in the order of the columns in `fault_kernels`."""
+        too_close, skew = TOO_CLOSE[self.too_close], SKEW[self.skew]
+        return np.array([
+            noise_std, self.noise_proportional, self.dropout, self.dropout_far, too_close,
+            self.quantisation, skew,
+        ])  # fmt: skip

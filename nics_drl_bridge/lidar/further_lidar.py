@@ -48,7 +48,7 @@ class FurtherLidar(Sensor):
         """Scans bodies, walls and map like the first lidar, with this one's faults."""
         scanner = make_scanner(self.lidar, around.shapes, around.renderer, around.grid)
         state, lidar, salt = around.state, scanner.arguments, crc32(self.name.encode())
-        limits = np.array([self.lidar.range_min, self.lidar.range_max])
+        limits = self.lidar.range_min, self.lidar.range_max
         faults = self.lidar.fault_parameters
 
         def render(out: Readings, worlds: NDArray[np.int64]) -> None:
@@ -56,11 +56,6 @@ class FurtherLidar(Sensor):
             scan_kernels.scan_worlds(
                 out, state.pose, worlds, state.bodies, around.first, around.walls, lidar, lanes
             )
-            if scanner.grid is not None:
-                scan_kernels.add_map(
-                    out, state.pose, worlds, lidar, scanner.grid.arrays,
-                    scanner.renderer == "exact", lanes,
-                )  # fmt: skip
             fault_kernels.distort_worlds(
                 out, worlds, limits, faults, state.seeds ^ salt, state.steps
             )

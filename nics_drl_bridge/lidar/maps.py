@@ -7,12 +7,12 @@ import warnings
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 from scipy import ndimage
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml
@@ -112,7 +112,6 @@ MAX_BYTES = 4 * MAX_CELLS + 2**20  # of an image file; larger files are not open
 FORMATS = {"PPM": (".pgm", ".pnm", ".ppm", ".pbm"), "PNG": (".png",), "BMP": (".bmp",)}
 LUMA = np.array([0.212656, 0.715158, 0.072186])
 """Luma weights of red, green, blue (Rec. 709), as used by ImageMagick for Nav2."""
-Mode = Literal["trinary", "scale", "raw"]
 
 
 class MapFile(Schema):
@@ -128,14 +127,7 @@ class MapFile(Schema):
     negate: bool  # 0 or 1; True if white is occupied, rather than black
     occupied_thresh: float = Field(ge=0.0, le=1.0)  # from this darkness on pixels are occupied
     free_thresh: float = Field(ge=0.0, le=1.0)  # up to this darkness they are free
-    mode: Mode = "trinary"
-
-    @field_validator("mode", mode="before")
-    @classmethod
-    def _known(cls, mode: object) -> object:
-        if isinstance(mode, str) and mode not in get_args(Mode):
-            raise ValueError(f"unknown mode; {nearest(mode, get_args(Mode))}")
-        return mode
+    mode: Literal["trinary", "scale", "raw"] = "trinary"
 
     @model_validator(mode="after")
     def _consistent(self) -> MapFile:

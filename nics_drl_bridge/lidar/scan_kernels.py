@@ -1,11 +1,10 @@
 """Scans of whole worlds; and the fast path of the look-up, which goes through many bodies at once.
 
 Nearly all time of a look-up goes into cache misses, branch mispredictions and latencies. So the
-visible bodies of several scans go through each step of `baked_kernels.look_up` together, in loops
-without branches that LLVM turns into vector instructions. Steps hand on their results in lanes: one
-array for each type of number, in which every quantity has `LANES` places from a constant on, so
-that LLVM can prove that they do not overlap. A scan is that of `baked_kernels.scan_robot` to the
-bit, in any batch.
+visible bodies of several scans go through each step of `baked_kernels` together, in loops without
+branches that LLVM turns into vector instructions. Steps hand on their results in lanes: one array
+for each type of number, in which every quantity has `LANES` places from a constant on, so that LLVM
+can prove that they do not overlap. A scan is the same to the bit in any batch.
 """
 
 from __future__ import annotations
@@ -68,17 +67,10 @@ class Device(NamedTuple):
 
 @kernel
 def scan_worlds(ranges, poses, chosen, bodies, first, walls, lidar, lanes):  # type: ignore[no-untyped-def]
-    """Scans from the robots of some worlds.
+    """Scans from the robots of the worlds `chosen` (n,), at poses (N, M, 3), into ranges (N, M, B).
 
-    Args:
-        ranges: (N, M, B) result, contiguous.
-        poses: (N, M, 3) of `base_link` in the world.
-        chosen: (n,) indices of the worlds.
-        bodies: (N, K, 7), see `shapes.BODY`.
-        first: index of the body of robot 0, the others follow; -1 if robots are not bodies.
-        walls: (W, 4) x1, y1, x2, y2 [m], the same in every world.
-        lidar: `baked_kernels.LidarArrays`.
-        lanes: `ScanLanes`; bodies wait there across scans until it is full.
+    Of the bodies (N, K, 7) that of robot 0 is `first`, the others follow; -1 if robots are none.
+    Walls (W, 4) [m] are the same in every world. Bodies wait in the lanes until these are full.
     """
     count, robots, found = bodies.shape[1], poses.shape[1], 0
     for n in chosen:
@@ -100,14 +92,15 @@ def scan_worlds(ranges, poses, chosen, bodies, first, walls, lidar, lanes):  # t
                 here = LidarPose(x, y, math.cos(heading), math.sin(heading))
                 baked.compute(out, here, bodies[n], me, computed > 0, walls, lidar)
     look_up(found, ranges, lidar, lanes)
+    if lidar.grid.squares.size > 0:
+        add_map(ranges, poses, chosen, lidar, lanes)
 
 
 @kernel(contracts=True, inline=True)
 def select(found, begin, end, bodies, me, device, lidar, lanes):  # type: ignore[no-untyped-def]
     """Puts the bodies [begin, end) that a device looks up into the lanes from `found` on.
 
-    Returns:
-        Number of lanes in use, and number of bodies that are computed, see `baked_kernels.way_of`.
+    Returns the number of lanes in use, and of bodies that are computed, see `baked_kernels.way_of`.
     """
     wide, computed = lanes.wide, 0
     for j in range(begin, end):
@@ -295,18 +288,12 @@ def fuse(flat, k, lidar, lanes):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def add_map(ranges, poses, chosen, lidar, grid, exact, lanes):  # type: ignore[no-untyped-def]
-    """Fuses a static map into the scans of some worlds, see `scan_worlds`.
-
-    Args:
-        ranges, poses, chosen, lidar, lanes: as there.
-        grid: `map_kernels.GridArrays`.
-        exact: True to walk from cell to cell.
-    """
+def add_map(ranges, poses, chosen, lidar, lanes):  # type: ignore[no-untyped-def]
+    """Fuses the static map into the scans of some worlds, see `scan_worlds`."""
     for n in chosen:
         for m in range(poses.shape[1]):
             x, y, heading = baked.sensor_pose(poses[n, m], lidar.mount)
             here = LidarPose(x, y, math.cos(heading), math.sin(heading))
-            out = ranges[n, m]
-            map_kernels.map_into(out, lidar.beams, here, lidar.range_max, grid, exact, lanes)
+            out, far = ranges[n, m], lidar.range_max
+            map_kernels.map_into(out, lidar.beams, here, far, lidar.grid, lidar.exact, lanes)
             exact_kernels.finish(out, lidar.range_min, lidar.range_max)

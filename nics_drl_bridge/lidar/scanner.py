@@ -17,7 +17,7 @@ from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.exact_kernels import SHAPE, Beams
 from nics_drl_bridge.lidar.lookup_error import lookup_distances
-from nics_drl_bridge.lidar.maps import GridMap
+from nics_drl_bridge.lidar.maps import NO_MAP, GridMap
 from nics_drl_bridge.lidar.shapes import BODY, Shape, place
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import LidarTable
@@ -59,54 +59,47 @@ class Scanner:
             raise ConfigError(f"unknown renderer {self.renderer!r}; {known}")
         if self.renderer == "exact" or not table.shapes:
             return
+        reach, reason = float((table.grid[:, 0] - table.outlines.radii).min()), ""
         if not table.has_rows:
             reason = f"has no rows to look up with the renderer {self.renderer!r}"
-            raise ModelError(f"the lidar table {reason}; scan with `exact`, or bake one.")
-        bake_one = f"; bake one for the lidar {spec.name!r}."
-        if not math.isclose(table.beam_angle, spec.angle_increment, rel_tol=1e-9):
+        elif not math.isclose(table.beam_angle, spec.angle_increment, rel_tol=1e-9):
             apart = f"{table.beam_angle:.6g} rad apart, not {spec.angle_increment:.6g} rad"
-            raise ModelError(f"the lidar table is for beams that are {apart}{bake_one}")
-        reach = float((table.grid[:, 0] - table.outlines.radii).min())
-        if reach < spec.range_max * (1.0 - 1e-9):
-            reaches = f"reaches {reach:g} m, not {spec.range_max:g} m"
-            raise ModelError(f"the lidar table {reaches}{bake_one}")
+            reason = f"is for beams that are {apart}"
+        elif reach < spec.range_max * (1.0 - 1e-9):
+            reason = f"reaches {reach:g} m, not {spec.range_max:g} m"
+        if reason:
+            fix = f"bake one for the lidar {spec.name!r}, or scan with `exact`."
+            raise ModelError(f"the lidar table {reason}; {fix}")
 
     @cached_property
     def arguments(self) -> LidarArrays:
         """Lidar and table for the kernels."""
         spec, table = self.spec, self.table
-        directions = np.stack([np.cos(spec.angles), np.sin(spec.angles)], axis=1)
         return LidarArrays(
             np.array(spec.mount),
-            Beams(directions, spec.angle_min, spec.angle_increment, spec.full_circle),
-            spec.range_min, spec.range_max, self._looked_up(), table.outlines.arguments,
-            table.arrays,
+            Beams(spec.directions, spec.angle_min, spec.angle_increment, spec.full_circle),
+            spec.range_min, spec.range_max, spec.sweep_time, self._looked_up(),
+            table.outlines.arguments, table.arrays,
+            NO_MAP if self.grid is None else self.grid.arrays, self.renderer == "exact",
         )  # fmt: skip
 
     def _looked_up(self) -> Array:
         """(H, 2) squares of the distances between which a shape is looked up [m^2]."""
-        radii = self.table.outlines.radii
+        spec, table, radii = self.spec, self.table, self.table.outlines.radii
         between = np.full((len(radii), 2), np.inf)
         if self.renderer == "baked":
             between[:, 0] = radii
-        elif self.renderer == "auto" and self.spec.angle_increment <= WIDEST_BEAMS:
-            for h in np.flatnonzero(radii < self.spec.range_max):
-                between[h] = self._lookup_distances(int(h))
+        elif self.renderer == "auto" and spec.angle_increment <= WIDEST_BEAMS:
+            for h in np.flatnonzero(radii < spec.range_max).tolist():
+                farthest = float(table.grid[h, 0])
+                key = spec.model_dump_json(), table.shapes[h], table.density, farthest
+                if key not in _MEASURED:  # once per process
+                    ways = (replace(self, renderer=way, grid=None) for way in ("exact", "baked"))
+                    exact, baked = (way.arguments for way in ways)
+                    found = lookup_distances(exact, baked, h, float(radii[h]), GREATEST_ERROR)
+                    _MEASURED[key] = found
+                between[h] = _MEASURED[key]
         return np.asarray(np.square(between))
-
-    def _lookup_distances(self, shape: int) -> tuple[float, float]:
-        """Distances of one shape [m], see `lookup_distances`; measured once per process."""
-        radius, table = float(self.table.outlines.radii[shape]), self.table
-        key = (
-            self.spec.model_dump_json(), table.shapes[shape], table.density,
-            float(table.grid[shape, 0]),
-        )  # fmt: skip
-        if key not in _MEASURED:
-            exact, baked = (replace(self, renderer=way, grid=None) for way in ("exact", "baked"))
-            _MEASURED[key] = lookup_distances(
-                exact.arguments, baked.arguments, shape, radius, GREATEST_ERROR
-            )
-        return _MEASURED[key]
 
     def place(self, shapes: Sequence[Shape], poses: ArrayLike) -> NDArray[np.float64]:
         """Returns bodies (..., K, 7) of K shapes at poses (..., K, 3): x, y [m], heading [rad].
@@ -117,12 +110,9 @@ class Scanner:
         return place(poses, self.table.outlines.radii[index], index)
 
     def scan(
-        self,
-        poses: ArrayLike,
-        bodies: ArrayLike,
-        walls: ArrayLike = NO_WALLS,
+        self, poses: ArrayLike, bodies: ArrayLike, walls: ArrayLike = NO_WALLS,
         out: NDArray[np.float32] | None = None,
-    ) -> NDArray[np.float32]:
+    ) -> NDArray[np.float32]:  # fmt: skip
         """Scans (N, B) [m], REP-117, from poses (N, 3) of robots, each in a separate world.
 
         The bodies (N, K, 7) are from `place`; walls (W, 4) x1, y1, x2, y2 [m] are the same in every
@@ -141,11 +131,6 @@ class Scanner:
         scan_kernels.scan_worlds(
             out[:, None], poses[:, None], worlds, bodies, -1, walls, self.arguments, lanes
         )
-        if self.grid is not None:
-            scan_kernels.add_map(
-                out[:, None], poses[:, None], worlds, self.arguments, self.grid.arrays,
-                self.renderer == "exact", lanes,
-            )  # fmt: skip
         return out
 
     def _scene(self, poses: ArrayLike, bodies: ArrayLike, walls: ArrayLike) -> tuple[Array, ...]:
@@ -172,11 +157,9 @@ class Scanner:
 
 
 def make_scanner(
-    spec: LidarSpec,
-    shapes: Sequence[Shape],
-    renderer: Renderer = "auto",
+    spec: LidarSpec, shapes: Sequence[Shape], renderer: Renderer = "auto",
     grid: GridMap | None = None,
-) -> Scanner:
+) -> Scanner:  # fmt: skip
     """Returns a scanner with a table for the shapes, baked now if needed, and a static map.
 
     Raises ConfigError if the renderer is unknown, or the table would be too large.

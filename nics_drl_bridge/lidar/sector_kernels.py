@@ -29,28 +29,14 @@ class SectorPlan(NamedTuple):
     range_max: float
     closed: bool  # True if the last beam and the first are neighbours
 
-    def resample(self, ranges: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Resamples scans (..., B) to the nearest return (..., S) in each sector [m], REP-117.
-
-        A sector without a beam takes the nearer return of the two adjacent beams. NaN stays where
-        nothing was measured.
-        """
-        rows = np.ascontiguousarray(ranges, np.float32).reshape(-1, len(self.directions))
-        out = np.empty((len(rows), len(self.first)), np.float32)
-        resample_all(out, rows, self)
-        return out.reshape(*np.shape(ranges)[:-1], -1)
-
-
-@kernel(allocates=True)
-def resample_all(out, ranges, plan):  # type: ignore[no-untyped-def]
-    """Applies `resample` to scans (R, B), into (R, S)."""
-    for i in range(ranges.shape[0]):
-        resample(out[i], ranges[i], plan)
-
 
 @kernel(allocates=True)
 def resample(out, ranges, plan):  # type: ignore[no-untyped-def]
-    """Writes the nearest return in each sector (S,) of one scan (B,)."""
+    """Writes the nearest return in each sector (S,) of one scan (B,) [m], REP-117.
+
+    A sector without a beam takes the nearer return of the two adjacent beams. NaN stays where
+    nothing was measured.
+    """
     if plan.shift[0] != 0.0 or plan.shift[1] != 0.0:
         _by_place(out, ranges, plan)
     else:

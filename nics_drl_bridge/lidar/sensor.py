@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Protocol
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,31 +30,16 @@ TAKEN = ("scan", "odom", "pose", "imu", "joint_states", "ground_truth", "cmd_vel
 """Topics of a robot that are no sensor's."""
 
 
-class SensedState(Protocol):
-    """State of N worlds of M robots and K other bodies; the simulator changes it in place."""
-
-    @property
-    def pose(self) -> Array:
-        """(N, M, 3) true pose of `base_link` in `map`."""
-
-    @property
-    def bodies(self) -> Array:
-        """(N, K + M, 7) other bodies, then robots, columns as in `lidar.exact_kernels`."""
-
-    @property
-    def seeds(self) -> NDArray[np.int64]:
-        """(N,) of the episodes."""
-
-    @property
-    def steps(self) -> NDArray[np.int64]:
-        """(N,) control periods since the reset."""
-
-
 @dataclass(frozen=True)
 class SensedWorlds:
-    """All that a sensor can see."""
+    """All that a sensor can see in N worlds of M robots and K other bodies.
 
-    state: SensedState
+    Its `state`, which the simulator changes in place, has the true `pose` (N, M, 3) of `base_link`
+    in `map`, `bodies` (N, K + M, 7) as in `lidar.exact_kernels`, robots last, the `seeds` (N,) of
+    the episodes, and the `steps` (N,), control periods since the reset.
+    """
+
+    state: Any
     shapes: tuple[Shape, ...]  # of the bodies, by the index in their column `SHAPE`
     first: int  # K, the body of robot 0
     walls: Array  # (W, 4) x1, y1, x2, y2 [m]
@@ -158,10 +143,8 @@ def check_sensors(sensors: tuple[Sensor, ...], frames: tuple[str, ...]) -> None:
     names, used = list(TAKEN), list(frames)
     for sensor in sensors:
         if sensor.name in names or sensor.frame in used:
-            raise ConfigError(
-                f"sensor {sensor.name!r} with frame {sensor.frame!r}: another has that name or "
-                "frame already; choose others."
-            )
+            reason = "another has that name or frame already; choose others."
+            raise ConfigError(f"sensor {sensor.name!r} with frame {sensor.frame!r}: {reason}")
         names.append(sensor.name)
         used.append(sensor.frame)
 

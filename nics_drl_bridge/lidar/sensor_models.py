@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import AfterValidator, Field, field_validator
+from pydantic import AfterValidator, Field
 
 from nics_drl_bridge.config import Schema, load_yaml
 
@@ -26,14 +26,8 @@ class IncidenceDropout(Schema):
     """Loses returns at oblique incidence, as from polished metal."""
 
     kind: Literal["incidence_dropout"] = "incidence_dropout"
-    greatest_incidence: float  # between the ray and the normal of the surface [rad]
-
-    @field_validator("greatest_incidence")
-    @classmethod
-    def _acute(cls, angle: float) -> float:
-        if not 0.0 < angle < math.pi / 2.0:
-            raise ValueError("must lie between 0 and a right angle, in radians")
-        return angle
+    # between the ray and the normal of the surface [rad]
+    greatest_incidence: float = Field(gt=0.0, lt=math.pi / 2.0)
 
     def __str__(self) -> str:
         """In a few words."""
@@ -106,11 +100,9 @@ def load_sensor_models(path: str | Path) -> tuple[SensorModel, ...]:
 
 
 def returned(
-    models: Sequence[SensorModel],
-    ranges: Ranges,
-    incidence: NDArray[np.float64],
+    models: Sequence[SensorModel], ranges: Ranges, incidence: NDArray[np.float64],
     reflectivity: float | None,
-) -> Ranges:
+) -> Ranges:  # fmt: skip
     """Returns ranges (P,) with `inf` where any model loses the return; see `Intensity.lost`."""
     for model in models:
         ranges = np.where(model.lost(ranges, incidence, reflectivity), np.float32(np.inf), ranges)

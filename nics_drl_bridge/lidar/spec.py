@@ -97,9 +97,9 @@ class LidarSpec(Schema):
         return np.asarray(self.angle_min + self.angle_increment * np.arange(self.beams))
 
     @cached_property
-    def directions(self) -> NDArray[np.float32]:
+    def directions(self) -> NDArray[np.float64]:
         """(B, 2) cosine and sine of each beam's direction."""
-        return np.stack([np.cos(self.angles), np.sin(self.angles)], axis=1).astype(np.float32)
+        return np.stack([np.cos(self.angles), np.sin(self.angles)], axis=1)
 
     @property
     def scan_time(self) -> float:
@@ -146,9 +146,7 @@ def to_device(ranges: ArrayLike, spec: LidarSpec) -> Ranges:
     Only `inf` is replaced. For a device that cannot report `-inf`, set `LidarFaults.too_close`.
     """
     out = np.array(ranges, dtype=np.float32)
-    if spec.no_return != "inf":
-        value = {"zero": 0.0, "nan": np.nan, "range_max": spec.range_max}[spec.no_return]
-        out[out == np.inf] = value
+    out[out == np.inf] = _no_return(spec)
     return out
 
 
@@ -159,14 +157,13 @@ def from_device(values: ArrayLike, spec: LidarSpec) -> Ranges:
     value for no return: it must not be taken for free space. If a device reports NaN for no return,
     invalid measurements cannot be distinguished from it.
     """
-    out = np.array(values, dtype=np.float32)
-    low, high = np.float32(spec.range_min), np.float32(spec.range_max)
-    if spec.no_return == "zero":
-        out[out == 0.0] = np.inf
-    elif spec.no_return == "nan":
-        out[np.isnan(out)] = np.inf
-    elif spec.no_return == "range_max":
-        out[out == high] = np.inf
-    out[out > high] = np.inf
-    out[out < low] = -np.inf
+    out, none = np.array(values, dtype=np.float32), _no_return(spec)
+    lost = np.isnan(out) if np.isnan(none) else out == none
+    out[lost | (out > np.float32(spec.range_max))] = np.inf
+    out[out < np.float32(spec.range_min)] = -np.inf
     return out
+
+
+def _no_return(spec: LidarSpec) -> np.float32:
+    values = {"inf": np.inf, "zero": 0.0, "nan": np.nan, "range_max": spec.range_max}
+    return np.float32(values[spec.no_return])

@@ -9,11 +9,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, field_validator
+from pydantic import Field
 
 from nics_drl_bridge.config import Schema, read_text, validate
 from nics_drl_bridge.errors import ModelError
@@ -38,20 +38,13 @@ class Density(Schema):
 
     distances: int = Field(default=100, ge=3, le=10_000)  # from the shape's radius to out of range
     rotations: int = Field(default=240, ge=1, le=100_000)  # in a full turn
-    phases: int = 1  # points per beam, 1, 2, 4 or 8; see `for_beams`
+    phases: Literal[1, 2, 4, 8] = 1  # points per beam, see `for_beams`
 
     @classmethod
     def for_beams(cls, beam_angle: float) -> Density:
         """Returns the default for an angle between beams [rad]; wide ones need several points."""
         wanted = math.ceil(math.log2(max(beam_angle / POINT_ANGLE, 1.0)))
-        return cls(phases=min(2**wanted, MOST_PHASES))
-
-    @field_validator("phases")
-    @classmethod
-    def _power_of_two(cls, phases: int) -> int:
-        if phases not in (1, 2, 4, 8):
-            raise ValueError("phases must be 1, 2, 4 or 8")
-        return phases
+        return cls.model_validate({"phases": min(2**wanted, MOST_PHASES)})
 
 
 class TableAbout(Schema):
@@ -207,10 +200,9 @@ class LidarTable:
     def _check(self) -> None:
         """Raises ValueError if the kernels would read beyond an array."""
         arrays: tuple[NDArray[Any], ...] = (self.grid, self.start, self.cell, self.rows)
-        if [array.dtype for array in arrays] != [np.float64, np.int32, np.int16, np.float32]:
-            raise ValueError("an array has another type of number")
-        if not all(array.flags.c_contiguous for array in arrays):
-            raise ValueError("an array has another order of its axes")
+        types = [array.dtype for array in arrays if array.flags.c_contiguous]
+        if types != [np.float64, np.int32, np.int16, np.float32]:
+            raise ValueError("an array has another type of number, or order of its axes")
         if self.grid.shape != (len(self.shapes), 3) or not np.isfinite(self.grid).all():
             raise ValueError("the grid does not fit the shapes")
         counts = self.grid[:, 1] * self.density.distances

@@ -102,8 +102,8 @@ class Estimator:
     @property
     def belief(self) -> Belief:
         """State of the filter; set to an earlier one when the past has changed."""
-        known = self._filter.x, self._filter.P, self._outliers, self._anchor, self._lost
-        return Belief(self.time_ns, *known)
+        own = self._filter
+        return Belief(self.time_ns, own.x, own.P, self._outliers, self._anchor, self._lost)
 
     @belief.setter
     def belief(self, belief: Belief) -> None:
@@ -163,15 +163,11 @@ class Estimator:
         """
         self._foreseen = None
         if time_ns > self.time_ns:
-            foreseen = self._forecast(time_ns)
-            self._foreseen = foreseen._replace(update=self._try(foreseen))
-
-    def _try(self, foreseen: Foreseen) -> tuple[Array, Array]:
-        """Returns gain and updated covariance for a measured twist, independent of its value."""
-        trial, (twist, derivative) = self._trial, foreseen.expected
-        trial.x, trial.P = foreseen.mean, foreseen.covariance
-        trial.update(twist, lambda _: derivative, lambda _: twist, R=self._noise[Kind.TWIST])
-        return trial.K, trial.P
+            foreseen, trial = self._forecast(time_ns), self._trial
+            trial.x, trial.P, (twist, derivative) = foreseen[1:4]
+            # Gain and covariance do not depend on the value that is measured.
+            trial.update(twist, lambda _: derivative, lambda _: twist, R=self._noise[Kind.TWIST])
+            self._foreseen = foreseen._replace(update=(trial.K, trial.P))
 
     def _forecast(self, time_ns: int) -> Foreseen:
         own, motion, log = self._filter, self._motion, self._log
@@ -189,25 +185,19 @@ class Estimator:
 
     def correct(self, measurement: Measurement) -> Judgement:
         """Corrects by a measurement at this time, after bridging unobserved motion."""
-        kind, odom = measurement.kind, measurement.odom
+        kind, odom, anchor = measurement.kind, measurement.odom, self._anchor
         if self._lost and odom is not None:
-            self._bridge(odom)
+            self._lost = False
+            seconds = 0.0 if anchor is None else (self.time_ns - anchor.time_ns) / NS_PER_S
+            if anchor and (bridged := self.unseen.bridged(anchor, odom, seconds)) is not None:
+                self._jump(*bridged)
+                self._foreseen = None
         verdict = self._correct(measurement)
         if odom is not None:
             self.anchor(odom)
         elif kind is Kind.POSE and verdict.outcome is not Acceptance.OUTLIER:
             self._lost = False
         return verdict
-
-    def _bridge(self, odom: Array) -> None:
-        """Moves the estimate by the odometry since the anchor, if that is within reach."""
-        anchor, self._lost = self._anchor, False
-        if anchor is not None:
-            seconds = (self.time_ns - anchor.time_ns) / NS_PER_S
-            bridged = self.unseen.bridged(anchor, odom, seconds)
-            if bridged is not None:
-                self._jump(*bridged)
-                self._foreseen = None
 
     def _correct(self, measurement: Measurement) -> Judgement:
         kind, value, noise, _ = measurement
@@ -251,7 +241,6 @@ class Estimator:
 
     @property
     def _foreseen_here(self) -> Foreseen | None:
-        """The last prediction if it is the present belief."""
         foreseen = self._foreseen
         return foreseen if foreseen is not None and foreseen.mean is self._filter.x else None
 

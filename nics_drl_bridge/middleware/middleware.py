@@ -13,19 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, RobotView
 from nics_drl_bridge.lidar.sensor import unread
+from nics_drl_bridge.middleware import measurement as measured
 from nics_drl_bridge.middleware import timeline
 from nics_drl_bridge.middleware.ekf import LEAST_POSE_STD, LEAST_TWIST_STD, START_STD, Estimator
-from nics_drl_bridge.middleware.measurement import (
-    CMD_VEL,
-    ODOM,
-    SCAN,
-    Acceptance,
-    Health,
-    Kind,
-    Measurement,
-    TopicHealth,
-    checked_covariance,
-)
+from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, SCAN, Kind, Measurement
 from nics_drl_bridge.middleware.timeline import ReportedPose, Stamps
 
 Array = NDArray[np.float64]
@@ -154,27 +145,27 @@ class Middleware:
 
     def scan(self, stamp_ns: int, arrival_ns: int, ranges: NDArray[np.float32]) -> bool:
         """Takes a scan (B,); True if it was used. Only the newest scan is kept."""
-        fault = self._stamps.fault(stamp_ns, arrival_ns)
-        if ranges.shape != (self._beams,):
-            fault = f"shape {ranges.shape}, not ({self._beams},)"
-        if fault:
-            return self.cache.reject(f"{SCAN}: {fault}")
-        if not self.cache.put(SCAN, stamp_ns, arrival_ns, ranges):
-            return False
-        self._stamps.accept(stamp_ns, arrival_ns)
-        return True
+        taken = self._keep(SCAN, stamp_ns, arrival_ns, ranges, self._beams)
+        if taken:
+            self._stamps.accept(stamp_ns, arrival_ns)
+        return taken
 
     def sense(
         self, name: str, stamp_ns: int, arrival_ns: int, reading: NDArray[np.float32]
     ) -> bool:
         """Takes a reading (S,) of a further sensor; True if it was used. The newest is kept."""
-        fault = self._stamps.fault(stamp_ns, arrival_ns)
         size = next(sensor.size for sensor in self._sensors if sensor.name == name)
-        if reading.shape != (size,):
-            fault = f"shape {reading.shape}, not ({size},)"
+        return self._keep(name, stamp_ns, arrival_ns, reading, size)
+
+    def _keep(
+        self, topic: str, stamp_ns: int, arrival_ns: int, values: NDArray[np.float32], size: int
+    ) -> bool:
+        fault = self._stamps.fault(stamp_ns, arrival_ns)
+        if values.shape != (size,):
+            fault = f"shape {values.shape}, not ({size},)"
         if fault:
-            return self.cache.reject(f"{name}: {fault}")
-        return self.cache.put(name, stamp_ns, arrival_ns, reading)
+            return self.cache.reject(f"{topic}: {fault}")
+        return self.cache.put(topic, stamp_ns, arrival_ns, values)
 
     def odometry(self, stamp_ns: int, arrival_ns: int, pose: ArrayLike, twist: ArrayLike) -> bool:
         """Takes an odometry: pose (3,) in `odom`, body twist (3,); True if it was accepted.
@@ -235,7 +226,7 @@ class Middleware:
         if not np.isfinite(value).all():
             return self.cache.reject(f"{kind.topic}: {NOT_FINITE}")
         try:
-            noise = checked_covariance(about, len(value), LEAST_STD[kind])
+            noise = measured.checked_covariance(about, len(value), LEAST_STD[kind])
         except ValueError as error:
             return self.cache.reject(f"{kind.topic}: {error}")
         return not self._measure(stamp_ns, arrival_ns, Measurement(kind, value, noise), value)
@@ -288,12 +279,12 @@ class Middleware:
             sensed_age_s=max((self.cache.age_s(name, now_ns) for name in sensed), default=0.0),
         )
 
-    def health(self, arrival_ns: int) -> Health:
+    def health(self, arrival_ns: int) -> measured.Health:
         """Returns the health of all topics at a time of the receiver's clock [ns]."""
-        cache, outcomes = self.cache, self._timeline.outcomes()
-        distances = {kind.topic: d for kind, d in self._timeline.distances().items()}
+        cache, outcomes = self.cache, +self._timeline.outcomes  # those that are not 0
+        distances = {kind.topic: d for kind, d in self._timeline.distances.items()}
         topics = {
-            topic: TopicHealth(
+            topic: measured.TopicHealth(
                 received,
                 cache.rate_hz(topic, arrival_ns),
                 (arrival_ns - cache.arrivals[topic][-1]) * S_PER_NS,
@@ -303,12 +294,12 @@ class Middleware:
         }
         rejected, noticed = dict(cache.rejected), dict[str, int]()
         for (kind, outcome), count in outcomes.items():
-            if outcome is not Acceptance.USED:
-                counts = rejected if outcome is Acceptance.OUTLIER else noticed
+            if outcome is not measured.Acceptance.USED:
+                counts = rejected if outcome is measured.Acceptance.OUTLIER else noticed
                 counts[f"{kind.topic}: {outcome.name.lower()}"] = count
         if self._clock_jumps:
             noticed["clock: jump"] = self._clock_jumps
-        return Health(topics, rejected, noticed, self._timeline.replayed)
+        return measured.Health(topics, rejected, noticed, self._timeline.replayed)
 
 
 def rehearse(model: SimulatorModel) -> RobotView:

@@ -32,12 +32,9 @@ Array = NDArray[np.float64]
 
 SCAN_TYPE = "sensor_msgs/msg/LaserScan"
 TYPES: Mapping[str, tuple[str, ...]] = {
-    SCAN: (SCAN_TYPE,),
-    ODOM: (topic_roles.ODOMETRY,),
-    CMD_VEL: topic_roles.TYPES["cmd_vel"],
-    POSE: (topic_roles.POSE, topic_roles.POSE_COVARIANCE),
-    IMU: (topic_roles.IMU,),
-}
+    SCAN: (SCAN_TYPE,), ODOM: (topic_roles.ODOMETRY,), CMD_VEL: topic_roles.TYPES["cmd_vel"],
+    POSE: (topic_roles.POSE, topic_roles.POSE_COVARIANCE), IMU: (topic_roles.IMU,),
+}  # fmt: skip
 ALWAYS = (SCAN, ODOM, CMD_VEL)
 """Roles whose topics are used if the bag has them; the others only on request."""
 APART_S = 1.0  # Greatest difference between stamps of one clock at the same time of receipt [s]
@@ -79,9 +76,7 @@ def estimate(path: str | Path, model: SimulatorModel, topics: Mapping[str, str])
             view, covariance = middleware.view(stamp_ns), middleware.estimator.covariance
             rows.append((stamp_ns, view.pose, view.twist, covariance[:3, :3]))
     if not rows:
-        raise RecordingError(
-            "no odometry of the bag could be used; look at it with `nics bag info`."
-        )
+        raise RecordingError("no odometry of the bag could be used; see `nics bag info`.")
     stamps, poses, twists, covariances = zip(*rows, strict=True)
     return EstimatedDrive(
         np.array(stamps, dtype=np.int64), np.array(poses), np.array(twists),
@@ -110,21 +105,17 @@ def chosen(bag: BagFile, topics: Mapping[str, str]) -> dict[str, str]:
         if role not in topics and (role not in ALWAYS or not topic or topic in bag.empty):
             continue
         if topic not in bag.types:
-            raise RecordingError(
-                f"{bag.place}: has no topic {topic!r} ({role}); {nearest(topic, bag.types)}"
-            )
+            hint = nearest(topic, bag.types)
+            raise RecordingError(f"{bag.place}: has no topic {topic!r} ({role}); {hint}")
         if bag.types[topic] not in kinds or topic in bag.empty:
             is_now = "empty" if topic in bag.empty else f"of type {bag.types[topic]}"
-            raise RecordingError(
-                f"{bag.place}: the topic {topic!r} is {is_now}; {role} needs messages of "
-                f"{' or '.join(kinds)}."
-            )
+            needed = f"{role} needs messages of {' or '.join(kinds)}."
+            raise RecordingError(f"{bag.place}: the topic {topic!r} is {is_now}; {needed}")
         roles[role] = topic
     if ODOM not in roles:
-        raise RecordingError(
-            f"{bag.place}: has no odometry; say which topic it is, as in --topic odom=/wheel_odom; "
-            f"its topics are {', '.join(sorted(bag.types))}."
-        )
+        fix = "say which topic it is, as in --topic odom=/wheel_odom"
+        known = ", ".join(sorted(bag.types))
+        raise RecordingError(f"{bag.place}: has no odometry; {fix}; its topics are {known}.")
     return roles
 
 
@@ -140,10 +131,8 @@ def _check_clocks(
         if not times[:, 1].any():
             if role == CMD_VEL:
                 continue
-            raise RecordingError(
-                f"{place}: topic {roles[role]!r}: its messages are not stamped; have the driver "
-                "stamp them, the middleware orders data by their stamps."
-            )
+            fix = "have the driver stamp them, the middleware orders data by their stamps."
+            raise RecordingError(f"{place}: topic {roles[role]!r} is not stamped; {fix}")
         clock = stamps[ODOM]
         there = clock[0, 1] + np.interp(times[:, 0], clock[:, 0], clock[:, 1] - clock[0, 1])
         apart = float(np.median(times[:, 1] - there)) * 1e-9
@@ -181,21 +170,17 @@ class Playback:
 
     def _scan(self, arrival_ns: int, message: Any) -> bool:
         values = np.asarray(message.ranges, np.float32)
-        if self._any_lidar:
-            values = self._followed(message).ordered(values)
-            if len(values) != self.lidar.beams:
-                return self.middleware.cache.reject(f"{SCAN}: another lidar")
-        ranges = from_device(np.ascontiguousarray(values), self.lidar)
-        return self.middleware.scan(stamp(message), arrival_ns, ranges)
-
-    def _followed(self, message: Any) -> Reader:
-        """Returns the reader of the scans, which the lidar of the first scan determines."""
-        if self._reader is None:
+        if self._any_lidar and self._reader is None:
             header = ScanHeader(*(float(getattr(message, name)) for name in ScanHeader._fields))
             self._reader = reader_beside(header, len(message.ranges), self._model.lidar)
             self.lidar = self._reader.lidar
             self.middleware.expect_beams(self.lidar.beams)
-        return self._reader
+        if self._reader is not None:
+            values = self._reader.ordered(values)
+            if len(values) != self.lidar.beams:
+                return self.middleware.cache.reject(f"{SCAN}: another lidar")
+        ranges = from_device(np.ascontiguousarray(values), self.lidar)
+        return self.middleware.scan(stamp(message), arrival_ns, ranges)
 
     def _odometry(self, arrival_ns: int, message: Any) -> bool:
         stamp_ns, pose = stamp(message), np.array(pose_row(message))

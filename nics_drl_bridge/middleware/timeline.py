@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from operator import attrgetter, index
@@ -73,8 +72,9 @@ class Timeline:
     def reset(self) -> None:
         """Forgets the past; begins with the present state of the estimator."""
         self._start_ns = self._estimator.time_ns
-        self._past: Counter[tuple[Kind, Acceptance]] = Counter()
-        self._distances: dict[Kind, float] = {}
+        # Numbers of measurements by kind and outcome; the innovation of the newest of each kind.
+        self.outcomes: Counter[tuple[Kind, Acceptance]] = Counter()
+        self.distances: dict[Kind, float] = {}
         self.replayed = 0
         self._entries = deque([_Entry((self._start_ns, -1), self._estimator.belief)])
 
@@ -99,7 +99,8 @@ class Timeline:
         place = bisect_left(self._entries, moment, key=attrgetter("moment"))
         if place == len(self._entries):
             self._entries.append(self._run(moment, measurement))
-            self._forget()
+            while self._entries[1].moment[0] < stamp_ns - HISTORY_NS:
+                self._entries.popleft()  # it can no longer change
         elif self._entries[place].moment == moment:
             return DUPLICATE
         else:
@@ -120,41 +121,23 @@ class Timeline:
             self._rerun(bisect_right(self._entries, effective_ns, key=lambda e: e.moment[0]))
         return ""
 
-    def outcomes(self) -> Mapping[tuple[Kind, Acceptance], int]:
-        """Returns the number of measurements by kind and outcome."""
-        recent = Counter((kind, each.outcome) for kind, each in _verdicts(self._entries))
-        return self._past + recent
-
-    def distances(self) -> Mapping[Kind, float]:
-        """Returns the squared, normalised innovation of the newest measurement of each kind."""
-        return self._distances | {kind: each.distance for kind, each in _verdicts(self._entries)}
-
     def _run(self, moment: Moment, measurement: Measurement) -> _Entry:
         self._estimator.predict(moment[0])
         verdict = self._estimator.correct(measurement)
+        self.outcomes[measurement.kind, verdict.outcome] += 1
+        self.distances[measurement.kind] = verdict.distance
         return _Entry(moment, self._estimator.belief, measurement, verdict)
 
     def _rerun(self, place: int) -> None:
         self._estimator.belief = self._entries[place - 1].belief
         for k in range(place, len(self._entries)):
             entry = self._entries[k]
-            if entry.measurement is not None:
-                self._entries[k] = self._run(entry.moment, entry.measurement)
+            if entry.measurement is None:
+                continue
+            if entry.verdict is not None:
+                self.outcomes[entry.measurement.kind, entry.verdict.outcome] -= 1
+            self._entries[k] = self._run(entry.moment, entry.measurement)
         self.replayed += 1
-
-    def _forget(self) -> None:
-        """Drops entries that can no longer change, except the last one before the history."""
-        needed_ns = self.newest_ns - HISTORY_NS
-        while self._entries[1].moment[0] < needed_ns:
-            for kind, verdict in _verdicts([self._entries.popleft()]):
-                self._past[kind, verdict.outcome] += 1
-                self._distances[kind] = verdict.distance
-
-
-def _verdicts(entries: Iterable[_Entry]) -> Iterator[tuple[Kind, Judgement]]:
-    for entry in entries:
-        if entry.measurement is not None and entry.verdict is not None:
-            yield entry.measurement.kind, entry.verdict
 
 
 class Stamps:
@@ -291,7 +274,6 @@ class Trail:
         )
 
     def _fits(self, before: ReportedPose, after: ReportedPose, seconds: float) -> bool:
-        """True if the twists lead from one pose to the other in a time [s]."""
         mean, change = (before.twist + after.twist) / 2.0, np.abs(after.twist - before.twist)
         moved = geometry.between(before.pose, after.pose)
         off = np.abs(geometry.between(geometry.exp(mean * seconds), moved))

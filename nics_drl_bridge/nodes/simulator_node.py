@@ -28,14 +28,14 @@ from std_srvs.srv import SetBool
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import NS_PER_S, Array, Simulator
+from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.scanner import RENDERERS, Renderer
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import to_device
 from nics_drl_bridge.nodes import conversions, device_parameters, qos, runner, wire
 from nics_drl_bridge.nodes.conversions import sensor_to_ros, sensor_type
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, variances
+from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, Simulator, variances
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World, load_world
 

@@ -35,11 +35,9 @@ def steered(spec: RobotSpec, twist: Callable[[Array, Array], Array]) -> Textbook
     lag, rate = _actuators(spec.parameters, ("speed", "steering"))
     return Textbook(
         twist=lambda state: twist(state[..., v], state[..., phi]),
-        target=lambda given: given[..., command][..., order],
-        lag=lag[order],
-        rate=rate[order],
+        target=lambda given: given[..., command][..., order], lag=lag[order], rate=rate[order],
         structure={"vx": (names[0],), "vy": (), "wz": ("*".join(names),)},
-    )
+    )  # fmt: skip
 
 
 def steering_angle(spec: RobotSpec) -> StateVariable:
@@ -57,20 +55,15 @@ def wheeled(
     body twist per wheel speed. The wheels can move the degrees of freedom `moves`.
     """
     if len(spec.state) != len(inverse):
-        raise ConfigError(
-            f"robot {spec.name!r}: the {spec.textbook} kinematics have {len(inverse)} wheels as "
-            f"state, not {len(spec.state)} variables; correct `state:`."
-        )
+        needed = f"have {len(inverse)} wheels as state, not {len(spec.state)} variables"
+        raise _unfit(spec, f"{needed}; correct `state:`.")
     command = _commands(spec, fields)
     names = tuple(v.name for v in spec.state)
     lag, rate = _actuators(spec.parameters, ("wheel",) * len(inverse))
     return Textbook(
-        twist=lambda state: state @ forward.T,
-        target=lambda given: given[..., command] @ inverse.T,
-        lag=lag,
-        rate=rate,
-        structure={dof: names if dof in moves else () for dof in POSE_RATES},
-    )
+        twist=lambda state: state @ forward.T, target=lambda given: given[..., command] @ inverse.T,
+        lag=lag, rate=rate, structure={dof: names if dof in moves else () for dof in POSE_RATES},
+    )  # fmt: skip
 
 
 def _commands(spec: RobotSpec, fields: tuple[CmdVelField, ...]) -> list[int]:
@@ -80,20 +73,19 @@ def _commands(spec: RobotSpec, fields: tuple[CmdVelField, ...]) -> list[int]:
         return list(range(len(have)))
     for field in fields:
         if field not in have:
-            raise ConfigError(
-                f"robot {spec.name!r}: the {spec.textbook} kinematics need a command with "
-                f"`cmd_vel: {field}`; add it."
-            )
+            raise _unfit(spec, f"need a command with `cmd_vel: {field}`; add it.")
     return [have.index(field) for field in fields]
+
+
+def _unfit(spec: RobotSpec, reason: str) -> ConfigError:
+    return ConfigError(f"robot {spec.name!r}: the {spec.textbook} kinematics {reason}")
 
 
 def _states(spec: RobotSpec) -> tuple[int, int]:
     have = [v.unit for v in spec.state]
     if sorted(have) != ["m/s", "rad"]:
-        raise ConfigError(
-            f"robot {spec.name!r}: the {spec.textbook} kinematics need a state in m/s and rad, not "
-            f"in {', '.join(have) or 'nothing'}; correct `state:`."
-        )
+        given = ", ".join(have) or "nothing"
+        raise _unfit(spec, f"need a state in m/s and rad, not in {given}; correct `state:`.")
     return have.index("m/s"), have.index("rad")
 
 

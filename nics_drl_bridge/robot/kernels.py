@@ -11,11 +11,9 @@ the rates; `series` is `SERIES` in the type of the other arrays.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numba import types
-from numba.extending import overload
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ModelError
@@ -47,10 +45,8 @@ def term_arrays(model: TaylorModel) -> Terms:
     one = len(model.variables)
     order = max(1, int(model.powers.sum(axis=1).max(initial=1)))
     if order > GREATEST_ORDER:
-        raise ModelError(
-            f"the kinematics have a term of order {order}; the greatest is {GREATEST_ORDER}: "
-            "generate the model anew."
-        )
+        most = f"the greatest is {GREATEST_ORDER}: generate the model anew."
+        raise ModelError(f"the kinematics have a term of order {order}; {most}")
     dofs, places = np.nonzero(model.coefficients)
     factors = np.full((len(dofs), order), one, dtype=np.int64)
     for row, k in enumerate(places):
@@ -95,7 +91,6 @@ def move(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
 
 @kernel
 def _move_little(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
-    """Does the same as `move` for turns up to `WIDE_TURN`."""
     t2 = turn * turn
     a = series[0] - t2 * (series[1] - t2 * series[2])
     a = (series[3] + series[3]) - t2 * a
@@ -132,25 +127,13 @@ def advance(pose, twist, dt, series):  # type: ignore[no-untyped-def]
     pose[2] = wrap(pose[2] + turn)
 
 
-def own(value: Any, lane: int) -> Any:
-    """Returns the value of a lane: its entry of an array, or the scalar shared by all lanes."""
-    return value[lane] if np.ndim(value) else value
-
-
-@overload(own)
-def _own(value, lane):  # type: ignore[no-untyped-def]
-    if isinstance(value, types.Array):
-        return lambda value, lane: value[lane]
-    return lambda value, lane: value
-
-
 @kernel
 def run(pose, x, dq, terms, series, dt, steps):  # type: ignore[no-untyped-def]
     """Moves a batch of robots by the same number of steps of dt [s], under constant commands.
 
     Updated in place are `pose` (6, n), x, y [m], cosine, sine and value of the heading, unwrapped,
     and an upper bound of the path length [m], and the state in `x` (S + C + 1, n). `dq` (3 + S, n)
-    are the rates of the last step; coefficients may be (T, n).
+    are the rates of the last step; coefficients are (T, n).
     """
     for _ in range(steps):
         _rates_of_all(dq, x, terms)
@@ -172,22 +155,22 @@ def _rates_of_all(dq, x, terms):  # type: ignore[no-untyped-def]
         rate, value, one = dq[terms.dof[k]], terms.coefficient[k], x[factors[k, 0]]
         if terms.degree[k] == 1:
             for i in range(n):
-                rate[i] += own(value, i) * one[i]
+                rate[i] += value[i] * one[i]
         elif terms.degree[k] == 2:
             other = x[factors[k, 1]]
             for i in range(n):
-                rate[i] += own(value, i) * one[i] * other[i]
+                rate[i] += value[i] * one[i] * other[i]
         elif terms.degree[k] == 3:
             other, third = x[factors[k, 1]], x[factors[k, 2]]
             for i in range(n):
-                rate[i] += own(value, i) * one[i] * other[i] * third[i]
+                rate[i] += value[i] * one[i] * other[i] * third[i]
         elif terms.degree[k] == 4:
             other, third, last = x[factors[k, 1]], x[factors[k, 2]], x[factors[k, 3]]
             for i in range(n):
-                rate[i] += own(value, i) * one[i] * other[i] * third[i] * last[i]
+                rate[i] += value[i] * one[i] * other[i] * third[i] * last[i]
         else:  # the constant
             for i in range(n):
-                rate[i] += own(value, i)
+                rate[i] += value[i]
 
 
 @kernel
@@ -197,7 +180,7 @@ def _move_all(pose, dq, dt, series):  # type: ignore[no-untyped-def]
     wide = np.int32(0)
     for i in range(px.shape[0]):
         wide |= np.int32(abs(wz[i] * dt) > WIDE_TURN)
-    if wide:
+    if wide:  # in a separate loop, as it is slower
         _move_widely(pose, dq, dt, series)
         return
     for i in range(px.shape[0]):
@@ -211,7 +194,6 @@ def _move_all(pose, dq, dt, series):  # type: ignore[no-untyped-def]
 
 @kernel
 def _move_widely(pose, dq, dt, series):  # type: ignore[no-untyped-def]
-    """Does the same as `_move_all` if some turns are wide: in a separate loop, as it is slower."""
     px, py, pc, ps, heading, length = pose[0], pose[1], pose[2], pose[3], pose[4], pose[5]
     vx, vy, wz = dq[0], dq[1], dq[2]
     for i in range(px.shape[0]):

@@ -94,28 +94,22 @@ def drawing(spec: RobotSpec) -> Drawing:
 
 
 def _made(spec: RobotSpec, make: Callable[[RobotKind], T]) -> T:
-    kind: RobotKind | None = find_kind(require_textbook(spec))
+    robot, kind = f"robot {spec.name!r}", find_kind(require_textbook(spec))
     if kind is None:
-        raise ConfigError(
-            f"robot {spec.name!r}: `textbook:` must be one of {', '.join(kind_names())}, not "
-            f"{spec.textbook!r}."
-        )
+        known = ", ".join(kind_names())
+        raise ConfigError(f"{robot}: `textbook:` must be one of {known}, not {spec.textbook!r}.")
     try:
         return make(kind)
     except KeyError as error:
-        raise ConfigError(
-            f"robot {spec.name!r}: the {spec.textbook} kinematics need the parameter {error}; add "
-            "it under `parameters:`."
-        ) from None
+        needed = f"the {spec.textbook} kinematics need the parameter {error}"
+        raise ConfigError(f"{robot}: {needed}; add it under `parameters:`.") from None
 
 
 def require_textbook(spec: RobotSpec) -> str:
     """Returns the name of a robot's kind. Raises ConfigError if it names none."""
     if spec.textbook is None:
-        raise ConfigError(
-            f"robot {spec.name!r} names no textbook kinematics; add `textbook:` to its YAML file "
-            "or give a recording."
-        )
+        fix = "add `textbook:` to its YAML file or give a recording."
+        raise ConfigError(f"robot {spec.name!r} names no textbook kinematics; {fix}")
     return spec.textbook
 
 

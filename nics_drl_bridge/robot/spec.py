@@ -8,6 +8,7 @@ group `nics_drl_bridge.kinds`.
 from __future__ import annotations
 
 import math
+from contextlib import suppress
 from functools import cached_property
 from importlib import import_module
 from importlib.util import find_spec
@@ -132,38 +133,28 @@ class RobotSpec(Schema):
         outline = data.get("footprint") if isinstance(data, dict) else None
         if outline is None or "footprint_radius" in data:
             return data
-        try:
+        with suppress(OverflowError, TypeError, ValueError):  # the field's own check reports it
             if len(outline) <= MOST_CORNERS:
                 data = data | {"footprint_radius": _reach(outline)}
-        except (OverflowError, TypeError, ValueError):
-            pass  # the field's own check reports the error
         return data
 
     @model_validator(mode="after")
-    def _outlined(self) -> RobotSpec:
-        if self.footprint is None:
-            return self
-        if _edges_cross(np.array(self.footprint)):
-            raise ValueError("edges of footprint cross or touch; list its corners in order")
-        radius = _reach(self.footprint)
-        if not math.isclose(radius, self.footprint_radius, rel_tol=1e-6):
-            raise ValueError(
-                f"footprint reaches {radius:.6g} m from base_link, footprint_radius is "
-                f"{self.footprint_radius:.6g} m; leave footprint_radius out"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _unique(self) -> RobotSpec:
+    def _consistent(self) -> RobotSpec:
+        if self.footprint is not None:
+            if _edges_cross(np.array(self.footprint)):
+                raise ValueError("edges of footprint cross or touch; list its corners in order")
+            reach, radius = _reach(self.footprint), self.footprint_radius
+            if not math.isclose(reach, radius, rel_tol=1e-6):
+                raise ValueError(
+                    f"footprint reaches {reach:.6g} m from base_link, footprint_radius is "
+                    f"{radius:.6g} m; leave footprint_radius out"
+                )
         names = self.variable_names
         if len(set(names)) != len(names):
             raise ValueError("every state and command variable needs a name of its own")
-        commands = [c.name for c in self.command]
-        for variable in self.state:
-            if variable.follows is not None and variable.follows not in commands:
-                raise ValueError(
-                    f"state {variable.name!r} follows {variable.follows!r}, which is no command"
-                )
+        for name, follows in ((v.name, v.follows) for v in self.state):
+            if follows is not None and follows not in [c.name for c in self.command]:
+                raise ValueError(f"state {name!r} follows {follows!r}, which is no command")
         fields = [c.cmd_vel for c in self.command if c.cmd_vel is not None]
         if len(set(fields)) != len(fields):
             raise ValueError("two commands share one field of cmd_vel")
@@ -204,10 +195,8 @@ class RobotSpec(Schema):
         """Distance between the axles of a robot that steers [m]. Raises ConfigError if unknown."""
         wheelbase = self.parameters.get("wheelbase", 0.0)
         if not wheelbase > 0.0:
-            raise ConfigError(
-                f"robot {self.name!r} steers, and its wheelbase is not known; add `wheelbase:` [m] "
-                "to the `parameters:` of its YAML file."
-            )
+            fix = "add `wheelbase:` [m] to the `parameters:` of its YAML file."
+            raise ConfigError(f"robot {self.name!r} steers, and its wheelbase is not known; {fix}")
         return wheelbase
 
     @cached_property
@@ -224,9 +213,8 @@ class RobotSpec(Schema):
     def _cmd_vel_index(self) -> NDArray[np.intp]:
         fields = [c.cmd_vel for c in self.command if c.cmd_vel is not None]
         if len(fields) < len(self.command):
-            raise ConfigError(
-                f"robot {self.name!r}: a command names no field of cmd_vel; add `cmd_vel:` to it."
-            )
+            reason = "a command names no field of cmd_vel; add `cmd_vel:` to it."
+            raise ConfigError(f"robot {self.name!r}: {reason}")
         return np.array([CMD_VEL_FIELDS.index(field) for field in fields], dtype=np.intp)
 
     def to_cmd_vel(self, command: ArrayLike) -> NDArray[np.float64]:

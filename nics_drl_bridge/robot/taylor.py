@@ -86,14 +86,15 @@ class TaylorModel:
 
     def equations(self) -> list[str]:
         """Returns one line per dof, with units: `wz = 4.6*speed*steering  [rad/s]`."""
-        lines = []
+        lines, names = [], self.term_names
         for d, dof in enumerate(self.dofs):
-            text = ""
-            for k in np.flatnonzero(self.coefficients[d]):
-                value, name = self.coefficients[d, k], term_name(self.powers[k], self.variables)
-                sign = ("-" if value < 0 else "") if not text else (" - " if value < 0 else " + ")
-                mark = " (assumed)" if (dof, name) in self.assumed else ""
-                text += f"{sign}{abs(value):.5g}" + ("" if name == "1" else f"*{name}") + mark
+            terms = [
+                f"{self.coefficients[d, k]:.5g}"
+                + ("" if names[k] == "1" else f"*{names[k]}")
+                + (" (assumed)" if (dof, names[k]) in self.assumed else "")
+                for k in np.flatnonzero(self.coefficients[d])
+            ]
+            text = " + ".join(terms).replace("+ -", "- ")
             lines.append(f"{dof} = {text or '0'}  [{self.dof_units[d]}]")
         return lines
 
@@ -107,14 +108,11 @@ class TaylorModel:
         }
         box = zip(self.low.tolist(), self.high.tolist(), strict=True)
         return NamedTaylorModel.model_construct(
-            dt=self.dt,
-            units=dict(zip(self.dofs, self.dof_units, strict=True)),
-            terms=terms,
-            valid=dict(zip(self.variables, box, strict=True)),
-            assumed=self.assumed,
+            dt=self.dt, units=dict(zip(self.dofs, self.dof_units, strict=True)), terms=terms,
+            valid=dict(zip(self.variables, box, strict=True)), assumed=self.assumed,
             standard_errors=self.named_errors if self.std_errors.size else None,
             quality=self.quality,
-        )
+        )  # fmt: skip
 
 
 def exponents(variables: int, order: int) -> NDArray[np.int64]:

@@ -17,12 +17,9 @@ BODY_HEIGHT = 0.04
 
 
 def urdf_of(
-    spec: RobotSpec,
-    mount: Place = (0.0, 0.0, 0.0),
-    laser: str = "laser",
-    base: str = "base_link",
+    spec: RobotSpec, mount: Place = (0.0, 0.0, 0.0), laser: str = "laser", base: str = "base_link",
     further: Mapping[str, Place] | None = None,
-) -> str:
+) -> str:  # fmt: skip
     """Returns the text of a robot's URDF.
 
     `base_link` lies on the ground, where its pose is measured; wheels stand on the ground and
@@ -46,10 +43,9 @@ def urdf_of(
         _visual(link, "body", (*body, BODY_HEIGHT), (looks.centre[0], 0.0, looks.centre[1]))
         for wheel in looks.wheels:
             _wheel(robot, base, wheel)
-    joints = {laser: "laser_mount"}
     for frame, (x, y, yaw) in {laser: mount, **(further or {})}.items():
         _visual(_add(robot, "link", name=frame), "laser", (0.02, 0.03), (0.0, 0.0, 0.07))
-        joint = joints.get(frame, f"{frame}_mount")
+        joint = "laser_mount" if frame == laser else f"{frame}_mount"
         _joint(robot, joint, "fixed", (base, frame), (x, y, 0.0), yaw=yaw)
     ElementTree.indent(robot)
     return f'<?xml version="1.0"?>\n{ElementTree.tostring(robot, encoding="unicode")}\n'

@@ -10,7 +10,7 @@ import numpy as np
 
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar import scan_kernels
-from nics_drl_bridge.lidar.maps import NO_MAP, GridMap
+from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.robot.kernels import SERIES, scratch, term_arrays
@@ -63,25 +63,19 @@ def allocate(model: SimulatorModel, sizes: Sizes) -> arrays.State:
     # One row for the newest; an age within a period needs the end of the period before it, too.
     rows, sent = (-(-most // substeps) + 1 for most in (sizes.longest_age, sizes.longest_delay))
     return arrays.State(
-        pose=np.zeros((*shape, 3)),
-        state=np.zeros((*shape, len(model.robot.state))),
+        pose=np.zeros((*shape, 3)), state=np.zeros((*shape, len(model.robot.state))),
         history=np.zeros((*shape, sent, len(model.robot.command))),
-        bodies=np.zeros((sizes.worlds, bodies, BODY)),
-        odom=np.zeros((*shape, 3)),
+        bodies=np.zeros((sizes.worlds, bodies, BODY)), odom=np.zeros((*shape, 3)),
         twist=np.zeros((*shape, 3)),
         ranges=np.full((*shape, model.lidar.beams), np.inf, np.float32),
-        collided=np.zeros(shape, np.uint8),
-        steps=np.zeros(sizes.worlds, np.int64),
+        collided=np.zeros(shape, np.uint8), steps=np.zeros(sizes.worlds, np.int64),
         seeds=np.zeros(sizes.worlds, np.int64),
         faults=np.tile(model.lidar.fault_parameters, (*shape, 1)),
         coefficient=np.tile(term_arrays(model.kinematics).coefficient, (*shape, 1)),
-        delay=np.full(shape, delay, np.int64),
-        age=np.zeros(shape, np.int64),
-        noise=np.tile(noise, (*shape, 1)),
-        velocity=np.zeros((sizes.worlds, sizes.obstacles, 3)),
-        past=np.zeros((*shape, rows, PAST)),
-        marks=np.zeros((sizes.worlds, sizes.obstacles, MARK)),
-    )
+        delay=np.full(shape, delay, np.int64), age=np.zeros(shape, np.int64),
+        noise=np.tile(noise, (*shape, 1)), velocity=np.zeros((sizes.worlds, sizes.obstacles, 3)),
+        past=np.zeros((*shape, rows, PAST)), marks=np.zeros((sizes.worlds, sizes.obstacles, MARK)),
+    )  # fmt: skip
 
 
 def split(worlds: int, threads: int) -> tuple[slice, ...]:
@@ -116,19 +110,10 @@ def part_of(
     sizes: Sizes, part: slice,
 ) -> arrays.Part:  # fmt: skip
     """Returns the arguments of the kernels for one part of the worlds, with scratch of its own."""
-    lidar, grid = model.lidar, scanner.grid
     dt, substeps, _ = model.timing
-    view = arrays.LidarView(
-        scanner.arguments,
-        NO_MAP if grid is None else grid.arrays,
-        scanner.renderer == "exact",
-        np.array(lidar.mount, dtype=np.float64),
-        np.array([lidar.range_min, lidar.range_max], dtype=np.float64),
-        float(lidar.sweep_time),
-    )
     motion = arrays.Dynamics(term_arrays(model.kinematics), SERIES, float(dt), int(substeps))
     own = _scratch(model, scanner, sizes, part.stop - part.start)
-    return arrays.Part(state, scene, view, motion, own)
+    return arrays.Part(state, scene, scanner.arguments, motion, own)
 
 
 def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int) -> arrays.Scratch:

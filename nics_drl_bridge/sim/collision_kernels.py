@@ -86,11 +86,9 @@ def _edges_distance2(ax, ay, bx, by, px, py, qx, qy):  # type: ignore[no-untyped
     if cross(ax, ay, bx, by, px, py, qx, qy):
         return -1.0
     return min(
-        segment_distance2(ax, ay, px, py, qx, qy),
-        segment_distance2(bx, by, px, py, qx, qy),
-        segment_distance2(px, py, ax, ay, bx, by),
-        segment_distance2(qx, qy, ax, ay, bx, by),
-    )
+        segment_distance2(ax, ay, px, py, qx, qy), segment_distance2(bx, by, px, py, qx, qy),
+        segment_distance2(px, py, ax, ay, bx, by), segment_distance2(qx, qy, ax, ay, bx, by),
+    )  # fmt: skip
 
 
 @kernel

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,14 +12,32 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import Simulator
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.sim import contact_kernels, step_kernels
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.state import State
 from nics_drl_bridge.sim.world import World
 
 Array = NDArray[np.float64]
+
+
+class Simulator(Protocol):
+    """One world of M robots, whatever moves them; `FastSimulator` does."""
+
+    @property
+    def data(self) -> State:
+        """The current state; a step may overwrite the same arrays."""
+
+    @property
+    def readings(self) -> Mapping[str, NDArray[np.float32]]:
+        """Name of a further sensor -> (1, M, S) its readings."""
+
+    def reset(self, seeds: ArrayLike, *, starts: ArrayLike | None = None) -> Any:
+        """Begins the episode of a seed (1,), at poses (1, M, 3) if they are given."""
+
+    def step(self, commands: ArrayLike) -> None:
+        """Moves the robots by one control period; commands (1, M, C) as in the RobotSpec."""
 
 
 @dataclass(frozen=True)
@@ -64,10 +83,8 @@ class DeviceWorld:
     def begin(self, seed: int, starts: Array | None) -> None:
         """Begins the episode of a seed, at x, y, heading of each robot (3 M,) if given."""
         if starts is not None and starts.size != 3 * self.robots:
-            raise ConfigError(
-                f"episode_start has {starts.size} numbers; {self.robots} robots need "
-                f"{3 * self.robots}: x, y, heading of each."
-            )
+            needed = f"{self.robots} robots need {3 * self.robots}: x, y, heading of each."
+            raise ConfigError(f"episode_start has {starts.size} numbers; {needed}")
         placed = None if starts is None else starts.reshape(1, self.robots, 3)
         self._simulator.reset([seed], starts=placed)
         self.commands[:] = 0.0

@@ -153,7 +153,6 @@ def _next_stop(b: int, time: float, until: float, flights: Array) -> float:
 
 @kernel
 def _rate(nx: float, ny: float, body: Placed, x: float, y: float) -> float:
-    """Velocity of a point of a body along n [m/s]."""
     # A turn moves a point (x, y) from the origin along n by turn * (x ny - y nx).
     return nx * (body.vx - body.turn * (y - body.y)) + ny * (body.vy + body.turn * (x - body.x))
 

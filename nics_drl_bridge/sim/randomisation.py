@@ -241,22 +241,21 @@ class Sampler:
         )  # fmt: skip
 
     def _name(self, model: SimulatorModel) -> Iterator[Label]:
-        kinematics = model.kinematics
-        terms = zip(*np.nonzero(kinematics.coefficients), strict=True)
-        for column, (d, k) in enumerate(terms):
-            if _varies(self._coefficient, column):
-                name = f"kinematics.{kinematics.dofs[d]}.{kinematics.term_names[k]}"
-                yield name, "coefficient", column
-        for column, name in enumerate(("action_latency_s", "observation_latency_s")):
-            if _varies(self._timing, column):
-                yield name, "latency", column
-        states = tuple(f"state_drift.{variable.name}" for variable in model.robot.state)
-        for column, noise in enumerate((*NOISE_NAMES, *states)):
-            if noise and _varies(self._noise, column):
-                yield f"odometry.{noise}", "noise", column
-        for column, fault in enumerate(FAULT_COLUMNS):
-            if column in self._choices or _varies(self._faults, column):
-                yield f"lidar.{fault}", "faults", column
+        kept, terms = zip(*np.nonzero(model.kinematics.coefficients), strict=True), []
+        for d, k in kept:
+            terms.append(f"kinematics.{model.kinematics.dofs[d]}.{model.kinematics.term_names[k]}")
+        noise = [name and f"odometry.{name}" for name in NOISE_NAMES]
+        noise += [f"odometry.state_drift.{variable.name}" for variable in model.robot.state]
+        for field, names, (low, high) in (
+            ("coefficient", terms, self._coefficient),
+            ("latency", ["action_latency_s", "observation_latency_s"], self._timing),
+            ("noise", noise, self._noise),
+            ("faults", [f"lidar.{fault}" for fault in FAULT_COLUMNS], self._faults),
+        ):
+            for column, name in enumerate(names):
+                chosen = field == "faults" and column in self._choices
+                if name and (chosen or low[column] != high[column]):
+                    yield name, field, column
         if self.randomisation.obstacles.count is not None:
             yield "obstacles.count", "count", None
         if len(self._sizes) > 1:
@@ -271,52 +270,41 @@ def _between(bounds: Bounds, seeds: Integers, robots: int, group: int, column: i
     return drawn
 
 
-def _varies(ends: Bounds, column: int) -> bool:
-    return bool(ends[0][column] != ends[1][column])
-
-
 def _coefficients(ranges: KinematicRanges, model: TaylorModel, where: str) -> Bounds:
     """Bounds (T,) of the coefficients. Raises ConfigError for an invalid name or range."""
     spans = np.tile(ranges.scale, (*model.coefficients.shape, 1))
+    for key, named in (("dofs", ranges.dofs), ("terms", ranges.terms)):
+        place = f"{where}: key 'kinematics.{key}'"
+        for dof in named:
+            if dof not in model.dofs:
+                raise ConfigError(f"{place}: unknown rate {dof!r}; {nearest(dof, model.dofs)}")
     for dof, span in ranges.dofs.items():
-        spans[_rate(dof, model, f"{where}: key 'kinematics.dofs'")] = span
+        spans[model.dofs.index(dof)] = span
     for dof, terms in ranges.terms.items():
-        place = f"{where}: key 'kinematics.terms'"
-        d = _rate(dof, model, place)
+        d, place = model.dofs.index(dof), f"{where}: key 'kinematics.terms', rate {dof!r}"
         for term, span in terms.items():
-            spans[d, _term(d, term, model, f"{place}, rate {dof!r}")] = span
+            spans[d, _term(d, term, model, place)] = span
     _check_stable(model, spans, where)
     kept = np.nonzero(model.coefficients)
     base = term_arrays(model).coefficient
     return base * spans[kept][:, 0], base * spans[kept][:, 1]
 
 
-def _rate(name: str, model: TaylorModel, where: str) -> int:
-    if name not in model.dofs:
-        raise ConfigError(f"{where}: unknown rate {name!r}; {nearest(name, model.dofs)}")
-    return model.dofs.index(name)
-
-
 def _term(d: int, name: str, model: TaylorModel, where: str) -> int:
     known = {model.term_names[k]: int(k) for k in np.flatnonzero(model.coefficients[d])}
     with suppress(ValueError, KeyError):
         return known[taylor.term_name(taylor.parse_term(name, model.variables), model.variables)]
-    raise ConfigError(
-        f"{where}: the model has no term {name!r} there; "
-        + (nearest(name, known) if known else "it has none at all: remove it.")
-    )
+    hint = nearest(name, known) if known else "it has none at all: remove it."
+    raise ConfigError(f"{where}: the model has no term {name!r} there; {hint}")
 
 
 def _check_stable(model: TaylorModel, spans: Array, where: str) -> None:
     """Raises ConfigError if the linear part of the state's step would grow for some factors."""
-    size = model.state_size
-    if not size:
+    if not (size := model.state_size):
         return
-    linear = np.zeros((size, size))
-    low, high = np.ones_like(linear), np.ones_like(linear)
+    linear, low, high = np.zeros((size, size)), np.ones((size, size)), np.ones((size, size))
     for k in np.flatnonzero(model.powers.sum(axis=1) == 1):
-        v = int(np.argmax(model.powers[k]))
-        if v < size:
+        if (v := int(np.argmax(model.powers[k]))) < size:
             linear[:, v] = model.coefficients[3:, k]
             low[:, v], high[:, v] = spans[3:, k].T
     mixed = np.random.default_rng(0).integers(0, 2, (CORNERS, size, size)).astype(bool)
@@ -345,18 +333,15 @@ def _levels(ranges: Randomisation, model: SimulatorModel, where: str) -> Bounds:
     base = np.array([*model.noise.odometry, *model.noise.simulated_drift(model.robot)])
     low, high = base.copy(), base.copy()
     for key, (part, (one, other)) in SCALED.items():
-        factor = getattr(odometry, key)
-        if factor is None:
+        if (factor := getattr(odometry, key)) is None:
             continue
         if not base[part].any():
-            raise ConfigError(
-                f"{where}: key 'odometry.{key}': the model of {model.robot.name!r} has no "
-                f"measured {key} to scale; give {one!r} and {other!r} instead."
-            )
+            lacks = f"the model of {model.robot.name!r} has no measured {key} to scale"
+            fix = f"give {one!r} and {other!r} instead."
+            raise ConfigError(f"{where}: key 'odometry.{key}': {lacks}; {fix}")
         low[part], high[part] = base[part] * factor[0], base[part] * factor[1]
     for column, name in enumerate(NOISE_NAMES):
-        level = getattr(odometry, name) if name else None
-        if level is not None:
+        if name and (level := getattr(odometry, name)) is not None:
             low[column], high[column] = level
     return low, high
 

@@ -154,7 +154,6 @@ def _clear_of_walls(body, room, plan, spare):  # type: ignore[no-untyped-def]
 
 @kernel
 def _clear_of(body, other, room, outlines, spare):  # type: ignore[no-untyped-def]
-    """True if a body keeps `room` [m] from another."""
     dx, dy, far = body[X] - other[X], body[Y] - other[Y], body[RADIUS] + other[RADIUS] + room
     if dx * dx + dy * dy >= far * far:
         return True
@@ -178,7 +177,6 @@ def _is_clear(x, y, room, moving, plan, bodies, scratch):  # type: ignore[no-unt
 
 @kernel
 def _is_free(x, y, plan, bodies, scratch):  # type: ignore[no-untyped-def]
-    """True if a robot with the clearance around it fits at a point."""
     return _is_clear(x, y, plan.clearance, True, plan, bodies, scratch) and _clear_of_walls(
         scratch.disc, plan.clearance, plan, scratch.spare
     )
@@ -282,7 +280,6 @@ def _choose(seed, wanted, size, plan, bodies, active):  # type: ignore[no-untype
 
 @kernel
 def _place_obstacles(seed, counter, plan, bodies, scratch):  # type: ignore[no-untyped-def]
-    """Places the obstacles: first those at fixed poses, then the others."""
     space, outlines, gaps, trial = plan.space, plan.outlines, scratch.gaps, scratch.trial
     for k in range(bodies.shape[0]):
         group, shape = plan.groups[plan.group[k]], int(bodies[k, SHAPE])

@@ -42,13 +42,8 @@ class Scene:
     goals: Array  # (M, 2) position of each goal [m]
 
 
-@dataclass(frozen=True)
-class Scenes:
+class Scenes(Scene):
     """Scenes of n seeds in a world, arrays (n, ...) as in `Scene`; `scenes[i]` is that of one."""
-
-    bodies: Array
-    starts: Array
-    goals: Array
 
     def __len__(self) -> int:
         return len(self.bodies)
@@ -116,18 +111,17 @@ class SceneSampler:
         return scenes
 
     def _no_room(self, seed: int, why: int) -> ConfigError:
-        scene, others = f"in the scene of seed {seed}", f" among {self.count} obstacles"
+        where, scene = self.world.source, f"in the scene of seed {seed}"
         if why == kernels.NO_OBSTACLES:
-            return ConfigError(
-                f"{self.world.source}: key 'obstacles': no free place for {self.count} obstacles "
-                f"{scene}; lower `count` or `gap`, or enlarge `size`."
-            )
+            reason = f"no free place for {self.count} obstacles {scene}"
+            fix = "lower `count` or `gap`, or enlarge `size`."
+            return ConfigError(f"{where}: key 'obstacles': {reason}; {fix}")
         least, greatest = self.world.goal_distance
         return ConfigError(
-            f"{self.world.source}: key 'goal_distance': no free places for {self.robots} start(s) "
-            f"and goal(s) of robots of radius {self._plan.footprint:g} m, {least:g} to "
-            f"{greatest:g} m apart with a way between{others if self.count else ''}, {scene}; "
-            "change `goal_distance`, lower `clearance` or `obstacles`, or enlarge `size`."
+            f"{where}: key 'goal_distance': no free places for {self.robots} start(s) and goal(s) "
+            f"of robots of radius {self._plan.footprint:g} m, {least:g} to {greatest:g} m apart "
+            f"with a way between among {self.count} obstacles, {scene}; change `goal_distance`, "
+            "lower `clearance` or `obstacles`, or enlarge `size`."
         )
 
 
@@ -244,18 +238,14 @@ def _free_space(world: World, footprint: float) -> FreeSpace:
     room = math.hypot(footprint + world.clearance, cells.cell / 2.0)
     area, _ = ndimage.label(cells.distances >= room)
     robot = f"a robot of radius {footprint:g} m with {world.clearance:g} m around it"
+    least, fault = world.goal_distance[0], ""
     if not area.any():
-        raise ConfigError(
-            f"{world.source}: key 'clearance': no free space for {robot}; lower `clearance`, or "
-            "enlarge the world."
-        )
-    least = world.goal_distance[0]
-    area = _large_enough(area, cells.cell, least)
-    if not area.any():
-        raise ConfigError(
-            f"{world.source}: key 'goal_distance': nowhere can {robot} reach a goal {least:g} m "
-            "away; lower `goal_distance` or `clearance`, or enlarge the world."
-        )
+        fault = f"key 'clearance': no free space for {robot}; lower `clearance`"
+    elif not (area := _large_enough(area, cells.cell, least)).any():
+        fault = f"key 'goal_distance': nowhere can {robot} reach a goal {least:g} m away; lower "
+        fault += "`goal_distance` or `clearance`"
+    if fault:
+        raise ConfigError(f"{world.source}: {fault}, or enlarge the world.")
     for key, places in (("starts", world.starts), ("goals", world.goals)):
         _check(world, key, places, area, cells)
     free = np.flatnonzero(area), np.flatnonzero(cells.distances > 0.0)
@@ -311,7 +301,6 @@ def _check(
         fits[f"{key}.at.{number}"] = inside and bool(area[i, j]), list(at)
     for place, (free, value) in fits.items():
         if not free:
-            raise ConfigError(
-                f"{world.source}: key {place!r}: a robot with {world.clearance:g} m around it does "
-                f"not fit there, at {value}; move it, or lower `clearance`."
-            )
+            robot = f"a robot with {world.clearance:g} m around it does not fit there, at {value}"
+            fix = "move it, or lower `clearance`."
+            raise ConfigError(f"{world.source}: key {place!r}: {robot}; {fix}")

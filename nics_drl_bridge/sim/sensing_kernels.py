@@ -12,10 +12,11 @@ import math
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import fault_kernels, scan_kernels
+from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, X, Y
 from nics_drl_bridge.robot.kernels import move, wrap
 from nics_drl_bridge.sim import contact_kernels as contacts
-from nics_drl_bridge.sim.state import Array, Dynamics, LidarView, Scratch, State, Surroundings
+from nics_drl_bridge.sim.state import Array, Dynamics, Scratch, State, Surroundings
 
 POSE, TWIST, ODOM, MEASURED, PAST = 0, 3, 6, 9, 12  # Columns of `past`
 
@@ -132,7 +133,7 @@ def drift_of(n: int, m: int, state: State, period: float) -> tuple[float, float,
 
 @kernel(inline=True)
 def scan_or_wait(
-    n: int, waiting: int, state: State, scene: Surroundings, view: LidarView, motion: Dynamics,
+    n: int, waiting: int, state: State, scene: Surroundings, lidar: LidarArrays, motion: Dynamics,
     scratch: Scratch,
 ) -> int:  # fmt: skip
     """Scans world n, unless `scan_together` can; returns how many worlds now wait for it."""
@@ -141,7 +142,7 @@ def scan_or_wait(
         alone = alone or state.age[n, m] > 0 or state.faults[n, m, fault_kernels.SKEW] != 0.0
     if alone:
         for m in range(state.pose.shape[1]):
-            _scan_alone(n, m, state, scene, view, motion, scratch)
+            _scan_alone(n, m, state, scene, lidar, motion, scratch)
         return waiting
     scratch.scans.waiting[waiting] = n
     return waiting + 1
@@ -149,35 +150,31 @@ def scan_or_wait(
 
 @kernel
 def scan_together(
-    waiting: int, state: State, scene: Surroundings, view: LidarView, scratch: Scratch
+    waiting: int, state: State, scene: Surroundings, lidar: LidarArrays, scratch: Scratch
 ) -> None:
     """Scans the first `waiting` worlds of the list in the scratch memory, as they stand."""
     scans = scratch.scans
     chosen, first = scans.waiting[:waiting], state.velocity.shape[1]
     scan_kernels.scan_worlds(
-        state.ranges, state.pose, chosen, state.bodies, first, scene.walls, view.sensor,
-        scans.lookup,
-    )  # fmt: skip
-    if view.grid.squares.size > 0:
-        scan_kernels.add_map(
-            state.ranges, state.pose, chosen, view.sensor, view.grid, view.exact, scans.lookup
-        )
+        state.ranges, state.pose, chosen, state.bodies, first, scene.walls, lidar, scans.lookup
+    )
 
 
 @kernel
-def distort(low: int, high: int, state: State, view: LidarView) -> None:
+def distort(low: int, high: int, state: State, lidar: LidarArrays) -> None:
     """Applies the faults of each robot's device to the scans of the worlds [low, high)."""
+    limits = lidar.range_min, lidar.range_max
     for n in range(low, high):
         for m in range(state.ranges.shape[1]):
             counter = state.steps[n] * state.ranges.shape[1] + m
             fault_kernels.distort(
-                state.ranges[n, m], view.limits, state.faults[n, m], state.seeds[n], counter
+                state.ranges[n, m], limits, state.faults[n, m], state.seeds[n], counter
             )
 
 
 @kernel
 def _scan_alone(
-    n: int, m: int, state: State, scene: Surroundings, view: LidarView, motion: Dynamics,
+    n: int, m: int, state: State, scene: Surroundings, lidar: LidarArrays, motion: Dynamics,
     scratch: Scratch,
 ) -> None:  # fmt: skip
     """Scans one robot from its own place and time, maybe skewed."""
@@ -187,27 +184,21 @@ def _scan_alone(
     lag = lag_of(state.age[n, m], steps, past.shape[2], substeps)
     here[0], here[1], here[2] = at_lag(past, n, m, POSE, lag, steps, substeps)
     drive[0], drive[1], drive[2] = at_lag(past, n, m, TWIST, lag, steps, substeps)
-    reach = view.limits[1] + math.hypot(view.mount[0], view.mount[1])
+    reach = lidar.range_max + math.hypot(lidar.mount[0], lidar.mount[1])
     if skew != 0.0:
-        reach += math.hypot(drive[0], drive[1]) * view.sweep_time
+        reach += math.hypot(drive[0], drive[1]) * lidar.sweep_time
     count = _gather(n, m, lag, reach, state, scene, motion, scratch)
     seen = scans.seen[:count].reshape((1, count, 7))
     begin = (n * state.ranges.shape[1] + m) * beams
     scan = state.ranges.reshape(-1)[begin : begin + beams].reshape((1, 1, beams))
     groups = 1 if skew == 0.0 else scans.slices.shape[0]
     if groups > 1:
-        fault_kernels.slice_poses(scans.slices, spot[0, 0], drive, view.sweep_time, skew)
+        fault_kernels.slice_poses(scans.slices, spot[0, 0], drive, lidar.sweep_time, skew)
     for g in range(groups):  # large functions are called below: compiling them once is enough
         out = scan if groups == 1 else scans.part
         for i in range(3 if groups > 1 else 0):
             spot[0, 0, i] = scans.slices[g, i]
-        scan_kernels.scan_worlds(
-            out, spot, scans.none, seen, -1, scene.walls, view.sensor, scans.lookup
-        )
-        if view.grid.squares.size > 0:
-            scan_kernels.add_map(
-                out, spot, scans.none, view.sensor, view.grid, view.exact, scans.lookup
-            )
+        scan_kernels.scan_worlds(out, spot, scans.none, seen, -1, scene.walls, lidar, scans.lookup)
         for i in range(g * beams // groups, (g + 1) * beams // groups if groups > 1 else 0):
             scan[0, 0, i] = scans.part[0, 0, i]
 

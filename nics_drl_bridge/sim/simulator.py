@@ -25,7 +25,7 @@ from nics_drl_bridge.sim.allocation import Sizes, allocate, part_of, split, surr
 from nics_drl_bridge.sim.randomisation import Draws, Randomisation, Sampler, load_randomisation
 from nics_drl_bridge.sim.scenes import Scenes, SceneSampler
 from nics_drl_bridge.sim.world import World
-from nics_drl_bridge.threads import Crew
+from nics_drl_bridge.threads import run_parts
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -77,13 +77,12 @@ class CommandBox:
         least, most = flat.min(axis=0), flat.max(axis=0)
         outside = (least < self._low) | (most > self._high)
         if outside.any():
-            self._armed = False
-            i = int(np.argmax(outside))
+            self._armed, i = False, int(np.argmax(outside))
             value = least[i] if least[i] < self._low[i] else most[i]
+            fitted = f"{self._range[0][i]:.4g} to {self._range[1][i]:.4g} only"
+            fix = "its motion there is extrapolated; record a drive that covers it."
             self._tell(
-                f"{self._names[i]} is {value:.4g}, but the model was fitted to "
-                f"{self._range[0][i]:.4g} to {self._range[1][i]:.4g} only: its motion there is "
-                "extrapolated; record a drive that covers it."
+                f"{self._names[i]} is {value:.4g}, but the model was fitted to {fitted}: {fix}"
             )
 
 
@@ -96,13 +95,10 @@ def _check_speed(model: TaylorModel, robot: RobotSpec, world: World) -> None:
     products = np.prod(most**model.powers, axis=1)
     step = float((np.abs(model.coefficients[:2]) @ products).max() * model.dt)
     x1, y1, x2, y2 = world.extent
-    least = min(x2 - x1, y2 - y1)
-    if not step < least:
-        raise ConfigError(
-            f"the robot {robot.name!r} could drive {step:.3g} m in a step of {model.dt:g} s, "
-            f"across a world of {least:.3g} m; lower the limits of its commands, or generate its "
-            "model with a shorter step."
-        )
+    if not step < (least := min(x2 - x1, y2 - y1)):
+        drives = f"could drive {step:.3g} m in a step of {model.dt:g} s, across {least:.3g} m"
+        fix = "lower the limits of its commands, or generate its model with a shorter step."
+        raise ConfigError(f"the robot {robot.name!r} {drives} of world; {fix}")
 
 
 def _check_memory(model: SimulatorModel, world: World, worlds: int, robots: int) -> None:
@@ -122,17 +118,12 @@ class FastSimulator:
     A world is bit-identical in a batch of any size and with any number of threads. The M robots of
     a world scan and collide with each other.
 
-    Args:
-        model, world: the robot with its lidar and noise, and the field with its obstacles.
-        worlds, robots: N, and M in each world.
-        renderer: `auto`, `baked` or `exact`, see `lidar.scanner.Scanner`.
-        threads: number of parts of the worlds that are stepped in parallel.
-        randomisation: ranges drawn from in each episode: an object, the name of a shipped one, or
-            a YAML file.
-        longest_delay, longest_age: greatest values that `data.delay` of commands (by default the
-            model's) and `data.age` of scan and odometry may be set to [substeps]; raised to the
-            randomisation's greatest.
-        tell: called with a message when commands leave the range that the model was fitted to.
+    The renderer is `auto`, `baked` or `exact`, see `lidar.scanner.Scanner`; `threads` parts of the
+    worlds are stepped in parallel. The randomisation, drawn from in each episode, may be the name
+    of a shipped one, or a YAML file. `longest_delay` and `longest_age` are the greatest values that
+    `data.delay` of commands (by default the model's) and `data.age` of scan and odometry may be set
+    to [substeps], raised to the randomisation's. `tell` is called with a message when commands
+    leave the range that the model was fitted to.
     """
 
     def __init__(
@@ -176,7 +167,6 @@ class FastSimulator:
         self.parts = split(worlds, threads)  # the worlds that each thread steps
         known = model.kinematics, model.robot, tell
         self._boxes = {part.start: CommandBox(*known) for part in self.parts}
-        self._crew = Crew(len(self.parts))
 
     @cached_property
     def packed(self) -> dict[int, Any]:
@@ -215,10 +205,8 @@ class FastSimulator:
         scenes, draws = self._draw(seeds)
         begin = scenes.starts if starts is None else np.asarray(starts, dtype=np.float64)
         if len(scenes) != len(chosen) or begin.shape != scenes.starts.shape:
-            raise ConfigError(
-                f"{len(scenes)} seeds and starts {begin.shape} must be of {len(chosen)} worlds "
-                f"with {self.data.pose.shape[1]} robots each."
-            )
+            needed = f"{len(chosen)} worlds with {self.data.pose.shape[1]} robots each."
+            raise ConfigError(f"{len(scenes)} seeds and starts {begin.shape} must be of {needed}")
         self._place(chosen, np.asarray(seeds, dtype=np.int64), scenes, begin)
         if draws is not None:
             self._assign(chosen, draws)
@@ -278,7 +266,7 @@ class FastSimulator:
 
     def run_parts(self, function: Callable[[slice], R]) -> list[R]:
         """Runs a function for each of `parts`, one thread per part; returns the results."""
-        return self._crew.run(function, self.parts)
+        return run_parts(function, self.parts)
 
     def step_part(self, part: slice, commands: ArrayLike) -> None:
         """Moves the worlds of one of `parts` under commands (n, M, C), in the calling thread."""
@@ -295,9 +283,7 @@ class FastSimulator:
         robots, _, width = self.data.history.shape[1:]
         expected = (part.stop - part.start, robots, width)
         if checked.shape != expected:
-            raise ConfigError(
-                f"commands are {checked.shape}; they must be {expected}: worlds, robots, and a "
-                "robot's commands."
-            )
+            needed = f"they must be {expected}: worlds, robots, and a robot's commands."
+            raise ConfigError(f"commands are {checked.shape}; {needed}")
         self._boxes[part.start].check(checked)
         return checked

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
-from nics_drl_bridge.lidar.map_kernels import GridArrays
 from nics_drl_bridge.lidar.scan_kernels import ScanLanes
 from nics_drl_bridge.robot.kernels import Terms
 
@@ -78,17 +77,6 @@ class Surroundings(NamedTuple):
     crowded: bool  # True if the bodies of a world are sorted into cells
     scattered: bool  # True if scans use the cells too
     movers: Movers
-
-
-class LidarView(NamedTuple):
-    """The lidar."""
-
-    sensor: LidarArrays  # the lidar and its table
-    grid: GridArrays  # the static map as scanned
-    exact: bool  # True if the map is scanned exactly
-    mount: Array  # (3,) pose of the lidar on the robot
-    limits: Array  # (2,) least and greatest range [m]
-    sweep_time: float  # duration of a sweep [s]
 
 
 class Dynamics(NamedTuple):
@@ -172,6 +160,6 @@ class Part(NamedTuple):
 
     state: State
     scene: Surroundings
-    lidar: LidarView
+    lidar: LidarArrays
     motion: Dynamics
     scratch: Scratch

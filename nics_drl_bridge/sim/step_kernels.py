@@ -14,6 +14,7 @@ from numba import types
 from numba.experimental import structref
 
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.robot.kernels import Terms, delayed, run, wrap
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import obstacle_kernels as obstacles
@@ -24,7 +25,6 @@ from nics_drl_bridge.sim.state import (
     Dynamics,
     Integers,
     Lanes,
-    LidarView,
     Part,
     Scratch,
     State,
@@ -146,7 +146,7 @@ def step_worlds(packed: Any, commands: Array, begin: int) -> None:
 
 @kernel
 def _step(
-    state: State, scene: Surroundings, view: LidarView, motion: Dynamics, scratch: Scratch,
+    state: State, scene: Surroundings, lidar: LidarArrays, motion: Dynamics, scratch: Scratch,
     commands: Array, begin: int,
 ) -> None:  # fmt: skip
     """See `step_worlds`; without reference counts, which took longer than the step."""
@@ -163,9 +163,9 @@ def _step(
             skip = (n - low) * many
             _move_world(n, skip, state, scene, motion, scratch)
             _measure(n, skip, state, motion, scratch)
-            waiting = sensing.scan_or_wait(n, waiting, state, scene, view, motion, scratch)
-        sensing.scan_together(waiting, state, scene, view, scratch)
-        sensing.distort(low, high, state, view)
+            waiting = sensing.scan_or_wait(n, waiting, state, scene, lidar, motion, scratch)
+        sensing.scan_together(waiting, state, scene, lidar, scratch)
+        sensing.distort(low, high, state, lidar)
 
 
 @kernel(inline=True)

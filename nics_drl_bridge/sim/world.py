@@ -47,9 +47,8 @@ class Obstacles(Schema):
         several = count if isinstance(count, list | tuple) else (count, count)
         whole = len(several) == 2 and all(type(n) is int for n in several)
         if count is not None and not (whole and 0 <= several[0] <= several[1] <= MOST_OBSTACLES):
-            raise ValueError(
-                f"count must be a whole number, or [least, greatest], from 0 to {MOST_OBSTACLES}"
-            )
+            needed = f"a whole number, or [least, greatest], from 0 to {MOST_OBSTACLES}"
+            raise ValueError(f"count must be {needed}")
         return count
 
     @model_validator(mode="after")
@@ -191,10 +190,8 @@ def check_places(world: World) -> None:
         waypoints = group.motion.waypoints if isinstance(group.motion, Patrol) else ()
         for n, point in enumerate(waypoints):
             if _room_at(world, *point) < radius:
-                raise ConfigError(
-                    f"{where}.motion.waypoints.{n}': an obstacle of radius {radius:g} m does not "
-                    f"fit there, at {list(point)}; move it."
-                )
+                reason = f"an obstacle of radius {radius:g} m does not fit there, at {list(point)}"
+                raise ConfigError(f"{where}.motion.waypoints.{n}': {reason}; move it.")
 
 
 def _inside(world: World, x: float, y: float) -> bool:

@@ -31,11 +31,11 @@ ENVS = {"single": single, "vector": vector, "agents": agents}
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        ({"seed": 2**63}, "^seed 9223372036854775808: must be at most"),
-        ({"seed": 2**200}, "^seed of 201 bits: must be at most"),
-        ({"seed": 10**6000}, "^seed of 19932 bits: must be at most"),
-        ({"seed": "three"}, "^seed of type str: must be an integer, or None"),
-        ({"seed": 3.0}, "^seed of type float: must be an integer, or None"),
+        ({"seed": 2**63}, "^seed 9223372036854775808: must be a whole number"),
+        ({"seed": 2**200}, "^seed 16069\\d*\\.\\.\\.\\d*: must be a whole number"),
+        ({"seed": 10**6000}, "^seed of very many digits: must be a whole number"),
+        ({"seed": "three"}, "^seed 'three': must be a whole number"),
+        ({"seed": 3.0}, "^seed 3.0: must be a whole number"),
         ({"options": [1]}, "^reset options of type list: must be a dict"),
         ({"options": "start"}, "^reset options of type str: must be a dict"),
         ({"options": {"gaol": (1.0, 1.0)}}, "^unknown reset option 'gaol'; did you mean 'goal'?"),
@@ -53,7 +53,7 @@ def test_what_a_reset_cant_use_is_one_sentence_and_the_next_reset_works(kind, ar
 
 @pytest.mark.parametrize("kind", sorted(ENVS))
 def test_a_negative_seed_is_one_sentence(kind):
-    with pytest.raises(gymnasium.error.Error, match="must be greater or equal to zero"):
+    with pytest.raises(ConfigError, match="seed -1: must be a whole number"):
         ENVS[kind]().reset(seed=-1)
 
 
@@ -63,7 +63,7 @@ def test_the_greatest_seed_works():
 
 
 def test_the_last_world_counts_on_from_the_seed_of_the_first():
-    with pytest.raises(ConfigError, match=r"must be at most 2\*\*63 - 3\.$"):
+    with pytest.raises(ConfigError, match=f"must be a whole number from 0 to {2**63 - 3}"):
         vector(3).reset(seed=2**63 - 2)
 
 

@@ -62,12 +62,6 @@ def test_every_row_is_finite_and_lies_between_touching_and_out_of_range(make):
     assert rows.max() <= SPEC.range_max + 2.0 * shape.radius
 
 
-def test_progress_runs_to_its_end():
-    told = []
-    bake(SPEC, (SQUARE, Circle(radius=0.2)), SMALL, progress=lambda *what: told.append(what))
-    assert told == [(i, 5) for i in range(1, 6)]
-
-
 def test_shapes_are_added_at_the_density_of_the_table():
     table = bake(SPEC, [SQUARE], SMALL)
     assert with_shapes(SPEC, table, [SQUARE]) is table

@@ -2,12 +2,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from lidar_scenes import scan_skewed
+from lidar_scenes import scan_skewed, slice_poses
 from robots import direct_model, field, lidar
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.lidar import fault_kernels
-from nics_drl_bridge.lidar.faults import LidarFaults, distort, slice_poses
+from nics_drl_bridge.lidar.faults import LidarFaults
 from nics_drl_bridge.lidar.scanner import make_scanner
 from nics_drl_bridge.sim.simulator import FastSimulator
 
@@ -21,7 +21,9 @@ def scan_at(distance, beams=BEAMS):
 
 
 def reported(ranges, noise_std=0.0, seed=1, counter=0, **faults):
-    return distort(ranges, LIMITS, LidarFaults(**faults).parameters(noise_std), seed, counter)
+    out, row = ranges.copy(), LidarFaults(**faults).parameters(noise_std)
+    fault_kernels.distort(out, np.array(LIMITS), row, seed, counter)
+    return out
 
 
 def mixed_scan():

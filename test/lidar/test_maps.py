@@ -140,7 +140,10 @@ def test_the_shipped_map_is_one_closed_room_with_doors():
         ({"resolutoin": 1}, "map.yaml: unknown key 'resolutoin'; did you mean 'resolution'?"),
         ({"resolution": 0}, "key 'resolution': input should be greater than or equal to 0.0001"),
         ({"origin": [0, 0]}, "key 'origin"),
-        ({"mode": "trinery"}, "key 'mode': unknown mode; did you mean 'trinary'?"),
+        (
+            {"mode": "trinery"},
+            "key 'mode': input should be 'trinary', 'scale' or 'raw', not 'trinery'",
+        ),
         ({"free_thresh": 0.7}, "free_thresh must be less than occupied_thresh"),
         ({"occupied_thresh": 65}, "key 'occupied_thresh': input should be less than or equal to 1"),
         ({"negate": 2}, "key 'negate'"),

@@ -480,7 +480,7 @@ def test_a_lidar_of_the_most_beams_scans_exactly_without_a_table(view, few, ever
     expected, clear = by_plane_geometry(spec.model_copy(update={"beams": few}), scene)
     assert scan(scanner, scene)[::every][clear] == pytest.approx(expected[clear], abs=1e-3)
     assert np.isfinite(expected[clear]).sum() > 50
-    with pytest.raises(ModelError, match="has no rows to look up with the renderer 'baked'; scan"):
+    with pytest.raises(ModelError, match="no rows to look up with the renderer 'baked'; bake one"):
         Scanner(spec, scanner.table, "baked")
 
 

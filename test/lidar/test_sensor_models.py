@@ -61,8 +61,8 @@ def test_a_file_of_sensor_models_reads_to_what_it_says(tmp_path):
          "you mean 'threshold'?"),
         ("[{kind: intensty}]", "unknown kind 'intensty'; did you mean 'intensity'?"),
         ("[{gain: 3}]", "the key 'sensor_model.0.kind' is missing; add it."),
-        ("[{kind: incidence_dropout, greatest_incidence: 75}]", "must lie between 0 and a right "
-         "angle, in radians, not 75."),
+        ("[{kind: incidence_dropout, greatest_incidence: 75}]", "input should be less than "
+         "1.5707963267948966, not 75."),
         ("[{kind: intensity}, {kind: intensity}]", "one model of the kind intensity; keep one"),
         ("[{kind: intensity, reflectivity: 0}]", "should be greater than 0, not 0."),
     ],

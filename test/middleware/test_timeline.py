@@ -213,7 +213,7 @@ def test_the_past_is_as_long_as_a_second_and_no_longer(timeline):
     for k in range(1, 1001):
         timeline.measure(SECOND + k * 10 * MILLISECOND, twist())
     assert len(timeline._entries) == 102
-    assert timeline.outcomes()[Kind.TWIST, Acceptance.USED] == 1000
+    assert timeline.outcomes[Kind.TWIST, Acceptance.USED] == 1000
 
 
 def test_a_late_command_after_a_silence_finds_the_commands_before_it():

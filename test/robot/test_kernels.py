@@ -65,7 +65,9 @@ def test_robots_side_by_side_move_as_the_model_steps_each(order):
     pose[2], pose[3] = np.cos(start[:, 2]), np.sin(start[:, 2])
     x = np.ones((5, 37))
     x[:4] = inputs.T
-    run(pose, x, np.zeros((5, 37)), term_arrays(model), SERIES, model.dt, 10)
+    terms = term_arrays(model)
+    lanes = terms._replace(coefficient=np.tile(terms.coefficient[:, None], 37))
+    run(pose, x, np.zeros((5, 37)), lanes, SERIES, model.dt, 10)
     moved, state = start, inputs[:, :2]
     for _ in range(10):
         moved, state = model.step(moved, state, inputs[:, 2:])

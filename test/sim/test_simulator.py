@@ -5,13 +5,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lidar_scenes import scan_skewed
+from lidar_scenes import scan_skewed, slice_poses
 from robots import FOOTPRINT, RADIUS, circles, direct_model, field, lidar
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.lidar.faults import slice_poses
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.robot.taylor import TaylorModel

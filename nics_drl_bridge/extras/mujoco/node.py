@@ -12,11 +12,11 @@ from rclpy.node import Node
 from nics_drl_bridge.extras.mujoco.machines import Physics
 from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import Simulator
 from nics_drl_bridge.lidar.scanner import RENDERERS, Renderer
 from nics_drl_bridge.nodes.device_parameters import choice
 from nics_drl_bridge.nodes.runner import declare, run_node
 from nics_drl_bridge.nodes.simulator_node import DeviceNode
+from nics_drl_bridge.sim.device import Simulator
 from nics_drl_bridge.sim.world import World
 
 
