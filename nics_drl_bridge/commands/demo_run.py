@@ -74,20 +74,6 @@ class Learned:
     curve: Sequence[Point] = ()
 
 
-@dataclass(frozen=True)
-class DemoResults:
-    """All results of the demo; `here` and `there` are the same episodes in process and over DDS."""
-
-    model: SimulatorModel
-    identified: Identified
-    learned: Learned
-    summary: Summary  # of the policy's many episodes in the fast simulator
-    here: Sequence[Episode]
-    there: Sequence[Episode]
-    live: Episode  # of the deployed nodes
-    took: dict[str, float]  # part of the demo -> wall time [s]
-
-
 def run(plan: DemoPlan, say: Say) -> str:
     """Generates a simulator, trains a policy in it, drives it over DDS, and writes the report.
 
@@ -113,9 +99,17 @@ def run(plan: DemoPlan, say: Say) -> str:
     there = timed("driving over DDS", _drive, DDS, learned.policy)
     arrived = (episode.seed for episode in there if episode.result == "success")
     live = timed("deploying", _deploy, model, learned.policy, next(arrived, 0))
-    results = DemoResults(model, identified, learned, summary, here, there, live, took)
-    file = plan.out / "report.html"
-    write_text(file, report(plan, results))
+    times = [(part, f"{s:.0f}") for part, s in {**took, "all": sum(took.values())}.items()]
+    sections: list[tuple[str, Sequence[Block]]] = [
+        ("The model", _model(plan, model, identified)),
+        ("The policy", _policy(plan, learned, summary)),
+        ("The same episodes, in process and over DDS", _episodes(plan, model, here, there)),
+        ("Deployed", _deployed(plan, model, here, live)),
+        ("Time", [Table(("part", "wall time [s]"), times)]),
+    ]
+    name, file = model.robot.name, plan.out / "report.html"
+    lead = f"Robot {name!r} in the world {plan.world!r}, policy {learned.policy!r}."
+    write_text(file, page("nics_drl_bridge: demo", lead, sections))
     return (
         f"demo: in process {successes(here)}/{plan.episodes}, "
         f"over DDS {successes(there)}/{plan.episodes}, report {file}"
@@ -148,7 +142,11 @@ def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
     missing = next((module for module in NEEDED if find_spec(module) is None), None)
     if missing is None:
         return _trained(plan, say)
-    policy = _ready_made(model)
+    policy = BASELINE
+    if model.robot.name in shipped_policies() and find_spec("onnxruntime") and find_spec("onnx"):
+        with suppress(PolicyError):  # a shipped one may not fit
+            open_policy(model.robot.name, model)
+            policy = model.robot.name
     say(
         f"not training, which needs the module {missing!r} (pip install "
         f"'nics_drl_bridge[train,deploy]'); driving with the policy {policy!r} instead"
@@ -184,16 +182,6 @@ def _trained(plan: DemoPlan, say: Say) -> Learned:
     steps = f"{trained.steps:,} steps, {trained.stepping_s:.0f} s of {trained.wall_s:.0f} s"
     how = f"PPO learned it from nothing in the generated simulator: {steps} in the simulator."
     return Learned(str(file), how, curve)
-
-
-def _ready_made(model: SimulatorModel) -> str:
-    """The shipped policy of the robot if it fits, else a baseline."""
-    name = model.robot.name
-    if name in shipped_policies() and find_spec("onnxruntime") and find_spec("onnx"):
-        with suppress(PolicyError):
-            open_policy(name, model)
-            return name
-    return BASELINE
 
 
 def _evaluate(plan: DemoPlan, model: SimulatorModel, name: str, say: Say) -> Summary:
@@ -290,39 +278,22 @@ def _write_limits(robot: RobotSpec, path: Path) -> Path:
     return path
 
 
-def report(plan: DemoPlan, results: DemoResults) -> str:
-    """Builds the page, as HTML."""
-    took = {**results.took, "all": sum(results.took.values())}
-    times = [(part, f"{seconds:.0f}") for part, seconds in took.items()]
-    sections: list[tuple[str, Sequence[Block]]] = [
-        ("The model", _model(plan, results)),
-        ("The policy", _policy(plan, results)),
-        ("The same episodes, in process and over DDS", _episodes(plan, results)),
-        ("Deployed", _deployed(plan, results)),
-        ("Time", [Table(("part", "wall time [s]"), times)]),
-    ]
-    policy = results.learned.policy
-    lead = f"Robot {results.model.robot.name!r} in the world {plan.world!r}, policy {policy!r}."
-    return page("nics_drl_bridge: demo", lead, sections)
-
-
-def _model(plan: DemoPlan, results: DemoResults) -> list[Block]:
-    calibrated = calibration_pictures(results.model.robot, results.identified)
+def _model(plan: DemoPlan, model: SimulatorModel, identified: Identified) -> list[Block]:
+    calibrated = calibration_pictures(model.robot, identified)
     caption = "What each further term is worth; circles mark how many are kept."
     return [
         f"Generated from {plan.recording or 'a textbook drive'}.",
-        Code(results.model.report),
-        Picture(accuracy(results.identified), caption),
+        Code(model.report),
+        Picture(accuracy(identified), caption),
         *(Picture(picture, CAPTIONS[name]) for name, picture in calibrated.items()),
     ]
 
 
-def _policy(plan: DemoPlan, results: DemoResults) -> list[Block]:
-    blocks: list[Block] = [results.learned.how]
-    if results.learned.curve:
+def _policy(plan: DemoPlan, learned: Learned, summary: Summary) -> list[Block]:
+    blocks: list[Block] = [learned.how]
+    if learned.curve:
         caption = "Success and collisions while it explores; all episodes are new ones."
-        blocks.append(Picture(training_curve(results.learned.curve), caption))
-    summary = results.summary
+        blocks.append(Picture(training_curve(learned.curve), caption))
     rows = [
         (name, *(f"{100 * value:.1f} %" for value in astuple(share)))
         for name, share in summary.shares.items()
@@ -336,34 +307,34 @@ def _policy(plan: DemoPlan, results: DemoResults) -> list[Block]:
     return [*blocks, text, Table(("", "value", "95 % from", "to"), rows)]
 
 
-def _episodes(plan: DemoPlan, results: DemoResults) -> list[Block]:
-    here, there = results.here, results.there
+def _episodes(
+    plan: DemoPlan, model: SimulatorModel, here: Sequence[Episode], there: Sequence[Episode]
+) -> list[Block]:
     both, each = (LABELS[FAST], LABELS[DDS]), ("steps", "path [m]")
-    head = ("seed", both[0], *each, both[1], *each, "deviation [m]")
     rows = [
-        (f"{a.seed}", *_cells(a), *_cells(b), f"{deviation(a, b):.1g}")
+        (
+            f"{a.seed}", a.result, f"{a.steps}", f"{a.length:.2f}",
+            b.result, f"{b.steps}", f"{b.length:.2f}", f"{deviation(a, b):.1g}",
+        )
         for a, b in zip(here, there, strict=True)
-    ]
+    ]  # fmt: skip
     runs = {both[0]: here[:PANELS], both[1]: there[:PANELS]}
-    drawn = trajectories(runs, load_world(plan.world), results.model.robot.footprint_radius)
+    drawn = trajectories(runs, load_world(plan.world), model.robot.footprint_radius)
     return [
         f"{successes(here)} of {len(here)} episodes reached the goal in process, "
         f"{successes(there)} of {len(there)} over DDS in lock-step. Deviation is the "
         "greatest distance between the two true paths at the same step.",
-        Table(head, rows),
+        Table(("seed", both[0], *each, both[1], *each, "deviation [m]"), rows),
         Picture(drawn, "Blue: in process. Red, dashed: over DDS."),
     ]
 
 
-def _cells(episode: Episode) -> tuple[str, str, str]:
-    return episode.result, f"{episode.steps}", f"{episode.length:.2f}"
-
-
-def _deployed(plan: DemoPlan, results: DemoResults) -> list[Block]:
-    live = results.live
-    beside = [episode for episode in results.here if episode.seed == live.seed]
+def _deployed(
+    plan: DemoPlan, model: SimulatorModel, here: Sequence[Episode], live: Episode
+) -> list[Block]:
+    beside = [episode for episode in here if episode.seed == live.seed]
     runs = {LABELS[FAST]: beside, "deployed": [live]}
-    drawn = trajectories(runs, load_world(plan.world), results.model.robot.footprint_radius)
+    drawn = trajectories(runs, load_world(plan.world), model.robot.footprint_radius)
     return [
         "simulator_node in real time, middleware_node, policy_node and command_gate ran as "
         "processes of their own; nobody stepped them. The robot "

@@ -16,8 +16,10 @@ from nics_drl_bridge.commands.console import (
     TopicsOption,
     WorldOption,
     intact,
+    needs_ros,
     one_sentence,
 )
+from nics_drl_bridge.errors import BackendError
 
 
 def record(
@@ -43,23 +45,29 @@ def record(
     with one_sentence():
         from nics_drl_bridge.nodes import recorder
 
-        order = recorder.RecordOrder(
-            robot, out, bound, duration, speed, seed, namespace, tuple(remap or ()), topics,
-            stamped, use_sim_time,
-        )  # fmt: skip
+        arguments = recorder.arguments(namespace, remap or ())
+        given = {
+            "robot": robot, "out": str(out), "bound": bound, "duration": duration, "speed": speed,
+            "seed": seed, "topics": str(topics or ""), "stamped": stamped,
+            "use_sim_time": use_sim_time,
+        }  # fmt: skip
         if not preview:
-            recorder.require_ros()  # first: with ROS 2 from wheels it restarts Python
-        for line in recorder.preview(order):
+            with needs_ros("nics record"):  # first: with ROS 2 from wheels it restarts Python
+                from nics_drl_bridge.nodes.record_node import record as drive
+        for line in recorder.preview(given):
             typer.echo(line)
         if preview:
             return
         if not yes and not typer.confirm("Drive the robot now?"):
             typer.echo("nothing was driven or recorded.")
             return
-        lines, whole = recorder.drive(order)
-        for line in lines:
-            typer.echo(line)
-        if not whole:
+        driven = drive(given, arguments)
+        if driven.failure is not None:
+            raise BackendError(driven.line)
+        typer.echo(driven.line)
+        if driven.recording is not None:
+            typer.echo("\n".join(recorder.summary(driven.recording, given)))
+        if not driven.complete:
             raise typer.Exit(EXIT_INTERRUPTED)
 
 
