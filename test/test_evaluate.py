@@ -109,7 +109,7 @@ def test_bad_input_ends_it_with_one_sentence(tmp_path, words, said):
 @pytest.mark.campaign
 @needs_nodes
 def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path, monkeypatch):
-    from nics_drl_bridge.commands import vehicle
+    from nics_drl_bridge.commands import episodes as vehicle
     from nics_drl_bridge.nodes.processes import NodeProcess, Witness
 
     limits = {

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS, Say, Trial, drive_in
+from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS, Say, drive_in
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
@@ -202,11 +202,9 @@ def _drive(plan: DemoPlan, place: str, policy: str, say: Say) -> list[Episode]:
     say(f"driving {'' if place == FAST else 'the same '}{plan.episodes} episodes {where}")
     seeds, logs = range(plan.episodes), plan.out / "logs" / place
     return drive_in(
-        place,
-        Trial(policy, str(plan.model), plan.world, seeds, logs),
-        lambda e: say(f"  seed {e.seed}: {e.result}, {e.steps} steps, {e.length:.2f} m"),
-        say,
-    )
+        place, policy, str(plan.model), plan.world, seeds, logs,
+        lambda e: say(f"  seed {e.seed}: {e.result}, {e.steps} steps, {e.length:.2f} m"), say,
+    )  # fmt: skip
 
 
 def _deploy(plan: DemoPlan, model: SimulatorModel, policy: str, seed: int, say: Say) -> Episode:

@@ -81,7 +81,7 @@ def evaluate(
         if shadow is not None:
             _shadow(shadow, policies, model, topic or [], place, ahead, out)
         elif hardware:
-            from nics_drl_bridge.commands.vehicle import VehicleOrder
+            from nics_drl_bridge.commands.episodes import VehicleOrder
 
             trip = VehicleOrder(
                 policies[0], out, model, world, episodes or 1, seed, start, place, namespace,
@@ -148,7 +148,7 @@ def _shadow(
 
 
 def _hardware(order: Any, yes: bool) -> None:
-    from nics_drl_bridge.commands.vehicle import drive_vehicle
+    from nics_drl_bridge.commands.episodes import drive_vehicle
 
     def ask(question: str) -> None:
         typer.echo(question)
