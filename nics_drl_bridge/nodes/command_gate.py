@@ -132,7 +132,7 @@ def _declare_shield(
 
 
 def scan(lidar: LidarSpec, content: bytes) -> inputs.Scan:
-    """Reads a serialised LaserScan; raises `wire.UNREADABLE`, as the next five."""
+    """Reads a serialised LaserScan; raises `wire.UNREADABLE`, as the other readers."""
     ranges = from_device(wire.ranges_of(content), lidar)
     return inputs.Scan(wire.stamp_of(content), ranges, wire.angles_of(content))
 
@@ -178,8 +178,7 @@ def take_priority(priority: int) -> str:
     if priority == 0:
         return ""
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-        for thread in os.listdir("/proc/self/task"):
+        for thread in ("0", *os.listdir("/proc/self/task")):
             with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
                 os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(priority))
     except (OSError, AttributeError) as error:  # the latter on systems without it
@@ -228,10 +227,11 @@ class CommandGate(qos.QosWatch):
             (Odometry, "odometry/filtered", estimate, qos.SENSOR),
             (TwistStamped, "cmd_vel_raw", command, qos.COMMAND),
             (Bool, "e_stop", e_stop, qos.EVERY_COMMAND),
+            *(
+                (sensor_type(each), each.name, partial(reading, each), qos.SENSOR)
+                for each in self._sensors
+            ),
         )
-        for each in self._sensors:
-            further = (sensor_type(each), each.name, partial(reading, each), qos.SENSOR)
-            readers = (*readers, further)
         for kind, topic, read, profile in readers:
             taker = partial(self._take, topic, read)
             self.create_subscription(kind, topic, taker, profile, raw=True)

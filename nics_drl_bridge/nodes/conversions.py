@@ -31,7 +31,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.sectors import Reader, reader_beside
 from nics_drl_bridge.lidar.sensor import Sensor
-from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader, from_device, to_device
+from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader, to_device
 from nics_drl_bridge.recording.messages import POSITION_UNITS
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -75,9 +75,8 @@ def is_rotation(x: float, y: float, z: float, w: float) -> bool:
 
 def twist_to_ros(twist: ArrayLike) -> Twist:
     """Returns linear.x, linear.y, angular.z (3,) as a Twist."""
-    x, y, w = (float(value) for value in np.asarray(twist))
     message = Twist()
-    message.linear.x, message.linear.y, message.angular.z = x, y, w
+    message.linear.x, message.linear.y, message.angular.z = np.asarray(twist, np.float64).tolist()
     return message
 
 
@@ -105,11 +104,6 @@ def scan_to_ros(
     return message
 
 
-def scan_from_ros(spec: LidarSpec, message: LaserScan) -> NDArray[np.float32]:
-    """Returns the ranges (B,) of the device's LaserScan, REP-117."""
-    return from_device(message.ranges, spec)
-
-
 def reader_from_ros(message: LaserScan, like: LidarSpec, upside_down: bool = False) -> Reader:
     """Returns the lidar of a header (the expected one if it agrees) and the order of its beams.
 
@@ -127,10 +121,9 @@ def odometry_to_ros(
 
     The variances are of position [m^2], heading [rad^2], linear [m^2/s^2], angular [rad^2/s^2].
     """
-    x, y, heading = (float(value) for value in np.asarray(pose))
-    message = Odometry()
+    x, y, heading = np.asarray(pose, np.float64).tolist()
+    message = Odometry(child_frame_id=frames[1])
     message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frames[0]
-    message.child_frame_id = frames[1]
     message.pose.pose.position.x, message.pose.pose.position.y = x, y
     message.pose.pose.orientation = heading_to_ros(heading)
     message.twist.twist = twist_to_ros(twist)
@@ -184,11 +177,9 @@ def joints_to_ros(spec: RobotSpec, state: ArrayLike, time_ns: int) -> JointState
 
 def message_type(kind: str) -> Any | None:
     """Returns the class of a type like `nav_msgs/msg/Odometry`; None if it is not installed."""
-    parts = kind.split("/")
-    if len(parts) != 3:
-        return None
+    module, _, name = kind.replace("/", ".").rpartition(".")
     try:
-        return getattr(import_module(f"{parts[0]}.{parts[1]}"), parts[2], None)
+        return getattr(import_module(module), name, None) if kind.count("/") == 2 else None
     except ImportError:
         return None
 
@@ -228,8 +219,7 @@ def message_texts(kind: str) -> dict[str, str]:
     waiting = [kind]
     while waiting:
         each = waiting.pop()
-        file = _message_file(each)
-        if each in texts or file is None:
+        if each in texts or (file := _message_file(each)) is None:
             continue
         texts[each] = file.read_text(encoding="utf-8")
         for name in filter(None, map(FIELD.match, texts[each].splitlines())):

@@ -239,18 +239,6 @@ class EpisodeServices:
         """True if a simulator offers them."""
         return all(client.service_is_ready() for client in self.clients)
 
-    def choose(self, start: Start, timeout_s: float) -> None:
-        """Chooses the episode for the next `begin`. Raises BackendError if it is refused."""
-        request = SetParametersAtomically.Request()
-        request.parameters = [
-            Parameter("episode_seed", value=int(start.seed)).to_parameter_msg(),
-            Parameter("episode_start", value=start.pose.ravel().tolist()).to_parameter_msg(),
-            Parameter("episode_start_given", value=True).to_parameter_msg(),
-        ]
-        result = self._link.call(self._parameters, request, timeout_s).result
-        if not result.successful:
-            raise BackendError(f"the simulator refused the episode: {result.reason}")
-
     def repeat(self) -> None:
         """Requests the present data again, without waiting, unless such a request is pending."""
         now, asked = time.monotonic(), self._repeating
@@ -261,11 +249,21 @@ class EpisodeServices:
         if self._repeat.service_is_ready():
             self._repeating, self._asked_s = self._repeat.call_async(Trigger.Request()), now
 
-    def begin(self, timeout_s: float) -> int:
-        """Begins the chosen episode; returns the stamp of its first data [ns].
+    def begin(self, start: Start, timeout_s: float) -> int:
+        """Begins an episode; returns the stamp of its first data [ns].
 
         Raises BackendError if the simulator refuses, ModelError if it runs another model or world.
         """
+        chosen = {
+            "episode_seed": int(start.seed), "episode_start": start.pose.ravel().tolist(),
+            "episode_start_given": True,
+        }  # fmt: skip
+        request = SetParametersAtomically.Request(
+            parameters=[Parameter(name, value=it).to_parameter_msg() for name, it in chosen.items()]
+        )
+        result = self._link.call(self._parameters, request, timeout_s).result
+        if not result.successful:
+            raise BackendError(f"the simulator refused the episode: {result.reason}")
         response = self._link.call(self._reset, Trigger.Request(), timeout_s)
         if not response.success:
             raise BackendError(f"the simulator could not reset: {response.message}")

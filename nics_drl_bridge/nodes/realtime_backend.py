@@ -137,8 +137,7 @@ class RealtimeBackend:
 
     def _begin(self, start: Start) -> None:
         timeout_s = self._options.timeout_s
-        self._episodes.choose(start, timeout_s)
-        stamp_ns = self._episodes.begin(timeout_s)
+        stamp_ns = self._episodes.begin(start, timeout_s)
         with self._topics.lock:
             self._topics.begin(stamp_ns, start.pose)
         if not holds(lambda: math.isfinite(self._oldest()[1]), timeout_s, POLL_S):

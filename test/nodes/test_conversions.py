@@ -95,7 +95,7 @@ def test_ranges_keep_their_infinities_nan_and_bits():
     )
     ranges = np.array([np.inf, -np.inf, np.nan, 0.1, np.pi, 7.999999], np.float32)
     message = over_the_wire(conversions.scan_to_ros(spec, ranges, 0, "l"))
-    back = conversions.scan_from_ros(spec, message)
+    back = from_device(message.ranges, spec)
     assert back.dtype == np.float32
     assert back.tobytes() == ranges.tobytes()
 
@@ -111,7 +111,7 @@ def test_ranges_of_a_slice_are_those_of_the_slice():
 
 def test_ranges_taken_from_a_message_are_a_copy():
     message = LaserScan(ranges=[1.0, 2.0])
-    ranges = conversions.scan_from_ros(FORWARD, message)
+    ranges = from_device(message.ranges, FORWARD)
     ranges[0] = 9.0
     assert message.ranges[0] == 1.0
 
@@ -126,7 +126,7 @@ def test_no_return_travels_in_the_words_of_the_device_and_comes_back_as_inf(no_r
     message = over_the_wire(conversions.scan_to_ros(spec, ranges, 0, "laser"))
     assert list(message.ranges[:2]) == [1.5, -math.inf]
     assert message.ranges[2] == pytest.approx(wire, nan_ok=True)
-    assert np.array_equal(conversions.scan_from_ros(spec, message), ranges)
+    assert np.array_equal(from_device(message.ranges, spec), ranges)
 
 
 def test_a_device_that_turns_while_it_measures_says_so_in_the_header():
