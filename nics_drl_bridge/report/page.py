@@ -7,6 +7,7 @@ import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -84,8 +85,19 @@ def _block(block: Block) -> str:
     return f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
 
 
+def panels(
+    rows: int, columns: int, size: tuple[float, float], **options: Any
+) -> tuple[Figure, list[Axes]]:
+    """Returns a figure of a size [inch], and its axes in rows."""
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, list(figure.subplots(rows, columns, squeeze=False, **options).ravel())
+
+
 def png(figure: Figure, legend: Axes | None = None) -> bytes:
-    """Renders a figure as a PNG, with the legend of one of its axes above them."""
+    """Renders a figure as a PNG, without empty axes, with the legend of one of them above."""
+    for axes in figure.axes:
+        if not axes.has_data():
+            axes.set_axis_off()
     if legend is not None:
         handles, labels = legend.get_legend_handles_labels()
         columns = max(3, len(labels))

@@ -14,7 +14,7 @@ from nics_drl_bridge.env.rendering import draw_world
 from nics_drl_bridge.policy.evaluation import Episode
 from nics_drl_bridge.policy.shadow import Shadow
 from nics_drl_bridge.recording.excite import Pattern
-from nics_drl_bridge.report.page import DARK, MEASURED, MODEL, OTHER, png
+from nics_drl_bridge.report.page import DARK, MEASURED, MODEL, OTHER, panels, png
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.world import World
 
@@ -35,12 +35,9 @@ def trajectories(runs: Mapping[str, Sequence[Episode]], world: World, footprint:
     count = max(len(episodes) for episodes in runs.values())
     columns, rows = min(count, 3), -(-count // 3)
     size = max(4.2 * columns, LEAST_WIDTH), 4.2 * rows + 0.5
-    figure = Figure(figsize=size, layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    figure, grid = panels(rows, columns, size)
     for axes, *episodes in zip(grid, *runs.values(), strict=False):
         _panel(axes, dict(zip(runs, episodes, strict=True)), world, footprint)
-    for axes in grid[count:]:
-        axes.set_axis_off()
     return png(figure, grid[0])
 
 
@@ -93,8 +90,7 @@ class Point(NamedTuple):
 
 def training_curve(points: Sequence[Point]) -> bytes:
     """Draws success and collisions [%] over the environment steps."""
-    figure = Figure(figsize=(7.5, 3.8), layout="constrained")
-    axes = figure.subplots()
+    figure, (axes,) = panels(1, 1, (7.5, 3.8))
     steps, *shares = np.array(points, np.float64).T
     for name, share, color in zip(("success", "collision"), shares, (MEASURED, MODEL), strict=True):
         axes.plot(steps / 1e3, 100.0 * share, color=color, linewidth=2.0, label=name)
@@ -109,14 +105,13 @@ def training_curve(points: Sequence[Point]) -> bytes:
 def shadow_picture(shadow: Shadow) -> bytes:
     """Draws each command over time, as driven and as chosen by the policy."""
     count = len(shadow.names)
-    figure = Figure(figsize=(11.0, 2.4 * count + 0.6), layout="constrained")
-    grid = figure.subplots(count, 2, squeeze=False, width_ratios=(4.0, 1.0))
-    for c, (wide, narrow) in enumerate(grid):
+    figure, grid = panels(count, 2, (11.0, 2.4 * count + 0.6), width_ratios=(4.0, 1.0))
+    for c, (wide, narrow) in enumerate(zip(grid[::2], grid[1::2], strict=True)):
         driven, wanted = shadow.driven[:, c], shadow.policy[:, c]
         wide.step(shadow.time, driven, where="post", color=MEASURED, linewidth=1.6, label="driven")
         wide.step(shadow.time, wanted, where="post", color=MODEL, linewidth=1.0, label="policy")
         wide.set_ylabel(f"{shadow.names[c]} [{shadow.units[c]}]")
         narrow.hist(wanted - driven, bins=31, color=OTHER)
         narrow.set_xlabel(f"policy less driven [{shadow.units[c]}]")
-    grid[-1][0].set_xlabel("time [s]")
-    return png(figure, grid[0][0])
+    grid[-2].set_xlabel("time [s]")
+    return png(figure, grid[0])

@@ -11,7 +11,7 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, LaserScan
 
-from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
+from nics_drl_bridge.lidar.spec import LidarSpec, from_device, load_lidar
 from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.robot.spec import load_robot
 
