@@ -29,7 +29,7 @@ from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import save_recording
 from nics_drl_bridge.report.fit_pictures import CAPTIONS, accuracy, calibration_pictures
-from nics_drl_bridge.report.page import Block, Code, Picture, Table, page
+from nics_drl_bridge.report.page import code, page, paragraph, picture, table
 from nics_drl_bridge.report.pictures import Point, training_curve, trajectories
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.sim.scenes import sample_scene
@@ -100,12 +100,12 @@ def run(plan: DemoPlan, say: Say) -> str:
     arrived = (episode.seed for episode in there if episode.result == "success")
     live = timed("deploying", _deploy, model, learned.policy, next(arrived, 0))
     times = [(part, f"{s:.0f}") for part, s in {**took, "all": sum(took.values())}.items()]
-    sections: list[tuple[str, Sequence[Block]]] = [
+    sections: list[tuple[str, Sequence[str]]] = [
         ("The model", _model(plan, model, identified)),
         ("The policy", _policy(plan, learned, summary)),
         ("The same episodes, in process and over DDS", _episodes(plan, model, here, there)),
         ("Deployed", _deployed(plan, model, here, live)),
-        ("Time", [Table(("part", "wall time [s]"), times)]),
+        ("Time", [table(("part", "wall time [s]"), times)]),
     ]
     name, file = model.robot.name, plan.out / "report.html"
     lead = f"Robot {name!r} in the world {plan.world!r}, policy {learned.policy!r}."
@@ -276,22 +276,22 @@ def _write_limits(robot: RobotSpec, path: Path) -> Path:
     return path
 
 
-def _model(plan: DemoPlan, model: SimulatorModel, identified: Identified) -> list[Block]:
+def _model(plan: DemoPlan, model: SimulatorModel, identified: Identified) -> list[str]:
     calibrated = calibration_pictures(model.robot, identified)
     caption = "What each further term is worth; circles mark how many are kept."
     return [
-        f"Generated from {plan.recording or 'a textbook drive'}.",
-        Code(model.report),
-        Picture(accuracy(identified), caption),
-        *(Picture(picture, CAPTIONS[name]) for name, picture in calibrated.items()),
+        paragraph(f"Generated from {plan.recording or 'a textbook drive'}."),
+        code(model.report),
+        picture(accuracy(identified), caption),
+        *(picture(png, CAPTIONS[name]) for name, png in calibrated.items()),
     ]
 
 
-def _policy(plan: DemoPlan, learned: Learned, summary: Summary) -> list[Block]:
-    blocks: list[Block] = [learned.how]
+def _policy(plan: DemoPlan, learned: Learned, summary: Summary) -> list[str]:
+    blocks = [paragraph(learned.how)]
     if learned.curve:
         caption = "Success and collisions while it explores; all episodes are new ones."
-        blocks.append(Picture(training_curve(learned.curve), caption))
+        blocks.append(picture(training_curve(learned.curve), caption))
     rows = [
         (name, *(f"{100 * value:.1f} %" for value in astuple(share)))
         for name, share in summary.shares.items()
@@ -302,12 +302,12 @@ def _policy(plan: DemoPlan, learned: Learned, summary: Summary) -> list[Block]:
         f"{summary.episodes} unseen episodes in the world {plan.world!r}, side by side in the fast "
         "simulator, the policy at its best; path and time are means of the successful ones."
     )
-    return [*blocks, text, Table(("", "value", "95 % from", "to"), rows)]
+    return [*blocks, paragraph(text), table(("", "value", "95 % from", "to"), rows)]
 
 
 def _episodes(
     plan: DemoPlan, model: SimulatorModel, here: Sequence[Episode], there: Sequence[Episode]
-) -> list[Block]:
+) -> list[str]:
     both, each = (LABELS[FAST], LABELS[DDS]), ("steps", "path [m]")
     rows = [
         (
@@ -318,24 +318,30 @@ def _episodes(
     ]  # fmt: skip
     runs = {both[0]: here[:PANELS], both[1]: there[:PANELS]}
     drawn = trajectories(runs, load_world(plan.world), model.robot.footprint_radius)
-    return [
+    text = (
         f"{successes(here)} of {len(here)} episodes reached the goal in process, "
         f"{successes(there)} of {len(there)} over DDS in lock-step. Deviation is the "
-        "greatest distance between the two true paths at the same step.",
-        Table(("seed", both[0], *each, both[1], *each, "deviation [m]"), rows),
-        Picture(drawn, "Blue: in process. Red, dashed: over DDS."),
+        "greatest distance between the two true paths at the same step."
+    )
+    return [
+        paragraph(text),
+        table(("seed", both[0], *each, both[1], *each, "deviation [m]"), rows),
+        picture(drawn, "Blue: in process. Red, dashed: over DDS."),
     ]
 
 
 def _deployed(
     plan: DemoPlan, model: SimulatorModel, here: Sequence[Episode], live: Episode
-) -> list[Block]:
+) -> list[str]:
     beside = [episode for episode in here if episode.seed == live.seed]
     runs = {LABELS[FAST]: beside, "deployed": [live]}
     drawn = trajectories(runs, load_world(plan.world), model.robot.footprint_radius)
-    return [
+    text = (
         "simulator_node in real time, middleware_node, policy_node and command_gate ran as "
         "processes of their own; nobody stepped them. The robot "
-        f"{'reached' if live.result == 'success' else 'did not reach'} its goal.",
-        Picture(drawn, "The true path of the deployed robot beside the lock-step one."),
+        f"{'reached' if live.result == 'success' else 'did not reach'} its goal."
+    )
+    return [
+        paragraph(text),
+        picture(drawn, "The true path of the deployed robot beside the lock-step one."),
     ]

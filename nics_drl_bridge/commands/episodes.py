@@ -23,14 +23,8 @@ from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, nearest
 from nics_drl_bridge.files import write_bytes, write_text
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.policy.evaluation import (
-    FIRST_SEED,
-    Episode,
-    Tally,
-    drive,
-    drive_all,
-    tallies,
-)
+from nics_drl_bridge.policy import evaluation
+from nics_drl_bridge.policy.evaluation import Episode, Tally, drive, drive_all
 from nics_drl_bridge.policy.policies import Policy, is_policy_file, open_policy
 from nics_drl_bridge.report.doctor import examine
 from nics_drl_bridge.report.doctor_facts import expected_of
@@ -131,7 +125,7 @@ class EvaluationOrder:
     model: str | None = None  # folder of a model or a shipped robot; None: the policies' own robot
     world: str = "circles"  # YAML file or name of the world
     episodes: int = 20
-    seed: int = FIRST_SEED
+    seed: int = evaluation.FIRST_SEED
     places: Sequence[str] = PLACES  # some of `PLACES`; the others are compared with the first
 
     @property
@@ -187,7 +181,7 @@ def judged(
     shown = {LABELS[place]: some[:panels] for place, some in runs.items()}
     picture = trajectories(shown, world, model.robot.footprint_radius)
     write_bytes(out / f"trajectories_{Path(policy).stem}.png", picture)
-    return Evaluated(policy, runs, tallies(runs, model.control_period))
+    return Evaluated(policy, runs, evaluation.tallies(runs, model.control_period))
 
 
 def _model_name(order: EvaluationOrder) -> str:

@@ -9,11 +9,9 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
+from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands.console import (
-    EXIT_INTERRUPTED,
     RobotOption,
-    TopicOption,
-    TopicsOption,
     WorldOption,
     intact,
     needs_ros,
@@ -68,7 +66,7 @@ def record(
         if driven.recording is not None:
             typer.echo("\n".join(recorder.summary(driven.recording, given)))
         if not driven.complete:
-            raise typer.Exit(EXIT_INTERRUPTED)
+            raise typer.Exit(console.EXIT_INTERRUPTED)
 
 
 def generate(
@@ -77,8 +75,8 @@ def generate(
     ],
     out: Annotated[Path, Option(help="Folder of the model to write.")],
     robot: RobotOption = "ackermann",
-    topics: TopicsOption = None,
-    topic: TopicOption = None,
+    topics: console.TopicsOption = None,
+    topic: console.TopicOption = None,
     world: WorldOption = "arena",
     lidar: Annotated[str, Option(help="A shipped lidar (paper) or a YAML file.")] = "paper",
     sensor: Annotated[

@@ -14,19 +14,11 @@ import numpy as np
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import LaserScan
 
+from nics_drl_bridge import interface
 from nics_drl_bridge.env.guard import halts_on_error
 from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError, nearest
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import (
-    NS_PER_S,
-    S_PER_NS,
-    Array,
-    Backend,
-    BackendFacts,
-    RobotView,
-    Start,
-    stacked,
-)
+from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, Array, BackendFacts, RobotView, Start
 from nics_drl_bridge.lidar.spec import from_device
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import qos, wire
@@ -289,7 +281,7 @@ class FleetBackend:
         """Begins one episode for all robots, at poses (M, 3); see `DdsBackend.reset`."""
         stamp_ns = self._robots[0].begin(start)
         both = zip(self._robots, start.pose, strict=True)
-        return stacked([robot.first(stamp_ns, pose) for robot, pose in both])
+        return interface.stacked([robot.first(stamp_ns, pose) for robot, pose in both])
 
     @halts_on_error
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
@@ -297,7 +289,7 @@ class FleetBackend:
         for robot, one in zip(self._robots, command, strict=True):
             robot.send(one)
         views, facts = zip(*(robot.receive() for robot in self._robots), strict=True)
-        return stacked(views), together(facts)
+        return interface.stacked(views), together(facts)
 
     def facts(self) -> BackendFacts:
         """Returns what is known of all robots, stacked."""
@@ -332,7 +324,7 @@ MODES = {"lockstep": DdsBackend, "realtime": RealtimeBackend}
 def dds_backend(
     model: SimulatorModel, world: World, mode: str = "lockstep", robots: int = 1,
     estimator: bool = True, randomisation: None = None, **options: Any,
-) -> Backend:  # fmt: skip
+) -> interface.Backend:  # fmt: skip
     """Returns the backend of a robot behind ROS 2 topics, or of a team in lock-step.
 
     In mode `lockstep` it is a `DdsBackend`, or for a team a `FleetBackend` with the option
@@ -355,5 +347,5 @@ def dds_backend(
                 f"with {robots} namespaces, not in {mode!r} with {list(names)!r}."
             )
         return FleetBackend(model, world, names, **options)
-    made: Backend = MODES[mode](model, world, **options)
+    made: interface.Backend = MODES[mode](model, world, **options)
     return made

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import (
-    Pose,
     PoseStamped,
     PoseWithCovarianceStamped,
     Quaternion,
@@ -32,7 +31,7 @@ from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.sectors import Reader, reader_beside
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader, to_device
-from nics_drl_bridge.recording.messages import POSITION_UNITS
+from nics_drl_bridge.recording import messages
 from nics_drl_bridge.robot.spec import RobotSpec
 
 QUATERNION_TOLERANCE = 0.1  # tolerance of the squared length of a quaternion about 1
@@ -56,11 +55,6 @@ def stamp_from_ros(stamp: Time) -> int:
 def heading_to_ros(heading: float) -> Quaternion:
     """Returns a heading [rad] as a quaternion."""
     return Quaternion(z=math.sin(heading / 2.0), w=math.cos(heading / 2.0))
-
-
-def heading_from_ros(q: Quaternion) -> float:
-    """Returns the heading [rad] of a quaternion."""
-    return heading_of(q.x, q.y, q.z, q.w)
 
 
 def heading_of(x: float, y: float, z: float, w: float) -> float:
@@ -87,9 +81,9 @@ def stamped_to_ros(twist: ArrayLike, time_ns: int, frame: str) -> TwistStamped:
     return message
 
 
-def twist_from_ros(message: Twist) -> Array:
-    """Returns linear.x, linear.y, angular.z (3,) of a Twist."""
-    return np.array([message.linear.x, message.linear.y, message.angular.z])
+def twist_from_ros(message: Twist | TwistStamped) -> Array:
+    """Returns linear.x, linear.y, angular.z (3,) of a Twist, stamped or not."""
+    return np.array(messages.command_row(message))
 
 
 def scan_to_ros(
@@ -134,11 +128,7 @@ def odometry_to_ros(
 
 def odometry_from_ros(message: Odometry) -> tuple[Array, Array]:
     """Returns pose (3,) and body twist (3,) of an Odometry message."""
-    return _planar(message.pose.pose), twist_from_ros(message.twist.twist)
-
-
-def _planar(pose: Pose) -> Array:
-    return np.array([pose.position.x, pose.position.y, heading_from_ros(pose.orientation)])
+    return np.array(messages.pose_row(message)), np.array(messages.twist_row(message))
 
 
 def covariance_to_ros(planar: Array) -> Array:
@@ -150,9 +140,9 @@ def covariance_to_ros(planar: Array) -> Array:
 
 def pose_from_ros(message: PoseStamped | PoseWithCovarianceStamped) -> tuple[Array, Array | None]:
     """Returns the pose (3,) of a message and its covariance (3, 3); None if it carries none."""
-    if isinstance(message, PoseWithCovarianceStamped):
-        return _planar(message.pose.pose), np.reshape(message.pose.covariance, (6, 6))[PLANAR]
-    return _planar(message.pose), None
+    known = isinstance(message, PoseWithCovarianceStamped)
+    covariance = np.reshape(message.pose.covariance, (6, 6))[PLANAR] if known else None
+    return np.array(messages.pose_row(message)), covariance
 
 
 def imu_from_ros(message: Imu) -> tuple[float, float] | None:
@@ -168,7 +158,7 @@ def joints_to_ros(spec: RobotSpec, state: ArrayLike, time_ns: int) -> JointState
     message = JointState()
     message.header.stamp = stamp_to_ros(time_ns)
     for variable, value in zip(spec.state, np.asarray(state, dtype=np.float64), strict=True):
-        still = variable.unit in POSITION_UNITS
+        still = variable.unit in messages.POSITION_UNITS
         message.name.append(variable.name)
         message.position.append(float(value) if still else 0.0)
         message.velocity.append(0.0 if still else float(value))

@@ -10,18 +10,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from rclpy import qos as rclpy_qos
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import (
-    DurabilityPolicy,
-    HistoryPolicy,
-    QoSCompatibility,
-    QoSProfile,
-    ReliabilityPolicy,
-    qos_check_compatible,
-    qos_policy_name_from_kind,
-)
+from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
 from nics_drl_bridge.recording.messages import Offer
@@ -34,9 +27,9 @@ except ModuleNotFoundError:  # Humble
 
 def profile_of(offer: Offer) -> QoSProfile:
     """Returns an offer, or a request, as a profile."""
-    reliability, durability = ReliabilityPolicy, DurabilityPolicy
+    reliability, durability = rclpy_qos.ReliabilityPolicy, rclpy_qos.DurabilityPolicy
     return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
+        history=rclpy_qos.HistoryPolicy.KEEP_LAST,
         depth=offer.depth,
         reliability=reliability.RELIABLE if offer.reliable else reliability.BEST_EFFORT,
         durability=durability.TRANSIENT_LOCAL if offer.transient_local else durability.VOLATILE,
@@ -47,8 +40,8 @@ def offer_of(profile: QoSProfile) -> Offer:
     """Returns what a publisher offers, or a subscriber requests."""
     return Offer(
         max(profile.depth, 1),
-        profile.reliability != ReliabilityPolicy.BEST_EFFORT,
-        profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+        profile.reliability != rclpy_qos.ReliabilityPolicy.BEST_EFFORT,
+        profile.durability == rclpy_qos.DurabilityPolicy.TRANSIENT_LOCAL,
     )
 
 
@@ -105,7 +98,7 @@ class QosWatch(Node):
 
     def _warn(self, event: Any, topic: str, qos: Any, publishing: bool) -> None:
         """Warns after a moment: a peer's name is known later than its quality of service."""
-        policy = qos_policy_name_from_kind(event.last_policy_kind)
+        policy = rclpy_qos.qos_policy_name_from_kind(event.last_policy_kind)
         resolved = self.resolve_topic_name(topic)
 
         def say() -> None:
@@ -133,7 +126,7 @@ class QosWatch(Node):
         )  # fmt: skip
         for peer in reversed((subscriptions if publishing else publishers)(topic)):
             pair = (ours, peer.qos_profile) if publishing else (peer.qos_profile, ours)
-            if qos_check_compatible(*pair)[0] == QoSCompatibility.ERROR:
+            if rclpy_qos.qos_check_compatible(*pair)[0] == rclpy_qos.QoSCompatibility.ERROR:
                 return owner(peer) or "a peer", peer.qos_profile
         return "a peer", None
 

@@ -202,8 +202,8 @@ class RobotTopics:
             self.middleware.sense(sensor.name, stamp, self.now_ns(), reading)
 
     def _take_command(self, message: Twist | TwistStamped) -> None:
-        twist = message.twist if isinstance(message, TwistStamped) else message
-        self.middleware.command(None, self._robot.from_cmd_vel(conversions.twist_from_ros(twist)))
+        twist = conversions.twist_from_ros(message)
+        self.middleware.command(None, self._robot.from_cmd_vel(twist))
 
 
 def data_facts(middleware: Middleware, now_ns: int) -> dict[str, Any]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Sequence
-from dataclasses import dataclass
 from html import escape
 from typing import Any
 
@@ -26,39 +25,9 @@ img { max-width: 100% }
 """
 
 
-@dataclass(frozen=True)
-class Table:
-    """Rows of text under a heading row."""
-
-    head: Sequence[str]
-    rows: Sequence[Sequence[str]]
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A PNG with its caption."""
-
-    png: bytes
-    caption: str
-
-
-@dataclass(frozen=True)
-class Code:
-    """Preformatted text."""
-
-    text: str
-
-
-Block = Table | Picture | Code | str
-"""Part of a section; plain text is a paragraph."""
-
-
-def page(title: str, lead: str, sections: Sequence[tuple[str, Sequence[Block]]]) -> str:
-    """Builds an HTML page of sections, each a heading and blocks, below a lead sentence."""
-    body = "".join(
-        f"<h2>{escape(heading)}</h2>{''.join(_block(block) for block in blocks)}"
-        for heading, blocks in sections
-    )
+def page(title: str, lead: str, sections: Sequence[tuple[str, Sequence[str]]]) -> str:
+    """Builds an HTML page of sections, each a heading and HTML blocks, below a lead sentence."""
+    body = "".join(f"<h2>{escape(heading)}</h2>{''.join(blocks)}" for heading, blocks in sections)
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
         f"<style>{STYLE}</style></head><body><h1>{escape(title)}</h1>"
@@ -66,23 +35,33 @@ def page(title: str, lead: str, sections: Sequence[tuple[str, Sequence[Block]]])
     )
 
 
-def _block(block: Block) -> str:
-    if isinstance(block, str):
-        return f"<p>{escape(block)}</p>"
-    if isinstance(block, Code):
-        return f"<pre>{escape(block.text)}</pre>"
-    if isinstance(block, Picture):
-        data = base64.b64encode(block.png).decode()
-        caption = escape(block.caption)
-        return (
-            f'<figure><img src="data:image/png;base64,{data}" alt="{caption}">'
-            f"<figcaption>{caption}</figcaption></figure>"
-        )
-    head = "".join(f"<th>{escape(cell)}</th>" for cell in block.head)
-    rows = "".join(
-        "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in block.rows
+def paragraph(text: str) -> str:
+    """Returns a paragraph as HTML, as the next three."""
+    return f"<p>{escape(text)}</p>"
+
+
+def code(text: str) -> str:
+    """Preformatted text."""
+    return f"<pre>{escape(text)}</pre>"
+
+
+def picture(png: bytes, caption: str) -> str:
+    """A PNG with its caption."""
+    data, caption = base64.b64encode(png).decode(), escape(caption)
+    return (
+        f'<figure><img src="data:image/png;base64,{data}" alt="{caption}">'
+        f"<figcaption>{caption}</figcaption></figure>"
     )
-    return f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Rows of text under a heading row."""
+
+    def cells(kind: str, row: Sequence[str]) -> str:
+        return "<tr>" + "".join(f"<{kind}>{escape(cell)}</{kind}>" for cell in row) + "</tr>"
+
+    body = "".join(cells("td", row) for row in rows)
+    return f"<table><thead>{cells('th', head)}</thead><tbody>{body}</tbody></table>"
 
 
 def panels(
