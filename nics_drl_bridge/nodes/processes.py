@@ -25,13 +25,13 @@ from std_srvs.srv import Trigger
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.runner import open_context, spin
+from nics_drl_bridge.nodes.runner import holds, open_context, spin
 from nics_drl_bridge.nodes.transport import domains_in_use
 
 LAST_DOMAIN_ID = 101  # above it DDS ports may collide with Linux's ephemeral ports
 GREATEST_DOMAIN_ID = 232  # above it there are no ports
 PR_SET_PDEATHSIG, LOG_LINES = 1, 5
-PATIENCE_S, ASK_AGAIN_S, ANSWER_S = 5.0, 0.2, 2.0
+PATIENCE_S, ASK_AGAIN_S, ANSWER_S, ASK_POLL_S = 5.0, 0.2, 2.0, 0.005
 
 
 def free_domain_id() -> int:
@@ -95,11 +95,7 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
                 command, env=os.environ | chosen, stdin=subprocess.DEVNULL, stdout=log,
                 stderr=subprocess.STDOUT, start_new_session=True, preexec_fn=_dies_with_parent(),
             )  # fmt: skip
-
-    @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._process.pid
+        self.pid = self._process.pid
 
     def check(self) -> None:
         """Raises BackendError with the end of its log if the node has ended by itself."""
@@ -159,8 +155,8 @@ class Witness(AbstractContextManager["Witness", None]):
         """Waits until the robot is within `radius` of a goal (2,); False after the time [s]."""
 
         def there() -> bool:
-            poses = self._poses[-1:]
-            return bool(poses) and bool(np.linalg.norm(poses[0][:2] - np.asarray(goal)) < radius)
+            newest = self._poses[-1:]
+            return any(np.linalg.norm(pose[:2] - np.asarray(goal)) < radius for pose in newest)
 
         with self._changed:
             return self._changed.wait_for(there, timeout_s)
@@ -188,16 +184,13 @@ class Witness(AbstractContextManager["Witness", None]):
         client = self._node.create_client(Trigger, service)
         answer = Trigger.Response(success=False, message=f"{service} does not answer")
         deadline = time.monotonic() + timeout_s
-        while time.monotonic() < deadline:
+        while time.monotonic() < deadline and not answer.success:
             if client.wait_for_service(timeout_sec=ASK_AGAIN_S):
-                answered = threading.Event()
                 future = client.call_async(Trigger.Request())
-                future.add_done_callback(lambda _, answered=answered: answered.set())
-                if answered.wait(ANSWER_S):
+                if holds(future.done, ANSWER_S, ASK_POLL_S):
                     answer = future.result()
-                    if answer.success:
-                        break
-            time.sleep(ASK_AGAIN_S)
+            if not answer.success:
+                time.sleep(ASK_AGAIN_S)
         self._node.destroy_client(client)
         return answer
 

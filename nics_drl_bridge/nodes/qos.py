@@ -121,10 +121,8 @@ class QosWatch(Node):
 
     def _misfit(self, topic: str, ours: QoSProfile, publishing: bool) -> tuple[str, Any]:
         """Returns name and profile of the last peer that does not fit, as far as known."""
-        subscriptions, publishers = (
-            self.get_subscriptions_info_by_topic, self.get_publishers_info_by_topic
-        )  # fmt: skip
-        for peer in reversed((subscriptions if publishing else publishers)(topic)):
+        kind = "subscriptions" if publishing else "publishers"
+        for peer in reversed(getattr(self, f"get_{kind}_info_by_topic")(topic)):
             pair = (ours, peer.qos_profile) if publishing else (peer.qos_profile, ours)
             if rclpy_qos.qos_check_compatible(*pair)[0] == rclpy_qos.QoSCompatibility.ERROR:
                 return owner(peer) or "a peer", peer.qos_profile

@@ -81,13 +81,12 @@ def run_node(
     publish, to leave its robot at rest. A user's error becomes one sentence on standard error and
     exit code 2. With a `sole_name` only a single instance runs in a namespace.
     """
-    stopping, starting = threading.Event(), threading.Event()
-    starting.set()
+    stopping, started = threading.Event(), threading.Event()
 
     def end(*_: Any) -> None:
         stopping.set()
-        if starting.is_set():  # it may be compiling, which can take longer than a launch waits
-            starting.clear()
+        if not started.is_set():  # it may be compiling, which can take longer than a launch waits
+            started.set()
             raise SystemExit(0)
 
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -102,7 +101,7 @@ def run_node(
             node.start()
         for sentence in unknown(node):  # rclpy ignores them silently
             node.get_logger().warning(sentence)
-        starting.clear()
+        started.set()
         spin(node, stopping)
     except (BridgeError, ParameterException, OSError) as error:
         sentence = " ".join(str(error).split())
@@ -112,7 +111,7 @@ def run_node(
         sys.stderr.write(f"{sentence}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
     finally:
-        starting.clear()
+        started.set()
         if node is not None:
             if node.context.ok() and hasattr(node, "stop"):
                 node.stop()
@@ -156,7 +155,13 @@ def sole(context: Context, name: str) -> Iterator[None]:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as claim:
         try:
             whole, domain = probe.get_fully_qualified_name(), context.get_domain_id()
-            taken = not _claims(claim, f"{domain} {whole}")
+            key = hashlib.sha256(f"{domain} {whole}".encode()).hexdigest().encode()
+            taken = False
+            try:
+                if sys.platform == "linux":
+                    claim.bind(b"\0nics_drl_bridge " + key)
+            except OSError:
+                taken = True
             if taken or (_seen(probe, whole) and _lives(probe, whole)):
                 raise BackendError(
                     f"a node {whole!r} runs already in ROS domain {domain}; end it, or give this "
@@ -165,16 +170,6 @@ def sole(context: Context, name: str) -> Iterator[None]:
         finally:
             probe.destroy_node()
         yield
-
-
-def _claims(claim: socket.socket, key: str) -> bool:
-    """Binds a socket to a name, on Linux; False if another has it."""
-    name = b"\0nics_drl_bridge " + hashlib.sha256(key.encode()).hexdigest().encode()
-    with contextlib.suppress(OSError):
-        if sys.platform == "linux":
-            claim.bind(name)
-        return True
-    return False
 
 
 def _seen(probe: Node, whole: str) -> bool:

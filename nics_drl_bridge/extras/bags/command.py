@@ -5,17 +5,18 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from nics_drl_bridge.commands.console import intact, needs_ros, one_sentence, roles_of, table
 
 if TYPE_CHECKING:
-    from nics_drl_bridge.extras.bags.info import BagInfo, BagTopic
+    from nics_drl_bridge.extras.bags.info import BagTopic
 
 bag = typer.Typer(help="Records, describes, replays and saves bags.", no_args_is_help=True)
 
+STORAGES = ("mcap", "sqlite3")
 BagArgument = Annotated[Path, typer.Argument(help="Folder or file of a rosbag2.")]
 SalvageOption = Annotated[
     bool, typer.Option("--salvage", help="Take what is intact of a damaged bag, and tell the rest.")
@@ -70,8 +71,11 @@ def info(
             told = bag_info(whole)
         if as_json:
             typer.echo(json.dumps(asdict(told) | {"path": str(path)}))
-        else:
-            _print(told, path)
+            return
+        span, size = f"{told.duration_s:.3f} s", f"{told.size_bytes / 1e6:.2f} MB"
+        typer.echo(f"{path}: {told.messages} messages in {span}, {size}")
+        heads = ("topic", "type", "count", "Hz", "from, to [s]", "gaps", "clock", "delay [ms]")
+        typer.echo(table(heads, [_row(each) for each in told.topics]))
 
 
 @bag.command()
@@ -137,13 +141,12 @@ def salvage(
         typer.echo(f"bag written to {out}")
 
 
-def _storage(name: str) -> Literal["mcap", "sqlite3"]:
+def _storage(name: str) -> Any:
     from nics_drl_bridge.errors import ConfigError, nearest
 
-    storages: dict[str, Literal["mcap", "sqlite3"]] = {"mcap": "mcap", "sqlite3": "sqlite3"}
-    if name in storages:
-        return storages[name]
-    raise ConfigError(f"--storage {name!r}: {nearest(name, storages)}")
+    if name not in STORAGES:
+        raise ConfigError(f"--storage {name!r}: {nearest(name, STORAGES)}")
+    return name
 
 
 def _estimate(path: Path, model: str, topics: list[str], out: Path | None) -> None:
@@ -158,15 +161,6 @@ def _estimate(path: Path, model: str, topics: list[str], out: Path | None) -> No
     x, y, heading = made.pose[-1]
     typer.echo(f"{len(made.stamp_ns)} estimates; the last is {x:.3f} m, {y:.3f} m, {heading:.3f}")
     typer.echo(f"sha256 {made.digest}")
-
-
-def _print(told: BagInfo, path: Path) -> None:
-    typer.echo(
-        f"{path}: {told.messages} messages in {told.duration_s:.3f} s, "
-        f"{told.size_bytes / 1e6:.2f} MB"
-    )
-    heads = ("topic", "type", "count", "Hz", "from, to [s]", "gaps", "clock", "delay [ms]")
-    typer.echo(table(heads, [_row(each) for each in told.topics]))
 
 
 def _row(each: BagTopic) -> tuple[str, ...]:

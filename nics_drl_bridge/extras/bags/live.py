@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.srv import GetParameters
-from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
@@ -25,7 +24,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from nics_drl_bridge.errors import BackendError, RecordingError, nearest
 from nics_drl_bridge.nodes.conversions import message_texts, message_type, stamp_to_ros
 from nics_drl_bridge.nodes.qos import QosWatch, offer_of, profile_of
-from nics_drl_bridge.nodes.runner import DELIVERY_S, open_context, run_node
+from nics_drl_bridge.nodes.runner import DELIVERY_S, holds, open_context, run_node, steadily
 from nics_drl_bridge.recording.bag_file import BagFile, opened
 from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.recording.write import BagSink, Storage, bag_sink
@@ -74,22 +73,22 @@ class BagRecorder(QosWatch):
 
     A subscription requests the best quality of service that all publishers of its topic offer, so
     that none of them is left out; their offers are stored in the bag. `say` is called with a
-    sentence when a topic begins or can't be recorded.
+    sentence when a topic begins, or can't be recorded and is added to the `skipped` ones.
     """
 
     def __init__(
-        self, context: Context, order: BagOrder, sink: BagSink, say: Callable[[str], None]
-    ) -> None:
+        self, context: Context, order: BagOrder, sink: BagSink, say: Callable[[str], None],
+        skipped: dict[str, str],
+    ) -> None:  # fmt: skip
         given = [Parameter("use_sim_time", value=order.use_sim_time)]
         super().__init__(
             "bag_recorder", context=context, parameter_overrides=given,
             start_parameter_services=False,
         )  # fmt: skip
-        self._order, self._sink, self._say = order, sink, say
+        self._order, self._sink, self._say, self.skipped = order, sink, say, skipped
         self._heard: dict[str, tuple[Offer, Subscription[Any]]] = {}
-        self.skipped: dict[str, str] = {}
         self._began = self._flushed = time.monotonic()
-        self.create_timer(LOOK_S, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        steadily(self, LOOK_S, self._look)
         self._look()
 
     def _look(self) -> None:
@@ -146,20 +145,14 @@ def record_bag(order: BagOrder, say: Callable[[str], None]) -> dict[str, int]:
     `say` is called with a sentence when a topic begins or can't be recorded. Raises BackendError if
     nothing was received, RecordingError if the bag can't be written.
     """
-    nodes: list[BagRecorder] = []
+    skipped: dict[str, str] = {}
     with bag_sink(order.out, order.storage) as sink:
-
-        def make(context: Context) -> BagRecorder:
-            nodes.append(BagRecorder(context, order, sink, say))
-            return nodes[-1]
-
-        run_node(make, ["nics"])
+        run_node(lambda context: BagRecorder(context, order, sink, say, skipped), ["nics"])
         if not sum(sink.counts.values()):
-            skipped = " ".join(text for node in nodes for text in node.skipped.values())
+            left_out = f" Not recorded: {' '.join(skipped.values())}" if skipped else ""
             raise BackendError(
                 "nothing was heard on any of the topics, so no bag is written; start the robot, "
-                "or correct --topics, --namespace or ROS_DOMAIN_ID."
-                + (f" Not recorded: {skipped}" if skipped else "")
+                f"or correct --topics, --namespace or ROS_DOMAIN_ID.{left_out}"
             )
     return sink.counts
 
@@ -211,47 +204,39 @@ class _Player:
 
     def ready(self) -> None:
         """Waits for the node in lock-step, or a while for subscribers."""
-        publishers = self.publishers.values()
+        publishers, known = self.publishers.values(), self._node.count_subscribers
         self._stopping.wait(DISCOVERY_S)
         self._wait(lambda: any(each.get_subscription_count() for each in publishers), ALONE_S)
-        known = self._node.count_subscribers
         self._wait(  # for all known subscribers to find their topic
             lambda: all(p.get_subscription_count() >= known(p.topic_name) for p in publishers),
             PATIENCE_S,
         )
-        if self._barrier is None or self._wait(self._barrier.service_is_ready, PATIENCE_S):
-            return
-        raise BackendError(
-            f"node {self._order.lockstep!r}: not found within {PATIENCE_S:g} s; start it, or "
-            "correct its name, namespace or ROS_DOMAIN_ID."
-        )
+        if self._barrier and not self._wait(self._barrier.service_is_ready, PATIENCE_S):
+            raise BackendError(
+                f"node {self._order.lockstep!r}: not found within {PATIENCE_S:g} s; start it, or "
+                "correct its name, namespace or ROS_DOMAIN_ID."
+            )
 
     def _wait(self, condition: Callable[[], bool], patience_s: float) -> bool:
-        until = time.monotonic() + patience_s
-        while not (condition() or self._stopping.is_set()):
-            if time.monotonic() > until:
-                return False
-            self._stopping.wait(NAP_S)
-        return True
+        return holds(lambda: condition() or self._stopping.is_set(), patience_s, NAP_S)
 
     def play(self, messages: list[Timed]) -> int:
         """Publishes all messages; returns their number, fewer if it is stopped."""
-        first, began, sent = messages[0][0], time.monotonic_ns(), 0
-        now = first
-        for due, topic, data in messages:
+        now = first = messages[0][0]
+        began, rate = time.monotonic_ns(), self._order.rate
+        for sent, (due, topic, data) in enumerate(messages):
             while self._order.lockstep is None and now < due and not self._stopping.is_set():
-                now = min(due, now + round(CLOCK_PERIOD_NS * self._order.rate))
-                at = began + round((now - first) / self._order.rate)
+                now = min(due, now + round(CLOCK_PERIOD_NS * rate))
+                at = began + round((now - first) / rate)
                 self._stopping.wait(max(at - time.monotonic_ns(), 0) * 1e-9)
                 self._tick(now)
             if self._stopping.is_set():
-                break
+                return sent
             if self._order.lockstep is not None:
                 self._tick(due)
             self.publishers[topic].publish(data)
-            sent += 1
             self._wait_for_peer()
-        return sent
+        return len(messages)
 
     def _tick(self, now_ns: int) -> None:
         if self._clock is not None:
