@@ -66,8 +66,12 @@ class GateLog:
         if rule != self._rule:
             self._changed(rule)
         self._cause = cause
-        if self._owed:
-            self._tell(rule)
+        if self._owed and (more := self._due(rule)) is not None:  # else it is told later
+            self._owed = False
+            if cause is None:
+                self._logger.info(f"commands pass{more}")
+            else:
+                self._logger.warning(f"stopped by {cause.line}{more}")
         if self._burst and not rule and entry.now - self._since >= BURST_S:
             self._burst.clear()
 
@@ -107,15 +111,6 @@ class GateLog:
         elif was_passing:
             self._burst.add(rule)
             self._write(rule)
-
-    def _tell(self, rule: str) -> None:
-        """Logs the present state; later, if it was logged a moment ago."""
-        more = self._due(rule)
-        self._owed = more is None
-        if more is not None and self._cause is None:
-            self._logger.info(f"commands pass{more}")
-        elif more is not None and self._cause is not None:
-            self._logger.warning(f"stopped by {self._cause.line}{more}")
 
     def _write(self, rule: str) -> None:
         name = f"{time.strftime('%Y%m%d_%H%M%S')}_{self.counters.total():06d}_{rule}.jsonl"
@@ -207,15 +202,17 @@ class BoxWriter:
     def failures(self) -> list[str]:
         """Returns the failures since the last call; kills the writers that are overdue."""
         for pid, (heard, begun_s) in tuple(self._writers.items()):
-            status = _ended(pid)
-            if status is None:
-                if time.monotonic() - begun_s > OVERDUE_S:
-                    os.kill(pid, signal.SIGKILL)
-                continue
-            del self._writers[pid]
-            if status != 0:
-                self._failed.append(_read(heard) or f"its writer ended with {status}")
-            os.close(heard)
+            try:
+                ended, status = os.waitpid(pid, os.WNOHANG)
+            except ChildProcessError:  # if SIGCHLD is ignored, no status is kept
+                ended, status = pid, 0
+            if ended:
+                del self._writers[pid]
+                if status != 0:
+                    self._failed.append(_read(heard) or f"its writer ended with {status}")
+                os.close(heard)
+            elif time.monotonic() - begun_s > OVERDUE_S:
+                os.kill(pid, signal.SIGKILL)
         failed, self._failed = self._failed, []
         return failed
 
@@ -236,15 +233,6 @@ class BoxWriter:
             time.sleep(POLL_S)
             failed += self.failures()
         return failed
-
-
-def _ended(pid: int) -> int | None:
-    """Returns the exit status of a writer; None while it runs."""
-    try:
-        ended, status = os.waitpid(pid, os.WNOHANG)
-    except ChildProcessError:  # if SIGCHLD is ignored, no status is kept
-        return 0
-    return status if ended else None
 
 
 def _live(write: Callable[[], object], told: int) -> NoReturn:
