@@ -132,10 +132,7 @@ def _generate(plan: DemoPlan, say: Say) -> tuple[SimulatorModel, Identified]:
 
 
 def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
-    """Trains a policy, unless the plan names one or a module for training is not installed.
-
-    Raises BridgeError if the named policy can't be used, or the settings do not fit.
-    """
+    """Trains a policy, unless one is named or a module is missing. Raises BridgeError."""
     if plan.policy is not None:
         open_policy(plan.policy, model)
         return Learned(plan.policy, f"The policy {plan.policy!r} was given; none was trained.")
@@ -208,10 +205,7 @@ def _drive(plan: DemoPlan, place: str, policy: str, say: Say) -> list[Episode]:
 
 
 def _deploy(plan: DemoPlan, model: SimulatorModel, policy: str, seed: int, say: Say) -> Episode:
-    """Runs the nodes of a robot in real time, each in its own process, in the scene of a seed.
-
-    Raises BackendError if a node does not start, or ends.
-    """
+    """Runs a robot's nodes in real time in the scene of a seed; BackendError if one ends."""
     scene = sample_scene(load_world(plan.world), model.robot.footprint_radius, seed)
     goal = [float(value) for value in scene.goals[0]]
     folder = str(plan.model)

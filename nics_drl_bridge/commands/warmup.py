@@ -68,7 +68,6 @@ def _simulate(model: SimulatorModel) -> None:
 
 
 def _drive(model: SimulatorModel) -> None:
-    """Estimates, plans and shields."""
     import numpy as np
 
     from nics_drl_bridge.gate import shield

@@ -80,7 +80,6 @@ class _Mailbox:
         return next((topic for topic, mail in self._mail.items() if mail.stamp_ns < stamp_ns), None)
 
     def stamp_ns(self, topic: str) -> int:
-        """Returns the stamp of the newest message [ns]; -1 if there is none."""
         return self._mail[topic].stamp_ns
 
     def wait(self, stamp_ns: int, timeout_s: float) -> dict[str, _Mail]:

@@ -52,10 +52,7 @@ REFUSED = (
 
 
 def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
-    """Declares the parameters of a gate, reads them, and logs doubts about them.
-
-    Raises ConfigError if a value can't be used, or would never let the robot move.
-    """
+    """Declares and reads a gate's parameters, logs doubts; ConfigError if one can't be used."""
     lidar, robot = model.lidar, model.robot
     about = "Limits of the robot: a shipped file, or a YAML file; no default."
     file = str(runner.declare(node, "limits", "", about, read_only=True))

@@ -99,10 +99,7 @@ def scan_to_ros(
 
 
 def reader_from_ros(message: LaserScan, like: LidarSpec, upside_down: bool = False) -> Reader:
-    """Returns the lidar of a header (the expected one if it agrees) and the order of its beams.
-
-    Raises ConfigError if the header describes no lidar.
-    """
+    """Returns the reader of the lidar that a header describes. Raises ConfigError."""
     header = ScanHeader(*(float(getattr(message, name)) for name in ScanHeader._fields))
     return reader_beside(header, len(message.ranges), like, upside_down)
 

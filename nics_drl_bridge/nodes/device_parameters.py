@@ -146,10 +146,7 @@ def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
 
 
 def namespaces(node: Node) -> tuple[str, ...]:
-    """Returns the namespace of each robot below the node's own; one empty name for a single robot.
-
-    Raises ConfigError if `robots` is neither a count nor a list of different names.
-    """
+    """Returns each robot's namespace, below the node's own and empty for one. ConfigError."""
     value: Any = node.get_parameter("robots").value
     if isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= GREATEST_FLEET:
         return ("",) if value == 1 else default_namespaces(value)

@@ -111,7 +111,6 @@ class StandingExecutor(SingleThreadedExecutor):
             get_logger("executor").warning(f"this rclpy needs its own, slower executor ({error})")
 
     def _handle_others(self) -> None:
-        """Lets rclpy handle everything that is ready now."""
         with contextlib.suppress(TimeoutException):
             for _ in range(MOST_AT_ONCE):
                 if not self.context.ok():  # a callback may have shut it down
@@ -230,7 +229,6 @@ def _call(received: Iterable[Received]) -> None:
 
 
 def _takes(callback: Any, *arguments: Any) -> bool:
-    """True if a callback can be called with these arguments."""
     try:
         inspect.signature(callback).bind(*arguments)
     except TypeError:

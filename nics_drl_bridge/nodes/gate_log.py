@@ -146,10 +146,7 @@ class GateLog:
 
 
 def prune(folder: Path, own: Sequence[str]) -> None:
-    """Removes the files of stops beyond `FILES_KEPT`, oldest first.
-
-    This gate's own, oldest first, count as the newest: the clock may have been set back since.
-    """
+    """Removes the oldest files beyond `FILES_KEPT`; `own` names are newer than all others."""
     place = {name: i for i, name in enumerate(own, 1)}
     files = sorted(folder.glob("*.jsonl"), key=lambda file: (place.get(file.name, 0), file.name))
     for old in files[:-FILES_KEPT]:

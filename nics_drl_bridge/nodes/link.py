@@ -74,10 +74,7 @@ class Link:
         self._closing = weakref.finalize(self, _shut_down, self._context, self._timeout, thread)
 
     def send(self, twist: NDArray[np.float64], stamp_ns: int = 0) -> None:
-        """Publishes linear.x, linear.y, angular.z (3,), stamped if the topic is.
-
-        Raises BackendError if it is not finite, and publishes a zero instead.
-        """
+        """Publishes linear.x, linear.y, angular.z (3,); BackendError, and a zero, for NaN or inf."""
         if not all(map(math.isfinite, twist)):
             self.halt()
             raise BackendError(
@@ -250,10 +247,7 @@ class EpisodeServices:
             self._repeating, self._asked_s = self._repeat.call_async(Trigger.Request()), now
 
     def begin(self, start: Start, timeout_s: float) -> int:
-        """Begins an episode; returns the stamp of its first data [ns].
-
-        Raises BackendError if the simulator refuses, ModelError if it runs another model or world.
-        """
+        """Begins an episode; returns the stamp of its first data [ns]. Raises BridgeError."""
         chosen = {
             "episode_seed": int(start.seed), "episode_start": start.pose.ravel().tolist(),
             "episode_start_given": True,

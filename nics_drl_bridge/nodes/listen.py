@@ -21,10 +21,7 @@ ANY_PUBLISHER = profile_of(Offer(100, reliable=False))  # matches any offer, so 
 
 
 def listen(seconds: float, namespace: str = "", domain_id: int | None = None) -> Facts:
-    """Listens to a robot without sending anything.
-
-    The seconds count from the first message on, which is awaited for at most 10 s.
-    """
+    """Listens so long [s] from the first message on, awaited for at most 10 s; sends nothing."""
     context = open_context([], domain_id)
     node = Node(NAME, context=context, start_parameter_services=False)
     executor = SingleThreadedExecutor(context=context)

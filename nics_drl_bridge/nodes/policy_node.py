@@ -149,10 +149,7 @@ class PolicyNode(ManagedNode):
         return runner.Condition(f"{self.state}; {done.late} late inferences", done.late > 0, facts)
 
     def _twist(self) -> Array:
-        """Returns the command (3,) for the present view; zero without a goal, at it, or on contact.
-
-        With a pose sensor, it is also zero before the first pose.
-        """
+        """Returns the command (3,); zero without a pose or goal, at the goal, or on contact."""
         if not (self._topics.located and np.isfinite(self._goal).all()):
             return np.zeros(3)
         view = self._topics.view()

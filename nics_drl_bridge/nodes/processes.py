@@ -35,10 +35,7 @@ PATIENCE_S, ASK_AGAIN_S, ANSWER_S, ASK_POLL_S = 5.0, 0.2, 2.0, 0.005
 
 
 def free_domain_id() -> int:
-    """Returns the domain id of the environment, or a random one that this machine does not use.
-
-    Raises ConfigError if the environment's value is not a domain id.
-    """
+    """Returns the environment's domain id (ConfigError if it is none), or a random unused one."""
     given = os.environ.get("ROS_DOMAIN_ID")
     if not given:
         every = range(1, LAST_DOMAIN_ID + 1)
@@ -52,10 +49,7 @@ def free_domain_id() -> int:
 
 
 def _dies_with_parent() -> Callable[[], None] | None:
-    """Returns what a child does first, on Linux: request SIGTERM for any death of its parent.
-
-    The library is loaded before the fork, because little is safe after it.
-    """
+    """Returns what a child does first, on Linux: request SIGTERM for any death of its parent."""
     if sys.platform != "linux":
         return None
     prctl, parent = ctypes.CDLL(None).prctl, os.getpid()
@@ -162,25 +156,18 @@ class Witness(AbstractContextManager["Witness", None]):
             return self._changed.wait_for(there, timeout_s)
 
     def arms(self, gate: str, timeout_s: float) -> str:
-        """Requests a gate to let commands pass, repeatedly until it does.
-
-        Returns an empty string, or after the time [s] the gate's last reason to refuse.
-        """
+        """Arms a gate, asking until it agrees; returns its last reason to refuse, or ''."""
         answer = self._asked(f"{gate}/arm", timeout_s)
         return "" if answer.success else str(answer.message)
 
     def touched(self, simulator: str, timeout_s: float) -> bool:
-        """True if a simulator says that its robot has touched something in this episode.
-
-        Raises BackendError if it does not answer within the time [s].
-        """
+        """True if its robot has touched something in this episode. Raises BackendError."""
         answer = self._asked(f"{simulator}/touched", timeout_s)
         if not answer.success:
             raise BackendError(f"the episode can't be judged: {answer.message}.")
         return bool(np.any(json.loads(answer.message)))
 
     def _asked(self, service: str, timeout_s: float) -> Trigger.Response:
-        """Returns the first successful answer, otherwise the last one."""
         client = self._node.create_client(Trigger, service)
         answer = Trigger.Response(success=False, message=f"{service} does not answer")
         deadline = time.monotonic() + timeout_s

@@ -130,15 +130,11 @@ class QosWatch(Node):
 
 
 def _value(profile: Any, policy: str) -> str:
-    """Returns the value of a policy in a profile, in words."""
     value = getattr(profile, policy.lower(), None)
     return str(getattr(value, "name", value) or "unknown").lower().replace("_", " ")
 
 
 def owner(end: Any) -> str | None:
-    """Returns the full name of the node of a `TopicEndpointInfo`; None while it is unknown.
-
-    A node's name is discovered apart from its publishers and subscriptions.
-    """
+    """Returns the full name of an endpoint's node; None until it is discovered."""
     name = f"{end.node_namespace.rstrip('/')}/{end.node_name}"
     return None if UNKNOWN in name else name

@@ -126,10 +126,7 @@ class RealtimeBackend:
         return self._fresh_view()[0]
 
     def _is_vehicle(self) -> bool:
-        """True for a vehicle: by the options, otherwise if it shows no services of a simulator.
-
-        What was a simulator once stays one, because it may be out of sight for a while.
-        """
+        """True for a vehicle: by the options, or if it has never shown services of a simulator."""
         if self._options.vehicle is not None:
             return self._options.vehicle
         self._simulated = self._simulated or self._episodes.there
@@ -144,10 +141,7 @@ class RealtimeBackend:
             raise StaleDataError(*self._oldest(), timeout_s)
 
     def _await_start(self, start: Start) -> None:
-        """Waits until a vehicle stands at its start, and reports what is missing.
-
-        Also ends if services show that it is a simulator.
-        """
+        """Waits until a vehicle stands at its start, telling what is missing, or is a simulator."""
         say = self._options.say or self._link.node.get_logger().info
         began, said = time.monotonic(), -math.inf
         while self._is_vehicle() and (missing := self._missing(start)):
@@ -186,10 +180,7 @@ class RealtimeBackend:
         )
 
     def _oldest(self) -> tuple[str, float]:
-        """Returns the topic with the oldest datum, and its age [s]; inf if there is none.
-
-        The age is the time since arrival, or the lag of its stamp behind the newest of all topics.
-        """
+        """Returns the topic with the oldest datum, and its age or lag [s]; inf without one."""
         with self._topics.lock:
             newest, now = dict(self._topics.middleware.cache.newest), time.monotonic_ns()
         latest = max((datum.stamp_ns for datum in newest.values()), default=0)

@@ -107,10 +107,7 @@ class DriveLog:
         self._joints.append(Message(self._now(), message))
 
     def check(self) -> None:
-        """Raises BackendError or RecordingError, before the robot moves, for an unusable recording.
-
-        A state that has to be measured is not, or stamps run at another rate than receipt.
-        """
+        """Raises BridgeError if a state is not measured, or stamps run at another rate."""
         measured = [v.name for v in self._spec.state if v.follows is None]
         if self._joints:
             joint_streams("joint_states", self._joints, self._spec, self._roles, PLACE)
@@ -157,10 +154,7 @@ class DriveLog:
 
 
 def pace(receive: Nanoseconds, header: Nanoseconds) -> float:
-    """Returns seconds by stamp (T,) per second of receipt; 1 if that can't be determined.
-
-    It is that of the least delayed message of each half.
-    """
+    """Returns seconds by stamp per second of receipt, by the least delayed of each half."""
     heard, stamped = receive[-1] - receive[0], header[-1] - header[0]
     if heard <= 0 or stamped <= 0:
         return 1.0
@@ -270,7 +264,6 @@ class RecordNode(qos.QosWatch):
         return f"{self.resolve_topic_name(topic)!r} ({place})"
 
     def _go_on(self) -> None:
-        """Sends the command if one is due."""
         self._guard()
         due = (self._now_ns() - self._origin_ns) // PERIOD_NS + 1 - self._ticks
         if due <= 0:
@@ -283,7 +276,6 @@ class RecordNode(qos.QosWatch):
         self._send(command)
 
     def _guard(self) -> None:
-        """Raises BackendError if the robot must not continue."""
         age, limit = time.monotonic() - self._heard, self._order.odom_timeout
         if age > limit:
             raise BackendError(
@@ -334,7 +326,6 @@ class RecordNode(qos.QosWatch):
         last_word(self._topic, self._message(np.zeros(3)))
 
     def _save(self) -> tuple[Recording | None, str]:
-        """Saves the recording; returns it with a clause about it."""
         try:
             recording = self._log.recording()
             write_drive(recording, self._order.out, self._order.plan.robot)
@@ -346,10 +337,7 @@ class RecordNode(qos.QosWatch):
 def record(
     given: Mapping[str, Any] | None = None, args: Sequence[str] | None = None
 ) -> DriveResult:
-    """Drives and records until the end, an error, SIGINT or SIGTERM.
-
-    Given parameters override those of the command line, `sys.argv` by default.
-    """
+    """Drives and records until the end, an error or a signal, with parameters beside `args`."""
     nodes: list[RecordNode] = []
 
     def make(context: Context) -> RecordNode:

@@ -34,10 +34,7 @@ def arguments(namespace: str, remap: Sequence[str]) -> list[str]:
 
 
 def preview(given: Mapping[str, Any]) -> tuple[str, ...]:
-    """Draws the expected drive next to the recording; returns lines for people.
-
-    Given are the parameters of `record_node`. Raises ConfigError if one can't be used.
-    """
+    """Draws the drive that `record_node` would make of its parameters; returns lines."""
     robot, out = load_robot(given["robot"]), check_out(Path(given["out"]))
     topic_roles(given["topics"] or None)  # reports a wrong file before the robot moves
     plan = DrivePlan(robot, *(given[name] for name in ("bound", "duration", "speed", "seed")))

@@ -183,7 +183,6 @@ def _seen(probe: Node, whole: str) -> bool:
 
 
 def _lives(probe: Node, whole: str) -> bool:
-    """True if the other node answers."""
     client = probe.create_client(GetParameters, f"{whole}/get_parameters")
     executor = SingleThreadedExecutor(context=probe.context)
     executor.add_node(probe)

@@ -212,10 +212,7 @@ class Outbox:
     def send(
         self, publisher: Publisher, message: Any, now_ns: int, late_ns: tuple[int, int]
     ) -> None:
-        """Publishes a message, or its bytes, now, or schedules it.
-
-        `late_ns` is the least delay, and the greatest additional one, drawn uniformly for each.
-        """
+        """Publishes a message or its bytes, after a delay and a drawn part of a jitter [ns]."""
         delay, jitter = late_ns
         if jitter:
             delay += int(self._random.integers(jitter + 1))
@@ -441,7 +438,6 @@ class DeviceNode(qos.QosWatch):
         return True, ""
 
     def _publish(self) -> None:
-        """Publishes what is due at present."""
         now_ns = self._now_ns
         if self._clock_topic.get_subscription_count():
             self._clock_topic.publish(Clock(clock=conversions.stamp_to_ros(now_ns)))
@@ -450,7 +446,6 @@ class DeviceNode(qos.QosWatch):
             self._publish_data(odom_due, scan_due)
 
     def _publish_data(self, odom_due: bool, scan_due: bool) -> None:
-        """Publishes the present data of the robots' devices."""
         now_ns, outbox, moving = self._now_ns, self._outbox, []
         for k, port in enumerate(self._ports):
             sensed = self._world.sensed(k)

@@ -49,12 +49,10 @@ def _after_text(content: Bytes, place: int, order: str) -> int:
 
 
 def _aligned(place: int, size: int) -> int:
-    """Returns the next offset at which a number of a size may stand."""
     return place + (HEAD - place) % size
 
 
 def _floats(content: Bytes, order: str) -> int:
-    """Returns the offset of the floats of a scan."""
     return _aligned(_after_text(content, FRAME, order), 4)
 
 

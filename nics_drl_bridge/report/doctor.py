@@ -295,7 +295,6 @@ def _alike(ratio: float) -> bool:
 
 
 def _slope(x: Array, y: Array) -> float:
-    """Least-squares slope of y over x; inf if x is zero."""
     power = float(x @ x)
     return float(x @ y) / power if power > 0.0 else float("inf")
 

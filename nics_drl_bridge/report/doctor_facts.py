@@ -140,10 +140,7 @@ def facts_of_bag(path: str | Path, namespace: str = "") -> Facts:
 
 @dataclass(frozen=True)
 class Mismatch:
-    """A mismatch between robot and expectation on a topic, with numbers and the remedy.
-
-    An `error` makes a policy misbehave; a `warning` may.
-    """
+    """A mismatch with its remedy; an `error` makes a policy misbehave, a `warning` may."""
 
     severity: Literal["error", "warning"]
     check: str

@@ -127,11 +127,7 @@ def load_mujoco() -> Any:
 
 
 def build_machine(spec: RobotSpec, physics: Physics | None = None) -> Machine:
-    """Builds the machine of a robot; an Ackermann spec may also have `wheel_radius` and `track`.
-
-    Raises ConfigError if the spec names no textbook kinematics or a kind without a machine, or
-    lacks a parameter.
-    """
+    """Builds the machine of a robot; ConfigError without one of its kind, or a parameter."""
     kind = require_textbook(spec)
     if kind not in _BUILDERS:
         raise ConfigError(

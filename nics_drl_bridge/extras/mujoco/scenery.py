@@ -52,10 +52,7 @@ def obstacle_name(k: int) -> str:
 def compile_scene(
     mujoco: Any, machine: Machine, footprint: Shape, robots: int, scenery: Scenery, physics: Physics
 ) -> Any:
-    """Compiles the MuJoCo model of robots of one kind, whose parts have names with `prefix_of`.
-
-    `mujoco` is the module; the footprint is a circle or a polygon.
-    """
+    """Compiles the model of robots of one kind, with a circle or polygon as footprint."""
     spec = mujoco.MjSpec.from_string(machine.xml)
     maker = _Maker(mujoco, spec, physics)
     maker.bumper(spec.body("base_link"), footprint)
@@ -107,7 +104,6 @@ class _Maker:
         self._box(body, middle, float(np.arctan2(along[1], along[0])), size)
 
     def map(self, grid: GridMap) -> None:
-        """Adds the blocked cells of a map."""
         heading, side = grid.origin[2], grid.resolution
         for first_row, first, row, column in rectangles(grid.blocked):
             middle = grid.cell_to_world([0.5 * (first_row + row - 1), 0.5 * (first + column - 1)])
@@ -115,7 +111,6 @@ class _Maker:
             self._box(self._spec.worldbody, middle, heading, size)
 
     def obstacle(self, k: int, shape: Shape, pose: Array, moves: bool) -> None:
-        """Adds an obstacle at a pose (3,)."""
         x, y, heading = pose
         body = self._spec.worldbody.add_body(
             name=obstacle_name(k), pos=[x, y, 0.0], quat=quaternion(heading), mocap=moves
@@ -154,10 +149,7 @@ def quaternion(heading: float) -> list[float]:
 
 
 def convex_parts(outline: Array) -> list[Array]:
-    """Splits an outline (V, 2), counter-clockwise, into convex outlines (v, 2) that fill it.
-
-    One that is not convex is cut into triangles by ear clipping (Meisters 1975).
-    """
+    """Splits an outline (V, 2) into convex ones, if need be by ear clipping (Meisters 1975)."""
     if len(convex_hull(outline)) == len(outline):
         return [outline]
     rest, parts = list(range(len(outline))), []

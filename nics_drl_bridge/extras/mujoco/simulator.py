@@ -99,10 +99,7 @@ class Rig:
 
 
 class MujocoRobot:
-    """A robot on an infinite floor, moved only by its motors and by contact.
-
-    Raises ConfigError if MuJoCo is not installed, or the spec lacks a parameter of the machine.
-    """
+    """A robot on an infinite floor, moved by its motors and by contact; see `build_machine`."""
 
     def __init__(self, spec: RobotSpec, physics: Physics | None = None) -> None:
         self._mujoco = load_mujoco()
@@ -217,7 +214,6 @@ class MujocoSimulator(DrivenSimulator):
             )
 
     def _move(self) -> None:
-        """Runs MuJoCo for one control period."""
         rigs, data, part_s = self._rigs, self._data, self.model.control_period / self._subperiods
         wheels, counted = self.wheels.copy(), np.zeros((len(rigs), 3))
         touched = np.zeros(len(rigs), np.bool_)
@@ -246,10 +242,7 @@ class MujocoSimulator(DrivenSimulator):
 
 
 def divide(period: float, longest: float) -> tuple[int, int, float]:
-    """Divides a control period [s] into time steps of at most `longest` [s].
-
-    Returns the number of parts of about `ENCODER_PERIOD_S`, time steps per part, and the step [s].
-    """
+    """Returns parts of a period of about `ENCODER_PERIOD_S`, steps per part, and the step [s]."""
     parts = max(1, round(period / ENCODER_PERIOD_S))
     steps = max(1, math.ceil(period / parts / longest - 1e-6))
     return parts, steps, period / parts / steps

@@ -162,10 +162,7 @@ Batch = dict[str, Any]
 
 
 class ActorCritic(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
-    """`Actor` and a critic of the same widths, as a module of RLlib.
-
-    `model_config` contains `hidden`, `normaliser` and `log_std`, see `Actor` and `PpoSettings`.
-    """
+    """`Actor` and a critic alike; `model_config` holds `hidden`, `normaliser` and `log_std`."""
 
     def setup(self) -> None:
         """Builds the layers."""
@@ -335,7 +332,6 @@ class Learning:
         logger.close()
 
     def _take(self, result: Mapping[str, Any]) -> None:
-        """Adds the results of a roll-out of all env runners."""
         found = result.get(ENV_RUNNER_RESULTS, {})
         self.steps += int(found.get(NUM_ENV_STEPS_SAMPLED, 0))
         self.stepping_s += float(found.get(STEPPING, 0.0)) / self.runners
@@ -425,7 +421,6 @@ def _config(
     settings: TrainingSettings, seed: int, done: int, normaliser: tuple[Array, Array],
     spaces: tuple[gymnasium.Space[Any], gymnasium.Space[Any]],
 ) -> PPOConfig:  # fmt: skip
-    """Translates the settings into RLlib's configuration."""
     chosen, left = settings.ppo, max(settings.steps - done, 1)
     rate = chosen.learning_rate
     now = rate * max(1.0 - done / settings.steps, train_algorithms.LEAST_RATE)
