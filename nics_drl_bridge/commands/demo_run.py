@@ -28,9 +28,8 @@ from nics_drl_bridge.policy.training_settings import TrainingSettings, load_trai
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import save_recording
+from nics_drl_bridge.report import pictures
 from nics_drl_bridge.report.fit_pictures import CAPTIONS, accuracy, calibration_pictures
-from nics_drl_bridge.report.page import code, page, paragraph, picture, table
-from nics_drl_bridge.report.pictures import Point, training_curve, trajectories
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.world import load_world
@@ -71,7 +70,7 @@ class Learned:
 
     policy: str
     how: str
-    curve: Sequence[Point] = ()
+    curve: Sequence[pictures.Point] = ()
 
 
 def run(plan: DemoPlan, say: Say) -> str:
@@ -105,11 +104,11 @@ def run(plan: DemoPlan, say: Say) -> str:
         ("The policy", _policy(plan, learned, summary)),
         ("The same episodes, in process and over DDS", _episodes(plan, model, here, there)),
         ("Deployed", _deployed(plan, model, here, live)),
-        ("Time", [table(("part", "wall time [s]"), times)]),
+        ("Time", [pictures.table(("part", "wall time [s]"), times)]),
     ]
     name, file = model.robot.name, plan.out / "report.html"
     lead = f"Robot {name!r} in the world {plan.world!r}, policy {learned.policy!r}."
-    write_text(file, page("nics_drl_bridge: demo", lead, sections))
+    write_text(file, pictures.page("nics_drl_bridge: demo", lead, sections))
     return (
         f"demo: in process {successes(here)}/{plan.episodes}, "
         f"over DDS {successes(there)}/{plan.episodes}, report {file}"
@@ -161,12 +160,12 @@ def settings_of(plan: DemoPlan) -> TrainingSettings:
 def _trained(plan: DemoPlan, say: Say) -> Learned:
     from nics_drl_bridge.policy.train import SeedResult, export, train  # needs torch
 
-    settings, curve = settings_of(plan), list[Point]()
+    settings, curve = settings_of(plan), list[pictures.Point]()
     say(f"training a policy for {settings.steps:,} steps in {settings.num_envs} worlds at once")
 
     def tell(progress: Any) -> None:
         before = curve[-1].steps if curve else 0
-        curve.append(Point(progress.steps, progress.success, progress.collision))
+        curve.append(pictures.Point(progress.steps, progress.success, progress.collision))
         if progress.steps * LINES // settings.steps > before * LINES // settings.steps:
             say(
                 f"  {progress.steps:,} steps: success {100 * progress.success:.1f} %, "
@@ -274,18 +273,18 @@ def _model(plan: DemoPlan, model: SimulatorModel, identified: Identified) -> lis
     calibrated = calibration_pictures(model.robot, identified)
     caption = "What each further term is worth; circles mark how many are kept."
     return [
-        paragraph(f"Generated from {plan.recording or 'a textbook drive'}."),
-        code(model.report),
-        picture(accuracy(identified), caption),
-        *(picture(png, CAPTIONS[name]) for name, png in calibrated.items()),
+        pictures.paragraph(f"Generated from {plan.recording or 'a textbook drive'}."),
+        pictures.code(model.report),
+        pictures.picture(accuracy(identified), caption),
+        *(pictures.picture(png, CAPTIONS[name]) for name, png in calibrated.items()),
     ]
 
 
 def _policy(plan: DemoPlan, learned: Learned, summary: Summary) -> list[str]:
-    blocks = [paragraph(learned.how)]
+    blocks = [pictures.paragraph(learned.how)]
     if learned.curve:
         caption = "Success and collisions while it explores; all episodes are new ones."
-        blocks.append(picture(training_curve(learned.curve), caption))
+        blocks.append(pictures.picture(pictures.training_curve(learned.curve), caption))
     rows = [
         (name, *(f"{100 * value:.1f} %" for value in astuple(share)))
         for name, share in summary.shares.items()
@@ -296,7 +295,8 @@ def _policy(plan: DemoPlan, learned: Learned, summary: Summary) -> list[str]:
         f"{summary.episodes} unseen episodes in the world {plan.world!r}, side by side in the fast "
         "simulator, the policy at its best; path and time are means of the successful ones."
     )
-    return [*blocks, paragraph(text), table(("", "value", "95 % from", "to"), rows)]
+    table = pictures.table(("", "value", "95 % from", "to"), rows)
+    return [*blocks, pictures.paragraph(text), table]
 
 
 def _episodes(
@@ -311,16 +311,16 @@ def _episodes(
         for a, b in zip(here, there, strict=True)
     ]  # fmt: skip
     runs = {both[0]: here[:PANELS], both[1]: there[:PANELS]}
-    drawn = trajectories(runs, load_world(plan.world), model.robot.footprint_radius)
+    drawn = pictures.trajectories(runs, load_world(plan.world), model.robot.footprint_radius)
     text = (
         f"{successes(here)} of {len(here)} episodes reached the goal in process, "
         f"{successes(there)} of {len(there)} over DDS in lock-step. Deviation is the "
         "greatest distance between the two true paths at the same step."
     )
     return [
-        paragraph(text),
-        table(("seed", both[0], *each, both[1], *each, "deviation [m]"), rows),
-        picture(drawn, "Blue: in process. Red, dashed: over DDS."),
+        pictures.paragraph(text),
+        pictures.table(("seed", both[0], *each, both[1], *each, "deviation [m]"), rows),
+        pictures.picture(drawn, "Blue: in process. Red, dashed: over DDS."),
     ]
 
 
@@ -329,13 +329,13 @@ def _deployed(
 ) -> list[str]:
     beside = [episode for episode in here if episode.seed == live.seed]
     runs = {LABELS[FAST]: beside, "deployed": [live]}
-    drawn = trajectories(runs, load_world(plan.world), model.robot.footprint_radius)
+    drawn = pictures.trajectories(runs, load_world(plan.world), model.robot.footprint_radius)
     text = (
         "simulator_node in real time, middleware_node, policy_node and command_gate ran as "
         "processes of their own; nobody stepped them. The robot "
         f"{'reached' if live.result == 'success' else 'did not reach'} its goal."
     )
     return [
-        paragraph(text),
-        picture(drawn, "The true path of the deployed robot beside the lock-step one."),
+        pictures.paragraph(text),
+        pictures.picture(drawn, "The true path of the deployed robot beside the lock-step one."),
     ]

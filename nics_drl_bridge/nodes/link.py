@@ -74,7 +74,7 @@ class Link:
         self._closing = weakref.finalize(self, _shut_down, self._context, self._timeout, thread)
 
     def send(self, twist: NDArray[np.float64], stamp_ns: int = 0) -> None:
-        """Publishes linear.x, linear.y, angular.z (3,); BackendError, and a zero, for NaN or inf."""
+        """Publishes linear.x, linear.y, angular.z (3,); BackendError and a zero for NaN or inf."""
         if not all(map(math.isfinite, twist)):
             self.halt()
             raise BackendError(

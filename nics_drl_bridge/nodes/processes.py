@@ -31,7 +31,7 @@ from nics_drl_bridge.nodes.transport import domains_in_use
 LAST_DOMAIN_ID = 101  # above it DDS ports may collide with Linux's ephemeral ports
 GREATEST_DOMAIN_ID = 232  # above it there are no ports
 PR_SET_PDEATHSIG, LOG_LINES = 1, 5
-PATIENCE_S, ASK_AGAIN_S, ANSWER_S, ASK_POLL_S = 5.0, 0.2, 2.0, 0.005
+PATIENCE_S, ASK_AGAIN_S, ANSWER_S, POLL_S = 5.0, 0.2, 2.0, 0.005
 
 
 def free_domain_id() -> int:
@@ -120,7 +120,6 @@ class Witness(AbstractContextManager["Witness", None]):
 
     def __init__(self, domain_id: int | None = None, topic: str = "ground_truth") -> None:
         self._poses: list[NDArray[np.float64]] = []
-        self._changed = threading.Condition()
         self._context = open_context(domain_id=domain_id)
         self._node = Node("witness", context=self._context, start_parameter_services=False)
         self._node.create_subscription(Odometry, topic, self._take, qos.SENSOR_RELIABLE)
@@ -130,20 +129,16 @@ class Witness(AbstractContextManager["Witness", None]):
         self._thread.start()
 
     def _take(self, message: Odometry) -> None:
-        with self._changed:
-            self._poses.append(conversions.odometry_from_ros(message)[0])
-            self._changed.notify_all()
+        self._poses.append(conversions.odometry_from_ros(message)[0])
 
     @property
     def path(self) -> NDArray[np.float64]:
         """All poses so far (T, 3)."""
-        with self._changed:
-            return np.array(self._poses).reshape(-1, 3)
+        return np.array(self._poses).reshape(-1, 3)
 
     def sees(self, timeout_s: float) -> bool:
         """Waits for a first pose; False after the time [s]."""
-        with self._changed:
-            return self._changed.wait_for(lambda: bool(self._poses), timeout_s)
+        return holds(lambda: self._poses, timeout_s, POLL_S)
 
     def arrives(self, goal: ArrayLike, radius: float, timeout_s: float) -> bool:
         """Waits until the robot is within `radius` of a goal (2,); False after the time [s]."""
@@ -152,8 +147,7 @@ class Witness(AbstractContextManager["Witness", None]):
             newest = self._poses[-1:]
             return any(np.linalg.norm(pose[:2] - np.asarray(goal)) < radius for pose in newest)
 
-        with self._changed:
-            return self._changed.wait_for(there, timeout_s)
+        return holds(there, timeout_s, POLL_S)
 
     def arms(self, gate: str, timeout_s: float) -> str:
         """Arms a gate, asking until it agrees; returns its last reason to refuse, or ''."""
@@ -174,7 +168,7 @@ class Witness(AbstractContextManager["Witness", None]):
         while time.monotonic() < deadline and not answer.success:
             if client.wait_for_service(timeout_sec=ASK_AGAIN_S):
                 future = client.call_async(Trigger.Request())
-                if holds(future.done, ANSWER_S, ASK_POLL_S):
+                if holds(future.done, ANSWER_S, POLL_S):
                     answer = future.result()
             if not answer.success:
                 time.sleep(ASK_AGAIN_S)

@@ -338,14 +338,8 @@ def record(
     given: Mapping[str, Any] | None = None, args: Sequence[str] | None = None
 ) -> DriveResult:
     """Drives and records until the end, an error or a signal, with parameters beside `args`."""
-    nodes: list[RecordNode] = []
-
-    def make(context: Context) -> RecordNode:
-        nodes.append(RecordNode(context, given))
-        return nodes[-1]
-
-    run_node(make, args, "record_node")
-    return nodes[-1].outcome or DriveResult(False, None, None, "interrupted: nothing was saved")
+    node: RecordNode = run_node(partial(RecordNode, given=given), args, "record_node")
+    return node.outcome or DriveResult(False, None, None, "interrupted: nothing was saved")
 
 
 def main(args: list[str] | None = None) -> None:

@@ -74,8 +74,8 @@ def last_word(publisher: Publisher, message: Any) -> None:
 
 def run_node(
     make: Callable[[Context], Node], args: Sequence[str] | None = None, sole_name: str = ""
-) -> None:
-    """Runs a node until SIGINT or SIGTERM, then destroys it in order.
+) -> Any:
+    """Runs a node until SIGINT or SIGTERM, then destroys it in order, and returns it.
 
     A node's `start()`, if any, is called before it spins, and its `stop()` while it can still
     publish, to leave its robot at rest. A user's error becomes one sentence on standard error and
@@ -119,6 +119,7 @@ def run_node(
         if context is not None:
             context.try_shutdown()
         alone.close()
+    return node
 
 
 def holds(condition: Callable[[], Any], seconds: float, poll_s: float) -> bool:

@@ -50,6 +50,42 @@ TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 SWITCH = {STAMPED: "enable_stamped_cmd_vel:=false", TWIST: "enable_stamped_cmd_vel:=true"}
 
 
+class Outbox:
+    """Publishes messages after a latency and a jitter, each topic in order, or at once."""
+
+    def __init__(self) -> None:
+        self._random = np.random.default_rng(0)
+        self._waiting: list[tuple[int, int, Publisher, bytes]] = []
+        self._latest: dict[Publisher, int] = {}
+        self._numbers = itertools.count()
+
+    def send(
+        self, publisher: Publisher, message: Any, now_ns: int, late_ns: tuple[int, int]
+    ) -> None:
+        """Publishes a message or its bytes, after a delay and a drawn part of a jitter [ns]."""
+        delay, jitter = late_ns
+        if jitter:
+            delay += int(self._random.integers(jitter + 1))
+        if not delay:
+            publisher.publish(message)
+            return
+        due = max(now_ns + delay, self._latest.get(publisher, 0))
+        self._latest[publisher] = due
+        content = message if isinstance(message, bytes) else serialize_message(message)
+        heapq.heappush(self._waiting, (due, next(self._numbers), publisher, content))
+
+    def flush(self, now_ns: int) -> None:
+        """Publishes what is due."""
+        while self._waiting and self._waiting[0][0] <= now_ns:
+            _, _, publisher, content = heapq.heappop(self._waiting)
+            publisher.publish(content)
+
+    def clear(self) -> None:
+        """Drops the waiting messages: they are from an episode that is over."""
+        self._waiting.clear()
+        self._latest.clear()
+
+
 class RobotPort:
     """Publishes `scan`, `odom`, further sensors, `joint_states`, `ground_truth` of one robot.
 
@@ -57,14 +93,12 @@ class RobotPort:
     """
 
     def __init__(
-        self,
-        node: Node,
-        namespace: str,
-        model: SimulatorModel,
-        frames: device_parameters.Frames,
-        time: device_parameters.DeviceTiming,
-    ) -> None:
-        self._model, self._time, self.frames = model, time, frames
+        self, node: Node, namespace: str, model: SimulatorModel, frames: device_parameters.Frames,
+        time: device_parameters.DeviceTiming, outbox: Outbox,
+    ) -> None:  # fmt: skip
+        self._model, self.frames = model, frames
+        self._send = partial(outbox.send, late_ns=time.odom_late_ns)
+        self._send_scan = partial(outbox.send, late_ns=time.scan_late_ns)
 
         def publisher(kind: Any, topic: str) -> Publisher:
             return node.create_publisher(kind, f"{namespace}{topic}", qos.SENSOR_RELIABLE)
@@ -106,25 +140,23 @@ class RobotPort:
             moving.append(transform_to_ros(frames.map, frames.odom, home, now))
         return moving
 
-    def publish_odometry(self, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
+    def publish_odometry(self, sensed: Sensed, now_ns: int) -> None:
         """Publishes odometry, and joints and true pose if they have subscribers."""
-        late_ns = self._time.odom_late_ns
         odometry = self._odom.write(now_ns, sensed.odom, sensed.twist, sensed.covariance)
-        outbox.send(self._odoms, odometry, now_ns, late_ns)
+        self._send(self._odoms, odometry, now_ns)
         if self._joints.get_subscription_count():
             joints = conversions.joints_to_ros(self._model.robot, sensed.state, now_ns)
-            outbox.send(self._joints, joints, now_ns, late_ns)
+            self._send(self._joints, joints, now_ns)
         if self._truths.get_subscription_count():
             self._truths.publish(self._truth.write(now_ns, sensed.pose, sensed.true_twist))
 
-    def publish_scan(self, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
+    def publish_scan(self, sensed: Sensed, now_ns: int) -> None:
         """Publishes the scan, stamped with the time of beam 0, and readings of further sensors."""
         ranges = to_device(sensed.ranges, self._model.lidar)
-        message = self._scan.write(now_ns - self._sweep_ns, ranges)
-        outbox.send(self._scans, message, now_ns, self._time.scan_late_ns)
+        self._send_scan(self._scans, self._scan.write(now_ns - self._sweep_ns, ranges), now_ns)
         for sensor, frame, publisher in self._sensors:
             reading = sensor_to_ros(sensor, sensed.readings[sensor.name], now_ns, frame)
-            outbox.send(publisher, reading, now_ns, self._time.scan_late_ns)
+            self._send_scan(publisher, reading, now_ns)
 
 
 class CommandInlet:
@@ -200,42 +232,6 @@ class CommandInlet:
             )
 
 
-class Outbox:
-    """Publishes messages after a latency and a jitter, each topic in order, or at once."""
-
-    def __init__(self) -> None:
-        self._random = np.random.default_rng(0)
-        self._waiting: list[tuple[int, int, Publisher, bytes]] = []
-        self._latest: dict[Publisher, int] = {}
-        self._numbers = itertools.count()
-
-    def send(
-        self, publisher: Publisher, message: Any, now_ns: int, late_ns: tuple[int, int]
-    ) -> None:
-        """Publishes a message or its bytes, after a delay and a drawn part of a jitter [ns]."""
-        delay, jitter = late_ns
-        if jitter:
-            delay += int(self._random.integers(jitter + 1))
-        if not delay:
-            publisher.publish(message)
-            return
-        due = max(now_ns + delay, self._latest.get(publisher, 0))
-        self._latest[publisher] = due
-        content = message if isinstance(message, bytes) else serialize_message(message)
-        heapq.heappush(self._waiting, (due, next(self._numbers), publisher, content))
-
-    def flush(self, now_ns: int) -> None:
-        """Publishes what is due."""
-        while self._waiting and self._waiting[0][0] <= now_ns:
-            _, _, publisher, content = heapq.heappop(self._waiting)
-            publisher.publish(content)
-
-    def clear(self) -> None:
-        """Drops the waiting messages: they are from an episode that is over."""
-        self._waiting.clear()
-        self._latest.clear()
-
-
 def transform_to_ros(parent: str, child: str, pose: ArrayLike, stamp: Time) -> TransformStamped:
     """Returns a pose (3,) of a child frame in its parent as a transform."""
     x, y, heading = np.asarray(pose, np.float64).tolist()
@@ -285,7 +281,7 @@ class DeviceNode(qos.QosWatch):
         commands = qos.EVERY_COMMAND if self._time.lockstep else qos.COMMAND
         for k, name in enumerate(self._names):
             space, frames = f"{name}/" if name else "", device_parameters.frames(self, name)
-            self._ports.append(RobotPort(self, space, model, frames, self._time))
+            self._ports.append(RobotPort(self, space, model, frames, self._time, self._outbox))
             given = model.robot, commands, partial(self._on_command, k), self._too_old
             self._inlets.append(CommandInlet(self, space, *given))
         self._open_transforms()
@@ -446,18 +442,18 @@ class DeviceNode(qos.QosWatch):
             self._publish_data(odom_due, scan_due)
 
     def _publish_data(self, odom_due: bool, scan_due: bool) -> None:
-        now_ns, outbox, moving = self._now_ns, self._outbox, []
+        now_ns, moving = self._now_ns, []
         for k, port in enumerate(self._ports):
             sensed = self._world.sensed(k)
             if odom_due:
-                port.publish_odometry(sensed, outbox, now_ns)
+                port.publish_odometry(sensed, now_ns)
                 if self._transforms is not None:
                     moving += port.moving(conversions.stamp_to_ros(now_ns), sensed)
             if scan_due:
-                port.publish_scan(sensed, outbox, now_ns)
+                port.publish_scan(sensed, now_ns)
         if moving:  # with the delay of the odometry that it comes from
             message = self._transforms(transforms=moving)
-            outbox.send(self._moving, message, now_ns, self._time.odom_late_ns)
+            self._outbox.send(self._moving, message, now_ns, self._time.odom_late_ns)
 
 
 def declare_renderer(node: Node, default: Renderer) -> Renderer:

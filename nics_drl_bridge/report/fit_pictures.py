@@ -24,7 +24,7 @@ from nics_drl_bridge.identify.open_loop import HORIZON_S, Windows, predict, wind
 from nics_drl_bridge.identify.report import CalibratedValue, estimates
 from nics_drl_bridge.identify.signals import DIFFERENCE, held, moved_commands, nominal_lags
 from nics_drl_bridge.recording.recording import Samples
-from nics_drl_bridge.report.page import DARK, MEASURED, MODEL, OTHER, panels, png
+from nics_drl_bridge.report.pictures import DARK, MEASURED, MODEL, OTHER, panels, png
 from nics_drl_bridge.robot.noise import Level
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.threads import one_blas_thread

@@ -14,11 +14,15 @@ from PIL import Image
 from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.policy.evaluation import Episode
 from nics_drl_bridge.recording.excite import DrivePlan
-from nics_drl_bridge.report.page import code, page, paragraph, picture, table
 from nics_drl_bridge.report.pictures import (
     Point,
+    code,
     draw_world,
     drive_picture,
+    page,
+    paragraph,
+    picture,
+    table,
     training_curve,
     trajectories,
 )
