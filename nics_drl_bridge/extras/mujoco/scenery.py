@@ -8,7 +8,6 @@ so outlines are cut into convex parts and maps into rectangles.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,8 @@ from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import Circle, Rectangle, Segment, Shape, convex_hull
+from nics_drl_bridge.sim.scenes import SceneSampler
+from nics_drl_bridge.sim.world import World
 
 HEIGHT = 0.5  # height of walls and obstacles [m]
 THICKNESS = 0.002  # thickness of walls, which have none for the lidar [m]
@@ -26,17 +27,6 @@ BUMPER = 4  # bit of MuJoCo's `contype` and `conaffinity` for contacts of bumper
 BUMPER_FRICTION = 0.3
 BUMPER_NAME = "bumper_"
 SLIVER = 1e-9  # triangles of less area, relative to the square of the outline's size, are omitted
-
-
-@dataclass(frozen=True)
-class Scenery:
-    """Walls, map and obstacles of a world in one episode."""
-
-    walls: Array  # (W, 4) x1, y1, x2, y2 [m]
-    grid: GridMap | None
-    shapes: tuple[Shape, ...]  # of the obstacles
-    bodies: Array  # (K, 7) as in `lidar.shapes.BODY`
-    moving: NDArray[np.bool_]  # (K,) obstacles whose poses are prescribed (mocap)
 
 
 def prefix_of(robot: int) -> str:
@@ -50,9 +40,13 @@ def obstacle_name(k: int) -> str:
 
 
 def compile_scene(
-    mujoco: Any, machine: Machine, footprint: Shape, robots: int, scenery: Scenery, physics: Physics
-) -> Any:
-    """Compiles the model of robots of one kind, with a circle or polygon as footprint."""
+    mujoco: Any, machine: Machine, physics: Physics, footprint: Shape, robots: int, world: World,
+    sampler: SceneSampler, bodies: Array,
+) -> Any:  # fmt: skip
+    """Compiles the model of robots of one kind, with a circle or polygon as footprint, in a world.
+
+    Obstacles (K, 7), as in `lidar.shapes.BODY`, that move have prescribed poses (mocap).
+    """
     spec = mujoco.MjSpec.from_string(machine.xml)
     maker = _Maker(mujoco, spec, physics)
     maker.bumper(spec.body("base_link"), footprint)
@@ -61,13 +55,14 @@ def compile_scene(
         another.delete(another.geom("floor"))
         _Maker(mujoco, another, physics).bumper(another.body("base_link"), footprint)
         spec.attach(another, prefix=prefix_of(m), frame=spec.worldbody.add_frame())
-    for wall in scenery.walls:
+    for wall in world.all_walls():
         maker.wall(spec.worldbody, wall[:2], wall[2:])
-    if scenery.grid is not None:
-        maker.map(scenery.grid)
-    for k, body in enumerate(scenery.bodies):
+    if world.grid is not None:
+        maker.map(world.grid)
+    for k, body in enumerate(bodies):
         if body[RADIUS] > 0.0:
-            maker.obstacle(k, scenery.shapes[int(body[SHAPE])], body[:3], bool(scenery.moving[k]))
+            moves = sampler.motions[k] is not None
+            maker.obstacle(k, sampler.shapes[int(body[SHAPE])], body[:3], moves)
     return spec.compile()
 
 

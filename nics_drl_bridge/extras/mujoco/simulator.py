@@ -15,6 +15,7 @@ from nics_drl_bridge.extras.mujoco import scenery
 from nics_drl_bridge.extras.mujoco.machines import Machine, Physics, build_machine, load_mujoco
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
 from nics_drl_bridge.interface import Array
+from nics_drl_bridge.lidar.exact_kernels import RADIUS
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.kinds import textbook
@@ -170,20 +171,17 @@ class MujocoSimulator(DrivenSimulator):
         self, seeds: ArrayLike, worlds: ArrayLike | None = None, starts: ArrayLike | None = None
     ) -> Scenes:
         """Begins the episode of a seed (1,), at poses (1, M, 3); see `FastSimulator.reset`."""
-        scenes, sampler = super().reset(seeds, worlds, starts), self.sampler
-        moving = np.array([motion is not None for motion in sampler.motions], np.bool_)
-        bodies, robots = scenes.bodies[0], self.data.pose.shape[1]
-        walls, grid, spec = self.world.all_walls(), self.world.grid, self.model.robot
-        place = scenery.Scenery(walls, grid, sampler.shapes, bodies, moving)
+        scenes = super().reset(seeds, worlds, starts)
+        spec, robots, bodies = self.model.robot, self.data.pose.shape[1], scenes.bodies[0]
         compiled = self._simulation = scenery.compile_scene(
-            self._mujoco, self._machine, footprint_shape(spec), robots, place, self._physics
-        )
+            self._mujoco, self._machine, self._physics, footprint_shape(spec), robots, self.world,
+            self.sampler, bodies,
+        )  # fmt: skip
         self._data = self._mujoco.MjData(compiled)
         self._rigs = [Rig(spec, self._machine, compiled, m) for m in range(robots)]
-        self._mocap = [
-            (k, int(compiled.body(scenery.obstacle_name(k)).mocapid[0]))
-            for k in np.flatnonzero(moving & (bodies[:, 5] > 0.0)).tolist()
-        ]
+        there = np.flatnonzero(bodies[:, RADIUS] > 0.0).tolist()
+        mocap = ((k, int(compiled.body(scenery.obstacle_name(k)).mocapid[0])) for k in there)
+        self._mocap = [(k, one) for k, one in mocap if one >= 0]
         self._bumper_of = scenery.bumpers(compiled, robots)
         for rig, pose in zip(self._rigs, self.data.pose[0], strict=True):
             rig.put(self._data, self._rest, pose)
