@@ -121,7 +121,12 @@ class RealtimeBackend:
         if self._is_vehicle():
             self._await_start(start)
         if not self._is_vehicle():
-            self._begin(start)
+            timeout_s = self._options.timeout_s
+            stamp_ns = self._episodes.begin(start, timeout_s)
+            with self._topics.lock:
+                self._topics.begin(stamp_ns, start.pose)
+            if not holds(lambda: math.isfinite(self._oldest()[1]), timeout_s, POLL_S):
+                raise StaleDataError(*self._oldest(), timeout_s)
         self._misses, self._deadline_ns = 0, time.monotonic_ns() + self._period_ns
         return self._fresh_view()[0]
 
@@ -131,14 +136,6 @@ class RealtimeBackend:
             return self._options.vehicle
         self._simulated = self._simulated or self._episodes.there
         return not self._simulated
-
-    def _begin(self, start: Start) -> None:
-        timeout_s = self._options.timeout_s
-        stamp_ns = self._episodes.begin(start, timeout_s)
-        with self._topics.lock:
-            self._topics.begin(stamp_ns, start.pose)
-        if not holds(lambda: math.isfinite(self._oldest()[1]), timeout_s, POLL_S):
-            raise StaleDataError(*self._oldest(), timeout_s)
 
     def _await_start(self, start: Start) -> None:
         """Waits until a vehicle stands at its start, telling what is missing, or is a simulator."""

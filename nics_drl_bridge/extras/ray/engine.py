@@ -320,8 +320,7 @@ class Learning:
                 self._check_silence(now - heard, about)
                 continue
             heard = now
-            progress = self._progress(first, now - begin)
-            tell(progress)
+            tell(progress := self._progress(first, now - begin))
             for name in ("success", "collision", "steps_per_s", "env_share"):
                 logger.record(f"rollout/{name}", getattr(progress, name))
             logger.dump(self.steps)
@@ -349,27 +348,17 @@ class Learning:
             )
 
     def _progress(self, first: int, taken: float) -> Progress:
-        ended, success, collision = np.sum(list(self.recent), axis=0)
-        return Progress(
-            self.seed,
-            self.steps,
-            self.settings.steps,
-            float(success / ended) if ended else np.nan,
-            float(collision / ended) if ended else np.nan,
-            (self.steps - first) / taken,
-            self.stepping_s / taken,
-        )
+        ended, *counts = np.sum(list(self.recent), axis=0)
+        success, collision = (float(n / ended) if ended else np.nan for n in counts)
+        speed, busy = (self.steps - first) / taken, self.stepping_s / taken
+        return Progress(self.seed, self.steps, self.settings.steps, success, collision, speed, busy)
 
     def save(self, about: dict[str, Any]) -> None:
         """Saves network and optimiser."""
-        content = {
-            "format": FORMAT,
-            "about": json.dumps(about),
-            "steps": self.steps,
-            "network": self.module.state_dict(),
-            "optimiser": self.learner.get_optimizer().state_dict(),
-        }
-        write_content(self.path, content)
+        content = {"format": FORMAT, "about": json.dumps(about), "steps": self.steps}
+        optimiser = self.learner.get_optimizer().state_dict()
+        states = {"network": self.module.state_dict(), "optimiser": optimiser}
+        write_content(self.path, content | states)
 
     def resume(self, content: dict[str, Any]) -> None:
         """Continues with network and optimiser of a checkpoint; the worlds start afresh."""

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from nics_drl_bridge.commands import cli
+from nics_drl_bridge.commands import cli, model
 from nics_drl_bridge.errors import BackendError, ConfigError
-from nics_drl_bridge.nodes import recorder
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import load_robot
 
@@ -86,17 +85,17 @@ def test_what_can_not_be_done_is_one_sentence(tmp_path, words, hint):
 
 
 def test_options_become_arguments_of_the_node():
-    assert recorder.arguments("", ()) == ["nics"]
-    named = recorder.arguments("/bot/", ("odom:=/wheels",))
+    assert model.node_arguments("", ()) == ["nics"]
+    named = model.node_arguments("/bot/", ("odom:=/wheels",))
     assert named == ["nics", "--ros-args", "-r", "__ns:=/bot", "-r", "odom:=/wheels"]
     with pytest.raises(ConfigError, match="--remap 'odom=wheels': must be NAME:=OTHER"):
-        recorder.arguments("", ("odom=wheels",))
+        model.node_arguments("", ("odom=wheels",))
 
 
 def test_the_summary_tells_each_command_and_the_next_step():
     given = {"robot": "ackermann", "out": "runs/drive.npz"}
     drive = record(CAR, np.random.default_rng(0), duration=30.0)
-    measured, speed, steering, after = recorder.summary(drive, given)
+    measured, speed, steering, after = model.drive_summary(drive, given)
     assert measured.startswith("measured: a path of ")
     assert speed.startswith("speed_command: moved from 0.0")
     assert "on its own" in steering
