@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -116,9 +117,9 @@ def replay(
             _estimate(whole, model, topic or [], out)
             return
         with needs_ros("nics bag replay"):
-            from nics_drl_bridge.extras.bags.live import PlayOrder, play_bag
-        order = PlayOrder(whole, tuple(topics or ()), rate, loop, clock, namespace, lockstep)
-        sent = play_bag(order, lambda line: typer.echo(line, err=True))
+            from nics_drl_bridge.extras.bags.live import play_bag
+        say = partial(typer.echo, err=True)
+        sent = play_bag(whole, topics or (), rate, loop, clock, namespace, lockstep, say)
         typer.echo(f"{sent} messages were published")
 
 
