@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from typer import Argument, Option
@@ -19,9 +19,6 @@ from nics_drl_bridge.commands.console import (
     one_sentence,
 )
 from nics_drl_bridge.errors import BackendError, ConfigError
-
-if TYPE_CHECKING:
-    from nics_drl_bridge.recording.recording import Recording
 
 
 def record(
@@ -100,7 +97,7 @@ def preview_lines(given: dict[str, Any]) -> tuple[str, ...]:
     return (*pattern.lines(), f"its path is drawn in {picture}")
 
 
-def drive_summary(recording: Recording, given: dict[str, Any]) -> tuple[str, ...]:
+def drive_summary(recording: Any, given: dict[str, Any]) -> tuple[str, ...]:
     """Returns lines about the robot's path, the coverage of each command, and the next step."""
     import numpy as np
 

@@ -6,14 +6,11 @@ import json
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from nics_drl_bridge.commands.console import intact, needs_ros, one_sentence, roles_of, table
-
-if TYPE_CHECKING:
-    from nics_drl_bridge.extras.bags.info import BagTopic
 
 bag = typer.Typer(help="Records, describes, replays and saves bags.", no_args_is_help=True)
 
@@ -114,7 +111,17 @@ def replay(
     """Plays a bag over ROS 2, or gives the estimate that the middleware makes of it."""
     with one_sentence(), intact(path, salvage) as whole:
         if estimate:
-            _estimate(whole, model, topic or [], out)
+            from nics_drl_bridge.generator import open_model
+            from nics_drl_bridge.middleware import playback
+
+            made = playback.estimate(whole, open_model(model), roles_of(topic or []))
+            if out is not None:
+                playback.write_estimate(made, out)
+            for reason, count in sorted(made.rejected.items()):
+                typer.echo(f"not used: {count} of {reason}")
+            (x, y, heading), number = made.pose[-1], len(made.stamp_ns)
+            typer.echo(f"{number} estimates; the last is {x:.3f} m, {y:.3f} m, {heading:.3f}")
+            typer.echo(f"sha256 {made.digest}")
             return
         with needs_ros("nics bag replay"):
             from nics_drl_bridge.extras.bags.live import play_bag
@@ -150,23 +157,9 @@ def _storage(name: str) -> Any:
     return name
 
 
-def _estimate(path: Path, model: str, topics: list[str], out: Path | None) -> None:
-    from nics_drl_bridge.generator import open_model
-    from nics_drl_bridge.middleware import playback
-
-    made = playback.estimate(path, open_model(model), roles_of(topics))
-    if out is not None:
-        playback.write_estimate(made, out)
-    for reason, count in sorted(made.rejected.items()):
-        typer.echo(f"not used: {count} of {reason}")
-    x, y, heading = made.pose[-1]
-    typer.echo(f"{len(made.stamp_ns)} estimates; the last is {x:.3f} m, {y:.3f} m, {heading:.3f}")
-    typer.echo(f"sha256 {made.digest}")
-
-
-def _row(each: BagTopic) -> tuple[str, ...]:
+def _row(each: Any) -> tuple[str, ...]:
     span = "" if each.first_s is None else f"{each.first_s:.2f}, {each.last_s:.2f}"
     gaps = "" if each.longest_gap_s is None else f"{each.gaps}, longest {each.longest_gap_s:.2f} s"
-    delay = "" if each.delay_s is None else f"{1e3 * each.delay_s:.1f} ± {5e2 * each.jitter_s:.1f}"  # type: ignore[operator]
+    delay = "" if each.delay_s is None else f"{1e3 * each.delay_s:.1f} ± {5e2 * each.jitter_s:.1f}"
     rate = "" if each.rate_hz is None else f"{each.rate_hz:.2f}"
     return each.topic, each.type, str(each.count), rate, span, gaps, each.clock, delay
