@@ -23,7 +23,6 @@ from rclpy.node import Node
 from std_srvs.srv import Trigger
 
 from nics_drl_bridge.config import dump_yaml
-from nics_drl_bridge.env.guard import uninterrupted
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.runner import holds, open_context, spin
@@ -84,16 +83,12 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
         command = [sys.executable, "-m", "nics_drl_bridge.nodes.start", node, "--ros-args"]
         command += ["--params-file", str(file), *(word for rule in rules for word in ("-r", rule))]
         chosen = {"ROS_DOMAIN_ID": str(domain_id), "ROS_AUTOMATIC_DISCOVERY_RANGE": discovery}
-        try:  # Python itself would lose a Ctrl-C that comes while it forks
-            with self.log.open("wb") as log, uninterrupted():
-                # Its own session: a terminal's Ctrl-C reaches the parent alone, which then ends it.
-                self._process = subprocess.Popen(
-                    command, env=os.environ | chosen, stdin=subprocess.DEVNULL, stdout=log,
-                    stderr=log, start_new_session=True, preexec_fn=_dies_with_parent(),
-                )  # fmt: skip
-        except KeyboardInterrupt:
-            self.close()
-            raise
+        with self.log.open("wb") as log:
+            # Its own session: Ctrl-C in the terminal reaches the parent alone, which then ends it.
+            self._process = subprocess.Popen(
+                command, env=os.environ | chosen, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+                start_new_session=True, preexec_fn=_dies_with_parent(),
+            )  # fmt: skip
         self.pid = self._process.pid
 
     def check(self) -> None:
