@@ -181,7 +181,6 @@ def _trained(plan: DemoPlan, say: Say) -> Learned:
 
 
 def _evaluate(plan: DemoPlan, model: SimulatorModel, name: str, say: Say) -> Summary:
-    """Drives many unseen episodes at once, without the estimator."""
     say(f"evaluating {name} in {MANY} unseen episodes, all at once")
     policy, task = open_policy(name, model)
     env = BridgeVectorEnv(MANY, model, plan.world, task)
@@ -193,7 +192,6 @@ def _evaluate(plan: DemoPlan, model: SimulatorModel, name: str, say: Say) -> Sum
 
 
 def _drive(plan: DemoPlan, place: str, policy: str, say: Say) -> list[Episode]:
-    """Drives the plan's episodes in one of `episodes.PLACES` and reports each."""
     where = "in process" if place == FAST else "over DDS in lock-step"
     say(f"driving {'' if place == FAST else 'the same '}{plan.episodes} episodes {where}")
     seeds, logs = range(plan.episodes), plan.out / "logs" / place

@@ -100,12 +100,11 @@ class Link:
 
     def call(self, client: Any, request: Any, timeout_s: float) -> Any:
         """Calls a service; the executor's thread completes the future. Raises BackendError."""
-        done, deadline = threading.Event(), time.monotonic() + timeout_s
+        deadline = time.monotonic() + timeout_s
         # A server that hung for long was dropped, and has to be discovered again.
         holds(client.service_is_ready, timeout_s, POLL_S)
         future = client.call_async(request)
-        future.add_done_callback(lambda _: done.set())
-        if not done.wait(max(0.0, deadline - time.monotonic())):
+        if not holds(future.done, deadline - time.monotonic(), POLL_S):
             client.remove_pending_request(future)
             raise BackendError(
                 f"service {client.srv_name}: no answer within {timeout_s:g} s; look at the "

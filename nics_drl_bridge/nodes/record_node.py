@@ -305,7 +305,6 @@ class RecordNode(qos.QosWatch):
             self._end(None)
 
     def _end(self, failure: BridgeError | None, complete: bool = False) -> None:
-        """Stops the robot, saves, and ends the node, however the drive ended."""
         self.outcome = DriveResult(complete, failure, None, "")
         recording, told = None, "the robot was not moved, nothing is recorded"
         if self._ticks:

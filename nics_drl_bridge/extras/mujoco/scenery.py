@@ -93,7 +93,6 @@ class _Maker:
                 self._prism(base, part, (-half, half), name=f"{BUMPER_NAME}{i}", **own)
 
     def wall(self, body: Any, start: Array, end: Array) -> None:
-        """Adds a straight wall between two points (2,) [m]."""
         middle, along = 0.5 * (start + end), end - start
         size = [0.5 * float(np.hypot(*along)), 0.5 * THICKNESS, 0.5 * HEIGHT]
         self._box(body, middle, float(np.arctan2(along[1], along[0])), size)
@@ -126,7 +125,6 @@ class _Maker:
         self._add(body, type=self._kinds.mjGEOM_BOX, size=size, pos=pos, quat=turned)
 
     def _prism(self, body: Any, corners: Array, z: tuple[float, float], **others: Any) -> None:
-        """Adds the prism over a convex outline (v, 2) between two heights [m]."""
         mesh = self._spec.add_mesh(name=f"prism_{len(self._spec.meshes)}")
         mesh.uservert = np.concatenate(
             [np.column_stack([corners, np.full(len(corners), height)]) for height in z]
