@@ -75,8 +75,7 @@ class MiddlewareNode(ManagedNode):
 
 def silence(health: Health, expected: Sequence[str]) -> str:
     """Returns a sentence about expected topics that are silent; empty if none is."""
-    missing = [topic for topic in expected if topic not in health.topics]
-    if missing:
+    if missing := [topic for topic in expected if topic not in health.topics]:
         return f"nothing on {', '.join(missing)} yet"
     silent = [topic for topic in expected if health.topics[topic].age_s > SILENCE_S]
     return f"nothing on {', '.join(silent)} for {SILENCE_S:g} s" if silent else ""

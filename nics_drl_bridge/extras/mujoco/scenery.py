@@ -25,18 +25,13 @@ HEIGHT = 0.5  # height of walls and obstacles [m]
 THICKNESS = 0.002  # thickness of walls, which have none for the lidar [m]
 BUMPER = 4  # bit of MuJoCo's `contype` and `conaffinity` for contacts of bumpers
 BUMPER_FRICTION = 0.3
-BUMPER_NAME = "bumper_"
+BUMPER_NAME, OBSTACLE_NAME = "bumper_", "obstacle_"
 SLIVER = 1e-9  # triangles of less area, relative to the square of the outline's size, are omitted
 
 
 def prefix_of(robot: int) -> str:
     """Prefix of the names of a robot's parts."""
     return f"robot_{robot}/" if robot else ""
-
-
-def obstacle_name(k: int) -> str:
-    """Name of the body of obstacle k."""
-    return f"obstacle_{k}"
 
 
 def compile_scene(
@@ -107,7 +102,7 @@ class _Maker:
     def obstacle(self, k: int, shape: Shape, pose: Array, moves: bool) -> None:
         x, y, heading = pose
         body = self._spec.worldbody.add_body(
-            name=obstacle_name(k), pos=[x, y, 0.0], quat=quaternion(heading), mocap=moves
+            name=f"{OBSTACLE_NAME}{k}", pos=[x, y, 0.0], quat=quaternion(heading), mocap=moves
         )
         if isinstance(shape, Circle):
             size = [shape.radius, 0.5 * HEIGHT, 0.0]

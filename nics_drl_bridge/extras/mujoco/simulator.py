@@ -180,8 +180,8 @@ class MujocoSimulator(DrivenSimulator):
         self._data = self._mujoco.MjData(compiled)
         self._rigs = [Rig(spec, self._machine, compiled, m) for m in range(robots)]
         there = np.flatnonzero(bodies[:, RADIUS] > 0.0).tolist()
-        mocap = ((k, int(compiled.body(scenery.obstacle_name(k)).mocapid[0])) for k in there)
-        self._mocap = [(k, one) for k, one in mocap if one >= 0]
+        ids = [int(compiled.body(f"{scenery.OBSTACLE_NAME}{k}").mocapid[0]) for k in there]
+        self._mocap = [(k, one) for k, one in zip(there, ids, strict=True) if one >= 0]
         self._bumper_of = scenery.bumpers(compiled, robots)
         for rig, pose in zip(self._rigs, self.data.pose[0], strict=True):
             rig.put(self._data, self._rest, pose)
