@@ -211,7 +211,7 @@ class CommandGate(qos.QosWatch):
         self._zero = self._twists.write(np.zeros(3))
         self._listen()
         runner.steadily(self, PERIOD_S, lambda: self._decide(inputs.Tick()))
-        runner.Diagnostics(self, "gate", self._look)
+        runner.diagnose(self, "gate", self._look)
         about = "Real-time priority (SCHED_FIFO) of its process, 1 to 99; 0 for none."
         priority = runner.declare(self, "priority", 0, about, (0, HIGHEST), read_only=True)
         if refused := take_priority(priority):  # once all threads exist

@@ -34,7 +34,7 @@ class MiddlewareNode(ManagedNode):
         runner.declare(self, "map_frame", "map", "Frame id of the estimate.")
         runner.declare(self, "base_frame", "base_link", "Frame id of the robot.")
         runner.serve(self, "~/reset", self._reset)
-        runner.Diagnostics(self, "topics", self._look)
+        runner.diagnose(self, "topics", self._look)
 
     def configure(self) -> None:
         """Opens the model and subscribes."""

@@ -57,7 +57,7 @@ class PolicyNode(ManagedNode):
         about = "So many late inferences in a row command zero."
         runner.declare(self, "late_limit", 3, about, span=(1, 1000), read_only=True)
         self._acted_ns = 0
-        runner.Diagnostics(self, "policy", self._look)
+        runner.diagnose(self, "policy", self._look)
 
     def configure(self) -> None:
         """Opens model and policy, and subscribes."""

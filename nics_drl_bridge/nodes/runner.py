@@ -273,21 +273,20 @@ class Condition(NamedTuple):
     hardware: str = ""  # concerned, such as the robot's name
 
 
-class Diagnostics:
+def diagnose(node: Node, part: str, look: Callable[[], Condition]) -> None:
     """Publishes a node's finding about itself, which `look` returns, once a second."""
+    topic = node.create_publisher(DiagnosticArray, "/diagnostics", qos.DIAGNOSTICS)
+    name = f"{node.get_fully_qualified_name()}: {part}"
 
-    def __init__(self, node: Node, part: str, look: Callable[[], Condition]) -> None:
-        self._node, self._look = node, look
-        self._name = f"{node.get_fully_qualified_name()}: {part}"
-        self._topic = node.create_publisher(DiagnosticArray, "/diagnostics", qos.DIAGNOSTICS)
-        steadily(node, DIAGNOSTICS_S, self._publish)
-
-    def _publish(self) -> None:
-        found = self._look()
-        status = DiagnosticStatus(name=self._name, message=found.message)
-        status.level = DiagnosticStatus.WARN if found.warns else DiagnosticStatus.OK
-        status.hardware_id = found.hardware
-        status.values = [KeyValue(key=key, value=str(value)) for key, value in found.facts.items()]
+    def publish() -> None:
+        found = look()
+        level = DiagnosticStatus.WARN if found.warns else DiagnosticStatus.OK
+        values = [KeyValue(key=key, value=str(value)) for key, value in found.facts.items()]
+        status = DiagnosticStatus(
+            level=level, name=name, message=found.message, hardware_id=found.hardware, values=values
+        )
         message = DiagnosticArray(status=[status])
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        self._topic.publish(message)
+        message.header.stamp = node.get_clock().now().to_msg()
+        topic.publish(message)
+
+    steadily(node, DIAGNOSTICS_S, publish)

@@ -289,7 +289,7 @@ class DeviceNode(qos.QosWatch):
         self.create_service(SetBool, "~/pause", self._on_pause)
         runner.serve(self, "~/repeat", self._repeat)
         runner.serve(self, "~/touched", lambda: (True, json.dumps(self._world.touched)))
-        runner.Diagnostics(self, "simulator", self._look)
+        runner.diagnose(self, "simulator", self._look)
 
     def _open_transforms(self) -> None:
         """Publishes what never changes; if tf2_msgs is not installed, it logs that instead."""

@@ -379,21 +379,21 @@ def _curve(drive: Drive, calibration: Calibration, name: str) -> ShiftCurve | No
     recording, spec, twists = drive.recording, drive.spec, drive.twists
     state, wheels, command = recording.state, recording.wheels, recording.command
     value = float(getattr(calibration, name)) + np.linspace(-REACH_S, REACH_S, TRIALS)
-    signal, delay = (twists.start, twists.end, twists.twist), value
-    if name == "clock_offset_s":
-        delay = -value if state is not None else calibration.command_latency_s - value
-    elif state is None and recording.pose.clock != command.clock:
-        if wheels is None:
-            return None
-        signal = (wheels.t - float(np.median(np.diff(wheels.t))), wheels.t, wheels.values)
-    if state is None:
+    signal, of_clock = (twists.start, twists.end, twists.twist), name == "clock_offset_s"
+    if state is not None and of_clock:
+        by_shift = clocks.residual_by_shift(state, signal)
+        rest = [by_shift(np.array([-d])) for d in value]
+    elif state is not None:
+        by_delay = clocks.state_residual(command, state, spec)
+        rest = [by_delay(np.array([d])) for d in value]
+    else:
+        if not of_clock and recording.pose.clock != command.clock:
+            if wheels is None:
+                return None
+            signal = (wheels.t - float(np.median(np.diff(wheels.t))), wheels.t, wheels.values)
         lags = np.array([r.lag_s for r in calibration.responses])
         lags = lags if len(lags) == len(spec.state) else nominal_lags(spec)
         left = clocks.response_residual(command, spec, signal)
-        rest = [left(lags, d) for d in delay]
-    else:
-        by_delay = clocks.state_residual(command, state, spec)
-        if name == "clock_offset_s":
-            by_delay = clocks.residual_by_shift(state, signal)
-        rest = [by_delay(np.array([d])) for d in delay]
+        delays = calibration.command_latency_s - value if of_clock else value
+        rest = [left(lags, d) for d in delays]
     return ShiftCurve(name, value, np.array([np.sqrt(np.mean(r**2)) for r in rest]))
