@@ -207,8 +207,7 @@ class CommandGate(qos.QosWatch):
         if self._config.shield is not None:
             shield.rehearse()
         self._out = self.create_publisher(Twist, "cmd_vel", qos.COMMAND)
-        self._twists = wire.TwistWriter()
-        self._zero = self._twists.write(np.zeros(3))
+        self._zero = wire.twist_to_bytes(np.zeros(3))
         self._listen()
         runner.steadily(self, PERIOD_S, lambda: self._decide(inputs.Tick()))
         runner.diagnose(self, "gate", self._look)
@@ -272,7 +271,7 @@ class CommandGate(qos.QosWatch):
         What is not finite is sent as zero and presses the e-stop. A motion that was decided on too
         long ago, in a process frozen since, is not sent; so the clock is read immediately before.
         """
-        content = self._twists.write(decision.twist)
+        content = wire.twist_to_bytes(decision.twist)
         if not np.isfinite(decision.twist).all():
             self._out.publish(self._zero)
             self._log.no_number(decision.twist.tolist())

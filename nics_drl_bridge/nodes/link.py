@@ -32,7 +32,7 @@ from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.runner import holds, last_word, open_context
-from nics_drl_bridge.nodes.wire import TwistWriter
+from nics_drl_bridge.nodes.wire import twist_to_bytes
 from nics_drl_bridge.sim.world import World
 
 SPIN_S, POLL_S = 0.2, 0.002
@@ -61,7 +61,6 @@ class Link:
             start_parameter_services=False, parameter_overrides=overrides,
         )  # fmt: skip
         self._kind = TwistStamped if stamped else Twist
-        self._twists = TwistWriter()
         self.commands = self.node.create_publisher(self._kind, command_topic, qos.COMMAND)
         self._timeout = CommandTimeout(self.commands, self._kind, command_timeout_s)
         self._closing: weakref.finalize[Any, Any] | None = None
@@ -83,7 +82,7 @@ class Link:
             )
         self._timeout.begin(moving=True)
         if self._kind is Twist:
-            self.commands.publish(self._twists.write(twist))
+            self.commands.publish(twist_to_bytes(twist))
         else:
             self.commands.publish(conversions.stamped_to_ros(twist, stamp_ns, "base_link"))
 
