@@ -143,13 +143,12 @@ class DriveLog:
         if not data.keys() >= {"command", "pose"}:
             raise RecordingError("recording: nothing was received that could be saved.")
         if len(self._joints) >= FEWEST:
-            found = joint_streams("joint_states", self._joints, self._spec, self._roles, PLACE)
-            data |= {name: each for name, each in found.items() if each is not None}
+            data |= joint_streams("joint_states", self._joints, self._spec, self._roles, PLACE)
         try:
-            kept: dict[str, Any] = dict(streams(data, self._roles.stamps, PLACE))
+            kept: Any = streams(data, self._roles.stamps, PLACE)
         except RecordingError:
             # Poorer stamps are better than no recording of a drive that is over.
-            kept = dict(streams(data, "receive", PLACE))
+            kept = streams(data, "receive", PLACE)
         return Recording(**kept, source=PLACE, variables=self._spec.variable_names)
 
 
