@@ -200,7 +200,7 @@ class _Player:
             lambda: all(p.get_subscription_count() >= known(p.topic_name) for p in publishers),
             PATIENCE_S,
         )
-        if self._barrier and not self._wait(self._barrier.service_is_ready, PATIENCE_S):
+        if self._barrier is not None and not self._wait(self._barrier.service_is_ready, PATIENCE_S):
             raise BackendError(
                 f"node {self._lockstep!r}: not found within {PATIENCE_S:g} s; start it, or "
                 "correct its name, namespace or ROS_DOMAIN_ID."
