@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, PositiveFloat
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.config import Schema, validate
@@ -40,14 +40,14 @@ class RealtimeOptions(Schema):
     namespace: str = ""  # of the robot
     simulator: str = "simulator_node"  # name of its node in that namespace
     domain_id: int | None = Field(None, ge=0, le=232)  # the environment's by default
-    timeout_s: float = Field(30.0, gt=0.0)  # longest wait for a peer or an answer
+    timeout_s: PositiveFloat = 30.0  # longest wait for a peer or an answer
     vehicle: bool | None = None  # a vehicle has no services; None: detected
-    period_s: float | None = Field(None, gt=0.0)  # of a step; the model's control period by default
-    stale_after_s: float = Field(0.5, gt=0.0)  # age from which data are too old for a view
+    period_s: PositiveFloat | None = None  # of a step; the model's control period by default
+    stale_after_s: PositiveFloat = 0.5  # age from which data are too old for a view
     # An episode on a vehicle waits until it stands at the requested pose, or takes the present one.
     start: Literal["wait", "present"] = "wait"
-    tolerance: tuple[float, float] = (0.1, 0.1)  # of the pose at the start [m, rad]
-    start_timeout_s: float = Field(300.0, gt=0.0)  # longest wait for that
+    tolerance: tuple[PositiveFloat, PositiveFloat] = (0.1, 0.1)  # of the start's pose [m, rad]
+    start_timeout_s: PositiveFloat = 300.0  # longest wait for that
     say: Callable[[str], None] | None = None  # told what is missing; the node's logger by default
     # `cmd_vel_raw` leads through `command_gate`: then each command is a TwistStamped with the stamp
     # of the scan that it answers.
@@ -55,12 +55,6 @@ class RealtimeOptions(Schema):
     stamped: bool = False  # `cmd_vel` is a TwistStamped
     pose_type: str = "none"  # of `pose`, a pose sensor in `map`
     use_imu: bool = False  # the yaw rate of `imu`
-
-    @model_validator(mode="after")
-    def _check(self) -> RealtimeOptions:
-        if not all(value > 0.0 for value in self.tolerance):
-            raise ValueError("tolerance must be above 0: metres and radians.")
-        return self
 
     @property
     def gated(self) -> bool:
