@@ -128,7 +128,7 @@ class DdsBackend:
         self._sensors = {sensor.name: sensor for sensor in model.sensors}
         self._middleware = Middleware(model)
         self._period_ns = round(model.control_period * NS_PER_S)
-        further = (*self._sensors, *((TRUTH,) if truth else ()))
+        further = (*self._sensors, TRUTH) if truth else (*self._sensors,)
         self.timeout_s, self._topics = timeout_s, (ODOM, SCAN, *further)
         # No reference to the backend, which may be garbage.
         take = partial(_take_odometry, self._middleware)

@@ -64,8 +64,7 @@ class RobotTopics:
         on_lidar: Callable[[LidarSpec], None] | None = None,
         now_ns: Callable[[], int] | None = None,
     ) -> None:  # fmt: skip
-        self._node, self._robot, self._lidar = node, model.robot, model.lidar
-        self._model = model
+        self._node, self._model, self._robot, self._lidar = node, model, model.robot, model.lidar
         self.now_ns = now_ns or (lambda: int(node.get_clock().now().nanoseconds))
         self.lock = threading.RLock()
         self.middleware = Middleware(model)
