@@ -26,7 +26,7 @@ from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.lidar.scanner import Scanner, make_scanner
 from nics_drl_bridge.lidar.shapes import Circle, Polygon, Rectangle, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
-from nics_drl_bridge.report.page import DARK, MEASURED, MODEL, OTHER, png
+from nics_drl_bridge.report.pictures import DARK, MEASURED, MODEL, OTHER, png
 
 CONTROLS = {
     "shifted": "the baked scans are taken 0.1 m beside",

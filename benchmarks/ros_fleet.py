@@ -122,7 +122,7 @@ def command(robots: int) -> None:
     topics = [
         node.create_publisher(Twist, f"robot{k + 1}/cmd_vel", qos.COMMAND) for k in range(robots)
     ]
-    message, parent = wire.TwistWriter().write(np.array(COMMAND)), os.getppid()
+    message, parent = wire.twist_to_bytes(np.array(COMMAND)), os.getppid()
     while os.getppid() == parent:
         for topic in topics:
             topic.publish(message)

@@ -109,7 +109,7 @@ def test_bad_input_ends_it_with_one_sentence(tmp_path, words, said):
 @pytest.mark.campaign
 @needs_nodes
 def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path, monkeypatch):
-    from nics_drl_bridge.commands import vehicle
+    from nics_drl_bridge.commands import episodes as vehicle
     from nics_drl_bridge.nodes.processes import NodeProcess, Witness
 
     limits = {
@@ -123,10 +123,9 @@ def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path, monke
     gate |= {"use_sim_time": True, "e_stop_required": False}
     # What a busy machine does to rates and ages would be a finding; that is tested elsewhere.
     monkeypatch.setattr(vehicle, "examine", lambda facts, expected: [])
-    order = vehicle.VehicleOrder(
-        "dynamic_window", tmp_path / "out", "differential", "empty", start="present", arm=True,
-        stale_after_s=DEADLINE_S,
-    )  # fmt: skip
+    out = tmp_path / "out"
+    order = vehicle.EvaluationOrder(["dynamic_window"], out, "differential", "empty", 1, 0)
+    options = {"start": "present", "stale_after_s": DEADLINE_S}
     with claimed_domain() as domain_id:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain_id))
         monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -138,7 +137,7 @@ def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path, monke
         ):
             with Witness(domain_id) as witness:  # it may be compiling
                 assert witness.sees(DEADLINE_S)
-            made = vehicle.drive_vehicle(order, said.append, said.append)
+            made = vehicle.drive_vehicle(order, None, True, said.append, said.append, **options)
     assert "  command_gate is armed" in said
     assert any("it will drive to" in line for line in said)
     (driven,), (beside,) = made.runs.values()

@@ -172,7 +172,7 @@ def test_a_package_without_a_fault_passes(package):
         ("robot/taylor.py", "from .. import commands"),
         ("sim/world.py", "def f():\n    from nics_drl_bridge.middleware.middleware import M"),
         ("sim/world.py", "import importlib\nimportlib.import_module('nics_drl_bridge.nodes.gate')"),
-        ("sim/world.py", "if TYPE_CHECKING:\n    from nics_drl_bridge.report import page"),
+        ("sim/world.py", "if TYPE_CHECKING:\n    from nics_drl_bridge.report import pictures"),
         ("policy/act.py", "from nics_drl_bridge.gate.gate import decide"),
         ("nowhere/new.py", ""),
     ],

@@ -113,10 +113,7 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 @contextmanager
 def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
-    """Yields a function that updates a bar on a terminal: description, done, total.
-
-    Shows nothing if standard error is no terminal; a total of 0 means unknown.
-    """
+    """Yields an updater of a bar on a terminal: description, done, total (0 means unknown)."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 

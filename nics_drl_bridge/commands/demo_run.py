@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS, Say, Trial, drive_in
+from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS, Say, drive_in
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
@@ -28,9 +28,8 @@ from nics_drl_bridge.policy.training_settings import TrainingSettings, load_trai
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import save_recording
+from nics_drl_bridge.report import pictures
 from nics_drl_bridge.report.fit_pictures import CAPTIONS, accuracy, calibration_pictures
-from nics_drl_bridge.report.page import Block, Code, Picture, Table, page
-from nics_drl_bridge.report.pictures import Point, training_curve, trajectories
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.world import load_world
@@ -71,21 +70,7 @@ class Learned:
 
     policy: str
     how: str
-    curve: Sequence[Point] = ()
-
-
-@dataclass(frozen=True)
-class DemoResults:
-    """All results of the demo; `here` and `there` are the same episodes in process and over DDS."""
-
-    model: SimulatorModel
-    identified: Identified
-    learned: Learned
-    summary: Summary  # of the policy's many episodes in the fast simulator
-    here: Sequence[Episode]
-    there: Sequence[Episode]
-    live: Episode  # of the deployed nodes
-    took: dict[str, float]  # part of the demo -> wall time [s]
+    curve: Sequence[pictures.Point] = ()
 
 
 def run(plan: DemoPlan, say: Say) -> str:
@@ -113,9 +98,17 @@ def run(plan: DemoPlan, say: Say) -> str:
     there = timed("driving over DDS", _drive, DDS, learned.policy)
     arrived = (episode.seed for episode in there if episode.result == "success")
     live = timed("deploying", _deploy, model, learned.policy, next(arrived, 0))
-    results = DemoResults(model, identified, learned, summary, here, there, live, took)
-    file = plan.out / "report.html"
-    write_text(file, report(plan, results))
+    times = [(part, f"{s:.0f}") for part, s in {**took, "all": sum(took.values())}.items()]
+    sections: list[tuple[str, Sequence[str]]] = [
+        ("The model", _model(plan, model, identified)),
+        ("The policy", _policy(plan, learned, summary)),
+        ("The same episodes, in process and over DDS", _episodes(plan, model, here, there)),
+        ("Deployed", _deployed(plan, model, here, live)),
+        ("Time", [pictures.table(("part", "wall time [s]"), times)]),
+    ]
+    name, file = model.robot.name, plan.out / "report.html"
+    lead = f"Robot {name!r} in the world {plan.world!r}, policy {learned.policy!r}."
+    write_text(file, pictures.page("nics_drl_bridge: demo", lead, sections))
     return (
         f"demo: in process {successes(here)}/{plan.episodes}, "
         f"over DDS {successes(there)}/{plan.episodes}, report {file}"
@@ -138,17 +131,18 @@ def _generate(plan: DemoPlan, say: Say) -> tuple[SimulatorModel, Identified]:
 
 
 def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
-    """Trains a policy, unless the plan names one or a module for training is not installed.
-
-    Raises BridgeError if the named policy can't be used, or the settings do not fit.
-    """
+    """Trains a policy, unless one is named or a module is missing. Raises BridgeError."""
     if plan.policy is not None:
         open_policy(plan.policy, model)
         return Learned(plan.policy, f"The policy {plan.policy!r} was given; none was trained.")
     missing = next((module for module in NEEDED if find_spec(module) is None), None)
     if missing is None:
         return _trained(plan, say)
-    policy = _ready_made(model)
+    policy = BASELINE
+    if model.robot.name in shipped_policies() and find_spec("onnxruntime") and find_spec("onnx"):
+        with suppress(PolicyError):  # a shipped one may not fit
+            open_policy(model.robot.name, model)
+            policy = model.robot.name
     say(
         f"not training, which needs the module {missing!r} (pip install "
         f"'nics_drl_bridge[train,deploy]'); driving with the policy {policy!r} instead"
@@ -166,12 +160,12 @@ def settings_of(plan: DemoPlan) -> TrainingSettings:
 def _trained(plan: DemoPlan, say: Say) -> Learned:
     from nics_drl_bridge.policy.train import SeedResult, export, train  # needs torch
 
-    settings, curve = settings_of(plan), list[Point]()
+    settings, curve = settings_of(plan), list[pictures.Point]()
     say(f"training a policy for {settings.steps:,} steps in {settings.num_envs} worlds at once")
 
     def tell(progress: Any) -> None:
         before = curve[-1].steps if curve else 0
-        curve.append(Point(progress.steps, progress.success, progress.collision))
+        curve.append(pictures.Point(progress.steps, progress.success, progress.collision))
         if progress.steps * LINES // settings.steps > before * LINES // settings.steps:
             say(
                 f"  {progress.steps:,} steps: success {100 * progress.success:.1f} %, "
@@ -186,18 +180,7 @@ def _trained(plan: DemoPlan, say: Say) -> Learned:
     return Learned(str(file), how, curve)
 
 
-def _ready_made(model: SimulatorModel) -> str:
-    """The shipped policy of the robot if it fits, else a baseline."""
-    name = model.robot.name
-    if name in shipped_policies() and find_spec("onnxruntime") and find_spec("onnx"):
-        with suppress(PolicyError):
-            open_policy(name, model)
-            return name
-    return BASELINE
-
-
 def _evaluate(plan: DemoPlan, model: SimulatorModel, name: str, say: Say) -> Summary:
-    """Drives many unseen episodes at once, without the estimator."""
     say(f"evaluating {name} in {MANY} unseen episodes, all at once")
     policy, task = open_policy(name, model)
     env = BridgeVectorEnv(MANY, model, plan.world, task)
@@ -209,23 +192,17 @@ def _evaluate(plan: DemoPlan, model: SimulatorModel, name: str, say: Say) -> Sum
 
 
 def _drive(plan: DemoPlan, place: str, policy: str, say: Say) -> list[Episode]:
-    """Drives the plan's episodes in one of `episodes.PLACES` and reports each."""
     where = "in process" if place == FAST else "over DDS in lock-step"
     say(f"driving {'' if place == FAST else 'the same '}{plan.episodes} episodes {where}")
     seeds, logs = range(plan.episodes), plan.out / "logs" / place
     return drive_in(
-        place,
-        Trial(policy, str(plan.model), plan.world, seeds, logs),
-        lambda e: say(f"  seed {e.seed}: {e.result}, {e.steps} steps, {e.length:.2f} m"),
-        say,
-    )
+        place, policy, str(plan.model), plan.world, seeds, logs,
+        lambda e: say(f"  seed {e.seed}: {e.result}, {e.steps} steps, {e.length:.2f} m"), say,
+    )  # fmt: skip
 
 
 def _deploy(plan: DemoPlan, model: SimulatorModel, policy: str, seed: int, say: Say) -> Episode:
-    """Runs the nodes of a robot in real time, each in its own process, in the scene of a seed.
-
-    Raises BackendError if a node does not start, or ends.
-    """
+    """Runs a robot's nodes in real time in the scene of a seed; BackendError if one ends."""
     scene = sample_scene(load_world(plan.world), model.robot.footprint_radius, seed)
     goal = [float(value) for value in scene.goals[0]]
     folder = str(plan.model)
@@ -290,39 +267,22 @@ def _write_limits(robot: RobotSpec, path: Path) -> Path:
     return path
 
 
-def report(plan: DemoPlan, results: DemoResults) -> str:
-    """Builds the page, as HTML."""
-    took = {**results.took, "all": sum(results.took.values())}
-    times = [(part, f"{seconds:.0f}") for part, seconds in took.items()]
-    sections: list[tuple[str, Sequence[Block]]] = [
-        ("The model", _model(plan, results)),
-        ("The policy", _policy(plan, results)),
-        ("The same episodes, in process and over DDS", _episodes(plan, results)),
-        ("Deployed", _deployed(plan, results)),
-        ("Time", [Table(("part", "wall time [s]"), times)]),
-    ]
-    policy = results.learned.policy
-    lead = f"Robot {results.model.robot.name!r} in the world {plan.world!r}, policy {policy!r}."
-    return page("nics_drl_bridge: demo", lead, sections)
-
-
-def _model(plan: DemoPlan, results: DemoResults) -> list[Block]:
-    calibrated = calibration_pictures(results.model.robot, results.identified)
+def _model(plan: DemoPlan, model: SimulatorModel, identified: Identified) -> list[str]:
+    calibrated = calibration_pictures(model.robot, identified)
     caption = "What each further term is worth; circles mark how many are kept."
     return [
-        f"Generated from {plan.recording or 'a textbook drive'}.",
-        Code(results.model.report),
-        Picture(accuracy(results.identified), caption),
-        *(Picture(picture, CAPTIONS[name]) for name, picture in calibrated.items()),
+        pictures.paragraph(f"Generated from {plan.recording or 'a textbook drive'}."),
+        pictures.code(model.report),
+        pictures.picture(accuracy(identified), caption),
+        *(pictures.picture(png, CAPTIONS[name]) for name, png in calibrated.items()),
     ]
 
 
-def _policy(plan: DemoPlan, results: DemoResults) -> list[Block]:
-    blocks: list[Block] = [results.learned.how]
-    if results.learned.curve:
+def _policy(plan: DemoPlan, learned: Learned, summary: Summary) -> list[str]:
+    blocks = [pictures.paragraph(learned.how)]
+    if learned.curve:
         caption = "Success and collisions while it explores; all episodes are new ones."
-        blocks.append(Picture(training_curve(results.learned.curve), caption))
-    summary = results.summary
+        blocks.append(pictures.picture(pictures.training_curve(learned.curve), caption))
     rows = [
         (name, *(f"{100 * value:.1f} %" for value in astuple(share)))
         for name, share in summary.shares.items()
@@ -333,40 +293,47 @@ def _policy(plan: DemoPlan, results: DemoResults) -> list[Block]:
         f"{summary.episodes} unseen episodes in the world {plan.world!r}, side by side in the fast "
         "simulator, the policy at its best; path and time are means of the successful ones."
     )
-    return [*blocks, text, Table(("", "value", "95 % from", "to"), rows)]
+    table = pictures.table(("", "value", "95 % from", "to"), rows)
+    return [*blocks, pictures.paragraph(text), table]
 
 
-def _episodes(plan: DemoPlan, results: DemoResults) -> list[Block]:
-    here, there = results.here, results.there
+def _episodes(
+    plan: DemoPlan, model: SimulatorModel, here: Sequence[Episode], there: Sequence[Episode]
+) -> list[str]:
     both, each = (LABELS[FAST], LABELS[DDS]), ("steps", "path [m]")
-    head = ("seed", both[0], *each, both[1], *each, "deviation [m]")
     rows = [
-        (f"{a.seed}", *_cells(a), *_cells(b), f"{deviation(a, b):.1g}")
+        (
+            f"{a.seed}", a.result, f"{a.steps}", f"{a.length:.2f}",
+            b.result, f"{b.steps}", f"{b.length:.2f}", f"{deviation(a, b):.1g}",
+        )
         for a, b in zip(here, there, strict=True)
-    ]
+    ]  # fmt: skip
     runs = {both[0]: here[:PANELS], both[1]: there[:PANELS]}
-    drawn = trajectories(runs, load_world(plan.world), results.model.robot.footprint_radius)
-    return [
+    drawn = pictures.trajectories(runs, load_world(plan.world), model.robot.footprint_radius)
+    text = (
         f"{successes(here)} of {len(here)} episodes reached the goal in process, "
         f"{successes(there)} of {len(there)} over DDS in lock-step. Deviation is the "
-        "greatest distance between the two true paths at the same step.",
-        Table(head, rows),
-        Picture(drawn, "Blue: in process. Red, dashed: over DDS."),
+        "greatest distance between the two true paths at the same step."
+    )
+    return [
+        pictures.paragraph(text),
+        pictures.table(("seed", both[0], *each, both[1], *each, "deviation [m]"), rows),
+        pictures.picture(drawn, "Blue: in process. Red, dashed: over DDS."),
     ]
 
 
-def _cells(episode: Episode) -> tuple[str, str, str]:
-    return episode.result, f"{episode.steps}", f"{episode.length:.2f}"
-
-
-def _deployed(plan: DemoPlan, results: DemoResults) -> list[Block]:
-    live = results.live
-    beside = [episode for episode in results.here if episode.seed == live.seed]
+def _deployed(
+    plan: DemoPlan, model: SimulatorModel, here: Sequence[Episode], live: Episode
+) -> list[str]:
+    beside = [episode for episode in here if episode.seed == live.seed]
     runs = {LABELS[FAST]: beside, "deployed": [live]}
-    drawn = trajectories(runs, load_world(plan.world), results.model.robot.footprint_radius)
-    return [
+    drawn = pictures.trajectories(runs, load_world(plan.world), model.robot.footprint_radius)
+    text = (
         "simulator_node in real time, middleware_node, policy_node and command_gate ran as "
         "processes of their own; nobody stepped them. The robot "
-        f"{'reached' if live.result == 'success' else 'did not reach'} its goal.",
-        Picture(drawn, "The true path of the deployed robot beside the lock-step one."),
+        f"{'reached' if live.result == 'success' else 'did not reach'} its goal."
+    )
+    return [
+        pictures.paragraph(text),
+        pictures.picture(drawn, "The true path of the deployed robot beside the lock-step one."),
     ]

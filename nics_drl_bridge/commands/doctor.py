@@ -5,15 +5,13 @@ from __future__ import annotations
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from typer import Argument, Option
 
 from nics_drl_bridge.commands.console import needs_ros, one_sentence, table
-
-if TYPE_CHECKING:
-    from nics_drl_bridge.report.doctor_facts import Expected
+from nics_drl_bridge.errors import ConfigError
 
 EXIT_FINDINGS = 1
 DEFAULT = "ackermann"
@@ -35,10 +33,18 @@ def doctor(
 ) -> None:
     """Tells what of a robot or a bag does not fit a model or a policy; it sends nothing."""
     with one_sentence():
+        from nics_drl_bridge.generator import open_model
+        from nics_drl_bridge.policy.policy_file import load_policy
         from nics_drl_bridge.report.doctor import examine
-        from nics_drl_bridge.report.doctor_facts import facts_of_bag
+        from nics_drl_bridge.report.doctor_facts import expected_of, facts_of_bag
 
-        expected = _expected(model, policy)
+        if policy is None:
+            expected = expected_of(open_model(model or DEFAULT))
+        elif model is not None:
+            raise ConfigError("--model and --policy: give one of them, what the robot must fit.")
+        else:
+            contract = load_policy(policy).contract
+            expected = expected_of(contract, contract.scan)
         if bag is not None:
             facts = facts_of_bag(bag, namespace)
         else:
@@ -57,20 +63,6 @@ def doctor(
             typer.echo(f"{facts.source}: all fits {policy or model or DEFAULT}.")
         if findings:
             raise typer.Exit(EXIT_FINDINGS)
-
-
-def _expected(model: str | None, policy: str | None) -> Expected:
-    from nics_drl_bridge.errors import ConfigError
-    from nics_drl_bridge.generator import open_model
-    from nics_drl_bridge.policy.policy_file import load_policy
-    from nics_drl_bridge.report.doctor_facts import expected_of
-
-    if policy is None:
-        return expected_of(open_model(model or DEFAULT))
-    if model is not None:
-        raise ConfigError("--model and --policy: give one of them, what the robot must fit.")
-    contract = load_policy(policy).contract
-    return expected_of(contract, contract.scan)
 
 
 def replay(

@@ -1,14 +1,15 @@
-"""Drives policies through the same episodes in process, over DDS, and in MuJoCo over DDS.
+"""The same episodes in process, over DDS, in MuJoCo over DDS, and on the vehicle.
 
-Compares the worlds as Fig. 7 of the paper does, with a table.
+Compares the worlds as Fig. 7 of the paper does, with a table. The vehicle is driven in real time,
+through the command gate.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
 from math import isnan
@@ -22,10 +23,14 @@ from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, nearest
 from nics_drl_bridge.files import write_bytes, write_text
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.policy.evaluation import FIRST_SEED, Episode, Tally, drive_all, tallies
+from nics_drl_bridge.policy import evaluation
+from nics_drl_bridge.policy.evaluation import Episode, Tally, drive, drive_all
 from nics_drl_bridge.policy.policies import Policy, is_policy_file, open_policy
+from nics_drl_bridge.report.doctor import examine
+from nics_drl_bridge.report.doctor_facts import expected_of
 from nics_drl_bridge.report.pictures import trajectories
 from nics_drl_bridge.seeds import checked_seeds
+from nics_drl_bridge.sim.scenes import Scene, sample_scene
 from nics_drl_bridge.sim.world import World, load_world
 
 FAST, DDS, MUJOCO, VEHICLE = "fast", "dds", "mujoco_dds", "vehicle"
@@ -33,6 +38,8 @@ NODES = {DDS: "simulator_node", MUJOCO: "mujoco_node"}
 PLACES = (FAST, *NODES)
 LABELS = {FAST: "in process", DDS: "over DDS", MUJOCO: "MuJoCo over DDS", VEHICLE: "on the vehicle"}
 DEFAULT_ROBOT = "ackermann"
+GATE, RAW = "command_gate", "cmd_vel_raw"
+LISTEN_S, ARM_S = 5.0, 60.0
 START_S = 180.0  # time that a node may take to start [s]; its kernels may have to be compiled
 PANELS = 6
 HEADS = (
@@ -43,39 +50,39 @@ Say = Callable[[str], None]
 Tell = Callable[[str, int, int], None]
 
 
-@dataclass(frozen=True)
-class Trial:
-    """Episodes to drive."""
-
-    policy: str  # a policy file, or the name of a shipped policy or of a baseline
-    model: str  # folder of a model, or a shipped robot
-    world: str  # YAML file or name of the world
-    seeds: Sequence[int]  # of the episodes; each fixes obstacles, start, goal and noise
-    logs: Path  # folder for the logs of the nodes
-
-
 def drive_in(
-    place: str, trial: Trial, on_episode: Callable[[Episode], None], say: Say = lambda _: None
-) -> list[Episode]:
-    """Drives the episodes of a trial in one of `PLACES`; calls `on_episode` as each ends.
+    place: str, policy: str, name: str, world: str, seeds: Sequence[int], logs: Path,
+    on_episode: Callable[[Episode], None], say: Say = lambda _: None,
+) -> list[Episode]:  # fmt: skip
+    """Drives episodes with the model of a name in one of `PLACES`; `on_episode` hears of each.
 
-    The node that a place needs runs in its own process, in lock-step, and has ended when this
-    returns or raises. Raises BridgeError for a bad name or file, or a node that does not start.
+    The node that a place needs runs in its own process, in lock-step, with its log in a folder, and
+    has ended when this returns or raises. Raises BridgeError for a bad name or file, or a node that
+    does not start.
     """
     check_place(place)
-    model = open_model(trial.model)
+    model = open_model(name)
     if place == FAST:
-        env, policy = env_of(trial.policy, model, trial.world, "sim", estimator=True)
+        env, opened = env_of(policy, model, world, "sim", estimator=True)
         with closing(env):
-            return drive_all(env, policy, trial.seeds, on_episode)
-    from nics_drl_bridge.nodes.processes import Witness
+            return drive_all(env, opened, seeds, on_episode)
+    from nics_drl_bridge.nodes.processes import NodeProcess, Witness, free_domain_id
 
-    name = NODES[place]
-    with _node(name, trial, say) as options, Witness(options["domain_id"]) as witness:
-        env, policy = env_of(trial.policy, model, trial.world, "dds", backend_options=options)
-        with closing(env):
-            touched = partial(witness.touched, name, START_S)
-            return drive_all(env, policy, trial.seeds, on_episode, touched)
+    node, domain_id = NODES[place], free_domain_id()
+    parameters = {"model": name, "world": world, "mode": "lockstep"}
+    options = {"domain_id": domain_id, "simulator": node, "timeout_s": START_S, "truth": True}
+    with (
+        NodeProcess(node, logs, parameters, domain_id) as process, Witness(domain_id) as witness
+    ):  # fmt: skip
+        say(f"started {node} as process {process.pid} in ROS domain {domain_id}")
+        try:
+            env, opened = env_of(policy, model, world, "dds", backend_options=options)
+            with closing(env):
+                touched = partial(witness.touched, node, START_S)
+                return drive_all(env, opened, seeds, on_episode, touched)
+        except BackendError:
+            process.check()  # if the node has ended, its own error is more useful
+            raise
 
 
 def env_of(
@@ -88,23 +95,6 @@ def env_of(
         NAVIGATION, backend=backend, model=model, world=world, task=task, **arguments
     )
     return env, opened
-
-
-@contextmanager
-def _node(name: str, trial: Trial, say: Say) -> Iterator[dict[str, Any]]:
-    """Starts a simulator node; yields the options of the backend that drives it."""
-    from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
-
-    domain_id = free_domain_id()
-    parameters = {"model": trial.model, "world": trial.world, "mode": "lockstep"}
-    with NodeProcess(name, trial.logs, parameters, domain_id) as process:
-        say(f"started {name} as process {process.pid} in ROS domain {domain_id}")
-        options = {"domain_id": domain_id, "simulator": name, "timeout_s": START_S}
-        try:
-            yield {"truth": True, **options}
-        except BackendError:
-            process.check()  # if the node has ended, its own error is more useful
-            raise
 
 
 def check_place(place: str) -> None:
@@ -135,7 +125,7 @@ class EvaluationOrder:
     model: str | None = None  # folder of a model or a shipped robot; None: the policies' own robot
     world: str = "circles"  # YAML file or name of the world
     episodes: int = 20
-    seed: int = FIRST_SEED
+    seed: int = evaluation.FIRST_SEED
     places: Sequence[str] = PLACES  # some of `PLACES`; the others are compared with the first
 
     @property
@@ -162,7 +152,7 @@ def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
     the results of each policy; `evaluation.json` and a picture per policy are in `order.out`.
     Raises BridgeError for a bad name or file, or a node that does not start.
     """
-    name, seeds = _model_name(order), order.seeds
+    name, seeds, logs = _model_name(order), order.seeds, order.out / "logs"
     model, world = open_model(name), load_world(order.world)
     for place in order.places:
         check_place(place)
@@ -176,26 +166,22 @@ def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
             def on_episode(episode: Episode, what: str = what) -> None:
                 tell(what, episode.seed - order.seed + 1, order.episodes)
 
-            trial = Trial(policy, name, order.world, seeds, order.out / "logs")
-            runs[place] = drive_in(place, trial, on_episode, say)
+            given = place, policy, name, order.world, seeds, logs
+            runs[place] = drive_in(*given, on_episode, say)
         evaluated.append(judged(policy, runs, model, world, order.out, PANELS))
     write_evaluation(order.out, name, model, order.world, order.seed, evaluated)
     return evaluated
 
 
 def judged(
-    policy: str,
-    runs: Mapping[str, Sequence[Episode]],
-    model: SimulatorModel,
-    world: World,
-    out: Path,
-    panels: int | None = None,
-) -> Evaluated:
+    policy: str, runs: Mapping[str, Sequence[Episode]], model: SimulatorModel, world: World,
+    out: Path, panels: int | None = None,
+) -> Evaluated:  # fmt: skip
     """Judges the runs of a policy by place, and draws their first episodes into a folder."""
     shown = {LABELS[place]: some[:panels] for place, some in runs.items()}
     picture = trajectories(shown, world, model.robot.footprint_radius)
     write_bytes(out / f"trajectories_{Path(policy).stem}.png", picture)
-    return Evaluated(policy, runs, tallies(runs, model.control_period))
+    return Evaluated(policy, runs, evaluation.tallies(runs, model.control_period))
 
 
 def _model_name(order: EvaluationOrder) -> str:
@@ -252,3 +238,78 @@ def line_of(one: Evaluated) -> str:
     """Summarises a policy in one line."""
     each = ", ".join(f"{LABELS[p]} {_percent(t.success.value)}" for p, t in one.tallies.items())
     return f"{one.policy}: success {each}"
+
+
+def drive_vehicle(
+    order: EvaluationOrder, goal: tuple[float, float] | None, arm: bool, say: Say, ask: Say,
+    **options: Any,
+) -> Evaluated:  # fmt: skip
+    """Checks that the vehicle fits its model, drives the first policy, and compares.
+
+    Commands go to `cmd_vel_raw`, so that only an armed `command_gate` lets them pass; `arm` arms it
+    before each episode, otherwise the user does. A goal in `map` [m] takes the place of the
+    world's. Afterwards the fast simulator drives the same episodes from the vehicle's actual
+    starting poses. `ask` is called before each episode with where to place the vehicle, and returns
+    when it may begin; the options are those of `RealtimeBackend`. Returns the episodes of both;
+    `evaluation.json` and a picture are in `order.out`. Raises BackendError if the vehicle does not
+    fit its model, or does not answer, another BridgeError for a bad name or file.
+    """
+    policy = order.policies[0]
+    name, namespace = order.model or robot_of(policy), options.get("namespace", "")
+    model, world = open_model(name), load_world(order.world)
+    open_policy(policy, model)  # a misfit is an error before anything moves
+    from nics_drl_bridge.nodes.listen import listen
+
+    say(f"listening to the vehicle for {LISTEN_S:g} s, as nics doctor does")
+    errors = []
+    for finding in examine(listen(LISTEN_S, namespace), expected_of(model)):
+        sentence = f"{finding.where}: {finding.what} ({finding.fix})"
+        say(f"  {finding.severity}: {sentence}")
+        errors += [sentence] if finding.severity == "error" else []
+    if errors:
+        raise BackendError(f"the vehicle is not driven: {errors[0]}; see nics doctor for the rest.")
+    given = {"mode": "realtime", "vehicle": True, "command_topic": RAW, "say": say, **options}
+    env, driver = env_of(policy, model, order.world, "dds", backend_options=given)
+    episodes, chosen = list[Episode](), {} if goal is None else {"goal": goal}
+    with closing(env):
+        for count, seed in enumerate(order.seeds, 1):
+            scene = sample_scene(world, model.robot.footprint_radius, seed)
+            placed = _placed(scene, goal, options.get("start") == "present", arm)
+            ask(f"episode {count} of {order.episodes}: {placed}")
+            driven = drive(env, driver, seed, chosen, partial(_arm, arm, namespace, say))
+            # The vehicle's own estimate is all that is known of its path.
+            episodes.append(replace(driven, path=driven.estimate))
+            say(f"  {driven.result}, {driven.steps} steps, {episodes[-1].length:.2f} m")
+    env, driver = env_of(policy, model, order.world, "sim", estimator=True)
+    with closing(env):
+        again = [
+            drive(env, driver, one.seed, {"start": one.path[0], "goal": one.goal})
+            for one in episodes
+        ]
+    made = judged(policy, {VEHICLE: episodes, FAST: again}, model, world, order.out)
+    write_evaluation(order.out, name, model, order.world, order.seed, [made])
+    return made
+
+
+def _placed(scene: Scene, goal: tuple[float, float] | None, present: bool, armed: bool) -> str:
+    """Instruction before an episode: where to place the vehicle, and where it will drive."""
+    x, y = scene.goals[0] if goal is None else goal
+    where = f"it will drive to ({x:.2f} m, {y:.2f} m)"
+    order = "" if armed else f"; arm {GATE}"
+    if present:
+        return f"{where} from where it stands{order}"
+    sx, sy, heading = scene.starts[0]
+    return f"place the vehicle at ({sx:.2f} m, {sy:.2f} m, {heading:.2f} rad); {where}{order}"
+
+
+def _arm(wanted: bool, namespace: str, say: Say) -> None:
+    if not wanted:
+        return
+    from nics_drl_bridge.nodes.processes import Witness
+
+    gate = f"{namespace}/{GATE}" if namespace else GATE
+    with Witness() as witness:
+        refused = witness.arms(gate, ARM_S)
+    if refused:
+        raise BackendError(f"{gate} can't be armed: {refused}")
+    say(f"  {gate} is armed")

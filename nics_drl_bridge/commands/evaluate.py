@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from typer import Argument, Option
@@ -80,22 +80,31 @@ def evaluate(
             raise ConfigError(f"--hardware drives one policy at a time, not {', '.join(policies)}.")
         if shadow is not None:
             _shadow(shadow, policies, model, topic or [], place, ahead, out)
-        elif hardware:
-            from nics_drl_bridge.commands.vehicle import VehicleOrder
+            return
+        from nics_drl_bridge.commands import episodes as driving
 
-            trip = VehicleOrder(
-                policies[0], out, model, world, episodes or 1, seed, start, place, namespace,
-                pose_type, arm,
-            )  # fmt: skip
-            _hardware(trip, yes)
+        chosen = {"places": tuple(dict.fromkeys(places))} if places else {}
+        count, tell = episodes or (1 if hardware else 20), partial(typer.echo, err=True)
+        order = driving.EvaluationOrder(policies, out, model, world, count, seed, **chosen)
+        if hardware:
+            options = {"start": start, "namespace": namespace, "pose_type": pose_type}
+            with needs_ros("nics evaluate --hardware"):
+                evaluated = [
+                    driving.drive_vehicle(order, place, arm, tell, partial(_ask, yes), **options)
+                ]
         else:
-            from nics_drl_bridge.commands.episodes import EvaluationOrder
-            from nics_drl_bridge.commands.episodes import evaluate as drive
+            with progress_bar() as advance:
+                evaluated = driving.evaluate(order, tell, advance)
+        typer.echo(table(driving.HEADS, driving.rows_of(evaluated)))
+        for one in evaluated:
+            typer.echo(driving.line_of(one))
+        typer.echo(f"pictures and evaluation.json: {out}")
 
-            chosen = {"places": tuple(dict.fromkeys(places))} if places else {}
-            order = EvaluationOrder(policies, out, model, world, episodes or 20, seed, **chosen)
-            with progress_bar() as tell:
-                _print_evaluated(drive(order, partial(typer.echo, err=True), tell), out)
+
+def _ask(yes: bool, question: str) -> None:
+    typer.echo(question)
+    if not yes:
+        typer.prompt("Enter when ready", default="", show_default=False)
 
 
 def _point(text: str | None) -> tuple[float, float] | None:
@@ -145,25 +154,3 @@ def _shadow(
         "greatest", "opposite sign",
     )  # fmt: skip
     typer.echo("\n".join([table(heads, rows), *lines, f"pictures and shadow_*.json: {out}"]))
-
-
-def _hardware(order: Any, yes: bool) -> None:
-    from nics_drl_bridge.commands.vehicle import drive_vehicle
-
-    def ask(question: str) -> None:
-        typer.echo(question)
-        if not yes:
-            typer.prompt("Enter when ready", default="", show_default=False)
-
-    with needs_ros("nics evaluate --hardware"):
-        made = drive_vehicle(order, partial(typer.echo, err=True), ask)
-    _print_evaluated([made], order.out)
-
-
-def _print_evaluated(evaluated: list[Any], out: Path) -> None:
-    from nics_drl_bridge.commands.episodes import HEADS, line_of, rows_of
-
-    typer.echo(table(HEADS, rows_of(evaluated)))
-    for one in evaluated:
-        typer.echo(line_of(one))
-    typer.echo(f"pictures and evaluation.json: {out}")

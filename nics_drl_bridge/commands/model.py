@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from typer import Argument, Option
 
+from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands.console import (
-    EXIT_INTERRUPTED,
     RobotOption,
-    TopicOption,
-    TopicsOption,
     WorldOption,
     intact,
+    needs_ros,
     one_sentence,
 )
+from nics_drl_bridge.errors import BackendError, ConfigError
 
 
 def record(
@@ -41,26 +42,75 @@ def record(
 ) -> None:
     """Drives a robot over ROS 2 so that it shows its whole motion, and records it."""
     with one_sentence():
-        from nics_drl_bridge.nodes import recorder
-
-        order = recorder.RecordOrder(
-            robot, out, bound, duration, speed, seed, namespace, tuple(remap or ()), topics,
-            stamped, use_sim_time,
-        )  # fmt: skip
+        arguments = node_arguments(namespace, remap or ())
+        given = {
+            "robot": robot, "out": str(out), "bound": bound, "duration": duration, "speed": speed,
+            "seed": seed, "topics": str(topics or ""), "stamped": stamped,
+            "use_sim_time": use_sim_time,
+        }  # fmt: skip
         if not preview:
-            recorder.require_ros()  # first: with ROS 2 from wheels it restarts Python
-        for line in recorder.preview(order):
+            with needs_ros("nics record"):  # first: with ROS 2 from wheels it restarts Python
+                from nics_drl_bridge.nodes.record_node import record as drive
+        for line in preview_lines(given):
             typer.echo(line)
         if preview:
             return
         if not yes and not typer.confirm("Drive the robot now?"):
             typer.echo("nothing was driven or recorded.")
             return
-        lines, whole = recorder.drive(order)
-        for line in lines:
-            typer.echo(line)
-        if not whole:
-            raise typer.Exit(EXIT_INTERRUPTED)
+        driven = drive(given, arguments)
+        if driven.failure is not None:
+            raise BackendError(driven.line)
+        typer.echo(driven.line)
+        if driven.recording is not None:
+            typer.echo("\n".join(drive_summary(driven.recording, given)))
+        if not driven.complete:
+            raise typer.Exit(console.EXIT_INTERRUPTED)
+
+
+def node_arguments(namespace: str, remap: Sequence[str]) -> list[str]:
+    """Returns the command line for `record_node`; ConfigError for a malformed remapping rule."""
+    rules = [f"__ns:=/{namespace.strip('/')}"] if namespace.strip("/") else []
+    for rule in remap:
+        if not all(rule.partition(":=")):
+            raise ConfigError(f"--remap {rule!r}: must be NAME:=OTHER, as in odom:=/wheel_odom.")
+        rules.append(rule)
+    flags = [word for rule in rules for word in ("-r", rule)]
+    return ["nics", "--ros-args", *flags] if flags else ["nics"]
+
+
+def preview_lines(given: dict[str, Any]) -> tuple[str, ...]:
+    """Draws the drive that `record_node` would make of its parameters; returns lines."""
+    from nics_drl_bridge.files import write_bytes
+    from nics_drl_bridge.recording.excite import DrivePlan
+    from nics_drl_bridge.recording.topic_roles import topic_roles
+    from nics_drl_bridge.recording.write import check_out
+    from nics_drl_bridge.report.pictures import drive_picture
+    from nics_drl_bridge.robot.spec import load_robot
+
+    robot, out = load_robot(given["robot"]), check_out(Path(given["out"]))
+    topic_roles(given["topics"] or None)  # reports a wrong file before the robot moves
+    plan = DrivePlan(robot, *(given[name] for name in ("bound", "duration", "speed", "seed")))
+    pattern = plan.preview()
+    picture = out.parent / f"{out.stem}_preview.png"
+    write_bytes(picture, drive_picture(pattern, robot))
+    return (*pattern.lines(), f"its path is drawn in {picture}")
+
+
+def drive_summary(recording: Any, given: dict[str, Any]) -> tuple[str, ...]:
+    """Returns lines about the robot's path, the coverage of each command, and the next step."""
+    import numpy as np
+
+    from nics_drl_bridge.identify.excitation import coverage
+    from nics_drl_bridge.robot.spec import load_robot
+
+    out, place = Path(given["out"]), recording.pose.values[:, :2] - recording.pose.values[0, :2]
+    path, reach = np.hypot(*np.diff(place, axis=0).T).sum(), np.hypot(*place.T).max()
+    return (
+        f"measured: a path of {path:.1f} m, up to {reach:.2f} m from the start",
+        *(each.line() for each in coverage(recording, load_robot(given["robot"]))),
+        f"next: nics generate {out} --robot {given['robot']} --out {out.stem}_model",
+    )
 
 
 def generate(
@@ -69,8 +119,8 @@ def generate(
     ],
     out: Annotated[Path, Option(help="Folder of the model to write.")],
     robot: RobotOption = "ackermann",
-    topics: TopicsOption = None,
-    topic: TopicOption = None,
+    topics: console.TopicsOption = None,
+    topic: console.TopicOption = None,
     world: WorldOption = "arena",
     lidar: Annotated[str, Option(help="A shipped lidar (paper) or a YAML file.")] = "paper",
     sensor: Annotated[

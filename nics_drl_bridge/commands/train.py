@@ -104,12 +104,9 @@ def _learner(
 
 def _run(train_run: Any, order: Any, learn: Any) -> None:
     def told(progress: Any) -> None:
-        tell(
-            f"seed {progress.seed}: success {100 * progress.success:.1f} %, "
-            f"{progress.steps_per_s:,.0f} steps/s",
-            progress.steps,
-            progress.total,
-        )
+        success, speed = 100 * progress.success, progress.steps_per_s
+        what = f"seed {progress.seed}: success {success:.1f} %, {speed:,.0f} steps/s"
+        tell(what, progress.steps, progress.total)
 
     def done(result: Any) -> None:
         trained = result.trained

@@ -7,14 +7,11 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from nics_drl_bridge.commands.console import one_sentence
-
-if TYPE_CHECKING:
-    from nics_drl_bridge.generator import SimulatorModel
 
 ROBOT, WORLD = "differential", "arena"
 
@@ -49,14 +46,14 @@ def _compiled_by(part: Callable[..., Any], *given: Any) -> tuple[int, float, Any
     return COMPILING.count - count, COMPILING.cpu_s - cpu_s, result
 
 
-def _model() -> SimulatorModel:
+def _model() -> Any:
     """Fits the kinematics of a drive and bakes a lidar table."""
     from nics_drl_bridge.generator import builtin_model
 
     return builtin_model(ROBOT)
 
 
-def _simulate(model: SimulatorModel) -> None:
+def _simulate(model: Any) -> None:
     """Begins episodes and steps, alone and in many worlds at once."""
     from nics_drl_bridge.env.bridge_env import BridgeEnv
     from nics_drl_bridge.env.vector_env import BridgeVectorEnv
@@ -67,8 +64,7 @@ def _simulate(model: SimulatorModel) -> None:
         env.close()
 
 
-def _drive(model: SimulatorModel) -> None:
-    """Estimates, plans and shields."""
+def _drive(model: Any) -> None:
     import numpy as np
 
     from nics_drl_bridge.gate import shield

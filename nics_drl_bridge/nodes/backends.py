@@ -8,24 +8,17 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import numpy as np
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import LaserScan
 
+from nics_drl_bridge import interface
 from nics_drl_bridge.env.guard import halts_on_error
 from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError, nearest
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import (
-    NS_PER_S,
-    Array,
-    Backend,
-    BackendFacts,
-    RobotView,
-    Start,
-    stacked,
-)
+from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, Array, BackendFacts, RobotView, Start
 from nics_drl_bridge.lidar.spec import from_device
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import qos, wire
@@ -43,6 +36,12 @@ AGAIN_S = 0.05  # data that do not arrive within this time are requested again [
 ADVICE = "start `simulator_node` with mode:=lockstep in the same ROS_DOMAIN_ID and namespace."
 
 
+class _Mail(NamedTuple):
+    stamp_ns: int = -1  # without a message
+    arrival_ns: int = 0
+    content: bytes = b""
+
+
 class _Mailbox:
     """The newest message of each topic, serialised, from the executor's thread to the caller's.
 
@@ -52,10 +51,7 @@ class _Mailbox:
     """
 
     def __init__(self, topics: tuple[str, ...], work: Callable[[int, int, bytes], None]) -> None:
-        self._topics, self._work = topics, work
-        self._messages: dict[str, bytes] = {}
-        self._stamps = dict.fromkeys(topics, -1)
-        self._arrivals: dict[str, int] = {}
+        self._mail, self._work = dict.fromkeys(topics, _Mail()), work
         self._lock, self._complete = threading.Lock(), threading.Event()
         self._awaited_ns, self._worked_ns = -1, -1
         self._failure: Exception | None = None
@@ -64,8 +60,8 @@ class _Mailbox:
         """Takes a message; returns `HANDED_OVER` if the caller now continues."""
         with self._lock:
             try:
-                self._stamps[topic] = _read(topic, wire.stamp_of, message)
-                self._messages[topic], self._arrivals[topic] = message, time.monotonic_ns()
+                stamp_ns = _read(topic, wire.stamp_of, message)
+                self._mail[topic] = _Mail(stamp_ns, time.monotonic_ns(), message)
                 self._work_in()
             except Exception as error:  # noqa: BLE001  (it is raised in the caller's thread)
                 self._failure = error
@@ -75,29 +71,19 @@ class _Mailbox:
         return None
 
     def _work_in(self) -> None:
-        awaited = self._awaited_ns
-        if self._stamps[ODOM] == awaited != self._worked_ns:
-            self._worked_ns = awaited
-            self._work(awaited, self._arrivals[ODOM], self._messages[ODOM])
+        if self._mail[ODOM].stamp_ns == self._awaited_ns != self._worked_ns:
+            self._worked_ns = self._awaited_ns
+            self._work(*self._mail[ODOM])
 
     def _late(self, stamp_ns: int) -> str | None:
         """Returns the first topic whose newest message is older than a stamp; None if none is."""
-        return next((topic for topic in self._topics if self._stamps[topic] < stamp_ns), None)
+        return next((topic for topic, mail in self._mail.items() if mail.stamp_ns < stamp_ns), None)
 
     def stamp_ns(self, topic: str) -> int:
-        """Returns the stamp of the newest message [ns]; -1 if there is none."""
-        return self._stamps[topic]
+        return self._mail[topic].stamp_ns
 
-    def age_s(self, topic: str) -> float:
-        """Returns the seconds since the newest message arrived; inf if there is none."""
-        arrival_ns = self._arrivals.get(topic)
-        return math.inf if arrival_ns is None else (time.monotonic_ns() - arrival_ns) * 1e-9
-
-    def wait(self, stamp_ns: int, timeout_s: float) -> dict[str, tuple[bytes, int]]:
-        """Waits until each topic is at least as new as a stamp; returns messages and arrivals [ns].
-
-        Raises StaleDataError if a message does not arrive.
-        """
+    def wait(self, stamp_ns: int, timeout_s: float) -> dict[str, _Mail]:
+        """Waits until each topic is at least as new as a stamp; StaleDataError if one is not."""
         with self._lock:
             self._awaited_ns, self._failure = stamp_ns, None
             self._complete.clear()
@@ -109,10 +95,11 @@ class _Mailbox:
             self._awaited_ns = -1
             if self._failure is not None:
                 raise self._failure
-            late = self._late(stamp_ns)
-            if late is not None:
-                raise StaleDataError(late, self.age_s(late), timeout_s)
-            return {t: (message, self._arrivals[t]) for t, message in self._messages.items()}
+            if (late := self._late(stamp_ns)) is not None:
+                mail = self._mail[late]
+                age_s = (time.monotonic_ns() - mail.arrival_ns) * S_PER_NS
+                raise StaleDataError(late, age_s if mail.content else math.inf, timeout_s)
+            return dict(self._mail)
 
 
 def _take_odometry(middleware: Middleware, stamp_ns: int, arrival_ns: int, message: bytes) -> None:
@@ -141,7 +128,7 @@ class DdsBackend:
         self._sensors = {sensor.name: sensor for sensor in model.sensors}
         self._middleware = Middleware(model)
         self._period_ns = round(model.control_period * NS_PER_S)
-        further = (*self._sensors, *((TRUTH,) if truth else ()))
+        further = (*self._sensors, TRUTH) if truth else (*self._sensors,)
         self.timeout_s, self._topics = timeout_s, (ODOM, SCAN, *further)
         # No reference to the backend, which may be garbage.
         take = partial(_take_odometry, self._middleware)
@@ -152,8 +139,8 @@ class DdsBackend:
             kind = LaserScan if topic == SCAN else Odometry
             if topic in self._sensors:
                 kind = sensor_type(self._sensors[topic])
-            put = _putter(self._mail, topic)
-            self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
+            take_up = partial(_put, self._mail, topic)
+            self._link.node.create_subscription(kind, topic, take_up, qos.SENSOR, raw=True)
         self._episodes = EpisodeServices(self._link, simulator, model, world)
         self._link.begin()
         try:
@@ -171,8 +158,7 @@ class DdsBackend:
         """Begins an episode, the first part of a reset; returns the stamp of its data [ns]."""
         self._link.check_open()
         self._link.check_alone()
-        self._episodes.choose(start, self.timeout_s)
-        return self._episodes.begin(self.timeout_s)
+        return self._episodes.begin(start, self.timeout_s)
 
     def first(self, stamp_ns: int, pose: Array) -> RobotView:
         """The second part: waits for the data of a stamp, of a robot that stands at a pose (3,)."""
@@ -212,22 +198,20 @@ class DdsBackend:
     def receive(self) -> tuple[RobotView, dict[str, Any]]:
         """The second half: waits for the data after the command; returns the view and `info`."""
         now = self._now_ns
-        messages = self._await(now)
+        mail = self._await(now)
         self._check_stamps()
-        message, arrival = messages[SCAN]
-        ranges = from_device(_read(SCAN, wire.ranges_of, message), self._lidar)
-        self._middleware.scan(now, arrival, ranges)
+        ranges = from_device(_read(SCAN, wire.ranges_of, mail[SCAN].content), self._lidar)
+        self._middleware.scan(now, mail[SCAN].arrival_ns, ranges)
         for name, sensor in self._sensors.items():
-            message, arrival = messages[name]
-            reading = _read(name, partial(sensor_from_ros, sensor), message)
-            self._middleware.sense(name, now, arrival, reading)
+            reading = _read(name, partial(sensor_from_ros, sensor), mail[name].content)
+            self._middleware.sense(name, now, mail[name].arrival_ns, reading)
         facts = {"stamp_ns": now, **data_facts(self._middleware, time.monotonic_ns())}
         if TRUTH in self._topics:
-            facts["true_pose"] = _read(TRUTH, wire.odometry_of, messages[TRUTH][0])[0]
+            facts["true_pose"] = _read(TRUTH, wire.odometry_of, mail[TRUTH].content)[0]
             self._known = {"true_pose": facts["true_pose"]}
         return self._middleware.view(now), facts
 
-    def _await(self, stamp_ns: int) -> dict[str, tuple[bytes, int]]:
+    def _await(self, stamp_ns: int) -> dict[str, _Mail]:
         """Returns the mailbox's data for a stamp; what does not arrive is requested again."""
         deadline = time.monotonic() + self.timeout_s
         while True:
@@ -262,8 +246,8 @@ def _read(topic: str, read: Callable[[bytes], T], message: bytes) -> T:
         ) from None
 
 
-def _putter(mail: _Mailbox, topic: str) -> Callable[[bytes], object]:
-    return lambda message: mail.put(topic, message)
+def _put(mail: _Mailbox, topic: str, message: bytes) -> object:
+    return mail.put(topic, message)
 
 
 class FleetBackend:
@@ -296,7 +280,7 @@ class FleetBackend:
         """Begins one episode for all robots, at poses (M, 3); see `DdsBackend.reset`."""
         stamp_ns = self._robots[0].begin(start)
         both = zip(self._robots, start.pose, strict=True)
-        return stacked([robot.first(stamp_ns, pose) for robot, pose in both])
+        return interface.stacked([robot.first(stamp_ns, pose) for robot, pose in both])
 
     @halts_on_error
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
@@ -304,7 +288,7 @@ class FleetBackend:
         for robot, one in zip(self._robots, command, strict=True):
             robot.send(one)
         views, facts = zip(*(robot.receive() for robot in self._robots), strict=True)
-        return stacked(views), together(facts)
+        return interface.stacked(views), together(facts)
 
     def facts(self) -> BackendFacts:
         """Returns what is known of all robots, stacked."""
@@ -339,7 +323,7 @@ MODES = {"lockstep": DdsBackend, "realtime": RealtimeBackend}
 def dds_backend(
     model: SimulatorModel, world: World, mode: str = "lockstep", robots: int = 1,
     estimator: bool = True, randomisation: None = None, **options: Any,
-) -> Backend:  # fmt: skip
+) -> interface.Backend:  # fmt: skip
     """Returns the backend of a robot behind ROS 2 topics, or of a team in lock-step.
 
     In mode `lockstep` it is a `DdsBackend`, or for a team a `FleetBackend` with the option
@@ -362,5 +346,5 @@ def dds_backend(
                 f"with {robots} namespaces, not in {mode!r} with {list(names)!r}."
             )
         return FleetBackend(model, world, names, **options)
-    made: Backend = MODES[mode](model, world, **options)
+    made: interface.Backend = MODES[mode](model, world, **options)
     return made

@@ -52,10 +52,7 @@ REFUSED = (
 
 
 def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
-    """Declares the parameters of a gate, reads them, and logs doubts about them.
-
-    Raises ConfigError if a value can't be used, or would never let the robot move.
-    """
+    """Declares and reads a gate's parameters, logs doubts; ConfigError if one can't be used."""
     lidar, robot = model.lidar, model.robot
     about = "Limits of the robot: a shipped file, or a YAML file; no default."
     file = str(runner.declare(node, "limits", "", about, read_only=True))
@@ -132,7 +129,7 @@ def _declare_shield(
 
 
 def scan(lidar: LidarSpec, content: bytes) -> inputs.Scan:
-    """Reads a serialised LaserScan; raises `wire.UNREADABLE`, as the next five."""
+    """Reads a serialised LaserScan; raises `wire.UNREADABLE`, as the other readers."""
     ranges = from_device(wire.ranges_of(content), lidar)
     return inputs.Scan(wire.stamp_of(content), ranges, wire.angles_of(content))
 
@@ -178,8 +175,7 @@ def take_priority(priority: int) -> str:
     if priority == 0:
         return ""
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-        for thread in os.listdir("/proc/self/task"):
+        for thread in ("0", *os.listdir("/proc/self/task")):
             with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
                 os.sched_setscheduler(int(thread), os.SCHED_FIFO, os.sched_param(priority))
     except (OSError, AttributeError) as error:  # the latter on systems without it
@@ -211,11 +207,10 @@ class CommandGate(qos.QosWatch):
         if self._config.shield is not None:
             shield.rehearse()
         self._out = self.create_publisher(Twist, "cmd_vel", qos.COMMAND)
-        self._twists = wire.TwistWriter()
-        self._zero = self._twists.write(np.zeros(3))
+        self._zero = wire.twist_to_bytes(np.zeros(3))
         self._listen()
         runner.steadily(self, PERIOD_S, lambda: self._decide(inputs.Tick()))
-        runner.Diagnostics(self, "gate", self._look)
+        runner.diagnose(self, "gate", self._look)
         about = "Real-time priority (SCHED_FIFO) of its process, 1 to 99; 0 for none."
         priority = runner.declare(self, "priority", 0, about, (0, HIGHEST), read_only=True)
         if refused := take_priority(priority):  # once all threads exist
@@ -228,10 +223,11 @@ class CommandGate(qos.QosWatch):
             (Odometry, "odometry/filtered", estimate, qos.SENSOR),
             (TwistStamped, "cmd_vel_raw", command, qos.COMMAND),
             (Bool, "e_stop", e_stop, qos.EVERY_COMMAND),
+            *(
+                (sensor_type(each), each.name, partial(reading, each), qos.SENSOR)
+                for each in self._sensors
+            ),
         )
-        for each in self._sensors:
-            further = (sensor_type(each), each.name, partial(reading, each), qos.SENSOR)
-            readers = (*readers, further)
         for kind, topic, read, profile in readers:
             taker = partial(self._take, topic, read)
             self.create_subscription(kind, topic, taker, profile, raw=True)
@@ -275,7 +271,7 @@ class CommandGate(qos.QosWatch):
         What is not finite is sent as zero and presses the e-stop. A motion that was decided on too
         long ago, in a process frozen since, is not sent; so the clock is read immediately before.
         """
-        content = self._twists.write(decision.twist)
+        content = wire.twist_to_bytes(decision.twist)
         if not np.isfinite(decision.twist).all():
             self._out.publish(self._zero)
             self._log.no_number(decision.twist.tolist())

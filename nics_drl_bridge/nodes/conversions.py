@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import (
-    Pose,
     PoseStamped,
     PoseWithCovarianceStamped,
     Quaternion,
@@ -31,8 +30,8 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.sectors import Reader, reader_beside
 from nics_drl_bridge.lidar.sensor import Sensor
-from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader, from_device, to_device
-from nics_drl_bridge.recording.messages import POSITION_UNITS
+from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader, to_device
+from nics_drl_bridge.recording import messages
 from nics_drl_bridge.robot.spec import RobotSpec
 
 QUATERNION_TOLERANCE = 0.1  # tolerance of the squared length of a quaternion about 1
@@ -58,11 +57,6 @@ def heading_to_ros(heading: float) -> Quaternion:
     return Quaternion(z=math.sin(heading / 2.0), w=math.cos(heading / 2.0))
 
 
-def heading_from_ros(q: Quaternion) -> float:
-    """Returns the heading [rad] of a quaternion."""
-    return heading_of(q.x, q.y, q.z, q.w)
-
-
 def heading_of(x: float, y: float, z: float, w: float) -> float:
     """Returns the heading [rad] of a quaternion given by its components."""
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
@@ -75,9 +69,8 @@ def is_rotation(x: float, y: float, z: float, w: float) -> bool:
 
 def twist_to_ros(twist: ArrayLike) -> Twist:
     """Returns linear.x, linear.y, angular.z (3,) as a Twist."""
-    x, y, w = (float(value) for value in np.asarray(twist))
     message = Twist()
-    message.linear.x, message.linear.y, message.angular.z = x, y, w
+    message.linear.x, message.linear.y, message.angular.z = np.asarray(twist, np.float64).tolist()
     return message
 
 
@@ -88,9 +81,9 @@ def stamped_to_ros(twist: ArrayLike, time_ns: int, frame: str) -> TwistStamped:
     return message
 
 
-def twist_from_ros(message: Twist) -> Array:
-    """Returns linear.x, linear.y, angular.z (3,) of a Twist."""
-    return np.array([message.linear.x, message.linear.y, message.angular.z])
+def twist_from_ros(message: Twist | TwistStamped) -> Array:
+    """Returns linear.x, linear.y, angular.z (3,) of a Twist, stamped or not."""
+    return np.array(messages.command_row(message))
 
 
 def scan_to_ros(
@@ -105,16 +98,8 @@ def scan_to_ros(
     return message
 
 
-def scan_from_ros(spec: LidarSpec, message: LaserScan) -> NDArray[np.float32]:
-    """Returns the ranges (B,) of the device's LaserScan, REP-117."""
-    return from_device(message.ranges, spec)
-
-
 def reader_from_ros(message: LaserScan, like: LidarSpec, upside_down: bool = False) -> Reader:
-    """Returns the lidar of a header (the expected one if it agrees) and the order of its beams.
-
-    Raises ConfigError if the header describes no lidar.
-    """
+    """Returns the reader of the lidar that a header describes. Raises ConfigError."""
     header = ScanHeader(*(float(getattr(message, name)) for name in ScanHeader._fields))
     return reader_beside(header, len(message.ranges), like, upside_down)
 
@@ -127,10 +112,9 @@ def odometry_to_ros(
 
     The variances are of position [m^2], heading [rad^2], linear [m^2/s^2], angular [rad^2/s^2].
     """
-    x, y, heading = (float(value) for value in np.asarray(pose))
-    message = Odometry()
+    x, y, heading = np.asarray(pose, np.float64).tolist()
+    message = Odometry(child_frame_id=frames[1])
     message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frames[0]
-    message.child_frame_id = frames[1]
     message.pose.pose.position.x, message.pose.pose.position.y = x, y
     message.pose.pose.orientation = heading_to_ros(heading)
     message.twist.twist = twist_to_ros(twist)
@@ -141,11 +125,7 @@ def odometry_to_ros(
 
 def odometry_from_ros(message: Odometry) -> tuple[Array, Array]:
     """Returns pose (3,) and body twist (3,) of an Odometry message."""
-    return _planar(message.pose.pose), twist_from_ros(message.twist.twist)
-
-
-def _planar(pose: Pose) -> Array:
-    return np.array([pose.position.x, pose.position.y, heading_from_ros(pose.orientation)])
+    return np.array(messages.pose_row(message)), np.array(messages.twist_row(message))
 
 
 def covariance_to_ros(planar: Array) -> Array:
@@ -157,9 +137,9 @@ def covariance_to_ros(planar: Array) -> Array:
 
 def pose_from_ros(message: PoseStamped | PoseWithCovarianceStamped) -> tuple[Array, Array | None]:
     """Returns the pose (3,) of a message and its covariance (3, 3); None if it carries none."""
-    if isinstance(message, PoseWithCovarianceStamped):
-        return _planar(message.pose.pose), np.reshape(message.pose.covariance, (6, 6))[PLANAR]
-    return _planar(message.pose), None
+    known = isinstance(message, PoseWithCovarianceStamped)
+    covariance = np.reshape(message.pose.covariance, (6, 6))[PLANAR] if known else None
+    return np.array(messages.pose_row(message)), covariance
 
 
 def imu_from_ros(message: Imu) -> tuple[float, float] | None:
@@ -175,7 +155,7 @@ def joints_to_ros(spec: RobotSpec, state: ArrayLike, time_ns: int) -> JointState
     message = JointState()
     message.header.stamp = stamp_to_ros(time_ns)
     for variable, value in zip(spec.state, np.asarray(state, dtype=np.float64), strict=True):
-        still = variable.unit in POSITION_UNITS
+        still = variable.unit in messages.POSITION_UNITS
         message.name.append(variable.name)
         message.position.append(float(value) if still else 0.0)
         message.velocity.append(0.0 if still else float(value))
@@ -184,11 +164,9 @@ def joints_to_ros(spec: RobotSpec, state: ArrayLike, time_ns: int) -> JointState
 
 def message_type(kind: str) -> Any | None:
     """Returns the class of a type like `nav_msgs/msg/Odometry`; None if it is not installed."""
-    parts = kind.split("/")
-    if len(parts) != 3:
-        return None
+    module, _, name = kind.replace("/", ".").rpartition(".")
     try:
-        return getattr(import_module(f"{parts[0]}.{parts[1]}"), parts[2], None)
+        return getattr(import_module(module), name, None) if kind.count("/") == 2 else None
     except ImportError:
         return None
 
@@ -228,8 +206,7 @@ def message_texts(kind: str) -> dict[str, str]:
     waiting = [kind]
     while waiting:
         each = waiting.pop()
-        file = _message_file(each)
-        if each in texts or file is None:
+        if each in texts or (file := _message_file(each)) is None:
             continue
         texts[each] = file.read_text(encoding="utf-8")
         for name in filter(None, map(FIELD.match, texts[each].splitlines())):

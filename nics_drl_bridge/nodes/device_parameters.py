@@ -111,22 +111,18 @@ def timing(node: Node, model: SimulatorModel) -> DeviceTiming:
     if mode == LOCKSTEP:
         period = round(model.control_period * NS_PER_S)
         return DeviceTiming(mode, 1.0, period, period, period, (0, 0), (0, 0))
-    rate = number(node, "odom_rate")
+    rate, dt = number(node, "odom_rate"), model.timing[0]
     odom = 1.0 / rate if rate else model.control_period
     scan = 1.0 / (number(node, "scan_rate") or model.lidar.rate)
-    dt = model.timing[0]
     step = common_step(dt, (odom, scan)) * dt
     step_ns, odom_ns, scan_ns = (round(seconds * NS_PER_S) for seconds in (step, odom, scan))
-    late = [_late_ns(node, topic, model) for topic in ("scan", "odom")]
+    late = []
+    for topic in ("scan", "odom"):
+        own = model.latency.measured.get(topic, Delay(least=0.0, jitter=0.0))
+        least, jitter = number(node, f"{topic}_latency"), number(node, "latency_jitter")
+        chosen = least if least >= 0.0 else own.least, jitter if jitter >= 0.0 else own.jitter
+        late.append((round(chosen[0] * NS_PER_S), round(chosen[1] * NS_PER_S)))
     return DeviceTiming(mode, number(node, "rate"), step_ns, odom_ns, scan_ns, *late)
-
-
-def _late_ns(node: Node, topic: str, model: SimulatorModel) -> tuple[int, int]:
-    """Returns least delay and jitter of a topic [ns]: as requested, otherwise as in the model."""
-    own = model.latency.measured.get(topic, Delay(least=0.0, jitter=0.0))
-    least, jitter = number(node, f"{topic}_latency"), number(node, "latency_jitter")
-    chosen = least if least >= 0.0 else own.least, jitter if jitter >= 0.0 else own.jitter
-    return round(chosen[0] * NS_PER_S), round(chosen[1] * NS_PER_S)
 
 
 def timed_model(node: Node, model: SimulatorModel, time: DeviceTiming) -> SimulatorModel:
@@ -150,10 +146,7 @@ def choice(node: Node, name: str, valid: tuple[str, ...]) -> str:
 
 
 def namespaces(node: Node) -> tuple[str, ...]:
-    """Returns the namespace of each robot below the node's own; one empty name for a single robot.
-
-    Raises ConfigError if `robots` is neither a count nor a list of different names.
-    """
+    """Returns each robot's namespace, below the node's own and empty for one. ConfigError."""
     value: Any = node.get_parameter("robots").value
     if isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= GREATEST_FLEET:
         return ("",) if value == 1 else default_namespaces(value)

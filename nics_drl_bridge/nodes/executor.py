@@ -60,13 +60,20 @@ class StandingExecutor(SingleThreadedExecutor):
             return
         # Before anything else: a peer may be waiting for the answer to a message.
         _call(received)
-        due, others = self._others_ready()
+        due: list[Any] = []
+        left = False
+        with self._falling_back():
+            if self._entities is not None and self.context.ok():  # a callback may have shut it down
+                woken, others = self._entities.others_ready(self._guard)
+                self._changed |= woken or others  # adding an entity to a node wakes the executor
+                # So does rclpy itself, after each callback; then there is nothing to handle.
+                due, left = self._entities.due(), others or (woken and bool(self._tasks))
         if received and self._entities is not None and self.context.ok():
             # To take what arrived while callbacks ran costs less than to wait for it.
             _call(self._entities.come())
         for timer in due:
             self._tick(timer)
-        if others:
+        if left:
             self._handle_others()
 
     def _wait(self, timeout_sec: float | None) -> list[Received]:
@@ -80,18 +87,6 @@ class StandingExecutor(SingleThreadedExecutor):
         if not self.context.ok():
             raise ExternalShutdownException
         return entities.taken()
-
-    def _others_ready(self) -> tuple[list[Any], bool]:
-        """Returns the timers that are due, and whether anything that is left to rclpy was ready."""
-        due: list[Any] = []
-        left = False
-        with self._falling_back():
-            if self._entities is not None and self.context.ok():  # a callback may have shut it down
-                woken, others = self._entities.others_ready(self._guard)
-                self._changed |= woken or others  # adding an entity to a node wakes the executor
-                # So does rclpy itself, after each callback; then there is nothing to handle.
-                due, left = self._entities.due(), others or (woken and bool(self._tasks))
-        return due, left
 
     def _tick(self, timer: Any) -> None:
         """Calls a timer back, unless an earlier callback has ended the context or the timer."""
@@ -116,7 +111,6 @@ class StandingExecutor(SingleThreadedExecutor):
             get_logger("executor").warning(f"this rclpy needs its own, slower executor ({error})")
 
     def _handle_others(self) -> None:
-        """Lets rclpy handle everything that is ready now."""
         with contextlib.suppress(TimeoutException):
             for _ in range(MOST_AT_ONCE):
                 if not self.context.ok():  # a callback may have shut it down
@@ -153,9 +147,7 @@ class _Entities:
         self.all = _entities_of(nodes)
         subscriptions, others, timers, clients, services, self._waitables = self.all
         # A subscription's callback takes the message, or also its info.
-        self._subscriptions = [
-            (one, 1 if _takes(one.callback, None) else 2) for one in subscriptions
-        ]
+        self._subscriptions = [(s, 1 if _takes(s.callback, None) else 2) for s in subscriptions]
         self._timers = [
             (i, one)
             for i, one in enumerate(timers)
@@ -214,9 +206,7 @@ class _Entities:
             triggered.remove(own.handle.pointer)
         others = bool(triggered or ready("client") or ready("service"))
         others = others or any(timer not in self._own for timer in ready("timer"))
-        return woken, others or any(
-            waitable.is_ready(self._wait_set) for waitable in self._waitables
-        )
+        return woken, others or any(each.is_ready(self._wait_set) for each in self._waitables)
 
 
 def _take(subscriptions: Iterable[tuple[Any, int]]) -> list[Received]:
@@ -239,7 +229,6 @@ def _call(received: Iterable[Received]) -> None:
 
 
 def _takes(callback: Any, *arguments: Any) -> bool:
-    """True if a callback can be called with these arguments."""
     try:
         inspect.signature(callback).bind(*arguments)
     except TypeError:

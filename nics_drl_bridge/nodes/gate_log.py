@@ -11,6 +11,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Callable, Sequence
+from mmap import mmap
 from pathlib import Path
 from typing import NoReturn
 
@@ -66,8 +67,12 @@ class GateLog:
         if rule != self._rule:
             self._changed(rule)
         self._cause = cause
-        if self._owed:
-            self._tell(rule)
+        if self._owed and (more := self._due(rule)) is not None:  # else it is told later
+            self._owed = False
+            if cause is None:
+                self._logger.info(f"commands pass{more}")
+            else:
+                self._logger.warning(f"stopped by {cause.line}{more}")
         if self._burst and not rule and entry.now - self._since >= BURST_S:
             self._burst.clear()
 
@@ -108,15 +113,6 @@ class GateLog:
             self._burst.add(rule)
             self._write(rule)
 
-    def _tell(self, rule: str) -> None:
-        """Logs the present state; later, if it was logged a moment ago."""
-        more = self._due(rule)
-        self._owed = more is None
-        if more is not None and self._cause is None:
-            self._logger.info(f"commands pass{more}")
-        elif more is not None and self._cause is not None:
-            self._logger.warning(f"stopped by {self._cause.line}{more}")
-
     def _write(self, rule: str) -> None:
         name = f"{time.strftime('%Y%m%d_%H%M%S')}_{self.counters.total():06d}_{rule}.jsonl"
         self._names = [*self._names[1 - FILES_KEPT :], name]
@@ -151,10 +147,7 @@ class GateLog:
 
 
 def prune(folder: Path, own: Sequence[str]) -> None:
-    """Removes the files of stops beyond `FILES_KEPT`, oldest first.
-
-    This gate's own, oldest first, count as the newest: the clock may have been set back since.
-    """
+    """Removes the oldest files beyond `FILES_KEPT`; `own` names are newer than all others."""
     place = {name: i for i, name in enumerate(own, 1)}
     files = sorted(folder.glob("*.jsonl"), key=lambda file: (place.get(file.name, 0), file.name))
     for old in files[:-FILES_KEPT]:
@@ -171,7 +164,7 @@ class BoxWriter:
     """
 
     def __init__(self) -> None:
-        self._writers: dict[int, tuple[int, float]] = {}  # pid: pipe with its failure, begin [s]
+        self._writers: dict[int, tuple[mmap, float]] = {}  # pid: what failed, begin [s]
         self._failed: list[str] = []
 
     def begin(self, write: Callable[[], object]) -> bool:
@@ -183,8 +176,7 @@ class BoxWriter:
         self._failed = self.failures()
         if len(self._writers) >= MOST_AT_WORK:
             return False
-        heard, told = os.pipe()
-        os.set_blocking(heard, False)
+        told = mmap(-1, MOST_TOLD)  # memory that the copy shares, for what failed
         # The copy must not run the handlers of the original.
         signals = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, *ENDING))
         try:
@@ -195,27 +187,25 @@ class BoxWriter:
                 pid = os.fork()
                 if pid == 0:
                     _live(write, told)
-        except OSError:
-            os.close(heard)
-            raise
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, signals)
-            os.close(told)
-        self._writers[pid] = heard, time.monotonic()
+        self._writers[pid] = told, time.monotonic()
         return True
 
     def failures(self) -> list[str]:
         """Returns the failures since the last call; kills the writers that are overdue."""
-        for pid, (heard, begun_s) in tuple(self._writers.items()):
-            status = _ended(pid)
-            if status is None:
-                if time.monotonic() - begun_s > OVERDUE_S:
-                    os.kill(pid, signal.SIGKILL)
-                continue
-            del self._writers[pid]
-            if status != 0:
-                self._failed.append(_read(heard) or f"its writer ended with {status}")
-            os.close(heard)
+        for pid, (told, begun_s) in tuple(self._writers.items()):
+            try:
+                ended, status = os.waitpid(pid, os.WNOHANG)
+            except ChildProcessError:  # if SIGCHLD is ignored, no status is kept
+                ended, status = pid, 0
+            if ended:
+                del self._writers[pid]
+                if status != 0:
+                    text = told[:].rstrip(b"\0").decode(errors="replace")
+                    self._failed.append(text or f"its writer ended with {status}")
+            elif time.monotonic() - begun_s > OVERDUE_S:
+                os.kill(pid, signal.SIGKILL)
         failed, self._failed = self._failed, []
         return failed
 
@@ -238,36 +228,26 @@ class BoxWriter:
         return failed
 
 
-def _ended(pid: int) -> int | None:
-    """Returns the exit status of a writer; None while it runs."""
-    try:
-        ended, status = os.waitpid(pid, os.WNOHANG)
-    except ChildProcessError:  # if SIGCHLD is ignored, no status is kept
-        return 0
-    return status if ended else None
-
-
-def _live(write: Callable[[], object], told: int) -> NoReturn:
+def _live(write: Callable[[], object], told: mmap) -> NoReturn:
     """Runs in the copy; never returns to the code that it was copied from."""
     code = 1
     try:
         gc.disable()  # which would touch, and so copy, all memory
-        _let_go(told)
+        _let_go()
         write()
         code = 0
     finally:  # on any exception, also from a signal
         error = sys.exc_info()[1]
         if error is not None:
-            os.write(told, (str(error) or type(error).__name__).encode()[:MOST_TOLD])
+            told.write((str(error) or type(error).__name__).encode()[:MOST_TOLD])
         os._exit(code)
 
 
-def _let_go(told: int) -> None:
+def _let_go() -> None:
     """Releases sockets, files, priority and signals that belong to the original."""
-    for number in [int(name) for name in os.listdir("/proc/self/fd")]:
-        if number != told:
-            with contextlib.suppress(OSError):
-                os.close(number)
+    for name in os.listdir("/proc/self/fd"):
+        with contextlib.suppress(OSError):
+            os.close(int(name))
     for _ in range(3):
         os.open(os.devnull, os.O_RDWR)
     with contextlib.suppress(OSError):
@@ -282,10 +262,3 @@ def _let_go(told: int) -> None:
 
 def _give_up(*_: object) -> NoReturn:
     raise TimeoutError("it took too long")
-
-
-def _read(told: int) -> str:
-    try:
-        return os.read(told, MOST_TOLD).decode(errors="replace")
-    except BlockingIOError:
-        return ""

@@ -70,7 +70,6 @@ class ManagedNode(QosWatch, LifecycleNode):
             self.deactivate()
 
     def _check_fixed(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Refuses changes that would no longer be read."""
         late = sorted(self.fixed & {parameter.name for parameter in parameters})
         if not late or self.state == UNCONFIGURED:
             return SetParametersResult(successful=True)
@@ -104,10 +103,7 @@ class ManagedNode(QosWatch, LifecycleNode):
         return self._attempt(self.undo.close, UNCONFIGURED)
 
     def on_shutdown(self, _: LifecycleState) -> TransitionCallbackReturn:
-        """Leaves the robot at rest, from any state, also after a transition that raised.
-
-        The process continues, and after an error the node can be configured again.
-        """
+        """Leaves the robot at rest, from any state; it can be configured again after an error."""
         self.stop()
         return self._attempt(self.undo.close, UNCONFIGURED)
 

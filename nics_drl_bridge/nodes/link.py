@@ -32,7 +32,7 @@ from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.runner import holds, last_word, open_context
-from nics_drl_bridge.nodes.wire import TwistWriter
+from nics_drl_bridge.nodes.wire import twist_to_bytes
 from nics_drl_bridge.sim.world import World
 
 SPIN_S, POLL_S = 0.2, 0.002
@@ -61,7 +61,6 @@ class Link:
             start_parameter_services=False, parameter_overrides=overrides,
         )  # fmt: skip
         self._kind = TwistStamped if stamped else Twist
-        self._twists = TwistWriter()
         self.commands = self.node.create_publisher(self._kind, command_topic, qos.COMMAND)
         self._timeout = CommandTimeout(self.commands, self._kind, command_timeout_s)
         self._closing: weakref.finalize[Any, Any] | None = None
@@ -74,10 +73,7 @@ class Link:
         self._closing = weakref.finalize(self, _shut_down, self._context, self._timeout, thread)
 
     def send(self, twist: NDArray[np.float64], stamp_ns: int = 0) -> None:
-        """Publishes linear.x, linear.y, angular.z (3,), stamped if the topic is.
-
-        Raises BackendError if it is not finite, and publishes a zero instead.
-        """
+        """Publishes linear.x, linear.y, angular.z (3,); BackendError and a zero for NaN or inf."""
         if not all(map(math.isfinite, twist)):
             self.halt()
             raise BackendError(
@@ -86,7 +82,7 @@ class Link:
             )
         self._timeout.begin(moving=True)
         if self._kind is Twist:
-            self.commands.publish(self._twists.write(twist))
+            self.commands.publish(twist_to_bytes(twist))
         else:
             self.commands.publish(conversions.stamped_to_ros(twist, stamp_ns, "base_link"))
 
@@ -103,12 +99,11 @@ class Link:
 
     def call(self, client: Any, request: Any, timeout_s: float) -> Any:
         """Calls a service; the executor's thread completes the future. Raises BackendError."""
-        done, deadline = threading.Event(), time.monotonic() + timeout_s
+        deadline = time.monotonic() + timeout_s
         # A server that hung for long was dropped, and has to be discovered again.
         holds(client.service_is_ready, timeout_s, POLL_S)
         future = client.call_async(request)
-        future.add_done_callback(lambda _: done.set())
-        if not done.wait(max(0.0, deadline - time.monotonic())):
+        if not holds(future.done, deadline - time.monotonic(), POLL_S):
             client.remove_pending_request(future)
             raise BackendError(
                 f"service {client.srv_name}: no answer within {timeout_s:g} s; look at the "
@@ -239,18 +234,6 @@ class EpisodeServices:
         """True if a simulator offers them."""
         return all(client.service_is_ready() for client in self.clients)
 
-    def choose(self, start: Start, timeout_s: float) -> None:
-        """Chooses the episode for the next `begin`. Raises BackendError if it is refused."""
-        request = SetParametersAtomically.Request()
-        request.parameters = [
-            Parameter("episode_seed", value=int(start.seed)).to_parameter_msg(),
-            Parameter("episode_start", value=start.pose.ravel().tolist()).to_parameter_msg(),
-            Parameter("episode_start_given", value=True).to_parameter_msg(),
-        ]
-        result = self._link.call(self._parameters, request, timeout_s).result
-        if not result.successful:
-            raise BackendError(f"the simulator refused the episode: {result.reason}")
-
     def repeat(self) -> None:
         """Requests the present data again, without waiting, unless such a request is pending."""
         now, asked = time.monotonic(), self._repeating
@@ -261,11 +244,18 @@ class EpisodeServices:
         if self._repeat.service_is_ready():
             self._repeating, self._asked_s = self._repeat.call_async(Trigger.Request()), now
 
-    def begin(self, timeout_s: float) -> int:
-        """Begins the chosen episode; returns the stamp of its first data [ns].
-
-        Raises BackendError if the simulator refuses, ModelError if it runs another model or world.
-        """
+    def begin(self, start: Start, timeout_s: float) -> int:
+        """Begins an episode; returns the stamp of its first data [ns]. Raises BridgeError."""
+        chosen = {
+            "episode_seed": int(start.seed), "episode_start": start.pose.ravel().tolist(),
+            "episode_start_given": True,
+        }  # fmt: skip
+        request = SetParametersAtomically.Request(
+            parameters=[Parameter(name, value=it).to_parameter_msg() for name, it in chosen.items()]
+        )
+        result = self._link.call(self._parameters, request, timeout_s).result
+        if not result.successful:
+            raise BackendError(f"the simulator refused the episode: {result.reason}")
         response = self._link.call(self._reset, Trigger.Request(), timeout_s)
         if not response.success:
             raise BackendError(f"the simulator could not reset: {response.message}")

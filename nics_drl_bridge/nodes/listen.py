@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from rclpy.executors import SingleThreadedExecutor
@@ -21,10 +21,7 @@ ANY_PUBLISHER = profile_of(Offer(100, reliable=False))  # matches any offer, so 
 
 
 def listen(seconds: float, namespace: str = "", domain_id: int | None = None) -> Facts:
-    """Listens to a robot without sending anything.
-
-    The seconds count from the first message on, which is awaited for at most 10 s.
-    """
+    """Listens so long [s] from the first message on, awaited for at most 10 s; sends nothing."""
     context = open_context([], domain_id)
     node = Node(NAME, context=context, start_parameter_services=False)
     executor = SingleThreadedExecutor(context=context)
@@ -65,12 +62,9 @@ def _look(node: Node, facts: Facts, subscribed: set[str]) -> None:
         wanted = [kind for kind in there.types if kind in KINDS[role]]
         if there.offers and wanted and role not in subscribed:
             subscribed.add(role)
-            kind = message_type(wanted[0])
-            node.create_subscription(kind, topic, _taker(facts, role), ANY_PUBLISHER)
+            kind, take = message_type(wanted[0]), partial(_take, facts, role)
+            node.create_subscription(kind, topic, take, ANY_PUBLISHER)
 
 
-def _taker(facts: Facts, role: str) -> Callable[[Any, Any], None]:
-    def take(message: Any, info: Any) -> None:
-        facts.take(role, int(info.get("received_timestamp") or time.time_ns()), message)
-
-    return take
+def _take(facts: Facts, role: str, message: Any, info: Any) -> None:
+    facts.take(role, int(info.get("received_timestamp") or time.time_ns()), message)

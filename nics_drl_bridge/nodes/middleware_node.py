@@ -34,7 +34,7 @@ class MiddlewareNode(ManagedNode):
         runner.declare(self, "map_frame", "map", "Frame id of the estimate.")
         runner.declare(self, "base_frame", "base_link", "Frame id of the robot.")
         runner.serve(self, "~/reset", self._reset)
-        runner.Diagnostics(self, "topics", self._look)
+        runner.diagnose(self, "topics", self._look)
 
     def configure(self) -> None:
         """Opens the model and subscribes."""
@@ -75,8 +75,7 @@ class MiddlewareNode(ManagedNode):
 
 def silence(health: Health, expected: Sequence[str]) -> str:
     """Returns a sentence about expected topics that are silent; empty if none is."""
-    missing = [topic for topic in expected if topic not in health.topics]
-    if missing:
+    if missing := [topic for topic in expected if topic not in health.topics]:
         return f"nothing on {', '.join(missing)} yet"
     silent = [topic for topic in expected if health.topics[topic].age_s > SILENCE_S]
     return f"nothing on {', '.join(silent)} for {SILENCE_S:g} s" if silent else ""

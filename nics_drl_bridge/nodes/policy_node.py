@@ -57,7 +57,7 @@ class PolicyNode(ManagedNode):
         about = "So many late inferences in a row command zero."
         runner.declare(self, "late_limit", 3, about, span=(1, 1000), read_only=True)
         self._acted_ns = 0
-        runner.Diagnostics(self, "policy", self._look)
+        runner.diagnose(self, "policy", self._look)
 
     def configure(self) -> None:
         """Opens model and policy, and subscribes."""
@@ -149,10 +149,7 @@ class PolicyNode(ManagedNode):
         return runner.Condition(f"{self.state}; {done.late} late inferences", done.late > 0, facts)
 
     def _twist(self) -> Array:
-        """Returns the command (3,) for the present view; zero without a goal, at it, or on contact.
-
-        With a pose sensor, it is also zero before the first pose.
-        """
+        """Returns the command (3,); zero without a pose or goal, at the goal, or on contact."""
         if not (self._topics.located and np.isfinite(self._goal).all()):
             return np.zeros(3)
         view = self._topics.view()

@@ -25,20 +25,17 @@ from std_srvs.srv import Trigger
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.runner import open_context, spin
+from nics_drl_bridge.nodes.runner import holds, open_context, spin
 from nics_drl_bridge.nodes.transport import domains_in_use
 
 LAST_DOMAIN_ID = 101  # above it DDS ports may collide with Linux's ephemeral ports
 GREATEST_DOMAIN_ID = 232  # above it there are no ports
 PR_SET_PDEATHSIG, LOG_LINES = 1, 5
-PATIENCE_S, ASK_AGAIN_S, ANSWER_S = 5.0, 0.2, 2.0
+PATIENCE_S, ASK_AGAIN_S, ANSWER_S, POLL_S = 5.0, 0.2, 2.0, 0.005
 
 
 def free_domain_id() -> int:
-    """Returns the domain id of the environment, or a random one that this machine does not use.
-
-    Raises ConfigError if the environment's value is not a domain id.
-    """
+    """Returns the environment's domain id (ConfigError if it is none), or a random unused one."""
     given = os.environ.get("ROS_DOMAIN_ID")
     if not given:
         every = range(1, LAST_DOMAIN_ID + 1)
@@ -52,10 +49,7 @@ def free_domain_id() -> int:
 
 
 def _dies_with_parent() -> Callable[[], None] | None:
-    """Returns what a child does first, on Linux: request SIGTERM for any death of its parent.
-
-    The library is loaded before the fork, because little is safe after it.
-    """
+    """Returns what a child does first, on Linux: request SIGTERM for any death of its parent."""
     if sys.platform != "linux":
         return None
     prctl, parent = ctypes.CDLL(None).prctl, os.getpid()
@@ -92,14 +86,10 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
         with self.log.open("wb") as log:
             # Its own session: Ctrl-C in the terminal reaches the parent alone, which then ends it.
             self._process = subprocess.Popen(
-                command, env=os.environ | chosen, stdin=subprocess.DEVNULL, stdout=log,
-                stderr=subprocess.STDOUT, start_new_session=True, preexec_fn=_dies_with_parent(),
+                command, env=os.environ | chosen, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
+                start_new_session=True, preexec_fn=_dies_with_parent(),
             )  # fmt: skip
-
-    @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._process.pid
+        self.pid = self._process.pid
 
     def check(self) -> None:
         """Raises BackendError with the end of its log if the node has ended by itself."""
@@ -130,7 +120,6 @@ class Witness(AbstractContextManager["Witness", None]):
 
     def __init__(self, domain_id: int | None = None, topic: str = "ground_truth") -> None:
         self._poses: list[NDArray[np.float64]] = []
-        self._changed = threading.Condition()
         self._context = open_context(domain_id=domain_id)
         self._node = Node("witness", context=self._context, start_parameter_services=False)
         self._node.create_subscription(Odometry, topic, self._take, qos.SENSOR_RELIABLE)
@@ -140,64 +129,49 @@ class Witness(AbstractContextManager["Witness", None]):
         self._thread.start()
 
     def _take(self, message: Odometry) -> None:
-        with self._changed:
-            self._poses.append(conversions.odometry_from_ros(message)[0])
-            self._changed.notify_all()
+        self._poses.append(conversions.odometry_from_ros(message)[0])
 
     @property
     def path(self) -> NDArray[np.float64]:
         """All poses so far (T, 3)."""
-        with self._changed:
-            return np.array(self._poses).reshape(-1, 3)
+        return np.array(self._poses).reshape(-1, 3)
 
     def sees(self, timeout_s: float) -> bool:
         """Waits for a first pose; False after the time [s]."""
-        with self._changed:
-            return self._changed.wait_for(lambda: bool(self._poses), timeout_s)
+        return holds(lambda: self._poses, timeout_s, POLL_S)
 
     def arrives(self, goal: ArrayLike, radius: float, timeout_s: float) -> bool:
         """Waits until the robot is within `radius` of a goal (2,); False after the time [s]."""
 
         def there() -> bool:
-            poses = self._poses[-1:]
-            return bool(poses) and bool(np.linalg.norm(poses[0][:2] - np.asarray(goal)) < radius)
+            newest = self._poses[-1:]
+            return any(np.linalg.norm(pose[:2] - np.asarray(goal)) < radius for pose in newest)
 
-        with self._changed:
-            return self._changed.wait_for(there, timeout_s)
+        return holds(there, timeout_s, POLL_S)
 
     def arms(self, gate: str, timeout_s: float) -> str:
-        """Requests a gate to let commands pass, repeatedly until it does.
-
-        Returns an empty string, or after the time [s] the gate's last reason to refuse.
-        """
+        """Arms a gate, asking until it agrees; returns its last reason to refuse, or ''."""
         answer = self._asked(f"{gate}/arm", timeout_s)
         return "" if answer.success else str(answer.message)
 
     def touched(self, simulator: str, timeout_s: float) -> bool:
-        """True if a simulator says that its robot has touched something in this episode.
-
-        Raises BackendError if it does not answer within the time [s].
-        """
+        """True if its robot has touched something in this episode. Raises BackendError."""
         answer = self._asked(f"{simulator}/touched", timeout_s)
         if not answer.success:
             raise BackendError(f"the episode can't be judged: {answer.message}.")
         return bool(np.any(json.loads(answer.message)))
 
     def _asked(self, service: str, timeout_s: float) -> Trigger.Response:
-        """Returns the first successful answer, otherwise the last one."""
         client = self._node.create_client(Trigger, service)
         answer = Trigger.Response(success=False, message=f"{service} does not answer")
         deadline = time.monotonic() + timeout_s
-        while time.monotonic() < deadline:
+        while time.monotonic() < deadline and not answer.success:
             if client.wait_for_service(timeout_sec=ASK_AGAIN_S):
-                answered = threading.Event()
                 future = client.call_async(Trigger.Request())
-                future.add_done_callback(lambda _, answered=answered: answered.set())
-                if answered.wait(ANSWER_S):
+                if holds(future.done, ANSWER_S, POLL_S):
                     answer = future.result()
-                    if answer.success:
-                        break
-            time.sleep(ASK_AGAIN_S)
+            if not answer.success:
+                time.sleep(ASK_AGAIN_S)
         self._node.destroy_client(client)
         return answer
 

@@ -10,18 +10,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from rclpy import qos as rclpy_qos
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import (
-    DurabilityPolicy,
-    HistoryPolicy,
-    QoSCompatibility,
-    QoSProfile,
-    ReliabilityPolicy,
-    qos_check_compatible,
-    qos_policy_name_from_kind,
-)
+from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 
 from nics_drl_bridge.recording.messages import Offer
@@ -34,9 +27,9 @@ except ModuleNotFoundError:  # Humble
 
 def profile_of(offer: Offer) -> QoSProfile:
     """Returns an offer, or a request, as a profile."""
-    reliability, durability = ReliabilityPolicy, DurabilityPolicy
+    reliability, durability = rclpy_qos.ReliabilityPolicy, rclpy_qos.DurabilityPolicy
     return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
+        history=rclpy_qos.HistoryPolicy.KEEP_LAST,
         depth=offer.depth,
         reliability=reliability.RELIABLE if offer.reliable else reliability.BEST_EFFORT,
         durability=durability.TRANSIENT_LOCAL if offer.transient_local else durability.VOLATILE,
@@ -47,8 +40,8 @@ def offer_of(profile: QoSProfile) -> Offer:
     """Returns what a publisher offers, or a subscriber requests."""
     return Offer(
         max(profile.depth, 1),
-        profile.reliability != ReliabilityPolicy.BEST_EFFORT,
-        profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+        profile.reliability != rclpy_qos.ReliabilityPolicy.BEST_EFFORT,
+        profile.durability == rclpy_qos.DurabilityPolicy.TRANSIENT_LOCAL,
     )
 
 
@@ -105,7 +98,7 @@ class QosWatch(Node):
 
     def _warn(self, event: Any, topic: str, qos: Any, publishing: bool) -> None:
         """Warns after a moment: a peer's name is known later than its quality of service."""
-        policy = qos_policy_name_from_kind(event.last_policy_kind)
+        policy = rclpy_qos.qos_policy_name_from_kind(event.last_policy_kind)
         resolved = self.resolve_topic_name(topic)
 
         def say() -> None:
@@ -128,26 +121,20 @@ class QosWatch(Node):
 
     def _misfit(self, topic: str, ours: QoSProfile, publishing: bool) -> tuple[str, Any]:
         """Returns name and profile of the last peer that does not fit, as far as known."""
-        subscriptions, publishers = (
-            self.get_subscriptions_info_by_topic, self.get_publishers_info_by_topic
-        )  # fmt: skip
-        for peer in reversed((subscriptions if publishing else publishers)(topic)):
+        kind = "subscriptions" if publishing else "publishers"
+        for peer in reversed(getattr(self, f"get_{kind}_info_by_topic")(topic)):
             pair = (ours, peer.qos_profile) if publishing else (peer.qos_profile, ours)
-            if qos_check_compatible(*pair)[0] == QoSCompatibility.ERROR:
+            if rclpy_qos.qos_check_compatible(*pair)[0] == rclpy_qos.QoSCompatibility.ERROR:
                 return owner(peer) or "a peer", peer.qos_profile
         return "a peer", None
 
 
 def _value(profile: Any, policy: str) -> str:
-    """Returns the value of a policy in a profile, in words."""
     value = getattr(profile, policy.lower(), None)
     return str(getattr(value, "name", value) or "unknown").lower().replace("_", " ")
 
 
 def owner(end: Any) -> str | None:
-    """Returns the full name of the node of a `TopicEndpointInfo`; None while it is unknown.
-
-    A node's name is discovered apart from its publishers and subscriptions.
-    """
+    """Returns the full name of an endpoint's node; None until it is discovered."""
     name = f"{end.node_namespace.rstrip('/')}/{end.node_name}"
     return None if UNKNOWN in name else name

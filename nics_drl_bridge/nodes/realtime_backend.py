@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, PositiveFloat
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.config import Schema, validate
@@ -40,14 +40,14 @@ class RealtimeOptions(Schema):
     namespace: str = ""  # of the robot
     simulator: str = "simulator_node"  # name of its node in that namespace
     domain_id: int | None = Field(None, ge=0, le=232)  # the environment's by default
-    timeout_s: float = Field(30.0, gt=0.0)  # longest wait for a peer or an answer
+    timeout_s: PositiveFloat = 30.0  # longest wait for a peer or an answer
     vehicle: bool | None = None  # a vehicle has no services; None: detected
-    period_s: float | None = Field(None, gt=0.0)  # of a step; the model's control period by default
-    stale_after_s: float = Field(0.5, gt=0.0)  # age from which data are too old for a view
+    period_s: PositiveFloat | None = None  # of a step; the model's control period by default
+    stale_after_s: PositiveFloat = 0.5  # age from which data are too old for a view
     # An episode on a vehicle waits until it stands at the requested pose, or takes the present one.
     start: Literal["wait", "present"] = "wait"
-    tolerance: tuple[float, float] = (0.1, 0.1)  # of the pose at the start [m, rad]
-    start_timeout_s: float = Field(300.0, gt=0.0)  # longest wait for that
+    tolerance: tuple[PositiveFloat, PositiveFloat] = (0.1, 0.1)  # of the start's pose [m, rad]
+    start_timeout_s: PositiveFloat = 300.0  # longest wait for that
     say: Callable[[str], None] | None = None  # told what is missing; the node's logger by default
     # `cmd_vel_raw` leads through `command_gate`: then each command is a TwistStamped with the stamp
     # of the scan that it answers.
@@ -55,12 +55,6 @@ class RealtimeOptions(Schema):
     stamped: bool = False  # `cmd_vel` is a TwistStamped
     pose_type: str = "none"  # of `pose`, a pose sensor in `map`
     use_imu: bool = False  # the yaw rate of `imu`
-
-    @model_validator(mode="after")
-    def _check(self) -> RealtimeOptions:
-        if not all(value > 0.0 for value in self.tolerance):
-            raise ValueError("tolerance must be above 0: metres and radians.")
-        return self
 
     @property
     def gated(self) -> bool:
@@ -121,34 +115,24 @@ class RealtimeBackend:
         if self._is_vehicle():
             self._await_start(start)
         if not self._is_vehicle():
-            self._begin(start)
+            timeout_s = self._options.timeout_s
+            stamp_ns = self._episodes.begin(start, timeout_s)
+            with self._topics.lock:
+                self._topics.begin(stamp_ns, start.pose)
+            if not holds(lambda: math.isfinite(self._oldest()[1]), timeout_s, POLL_S):
+                raise StaleDataError(*self._oldest(), timeout_s)
         self._misses, self._deadline_ns = 0, time.monotonic_ns() + self._period_ns
         return self._fresh_view()[0]
 
     def _is_vehicle(self) -> bool:
-        """True for a vehicle: by the options, otherwise if it shows no services of a simulator.
-
-        What was a simulator once stays one, because it may be out of sight for a while.
-        """
+        """True for a vehicle: by the options, or if it has never shown services of a simulator."""
         if self._options.vehicle is not None:
             return self._options.vehicle
         self._simulated = self._simulated or self._episodes.there
         return not self._simulated
 
-    def _begin(self, start: Start) -> None:
-        timeout_s = self._options.timeout_s
-        self._episodes.choose(start, timeout_s)
-        stamp_ns = self._episodes.begin(timeout_s)
-        with self._topics.lock:
-            self._topics.begin(stamp_ns, start.pose)
-        if not holds(lambda: math.isfinite(self._oldest()[1]), timeout_s, POLL_S):
-            raise StaleDataError(*self._oldest(), timeout_s)
-
     def _await_start(self, start: Start) -> None:
-        """Waits until a vehicle stands at its start, and reports what is missing.
-
-        Also ends if services show that it is a simulator.
-        """
+        """Waits until a vehicle stands at its start, telling what is missing, or is a simulator."""
         say = self._options.say or self._link.node.get_logger().info
         began, said = time.monotonic(), -math.inf
         while self._is_vehicle() and (missing := self._missing(start)):
@@ -187,10 +171,7 @@ class RealtimeBackend:
         )
 
     def _oldest(self) -> tuple[str, float]:
-        """Returns the topic with the oldest datum, and its age [s]; inf if there is none.
-
-        The age is the time since arrival, or the lag of its stamp behind the newest of all topics.
-        """
+        """Returns the topic with the oldest datum, and its age or lag [s]; inf without one."""
         with self._topics.lock:
             newest, now = dict(self._topics.middleware.cache.newest), time.monotonic_ns()
         latest = max((datum.stamp_ns for datum in newest.values()), default=0)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
+from numpy.typing import ArrayLike
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -28,7 +30,7 @@ from nics_drl_bridge.recording.bag_reader import joint_streams
 from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S, DrivePlan
 from nics_drl_bridge.recording.messages import imu_row, pose_row, stamp, twist_row
 from nics_drl_bridge.recording.recording import Recording
-from nics_drl_bridge.recording.stamping import TopicData, streams
+from nics_drl_bridge.recording.stamping import Nanoseconds, TopicData, streams
 from nics_drl_bridge.recording.topic_roles import TopicRoles, topic_roles
 from nics_drl_bridge.recording.write import check_out, write_drive
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
@@ -60,65 +62,14 @@ def declare_drive(node: Node) -> DriveParameters:
     robot = load_robot(get("robot", "ackermann", "A shipped robot, or its YAML file."))
     about = "File *.npz of the recording, or folder of a rosbag2."
     out = check_out(Path(get("out", "drive.npz", about)))
-    plan = DrivePlan(
-        robot,
-        bound=get("bound", 2.0, "Radius of the circle around the start to keep within [m]."),
-        duration=get("duration", 60.0, "Of the drive [s]."),
-        speed=get("speed", 1.0, "Share of the greatest speeds to use."),
-        seed=get("seed", 0, "Of the pattern."),
-    )
+    bound = get("bound", 2.0, "Radius of the circle around the start to keep within [m].")
+    duration = get("duration", 60.0, "Of the drive [s].")
+    speed = get("speed", 1.0, "Share of the greatest speeds to use.")
+    plan = DrivePlan(robot, bound, duration, speed, get("seed", 0, "Of the pattern."))
     topics = get("topics", "", "YAML file that names joints; none if empty.")
     silence = get("odom_timeout", 0.5, "Stops after this silence of odom [s].", span=(0.05, 10.0))
     stamped = get("stamped", False, "Whether cmd_vel is a TwistStamped.")
     return DriveParameters(plan, out, silence, stamped, topic_roles(topics or None))
-
-
-class _Rows:
-    """The messages of one topic, in the order of their stamps."""
-
-    def __init__(self, topic: str) -> None:
-        self._topic = topic
-        self._receive: list[int] = []
-        self._header: list[int] = []
-        self._values: list[Array] = []
-
-    def __len__(self) -> int:
-        return len(self._values)
-
-    def add(self, receive_ns: int, header_ns: int, values: Array) -> bool:
-        """Adds a message; returns False if it is not finite, or not newer than the last."""
-        stale = header_ns != 0 and len(self._header) > 0 and header_ns <= self._header[-1]
-        if stale or not np.isfinite(values).all():
-            return False
-        self._receive.append(receive_ns)
-        self._header.append(header_ns)
-        self._values.append(values)
-        return True
-
-    @property
-    def spans(self) -> tuple[int, int]:
-        """Time from the first message to the last, by receipt and by stamp [ns]."""
-        if not self._values:
-            return 0, 0
-        return self._receive[-1] - self._receive[0], self._header[-1] - self._header[0]
-
-    @property
-    def pace(self) -> float:
-        """Seconds by stamp per second of receipt, by the least delayed message of each half.
-
-        It is 1 if it can't be determined.
-        """
-        heard, stamped = self.spans
-        if heard <= 0 or stamped <= 0:
-            return 1.0
-        delay = np.array(self._receive, np.int64) - np.array(self._header, np.int64)
-        half = len(delay) // 2
-        apart = heard * half / (len(delay) - 1)
-        return 1.0 - float(delay[half:].min() - delay[:half].min()) / apart
-
-    def data(self) -> TopicData:
-        receive, header = (np.array(ns, dtype=np.int64) for ns in (self._receive, self._header))
-        return TopicData(self._topic, receive, header, np.array(self._values))
 
 
 class DriveLog:
@@ -126,44 +77,37 @@ class DriveLog:
 
     def __init__(self, spec: RobotSpec, roles: TopicRoles, now: Callable[[], int]) -> None:
         self._spec, self._roles, self._now = spec, roles, now
-        self._commands, self._odom, self._twist = _Rows("cmd_vel"), _Rows("odom"), _Rows("odom")
-        self._pose, self._imu = _Rows("pose"), _Rows("imu")
+        # Topic, or `odom twist` -> receipt [ns], stamp [ns] or 0, and values of each message.
+        self.rows: dict[str, list[tuple[int, int, Array]]] = defaultdict(list)
         self._joints: list[Message] = []
 
     @property
     def seconds(self) -> float:
         """Time over which commands were sent [s]."""
-        return self._commands.spans[0] / NS_PER_S
+        return (self.rows["cmd_vel"][-1][0] - self.rows["cmd_vel"][0][0]) / NS_PER_S
 
-    def command(self, command: Array) -> None:
-        """Records a command (C,) that is sent now."""
-        self._commands.add(self._now(), 0, command)
+    def add(self, topic: str, header_ns: int, values: ArrayLike) -> bool:
+        """Adds a message; returns False if it is not finite, or not newer than the last."""
+        rows, values = self.rows[topic], np.asarray(values, np.float64)
+        if (rows and 0 != header_ns <= rows[-1][1]) or not np.isfinite(values).all():
+            return False
+        rows.append((self._now(), header_ns, values))
+        return True
 
     def odometry(self, message: Odometry) -> Array | None:
         """Records an odometry; returns its pose (3,), or None if it is old, NaN or inf."""
-        now, header, pose = self._now(), stamp(message), np.array(pose_row(message))
-        if not self._odom.add(now, header, pose):
+        header, pose = stamp(message), np.array(pose_row(message))
+        if not self.add("odom", header, pose):
             return None
-        self._twist.add(now, header, np.array(twist_row(message)))
+        self.add("odom twist", header, twist_row(message))
         return pose
-
-    def pose(self, message: Any) -> None:
-        """Records a pose from motion capture or localisation."""
-        self._pose.add(self._now(), stamp(message), np.array(pose_row(message)))
-
-    def imu(self, message: Any) -> None:
-        """Records accelerations and yaw rate."""
-        self._imu.add(self._now(), stamp(message), np.array(imu_row(message)))
 
     def joints(self, message: JointState) -> None:
         """Records the data of the joints."""
         self._joints.append(Message(self._now(), message))
 
     def check(self) -> None:
-        """Raises BackendError or RecordingError, before the robot moves, for an unusable recording.
-
-        A state that has to be measured is not, or stamps run at another rate than receipt.
-        """
+        """Raises BridgeError if a state is not measured, or stamps run at another rate."""
         measured = [v.name for v in self._spec.state if v.follows is None]
         if self._joints:
             joint_streams("joint_states", self._joints, self._spec, self._roles, PLACE)
@@ -173,10 +117,11 @@ class DriveLog:
                 f"of robot {self._spec.name!r} has to be measured; start the joints' publisher, "
                 "or remap the topic."
             )
-        pace, heard = self._odom.pace, self._odom.spans[0] / NS_PER_S
-        if not SAME_PACE[0] <= pace <= SAME_PACE[1]:
+        receive, header = np.array([row[:2] for row in self.rows["odom"]]).T
+        heard, rate = (receive[-1] - receive[0]) / NS_PER_S, pace(receive, header)
+        if not SAME_PACE[0] <= rate <= SAME_PACE[1]:
             raise BackendError(
-                f"topic 'odom': its stamps went on by {pace * heard:.2f} s within {heard:.2f} s; "
+                f"topic 'odom': its stamps went on by {rate * heard:.2f} s within {heard:.2f} s; "
                 "where a simulator is the robot, take its time: --use-sim-time, or "
                 "-p use_sim_time:=true."
             )
@@ -187,25 +132,34 @@ class DriveLog:
         In addition to such a pose, the twist of the odometry is kept, to determine its noise.
         Raises RecordingError if too little was received.
         """
-        posed = len(self._pose) >= FEWEST
-        rows = {"pose": self._pose if posed else self._odom, "imu": self._imu}
-        if posed:
-            rows["odometry"] = self._twist
-        if min(len(rows["pose"]), len(self._commands)) < FEWEST:
+        topics = {"command": "cmd_vel", "pose": "odom", "imu": "imu"}
+        if len(self.rows["pose"]) >= FEWEST:
+            topics |= {"pose": "pose", "odometry": "odom twist"}
+        data: dict[str, TopicData] = {}
+        for name, topic in topics.items():
+            if len(self.rows[topic]) >= FEWEST:
+                times_and_values = map(np.array, zip(*self.rows[topic], strict=True))
+                data[name] = TopicData(topic.removesuffix(" twist"), *times_and_values)
+        if not data.keys() >= {"command", "pose"}:
             raise RecordingError("recording: nothing was received that could be saved.")
-        data: dict[str, TopicData | None] = {
-            "command": replace(self._commands.data(), header_ns=None),
-            **{name: each.data() for name, each in rows.items() if len(each) >= FEWEST},
-        }
         if len(self._joints) >= FEWEST:
             data |= joint_streams("joint_states", self._joints, self._spec, self._roles, PLACE)
-        known = {name: each for name, each in data.items() if each is not None}
         try:
-            found: dict[str, Any] = dict(streams(known, self._roles.stamps, PLACE))
+            kept: Any = streams(data, self._roles.stamps, PLACE)
         except RecordingError:
             # Poorer stamps are better than no recording of a drive that is over.
-            found = dict(streams(known, "receive", PLACE))
-        return Recording(**found, source=PLACE, variables=self._spec.variable_names)
+            kept = streams(data, "receive", PLACE)
+        return Recording(**kept, source=PLACE, variables=self._spec.variable_names)
+
+
+def pace(receive: Nanoseconds, header: Nanoseconds) -> float:
+    """Returns seconds by stamp per second of receipt, by the least delayed of each half."""
+    heard, stamped = receive[-1] - receive[0], header[-1] - header[0]
+    if heard <= 0 or stamped <= 0:
+        return 1.0
+    delay, half = receive - header, len(receive) // 2
+    apart = heard * half / (len(delay) - 1)
+    return float(1.0 - (delay[half:].min() - delay[:half].min()) / apart)
 
 
 @dataclass(frozen=True)
@@ -237,12 +191,13 @@ class RecordNode(qos.QosWatch):
         self._sim_time = bool(self.get_parameter("use_sim_time").value)
         self._steady_origin_ns = time.time_ns() - time.monotonic_ns()
         self._log = DriveLog(self._order.plan.robot, self._order.roles, self._now_ns)
-        kind = TwistStamped if self._order.stamped else Twist
-        self._topic = self.create_publisher(kind, "cmd_vel", qos.COMMAND)
+        command = TwistStamped if self._order.stamped else Twist
+        self._topic = self.create_publisher(command, "cmd_vel", qos.COMMAND)
         self.create_subscription(Odometry, "odom", self._on_odometry, qos.SENSOR)
-        self.create_subscription(PoseStamped, "pose", self._log.pose, qos.SENSOR)
         self.create_subscription(JointState, "joint_states", self._log.joints, qos.SENSOR)
-        self.create_subscription(Imu, "imu", self._log.imu, qos.SENSOR)
+        for each, topic, row in ((PoseStamped, "pose", pose_row), (Imu, "imu", imu_row)):
+            take = partial(self._take, topic, row)
+            self.create_subscription(each, topic, take, qos.SENSOR)
         self._began, self._heard = time.monotonic(), -np.inf
         self._ticks = self._origin_ns = self._stamp_ns = 0
         self._pose: Array | None = None
@@ -256,6 +211,9 @@ class RecordNode(qos.QosWatch):
             # Odometry may arrive before its tick of /clock.
             return max(int(self.get_clock().now().nanoseconds), self._stamp_ns)
         return self._steady_origin_ns + time.monotonic_ns()
+
+    def _take(self, topic: str, row: Callable[[Any], ArrayLike], message: Any) -> None:
+        self._log.add(topic, stamp(message), row(message))
 
     def _on_odometry(self, message: Odometry) -> None:
         self._stamp_ns = max(self._stamp_ns, conversions.stamp_from_ros(message.header.stamp))
@@ -305,7 +263,6 @@ class RecordNode(qos.QosWatch):
         return f"{self.resolve_topic_name(topic)!r} ({place})"
 
     def _go_on(self) -> None:
-        """Sends the command if one is due."""
         self._guard()
         due = (self._now_ns() - self._origin_ns) // PERIOD_NS + 1 - self._ticks
         if due <= 0:
@@ -318,7 +275,6 @@ class RecordNode(qos.QosWatch):
         self._send(command)
 
     def _guard(self) -> None:
-        """Raises BackendError if the robot must not continue."""
         age, limit = time.monotonic() - self._heard, self._order.odom_timeout
         if age > limit:
             raise BackendError(
@@ -336,7 +292,7 @@ class RecordNode(qos.QosWatch):
 
     def _send(self, command: Array) -> None:
         self._topic.publish(self._message(self._order.plan.robot.to_cmd_vel(command)))
-        self._log.command(command)
+        self._log.add("cmd_vel", 0, command)
 
     def _message(self, twist: Array) -> Twist | TwistStamped:
         stamped = conversions.stamped_to_ros(twist, self._now_ns(), "")
@@ -348,7 +304,6 @@ class RecordNode(qos.QosWatch):
             self._end(None)
 
     def _end(self, failure: BridgeError | None, complete: bool = False) -> None:
-        """Stops the robot, saves, and ends the node, however the drive ended."""
         self.outcome = DriveResult(complete, failure, None, "")
         recording, told = None, "the robot was not moved, nothing is recorded"
         if self._ticks:
@@ -369,7 +324,6 @@ class RecordNode(qos.QosWatch):
         last_word(self._topic, self._message(np.zeros(3)))
 
     def _save(self) -> tuple[Recording | None, str]:
-        """Saves the recording; returns it with a clause about it."""
         try:
             recording = self._log.recording()
             write_drive(recording, self._order.out, self._order.plan.robot)
@@ -381,18 +335,9 @@ class RecordNode(qos.QosWatch):
 def record(
     given: Mapping[str, Any] | None = None, args: Sequence[str] | None = None
 ) -> DriveResult:
-    """Drives and records until the end, an error, SIGINT or SIGTERM.
-
-    Given parameters override those of the command line, `sys.argv` by default.
-    """
-    nodes: list[RecordNode] = []
-
-    def make(context: Context) -> RecordNode:
-        nodes.append(RecordNode(context, given))
-        return nodes[-1]
-
-    run_node(make, args, "record_node")
-    return nodes[-1].outcome or DriveResult(False, None, None, "interrupted: nothing was saved")
+    """Drives and records until the end, an error or a signal, with parameters beside `args`."""
+    node: RecordNode = run_node(partial(RecordNode, given=given), args, "record_node")
+    return node.outcome or DriveResult(False, None, None, "interrupted: nothing was saved")
 
 
 def main(args: list[str] | None = None) -> None:

@@ -64,8 +64,7 @@ class RobotTopics:
         on_lidar: Callable[[LidarSpec], None] | None = None,
         now_ns: Callable[[], int] | None = None,
     ) -> None:  # fmt: skip
-        self._node, self._robot, self._lidar = node, model.robot, model.lidar
-        self._model = model
+        self._node, self._model, self._robot, self._lidar = node, model, model.robot, model.lidar
         self.now_ns = now_ns or (lambda: int(node.get_clock().now().nanoseconds))
         self.lock = threading.RLock()
         self.middleware = Middleware(model)
@@ -153,24 +152,22 @@ class RobotTopics:
         """Returns the reader of a scan; None if it can't be used, logged once for each header."""
         fields = [message.angle_min, message.angle_increment, message.range_min, message.range_max]
         header = np.array([*fields, len(message.ranges)], np.float32).tobytes()
-        if header != self._header and self._on_lidar is not None:
-            self._header, self._reader = header, self._follow(message)
-        return self._reader
-
-    def _follow(self, message: LaserScan) -> Reader | None:
+        if header == self._header or self._on_lidar is None:
+            return self._reader
+        self._header, self._reader = header, None
         upside_down = bool(self._node.get_parameter("lidar_upside_down").value)
         try:
             reader = conversions.reader_from_ros(message, self._model.lidar, upside_down)
-            if reader.lidar != self._lidar and self._on_lidar is not None:
+            if reader.lidar != self._lidar:
                 self._on_lidar(reader.lidar)
                 self.middleware.expect_beams(reader.lidar.beams)
                 self._lidar = reader.lidar
+            self._reader = reader
         except BridgeError as error:
             if str(error) != self._told:
                 self._node.get_logger().error(f"{SCAN} is not used: {error}")
             self._told = str(error)
-            return None
-        return reader
+        return self._reader
 
     def _take_odometry(self, message: Odometry) -> None:
         stamp = conversions.stamp_from_ros(message.header.stamp)
@@ -185,16 +182,14 @@ class RobotTopics:
 
     def _take_pose(self, message: PoseStamped | PoseWithCovarianceStamped) -> None:
         stamp = conversions.stamp_from_ros(message.header.stamp)
-        pose, covariance = conversions.pose_from_ros(message)
-        self.middleware.pose(stamp, self.now_ns(), pose, covariance)
+        self.middleware.pose(stamp, self.now_ns(), *conversions.pose_from_ros(message))
 
     def _take_imu(self, message: Imu) -> None:
         stamp = conversions.stamp_from_ros(message.header.stamp)
-        measured = conversions.imu_from_ros(message)
-        if measured is None:
+        if (measured := conversions.imu_from_ros(message)) is None:
             self.middleware.cache.reject(f"{IMU}: no angular velocity")
-            return
-        self.middleware.imu(stamp, self.now_ns(), *measured)
+        else:
+            self.middleware.imu(stamp, self.now_ns(), *measured)
 
     def _take_reading(self, sensor: Sensor, message: Any) -> None:
         stamp = conversions.stamp_from_ros(message.header.stamp)
@@ -202,12 +197,12 @@ class RobotTopics:
             reading = sensor.read(message)
         except ValueError as error:
             self.middleware.cache.reject(f"{sensor.name}: {error}")
-            return
-        self.middleware.sense(sensor.name, stamp, self.now_ns(), reading)
+        else:
+            self.middleware.sense(sensor.name, stamp, self.now_ns(), reading)
 
     def _take_command(self, message: Twist | TwistStamped) -> None:
-        twist = message.twist if isinstance(message, TwistStamped) else message
-        self.middleware.command(None, self._robot.from_cmd_vel(conversions.twist_from_ros(twist)))
+        twist = conversions.twist_from_ros(message)
+        self.middleware.command(None, self._robot.from_cmd_vel(twist))
 
 
 def data_facts(middleware: Middleware, now_ns: int) -> dict[str, Any]:

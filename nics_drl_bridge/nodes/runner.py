@@ -74,20 +74,19 @@ def last_word(publisher: Publisher, message: Any) -> None:
 
 def run_node(
     make: Callable[[Context], Node], args: Sequence[str] | None = None, sole_name: str = ""
-) -> None:
-    """Runs a node until SIGINT or SIGTERM, then destroys it in order.
+) -> Any:
+    """Runs a node until SIGINT or SIGTERM, then destroys it in order, and returns it.
 
     A node's `start()`, if any, is called before it spins, and its `stop()` while it can still
     publish, to leave its robot at rest. A user's error becomes one sentence on standard error and
     exit code 2. With a `sole_name` only a single instance runs in a namespace.
     """
-    stopping, starting = threading.Event(), threading.Event()
-    starting.set()
+    stopping, started = threading.Event(), threading.Event()
 
     def end(*_: Any) -> None:
         stopping.set()
-        if starting.is_set():  # it may be compiling, which can take longer than a launch waits
-            starting.clear()
+        if not started.is_set():  # it may be compiling, which can take longer than a launch waits
+            started.set()
             raise SystemExit(0)
 
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -102,7 +101,7 @@ def run_node(
             node.start()
         for sentence in unknown(node):  # rclpy ignores them silently
             node.get_logger().warning(sentence)
-        starting.clear()
+        started.set()
         spin(node, stopping)
     except (BridgeError, ParameterException, OSError) as error:
         sentence = " ".join(str(error).split())
@@ -112,7 +111,7 @@ def run_node(
         sys.stderr.write(f"{sentence}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
     finally:
-        starting.clear()
+        started.set()
         if node is not None:
             if node.context.ok() and hasattr(node, "stop"):
                 node.stop()
@@ -120,6 +119,7 @@ def run_node(
         if context is not None:
             context.try_shutdown()
         alone.close()
+    return node
 
 
 def holds(condition: Callable[[], Any], seconds: float, poll_s: float) -> bool:
@@ -156,7 +156,13 @@ def sole(context: Context, name: str) -> Iterator[None]:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as claim:
         try:
             whole, domain = probe.get_fully_qualified_name(), context.get_domain_id()
-            taken = not _claims(claim, f"{domain} {whole}")
+            key = hashlib.sha256(f"{domain} {whole}".encode()).hexdigest().encode()
+            taken = False
+            try:
+                if sys.platform == "linux":
+                    claim.bind(b"\0nics_drl_bridge " + key)
+            except OSError:
+                taken = True
             if taken or (_seen(probe, whole) and _lives(probe, whole)):
                 raise BackendError(
                     f"a node {whole!r} runs already in ROS domain {domain}; end it, or give this "
@@ -165,16 +171,6 @@ def sole(context: Context, name: str) -> Iterator[None]:
         finally:
             probe.destroy_node()
         yield
-
-
-def _claims(claim: socket.socket, key: str) -> bool:
-    """Binds a socket to a name, on Linux; False if another has it."""
-    name = b"\0nics_drl_bridge " + hashlib.sha256(key.encode()).hexdigest().encode()
-    with contextlib.suppress(OSError):
-        if sys.platform == "linux":
-            claim.bind(name)
-        return True
-    return False
 
 
 def _seen(probe: Node, whole: str) -> bool:
@@ -188,7 +184,6 @@ def _seen(probe: Node, whole: str) -> bool:
 
 
 def _lives(probe: Node, whole: str) -> bool:
-    """True if the other node answers."""
     client = probe.create_client(GetParameters, f"{whole}/get_parameters")
     executor = SingleThreadedExecutor(context=probe.context)
     executor.add_node(probe)
@@ -278,21 +273,20 @@ class Condition(NamedTuple):
     hardware: str = ""  # concerned, such as the robot's name
 
 
-class Diagnostics:
+def diagnose(node: Node, part: str, look: Callable[[], Condition]) -> None:
     """Publishes a node's finding about itself, which `look` returns, once a second."""
+    topic = node.create_publisher(DiagnosticArray, "/diagnostics", qos.DIAGNOSTICS)
+    name = f"{node.get_fully_qualified_name()}: {part}"
 
-    def __init__(self, node: Node, part: str, look: Callable[[], Condition]) -> None:
-        self._node, self._look = node, look
-        self._name = f"{node.get_fully_qualified_name()}: {part}"
-        self._topic = node.create_publisher(DiagnosticArray, "/diagnostics", qos.DIAGNOSTICS)
-        steadily(node, DIAGNOSTICS_S, self._publish)
-
-    def _publish(self) -> None:
-        found = self._look()
-        status = DiagnosticStatus(name=self._name, message=found.message)
-        status.level = DiagnosticStatus.WARN if found.warns else DiagnosticStatus.OK
-        status.hardware_id = found.hardware
-        status.values = [KeyValue(key=key, value=str(value)) for key, value in found.facts.items()]
+    def publish() -> None:
+        found = look()
+        level = DiagnosticStatus.WARN if found.warns else DiagnosticStatus.OK
+        values = [KeyValue(key=key, value=str(value)) for key, value in found.facts.items()]
+        status = DiagnosticStatus(
+            level=level, name=name, message=found.message, hardware_id=found.hardware, values=values
+        )
         message = DiagnosticArray(status=[status])
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        self._topic.publish(message)
+        message.header.stamp = node.get_clock().now().to_msg()
+        topic.publish(message)
+
+    steadily(node, DIAGNOSTICS_S, publish)

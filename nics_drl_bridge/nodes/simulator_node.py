@@ -30,12 +30,11 @@ from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.scanner import RENDERERS, Renderer
-from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import to_device
 from nics_drl_bridge.nodes import conversions, device_parameters, qos, runner, wire
 from nics_drl_bridge.nodes.conversions import sensor_to_ros, sensor_type
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, Simulator, variances
+from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, variances
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World, load_world
 
@@ -45,10 +44,46 @@ LONGEST_TICK_S = 0.005  # longest time between two checks for delayed data that 
 
 # Makes the simulator of some robots; may declare its own parameters at the node. Its control
 # period is that of the given model.
-MakeSimulator = Callable[[Node, SimulatorModel, World, int], Simulator]
+MakeSimulator = Callable[[Node, SimulatorModel, World, int], FastSimulator]
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 # The setting that selects the other type.
 SWITCH = {STAMPED: "enable_stamped_cmd_vel:=false", TWIST: "enable_stamped_cmd_vel:=true"}
+
+
+class Outbox:
+    """Publishes messages after a latency and a jitter, each topic in order, or at once."""
+
+    def __init__(self) -> None:
+        self._random = np.random.default_rng(0)
+        self._waiting: list[tuple[int, int, Publisher, bytes]] = []
+        self._latest: dict[Publisher, int] = {}
+        self._numbers = itertools.count()
+
+    def send(
+        self, publisher: Publisher, message: Any, now_ns: int, late_ns: tuple[int, int]
+    ) -> None:
+        """Publishes a message or its bytes, after a delay and a drawn part of a jitter [ns]."""
+        delay, jitter = late_ns
+        if jitter:
+            delay += int(self._random.integers(jitter + 1))
+        if not delay:
+            publisher.publish(message)
+            return
+        due = max(now_ns + delay, self._latest.get(publisher, 0))
+        self._latest[publisher] = due
+        content = message if isinstance(message, bytes) else serialize_message(message)
+        heapq.heappush(self._waiting, (due, next(self._numbers), publisher, content))
+
+    def flush(self, now_ns: int) -> None:
+        """Publishes what is due."""
+        while self._waiting and self._waiting[0][0] <= now_ns:
+            _, _, publisher, content = heapq.heappop(self._waiting)
+            publisher.publish(content)
+
+    def clear(self) -> None:
+        """Drops the waiting messages: they are from an episode that is over."""
+        self._waiting.clear()
+        self._latest.clear()
 
 
 class RobotPort:
@@ -58,21 +93,21 @@ class RobotPort:
     """
 
     def __init__(
-        self,
-        node: Node,
-        namespace: str,
-        model: SimulatorModel,
-        frames: device_parameters.Frames,
-        time: device_parameters.DeviceTiming,
-    ) -> None:
-        self._model, self._time, self.frames = model, time, frames
-        quality = qos.SENSOR_RELIABLE
-        self._scans = node.create_publisher(LaserScan, f"{namespace}scan", quality)
-        self._odoms = node.create_publisher(Odometry, f"{namespace}odom", quality)
-        self._truths = node.create_publisher(Odometry, f"{namespace}ground_truth", quality)
-        self._joints = node.create_publisher(JointState, f"{namespace}joint_states", quality)
+        self, node: Node, namespace: str, model: SimulatorModel, frames: device_parameters.Frames,
+        time: device_parameters.DeviceTiming, outbox: Outbox,
+    ) -> None:  # fmt: skip
+        self._model, self.frames = model, frames
+        self._send = partial(outbox.send, late_ns=time.odom_late_ns)
+        self._send_scan = partial(outbox.send, late_ns=time.scan_late_ns)
+
+        def publisher(kind: Any, topic: str) -> Publisher:
+            return node.create_publisher(kind, f"{namespace}{topic}", qos.SENSOR_RELIABLE)
+
+        self._scans = publisher(LaserScan, "scan")
+        self._odoms, self._truths = publisher(Odometry, "odom"), publisher(Odometry, "ground_truth")
+        self._joints = publisher(JointState, "joint_states")
         self._sensors = [
-            (each, node.create_publisher(sensor_type(each), f"{namespace}{each.name}", quality))
+            (each, frames.prefix + each.frame, publisher(sensor_type(each), each.name))
             for each in model.sensors
         ]
         free = np.full(model.lidar.beams, np.inf, np.float32)
@@ -83,28 +118,18 @@ class RobotPort:
         self._sweep_ns = 0 if time.lockstep else round(sweep_s * NS_PER_S)
         self._scan = wire.ScanWriter(scan)
         linear, _, turn = variances(model.noise.odometry)
-        self._odom, self._truth = (
-            wire.OdometryWriter(
-                conversions.odometry_to_ros(
-                    np.zeros(3), np.zeros(3), 0, (parent, frames.base), variance
-                )
-            )
-            for parent, variance in (
-                (frames.odom, (LEAST_VARIANCE, LEAST_VARIANCE, linear, turn)),
-                (frames.map, (LEAST_VARIANCE,) * 4),
-            )
-        )
+        odom, truth = (LEAST_VARIANCE, LEAST_VARIANCE, linear, turn), (LEAST_VARIANCE,) * 4
+        at_rest = partial(conversions.odometry_to_ros, np.zeros(3), np.zeros(3), 0)
+        self._odom = wire.OdometryWriter(at_rest((frames.odom, frames.base), odom))
+        self._truth = wire.OdometryWriter(at_rest((frames.map, frames.base), truth))
         self._locates = bool(node.get_parameter("publish_map_to_odom").value)
 
     def mounts(self) -> list[TransformStamped]:
         """Returns the transforms base_link -> laser, and to each further sensor."""
         mounted = [(self.frames.laser, self._model.lidar.mount)]
-        mounted += [(self._frame_of(sensor), sensor.mount) for sensor, _ in self._sensors]
+        mounted += [(frame, sensor.mount) for sensor, frame, _ in self._sensors]
         base = self.frames.base
         return [transform_to_ros(base, frame, place, Time()) for frame, place in mounted]
-
-    def _frame_of(self, sensor: Sensor) -> str:
-        return self.frames.prefix + sensor.frame
 
     def moving(self, now: Time, sensed: Sensed) -> list[TransformStamped]:
         """Returns the transforms odom -> base_link, and map -> odom if requested."""
@@ -115,26 +140,23 @@ class RobotPort:
             moving.append(transform_to_ros(frames.map, frames.odom, home, now))
         return moving
 
-    def publish_odometry(self, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
+    def publish_odometry(self, sensed: Sensed, now_ns: int) -> None:
         """Publishes odometry, and joints and true pose if they have subscribers."""
-        late_ns = self._time.odom_late_ns
         odometry = self._odom.write(now_ns, sensed.odom, sensed.twist, sensed.covariance)
-        outbox.send(self._odoms, odometry, now_ns, late_ns)
+        self._send(self._odoms, odometry, now_ns)
         if self._joints.get_subscription_count():
             joints = conversions.joints_to_ros(self._model.robot, sensed.state, now_ns)
-            outbox.send(self._joints, joints, now_ns, late_ns)
+            self._send(self._joints, joints, now_ns)
         if self._truths.get_subscription_count():
             self._truths.publish(self._truth.write(now_ns, sensed.pose, sensed.true_twist))
 
-    def publish_scan(self, sensed: Sensed, outbox: Outbox, now_ns: int) -> None:
+    def publish_scan(self, sensed: Sensed, now_ns: int) -> None:
         """Publishes the scan, stamped with the time of beam 0, and readings of further sensors."""
         ranges = to_device(sensed.ranges, self._model.lidar)
-        message = self._scan.write(now_ns - self._sweep_ns, ranges)
-        outbox.send(self._scans, message, now_ns, self._time.scan_late_ns)
-        for sensor, publisher in self._sensors:
-            reading = sensed.readings[sensor.name]
-            late_ns, frame = self._time.scan_late_ns, self._frame_of(sensor)
-            outbox.send(publisher, sensor_to_ros(sensor, reading, now_ns, frame), now_ns, late_ns)
+        self._send_scan(self._scans, self._scan.write(now_ns - self._sweep_ns, ranges), now_ns)
+        for sensor, frame, publisher in self._sensors:
+            reading = sensor_to_ros(sensor, sensed.readings[sensor.name], now_ns, frame)
+            self._send_scan(publisher, reading, now_ns)
 
 
 class CommandInlet:
@@ -210,45 +232,6 @@ class CommandInlet:
             )
 
 
-class Outbox:
-    """Publishes messages after a latency and a jitter, each topic in order, or at once."""
-
-    def __init__(self) -> None:
-        self._random = np.random.default_rng(0)
-        self._waiting: list[tuple[int, int, Publisher, bytes]] = []
-        self._latest: dict[Publisher, int] = {}
-        self._numbers = itertools.count()
-
-    def send(
-        self, publisher: Publisher, message: Any, now_ns: int, late_ns: tuple[int, int]
-    ) -> None:
-        """Publishes a message, or its bytes, now, or schedules it.
-
-        `late_ns` is the least delay, and the greatest additional one, drawn uniformly for each.
-        """
-        delay, jitter = late_ns
-        if jitter:
-            delay += int(self._random.integers(jitter + 1))
-        if not delay:
-            publisher.publish(message)
-            return
-        due = max(now_ns + delay, self._latest.get(publisher, 0))
-        self._latest[publisher] = due
-        content = message if isinstance(message, bytes) else serialize_message(message)
-        heapq.heappush(self._waiting, (due, next(self._numbers), publisher, content))
-
-    def flush(self, now_ns: int) -> None:
-        """Publishes what is due."""
-        while self._waiting and self._waiting[0][0] <= now_ns:
-            _, _, publisher, content = heapq.heappop(self._waiting)
-            publisher.publish(content)
-
-    def clear(self) -> None:
-        """Drops the waiting messages: they are from an episode that is over."""
-        self._waiting.clear()
-        self._latest.clear()
-
-
 def transform_to_ros(parent: str, child: str, pose: ArrayLike, stamp: Time) -> TransformStamped:
     """Returns a pose (3,) of a child frame in its parent as a transform."""
     x, y, heading = np.asarray(pose, np.float64).tolist()
@@ -257,34 +240,6 @@ def transform_to_ros(parent: str, child: str, pose: ArrayLike, stamp: Time) -> T
     message.transform.translation.x, message.transform.translation.y = x, y
     message.transform.rotation = conversions.heading_to_ros(heading)
     return message
-
-
-class Transforms:
-    """Publishes transforms; if tf2_msgs is not installed, it logs that once."""
-
-    def __init__(self, node: Node) -> None:
-        kind = conversions.message_type("tf2_msgs/msg/TFMessage")
-        self.published = kind is not None
-        if kind is None:
-            node.get_logger().warning(
-                "the message package tf2_msgs is not installed, so that neither /tf nor /tf_static "
-                "is published; install it with your ROS 2 distribution."
-            )
-            return
-        self._kind = kind
-        self._moving = node.create_publisher(kind, "/tf", qos.TRANSFORMS)
-        self._fixed = node.create_publisher(kind, "/tf_static", qos.FIXED_TRANSFORMS)
-
-    def publish_fixed(self, transforms: list[TransformStamped]) -> None:
-        """Publishes once what never changes; late joiners get it, too."""
-        if self.published:
-            self._fixed.publish(self._kind(transforms=transforms))
-
-    def publish(
-        self, moving: list[TransformStamped], outbox: Outbox, now_ns: int, late_ns: tuple[int, int]
-    ) -> None:
-        """Publishes what changes, with the delay of the odometry that it comes from."""
-        outbox.send(self._moving, self._kind(transforms=moving), now_ns, late_ns)
 
 
 class DeviceNode(qos.QosWatch):
@@ -322,20 +277,33 @@ class DeviceNode(qos.QosWatch):
         self._outbox = Outbox()
         self._clock_topic = self.create_publisher(Clock, CLOCK, qos.SENSOR_RELIABLE)
         self._clocks = {self.get_fully_qualified_name()}
-        self._transforms = Transforms(self)
         self._ports, self._inlets = [], []
         commands = qos.EVERY_COMMAND if self._time.lockstep else qos.COMMAND
         for k, name in enumerate(self._names):
             space, frames = f"{name}/" if name else "", device_parameters.frames(self, name)
-            self._ports.append(RobotPort(self, space, model, frames, self._time))
+            self._ports.append(RobotPort(self, space, model, frames, self._time, self._outbox))
             given = model.robot, commands, partial(self._on_command, k), self._too_old
             self._inlets.append(CommandInlet(self, space, *given))
-        self._transforms.publish_fixed([each for port in self._ports for each in port.mounts()])
+        self._open_transforms()
         runner.serve(self, "~/reset", self._reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
         runner.serve(self, "~/repeat", self._repeat)
         runner.serve(self, "~/touched", lambda: (True, json.dumps(self._world.touched)))
-        runner.Diagnostics(self, "simulator", self._look)
+        runner.diagnose(self, "simulator", self._look)
+
+    def _open_transforms(self) -> None:
+        """Publishes what never changes; if tf2_msgs is not installed, it logs that instead."""
+        self._transforms: Any = conversions.message_type("tf2_msgs/msg/TFMessage")
+        if self._transforms is None:
+            self.get_logger().warning(
+                "the message package tf2_msgs is not installed, so that neither /tf nor /tf_static "
+                "is published; install it with your ROS 2 distribution."
+            )
+            return
+        self._moving = self.create_publisher(self._transforms, "/tf", qos.TRANSFORMS)
+        fixed = self.create_publisher(self._transforms, "/tf_static", qos.FIXED_TRANSFORMS)
+        mounts = [each for port in self._ports for each in port.mounts()]
+        fixed.publish(self._transforms(transforms=mounts))
 
     def _start_time(self) -> None:
         # Steady: with use_sim_time the node's clock would wait for this very node.
@@ -406,7 +374,6 @@ class DeviceNode(qos.QosWatch):
             self._real_time.begin(steady_ns, self._now_ns + self._time.step_ns)
         behind = self._real_time.behind(steady_ns, self._now_ns)
         if behind:
-            self._stop_the_silent()
             self._advance()
         if behind > 1:
             self._soon.trigger()  # not here: commands that have arrived are for the next step
@@ -414,14 +381,12 @@ class DeviceNode(qos.QosWatch):
 
     def _on_free_time(self) -> None:
         if not self._paused:
-            self._stop_the_silent()
             self._advance()
             self._outbox.flush(self._now_ns)
 
-    def _stop_the_silent(self) -> None:
-        self._world.commands[self._now_ns - self._command_ns > self._timeout_ns()] = 0.0
-
     def _advance(self) -> None:
+        if not self._time.lockstep:  # those that have been silent stop
+            self._world.commands[self._now_ns - self._command_ns > self._timeout_ns()] = 0.0
         self._world.advance()
         self._heard[:] = False
         self._now_ns += self._time.step_ns
@@ -431,9 +396,8 @@ class DeviceNode(qos.QosWatch):
         """Begins an episode. Raises BridgeError if the parameters do not fit the world."""
         given = bool(self.get_parameter("episode_start_given").value)
         start = np.array(self.get_parameter("episode_start").value, dtype=np.float64)
-        self._world.begin(
-            int(device_parameters.number(self, "episode_seed")), start if given else None
-        )
+        seed = int(device_parameters.number(self, "episode_seed"))
+        self._world.begin(seed, start if given else None)
         self._outbox.clear()
         self._heard[:] = False
         self._now_ns += self._time.step_ns
@@ -470,7 +434,6 @@ class DeviceNode(qos.QosWatch):
         return True, ""
 
     def _publish(self) -> None:
-        """Publishes what is due at present."""
         now_ns = self._now_ns
         if self._clock_topic.get_subscription_count():
             self._clock_topic.publish(Clock(clock=conversions.stamp_to_ros(now_ns)))
@@ -479,25 +442,29 @@ class DeviceNode(qos.QosWatch):
             self._publish_data(odom_due, scan_due)
 
     def _publish_data(self, odom_due: bool, scan_due: bool) -> None:
-        """Publishes the present data of the robots' devices."""
-        now_ns, outbox, moving = self._now_ns, self._outbox, []
+        now_ns, moving = self._now_ns, []
         for k, port in enumerate(self._ports):
             sensed = self._world.sensed(k)
             if odom_due:
-                port.publish_odometry(sensed, outbox, now_ns)
-                if self._transforms.published:
+                port.publish_odometry(sensed, now_ns)
+                if self._transforms is not None:
                     moving += port.moving(conversions.stamp_to_ros(now_ns), sensed)
             if scan_due:
-                port.publish_scan(sensed, outbox, now_ns)
-        if moving:
-            self._transforms.publish(moving, outbox, now_ns, self._time.odom_late_ns)
+                port.publish_scan(sensed, now_ns)
+        if moving:  # with the delay of the odometry that it comes from
+            message = self._transforms(transforms=moving)
+            self._outbox.send(self._moving, message, now_ns, self._time.odom_late_ns)
 
 
-def fast_simulator(node: Node, model: SimulatorModel, world: World, robots: int) -> Simulator:
+def declare_renderer(node: Node, default: Renderer) -> Renderer:
+    """Declares the parameter `renderer`, and returns its value."""
+    runner.declare(node, "renderer", default, "Lidar: baked or exact.", read_only=True)
+    return cast(Renderer, device_parameters.choice(node, "renderer", RENDERERS))
+
+
+def fast_simulator(node: Node, model: SimulatorModel, world: World, robots: int) -> FastSimulator:
     """Makes the fast simulator, with the lidar that the parameter `renderer` names."""
-    runner.declare(node, "renderer", "baked", "Lidar: baked or exact.", read_only=True)
-    renderer = cast(Renderer, device_parameters.choice(node, "renderer", RENDERERS))
-    tell = node.get_logger().warning
+    renderer, tell = declare_renderer(node, "baked"), node.get_logger().warning
     return FastSimulator(model, world, robots=robots, renderer=renderer, tell=tell)
 
 

@@ -76,10 +76,7 @@ class Transport:
         self._in_force: bool | None = None  # the profile; None: not tried yet
 
     def open(self, make: Callable[[], Context]) -> Context:
-        """Returns a context over UDP, or ROS 2's default if the user chose or UDP is unavailable.
-
-        Raises BackendError if discovery should reach further than that of an earlier context.
-        """
+        """Returns a context over UDP, or ROS 2's default. Raises BackendError."""
         with self._lock:
             stay_on_this_machine(os.environ)
             here = stays_here(os.environ)

@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import math
 import struct
+import sys
 
 import numpy as np
-from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
 from numpy.typing import ArrayLike, NDArray
 from rclpy.serialization import serialize_message
@@ -29,6 +29,7 @@ STAMP, FRAME = 4, 12  # offsets of stamp and frame of a message's header
 UNREADABLE = (ValueError, struct.error)
 """Raised by all readers for bytes that are not a message of the type."""
 PLAIN = (0, 1)  # big-endian and little-endian plain CDR
+NATIVE = bytes((0, PLAIN[sys.byteorder == "little"], 0, 0))  # header of this machine
 POSE_COVARIANCE, TWIST, DOUBLES = 7, 7 + 36, 7 + 36 + 6 + 36
 """Numbers of an odometry before each: pose, its covariance, twist, its covariance."""
 SCAN_FIELDS = 7  # floats of a scan between its header and its ranges
@@ -49,12 +50,10 @@ def _after_text(content: Bytes, place: int, order: str) -> int:
 
 
 def _aligned(place: int, size: int) -> int:
-    """Returns the next offset at which a number of a size may stand."""
     return place + (HEAD - place) % size
 
 
 def _floats(content: Bytes, order: str) -> int:
-    """Returns the offset of the floats of a scan."""
     return _aligned(_after_text(content, FRAME, order), 4)
 
 
@@ -149,14 +148,7 @@ class ScanWriter:
         return bytes(self._content)
 
 
-class TwistWriter:
-    """Serialises twists in the plane."""
-
-    def __init__(self) -> None:
-        self._content: bytes = serialize_message(Twist())
-        self._six = struct.Struct(f"{_order(self._content)}6d")
-
-    def write(self, twist: ArrayLike) -> bytes:
-        """Returns a message with linear.x, linear.y, angular.z (3,)."""
-        x, y, w = np.asarray(twist, np.float64).tolist()
-        return self._content[:HEAD] + self._six.pack(x, y, 0.0, 0.0, 0.0, w)
+def twist_to_bytes(twist: ArrayLike) -> bytes:
+    """Serialises linear.x, linear.y, angular.z (3,) as a Twist."""
+    x, y, w = np.asarray(twist, np.float64).tolist()
+    return NATIVE + struct.pack("=6d", x, y, 0.0, 0.0, 0.0, w)

@@ -143,12 +143,13 @@ def rates(facts: Facts, expected: Expected) -> Findings:
 
 def _rate(facts: Facts, role: str) -> float | None:
     """Rate by the stamps if there is a `/clock`: a simulation may run at another speed."""
-    if (heard := facts.heard.get(role)) is None:
+    if (heard := facts.heard.get(role)) is None or len(heard.arrivals_ns) <= 2:
         return None
-    stamps = heard.stamps_ns
+    stamps, times = heard.stamps_ns, heard.arrivals_ns
     if facts.clock_ns and len(stamps) > 2 and stamps[-1] > stamps[0]:
-        return (len(stamps) - 1) / ((stamps[-1] - stamps[0]) * S_PER_NS)
-    return heard.rate_hz
+        times = stamps
+    span = times[-1] - times[0]
+    return (len(times) - 1) / (span * S_PER_NS) if span else None
 
 
 def latency(facts: Facts, _: Expected) -> Findings:
@@ -294,7 +295,6 @@ def _alike(ratio: float) -> bool:
 
 
 def _slope(x: Array, y: Array) -> float:
-    """Least-squares slope of y over x; inf if x is zero."""
     power = float(x @ x)
     return float(x @ y) / power if power > 0.0 else float("inf")
 
@@ -322,12 +322,12 @@ def layout(facts: Facts, expected: Expected) -> Findings:
         fix = "use the driver's mode of fixed angles (as `angle_compensate`), or resample"
         yield layout_error(f"its header changes; numbers of beams are {counts}", fix)
     for have in facts.layouts[:1]:
-        slack = ANGLE_TOLERANCE * max(abs(have.angle_increment), 1e-9)
-        if abs(have.last - have.angle_max) > slack:
-            what = f"angle_max is {have.angle_max:.5f}, but its beams end at {have.last:.5f} rad"
+        header = have.header
+        if abs(have.last - header.angle_max) > ANGLE_TOLERANCE * abs(header.angle_increment) + 1e-9:
+            what = f"angle_max is {header.angle_max:.5f}, but its beams end at {have.last:.5f} rad"
             yield warning("beam layout", SCAN, what, "correct the driver's header")
         if have.in_degrees:
-            what = f"angles go from {have.angle_min:.4g} to {have.angle_max:.4g}: degrees"
+            what = f"angles go from {header.angle_min:.4g} to {header.angle_max:.4g}: degrees"
             yield error("unit", SCAN, what, "let the driver send radians")
         try:
             if expected.scan is not None:
@@ -340,22 +340,22 @@ def layout(facts: Facts, expected: Expected) -> Findings:
 
 
 def _beams(have: doctor_facts.Layout, expected: Expected) -> Findings:
-    want = expected.lidar.header
+    want, header = expected.lidar.header, have.header
     fix = "set the driver, or make a lidar file of what it sends and generate the model anew"
     if have.beams != expected.lidar.beams:
         yield layout_error(f"has {have.beams} beams, expected {expected.lidar.beams}", fix)
-    off = max(abs(have.angle_min - want.angle_min), abs(have.last - want.angle_max))
-    if have.angle_increment < 0.0:
+    off = max(abs(header.angle_min - want.angle_min), abs(have.last - want.angle_max))
+    if header.angle_increment < 0.0:
         if expected.scan is None and not have.in_degrees:
             what = "its beams go clockwise (angle_increment is negative)"
             turn = "turn the order in the driver (`inverted`): they go counter-clockwise (REP-103)"
             yield layout_error(what, turn)
     elif not have.in_degrees and off > ANGLE_TOLERANCE * abs(want.angle_increment):
         wanted = f"{want.angle_min:.4f} to {want.angle_max:.4f}"
-        what = f"beams go from {have.angle_min:.4f} to {have.last:.4f} rad, expected {wanted}"
+        what = f"beams go from {header.angle_min:.4f} to {have.last:.4f} rad, expected {wanted}"
         yield layout_error(what, fix)
     for key in ("range_min", "range_max"):
-        ours, theirs = getattr(want, key), getattr(have, key)
+        ours, theirs = getattr(want, key), getattr(header, key)
         what = f"{key} is {theirs:.4g}, expected {ours:.4g} m"
         if theirs > 100.0 * max(ours, 0.1):
             yield error("unit", SCAN, what, fix)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,24 +23,25 @@ from nics_drl_bridge.recording.messages import Offer, Row
 from nics_drl_bridge.robot.spec import RobotSpec
 
 SCAN, ODOM, CMD_VEL, CLOCK = "scan", "odom", "cmd_vel", "/clock"
-SCAN_TYPE, ODOM_TYPE = "sensor_msgs/msg/LaserScan", "nav_msgs/msg/Odometry"
-TWIST_TYPE, TWIST_STAMPED_TYPE = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
-CLOCK_TYPE = "rosgraph_msgs/msg/Clock"
+TWIST_STAMPED_TYPE = "geometry_msgs/msg/TwistStamped"
+KINDS: dict[str, Sequence[str]] = {
+    SCAN: ("sensor_msgs/msg/LaserScan",),
+    ODOM: ("nav_msgs/msg/Odometry",),
+    CMD_VEL: ("geometry_msgs/msg/Twist", TWIST_STAMPED_TYPE),
+    CLOCK: ("rosgraph_msgs/msg/Clock",),
+}
+"""Message types of each role; messages of other types are not read."""
 MOST_SCANS = 200  # maximum number of scans whose ranges are kept; of the others only the times are
 MOST_RAD = 7.0
 
 
 @dataclass(frozen=True)
 class Endpoints:
-    """Publishers and subscribers of a topic, without the doctor's own.
+    """Publishers and subscribers of a topic, without the doctor's own."""
 
-    Types of the messages as the publishers declare them, and the quality of service that each
-    publisher offers and each subscriber asks for.
-    """
-
-    types: tuple[str, ...]
-    offers: tuple[Offer, ...] = ()
-    asks: tuple[Offer, ...] = ()
+    types: tuple[str, ...]  # of the messages, as the publishers declare them
+    offers: tuple[Offer, ...] = ()  # quality of service of each publisher
+    asks: tuple[Offer, ...] = ()  # and of each subscriber
 
 
 @dataclass
@@ -52,33 +53,22 @@ class TopicFacts:
     frames: set[str] = field(default_factory=set)
     children: set[str] = field(default_factory=set)
 
-    @property
-    def rate_hz(self) -> float | None:
-        """Messages per second between the first and the last; None for fewer than three."""
-        span = (self.arrivals_ns[-1] - self.arrivals_ns[0]) / NS_PER_S if self.arrivals_ns else 0.0
-        return (len(self.arrivals_ns) - 1) / span if len(self.arrivals_ns) > 2 and span else None
 
-
-@dataclass(frozen=True)
-class Layout:
-    """The beams of a scan according to its header, see `ScanHeader`."""
+class Layout(NamedTuple):
+    """The beams of a scan according to its header, whose times are left out."""
 
     beams: int
-    angle_min: float
-    angle_max: float
-    angle_increment: float
-    range_min: float
-    range_max: float
+    header: ScanHeader
 
     @property
     def last(self) -> float:
         """Angle of the last beam, by the increment."""
-        return self.angle_min + (self.beams - 1) * self.angle_increment
+        return self.header.angle_min + (self.beams - 1) * self.header.angle_increment
 
     @property
     def in_degrees(self) -> bool:
         """True if the angles are too large for radians."""
-        return max(abs(self.angle_min), abs(self.angle_max)) > MOST_RAD
+        return max(abs(self.header.angle_min), abs(self.header.angle_max)) > MOST_RAD
 
 
 @dataclass
@@ -108,10 +98,9 @@ class Facts:
             heard.stamps_ns.append(messages.stamp(message))
             heard.frames.add(str(message.header.frame_id))
         if role == SCAN:
-            layout = Layout(
-                len(message.ranges), message.angle_min, message.angle_max, message.angle_increment,
-                message.range_min, message.range_max,
-            )  # fmt: skip
+            fields = {name: float(getattr(message, name)) for name in ScanHeader._fields}
+            header = ScanHeader(**fields | {"time_increment": 0.0, "scan_time": 0.0})
+            layout = Layout(len(message.ranges), header)
             if layout not in self.layouts:
                 self.layouts.append(layout)
             if len(self.ranges) < MOST_SCANS:
@@ -135,15 +124,6 @@ def names_in(namespace: str) -> dict[str, str]:
     return {role: f"{space}/{role}" for role in (SCAN, ODOM, CMD_VEL)} | {CLOCK: CLOCK}
 
 
-KINDS: dict[str, Sequence[str]] = {
-    SCAN: (SCAN_TYPE,),
-    ODOM: (ODOM_TYPE,),
-    CMD_VEL: (TWIST_TYPE, TWIST_STAMPED_TYPE),
-    CLOCK: (CLOCK_TYPE,),
-}
-"""Message types of each role; messages of other types are not read."""
-
-
 def facts_of_bag(path: str | Path, namespace: str = "") -> Facts:
     """Collects the facts of a robot from a bag. Raises RecordingError if it is damaged."""
     facts = Facts(str(path), False, names_in(namespace))
@@ -160,10 +140,7 @@ def facts_of_bag(path: str | Path, namespace: str = "") -> Facts:
 
 @dataclass(frozen=True)
 class Mismatch:
-    """A mismatch between robot and expectation on a topic, with numbers and the remedy.
-
-    An `error` makes a policy misbehave; a `warning` may.
-    """
+    """A mismatch with its remedy; an `error` makes a policy misbehave, a `warning` may."""
 
     severity: Literal["error", "warning"]
     check: str
@@ -203,10 +180,6 @@ def seen(facts: Facts, expected: Expected) -> Expected:
 
 def filling(have: Layout, like: LidarSpec, scan: ScanLayout) -> LidarSpec:
     """The lidar of a scan header, mounted like another one. Raises ConfigError if it fills less."""
-    header = ScanHeader(
-        have.angle_min, have.angle_max, have.angle_increment, 0.0, 0.0, have.range_min,
-        have.range_max,
-    )  # fmt: skip
-    lidar = reader_of(header, have.beams, like).lidar
+    lidar = reader_of(have.header, have.beams, like).lidar
     plan_of(lidar, scan)
     return lidar

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
@@ -25,7 +24,7 @@ from nics_drl_bridge.identify.open_loop import HORIZON_S, Windows, predict, wind
 from nics_drl_bridge.identify.report import CalibratedValue, estimates
 from nics_drl_bridge.identify.signals import DIFFERENCE, held, moved_commands, nominal_lags
 from nics_drl_bridge.recording.recording import Samples
-from nics_drl_bridge.report.page import DARK, MEASURED, MODEL, OTHER, png
+from nics_drl_bridge.report.pictures import DARK, MEASURED, MODEL, OTHER, panels, png
 from nics_drl_bridge.robot.noise import Level
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.threads import one_blas_thread
@@ -78,8 +77,7 @@ def fit_pictures(spec: RobotSpec, identified: Identified) -> dict[str, bytes]:
 
 def accuracy(identified: Identified) -> bytes:
     """Draws the cross-validated error over the number of terms, a line per degree of freedom."""
-    figure = Figure(figsize=(7.5, 4.5), layout="constrained")
-    axes = figure.subplots()
+    figure, (axes,) = panels(1, 1, (7.5, 4.5))
     circle: dict[str, Any] = {"markersize": 10, "fillstyle": "none"}
     for n, curve in enumerate(identified.fit.curves):
         share = np.maximum(curve.share, LEAST_SHARE)
@@ -87,10 +85,11 @@ def accuracy(identified: Identified) -> bytes:
         axes.plot(curve.kept, share[curve.kept], "o", color=line.get_color(), **circle)
     axes.plot([], [], "o", color=DARK, label="kept", **circle)
     axes.set_yscale("log")
-    axes.set_xlabel("number of terms, largest standardised coefficient first (Eq. 2)")
-    axes.set_ylabel("cross-validated error / size of the rates")
     longest = max((len(curve.error) for curve in identified.fit.curves), default=2)
-    axes.set_xlim(-0.3, longest - 0.7)
+    axes.set(
+        xlabel="number of terms, largest standardised coefficient first (Eq. 2)",
+        ylabel="cross-validated error / size of the rates", xlim=(-0.3, longest - 0.7),
+    )  # fmt: skip
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.grid(alpha=0.3)
     axes.legend(frameon=False, fontsize=9)
@@ -106,9 +105,9 @@ def held_out_paths(identified: Identified) -> bytes:
     )
     predicted = _predicted(identified, chosen)
     count = min(len(predicted), PATHS)
-    figure = Figure(figsize=(3.4 * min(count, 3), 3.4 * -(-count // 3) + 0.4), layout="constrained")
-    grid = figure.subplots(-(-count // 3), min(count, 3), squeeze=False).ravel()
-    for n, (axes, path) in enumerate(zip(grid, predicted, strict=False)):
+    rows, columns = -(-count // 3), min(count, 3)
+    figure, grid = panels(rows, columns, (3.4 * columns, 3.4 * rows + 0.4))
+    for n, (axes, path) in enumerate(zip(grid, predicted[:count], strict=False)):
         during = (pose.t >= chosen.start_t[n]) & (pose.t <= chosen.end_t[n])
         truth = pose.values[during]
         axes.plot(*truth[:, :2].T, color=MEASURED, linewidth=3.5, alpha=0.55, label="measured")
@@ -118,8 +117,6 @@ def held_out_paths(identified: Identified) -> bytes:
         apart = float(np.hypot(*(path[-1] - chosen.end[n])[:2]))
         axes.set_title(f"{apart:.3f} m apart after {HORIZON_S:g} s", fontsize=10)
         axes.set(xlabel="x [m]", ylabel="y [m]")
-    for axes in grid[count:]:
-        axes.set_axis_off()
     return png(figure, grid[0])
 
 
@@ -129,8 +126,7 @@ def residuals(identified: Identified, unseen: Samples) -> bytes:
     predicted, t = model.rates(unseen.x), unseen.t - unseen.t[0]
     shown = t < SHOWN_S
     moving = np.flatnonzero(np.abs(unseen.dq).max(axis=0) > LEAST_RATE)
-    figure = Figure(figsize=(9.0, 1.7 * len(moving) + 0.6), layout="constrained")
-    grid = figure.subplots(len(moving), 1, sharex=True, squeeze=False).ravel()
+    figure, grid = panels(len(moving), 1, (9.0, 1.7 * len(moving) + 0.6), sharex=True)
     for d, axes in zip(map(int, moving), grid, strict=True):
         rest = unseen.dq[:, d] - predicted[:, d]
         axes.plot(t[shown], unseen.dq[shown, d], color=MEASURED, linewidth=2.5, alpha=0.55)
@@ -149,8 +145,7 @@ def alignment(spec: RobotSpec, identified: Identified) -> bytes:
     samples, calibration = identified.samples, identified.calibration
     command = identified.recording.command
     moved = np.flatnonzero(np.ptp(command.values, axis=0) > 0.0)
-    figure = Figure(figsize=(9.0, 2.5 * len(moved) + 0.6), layout="constrained")
-    grid = figure.subplots(len(moved), 1, sharex=True, squeeze=False).ravel()
+    figure, grid = panels(len(moved), 1, (9.0, 2.5 * len(moved) + 0.6), sharex=True)
     begin = samples.t[0] + SETTLED_S
     shown = (samples.t >= begin) & (samples.t < begin + SHOWN_S)
     t = samples.t[shown]
@@ -211,8 +206,8 @@ def timing(identified: Identified, found: dict[str, CalibratedValue]) -> bytes |
     curves = timing_curves(identified.drive, identified.calibration)
     if not curves:
         return None
-    figure = Figure(figsize=(5.2 * len(curves), 3.8), layout="constrained")
-    for axes, curve in zip(figure.subplots(1, len(curves), squeeze=False)[0], curves, strict=True):
+    figure, grid = panels(1, len(curves), (5.2 * len(curves), 3.8))
+    for axes, curve in zip(grid, curves, strict=True):
         estimate = found[curve.name]
         value, sigma = estimate.value or 0.0, estimate.sigma or 0.0
         axes.plot(curve.value, curve.unexplained, color=MEASURED)
@@ -231,14 +226,13 @@ def bursts(identified: Identified, found: dict[str, CalibratedValue]) -> bytes |
         return None
     shown = slice(0, int(BURSTS_SHOWN * groups.size))
     spread = identified.drive.sample_t
-    figure = Figure(figsize=(9.0, 3.8), layout="constrained")
-    axes, intervals = figure.subplots(1, 2)
+    figure, (axes, intervals) = panels(1, 2, (9.0, 3.8))
     number = np.arange(len(t))[shown]
     axes.plot(t[shown] - t[0], number, ".", color=OTHER, label="as they arrived")
     axes.plot(spread[shown] - t[0], number, "-", color=MODEL, label="spread over the period")
     axes.set(xlabel="stamp [s]", ylabel="pose number")
     _finish(axes, f"{found['burst_period_s'].text}, {groups.size:.0f} poses in each")
-    edges = np.linspace(0.0, 1.5 * groups.period_s, 60)
+    edges = list(np.linspace(0.0, 1.5 * groups.period_s, 60))
     intervals.hist(np.diff(t), edges, color=OTHER, label="as they arrived")
     intervals.hist(np.diff(spread), edges, color=MODEL, alpha=0.7, label="spread over the period")
     intervals.set(xlabel="time between two poses [s]", ylabel="number")
@@ -260,8 +254,7 @@ def mounting(identified: Identified, found: dict[str, CalibratedValue]) -> bytes
     x, y = calibration.lever_arm_m
     base = turned + tracked[:, 2:] * np.array([y, -x])
     count = 1 if lever_x.value is None else 2
-    figure = Figure(figsize=(5.2 * count, 4.4), layout="constrained")
-    grid = figure.subplots(1, count, squeeze=False)[0]
+    figure, grid = panels(1, count, (5.2 * count, 4.4))
     _points(grid[0], (tracked[:, 0], tracked[:, 1]), (base[:, 0], base[:, 1]))
     grid[0].set_aspect("equal", adjustable="datalim")
     grid[0].set(xlabel="velocity along x of its own frame [m/s]", ylabel="velocity along y [m/s]")
@@ -290,8 +283,8 @@ def wheels(identified: Identified, found: dict[str, CalibratedValue]) -> bytes |
         ("turn_scale", "right less left wheel [unit]", "yaw rate [rad/s]",
          units[:, 1] - units[:, 0], turn),
     )  # fmt: skip
-    figure = Figure(figsize=(10.0, 4.0), layout="constrained")
-    for axes, (name, x_label, y_label, x, y) in zip(figure.subplots(1, 2), rows, strict=True):
+    figure, grid = panels(1, 2, (10.0, 4.0))
+    for axes, (name, x_label, y_label, x, y) in zip(grid, rows, strict=True):
         axes.plot(x, y, ".", markersize=4, color=MEASURED, label="measured")
         estimate = found[name]
         if estimate.value is not None:
@@ -311,37 +304,34 @@ def _finish(axes: Axes, title: str) -> None:
 
 def noise(identified: Identified) -> bytes | None:
     """Draws histograms of the residuals, and the growth of the drift; None if free of noise."""
-    levels, panels = identified.noise, []
+    levels, histograms = identified.noise, []
     drive, calibration, model = identified.drive, identified.calibration, identified.model
     if drive.bursts is None and len(pose := pose_residual(drive.recording.pose)) > DIFFERENCE:
-        panels += [("pose position", levels.pose_position, pose[:, :2].ravel())]
-        panels += [("pose heading", levels.pose_heading, pose[:, 2])]
+        histograms += [("pose position", levels.pose_position, pose[:, :2].ravel())]
+        histograms += [("pose heading", levels.pose_heading, pose[:, 2])]
     odometry = odometry_residual(drive, calibration, model, identified.samples)
     if odometry is not None:
-        panels += [("odometry, linear", levels.odom_linear, odometry[:, 0])]
-        panels += [("odometry, angular", levels.odom_angular, odometry[:, 2])]
-    panels = [p for p in panels if p[1].measured and p[1].std > 0.0]
+        histograms += [("odometry, linear", levels.odom_linear, odometry[:, 0])]
+        histograms += [("odometry, angular", levels.odom_angular, odometry[:, 2])]
+    histograms = [one for one in histograms if one[1].measured and one[1].std > 0.0]
     grown = drift_growth(drive, calibration, model)
     drifts = grown is not None and levels.position_drift.measured and bool(grown[1].max() > 1e-9)
-    if not panels and not drifts:
+    if not histograms and not drifts:
         return None
-    count = len(panels) + 2 * drifts
+    count = len(histograms) + 2 * drifts
     columns = 2 if count == 4 else min(count, 3)
     rows = -(-count // columns)
-    figure = Figure(figsize=(4.3 * columns, 3.4 * rows), layout="constrained")
-    grid = list(figure.subplots(rows, columns, squeeze=False).ravel())
-    for axes, (name, level, rest) in zip(grid, panels, strict=False):
-        _histogram(axes, name, level, rest)
+    figure, grid = panels(rows, columns, (4.3 * columns, 3.4 * rows))
+    for axes, histogram in zip(grid, histograms, strict=False):
+        _histogram(axes, *histogram)
     if drifts and grown is not None:
         horizon, position, heading = grown
         rows_ = (
             ("position", levels.position_drift, position, "m"),
             ("heading", levels.heading_drift, heading, "rad"),
         )
-        for axes, row in zip(grid[len(panels) :], rows_, strict=False):
+        for axes, row in zip(grid[len(histograms) :], rows_, strict=False):
             _growth(axes, horizon, *row)
-    for axes in grid[count:]:
-        axes.set_axis_off()
     return png(figure)
 
 
@@ -389,21 +379,21 @@ def _curve(drive: Drive, calibration: Calibration, name: str) -> ShiftCurve | No
     recording, spec, twists = drive.recording, drive.spec, drive.twists
     state, wheels, command = recording.state, recording.wheels, recording.command
     value = float(getattr(calibration, name)) + np.linspace(-REACH_S, REACH_S, TRIALS)
-    signal, delay = (twists.start, twists.end, twists.twist), value
-    if name == "clock_offset_s":
-        delay = -value if state is not None else calibration.command_latency_s - value
-    elif state is None and recording.pose.clock != command.clock:
-        if wheels is None:
-            return None
-        signal = (wheels.t - float(np.median(np.diff(wheels.t))), wheels.t, wheels.values)
-    if state is None:
+    signal, of_clock = (twists.start, twists.end, twists.twist), name == "clock_offset_s"
+    if state is not None and of_clock:
+        by_shift = clocks.residual_by_shift(state, signal)
+        rest = [by_shift(np.array([-d])) for d in value]
+    elif state is not None:
+        by_delay = clocks.state_residual(command, state, spec)
+        rest = [by_delay(np.array([d])) for d in value]
+    else:
+        if not of_clock and recording.pose.clock != command.clock:
+            if wheels is None:
+                return None
+            signal = (wheels.t - float(np.median(np.diff(wheels.t))), wheels.t, wheels.values)
         lags = np.array([r.lag_s for r in calibration.responses])
         lags = lags if len(lags) == len(spec.state) else nominal_lags(spec)
         left = clocks.response_residual(command, spec, signal)
-        rest = [left(lags, d) for d in delay]
-    else:
-        by_delay = clocks.state_residual(command, state, spec)
-        if name == "clock_offset_s":
-            by_delay = clocks.residual_by_shift(state, signal)
-        rest = [by_delay(np.array([d])) for d in delay]
+        delays = calibration.command_latency_s - value if of_clock else value
+        rest = [left(lags, d) for d in delays]
     return ShiftCurve(name, value, np.array([np.sqrt(np.mean(r**2)) for r in rest]))

@@ -1,8 +1,11 @@
-"""Pictures of trajectories, planned drives, trainings and policies in shadow mode, each a PNG."""
+"""The HTML report in one file, and its pictures of trajectories, drives, trainings and policies."""
 
 from __future__ import annotations
 
+import base64
+import io
 from collections.abc import Mapping, Sequence
+from html import escape
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,10 +17,21 @@ from nics_drl_bridge.env.rendering import draw_world
 from nics_drl_bridge.policy.evaluation import Episode
 from nics_drl_bridge.policy.shadow import Shadow
 from nics_drl_bridge.recording.excite import Pattern
-from nics_drl_bridge.report.page import DARK, MEASURED, MODEL, OTHER, png
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.world import World
 
+MEASURED, MODEL, OTHER, DARK = "#1f6fb2", "#d1495b", "#8d99ae", "#333333"
+STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 64rem;
+  padding: 0 1rem; color: #222; background: #fff }
+h1 { margin-bottom: 0 } h2 { margin-top: 2.2rem; border-bottom: 1px solid #ddd }
+table { border-collapse: collapse; margin: 1rem 0 }
+th, td { padding: .3rem .9rem; text-align: right;
+  border-bottom: 1px solid #e5e5e5 } th:first-child, td:first-child { text-align: left }
+pre { background: #f6f7f9; padding: 1rem; overflow-x: auto; font-size: 14px }
+img { max-width: 100% }
+.lead { color: #555; font-size: 1.1rem }
+"""
 GREEN = "#2f855a"
 LINES: tuple[dict[str, Any], ...] = (
     {"color": MEASURED, "linewidth": 3.5, "alpha": 0.55},
@@ -25,6 +39,67 @@ LINES: tuple[dict[str, Any], ...] = (
     {"color": GREEN, "linewidth": 1.4, "linestyle": ":"},
 )
 LEAST_WIDTH = 5.5
+
+
+def page(title: str, lead: str, sections: Sequence[tuple[str, Sequence[str]]]) -> str:
+    """Builds an HTML page of sections, each a heading and HTML blocks, below a lead sentence."""
+    body = "".join(f"<h2>{escape(heading)}</h2>{''.join(blocks)}" for heading, blocks in sections)
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
+        f"<style>{STYLE}</style></head><body><h1>{escape(title)}</h1>"
+        f'<p class="lead">{escape(lead)}</p>{body}</body></html>\n'
+    )
+
+
+def paragraph(text: str) -> str:
+    """Returns a paragraph as HTML, as the next three."""
+    return f"<p>{escape(text)}</p>"
+
+
+def code(text: str) -> str:
+    """Preformatted text."""
+    return f"<pre>{escape(text)}</pre>"
+
+
+def picture(png: bytes, caption: str) -> str:
+    """A PNG with its caption."""
+    data, caption = base64.b64encode(png).decode(), escape(caption)
+    return (
+        f'<figure><img src="data:image/png;base64,{data}" alt="{caption}">'
+        f"<figcaption>{caption}</figcaption></figure>"
+    )
+
+
+def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Rows of text under a heading row."""
+
+    def cells(kind: str, row: Sequence[str]) -> str:
+        return "<tr>" + "".join(f"<{kind}>{escape(cell)}</{kind}>" for cell in row) + "</tr>"
+
+    body = "".join(cells("td", row) for row in rows)
+    return f"<table><thead>{cells('th', head)}</thead><tbody>{body}</tbody></table>"
+
+
+def panels(
+    rows: int, columns: int, size: tuple[float, float], **options: Any
+) -> tuple[Figure, list[Axes]]:
+    """Returns a figure of a size [inch], and its axes in rows."""
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, list(figure.subplots(rows, columns, squeeze=False, **options).ravel())
+
+
+def png(figure: Figure, legend: Axes | None = None) -> bytes:
+    """Renders a figure as a PNG, without empty axes, with the legend of one of them above."""
+    for axes in figure.axes:
+        if not axes.has_data():
+            axes.set_axis_off()
+    if legend is not None:
+        handles, labels = legend.get_legend_handles_labels()
+        columns = max(3, len(labels))
+        figure.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    return buffer.getvalue()
 
 
 def trajectories(runs: Mapping[str, Sequence[Episode]], world: World, footprint: float) -> bytes:
@@ -35,12 +110,9 @@ def trajectories(runs: Mapping[str, Sequence[Episode]], world: World, footprint:
     count = max(len(episodes) for episodes in runs.values())
     columns, rows = min(count, 3), -(-count // 3)
     size = max(4.2 * columns, LEAST_WIDTH), 4.2 * rows + 0.5
-    figure = Figure(figsize=size, layout="constrained")
-    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    figure, grid = panels(rows, columns, size)
     for axes, *episodes in zip(grid, *runs.values(), strict=False):
         _panel(axes, dict(zip(runs, episodes, strict=True)), world, footprint)
-    for axes in grid[count:]:
-        axes.set_axis_off()
     return png(figure, grid[0])
 
 
@@ -93,8 +165,7 @@ class Point(NamedTuple):
 
 def training_curve(points: Sequence[Point]) -> bytes:
     """Draws success and collisions [%] over the environment steps."""
-    figure = Figure(figsize=(7.5, 3.8), layout="constrained")
-    axes = figure.subplots()
+    figure, (axes,) = panels(1, 1, (7.5, 3.8))
     steps, *shares = np.array(points, np.float64).T
     for name, share, color in zip(("success", "collision"), shares, (MEASURED, MODEL), strict=True):
         axes.plot(steps / 1e3, 100.0 * share, color=color, linewidth=2.0, label=name)
@@ -109,14 +180,13 @@ def training_curve(points: Sequence[Point]) -> bytes:
 def shadow_picture(shadow: Shadow) -> bytes:
     """Draws each command over time, as driven and as chosen by the policy."""
     count = len(shadow.names)
-    figure = Figure(figsize=(11.0, 2.4 * count + 0.6), layout="constrained")
-    grid = figure.subplots(count, 2, squeeze=False, width_ratios=(4.0, 1.0))
-    for c, (wide, narrow) in enumerate(grid):
+    figure, grid = panels(count, 2, (11.0, 2.4 * count + 0.6), width_ratios=(4.0, 1.0))
+    for c, (wide, narrow) in enumerate(zip(grid[::2], grid[1::2], strict=True)):
         driven, wanted = shadow.driven[:, c], shadow.policy[:, c]
         wide.step(shadow.time, driven, where="post", color=MEASURED, linewidth=1.6, label="driven")
         wide.step(shadow.time, wanted, where="post", color=MODEL, linewidth=1.0, label="policy")
         wide.set_ylabel(f"{shadow.names[c]} [{shadow.units[c]}]")
         narrow.hist(wanted - driven, bins=31, color=OTHER)
         narrow.set_xlabel(f"policy less driven [{shadow.units[c]}]")
-    grid[-1][0].set_xlabel("time [s]")
-    return png(figure, grid[0][0])
+    grid[-2].set_xlabel("time [s]")
+    return png(figure, grid[0])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,32 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.sim import contact_kernels, step_kernels
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.simulator import FastSimulator
-from nics_drl_bridge.sim.state import State
-from nics_drl_bridge.sim.world import World
 
 Array = NDArray[np.float64]
-
-
-class Simulator(Protocol):
-    """One world of M robots, whatever moves them; `FastSimulator` does."""
-
-    @property
-    def data(self) -> State:
-        """The current state; a step may overwrite the same arrays."""
-
-    @property
-    def readings(self) -> Mapping[str, NDArray[np.float32]]:
-        """Name of a further sensor -> (1, M, S) its readings."""
-
-    def reset(self, seeds: ArrayLike, *, starts: ArrayLike | None = None) -> Any:
-        """Begins the episode of a seed (1,), at poses (1, M, 3) if they are given."""
-
-    def step(self, commands: ArrayLike) -> None:
-        """Moves the robots by one control period; commands (1, M, C) as in the RobotSpec."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +41,7 @@ class Sensed:
 class DeviceWorld:
     """Keeps the next command of each of M robots, and the covariance of its odometry."""
 
-    def __init__(self, simulator: Simulator, model: SimulatorModel, robots: int) -> None:
+    def __init__(self, simulator: FastSimulator, model: SimulatorModel, robots: int) -> None:
         self._simulator, self._period = simulator, model.control_period
         self._added = step_covariance(model.noise.odometry, self._period)
         self.commands: Array = np.zeros((robots, len(model.robot.command)))
@@ -140,59 +118,47 @@ def propagate(covariance: Array, before: ArrayLike, after: ArrayLike, added: Arr
     return p + added
 
 
-@dataclass(frozen=True)
-class Driven:
-    """Motion of the robots in one control period."""
-
-    pose: Array  # (M, 3) true pose of `base_link` in `map` at the end
-    twist: Array  # (M, 3) true body twist at the end [m/s, m/s, rad/s]
-    state: Array  # (M, S) at the end
-    wheels: Array  # (M, 3) pose at the end by wheel odometry, without noise
-    counted: Array  # (M, 3) body twist at the end by wheel odometry
-    touched: NDArray[np.bool_]  # (M,) true for robots that touched anything
-
-
-class DrivenSimulator:
+class DrivenSimulator(FastSimulator):
     """One world of the fast simulator whose robots are moved from outside, by other physics.
 
     Scenes, motion of the obstacles, noise, faults and scans are those of the FastSimulator for the
     same seed. Odometry is the wheel odometry, `wheels` (M, 3) from the start pose, with the model's
-    noise. `fast` holds all data; do not call its `step`.
+    noise. A subclass steps.
     """
 
-    def __init__(
-        self, model: SimulatorModel, world: World, robots: int = 1, renderer: Renderer = "auto"
-    ) -> None:
-        self.fast = FastSimulator(model, world, robots=robots, renderer=renderer)
-        self._start = self.fast.obstacles[0, :, :3].copy()
-        self.wheels: Array = np.zeros((robots, 3))
-
-    def reset(self, seeds: ArrayLike, starts: ArrayLike | None = None) -> Scenes:
+    def reset(
+        self, seeds: ArrayLike, worlds: ArrayLike | None = None, starts: ArrayLike | None = None
+    ) -> Scenes:
         """Begins an episode, see `FastSimulator.reset`."""
-        scenes = self.fast.reset(seeds, starts=starts)
-        self.wheels = self.fast.data.pose[0].copy()
+        scenes = super().reset(seeds, worlds, starts)
+        self.wheels: Array = self.data.pose[0].copy()
         return scenes
 
     def begin_period(self) -> None:
         """Sets the obstacles' velocities for the period that begins."""
-        data = self.fast.data
-        self._start = data.bodies[0, :, :3].copy()
-        step_kernels.begin_period(self.fast.packed[0])
+        self._start = self.data.bodies[0, :, :3].copy()
+        step_kernels.begin_period(self.packed[0])
 
     def move_obstacles(self, time: float) -> Array:
         """Moves the obstacles (K, 7) to their poses `time` [s] after the period's beginning."""
-        data = self.fast.data
+        data = self.data
         contact_kernels.move_obstacles(data.bodies, self._start, data.velocity, 0, time)
         return data.bodies[0, : data.velocity.shape[1]]
 
-    def end_period(self, driven: Driven) -> None:
-        """Takes over the motion of the robots and measures what they sense."""
-        data = self.fast.data
-        data.pose[0], data.state[0] = driven.pose, driven.state
-        data.collided[0] |= driven.touched.astype(np.uint8)
+    def end_period(
+        self, pose: Array, twist: Array, state: Array, wheels: Array, counted: Array,
+        touched: NDArray[np.bool_],
+    ) -> None:  # fmt: skip
+        """Takes over the motion of the robots in the period, and measures what they sense.
+
+        True poses, body twists and states (M, ...) at its end; pose and body twist (M, 3) there by
+        wheel odometry, without noise; and (M,) true for robots that touched anything.
+        """
+        data = self.data
+        data.pose[0], data.state[0] = pose, state
+        data.collided[0] |= touched.astype(np.uint8)
         step_kernels.end_period(
-            self.fast.packed[0], driven.twist[None], self.wheels[None], driven.wheels[None],
-            driven.counted[None],
-        )  # fmt: skip
-        self.fast.sense(np.zeros(1, np.int64))
-        self.wheels = driven.wheels.copy()
+            self.packed[0], twist[None], self.wheels[None], wheels[None], counted[None]
+        )
+        self.sense(np.zeros(1, np.int64))
+        self.wheels = wheels.copy()

@@ -28,7 +28,7 @@ from nics_drl_bridge.gate.inputs import Press, Tick
 from nics_drl_bridge.generator import save_model
 from nics_drl_bridge.nodes import command_gate, conversions, qos
 from nics_drl_bridge.nodes.runner import open_context
-from nics_drl_bridge.nodes.wire import TwistWriter
+from nics_drl_bridge.nodes.wire import twist_to_bytes
 from nodes.peer import DEADLINE_S
 
 pytestmark = pytest.mark.ros
@@ -228,13 +228,13 @@ def test_a_decision_that_is_no_number_leaves_as_zero_and_latches(domain_id, tmp_
 
         monkeypatch.setattr(command_gate, "decide", mad)
         node._decide(Tick())
-        assert sent == [TwistWriter().write(np.zeros(3))]
+        assert sent == [twist_to_bytes(np.zeros(3))]
         found = node._look()
         assert found.message.startswith("e_stop_pressed")
         assert found.facts["not finite, sent as zero"] == 1
         wrong[:] = math.inf
         node._decide(Tick())
-        assert set(sent) == {TwistWriter().write(np.zeros(3))}
+        assert set(sent) == {twist_to_bytes(np.zeros(3))}
     finally:
         monkeypatch.undo()
         node.stop()

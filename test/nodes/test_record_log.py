@@ -15,6 +15,7 @@ from sensor_msgs.msg import Imu
 from nics_drl_bridge.errors import BackendError, RecordingError
 from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.record_node import DriveLog
+from nics_drl_bridge.recording.messages import imu_row, pose_row, stamp
 from nics_drl_bridge.recording.recording import check
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import load_robot
@@ -46,7 +47,7 @@ class Drive:
     def sends(self, k):
         """Command number k."""
         self.now_ns = START_NS + k * PERIOD_NS
-        self.log.command(np.array([0.01 * k, 0.0]))
+        self.log.add("cmd_vel", 0, [0.01 * k, 0.0])
 
     def goes(self, first, last):
         for k in range(first, last):
@@ -94,8 +95,8 @@ def test_the_pose_of_motion_capture_and_the_imu_are_taken():
         pose.pose.position.y = 0.2 * k
         pose.pose.orientation = conversions.heading_to_ros(0.5)
         imu.linear_acceleration.x, imu.angular_velocity.z = 0.3, -0.7
-        drive.log.pose(pose)
-        drive.log.imu(imu)
+        drive.log.add("pose", stamp(pose), pose_row(pose))
+        drive.log.add("imu", stamp(imu), imu_row(imu))
     recording = drive.log.recording()
     assert recording.pose.values[-1] == pytest.approx([0.0, 3.8, 0.5])
     assert recording.imu.values[-1] == pytest.approx([0.3, 0.0, -0.7])
@@ -108,7 +109,7 @@ def test_beside_a_pose_of_motion_capture_the_twist_of_the_odometry_is_taken():
         drive.hears(k, twist=(0.1 * k, 0.0, math.nan if k == 5 else -0.2))
         pose = PoseStamped()
         pose.header.stamp = conversions.stamp_to_ros(START_NS + k * PERIOD_NS)
-        drive.log.pose(pose)
+        drive.log.add("pose", stamp(pose), pose_row(pose))
     recording = check(drive.log.recording(), CAR)
     assert recording.odometry.values[-1] == pytest.approx([1.9, 0.0, -0.2])
     assert len(recording.odometry.t) == 19
@@ -144,9 +145,9 @@ def test_odometry_that_comes_late_and_all_at_once_is_at_its_pace():
     for k in range(10):
         drive.hears(k)
         late = [START_NS + 4 * PERIOD_NS] * 4 + [drive.now_ns] * 6
-        drive.log._odom._receive[-1] = late[k]
-    heard, stamped = drive.log._odom.spans
-    assert stamped / heard > 1.5
+        drive.log.rows["odom"][-1] = (late[k], *drive.log.rows["odom"][-1][1:])
+    (first, begin, _), *_, (last, end, _) = drive.log.rows["odom"]
+    assert (end - begin) / (last - first) > 1.5
     drive.log.check()
 
 

@@ -78,8 +78,8 @@ def test_its_scan_and_its_place_are_published(simulator, meet, two_lidars):
         model=two_lidars[0], world="arena", backend="dds", backend_options={"domain_id": simulator}
     )
     try:
-        env.reset(seed=0)
-        peer.until(lambda: scans, "a scan from the back")
+        # Again, as the first may be published before the peer's subscription is known.
+        peer.until(lambda: env.reset(seed=0) and scans, "a scan from the back")
     finally:
         env.close()
     assert scans[-1].header.frame_id == "rear_laser"

@@ -14,11 +14,15 @@ from PIL import Image
 from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.policy.evaluation import Episode
 from nics_drl_bridge.recording.excite import DrivePlan
-from nics_drl_bridge.report.page import Code, Picture, Table, page
 from nics_drl_bridge.report.pictures import (
     Point,
+    code,
     draw_world,
     drive_picture,
+    page,
+    paragraph,
+    picture,
+    table,
     training_curve,
     trajectories,
 )
@@ -80,7 +84,11 @@ def episode(seed=0, result="success", steps=20):
 
 
 def test_a_page_is_well_formed_and_holds_what_it_was_given():
-    blocks = ["a paragraph", Table(["name", "value"], [["speed", "1.5"]]), Code("x = 1\ny = 2")]
+    blocks = [
+        paragraph("a paragraph"),
+        table(["name", "value"], [["speed", "1.5"]]),
+        code("x = 1\ny = 2"),
+    ]
     found = parsed(page("Title", "a lead", [("First", blocks), ("Second", [])]))
     for text in ("Title", "a lead", "First", "a paragraph", "speed", "1.5", "x = 1\ny = 2"):
         assert text in found.text
@@ -90,7 +98,7 @@ def test_a_page_is_well_formed_and_holds_what_it_was_given():
 
 def test_text_is_never_taken_for_markup():
     evil = "<script>alert('1 & 2')</script>"
-    blocks = [evil, Code(evil), Table([evil], [[evil]]), Picture(b"png", evil + '"')]
+    blocks = [paragraph(evil), code(evil), table([evil], [[evil]]), picture(b"png", evil + '"')]
     html = page(evil, evil, [(evil, blocks)])
     found = parsed(html)
     assert "script" not in found.tags
@@ -99,7 +107,7 @@ def test_text_is_never_taken_for_markup():
 
 
 def test_a_page_needs_no_other_file():
-    html = page("t", "l", [("s", [Picture(b"\x89PNG", "c")])])
+    html = page("t", "l", [("s", [picture(b"\x89PNG", "c")])])
     source = re.search(r'src="data:image/png;base64,([^"]+)"', html)
     assert base64.b64decode(source[1]) == b"\x89PNG"
     assert "http" not in html

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from robots import direct_model, lidar
@@ -9,7 +7,6 @@ from robots import direct_model, lidar
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.sim.device import (
-    Driven,
     DrivenSimulator,
     propagate,
     step_covariance,
@@ -21,11 +18,11 @@ from nics_drl_bridge.sim.world import load_world
 PARTS = 4
 
 
-def end_of(fast: FastSimulator) -> Driven:
+def end_of(fast: FastSimulator) -> tuple[np.ndarray, ...]:
     """What robots did that move as the fast simulator's, and whose wheels never slip."""
     data, row = fast.data, fast.data.steps[0] % fast.data.past.shape[2]
     pose, twist = data.pose[0].copy(), data.past[0, :, row, 3:6].copy()
-    return Driven(pose, twist, data.state[0].copy(), pose, twist, data.collided[0] == 1)
+    return pose, twist, data.state[0].copy(), pose, twist, data.collided[0] == 1
 
 
 @pytest.mark.slow
@@ -45,11 +42,11 @@ def test_robots_moved_from_outside_sense_what_those_of_the_fast_simulator_do(nam
             driven.begin_period()
             for part in range(PARTS):
                 driven.move_obstacles(model.control_period * (part + 1) / PARTS)
-            driven.end_period(end_of(fast))
+            driven.end_period(*end_of(fast))
             for known in ("ranges", "twist", "collided", "steps", "marks"):
-                assert np.array_equal(getattr(driven.fast.data, known), getattr(fast.data, known))
+                assert np.array_equal(getattr(driven.data, known), getattr(fast.data, known))
             for rounded in ("bodies", "odom"):
-                ours, theirs = (getattr(s.data, rounded) for s in (driven.fast, fast))
+                ours, theirs = (getattr(s.data, rounded) for s in (driven, fast))
                 assert np.abs(ours - theirs).max() < 1e-12
 
 
@@ -57,15 +54,15 @@ def test_odometry_is_what_the_wheels_count_and_the_scan_is_of_where_the_robot_is
     model = direct_model(odometry=(0.0, 0.0))
     world, start = load_world("empty"), np.array([[[0.5, 0.0, 0.0]]])
     driven = DrivenSimulator(model, world)
-    driven.reset([0], start)
-    before = driven.fast.data.ranges.copy()
+    driven.reset([0], starts=start)
+    before = driven.data.ranges.copy()
     turned = np.array([[1.0, 0.2, 0.1]])
-    stuck = Driven(start[0], np.zeros((1, 3)), np.zeros((1, 0)), turned, turned, np.array([True]))
+    stuck = start[0], np.zeros((1, 3)), np.zeros((1, 0)), turned, turned
     driven.begin_period()
-    driven.end_period(stuck)
+    driven.end_period(*stuck, np.array([True]))
     driven.begin_period()
-    driven.end_period(replace(stuck, touched=np.array([False])))
-    data = driven.fast.data
+    driven.end_period(*stuck, np.array([False]))
+    data = driven.data
     assert data.odom[0] == pytest.approx(turned)
     assert data.twist[0] == pytest.approx(turned)
     assert np.array_equal(data.pose, start)

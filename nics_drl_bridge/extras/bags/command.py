@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Any
 
 import typer
 
 from nics_drl_bridge.commands.console import intact, needs_ros, one_sentence, roles_of, table
 
-if TYPE_CHECKING:
-    from nics_drl_bridge.extras.bags.info import BagInfo, BagTopic
-
 bag = typer.Typer(help="Records, describes, replays and saves bags.", no_args_is_help=True)
 
+STORAGES = ("mcap", "sqlite3")
 BagArgument = Annotated[Path, typer.Argument(help="Folder or file of a rosbag2.")]
 SalvageOption = Annotated[
     bool, typer.Option("--salvage", help="Take what is intact of a damaged bag, and tell the rest.")
@@ -70,8 +69,11 @@ def info(
             told = bag_info(whole)
         if as_json:
             typer.echo(json.dumps(asdict(told) | {"path": str(path)}))
-        else:
-            _print(told, path)
+            return
+        span, size = f"{told.duration_s:.3f} s", f"{told.size_bytes / 1e6:.2f} MB"
+        typer.echo(f"{path}: {told.messages} messages in {span}, {size}")
+        heads = ("topic", "type", "count", "Hz", "from, to [s]", "gaps", "clock", "delay [ms]")
+        typer.echo(table(heads, [_row(each) for each in told.topics]))
 
 
 @bag.command()
@@ -109,12 +111,22 @@ def replay(
     """Plays a bag over ROS 2, or gives the estimate that the middleware makes of it."""
     with one_sentence(), intact(path, salvage) as whole:
         if estimate:
-            _estimate(whole, model, topic or [], out)
+            from nics_drl_bridge.generator import open_model
+            from nics_drl_bridge.middleware import playback
+
+            made = playback.estimate(whole, open_model(model), roles_of(topic or []))
+            if out is not None:
+                playback.write_estimate(made, out)
+            for reason, count in sorted(made.rejected.items()):
+                typer.echo(f"not used: {count} of {reason}")
+            (x, y, heading), number = made.pose[-1], len(made.stamp_ns)
+            typer.echo(f"{number} estimates; the last is {x:.3f} m, {y:.3f} m, {heading:.3f}")
+            typer.echo(f"sha256 {made.digest}")
             return
         with needs_ros("nics bag replay"):
-            from nics_drl_bridge.extras.bags.live import PlayOrder, play_bag
-        order = PlayOrder(whole, tuple(topics or ()), rate, loop, clock, namespace, lockstep)
-        sent = play_bag(order, lambda line: typer.echo(line, err=True))
+            from nics_drl_bridge.extras.bags.live import play_bag
+        say = partial(typer.echo, err=True)
+        sent = play_bag(whole, topics or (), rate, loop, clock, namespace, lockstep, say)
         typer.echo(f"{sent} messages were published")
 
 
@@ -137,41 +149,17 @@ def salvage(
         typer.echo(f"bag written to {out}")
 
 
-def _storage(name: str) -> Literal["mcap", "sqlite3"]:
+def _storage(name: str) -> Any:
     from nics_drl_bridge.errors import ConfigError, nearest
 
-    storages: dict[str, Literal["mcap", "sqlite3"]] = {"mcap": "mcap", "sqlite3": "sqlite3"}
-    if name in storages:
-        return storages[name]
-    raise ConfigError(f"--storage {name!r}: {nearest(name, storages)}")
+    if name not in STORAGES:
+        raise ConfigError(f"--storage {name!r}: {nearest(name, STORAGES)}")
+    return name
 
 
-def _estimate(path: Path, model: str, topics: list[str], out: Path | None) -> None:
-    from nics_drl_bridge.generator import open_model
-    from nics_drl_bridge.middleware import playback
-
-    made = playback.estimate(path, open_model(model), roles_of(topics))
-    if out is not None:
-        playback.write_estimate(made, out)
-    for reason, count in sorted(made.rejected.items()):
-        typer.echo(f"not used: {count} of {reason}")
-    x, y, heading = made.pose[-1]
-    typer.echo(f"{len(made.stamp_ns)} estimates; the last is {x:.3f} m, {y:.3f} m, {heading:.3f}")
-    typer.echo(f"sha256 {made.digest}")
-
-
-def _print(told: BagInfo, path: Path) -> None:
-    typer.echo(
-        f"{path}: {told.messages} messages in {told.duration_s:.3f} s, "
-        f"{told.size_bytes / 1e6:.2f} MB"
-    )
-    heads = ("topic", "type", "count", "Hz", "from, to [s]", "gaps", "clock", "delay [ms]")
-    typer.echo(table(heads, [_row(each) for each in told.topics]))
-
-
-def _row(each: BagTopic) -> tuple[str, ...]:
+def _row(each: Any) -> tuple[str, ...]:
     span = "" if each.first_s is None else f"{each.first_s:.2f}, {each.last_s:.2f}"
     gaps = "" if each.longest_gap_s is None else f"{each.gaps}, longest {each.longest_gap_s:.2f} s"
-    delay = "" if each.delay_s is None else f"{1e3 * each.delay_s:.1f} ± {5e2 * each.jitter_s:.1f}"  # type: ignore[operator]
+    delay = "" if each.delay_s is None else f"{1e3 * each.delay_s:.1f} ± {5e2 * each.jitter_s:.1f}"
     rate = "" if each.rate_hz is None else f"{each.rate_hz:.2f}"
     return each.topic, each.type, str(each.count), rate, span, gaps, each.clock, delay

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from rcl_interfaces.srv import GetParameters
-from rclpy.clock import Clock, ClockType
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
@@ -25,7 +24,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from nics_drl_bridge.errors import BackendError, RecordingError, nearest
 from nics_drl_bridge.nodes.conversions import message_texts, message_type, stamp_to_ros
 from nics_drl_bridge.nodes.qos import QosWatch, offer_of, profile_of
-from nics_drl_bridge.nodes.runner import DELIVERY_S, open_context, run_node
+from nics_drl_bridge.nodes.runner import DELIVERY_S, holds, open_context, run_node, steadily
 from nics_drl_bridge.recording.bag_file import BagFile, opened
 from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.recording.write import BagSink, Storage, bag_sink
@@ -86,10 +85,10 @@ class BagRecorder(QosWatch):
             start_parameter_services=False,
         )  # fmt: skip
         self._order, self._sink, self._say = order, sink, say
+        self.skipped: dict[str, str] = {}  # a sentence by topic
         self._heard: dict[str, tuple[Offer, Subscription[Any]]] = {}
-        self.skipped: dict[str, str] = {}
         self._began = self._flushed = time.monotonic()
-        self.create_timer(LOOK_S, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        steadily(self, LOOK_S, self._look)
         self._look()
 
     def _look(self) -> None:
@@ -146,51 +145,35 @@ def record_bag(order: BagOrder, say: Callable[[str], None]) -> dict[str, int]:
     `say` is called with a sentence when a topic begins or can't be recorded. Raises BackendError if
     nothing was received, RecordingError if the bag can't be written.
     """
-    nodes: list[BagRecorder] = []
     with bag_sink(order.out, order.storage) as sink:
-
-        def make(context: Context) -> BagRecorder:
-            nodes.append(BagRecorder(context, order, sink, say))
-            return nodes[-1]
-
-        run_node(make, ["nics"])
+        node = run_node(lambda context: BagRecorder(context, order, sink, say), ["nics"])
         if not sum(sink.counts.values()):
-            skipped = " ".join(text for node in nodes for text in node.skipped.values())
+            skipped = " ".join(node.skipped.values())
+            left_out = f" Not recorded: {skipped}" if skipped else ""
             raise BackendError(
                 "nothing was heard on any of the topics, so no bag is written; start the robot, "
-                "or correct --topics, --namespace or ROS_DOMAIN_ID."
-                + (f" Not recorded: {skipped}" if skipped else "")
+                f"or correct --topics, --namespace or ROS_DOMAIN_ID.{left_out}"
             )
     return sink.counts
-
-
-@dataclass(frozen=True)
-class PlayOrder:
-    """Bag to play, and options."""
-
-    bag: Path  # folder or file of the bag
-    topics: tuple[str, ...] = ()  # to play; all if empty
-    rate: float = 1.0  # seconds of the bag per second of wall time
-    loop: bool = False  # starts again at the end; time on `/clock` then jumps back
-    clock: bool = True  # publishes `/clock`; the bag's own is then not played
-    namespace: str = ""  # put in front of the topics' names, except `/clock`, `/tf`, `/tf_static`
-    lockstep: str | None = None  # a node that must take each message before the next one is sent
-    domain_id: int | None = None  # DDS domain; the environment's by default
 
 
 Timed = tuple[int, str, bytes]  # receipt [ns], topic, data
 
 
 class _Player:
-    def __init__(self, node: Node, order: PlayOrder, stopping: threading.Event) -> None:
-        self._node, self._order, self._stopping = node, order, stopping
+    def __init__(
+        self, node: Node, stopping: threading.Event, rate: float, clock: bool, namespace: str,
+        lockstep: str | None,
+    ) -> None:  # fmt: skip
+        self._node, self._stopping, self._rate = node, stopping, rate
+        self._lockstep, self._space = lockstep, namespace.strip("/")
         self.publishers: dict[str, Publisher] = {}
-        self._clock = node.create_publisher(ClockMessage, CLOCK, 10) if order.clock else None
+        self._clock = node.create_publisher(ClockMessage, CLOCK, 10) if clock else None
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._barrier = None
-        if order.lockstep:
-            service = f"/{order.lockstep.strip('/')}/get_parameters"
+        if lockstep:
+            service = f"/{lockstep.strip('/')}/get_parameters"
             self._barrier = node.create_client(GetParameters, service)
 
     def offer(self, topic: str, kind: str, offers: tuple[Offer, ...]) -> bool:
@@ -198,9 +181,8 @@ class _Player:
         found = message_type(kind)
         if found is None:
             return False
-        space = self._order.namespace.strip("/")
         shared = topic in (CLOCK, "/tf", "/tf_static")
-        name = topic if shared or not space else f"/{space}{topic}"
+        name = topic if shared or not self._space else f"/{self._space}{topic}"
         best = Offer(  # matches any subscriber of one of the publishers
             max((offer.depth for offer in offers), default=USUAL_DEPTH),
             not offers or any(offer.reliable for offer in offers),
@@ -211,47 +193,39 @@ class _Player:
 
     def ready(self) -> None:
         """Waits for the node in lock-step, or a while for subscribers."""
-        publishers = self.publishers.values()
+        publishers, known = self.publishers.values(), self._node.count_subscribers
         self._stopping.wait(DISCOVERY_S)
         self._wait(lambda: any(each.get_subscription_count() for each in publishers), ALONE_S)
-        known = self._node.count_subscribers
         self._wait(  # for all known subscribers to find their topic
             lambda: all(p.get_subscription_count() >= known(p.topic_name) for p in publishers),
             PATIENCE_S,
         )
-        if self._barrier is None or self._wait(self._barrier.service_is_ready, PATIENCE_S):
-            return
-        raise BackendError(
-            f"node {self._order.lockstep!r}: not found within {PATIENCE_S:g} s; start it, or "
-            "correct its name, namespace or ROS_DOMAIN_ID."
-        )
+        if self._barrier is not None and not self._wait(self._barrier.service_is_ready, PATIENCE_S):
+            raise BackendError(
+                f"node {self._lockstep!r}: not found within {PATIENCE_S:g} s; start it, or "
+                "correct its name, namespace or ROS_DOMAIN_ID."
+            )
 
     def _wait(self, condition: Callable[[], bool], patience_s: float) -> bool:
-        until = time.monotonic() + patience_s
-        while not (condition() or self._stopping.is_set()):
-            if time.monotonic() > until:
-                return False
-            self._stopping.wait(NAP_S)
-        return True
+        return holds(lambda: condition() or self._stopping.is_set(), patience_s, NAP_S)
 
     def play(self, messages: list[Timed]) -> int:
         """Publishes all messages; returns their number, fewer if it is stopped."""
-        first, began, sent = messages[0][0], time.monotonic_ns(), 0
-        now = first
-        for due, topic, data in messages:
-            while self._order.lockstep is None and now < due and not self._stopping.is_set():
-                now = min(due, now + round(CLOCK_PERIOD_NS * self._order.rate))
-                at = began + round((now - first) / self._order.rate)
+        now = first = messages[0][0]
+        began, rate = time.monotonic_ns(), self._rate
+        for sent, (due, topic, data) in enumerate(messages):
+            while self._lockstep is None and now < due and not self._stopping.is_set():
+                now = min(due, now + round(CLOCK_PERIOD_NS * rate))
+                at = began + round((now - first) / rate)
                 self._stopping.wait(max(at - time.monotonic_ns(), 0) * 1e-9)
                 self._tick(now)
             if self._stopping.is_set():
-                break
-            if self._order.lockstep is not None:
+                return sent
+            if self._lockstep is not None:
                 self._tick(due)
             self.publishers[topic].publish(data)
-            sent += 1
             self._wait_for_peer()
-        return sent
+        return len(messages)
 
     def _tick(self, now_ns: int) -> None:
         if self._clock is not None:
@@ -265,30 +239,36 @@ class _Player:
         self._executor.spin_until_future_complete(future, timeout_sec=PATIENCE_S)
         if not future.done():
             raise BackendError(
-                f"node {self._order.lockstep!r}: has not answered for {PATIENCE_S:g} s; it hangs "
+                f"node {self._lockstep!r}: has not answered for {PATIENCE_S:g} s; it hangs "
                 "or has ended: start it anew."
             )
 
 
-def play_bag(order: PlayOrder, say: Callable[[str], None]) -> int:
+def play_bag(
+    path: Path, topics: Sequence[str], rate: float, loop: bool, clock: bool, namespace: str,
+    lockstep: str | None, say: Callable[[str], None],
+) -> int:  # fmt: skip
     """Publishes a bag until its end, SIGINT or SIGTERM; returns the number of published messages.
 
-    They are published as recorded, with the quality of service that their publishers offered.
-    `/clock` gives the times of receipt, as with `ros2 bag play --clock`. `say` is called with a
-    sentence about each topic that is left out. Raises RecordingError if the bag is damaged, lacks a
-    topic, or none of its types is installed, BackendError if the peer does not answer.
+    They are published as recorded, with the quality of service that their publishers offered: the
+    given topics or all, at a rate [seconds of the bag per second], in a namespace save `/clock`,
+    `/tf` and `/tf_static`, and in lock-step only when a node has taken the message before. A loop
+    begins anew at the end. `clock` publishes the times of receipt on `/clock`, as `ros2 bag play
+    --clock` does, instead of the bag's own. `say` is called with a sentence about each topic that
+    is left out. Raises RecordingError if the bag is damaged, lacks a topic, or none of its types is
+    installed, BackendError if the peer does not answer.
     """
     stopping = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopping.set())
-    with opened(order.bag) as bag:
-        kinds = {topic: bag.types[topic] for topic in _wanted(bag, order)}
+    with opened(path) as bag:
+        kinds = {topic: bag.types[topic] for topic in _wanted(bag, topics, clock)}
         offers = {topic: bag.offers(topic) for topic in kinds}
         messages = {topic: bag.serialized(topic) for topic in kinds}
-    context = open_context([], order.domain_id)
+    context = open_context([])
     node = Node("bag_player", context=context, start_parameter_services=False)
     try:
-        player = _Player(node, order, stopping)
+        player = _Player(node, stopping, rate, clock, namespace, lockstep)
         played = {t: m for t, m in messages.items() if player.offer(t, kinds[t], offers[t])}
         for topic in sorted(kinds.keys() - played.keys()):
             say(f"left out: {topic} is of {kinds[topic]}, whose package is not installed.")
@@ -296,10 +276,10 @@ def play_bag(order: PlayOrder, say: Callable[[str], None]) -> int:
         timed = [(ns, topic, data) for topic, some in sorted(played.items()) for ns, data in some]
         timed.sort(key=lambda one: one[:2])
         if not timed:
-            raise RecordingError(f"{order.bag}: holds nothing that can be played here.")
+            raise RecordingError(f"{path}: holds nothing that can be played here.")
         player.ready()
         sent = player.play(timed)
-        while order.loop and not stopping.is_set():
+        while loop and not stopping.is_set():
             sent += player.play(timed)
         for each in player.publishers.values():  # undelivered messages are lost with it
             each.wait_for_all_acked(Duration(seconds=DELIVERY_S))
@@ -309,13 +289,13 @@ def play_bag(order: PlayOrder, say: Callable[[str], None]) -> int:
         context.try_shutdown()
 
 
-def _wanted(bag: BagFile, order: PlayOrder) -> list[str]:
-    names = [name if name.startswith("/") else f"/{name}" for name in order.topics]
+def _wanted(bag: BagFile, topics: Sequence[str], clock: bool) -> list[str]:
+    names = [name if name.startswith("/") else f"/{name}" for name in topics]
     for name in names:
         if name not in bag.types:
             raise RecordingError(f"{bag.place}: has no topic {name!r}; {nearest(name, bag.types)}")
     return [
         topic
         for topic in sorted(names or bag.types)
-        if topic not in bag.empty and not (order.clock and topic == CLOCK)
+        if topic not in bag.empty and not (clock and topic == CLOCK)
     ]

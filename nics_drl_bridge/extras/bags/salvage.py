@@ -49,19 +49,18 @@ class Salvage:
 
     def lines(self) -> tuple[str, ...]:
         """Returns one line for the whole bag and one per topic."""
-        head, promised = f"{sum(self.kept.values())} messages are kept", self.promised or {}
-        if self.promised is None:
-            head += "; how many there were, nothing in the bag tells"
-        else:
-            total, lost = sum(promised.values()), self.lost or 0
-            share = 100.0 * lost / total if total else 0.0
-            head += f" and {lost} of {total} are lost ({share:.1f} %)"
+        promised, lost = self.promised or {}, "; how many there were, nothing in the bag tells"
+        if self.lost is not None:
+            total = sum(promised.values())
+            share = 100.0 * self.lost / max(total, 1)
+            lost = f" and {self.lost} of {total} are lost ({share:.1f} %)"
+        head = f"{sum(self.kept.values())} messages are kept{lost}; they span {self.span_s:.3f} s"
         topics = (
             f"  {topic}: {self.kept.get(topic, 0)}"
             + (f" of {promised[topic]}" if topic in promised else "")
             for topic in sorted({*self.kept, *promised})
         )
-        return f"{head}; they span {self.span_s:.3f} s", *topics
+        return head, *topics
 
 
 @dataclass
@@ -226,13 +225,11 @@ def _until_damage(data: memoryview, span_ns: tuple[int, int]) -> Iterator[mcap.R
 
 def _next_chunk(data: memoryview, start: int, end: int) -> int:
     """Returns the offset of the next record with the consistent lengths of a chunk, or the end."""
-    file = data.obj
-    if not isinstance(file, mmap):
-        return end
-    place = file.find(CHUNK_OP, start, end)
-    while place >= 0 and not _looks_like_chunk(data, place):
-        place = file.find(CHUNK_OP, place + 1, end)
-    return place if place >= 0 else end
+    file, place = data.obj, start - 1
+    while isinstance(file, mmap) and (place := file.find(CHUNK_OP, place + 1, end)) >= 0:
+        if _looks_like_chunk(data, place):
+            return place
+    return end
 
 
 def _looks_like_chunk(data: memoryview, place: int) -> bool:
@@ -283,8 +280,7 @@ def _drop_cut_page(copy: Path) -> None:
 def _rows(base: sqlite3.Connection, bound: int) -> list[tuple[Any, ...]]:
     """Reads messages: topic, time, data. Ranges that can't be read are halved."""
     ask = "SELECT topic_id, timestamp, data FROM messages WHERE id BETWEEN ? AND ?"
-    rows: list[tuple[Any, ...]] = []
-    waiting = [(1, bound)]
+    rows, waiting = list[tuple[Any, ...]](), [(1, bound)]
     with suppress(sqlite3.Error):
         waiting = [base.execute("SELECT MIN(id), MAX(id) FROM messages").fetchone()]
     for _ in range(2 * bound):  # damaged numbers can promise rows without end

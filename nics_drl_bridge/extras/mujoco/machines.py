@@ -55,36 +55,24 @@ class Machine:
     state: Callable[[Array, Array], Array]  # positions [rad] and speeds [rad/s] (J,) to state (S,)
 
 
-@dataclass(frozen=True)
-class Motor:
-    """A motor under a velocity servo: torque = gain x (wanted - actual speed), up to a limit.
+def _motor(
+    transmission: str, inertia: float, lag: float, radius: float, step: float, physics: Physics
+) -> str:
+    """MJCF of a motor at a `joint="NAME"` or a `tendon="NAME"`, under a velocity servo.
 
-    The wanted speed follows the command with a first-order lag, like the set point of a motor
-    controller, so that the servo is stiff and keeps its speed under load.
+    Torque = gain x (wanted - actual speed), up to a limit. The wanted speed follows the command
+    with a first-order lag [s], like the set point of a motor controller, so that the servo is stiff
+    and keeps its speed under load. Spinning or locked wheels do not steer, so the lag is longer if
+    the maximum step [m/s] of the command would accelerate the robot too much. The inertia is that
+    at the motor's shaft, including the share of the moving robot [kg m^2].
     """
-
-    gain: float  # [N m s/rad]
-    torque: float  # limit [N m]
-    lag: float  # of the set point [s]
-
-    def mjcf(self, transmission: str) -> str:
-        """The MJCF of the motor at a `joint="NAME"` or a `tendon="NAME"`."""
-        return f"""
-    <general {transmission} dyntype="filterexact" dynprm="{self.lag:.8g}" gainprm="{self.gain:.8g}"
-             biastype="affine" biasprm="0 0 {-self.gain:.8g}"
-             forcerange="{-self.torque:.8g} {self.torque:.8g}"/>"""
-
-
-def _motor(inertia: float, lag: float, radius: float, step: float, physics: Physics) -> Motor:
-    """Motor that makes a wheel follow its target with a lag [s], within the limits of friction.
-
-    Spinning or locked wheels do not steer, so the lag is longer if the maximum step [m/s] of the
-    command would accelerate the robot too much. The inertia is that at the motor's shaft, including
-    the share of the moving robot [kg m^2].
-    """
-    lag = max(lag, step / physics.acceleration)
-    limit = TORQUE_RESERVE * physics.acceleration
-    return Motor(inertia / SERVO_LAG_S, inertia * limit / radius, lag - SERVO_LAG_S)
+    lag = max(lag, step / physics.acceleration) - SERVO_LAG_S
+    gain = inertia / SERVO_LAG_S
+    torque = inertia * TORQUE_RESERVE * physics.acceleration / radius
+    return f"""
+    <general {transmission} dyntype="filterexact" dynprm="{lag:.8g}" gainprm="{gain:.8g}"
+             biastype="affine" biasprm="0 0 {-gain:.8g}"
+             forcerange="{-torque:.8g} {torque:.8g}"/>"""
 
 
 def _document(name: str, physics: Physics, height: float, robot: str, actuators: str) -> str:
@@ -139,11 +127,7 @@ def load_mujoco() -> Any:
 
 
 def build_machine(spec: RobotSpec, physics: Physics | None = None) -> Machine:
-    """Builds the machine of a robot; an Ackermann spec may also have `wheel_radius` and `track`.
-
-    Raises ConfigError if the spec names no textbook kinematics or a kind without a machine, or
-    lacks a parameter.
-    """
+    """Builds the machine of a robot; ConfigError without one of its kind, or a parameter."""
     kind = require_textbook(spec)
     if kind not in _BUILDERS:
         raise ConfigError(
@@ -169,9 +153,8 @@ def _ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
     wheelbase = p["wheelbase"]
     track, radius = track_and_radius(p)
     total = physics.mass + 4 * physics.wheel_mass
-    engine = _motor(
-        (total + 2 * physics.wheel_mass) * radius**2, p["speed_lag"], radius, step, physics
-    )
+    inertia = (total + 2 * physics.wheel_mass) * radius**2
+    engine = _motor('tendon="axle"', inertia, p["speed_lag"], radius, step, physics)
     centre, size = (0.45 * wheelbase, 0.0, 0.0), (1.3 * wheelbase, 0.7 * track, 0.04)
     wheels = _car_wheels(wheelbase, track, radius, p["steering_lag"], physics)
     robot = _chassis(physics.mass, centre, size) + wheels
@@ -212,7 +195,7 @@ def _car_wheels(wheelbase: float, track: float, radius: float, lag: float, physi
     return parts
 
 
-def _car_actuators(engine: Motor) -> str:
+def _car_actuators(engine: str) -> str:
     servos = "".join(
         f"""
     <position joint="steer_{side}" kp="{STEERING_STIFFNESS}"
@@ -224,7 +207,7 @@ def _car_actuators(engine: Motor) -> str:
     <fixed name="axle"><joint joint="rear_left" coef="0.5"/><joint joint="rear_right" coef="0.5"/>
     </fixed>
   </tendon>
-  <actuator>{engine.mjcf('tendon="axle"')}{servos}
+  <actuator>{engine}{servos}
   </actuator>"""
 
 
@@ -233,10 +216,7 @@ def _differential(p: Parameters, step: float, physics: Physics) -> Machine:
     radius, track = p["wheel_radius"], p["track"]
     behind, ball = -0.5 * track, 0.4 * radius
     total = physics.mass + 2 * physics.wheel_mass
-    servo = _motor(
-        0.5 * (total + physics.wheel_mass) * radius**2,
-        p["wheel_lag"], radius, step, physics,
-    )  # fmt: skip
+    inertia = 0.5 * (total + physics.wheel_mass) * radius**2
     wheels = "".join(
         f"""
       <body pos="0 {y:.6g} 0">{_wheel(side, radius, 0.4 * radius, physics)}
@@ -251,8 +231,10 @@ def _differential(p: Parameters, step: float, physics: Physics) -> Machine:
         <joint type="ball" damping="{physics.bearing}"/>
         <geom class="tread" type="sphere" size="{ball:.6g}" mass="0.03"/>
       </body>{wheels}"""
-    xml = _document("differential", physics, radius, robot, _motors(("left", "right"), servo))
-    return Machine(xml, ("left", "right"), lambda state: state, lambda _, speed: speed)
+    names = ("left", "right")
+    motors = _motors(names, inertia, p["wheel_lag"], radius, step, physics)
+    xml = _document("differential", physics, radius, robot, motors)
+    return Machine(xml, names, lambda state: state, lambda _, speed: speed)
 
 
 def _mecanum(p: Parameters, step: float, physics: Physics) -> Machine:
@@ -263,22 +245,20 @@ def _mecanum(p: Parameters, step: float, physics: Physics) -> Machine:
     """
     radius = p["wheel_radius"]
     total = physics.mass + 4 * physics.wheel_mass
-    servo = _motor(
-        (0.25 * total + 0.5 * physics.wheel_mass) * radius**2,
-        p["wheel_lag"], radius, step, physics,
-    )  # fmt: skip
+    inertia = (0.25 * total + 0.5 * physics.wheel_mass) * radius**2
     x, y = p["half_length"], p["half_width"]
     names = ("front_left", "front_right", "rear_left", "rear_right")
     places = ((x, y, -1), (x, -y, 1), (-x, y, 1), (-x, -y, -1))
     body = _chassis(physics.mass, (0, 0, 0), (2.2 * x, 1.4 * y, 0.04))
     for name, (px, py, lean) in zip(names, places, strict=True):
         body += _roller_wheel(name, (px, py), lean, radius, physics)
-    xml = _document("mecanum", physics, radius, body, _motors(names, servo))
+    motors = _motors(names, inertia, p["wheel_lag"], radius, step, physics)
+    xml = _document("mecanum", physics, radius, body, motors)
     return Machine(xml, names, lambda state: state, lambda _, speed: speed)
 
 
-def _motors(names: tuple[str, ...], servo: Motor) -> str:
-    rows = "".join(servo.mjcf(f'joint="{name}"') for name in names)
+def _motors(names: tuple[str, ...], *servo: Any) -> str:
+    rows = "".join(_motor(f'joint="{name}"', *servo) for name in names)
     return f"""
   <actuator>{rows}
   </actuator>"""

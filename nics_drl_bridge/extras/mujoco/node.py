@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import cast
 
 from rclpy.context import Context
 from rclpy.node import Node
@@ -12,20 +11,18 @@ from rclpy.node import Node
 from nics_drl_bridge.extras.mujoco.machines import Physics
 from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.lidar.scanner import RENDERERS, Renderer
-from nics_drl_bridge.nodes.device_parameters import choice
 from nics_drl_bridge.nodes.runner import declare, run_node
-from nics_drl_bridge.nodes.simulator_node import DeviceNode
-from nics_drl_bridge.sim.device import Simulator
+from nics_drl_bridge.nodes.simulator_node import DeviceNode, declare_renderer
 from nics_drl_bridge.sim.world import World
 
 
-def mujoco_simulator(node: Node, model: SimulatorModel, world: World, robots: int) -> Simulator:
+def mujoco_simulator(
+    node: Node, model: SimulatorModel, world: World, robots: int
+) -> MujocoSimulator:
     """Makes robots in MuJoCo, with the lidar and the floor that the parameters name."""
-    declare(node, "renderer", "exact", "Lidar: baked or exact.", read_only=True)
+    renderer = declare_renderer(node, "exact")
     floor = "Friction between tyres and floor; ice has 0.1."
     friction = declare(node, "friction", 1.0, floor, span=(0.01, 2.0), read_only=True)
-    renderer = cast(Renderer, choice(node, "renderer", RENDERERS))
     return MujocoSimulator(model, world, robots, renderer, replace(Physics(), friction=friction))
 
 

@@ -8,7 +8,6 @@ so outlines are cut into convex parts and maps into rectangles.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,24 +18,15 @@ from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import Circle, Rectangle, Segment, Shape, convex_hull
+from nics_drl_bridge.sim.scenes import SceneSampler
+from nics_drl_bridge.sim.world import World
 
 HEIGHT = 0.5  # height of walls and obstacles [m]
 THICKNESS = 0.002  # thickness of walls, which have none for the lidar [m]
 BUMPER = 4  # bit of MuJoCo's `contype` and `conaffinity` for contacts of bumpers
 BUMPER_FRICTION = 0.3
-BUMPER_NAME = "bumper_"
+BUMPER_NAME, OBSTACLE_NAME = "bumper_", "obstacle_"
 SLIVER = 1e-9  # triangles of less area, relative to the square of the outline's size, are omitted
-
-
-@dataclass(frozen=True)
-class Scenery:
-    """Walls, map and obstacles of a world in one episode."""
-
-    walls: Array  # (W, 4) x1, y1, x2, y2 [m]
-    grid: GridMap | None
-    shapes: tuple[Shape, ...]  # of the obstacles
-    bodies: Array  # (K, 7) as in `lidar.shapes.BODY`
-    moving: NDArray[np.bool_]  # (K,) obstacles whose poses are prescribed (mocap)
 
 
 def prefix_of(robot: int) -> str:
@@ -44,17 +34,13 @@ def prefix_of(robot: int) -> str:
     return f"robot_{robot}/" if robot else ""
 
 
-def obstacle_name(k: int) -> str:
-    """Name of the body of obstacle k."""
-    return f"obstacle_{k}"
-
-
 def compile_scene(
-    mujoco: Any, machine: Machine, footprint: Shape, robots: int, scenery: Scenery, physics: Physics
-) -> Any:
-    """Compiles the MuJoCo model of robots of one kind, whose parts have names with `prefix_of`.
+    mujoco: Any, machine: Machine, physics: Physics, footprint: Shape, robots: int, world: World,
+    sampler: SceneSampler, bodies: Array,
+) -> Any:  # fmt: skip
+    """Compiles the model of robots of one kind, with a circle or polygon as footprint, in a world.
 
-    `mujoco` is the module; the footprint is a circle or a polygon.
+    Obstacles (K, 7), as in `lidar.shapes.BODY`, that move have prescribed poses (mocap).
     """
     spec = mujoco.MjSpec.from_string(machine.xml)
     maker = _Maker(mujoco, spec, physics)
@@ -64,13 +50,14 @@ def compile_scene(
         another.delete(another.geom("floor"))
         _Maker(mujoco, another, physics).bumper(another.body("base_link"), footprint)
         spec.attach(another, prefix=prefix_of(m), frame=spec.worldbody.add_frame())
-    for wall in scenery.walls:
+    for wall in world.all_walls():
         maker.wall(spec.worldbody, wall[:2], wall[2:])
-    if scenery.grid is not None:
-        maker.map(scenery.grid)
-    for k, body in enumerate(scenery.bodies):
+    if world.grid is not None:
+        maker.map(world.grid)
+    for k, body in enumerate(bodies):
         if body[RADIUS] > 0.0:
-            maker.obstacle(k, scenery.shapes[int(body[SHAPE])], body[:3], bool(scenery.moving[k]))
+            moves = sampler.motions[k] is not None
+            maker.obstacle(k, sampler.shapes[int(body[SHAPE])], body[:3], moves)
     return spec.compile()
 
 
@@ -101,13 +88,11 @@ class _Maker:
                 self._prism(base, part, (-half, half), name=f"{BUMPER_NAME}{i}", **own)
 
     def wall(self, body: Any, start: Array, end: Array) -> None:
-        """Adds a straight wall between two points (2,) [m]."""
         middle, along = 0.5 * (start + end), end - start
         size = [0.5 * float(np.hypot(*along)), 0.5 * THICKNESS, 0.5 * HEIGHT]
         self._box(body, middle, float(np.arctan2(along[1], along[0])), size)
 
     def map(self, grid: GridMap) -> None:
-        """Adds the blocked cells of a map."""
         heading, side = grid.origin[2], grid.resolution
         for first_row, first, row, column in rectangles(grid.blocked):
             middle = grid.cell_to_world([0.5 * (first_row + row - 1), 0.5 * (first + column - 1)])
@@ -115,10 +100,9 @@ class _Maker:
             self._box(self._spec.worldbody, middle, heading, size)
 
     def obstacle(self, k: int, shape: Shape, pose: Array, moves: bool) -> None:
-        """Adds an obstacle at a pose (3,)."""
         x, y, heading = pose
         body = self._spec.worldbody.add_body(
-            name=obstacle_name(k), pos=[x, y, 0.0], quat=quaternion(heading), mocap=moves
+            name=f"{OBSTACLE_NAME}{k}", pos=[x, y, 0.0], quat=quaternion(heading), mocap=moves
         )
         if isinstance(shape, Circle):
             size = [shape.radius, 0.5 * HEIGHT, 0.0]
@@ -136,7 +120,6 @@ class _Maker:
         self._add(body, type=self._kinds.mjGEOM_BOX, size=size, pos=pos, quat=turned)
 
     def _prism(self, body: Any, corners: Array, z: tuple[float, float], **others: Any) -> None:
-        """Adds the prism over a convex outline (v, 2) between two heights [m]."""
         mesh = self._spec.add_mesh(name=f"prism_{len(self._spec.meshes)}")
         mesh.uservert = np.concatenate(
             [np.column_stack([corners, np.full(len(corners), height)]) for height in z]
@@ -154,10 +137,7 @@ def quaternion(heading: float) -> list[float]:
 
 
 def convex_parts(outline: Array) -> list[Array]:
-    """Splits an outline (V, 2), counter-clockwise, into convex outlines (v, 2) that fill it.
-
-    One that is not convex is cut into triangles by ear clipping (Meisters 1975).
-    """
+    """Splits an outline (V, 2) into convex ones, if need be by ear clipping (Meisters 1975)."""
     if len(convex_hull(outline)) == len(outline):
         return [outline]
     rest, parts = list(range(len(outline))), []

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, ConfigError
@@ -15,18 +15,19 @@ from nics_drl_bridge.extras.mujoco import scenery
 from nics_drl_bridge.extras.mujoco.machines import Machine, Physics, build_machine, load_mujoco
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
 from nics_drl_bridge.interface import Array
+from nics_drl_bridge.lidar.exact_kernels import RADIUS
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.sim.device import Driven, DrivenSimulator
+from nics_drl_bridge.sim.device import DrivenSimulator
 from nics_drl_bridge.sim.scenes import Scenes
-from nics_drl_bridge.sim.state import State
 from nics_drl_bridge.sim.world import World
 
 ENCODER_PERIOD_S = 0.01  # approximate period of encoder readings and of updates of moving obstacles
 LARGEST_TILT_RAD = 0.5
 SETTLING_S = 0.5
+MOTION = ("pose", "twist", "state")
 
 
 @dataclass(frozen=True)
@@ -99,10 +100,7 @@ class Rig:
 
 
 class MujocoRobot:
-    """A robot on an infinite floor, moved only by its motors and by contact.
-
-    Raises ConfigError if MuJoCo is not installed, or the spec lacks a parameter of the machine.
-    """
+    """A robot on an infinite floor, moved by its motors and by contact; see `build_machine`."""
 
     def __init__(self, spec: RobotSpec, physics: Physics | None = None) -> None:
         self._mujoco = load_mujoco()
@@ -142,7 +140,7 @@ class MujocoRobot:
         self._mujoco.mj_step(self._model, self._data, nstep=steps)
 
 
-class MujocoSimulator:
+class MujocoSimulator(DrivenSimulator):
     """One world of robots in MuJoCo, with motors, wheels and contact.
 
     Scenes, moving obstacles, lidar and odometry noise are those of the FastSimulator for the same
@@ -160,86 +158,65 @@ class MujocoSimulator:
         physics: Physics | None = None,
     ) -> None:  # fmt: skip
         self._mujoco = load_mujoco()
-        self.model, self.world = model, world
         physics = physics or Physics()
-        self._parts, self._steps, timestep = divide(model.control_period, physics.timestep)
+        self._subperiods, self._steps, timestep = divide(model.control_period, physics.timestep)
         self._physics = replace(physics, timestep=timestep)
         alone = MujocoRobot(model.robot, self._physics)
         self._machine, self._rest = alone.machine, alone.rest
         self._twist = textbook(model.robot).twist
-        self._driven = DrivenSimulator(model, world, robots, renderer)
+        super().__init__(model, world, robots=robots, renderer=renderer)
         self.reset([0])
 
-    @property
-    def data(self) -> State:
-        """All state; `pose`, `twist` and others are (1, M, ...), see `State`."""
-        return self._driven.fast.data
-
-    @property
-    def readings(self) -> dict[str, NDArray[np.float32]]:
-        """Name of a further sensor -> (1, M, S) its readings."""
-        return self._driven.fast.readings
-
-    @property
-    def goals(self) -> Array:
-        """(1, M, 2) goals of the episode [m]."""
-        return self._driven.fast.goals
-
-    @property
-    def obstacles(self) -> Array:
-        """(1, K, 7) current obstacles, see `FastSimulator.obstacles`."""
-        return self._driven.fast.obstacles
-
-    def scenes(self, seeds: ArrayLike) -> Scenes:
-        """Scenes that `reset` would start with for seeds (n,)."""
-        return self._driven.fast.scenes(seeds)
-
-    def reset(self, seeds: ArrayLike, starts: ArrayLike | None = None) -> Scenes:
+    def reset(
+        self, seeds: ArrayLike, worlds: ArrayLike | None = None, starts: ArrayLike | None = None
+    ) -> Scenes:
         """Begins the episode of a seed (1,), at poses (1, M, 3); see `FastSimulator.reset`."""
-        scenes = self._driven.reset(seeds, starts)
-        sampler = self._driven.fast.sampler
-        moving = np.array([motion is not None for motion in sampler.motions], np.bool_)
-        bodies = scenes.bodies[0]
-        walls, grid = self.world.all_walls(), self.world.grid
-        place = scenery.Scenery(walls, grid, sampler.shapes, bodies, moving)
-        spec, robots = self.model.robot, self.data.pose.shape[1]
+        scenes = super().reset(seeds, worlds, starts)
+        spec, robots, bodies = self.model.robot, self.data.pose.shape[1], scenes.bodies[0]
         compiled = self._simulation = scenery.compile_scene(
-            self._mujoco, self._machine, footprint_shape(spec), robots, place, self._physics
-        )
+            self._mujoco, self._machine, self._physics, footprint_shape(spec), robots, self.world,
+            self.sampler, bodies,
+        )  # fmt: skip
         self._data = self._mujoco.MjData(compiled)
         self._rigs = [Rig(spec, self._machine, compiled, m) for m in range(robots)]
-        self._mocap = [
-            (k, int(compiled.body(scenery.obstacle_name(k)).mocapid[0]))
-            for k in np.flatnonzero(moving & (bodies[:, 5] > 0.0)).tolist()
-        ]
+        there = np.flatnonzero(bodies[:, RADIUS] > 0.0).tolist()
+        ids = [int(compiled.body(f"{scenery.OBSTACLE_NAME}{k}").mocapid[0]) for k in there]
+        self._mocap = [(k, one) for k, one in zip(there, ids, strict=True) if one >= 0]
         self._bumper_of = scenery.bumpers(compiled, robots)
         for rig, pose in zip(self._rigs, self.data.pose[0], strict=True):
             rig.put(self._data, self._rest, pose)
-        self._mujoco.mj_forward(self._simulation, self._data)
+        self._mujoco.mj_forward(compiled, self._data)
         return scenes
 
     def step(self, commands: ArrayLike) -> None:
         """Moves the world by one control period; commands (1, M, C) are clipped to their limits.
 
-        Raises ConfigError for a wrong shape; BackendError for NaN, or a robot that has fallen over.
+        Raises ConfigError for a wrong shape; BackendError for NaN, for a robot that fell over
+        without a collision, or if the motion diverges.
         """
         commands = np.asarray(commands, dtype=np.float64)
-        shape = (1, self.data.pose.shape[1], len(self.model.robot.command))
+        shape = (1, len(self._rigs), len(self.model.robot.command))
         if commands.shape != shape:
             raise ConfigError(f"commands are {commands.shape}; they must be {shape}.")
         for rig, command in zip(self._rigs, commands[0], strict=True):
             rig.command(self._data, command)
-        self._driven.begin_period()
-        self._driven.end_period(self._move())
-        self._require_sane()
+        self.begin_period()
+        self._move()
+        for rig, collided in zip(self._rigs, self.data.collided[0], strict=True):
+            if not collided:
+                rig.require_upright(self._data)
+        if any(warning.number for warning in self._data.warning):
+            raise BackendError(
+                f"MuJoCo warns at {self._data.time:.2f} s that the motion of robot "
+                f"{self.model.robot.name!r} diverges; shorten the timestep of its Physics."
+            )
 
-    def _move(self) -> Driven:
-        """Runs MuJoCo for one control period."""
-        rigs, data, part_s = self._rigs, self._data, self.model.control_period / self._parts
-        wheels, counted = self._driven.wheels.copy(), np.zeros((len(rigs), 3))
+    def _move(self) -> None:
+        rigs, data, part_s = self._rigs, self._data, self.model.control_period / self._subperiods
+        wheels, counted = self.wheels.copy(), np.zeros((len(rigs), 3))
         touched = np.zeros(len(rigs), np.bool_)
         turned = [rig.encoders(data) for rig in rigs]
-        for part in range(self._parts):
+        for part in range(self._subperiods):
             self._place_obstacles((part + 1) * part_s)
             self._mujoco.mj_step(self._simulation, data, nstep=self._steps)
             bumped = self._bumper_of[data.contact.geom.ravel()]
@@ -252,35 +229,18 @@ class MujocoSimulator:
             counted = self._twist(np.array(means))
             wheels = geometry.compose(wheels, geometry.exp(counted * part_s))
         readings = [rig.read(data) for rig in rigs]
-        pose, twist, state = (
-            np.array([getattr(reading, name) for reading in readings])
-            for name in ("pose", "twist", "state")
-        )
-        return Driven(pose, twist, state, wheels, counted, touched)
+        pose, twist, state = (np.array([getattr(r, n) for r in readings]) for n in MOTION)
+        self.end_period(pose, twist, state, wheels, counted, touched)
 
     def _place_obstacles(self, time: float) -> None:
-        bodies = self._driven.move_obstacles(time)
+        bodies = self.move_obstacles(time)
         for k, mocap in self._mocap:
             self._data.mocap_pos[mocap, :2] = bodies[k, :2]
             self._data.mocap_quat[mocap] = scenery.quaternion(bodies[k, 2])
 
-    def _require_sane(self) -> None:
-        """Raises BackendError for a robot that fell over without a collision, or for divergence."""
-        for rig, collided in zip(self._rigs, self.data.collided[0], strict=True):
-            if not collided:
-                rig.require_upright(self._data)
-        if any(warning.number for warning in self._data.warning):
-            raise BackendError(
-                f"MuJoCo warns at {self._data.time:.2f} s that the motion of robot "
-                f"{self.model.robot.name!r} diverges; shorten the timestep of its Physics."
-            )
-
 
 def divide(period: float, longest: float) -> tuple[int, int, float]:
-    """Divides a control period [s] into time steps of at most `longest` [s].
-
-    Returns the number of parts of about `ENCODER_PERIOD_S`, time steps per part, and the step [s].
-    """
+    """Returns parts of a period of about `ENCODER_PERIOD_S`, steps per part, and the step [s]."""
     parts = max(1, round(period / ENCODER_PERIOD_S))
     steps = max(1, math.ceil(period / parts / longest - 1e-6))
     return parts, steps, period / parts / steps
@@ -307,10 +267,5 @@ def record(
         states.append(reading.state)
         reading = robot.step(command, dt)
     t = np.asarray(np.arange(len(commands)) * dt, dtype=np.float64)
-    return Recording(
-        Stream(t, commands),
-        Stream(t, np.array(poses)),
-        Stream(t, np.array(states)),
-        source=f"MuJoCo {spec.name}",
-        variables=spec.variable_names,
-    )
+    drive = Stream(t, commands), Stream(t, np.array(poses)), Stream(t, np.array(states))
+    return Recording(*drive, source=f"MuJoCo {spec.name}", variables=spec.variable_names)

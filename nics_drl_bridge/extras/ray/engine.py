@@ -162,10 +162,7 @@ Batch = dict[str, Any]
 
 
 class ActorCritic(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
-    """`Actor` and a critic of the same widths, as a module of RLlib.
-
-    `model_config` contains `hidden`, `normaliser` and `log_std`, see `Actor` and `PpoSettings`.
-    """
+    """`Actor` and a critic alike; `model_config` holds `hidden`, `normaliser` and `log_std`."""
 
     def setup(self) -> None:
         """Builds the layers."""
@@ -323,8 +320,7 @@ class Learning:
                 self._check_silence(now - heard, about)
                 continue
             heard = now
-            progress = self._progress(first, now - begin)
-            tell(progress)
+            tell(progress := self._progress(first, now - begin))
             for name in ("success", "collision", "steps_per_s", "env_share"):
                 logger.record(f"rollout/{name}", getattr(progress, name))
             logger.dump(self.steps)
@@ -335,7 +331,6 @@ class Learning:
         logger.close()
 
     def _take(self, result: Mapping[str, Any]) -> None:
-        """Adds the results of a roll-out of all env runners."""
         found = result.get(ENV_RUNNER_RESULTS, {})
         self.steps += int(found.get(NUM_ENV_STEPS_SAMPLED, 0))
         self.stepping_s += float(found.get(STEPPING, 0.0)) / self.runners
@@ -353,27 +348,17 @@ class Learning:
             )
 
     def _progress(self, first: int, taken: float) -> Progress:
-        ended, success, collision = np.sum(list(self.recent), axis=0)
-        return Progress(
-            self.seed,
-            self.steps,
-            self.settings.steps,
-            float(success / ended) if ended else np.nan,
-            float(collision / ended) if ended else np.nan,
-            (self.steps - first) / taken,
-            self.stepping_s / taken,
-        )
+        ended, *counts = np.sum(list(self.recent), axis=0)
+        success, collision = (float(n / ended) if ended else np.nan for n in counts)
+        speed, busy = (self.steps - first) / taken, self.stepping_s / taken
+        return Progress(self.seed, self.steps, self.settings.steps, success, collision, speed, busy)
 
     def save(self, about: dict[str, Any]) -> None:
         """Saves network and optimiser."""
-        content = {
-            "format": FORMAT,
-            "about": json.dumps(about),
-            "steps": self.steps,
-            "network": self.module.state_dict(),
-            "optimiser": self.learner.get_optimizer().state_dict(),
-        }
-        write_content(self.path, content)
+        content = {"format": FORMAT, "about": json.dumps(about), "steps": self.steps}
+        optimiser = self.learner.get_optimizer().state_dict()
+        states = {"network": self.module.state_dict(), "optimiser": optimiser}
+        write_content(self.path, content | states)
 
     def resume(self, content: dict[str, Any]) -> None:
         """Continues with network and optimiser of a checkpoint; the worlds start afresh."""
@@ -425,7 +410,6 @@ def _config(
     settings: TrainingSettings, seed: int, done: int, normaliser: tuple[Array, Array],
     spaces: tuple[gymnasium.Space[Any], gymnasium.Space[Any]],
 ) -> PPOConfig:  # fmt: skip
-    """Translates the settings into RLlib's configuration."""
     chosen, left = settings.ppo, max(settings.steps - done, 1)
     rate = chosen.learning_rate
     now = rate * max(1.0 - done / settings.steps, train_algorithms.LEAST_RATE)

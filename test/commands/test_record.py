@@ -3,14 +3,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from nics_drl_bridge.commands import cli, model
 from nics_drl_bridge.errors import BackendError, ConfigError
-from nics_drl_bridge.nodes import recorder
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import load_robot
 
@@ -88,42 +87,32 @@ def test_what_can_not_be_done_is_one_sentence(tmp_path, words, hint):
     assert os.listdir(tmp_path) == ["taken.npz"]
 
 
-def test_an_order_becomes_parameters_and_arguments_of_the_node():
-    order = recorder.RecordOrder("mecanum", Path("drive.npz"), bound=3.0, use_sim_time=True)
-    assert order.parameters["use_sim_time"] is True
-    assert (order.parameters["robot"], order.parameters["bound"]) == ("mecanum", 3.0)
-    assert order.arguments == ["nics"]
-    named = replace(order, namespace="/bot/", remap=("odom:=/wheels",))
-    assert named.arguments == ["nics", "--ros-args", "-r", "__ns:=/bot", "-r", "odom:=/wheels"]
+def test_options_become_arguments_of_the_node():
+    assert model.node_arguments("", ()) == ["nics"]
+    named = model.node_arguments("/bot/", ("odom:=/wheels",))
+    assert named == ["nics", "--ros-args", "-r", "__ns:=/bot", "-r", "odom:=/wheels"]
     with pytest.raises(ConfigError, match="--remap 'odom=wheels': must be NAME:=OTHER"):
-        _ = replace(order, remap=("odom=wheels",)).arguments
+        model.node_arguments("", ("odom=wheels",))
 
 
 def test_the_summary_tells_each_command_and_the_next_step():
-    order = recorder.RecordOrder("ackermann", Path("runs/drive.npz"))
+    given = {"robot": "ackermann", "out": "runs/drive.npz"}
     drive = record(CAR, np.random.default_rng(0), duration=30.0)
-    measured, speed, steering, after = recorder.summary(drive, CAR, order)
+    measured, speed, steering, after = model.drive_summary(drive, given)
     assert measured.startswith("measured: a path of ")
     assert speed.startswith("speed_command: moved from 0.0")
     assert "on its own" in steering
     assert after == "next: nics generate runs/drive.npz --robot ackermann --out drive_model"
 
 
+@pytest.mark.ros
 @pytest.mark.parametrize("complete", [True, False])
-def test_an_outcome_becomes_lines_or_an_error(monkeypatch, complete):
-    class Node:
-        failure = None
-
-        @classmethod
-        def record(cls, *_):
-            return type(
-                "Outcome", (),
-                {"complete": complete, "failure": cls.failure, "recording": None, "line": "over"},
-            )  # fmt: skip
-
-    monkeypatch.setattr(recorder, "import_module", lambda _: Node)
-    order = recorder.RecordOrder("ackermann", Path("drive.npz"))
-    assert recorder.drive(order) == (("over",), complete)
-    Node.failure = BackendError("odom")
-    with pytest.raises(BackendError, match=r"^over$"):
-        recorder.drive(order)
+def test_an_outcome_becomes_lines_or_an_error(monkeypatch, tmp_path, complete):
+    record_node = pytest.importorskip("nics_drl_bridge.nodes.record_node")
+    order = ["record", "--yes", "--out", str(tmp_path / "drive.npz")]
+    for failure, code in ((None, 0 if complete else 130), (BackendError("odom"), 2)):
+        outcome = record_node.DriveResult(complete, failure, None, "over")
+        monkeypatch.setattr(record_node, "record", lambda *_, outcome=outcome: outcome)
+        done = CliRunner().invoke(cli.app, order)
+        assert done.exit_code == code
+        assert done.output.endswith("over\n")
