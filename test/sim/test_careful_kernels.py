@@ -169,7 +169,8 @@ SHAPES = [CIRCLE, PLATE, HOOK, SEGMENT]
 MORE = {"marks": pytest.mark.campaign}
 FOOTPRINTS = [
     pytest.param(0.01, **MORE, id="1cm"), pytest.param(0.1, id="10cm"),
-    pytest.param(0.5, **MORE, id="50cm"), pytest.param(BAR, id="bar"), pytest.param(DART, id="dart"),
+    pytest.param(0.5, **MORE, id="50cm"), pytest.param(BAR, id="bar"),
+    pytest.param(DART, id="dart"),
 ]  # fmt: skip
 
 
