@@ -149,11 +149,11 @@ def builtin_model(robot: str) -> SimulatorModel:
 
 
 def open_model(name: str | Path) -> SimulatorModel:
-    """Opens a model by its folder, or by the name of a shipped robot (`ackermann`)."""
+    """Opens a model by its folder, or that of a shipped robot (`ackermann`) or robot's YAML file."""
     name = str(name)
     if Path(name).is_dir():
         return load_model(name)
-    if "/" in name:
+    if "/" in name and not name.endswith(".yaml"):
         raise ModelError(f"{name}: no such folder; make one with `nics generate`.")
     try:
         return builtin_model(name)

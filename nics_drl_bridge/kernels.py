@@ -2,8 +2,9 @@
 
 numba keeps machine code beside the source and checks the file of the function itself. A kernel
 calls others and uses constants of others, so here the code is kept as long as nothing changed in
-any module of the package that its own module imports, directly or not. This is decided by content:
-an edit, an update and another branch compile what they must, and nothing else.
+any module that its own module imports, directly or not: of this package, or of the folders in which
+a kernel of your own lies. This is decided by content: an edit, an update and another branch compile
+what they must, and nothing else.
 
 When compiling takes longer than `PATIENCE_S`, a line on standard error says how many kernels are
 compiled, and about how long that takes.
@@ -34,11 +35,11 @@ from numba.core.sigutils import normalize_signature
 
 PACKAGE = Path(__file__).parent
 PATIENCE_S = 2.0
+SECONDS_EACH = 0.5  # typical for a kernel with what only it calls [s]
 KERNELS: list[Any] = []
 """Every kernel that was imported so far, as numba's dispatchers."""
 _IMPORT = re.compile(
-    rf"^[ \t]*(?:from[ \t]+({PACKAGE.name}[.\w]*)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)"
-    rf"|import[ \t]+({PACKAGE.name}[.\w]*))",
+    r"^[ \t]*(?:from[ \t]+([.\w]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)|import[ \t]+([^\n]*))",
     re.MULTILINE,
 )
 _ALIAS = re.compile(r"\bas\s+\w+")
@@ -202,7 +203,7 @@ class _InnerCache(_Cache):
 
 @cache
 def digest_of(module: Path) -> str:
-    """SHA-256 of a module and of all modules of the package that it imports, directly or not."""
+    """SHA-256 of a module and of all modules that it imports, directly or not; no library."""
     files, left = set[Path](), [module]
     while left:
         file = left.pop()
@@ -220,14 +221,23 @@ def _read(file: Path) -> str:
 
 @cache
 def imports_of(file: Path) -> tuple[Path, ...]:
-    """The modules of the package that a file imports, wherever it does."""
-    found = []
+    """The modules that a file imports, wherever it does: of the package and of its own folders."""
+    own = file.is_relative_to(PACKAGE)
+    top = next(folder for folder in file.parents if not (folder / "__init__.py").is_file())
+    found = list[Path]()
     for origin, names, plain in _IMPORT.findall(_read(file)):
-        module = (origin or plain).split(".")[1:]
-        found.append(module)
-        found += [[*module, name] for name in re.findall(r"\w+", _ALIAS.sub("", names))]
-    places = (PACKAGE.joinpath(*parts).with_suffix(".py") for parts in found if parts)
-    return tuple(place for place in places if place.is_file())
+        for module in re.findall(r"[.\w]+", _ALIAS.sub("", origin or plain)):
+            name = module.lstrip(".")
+            root = file.parents[len(module) - len(name) - 1] if name != module else top
+            if name == module and name.split(".")[0] == PACKAGE.name:
+                root = PACKAGE.parent
+            elif own and name == module:
+                continue
+            place = root.joinpath(*name.split("."))
+            found += [place, *(place / each for each in re.findall(r"\w+", _ALIAS.sub("", names)))]
+            found += [place / "__init__"] if root != PACKAGE.parent and not own else []
+    files = (place.with_suffix(".py") for place in found if place not in {top, PACKAGE})
+    return tuple(file for file in files if file.is_file())
 
 
 class _Compiling(event.Listener):  # type: ignore[misc]
@@ -252,7 +262,7 @@ class _Compiling(event.Listener):  # type: ignore[misc]
             if spent > PATIENCE_S and not self.quiet:
                 self.quiet = True
                 left = sum(not each.is_warm for each in KERNELS)
-                seconds = left * spent / max(self.count, 1)
+                seconds = left * SECONDS_EACH
                 sys.stderr.write(
                     f"nics_drl_bridge: compiling up to {left} kernels, once on this machine: about "
                     f"{seconds:.0f} s\n"

@@ -133,3 +133,24 @@ def test_imports_are_read_in_every_spelling(tmp_path):
     assert found == {
         "geometry.py", "random_kernels.py", "robot/kernels.py", "robot/spec.py", "errors.py",
     }  # fmt: skip
+
+
+def test_a_kernel_of_ones_own_is_made_of_the_files_beside_it(tmp_path):
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    for name, text in {
+        "__init__.py": "",
+        "main_kernels.py": "from .helpers import half\nimport consts, numpy as np\n",
+        "helpers.py": "from nics_drl_bridge import geometry\nfrom . import more\n", "more.py": "",
+        "../consts.py": "import mine.deep as deep\n", "deep.py": "",
+    }.items():  # fmt: skip
+        (folder / name).write_text(text)
+    found, left = set(), [folder / "main_kernels.py"]
+    while left:
+        for each in kernels.imports_of(left.pop()):
+            if each not in found and tmp_path in each.parents:
+                left.append(each)
+            found.add(each)
+    names = {each.name for each in found if tmp_path in each.parents}
+    assert names - {"__init__.py"} == {"helpers.py", "more.py", "consts.py", "deep.py"}
+    assert kernels.PACKAGE / "geometry.py" in found

@@ -27,6 +27,7 @@ TURN_SCALE_M = 0.2  # a yaw rate counts as the speed at this distance
 DISTINCT = 4.0  # the second direction of motion must exceed the noise by this factor
 MIN_SECOND = 0.05  # it must have at least this share of the size of the first
 STILL = 1e-3
+FLAT = 0.02  # less of the direction without extent lies in the plane: it only never turned
 MIN_LENGTH = 1e-4  # m, rad
 REGULAR = 0.8
 BLOCKS = 8
@@ -83,7 +84,8 @@ def mounting_without_lateral_motion(motion: TwistIntervals, forward: Array) -> M
     The lateral speed of the tracked point is then yaw rate x lever arm:
     `cos(rotation) uy - sin(rotation) ux - lever_x wz = 0`, the direction in which the twists
     have no extent. On a path of a single curvature, rotation and lever arm can't be separated,
-    and the lever arm is set to zero. The lever arm along y remains unknown. None if nothing moved.
+    and the lever arm is set to zero. The lever arm along y remains unknown. None if nothing
+    moved, or it moved sideways as freely as ahead.
 
     Of the commanded or measured forward speed (n,) only the sign matters.
     """
@@ -99,6 +101,8 @@ def mounting_without_lateral_motion(motion: TwistIntervals, forward: Array) -> M
     else:
         normal = axes[2]
         flat = float(np.hypot(normal[0], normal[1]))
+        if flat < FLAT:
+            return None
         sigma = size[2] / size[1] / np.sqrt(len(rows)) / flat
         travel = float(np.arctan2(-normal[0], normal[1]))
         lever, lever_sigma = -float(normal[2]) * TURN_SCALE_M / flat, sigma * TURN_SCALE_M

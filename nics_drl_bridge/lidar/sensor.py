@@ -125,9 +125,16 @@ def sensor_of(given: Sensor | Mapping[str, Any]) -> Sensor:
 
 
 def load_sensor(file: Path) -> Sensor:
-    """Reads a sensor from a YAML file. Raises ConfigError for what is wrong with it."""
+    """Reads a sensor from a YAML file. Raises ConfigError for what is wrong with it.
+
+    The path in a `kind` counts from the YAML file, or from where the program runs.
+    """
     try:
-        return sensor_of(parse_yaml(read_text(file), str(file)))
+        given = parse_yaml(read_text(file), str(file))
+        place, colon, name = str(given.get("kind")).rpartition(":")
+        if colon and (beside := file.parent / place).is_file():
+            given["kind"] = f"{beside.resolve()}:{name}"
+        return sensor_of(given)
     except ConfigError as error:
         known = str(error).startswith(str(file))
         raise error if known else ConfigError(f"{file}: {error}") from None
