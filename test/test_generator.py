@@ -326,6 +326,11 @@ def test_a_model_is_opened_by_folder_or_by_the_name_of_a_robot(saved):
     assert open_model(str(saved)).fingerprint == open_model("ackermann").fingerprint
 
 
+def test_a_robots_file_is_a_model_by_any_path(tmp_path):
+    shutil.copy(config_dir() / "robots" / "differential.yaml", tmp_path / "mine.yaml")
+    assert open_model(tmp_path / "mine.yaml").robot.name == "differential"
+
+
 @pytest.mark.parametrize(
     ("name", "sentence"),
     [

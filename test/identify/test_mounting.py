@@ -5,7 +5,11 @@ import pytest
 
 from identify.drives import drive
 from nics_drl_bridge.identify.drive import Drive, TwistIntervals
-from nics_drl_bridge.identify.mounting import Mounting, jackknifed
+from nics_drl_bridge.identify.mounting import (
+    Mounting,
+    jackknifed,
+    mounting_without_lateral_motion,
+)
 
 
 def mean_of_twists(_, twists: TwistIntervals) -> Mounting:
@@ -40,3 +44,10 @@ def test_what_lasts_for_a_block_widens_the_uncertainty(mecanum):
 def test_a_drive_that_shows_nothing_has_no_mounting(mecanum):
     driven = Drive(drive(mecanum, duration=20.0), mecanum)
     assert jackknifed(driven, driven.twists, 0.0, lambda *_: None) is None
+
+
+def test_a_robot_that_keeps_its_heading_and_goes_anywhere_tells_nothing_of_its_mounting():
+    course, n = np.linspace(0.0, 6.0, 50), np.arange(50.0)
+    twist = np.stack([np.cos(course), np.sin(course), 0.0 * course], axis=1)
+    motion = TwistIntervals(n, n + 1.0, twist)
+    assert mounting_without_lateral_motion(motion, np.ones(50)) is None

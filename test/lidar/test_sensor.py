@@ -16,7 +16,7 @@ from nics_drl_bridge.errors import BridgeError, ConfigError, PolicyError
 from nics_drl_bridge.generator import load_model, save_model
 from nics_drl_bridge.lidar.further_lidar import FurtherLidar
 from nics_drl_bridge.lidar.scanner import Scanner
-from nics_drl_bridge.lidar.sensor import sensor_of
+from nics_drl_bridge.lidar.sensor import load_sensor, sensor_of
 from nics_drl_bridge.lidar.table import LidarTable
 from nics_drl_bridge.policy.contract import contract_of, read_contract
 from nics_drl_bridge.sim.simulator import FastSimulator
@@ -77,6 +77,13 @@ def sonar(tmp_path):
     file = tmp_path / "sonar.py"
     file.write_text(SONAR)
     return sensor_of({"kind": f"{file}:Nearest", "name": "sonar", "reach": 4.0})
+
+
+def test_the_file_of_a_kind_lies_beside_the_yaml_that_names_it(tmp_path):
+    (tmp_path / "nearest.py").write_text(SONAR)
+    (tmp_path / "sonar.yaml").write_text("{kind: 'nearest.py:Nearest', name: sonar}\n")
+    sensor = load_sensor(tmp_path / "sonar.yaml")
+    assert sensor.kind == f"{tmp_path}/nearest.py:Nearest"
 
 
 def test_a_second_lidar_scans_what_the_exact_scanner_sees_from_its_place(model):
