@@ -16,10 +16,8 @@ from nics_drl_bridge.interface import Array
 from nics_drl_bridge.robot.spec import CommandVariable, RobotSpec
 
 IMPLAUSIBLE = 10.0  # a command beyond this multiple of its limit is a fault, and refused
-LEAST_STEP_S = 1e-3
-"""Motions closer in time than this are not published: their derivatives would be noise."""
-PERIOD_S = 0.02
-"""Period of the gate's ticks [s]. A limit that allows the whole range within one is a typo."""
+LEAST_STEP_S = 1e-3  # motions closer in time are not published: their derivatives would be noise
+PERIOD_S = 0.02  # of the gate's ticks [s]; a limit that allows the whole range within one is a typo
 SNAP = 1e-12  # a value this close to its target, as a share of the greatest value, has reached it
 GREATEST = 1e300  # numbers are clipped to this before a multiplication: inf times 0 would be NaN
 STILL = 1e-9
@@ -76,17 +74,14 @@ class Limits:
 def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
     """Reads the limits of a robot from a shipped file in `config/limits`, or a YAML file.
 
-    Raises:
-        ConfigError: a key is missing or unknown; the file is for another robot; a limit exceeds
-            what the robot or a period of the gate allows, or would never let the robot move.
+    ConfigError names the key: one is missing or unknown, the robot is another one, or a limit
+    exceeds what the robot or a period of the gate allows, or would never let the robot move.
     """
     path = find_config(name, "limits")
     file = load_yaml(path, LimitsFile)
     if file.robot != robot.name:
-        raise ConfigError(
-            f"{path}: key 'robot': the limits are for {file.robot!r}, not for {robot.name!r}; name "
-            "the file of this robot."
-        )
+        other = f"the limits are for {file.robot!r}, not for {robot.name!r}"
+        raise ConfigError(f"{path}: key 'robot': {other}; name the file of this robot.")
     names = [variable.name for variable in robot.command]
     for given in file.commands:
         if given not in names:
@@ -117,9 +112,8 @@ def _check(key: str, limit: CommandLimit, variable: CommandVariable) -> None:
         ("max", limit.max, limit.max > high, f"at most {high:g}"),
     ):
         if beyond:
-            raise ConfigError(
-                f"{key}.{name}': {value:g} {unit} is beyond the robot's own limit; give {bound}."
-            )
+            fault = f"{value:g} {unit} is beyond the robot's own limit"
+            raise ConfigError(f"{key}.{name}': {fault}; give {bound}.")
     span, far = high - low, max(-limit.min, limit.max)
     for name, order, per in (("rate", 1, "/s"), ("jerk", 2, "/s^2")):
         value, most = getattr(limit, name), span / PERIOD_S**order

@@ -13,8 +13,6 @@ compared with some older ones by odometry.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -54,10 +52,7 @@ def remember(config: GateConfig, state: GateState, scan: Scan) -> tuple[View, ..
 
 
 def movers(config: GateConfig, shield: ShieldConfig, views: tuple[View, ...]) -> Flags:
-    """Returns which beams (B,) of the newest view end on something that moves.
-
-    A single beam is noise: a neighbour has to agree.
-    """
+    """Returns which beams (B,) of the newest view end on movers; a neighbour has to agree."""
     newest, angles = views[-1], config.beam_angles
     marked = np.zeros(len(newest.ranges), np.bool_)
     if len(angles) < 2 or shield.obstacle_speed == 0.0:
@@ -91,10 +86,7 @@ def too_close(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: F
 
 
 def unknown(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags) -> Array:
-    """Returns a wall (P, 3) on the footprint wherever too many beams, or all, are unknown.
-
-    So the robot does not drive into what it can't see, but can drive away from it.
-    """
+    """Returns a wall (P, 3) on the footprint wherever too many beams, or all, are unknown."""
     blocked = np.linspace(-np.pi, np.pi, len(ranges), endpoint=False)
     angles = config.beam_angles[~np.isnan(ranges)] + config.mount[2]
     known = np.sort(np.mod(angles + np.pi, 2.0 * np.pi) - np.pi)
@@ -109,8 +101,7 @@ def unknown(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Fla
     return np.stack([*wall, np.zeros_like(blocked)], axis=1)
 
 
-Evidence = Callable[[GateConfig, ShieldConfig, Ranges, Flags], Array]
-EVIDENCE: tuple[Evidence, ...] = (returns, too_close, unknown)
+EVIDENCE = (returns, too_close, unknown)
 
 
 def _ends(config: GateConfig, angles: Array, ranges: Array, speeds: Array | float) -> Array:
@@ -141,10 +132,7 @@ def rehearse() -> None:
 
 
 def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
-    """Returns the greatest part of a motion from which the robot can still stop in time.
-
-    If necessary, it brakes harder than the limits of rate and jerk allow.
-    """
+    """Returns the greatest part of a motion that can be stopped, past limits of rate at need."""
     if config.shield is None or config.limits is None or state.obstacles is None:
         return motion
     speeds = config.limits.linear | config.limits.turn
@@ -203,10 +191,8 @@ def _family(
     if odometry is not None:
         twists = np.concatenate([twists, odometry[None]])
     low, high = twists.min(axis=0), twists.max(axis=0)
-    axes = [
-        np.linspace(least, greatest, most if greatest > least else 1)
-        for least, greatest, most in zip(low, high, (SPEEDS, SPEEDS, TURNS), strict=True)
-    ]
+    counts = np.where(high > low, (SPEEDS, SPEEDS, TURNS), 1)
+    axes = [np.linspace(*ends) for ends in zip(low, high, counts, strict=True)]
     return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
 
 

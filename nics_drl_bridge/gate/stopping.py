@@ -72,10 +72,7 @@ def _derived(model: SimulatorModel, limits: Limits | None) -> Stopping:
 
 
 def lag(kinematics: TaylorModel) -> float:
-    """Returns the slowest time constant [s] of the model's states; a guess if none shows.
-
-    It comes from the eigenvalues, at rest, of the Jacobian of the state's rates by the state.
-    """
+    """Returns the slowest time constant [s] of the state's rates at rest; a guess if none shows."""
     states = kinematics.variables[: kinematics.state_size]
     names = [term_name(row, kinematics.variables) for row in kinematics.powers]
     own = np.zeros((len(states), len(states)))
@@ -88,10 +85,7 @@ def lag(kinematics: TaylorModel) -> float:
 
 
 def wheelbase(robot: RobotSpec) -> float:
-    """Returns the wheelbase of a robot commanded by steering angle [m]; 0 for other robots.
-
-    Raises ConfigError if the robot's file lacks it, or a command is no speed, turn rate or angle.
-    """
+    """Returns the wheelbase [m] of a car, else 0; ConfigError without it or for unknown units."""
     for variable in robot.command:
         if variable.unit not in (SPEED, TURN, ANGLE):
             raise ConfigError(

@@ -48,7 +48,7 @@ def arrived(
     if lead - arrivals.envelope > (AHEAD_S if armed else config.clock_jump_s):
         return fresh, "jumped"
     marks = _marked(arrivals, stamp_ns, now, lead, config.settle_s)
-    passed, envelope = now - arrivals.times[-1], _envelope(marks)
+    passed, envelope = now - arrivals.times[-1], max(mark[3] for mark in marks)
     if armed:
         fall = SIMULATED_LAG if config.simulated else DRIFT
         lowest, highest = arrivals.envelope - fall * passed, arrivals.envelope + DRIFT * passed
@@ -78,11 +78,8 @@ def _marked(
 
 def settled(arrivals: Arrivals) -> Arrivals:
     """Returns the arrivals with the envelope of the marked data alone, whatever it was before."""
-    return replace(arrivals, envelope=_envelope(arrivals.marks)) if arrivals.marks else arrivals
-
-
-def _envelope(marks: tuple[Mark, ...]) -> float:
-    return max(mark[3] for mark in marks)
+    leads = [mark[3] for mark in arrivals.marks]
+    return replace(arrivals, envelope=max(leads, default=arrivals.envelope))
 
 
 def age(arrivals: Arrivals, now: float) -> float:
@@ -119,13 +116,6 @@ def stamps_jumped(config: GateConfig, state: GateState, now: float) -> Cause | N
     return Cause("stamps_jumped", state.jumped, detail) if state.jumped else None
 
 
-def gap_free(arrivals: Arrivals, now: float, settle_s: float, limit: float) -> bool:
-    """True if data have arrived for the settling time without a gap longer than a limit."""
-    if not arrivals.times:
-        return False
-    return now - arrivals.unbroken_s >= settle_s and now - arrivals.times[-1] <= limit
-
-
 def rate(arrivals: Arrivals, now: float, settle_s: float) -> tuple[float, float]:
     """Returns the rate by arrival and by stamps over the settling time [Hz]; 0 if unknown."""
     first = next((mark for mark in arrivals.marks if mark[0] >= now - settle_s), None)
@@ -138,8 +128,8 @@ def rate(arrivals: Arrivals, now: float, settle_s: float) -> tuple[float, float]
 
 def creep(arrivals: Arrivals) -> float:
     """Returns by how much the later half of the marks is further ahead of the steady clock [s]."""
-    marks, half = arrivals.marks, len(arrivals.marks) // 2
-    return _envelope(marks[half:]) - _envelope(marks[:half]) if half else 0.0
+    leads, half = [mark[3] for mark in arrivals.marks], len(arrivals.marks) // 2
+    return max(leads[half:]) - max(leads[:half]) if half else 0.0
 
 
 def take_time(config: GateConfig, state: GateState, given: Input, now: float) -> GateState:

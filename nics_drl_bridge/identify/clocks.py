@@ -60,10 +60,7 @@ def delay_of_response(
     centers: tuple[float, ...] = (0.0,),
     lags: Array | None = None,
 ) -> DelayEstimate:
-    """Estimates the delay, searched around `centers` [s], with which a signal follows commands.
-
-    Also the lags of the commands that moved, unless all `lags` (S,) are known.
-    """
+    """Estimates a signal's delay around centers [s], and the moved commands' lags if unknown."""
     moved = signals.moved_inputs(command, spec)[: len(spec.state)]
     free = np.flatnonzero(moved if lags is None else [])
     base = signals.nominal_lags(spec) if lags is None else lags
@@ -271,10 +268,7 @@ def expected_speed(drive: Drive, timing: TimingEstimate) -> Array | None:
 def responses_of(
     drive: Drive, calibration: Calibration, timing: TimingEstimate, expected: Array | None
 ) -> tuple[Response, ...]:
-    """Returns the inferred states; a speed is scaled to that along the direction of travel.
-
-    `expected` (n,) is that speed over the intervals of the twists at gain 1; None if unknown.
-    """
+    """Returns the inferred states, of which a speed is scaled by that `expected` (n,) at gain 1."""
     spec = drive.spec
     if drive.recording.state is not None:
         return ()
@@ -305,10 +299,7 @@ def wheel_means(drive: Drive, calibration: Calibration) -> Array | None:
 
 
 def with_wheels(drive: Drive, calibration: Calibration) -> Calibration:
-    """Adds the scales of the wheel speeds and interchanged wheels, as far as the drive shows them.
-
-    The left wheel of interchanged wheels is faster in left turns.
-    """
+    """Adds scales of wheel speeds; the left of interchanged wheels is faster in left turns."""
     wheels = wheel_means(drive, calibration)
     if wheels is None:
         return calibration

@@ -78,10 +78,7 @@ class Drive:
 
     @cached_property
     def twists(self) -> TwistIntervals:
-        """Twists of the tracked body over intervals as long as the pose noise requires.
-
-        Between samples so far apart, motion stands out of the noise.
-        """
+        """Twists of the tracked body over spans in which motion stands out of the noise."""
         t, pose, stride, limit = self.dated.t, self.dated.values, 1, MAX_GAP_S
         if self.bursts is not None:
             limit = 1.8 * self.bursts.period_s

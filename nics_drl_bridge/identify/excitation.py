@@ -55,10 +55,7 @@ class Excitation:
 
 
 def unmoved_variables(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
-    """Returns the variables of X that stayed constant for the whole drive.
-
-    A state whose command never moved did not move either if it shows nothing but noise.
-    """
+    """Returns the variables of X that stayed constant, or show only noise without a command."""
     limits = np.array([v.max - v.min for v in (*spec.state, *spec.command)])
     spread = samples.x.std(axis=0)
     still = spread < STILL * limits

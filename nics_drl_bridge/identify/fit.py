@@ -50,10 +50,7 @@ SAME_STEP, ROUNDING_S = 1e-3, 1e-6
 
 
 def parse_alpha(text: str) -> Alpha:
-    """Parses a pruning threshold of Eq. 2.
-
-    Raises ConfigError: it is neither a number from 0 to 1 nor `auto`.
-    """
+    """Parses a pruning threshold: a number from 0 to 1, or `auto`; else ConfigError."""
     if text == "auto":
         return "auto"
     with suppress(ValueError):

@@ -46,10 +46,7 @@ TRAIN_SHARE = 2.0 / 3.0
 
 @dataclass(frozen=True)
 class Findings:
-    """Findings of the stages, in their order; None, empty or the default until they have run.
-
-    What a stage could not learn is None too, and a sentence in the notes.
-    """
+    """Findings of the stages in order; None or empty until they have run, or if not learnable."""
 
     training: Drive  # the part of the drive to learn from; repaired by `repair`
     whole: Drive  # repaired by `repair`
@@ -297,10 +294,7 @@ def identify(
 
 @one_blas_thread
 def calibrate(recording: Recording, spec: RobotSpec) -> Calibration:
-    """Estimates the corrections that a recording needs before a fit; the identity if none.
-
-    Raises RecordingError: the recording can't be used for this robot.
-    """
+    """Estimates a recording's corrections before a fit; RecordingError if it can't be used."""
     found = run(CALIBRATION, Drive(check(recording, spec), spec))
     return replace(found.calibration, notes=_sentences(found))
 

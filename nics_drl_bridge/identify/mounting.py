@@ -129,10 +129,7 @@ def lateral_lever(motion: TwistIntervals, rotation: float, speed: Array) -> tupl
 def _by_commands(
     timing: clocks.TimingEstimate, drive: Drive, twists: TwistIntervals
 ) -> Mounting | None:
-    """Estimates the mounting on an omnidirectional robot from its state, or else its commands.
-
-    None unless the robot moved along x and y and turned.
-    """
+    """Estimates an omnidirectional robot's mounting; None unless it moved along x, y and turned."""
     recording, spec = drive.recording, drive.spec
     if spec.state:
         expected = clocks.expected_states(drive, twists, timing)
@@ -193,10 +190,7 @@ Estimate = Callable[[Drive, TwistIntervals], Mounting | None]
 def jackknifed(
     drive: Drive, twists: TwistIntervals, offset: float, estimate: Estimate
 ) -> Mounting | None:
-    """Estimates a mounting, with at least the uncertainty of the delete-one-block jackknife.
-
-    The clock of the twists is `offset` [s] behind that of the drive's other streams.
-    """
+    """Estimates a mounting; delete-one-block uncertainty. Its twists' clock is `offset` behind."""
     whole = estimate(drive, twists)
     if whole is None:
         return None

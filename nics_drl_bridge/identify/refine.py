@@ -47,10 +47,7 @@ WORTH = 0.1  # terms are removed while the error rises by less than this share i
 def refined(
     linear: TaylorModel, calibration: Calibration, drive: Drive
 ) -> tuple[TaylorModel, Calibration, str]:
-    """Refines a linear fit by its predictions of the training part, and removes terms.
-
-    The sentence returned says what was done, or why it could not be.
-    """
+    """Refines a linear fit by its predictions, removes terms; a sentence tells of the result."""
     model, calibration = by_definition(linear.with_errors({}), calibration, drive.spec)
     problem = problem_of(model, calibration, drive)
     why = (
@@ -76,10 +73,7 @@ def refined(
 def by_definition(
     model: TaylorModel, calibration: Calibration, spec: RobotSpec
 ) -> tuple[TaylorModel, Calibration]:
-    """Scales an inferred speed so that vx = 1 speed, and treats lateral motion as noise.
-
-    `base_link` of a robot without a lateral command is the point without lateral motion.
-    """
+    """Scales an inferred speed to vx = 1 speed; lateral motion is noise unless commanded."""
     coefficients = model.coefficients.copy()
     if not spec.moves_sideways:
         coefficients[1] = 0.0
@@ -97,11 +91,7 @@ def by_definition(
 
 
 def merged(model: TaylorModel, linear: TaylorModel, refined: Errors) -> TaylorModel:
-    """Returns the model with the standard errors of its coefficients.
-
-    Rows that are unchanged from the linear fit keep its errors; a refined coefficient has the
-    larger of both.
-    """
+    """Adds standard errors: the linear fit's where a row is unchanged, else the larger of both."""
     first, rows = linear.named_errors, {}
     for dof, old, new in zip(model.dofs, linear.coefficients, model.coefficients, strict=True):
         before = dict(zip(linear.term_names, old, strict=True))
@@ -339,10 +329,7 @@ def _response(model: TaylorModel, i: int, response: Response) -> Response:
 
 
 def simplify(problem: Problem, refined: Refined) -> Refined:
-    """Removes terms of the body twist that hardly improve the prediction of the training part.
-
-    The term with the least weight is tried first; the rest is refined again.
-    """
+    """Removes terms of the twist that hardly improve predictions, least first; refines anew."""
     best, tried = refined, set[tuple[int, int]]()
     limit = refined.error * (1.0 + WORTH)
     while (weakest := _weakest(best, tried)) is not None:

@@ -77,10 +77,7 @@ def equations_with_errors(model: TaylorModel) -> list[str]:
 
 
 def with_error(value: float, error: float | None) -> str:
-    """Formats a number to the digits that its standard error leaves: `(4.63 +- 0.02)`.
-
-    An error that begins with a 1 has two digits. A mere rounding error is not shown.
-    """
+    """Formats a number to the digits that its standard error leaves: `(4.63 +- 0.02)`."""
     if error is None or error <= 1e-6 * value:
         return f"{value:.5g}"
     exponent = int(np.floor(np.log10(error)))
@@ -212,10 +209,7 @@ def is_useless(error: float, standing: float, path: float, radius: float) -> boo
 
 
 def why_useless(identified: Identified, spec: RobotSpec, order: int = ORDER) -> str:
-    """Returns one sentence on why a model is useless; empty if it is useful or untested.
-
-    The median counts: a single permanent jump of the pose spoils only some of the predictions.
-    """
+    """Returns a sentence on why a model is useless, by median errors; empty if it is not."""
     held_out, recording = identified.held_out, identified.recording
     if held_out is None:
         return ""

@@ -116,10 +116,7 @@ def unwrapped(pose: Array) -> Array:
 
 
 def resample(t: Array, pose: Array, at: Array, half_width: float) -> Array:
-    """Resamples poses (T, 3) with unwrapped headings at times (n,); stamps (T,) never decrease.
-
-    `half_width` [s] is that of a local parabola fitted to noisy samples; 0 interpolates.
-    """
+    """Resamples unwrapped poses (T, 3) at (n,), by parabolas over `half_width` [s] unless 0."""
     distinct = np.concatenate([[True], np.diff(t) > 0.0])
     t, pose = t[distinct], pose[distinct]
     if half_width == 0.0:

@@ -25,10 +25,7 @@ WORTH = 1e-3  # terms that lower the error by less than this share of the rates'
 
 
 def unexplained(chi: Array, signal: Array) -> Array:
-    """Returns the residual of a signal (n, D) on features (n, K) by least squares, flattened.
-
-    It is in units of each component's spread.
-    """
+    """Returns the flat residual of a signal (n, D) on features (n, K), in units of its spread."""
     spread = signal.std(axis=0)
     scaled = (signal - signal.mean(axis=0)) / np.where(spread > 1e-9, spread, 1e9)
     norm = np.linalg.norm(chi, axis=0)
@@ -104,11 +101,7 @@ def long_run(chi: Array, residual: Array) -> Array:
 
 
 def clustered_errors(jacobian: Array, residual: Array, cluster: NDArray[np.intp]) -> Array:
-    """Returns standard errors (P,) of least squares with residuals correlated within clusters (n,).
-
-    Cameron, Miller: A practitioner's guide to cluster-robust inference, 2015; corrected for few
-    clusters.
-    """
+    """Returns cluster-robust standard errors (P,) (Cameron, Miller 2015), also for few clusters."""
     groups = np.unique(cluster)
     count, terms = jacobian.shape
     if len(groups) < 2 or count <= terms:
@@ -215,10 +208,7 @@ class Curve:
 
 
 def curve(dof: str, terms: tuple[str, ...], chi: Array, target: Array) -> Curve:
-    """Returns the curve of one degree of freedom; `kept` is its knee.
-
-    The standardised features (T, n) of the n terms come with the largest weight first.
-    """
+    """Returns the curve of features (T, n), the largest weight first; `kept` is its knee."""
     squares = cross_validated(chi, target)
     error = np.sqrt(squares.mean(axis=0))
     sigma = squares.std(axis=0, ddof=1) / np.sqrt(len(squares)) / (2.0 * np.maximum(error, 1e-300))
@@ -226,11 +216,7 @@ def curve(dof: str, terms: tuple[str, ...], chi: Array, target: Array) -> Curve:
 
 
 def knee(error: Array, sigma: Array) -> int:
-    """Returns the fewest terms whose error is not significantly, or hardly, above the least.
-
-    Breiman's one-standard-error rule; Hastie, Tibshirani, Friedman: The Elements of Statistical
-    Learning, ch. 7.10.
-    """
+    """Returns the fewest terms within one standard error of the least (Breiman's rule)."""
     least = int(np.argmin(error))
     limit = error[least] + max(float(sigma[least]), WORTH * float(error[0]))
     return int(np.flatnonzero(error <= limit)[0])

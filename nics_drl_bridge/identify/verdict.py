@@ -149,10 +149,7 @@ def refuse_unexcited(excitation: Excitation, spec: RobotSpec) -> None:
 
 
 def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> Iterator[str]:
-    """Tells of inputs that the drive did not move, or not independently.
-
-    Also of states that depended on others, and of commands with two values only.
-    """
+    """Tells of inputs that were not moved, alone or at many levels, and of dependent states."""
     already = {name for r in calibration.responses for name in (r.command, r.state)}
     excitation = linear.regression.excitation
     if unmoved := ", ".join(excitation.unmoved):

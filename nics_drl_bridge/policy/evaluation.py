@@ -130,10 +130,7 @@ def drive(
 
 
 def truly_near(task: Any, poses: Array, goals: Array) -> Flags:
-    """True where robots at true poses (..., 3) are at their goals (..., 2), up to `DRIFT_M`.
-
-    Always True for tasks other than `Navigation`, whose robots have no individual goals.
-    """
+    """True where poses (..., 3) are at goals (..., 2), up to `DRIFT_M`; without goals always."""
     if not isinstance(task, Navigation):
         return np.ones(np.shape(poses)[:-1], np.bool_)
     gaps = np.hypot(*np.moveaxis(poses[..., :2] - goals, -1, 0))
@@ -233,10 +230,7 @@ def _robots(info: dict[str, Any], name: str) -> Flags:
 
 @dataclass(frozen=True)
 class ConfidenceInterval:
-    """A figure with its 95 % confidence interval.
-
-    `value` is NaN if nothing was observed; the ends are infinite for the mean of one observation.
-    """
+    """A figure, NaN if nothing was observed, with its 95 % interval, infinite for one value."""
 
     value: float
     low: float

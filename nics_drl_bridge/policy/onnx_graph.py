@@ -68,10 +68,7 @@ Fault = tuple[str, str]  # faulty field, and the reason
 
 
 def parse(data: bytes, source: str) -> Any:
-    """Parses and checks the ModelProto of a policy file's content.
-
-    Raises PolicyError if it is not an ONNX model, or one that this package does not run.
-    """
+    """Parses and checks a policy file's ModelProto; PolicyError if it is not one to be run."""
     for start, kind in OTHER_FORMATS:
         if data.startswith(start):
             reason = f"is {kind}, which is never opened; export the policy with `export_policy`."
@@ -116,10 +113,7 @@ def graph_hash(model: Any) -> str:
 
 
 def sealed(data: bytes) -> bytes:
-    """Appends to a model's bytes their checksum, as another metadata entry.
-
-    Parts of a protobuf message may be concatenated, so other programs read the file as usual.
-    """
+    """Appends a model's checksum as another metadata entry, as messages may be concatenated."""
     end = onnx.ModelProto()
     entry = end.metadata_props.add()
     entry.key, entry.value = SEAL, sha256(data)
@@ -258,10 +252,7 @@ def _tensors(graph: Any) -> Iterator[Any]:
 
 
 def check_ends(model: Any, widths: dict[str, int | None], source: str) -> None:
-    """Raises PolicyError unless inputs and outputs are those of a policy.
-
-    `widths` are those of `observation`, `action` and `command`; None: integers (n,).
-    """
+    """Raises PolicyError unless inputs and outputs have their widths; None: integers (n,)."""
     weights = {tensor.name for tensor in model.graph.initializer}
     inputs = [one for one in model.graph.input if one.name not in weights]
     for kind, ends, names in (
@@ -283,10 +274,7 @@ def check_ends(model: Any, widths: dict[str, int | None], source: str) -> None:
 
 
 def rows_at_once(model: Any, source: str) -> int:
-    """Number of observations that a graph of known operators may be given in one run.
-
-    Raises PolicyError if a size is unknown, or is more than any policy needs.
-    """
+    """Number of observations for one run; PolicyError if a size is unknown or far too large."""
     _refuse(_setting_faults(model.graph), source)
     _refuse(_integer_faults(model, source), source)
     numbers, work = _costs(model, ROWS, source)
@@ -372,10 +360,7 @@ def _work(node: Any, given: list[Shape], made: list[Shape]) -> tuple[int, int]:
 def _sizes(
     model: Any, rows: int, source: str, values: bool
 ) -> tuple[dict[str, int], dict[str, Shape]]:
-    """Type and, if known, shape of every tensor for `rows` observations.
-
-    `values`: also what follows from the values of integers.
-    """
+    """Type and known shape of every tensor for `rows` observations, or by integers' `values`."""
     bare = _without_weights(model, rows)
     try:
         graph = onnx.shape_inference.infer_shapes(bare, strict_mode=True, data_prop=values).graph

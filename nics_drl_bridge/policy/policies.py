@@ -176,10 +176,7 @@ def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None
 
 
 def open_policy(name: str, model: SimulatorModel) -> tuple[Policy, Navigation]:
-    """Opens a policy by name, with the navigation task that it is for.
-
-    Raises ConfigError, PolicyError: see `make_policy`; or the policy was trained for another task.
-    """
+    """Opens a policy as `make_policy`, with its task; PolicyError if that is no navigation."""
     if not is_policy_file(name):
         task = Navigation(model.robot, model.lidar)
         return POLICIES[name](task), task

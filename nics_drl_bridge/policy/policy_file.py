@@ -159,10 +159,7 @@ def find_policy(name: str) -> Path:
 
 
 def load_policy(path: str | Path) -> PolicyFile:
-    """Loads a policy file, by its path or the name of a shipped one, and runs every check.
-
-    Raises PolicyError if a check fails; names the field.
-    """
+    """Loads a policy file, by path or shipped name, with all checks; PolicyError has the field."""
     file = find_policy(str(path))
     source = str(file)
     try:
@@ -199,10 +196,7 @@ def policy_of(data: bytes, path: Path) -> PolicyFile:
 
 
 def open_session(data: bytes, source: str) -> Any:
-    """An onnxruntime session on one thread.
-
-    Raises ConfigError if onnxruntime is missing, PolicyError if it can't run the graph.
-    """
+    """An onnxruntime session on one thread; ConfigError without it, PolicyError by the graph."""
     try:
         import onnxruntime
     except ImportError:

@@ -32,10 +32,7 @@ ACTION_GAIN = 0.01  # initial gain of an actor's last layer: all its actions are
 def make_algorithm(
     settings: TrainingSettings, env: TrainVecEnv, seed: int, normaliser: tuple[Array, Array]
 ) -> BaseAlgorithm:
-    """Makes an untrained algorithm; `normaliser` is mean and deviation (O,) of observations.
-
-    Raises ConfigError if the algorithm does not suit the task.
-    """
+    """Makes an untrained algorithm; mean, deviation (O,); ConfigError if it suits no such task."""
     check_serves(settings, env)
     torch.set_num_threads(settings.threads)
     shared: dict[str, Any] = {"seed": seed, "device": "cpu", "stats_window_size": RECENT}
@@ -90,10 +87,7 @@ def act_of(algorithm: BaseAlgorithm | Actor) -> Act:
 
 
 class Normaliser(BaseFeaturesExtractor):
-    """First layer of actor and critic: (observation - mean) / std, cut at +-5; not trained.
-
-    Mean and std (O,) are those of `observed`; a part of the network, they can't get lost.
-    """
+    """First layer of actor and critic: (observation - mean) / std, cut at +-5; not trained."""
 
     mean: torch.Tensor
     std: torch.Tensor
@@ -129,10 +123,7 @@ def observed(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Array]:
 
 
 class Actor(torch.nn.Module):
-    """Maps observations (n, O) to raw actions (n, C), or to logits (n, A) of discrete ones.
-
-    `hidden` are the widths of the hidden layers, `normaliser` is as in `make_algorithm`.
-    """
+    """Maps observations (n, O) to raw actions (n, C), or to logits (n, A) of discrete ones."""
 
     def __init__(
         self,
@@ -159,10 +150,7 @@ class Actor(torch.nn.Module):
 
 
 def layers_of(widths: Sequence[int], gain: float) -> torch.nn.Sequential:
-    """Linear layers with tanh in between, initialised orthogonally as in Stable-Baselines3.
-
-    The gain is that of the last layer.
-    """
+    """Linear layers with tanh between, orthogonal as Stable-Baselines3's; gain of the last one."""
     layers: list[torch.nn.Module] = []
     for ins, outs in itertools.pairwise(widths):
         layers += [torch.nn.Linear(ins, outs), torch.nn.Tanh()]

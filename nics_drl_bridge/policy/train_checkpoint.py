@@ -68,10 +68,7 @@ def write_content(path: Path, content: dict[str, Any]) -> None:
 
 
 def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
-    """Reads the content of a checkpoint of a format; `about` is that of `save_checkpoint`.
-
-    Raises ConfigError if there is none, or it is damaged or of another format.
-    """
+    """Reads a checkpoint of a format; ConfigError if it is missing, damaged, or another kind."""
     if not path.is_file():
         raise ConfigError(f"{path}: no such checkpoint; leave out --resume to begin anew.")
     try:
@@ -238,10 +235,7 @@ MEMORY, DRAWN = "memory.", "drawn."
 
 
 def snapshot(env: BridgeVectorEnv) -> Arrays:
-    """Copies all that changes in a vector env, by name.
-
-    An env with the same arguments continues bit-identically from it after `restore`.
-    """
+    """Copies all that changes in a vector env, from which `restore` continues bit-identically."""
     found = dict(env.changing)
     found |= {MEMORY + name: rows for name, rows in env.memory.items()}
     found |= {DRAWN + name: rows for name, rows in env.simulator.drawn.items()}
@@ -249,10 +243,7 @@ def snapshot(env: BridgeVectorEnv) -> Arrays:
 
 
 def restore(env: BridgeVectorEnv, state: Mapping[str, NDArray[Any]]) -> None:
-    """Puts a snapshot into a vector env with the same arguments.
-
-    Raises ConfigError if the snapshot is of an env with other worlds, robots, lidar or task.
-    """
+    """Puts a snapshot into a vector env; ConfigError if its worlds, robots or task are others."""
     parts: dict[str, Arrays] = {"": {}, MEMORY: {}, DRAWN: {}}
     for name, rows in state.items():
         prefix = next((p for p in (MEMORY, DRAWN) if name.startswith(p)), "")

@@ -30,10 +30,7 @@ GOLDEN_SPREAD = 3.0
 
 
 class Deployed(torch.nn.Module):  # type: ignore[misc]
-    """Computation of the graph of a policy file, for an actor as `actor_of` returns it.
-
-    Stable-Baselines3's own recipe for ONNX omits clipping, unscaling and the normaliser.
-    """
+    """Graph of a policy file with clipping, unscaling and normaliser, around `actor_of`'s actor."""
 
     def __init__(self, actor: torch.nn.Module, task: Task, normaliser: Normaliser | None) -> None:
         super().__init__()

@@ -106,10 +106,7 @@ class TrainingSettings(Schema):
 
 
 def load_training(name: str | Path) -> TrainingSettings:
-    """Loads settings by the name of a shipped file (`navigation_differential`), or by path.
-
-    Raises ConfigError if there is no such file, or something in it is wrong.
-    """
+    """Loads settings by the name of a shipped file, or by path; ConfigError if it is wrong."""
     return load_yaml(find_config(name, "training"), TrainingSettings)
 
 

@@ -120,10 +120,7 @@ def _place(path: Path) -> Path:
 
 
 def metadata_of(folder: Path) -> dict[str, Any]:
-    """Returns a bag's metadata, read within the limits of `parse_yaml`, which rosbags lacks.
-
-    Raises ValueError if they are not such YAML, or lack the part that rosbag2 writes.
-    """
+    """Returns a bag's metadata within `parse_yaml`'s limits; ValueError if they are not whole."""
     try:
         about = parse_yaml(read_text(folder / METADATA), METADATA).get(ABOUT)
     except BridgeError as error:

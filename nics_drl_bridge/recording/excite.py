@@ -290,10 +290,7 @@ class ExpectedMotion:
     twist: Callable[[Array, Array], Array]  # state, command -> body twist
 
     def roll(self, pose: Array, state: Array, command: Array, period: float) -> tuple[Array, Array]:
-        """Rolls out commands (K, T, C), one arc each at the state in the middle of its period [s].
-
-        Returns poses (K, T + 1, 3) and states (K, T + 1, S), the given ones first.
-        """
+        """Rolls commands (K, T, C) out to poses (K, T + 1, 3) and states; one arc a period [s]."""
         poses, states = [pose], [state]
         for n in range(command.shape[1]):
             now = command[:, n]
@@ -355,10 +352,7 @@ class DrivePlan:
         return self._attempt(self._found[0])
 
     def preview(self) -> Pattern:
-        """Returns the pattern of the drive under the expected motion.
-
-        Raises ConfigError: the circle is too small for the robot to show its motion in it.
-        """
+        """Returns the pattern by the expected motion; ConfigError if the circle is too small."""
         return self._found[1]
 
     def _attempt(self, number: int) -> Exploration:

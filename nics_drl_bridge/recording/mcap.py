@@ -62,10 +62,7 @@ class _View:
 
 
 def records(data: memoryview, place: int = 0) -> Iterator[Record]:
-    """Yields the records from an offset on, until the end of the data or a footer.
-
-    Raises DamageError: a record is truncated, of an unknown kind, or shorter than its fields.
-    """
+    """Yields the records from an offset until a footer or the end; DamageError at a broken one."""
     stream = _View(data, place)
     source = cast("IO[bytes]", stream)
     reader = StreamReader(source, skip_magic=True, emit_chunks=True, record_size_limit=None)

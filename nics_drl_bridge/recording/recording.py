@@ -87,10 +87,7 @@ class Samples:
 
 
 def samples_on_one_clock(t: Array, pose: Array, state: Array, command: Array) -> Samples:
-    """Builds Samples from poses of `base_link`, states and held commands with shared stamps [s].
-
-    There is a row for each step of about the median length; gaps and repeated stamps are omitted.
-    """
+    """Builds Samples of shared stamps [s], a row per regular step, without gaps and repetitions."""
     span = np.diff(t)
     dt = float(np.median(span[span > 0.0])) if (span > 0.0).any() else 0.0
     regular = np.abs(span - dt) < IRREGULAR * dt
@@ -175,10 +172,7 @@ def _fault(stream: Stream, width: int) -> str:
 
 
 def save_recording(recording: Recording, path: str | Path) -> None:
-    """Writes a recording as `.npz`: `NAME_t` and `NAME` per stream, and `meta` as JSON text.
-
-    A checksum follows the archive, which `numpy.load` reads nevertheless.
-    """
+    """Writes `.npz`: `NAME_t`, `NAME` per stream, JSON `meta`; a checksum follows the archive."""
     streams = recording.streams
     arrays: dict[str, NDArray[Any]] = {}
     for name, stream in streams.items():
@@ -197,10 +191,7 @@ def save_recording(recording: Recording, path: str | Path) -> None:
 
 
 def load_recording(path: str | Path) -> Recording:
-    """Reads a recording written by `save_recording`.
-
-    Raises RecordingError if there is no such file, or it is not an `.npz`, damaged or incomplete.
-    """
+    """Reads a recording of `save_recording`; RecordingError if it is missing or not a whole one."""
     try:
         data = files.read_file(no_device(Path(path)))
         arrays = _arrays(data)
