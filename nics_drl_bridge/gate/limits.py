@@ -97,10 +97,8 @@ def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
     units = np.array([variable.unit for variable in robot.command])
     limits = Limits(low, high, rate, jerk, linear=units == SPEED, turn=units == TURN)
     if greatest(limits, limits.linear | limits.turn) < LEAST_MOTION:
-        raise ConfigError(
-            f"{path}: the robot could never move: none of its speeds and turn rates may reach "
-            f"{LEAST_MOTION:g}; raise a `max`."
-        )
+        fault = f"none of its speeds and turn rates may reach {LEAST_MOTION:g}"
+        raise ConfigError(f"{path}: the robot could never move: {fault}; raise a `max`.")
     return limits
 
 

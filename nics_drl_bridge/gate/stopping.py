@@ -110,10 +110,8 @@ def require_possible(config: GateConfig) -> None:
     ):
         declared = f"{topic} comes every {1.0 / rate:.3g} s ({rate:g} Hz are declared)"
         if age <= 1.0 / rate:
-            raise ConfigError(
-                f"parameter '{topic}_age': {age:g} s: {declared}, so the robot could never move; "
-                f"give more than {1.0 / rate:.3g}."
-            )
+            fault = f"{age:g} s: {declared}, so the robot could never move"
+            raise ConfigError(f"parameter '{topic}_age': {fault}; give more than {1.0 / rate:.3g}.")
         if rate * config.settle_s < LEAST_DATA:
             raise ConfigError(
                 f"{declared}, too seldom to be judged within {config.settle_s:g} s, so the robot "

@@ -158,10 +158,8 @@ def _grid(recording: Recording, calibration: Calibration) -> Array:
         first, last = max(first, recording.state.t[0]), min(last, recording.state.t[-1])
     count = int(np.floor((last - first) / step + 1e-6))
     if count < MIN_STAMPS:
-        raise RecordingError(
-            f"{recording.source}: commands and poses overlap for {max(last - first, 0.0):.2f} s "
-            "only; check that they are of one drive."
-        )
+        fault = f"commands and poses overlap for {max(last - first, 0.0):.2f} s only"
+        raise RecordingError(f"{recording.source}: {fault}; check that they are of one drive.")
     return np.asarray(first + step * np.arange(count + 1))
 
 

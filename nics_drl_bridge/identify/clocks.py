@@ -171,10 +171,8 @@ def timing_of(drive: Drive) -> TimingEstimate:
             "command; record the state too, or add `follows:` to the robot's YAML file."
         )
     if len(twists.start) < MIN_STAMPS:
-        raise RecordingError(
-            f"{place}: pose: only {len(twists.start)} usable intervals; record a drive of 20 s or "
-            "more without long gaps."
-        )
+        fault = f"pose: only {len(twists.start)} usable intervals"
+        raise RecordingError(f"{place}: {fault}; record a drive of 20 s or more without long gaps.")
     if state is not None:
         return _timing_of_measured_state(drive, state)
     if not signals.moved_commands(command).any():

@@ -55,10 +55,8 @@ def _without_repetitions(drive: Drive, notes: list[str]) -> Recording:
         again = (np.diff(stream.t) == 0.0) & (np.diff(stream.values, axis=0) == 0.0).all(axis=1)
         if again.any():
             recording = _with_rows(recording, name, np.append(True, ~again))
-            notes.append(
-                f"{name}: {int(again.sum())} of {len(stream.t)} rows repeat the row before them, "
-                "stamp and all, and were left out."
-            )
+            finding = f"{int(again.sum())} of {len(stream.t)} rows repeat the row before them"
+            notes.append(f"{name}: {finding}, stamp and all, and were left out.")
     return recording
 
 
@@ -197,11 +195,11 @@ def check_axes(drive: Drive) -> None:
     else:
         return
     if as_given < INCONSISTENT and mirrored > CONSISTENT:
-        raise RecordingError(
-            f"{recording.source}: pose: the heading turns one way and the path the other; one of "
-            "x, y and heading is reversed: they must be x forward, y left, heading "
-            "counter-clockwise (REP-103)."
+        fault = (
+            "the heading turns one way and the path the other; one of x, y and heading is reversed"
         )
+        advice = "they must be x forward, y left, heading counter-clockwise (REP-103)"
+        raise RecordingError(f"{recording.source}: pose: {fault}: {advice}.")
 
 
 def _steadiness(pose: Array) -> float:

@@ -88,15 +88,11 @@ def with_error(value: float, error: float | None) -> str:
 
 def _pruning(alpha: Alpha) -> str:
     if alpha == "auto":
-        return (
-            "Pruned (Eq. 2) per degree of freedom at the knee of its accuracy curve: the fewest "
-            "terms, largest standardised coefficient first, whose cross-validated error can't be "
-            "told from the least."
-        )
-    return (
-        f"Pruned by Eq. 2 at alpha = {alpha:g}, for each degree of freedom on its own; the "
-        "term that crosses the threshold is kept too."
-    )
+        knee = "Pruned (Eq. 2) per degree of freedom at the knee of its accuracy curve"
+        fewest = "the fewest terms, largest standardised coefficient first"
+        return f"{knee}: {fewest}, whose cross-validated error can't be told from the least."
+    pruned = f"Pruned by Eq. 2 at alpha = {alpha:g}, for each degree of freedom on its own"
+    return f"{pruned}; the term that crosses the threshold is kept too."
 
 
 def _curve(curve: Curve) -> list[str]:
@@ -121,14 +117,10 @@ def _held_out(identified: Identified) -> Iterator[str]:
     if found is None:
         yield "the drive is too short to hold data out"
     else:
-        yield (
-            f"after {found.horizon_s:g} s: position error {found.mean_position_error_m:.3g} m on "
-            f"average, {found.max_position_error_m:.3g} m at most,"
-        )
-        yield (
-            f"heading error {found.mean_heading_error_rad:.3g} rad on average, over a mean path of "
-            f"{found.mean_path_m:.2f} m ({found.windows} windows)"
-        )
+        finding = f"position error {found.mean_position_error_m:.3g} m on average"
+        yield f"after {found.horizon_s:g} s: {finding}, {found.max_position_error_m:.3g} m at most,"
+        finding = f"heading error {found.mean_heading_error_rad:.3g} rad on average"
+        yield f"{finding}, over a mean path of {found.mean_path_m:.2f} m ({found.windows} windows)"
     if quality is not None and quality.held_out_rmse:
         yield "the rates there:"
         for unit, dof in zip(model.dof_units, quality.held_out_rmse, strict=True):
@@ -239,15 +231,11 @@ def _suspicion(identified: Identified, spec: RobotSpec, order: int) -> str:
                 coarsest = max(coarsest, (float(step / size), variable.name))
     share, name = coarsest  # the greatest step between rows, as a share of its range
     if share > COARSE:
-        return (
-            f"{name} changes by {share:.0%} of its range between rows that are {apart}, so record "
-            "at a higher rate"
-        )
+        coarse = f"{name} changes by {share:.0%} of its range between rows that are {apart}"
+        return f"{coarse}, so record at a higher rate"
     if unmoved:
-        return (
-            f"{', '.join(unmoved)} never moved in its first {identified.train_until_s:.0f} s, from "
-            "which it is learnt, so change it from the beginning on"
-        )
+        reason = f"{', '.join(unmoved)} never moved in its first {identified.train_until_s:.0f} s"
+        return f"{reason}, from which it is learnt, so change it from the beginning on"
     if identified.alpha != "auto" or order < ORDER:
         return f"it may lack terms, so leave the order at {ORDER} and alpha at `auto`"
     return (

@@ -20,12 +20,9 @@ GAUSSIAN_MAD = 0.6745
 
 
 def held(
-    command: Stream,
-    spec: RobotSpec,
-    start: Array,
-    end: Array,
+    command: Stream, spec: RobotSpec, start: Array, end: Array,
     powers: NDArray[np.int64] | None = None,
-) -> Array:
+) -> Array:  # fmt: skip
     """Returns the mean (..., C) of held commands over intervals (...) on the commands' clock [s].
 
     Given powers (K, C), the mean (..., K) of these features of the commands. Before its first
@@ -87,11 +84,7 @@ def nominal_lags(spec: RobotSpec) -> Array:
 def inferred_states(
     command: Stream, spec: RobotSpec, lags: Array, latency: float, grid: Array
 ) -> Array:
-    """Infers states (T, S) at uniform times (T,) on the commands' clock, with gain one.
-
-    Each is a first-order response to its command with a time constant of `lags` (S,) [s]; if the
-    command never changes, the state keeps its value.
-    """
+    """Infers states (T, S) at uniform times (T,) by first-order lags (S,) [s], with gain one."""
     dt, follows = float(grid[1] - grid[0]), followed(spec)
     target = held(command, spec, grid - latency, grid + dt - latency)[:, follows]
     long_ago = np.array([command.t[0] - 2.0])

@@ -90,11 +90,9 @@ def about_mounting(
         )
     if not known_x:
         why = "all of the path had one curvature" if mounting.turns else "the robot never turned"
-        yield (
-            f"Where the tracked point lies on the robot could not be learnt, since {why}: it is "
-            "taken as base_link, and the rotation holds for this curvature; drive left, right and "
-            "straight on to learn it."
-        )
+        finding = f"Where the tracked point lies on the robot could not be learnt, since {why}"
+        advice = "it is taken as base_link, and the rotation holds for this curvature"
+        yield f"{finding}: {advice}; drive left, right and straight on to learn it."
     elif (x, y) != (0.0, 0.0):
         yield f"The tracked point lies at x {x:.4f} m, y {y:.4f} m of base_link."
     if known_x and not known_y and not drive.spec.moves_sideways:
@@ -113,10 +111,8 @@ def about_responses(
     for response, sigma in zip(calibration.responses, timing.lag_sigma, strict=False):
         state, command = response.state, response.command
         if command not in names:
-            yield (
-                f"{command} never changed, so how {state} follows it could not be learnt; drive "
-                f"with {command} changing over its whole range."
-            )
+            finding = f"{command} never changed, so how {state} follows it could not be learnt"
+            yield f"{finding}; drive with {command} changing over its whole range."
         else:
             spread = "" if np.isnan(sigma) else f" (+- {sigma:.4f} s)"
             yield (
@@ -153,10 +149,8 @@ def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> Iterator
     already = {name for r in calibration.responses for name in (r.command, r.state)}
     excitation = linear.regression.excitation
     if unmoved := ", ".join(excitation.unmoved):
-        yield (
-            f"The model has no terms of {unmoved}, which never moved: it holds for this drive's "
-            "constant value only."
-        )
+        finding = f"The model has no terms of {unmoved}, which never moved"
+        yield f"{finding}: it holds for this drive's constant value only."
     if missing := ", ".join(name for name in excitation.unmoved if name not in already):
         yield f"Drive with {missing} changing over the whole range to learn them."
     if together := _list(excitation.together):
@@ -171,10 +165,8 @@ def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> Iterator
         )
     levels = {n: v for n, v in excitation.levels.items() if n not in excitation.unmoved}
     if coarse := _list([name for name, count in levels.items() if count == FEW_LEVELS]):
-        yield (
-            f"{coarse} took two values only: between them the model is a straight line, "
-            "whatever the robot does; drive with values in between."
-        )
+        finding = "between them the model is a straight line, whatever the robot does"
+        yield f"{coarse} took two values only: {finding}; drive with values in between."
 
 
 def doubts(linear: Fit, held_out: OpenLoop | None, exact: bool) -> Iterator[str]:
@@ -201,10 +193,8 @@ def doubts(linear: Fit, held_out: OpenLoop | None, exact: bool) -> Iterator[str]
     share = held_out.mean_position_error_m / held_out.mean_path_m
     if not share <= FAR_OFF:
         end = f"end {share:.0%} of their path away" if isfinite(share) else "run away"
-        yield (
-            f"On unseen data the predictions {end}: the response does not follow the commands as "
-            "the model has it; do not train with this model."
-        )
+        finding = "the response does not follow the commands as the model has it"
+        yield f"On unseen data the predictions {end}: {finding}; do not train with this model."
 
 
 def _list(names: Sequence[str]) -> str:
@@ -221,11 +211,9 @@ def mirror_note(samples: Samples, spec: RobotSpec) -> Iterator[str]:
         if command.steers:
             wanted = wanted * np.sign(samples.dq[:, 0])
         if min(turn.std(), wanted.std()) > 1e-3 and np.corrcoef(turn, wanted)[0, 1] < MIRRORED:
-            yield (
-                f"The robot turns right where {command.name} is positive: the recording is a "
-                "mirror image (y and heading reversed), or the sign of the command is; the model "
-                "moves as recorded."
-            )
+            finding = f"The robot turns right where {command.name} is positive"
+            cause = "the recording is a mirror image (y and heading reversed), or the sign of"
+            yield f"{finding}: {cause} the command is; the model moves as recorded."
             return
 
 

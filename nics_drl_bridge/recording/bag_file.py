@@ -107,10 +107,8 @@ def _place(path: Path) -> Path:
     if (folder / METADATA).is_file() and (path.is_dir() or len(files) == 1):
         return folder
     if path.is_dir() and len(files) != 1:
-        raise RecordingError(
-            f"{path}: holds {len(files)} bag files and no {METADATA}; write it with "
-            "`ros2 bag reindex`."
-        )
+        fault = f"holds {len(files)} bag files and no {METADATA}"
+        raise RecordingError(f"{path}: {fault}; write it with `ros2 bag reindex`.")
     file = files[0] if path.is_dir() else path
     if file.suffix in COMPRESSED:
         raise RecordingError(
@@ -153,10 +151,8 @@ def _check_storage(file: Path) -> None:
         return
     journal = file.with_name(f"{file.name}-wal")
     if journal.is_file() and journal.stat().st_size > 0:
-        raise ValueError(
-            f"part of it is still in {journal.name}; stop the recorder, or close it with `sqlite3 "
-            f"{file.name} .quit`"
-        )
+        advice = f"stop the recorder, or close it with `sqlite3 {file.name} .quit`"
+        raise ValueError(f"part of it is still in {journal.name}; {advice}")
     place = f"{file.absolute().as_uri()}?mode=ro&immutable=1"
     with closing(sqlite3.connect(place, uri=True)) as base:
         (verdict,) = base.execute("PRAGMA integrity_check(1)").fetchone()
@@ -179,10 +175,8 @@ def _check_summary(reader: Reader) -> None:
     for topic, kind in sorted(set(summary + held), key=str):
         if (promised := summary[topic, kind]) != (found := held[topic, kind]):
             names = (repr(shortened(str(name), LONGEST_NAME)) for name in (topic, kind))
-            raise ValueError(
-                f"topic {' of type '.join(names)} has {found} messages in its files, {promised} by "
-                "its summary"
-            )
+            fault = f"topic {' of type '.join(names)} has {found} messages in its files"
+            raise ValueError(f"{fault}, {promised} by its summary")
     if reader.compression_mode == "message":
         for storage in storages:
             for _, _, data in storage.messages(storage.connections):

@@ -76,10 +76,9 @@ def _table(
     receive, header = times_of(messages)
     values = np.array([row(m.content) for m in messages], dtype=np.float64)
     for k in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1]:
-        raise RecordingError(
-            f"{bag.place}: topic {topic!r}: message {k} holds NaN or inf; find out why it was "
-            "sent, cut the bag there, or choose another topic."
-        )
+        fault = f"topic {topic!r}: message {k} holds NaN or inf"
+        advice = "find out why it was sent, cut the bag there, or choose another topic"
+        raise RecordingError(f"{bag.place}: {fault}; {advice}.")
     return TopicData(topic, receive, header, values)
 
 

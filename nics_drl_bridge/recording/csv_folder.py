@@ -69,10 +69,8 @@ def _read(path: Path) -> Array:
             raise ValueError("is empty; record the drive anew")
         table = np.array([_numbers(line, row, COLUMNS[path.name]) for line, row in rows])
         for k in np.flatnonzero(np.diff(table[:, -1]) < 0.0)[:1]:
-            raise ValueError(
-                f"row {rows[k + 1][0]}: time runs backwards ({table[k, -1]:.6f}, then "
-                f"{table[k + 1, -1]:.6f}); sort the rows, or cut the file there"
-            )
+            fault = f"time runs backwards ({table[k, -1]:.6f}, then {table[k + 1, -1]:.6f})"
+            raise ValueError(f"row {rows[k + 1][0]}: {fault}; sort the rows, or cut the file there")
         if path.name == "vrpn.csv":
             norm = np.linalg.norm(table[:, 3:7], axis=1)
             for k in np.flatnonzero(np.abs(norm - 1.0) > 0.05)[:1]:
@@ -115,10 +113,9 @@ def _numbers(line: int, row: list[str], columns: tuple[str, ...]) -> list[float]
         try:
             values.append(float(text))
         except ValueError:
-            raise ValueError(
-                f"row {line}: {name} is {text[:40]!r}, which is no number; mend the row, or "
-                "remove it (these files have no header)"
-            ) from None
+            fault = f"row {line}: {name} is {text[:40]!r}, which is no number"
+            advice = "mend the row, or remove it (these files have no header)"
+            raise ValueError(f"{fault}; {advice}") from None
     if not np.isfinite(values).all():
         raise ValueError(f"row {line} holds NaN or inf; remove the row")
     return values
@@ -139,12 +136,8 @@ def _check_units(path: Path, tables: dict[str, Array]) -> None:
         lasted = np.ptp(table[:, -1]) * factor
         alike = seconds == 0.0 or 1 / MAX_DURATION_RATIO < lasted / seconds < MAX_DURATION_RATIO
         if seconds > MAX_DURATION_S or (not alike and step > SLOWEST_SAMPLING_S):
-            raise RecordingError(
-                f"{path / 'cmd.csv'}: lasts {seconds:.3g} s, with {step:.3g} s from one command to "
-                "the next; its stamps must be in seconds."
-            )
+            fault = f"lasts {seconds:.3g} s, with {step:.3g} s from one command to the next"
+            raise RecordingError(f"{path / 'cmd.csv'}: {fault}; its stamps must be in seconds.")
         if not alike:
-            raise RecordingError(
-                f"{path / name}: lasts {lasted:.3g} s where the commands last {seconds:.3g} s; "
-                f"its stamps must be in {unit}."
-            )
+            fault = f"lasts {lasted:.3g} s where the commands last {seconds:.3g} s"
+            raise RecordingError(f"{path / name}: {fault}; its stamps must be in {unit}.")

@@ -111,11 +111,9 @@ def check(recording: Recording, spec: RobotSpec) -> Recording:
     backwards or has the wrong width, or the pose has wrong units.
     """
     if recording.variables and recording.variables != spec.variable_names:
-        raise RecordingError(
-            f"{recording.source}: is a drive of a robot with {', '.join(recording.variables)}; "
-            f"the robot {spec.name!r} has {', '.join(spec.variable_names)}: choose the robot that "
-            "drove."
-        )
+        problem = f"{recording.source}: is a drive of a robot with {', '.join(recording.variables)}"
+        advice = f"the robot {spec.name!r} has {', '.join(spec.variable_names)}"
+        raise RecordingError(f"{problem}; {advice}: choose the robot that drove.")
     width = {"command": len(spec.command), "state": len(spec.state), "wheels": 2}
     for name, stream in recording.streams.items():
         if fault := _fault(stream, width.get(name, 3)):
@@ -129,45 +127,35 @@ def _wrong_unit(pose: Stream, spec: RobotSpec) -> str:
     """Tells of a pose that only degrees, millimetres or milliseconds can explain."""
     turn = np.percentile(np.abs(geometry.wrap_angle(np.diff(pose.values[:, 2]))), 95)
     if turn > LARGEST_TURN:
-        return (
-            f"the heading jumps by {turn:.1f} rad between neighbouring samples; it must be in "
-            "radians (degrees look like this)"
-        )
+        reason = f"the heading jumps by {turn:.1f} rad between neighbouring samples"
+        return f"{reason}; it must be in radians (degrees look like this)"
     speeds = [v for v in spec.command if v.unit == "m/s"]
     fastest = max((max(abs(v.min), abs(v.max)) for v in speeds), default=np.inf)
     every = np.unique(np.searchsorted(pose.t, np.arange(pose.t[0], pose.t[-1], SPEED_OVER_S)))
     step, took = np.diff(pose.values[every, :2], axis=0), np.diff(pose.t[every])
     speed = np.percentile(np.hypot(*step.T) / np.maximum(took, 1e-9), 90) if len(took) else 0.0
     if speed > TOO_FAST * fastest:
-        return (
-            f"moves at {speed:.3g} m/s, a robot whose commands end at {fastest:g} m/s; positions "
-            "must be in metres and stamps in seconds"
-        )
+        reason = f"moves at {speed:.3g} m/s, a robot whose commands end at {fastest:g} m/s"
+        return f"{reason}; positions must be in metres and stamps in seconds"
     span = np.median(np.diff(pose.t))
     if span > SLOWEST_SAMPLING_S:
-        return (
-            f"there are {span:.3g} s between samples; stamps must be in seconds (milliseconds "
-            "look like this)"
-        )
+        reason = f"there are {span:.3g} s between samples"
+        return f"{reason}; stamps must be in seconds (milliseconds look like this)"
     return ""
 
 
 def _fault(stream: Stream, width: int) -> str:
     t, values = stream.t, stream.values
     if values.shape != (len(t), width):
-        return (
-            f"has the shape {values.shape} where ({len(t)}, {width}) is needed; check that the "
-            "recording is of this robot"
-        )
+        reason = f"has the shape {values.shape} where ({len(t)}, {width}) is needed"
+        return f"{reason}; check that the recording is of this robot"
     if len(t) < 2:
         return f"has {len(t)} samples; record a drive of 20 s or more"
     for row in np.flatnonzero(~np.isfinite(values).all(axis=1) | ~np.isfinite(t))[:1]:
         return f"row {row} holds NaN or inf; remove the row, or find out why it was recorded"
     for row in np.flatnonzero(np.diff(t) < 0.0)[:1]:
-        return (
-            f"time runs backwards at row {row + 1} ({t[row]:.6f} s, then {t[row + 1]:.6f} s); sort "
-            "the rows, or cut the file there"
-        )
+        reason = f"time runs backwards at row {row + 1} ({t[row]:.6f} s, then {t[row + 1]:.6f} s)"
+        return f"{reason}; sort the rows, or cut the file there"
     return ""
 
 

@@ -110,16 +110,12 @@ def _header(part: TopicData, stamps: Stamps, place: str) -> Nanoseconds | None:
     ns, topic = part.header_ns, f"{place}: topic {part.topic!r}"
     if ns is None or not ns.any():
         if stamps == "header":
-            raise RecordingError(
-                f"{topic}: its messages have no header stamps; write `stamps: auto` into the "
-                "topics file."
-            )
+            fault = "its messages have no header stamps"
+            raise RecordingError(f"{topic}: {fault}; write `stamps: auto` into the topics file.")
         return None
     if not ns.all():
-        raise RecordingError(
-            f"{topic}: {(ns == 0).sum()} of {len(ns)} headers have no stamp; write `stamps: "
-            "receive` into the topics file."
-        )
+        fault = f"{(ns == 0).sum()} of {len(ns)} headers have no stamp"
+        raise RecordingError(f"{topic}: {fault}; write `stamps: receive` into the topics file.")
     return ns
 
 
@@ -136,11 +132,9 @@ def _in_order(part: TopicData, place: str) -> TopicData:
     late = np.maximum.accumulate(ns) - ns
     if np.mean(late > 0) > MAX_LATE or late.max() * S_PER_NS > MAX_WANDER_S:
         k = int(np.argmax(late > 0))
-        raise RecordingError(
-            f"{place}: topic {part.topic!r}: the header stamps run backwards at message {k}, by "
-            f"{late[k] * S_PER_NS:.3f} s; write `stamps: receive` into the topics file, or cut the "
-            "bag there."
-        )
+        fault = f"the header stamps run backwards at message {k}, by {late[k] * S_PER_NS:.3f} s"
+        advice = "write `stamps: receive` into the topics file, or cut the bag there"
+        raise RecordingError(f"{place}: topic {part.topic!r}: {fault}; {advice}.")
     return part.rows(np.argsort(ns, kind="stable"))
 
 

@@ -134,10 +134,8 @@ class _Topics:
             listed = self._listed((role,))
             raise RecordingError(f"{self.place}: {lack} topic {topic!r} ({role}); {listed}")
         if self.types[topic] not in TYPES[role]:
-            raise RecordingError(
-                f"{self.place}: the topic {topic!r} is of type {self.types[topic]}; {role} must "
-                f"be one of {', '.join(TYPES[role])}."
-            )
+            fault = f"{self.place}: the topic {topic!r} is of type {self.types[topic]}"
+            raise RecordingError(f"{fault}; {role} must be one of {', '.join(TYPES[role])}.")
         return topic
 
     def _guess(self, role: str) -> str | None:
@@ -149,10 +147,8 @@ class _Topics:
             if len(found) > 1:
                 without = "" if role == REQUIRED else f", or {role}={NONE} for none"
                 several = ", ".join(f"{t} ({self.types[t]})" for t in found)
-                raise RecordingError(
-                    f"{self.place}: each of several topics could be {role}: {several}; say which "
-                    f"with --topic {role}={found[0]}{without}."
-                )
+                fault = f"{self.place}: each of several topics could be {role}: {several}"
+                raise RecordingError(f"{fault}; say which with --topic {role}={found[0]}{without}.")
             if found:
                 return found[0]
         return None

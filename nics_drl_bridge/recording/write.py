@@ -56,10 +56,8 @@ def check_out(path: str | Path) -> Path:
     if path.exists():
         raise ConfigError(f"{path}: is there already; give another name, or remove it.")
     if path.suffix not in (NPZ, ""):
-        raise ConfigError(
-            f"{path}: unknown kind of recording {path.suffix!r}; name a file *{NPZ}, or the "
-            "folder of a rosbag2 without suffix."
-        )
+        advice = f"name a file *{NPZ}, or the folder of a rosbag2 without suffix"
+        raise ConfigError(f"{path}: unknown kind of recording {path.suffix!r}; {advice}.")
     if path.suffix != NPZ:
         check_libraries(path, "writing", f", or name a file *{NPZ}")
     return path
