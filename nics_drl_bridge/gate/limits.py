@@ -74,8 +74,7 @@ class Limits:
 def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
     """Reads the limits of a robot from a shipped file in `config/limits`, or a YAML file.
 
-    ConfigError names the key: one is missing or unknown, the robot is another one, or a limit
-    exceeds what the robot or a period of the gate allows, or would never let the robot move.
+    ConfigError names the key: missing, unknown, of another robot, beyond it, or too low to move.
     """
     path = find_config(name, "limits")
     file = load_yaml(path, LimitsFile)
@@ -164,11 +163,9 @@ def saturate(command: Array, limits: Limits) -> Array:
 def follow(
     value: Array, slope: Array, target: Array, dt: float, limits: Limits
 ) -> tuple[Array, Array]:
-    """Moves a command towards its target as fast as rate and jerk allow.
+    """Moves a command (C,) towards its target as fast as rate and jerk allow; with its slope.
 
-    The turn waits for the speed, so that an accelerating robot is on its path from the start. The
-    last command (C,) has changed by its slope (C,) per second; the target (C,) lies within the
-    limits; `dt` is the time since the last command [s]. Returns the next value and its slope.
+    The turn waits for the speed, so that an accelerating robot is on its path from the start.
     """
     wanted, after, change = target.copy(), value.copy(), slope.copy()
     given = (value, slope, wanted, limits.low, limits.high, limits.rate, limits.jerk)
@@ -196,11 +193,8 @@ def _follow_one(
     """Moves one command; see `follow`.
 
     A slope a can be brought back to zero within a change of a^2 / (2 jerk) whatever the coming
-    intervals, because the sum over them lies below the integral. So a value with
-    value + a^2 / (2 jerk) within the bounds stays within them.
-
-    The calculation uses shares of the greatest value and steps of this interval. No slope then
-    exceeds what one interval can do, the whole range, and no limit causes an overflow.
+    intervals, as the sum over them lies below the integral: a value that far within the bounds
+    stays so. In shares of the greatest value and steps of this interval, nothing overflows.
     """
     scale = max(-least_value, most_value)
     low, high = least_value / scale, most_value / scale

@@ -1,14 +1,11 @@
 """The shield: passes only commands from which the robot can stop before the nearest obstacle.
 
-The robot is assumed to do anything between its recent commands, its motion by odometry and the
-present command, for as long as the scan is old, the next decision takes and the robot needs to
-react, and then to brake. A new command must also leave room to brake calmly, so that an approach
-ends slowly instead of in a series of full stops. The footprint is swept along the arcs of that
-whole family; a command is scaled down, on its path, until no obstacle in the scan lies in the swept
-area. The dynamic window of Fox, Burgard and Thrun (1997) tests the same for one arc.
-
-An obstacle may approach if it is where the robot saw free space a moment ago: the newest scan is
-compared with some older ones by odometry.
+The robot may do anything between its recent commands, its motion by odometry and the present
+command, for as long as the scan is old, the next decision takes and it needs to react, and then
+brakes; a new command must also leave room to brake calmly. The footprint is swept along the arcs of
+that family; a command is scaled down, on its path, until no obstacle lies in the swept area (for
+one arc: the dynamic window of Fox, Burgard, Thrun 1997). An obstacle may approach if it is where
+the robot saw free space a moment ago, in older scans moved by odometry.
 """
 
 from __future__ import annotations
@@ -114,8 +111,7 @@ def _ends(config: GateConfig, angles: Array, ranges: Array, speeds: Array | floa
 def obstacles(config: GateConfig, ranges: Ranges, views: tuple[View, ...]) -> Array | None:
     """Returns all obstacles (P, 3) in a scan (B,): x, y in `base_link` [m], greatest speed [m/s].
 
-    The views are that of the scan and earlier ones, empty before the first odometry. None without
-    shield.
+    The views are that of the scan and earlier ones, empty before odometry. None without shield.
     """
     given = config.shield
     if given is None:

@@ -31,11 +31,9 @@ def shield_config(
 ) -> tuple[ShieldConfig, str]:
     """Returns a robot's shield configuration, and a sentence with its values and their source.
 
-    The source is the `shield` of a file of limits, otherwise, with caution, model and limits; given
-    values, by their names in the file, override it.
-
-    Raises:
-        ConfigError: a value can't be used, or the shield does not know the robot's commands.
+    It is the `shield` of a file of limits, else, with caution, model and limits; given values
+    override it. ConfigError: a value can't be used, or the shield does not know the robot's
+    commands.
     """
     path = find_config(file, "limits") if file else None
     measured = load_yaml(path, LimitsFile).shield if path else None

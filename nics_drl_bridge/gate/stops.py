@@ -2,9 +2,8 @@
 
 The age of a datum is the time since its arrival on the steady clock, plus its delay. The lead of
 its stamp over that clock is the offset of the two clocks minus the delay; the greatest lead, the
-envelope, is that of the fastest data (the idea of one-way delay estimation by the lower envelope).
-It is found before the gate is armed and then fixed: it follows at most the drift of real clocks. So
-stamps that creep ahead, or fall behind, become neither the new present nor the new normal.
+envelope, is that of the fastest data. It is found before the gate is armed and then follows at most
+the drift of real clocks: stamps that creep ahead or fall behind do not become the new normal.
 """
 
 from __future__ import annotations
@@ -30,8 +29,7 @@ def arrived(
 ) -> tuple[Arrivals, str]:
     """Accounts for a datum; if the gate is armed, the envelope is fixed.
 
-    Returns the arrivals, and why the datum is not used: `repeated`, `jumped` or "". After a jump
-    only the new datum counts.
+    Returns the arrivals, after a jump of the new datum only, and `repeated`, `jumped` or "".
     """
     fresh = Arrivals(
         (stamp_ns,), (now,), (0.0,), (stamp_ns, now), 1, 0.0, now, ((now, stamp_ns, 1, 0.0),)

@@ -86,9 +86,8 @@ class Calibration:
 def align(drive: Drive, calibration: Calibration) -> Samples:
     """Puts a drive on one time axis, at `base_link` and on the clock of the commands.
 
-    A recording that needs no correction is used bit for bit. Otherwise the pose is smoothed by
-    local parabolas as far as its noise requires, and rows in gaps of the pose are dropped.
-    Raises RecordingError: the streams do not overlap in time.
+    A recording that needs no correction is used bit for bit; else noisy poses are smoothed by local
+    parabolas, and rows in gaps dropped. RecordingError: the streams do not overlap in time.
     """
     recording = drive.recording
     if calibration.is_identity and (shared := _shared_stamps(recording)) is not None:

@@ -127,9 +127,7 @@ def find_bursts(t: Array) -> Bursts | None:
 def spread(t: Array, bursts: Bursts | None) -> Array:
     """Estimates sample times (T,) from arrival stamps (T,) [s].
 
-    The samples of a burst were taken one after the other since the previous burst, the newest
-    just before its arrival. After a gap they are assumed to fill one period, or more if the
-    burst is larger than usual.
+    Those of a burst were taken since the one before; after a gap within a period, or more by size.
     """
     if bursts is None:
         return t

@@ -134,10 +134,9 @@ def states_are_noisy(samples: Samples, spec: RobotSpec) -> bool:
 
 
 def inliers(chi: Array, target: Array, usual: float) -> NDArray[np.bool_]:
-    """Selects the rows of a regression of a target (T,) on features (T, K) that are no outliers.
+    """Selects the rows of a target (T,) on features (T, K) that are no outliers.
 
-    They are searched for if a residual exceeds the usual range of such rates (`usual_ranges`),
-    more than any misfit of the model.
+    They are searched for if a residual exceeds the usual range, more than any misfit of a model.
     """
     everything = np.ones(len(target), dtype=np.bool_)
     plain = _left(chi, target)

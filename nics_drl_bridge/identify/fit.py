@@ -92,11 +92,10 @@ def regress(
 ) -> Regression:
     """Finds the coefficients of all features by least squares (Eq. 1); outliers are dropped.
 
-    The order of the expansion is 1 to 4; the paper's is 2. `noisy` is any recording but an exact
-    one: insignificant terms are dropped before Eq. 2 is applied to the rest, and the body twist is
-    a function of the state alone, if there is one, and zero at zero speed, if the speed moved. For
-    within a step a command acts through the state, and in noise the two can't be told apart.
-    Raises FitError: too few samples, or nothing moved.
+    The order is 1 to 4; the paper's is 2. `noisy` is any recording but an exact one: insignificant
+    terms are dropped before Eq. 2, and the body twist is a function of the state alone, if any, and
+    zero at zero speed, if it moved: within a step a command acts through the state, and in noise
+    the two can't be told apart. Raises FitError: too few samples, or nothing moved.
     """
     believed = excitation.plausible(samples.x, spec)
     samples = samples.rows(believed)
@@ -157,10 +156,9 @@ def prune(beta: Array, alpha: float, noise_floor: float = 0.0) -> NDArray[np.boo
 def pruned(regression: Regression, spec: RobotSpec, alpha: Alpha = ALPHA) -> Fit:
     """Prunes a regression (Eq. 2) and estimates the coefficients of the kept terms anew.
 
-    `alpha` is the share of the summed standardised coefficients that the kept terms of each
-    degree of freedom reach. The term that crosses the threshold is kept too: with a literal Eq. 2
-    a differential robot, whose wheels have equal weight, would lose one. `auto` keeps as many
-    terms, in the same order, as improve the cross-validated error (`statistics.knee`).
+    `alpha` is the share of the summed standardised coefficients that is kept per degree of freedom,
+    with the term that crosses it: else a differential robot would lose a wheel. `auto` keeps as
+    many terms, in the same order, as improve the cross-validated error (`statistics.knee`).
     """
     samples, shape = regression.samples, regression.beta.shape
     coefficients, errors, conditions = np.zeros(shape), np.zeros(shape), np.ones(shape[0])

@@ -276,10 +276,8 @@ def identify(
 ) -> Identified:
     """Learns a robot's motion from the first part of a recording and tests it on the rest.
 
-    Every command must have varied. The first part ends at `train_until`, counted from the first
-    pose [s]; after two thirds of the drive when None. For the other options, see `Settings`. Raises
-    RecordingError: the recording can't be used for this robot. Raises FitError: the drive does not
-    contain enough information to fit a model.
+    That ends at `train_until` after the first pose [s], or after two thirds; for the other options
+    see `Settings`. RecordingError: it can't be used for this robot. FitError: it shows too little.
     """
     drive = Drive(check(recording, spec), spec)
     until = TRAIN_SHARE * drive.duration_s if train_until is None else train_until
@@ -302,8 +300,7 @@ def calibrate(recording: Recording, spec: RobotSpec) -> Calibration:
 def cut(recording: Recording, until: float) -> Recording:
     """Returns the part of a recording up to `until` seconds after its first pose.
 
-    The other streams end at about that time, since the clock offset is not known yet. Commands
-    last a little longer, since they reveal no pose.
+    Other streams end about then, as the offset is unknown; commands, without poses, a little later.
     """
     pose = recording.pose.t
 

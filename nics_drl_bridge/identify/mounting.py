@@ -48,8 +48,7 @@ def mounting_of(
 ) -> Mounting | None:
     """Estimates the mounting as far as the drive shows it; None if it does not.
 
-    The speed (n,) along the direction of travel is expected over the intervals of the twists, up to
-    one factor.
+    The speed (n,) along the direction of travel is that expected over the twists, up to a factor.
     """
     spec, twists = drive.spec, drive.twists
     if spec.moves_sideways:
@@ -80,12 +79,10 @@ def mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
 def mounting_without_lateral_motion(motion: TwistIntervals, forward: Array) -> Mounting | None:
     """Estimates the mounting on a robot whose `base_link` never moves sideways.
 
-    The lateral speed of the tracked point is then yaw rate x lever arm:
-    `cos(rotation) uy - sin(rotation) ux - lever_x wz = 0`, the direction in which the twists
-    have no extent. On a path of a single curvature, rotation and lever arm can't be separated,
-    and the lever arm is set to zero. The lever arm along y remains unknown. None if nothing moved.
-
-    Of the commanded or measured forward speed (n,) only the sign matters.
+    The lateral speed of the tracked point is then yaw rate x lever arm: `cos(rotation) uy -
+    sin(rotation) ux - lever_x wz = 0`, the direction in which the twists have no extent. On a
+    single curvature the lever arm is set to zero; along y it remains unknown. None if nothing
+    moved. Of the forward speed (n,) only the sign matters.
     """
     rows = motion.twist * np.array([1.0, 1.0, TURN_SCALE_M])
     size, axes = np.linalg.svd(rows, full_matrices=False)[1:]
@@ -114,8 +111,7 @@ def mounting_without_lateral_motion(motion: TwistIntervals, forward: Array) -> M
 def lateral_lever(motion: TwistIntervals, rotation: float, speed: Array) -> tuple[float, float]:
     """Estimates the lever arm along y and its uncertainty [m] from a speed (n,).
 
-    The tracked point is faster than `base_link` on the outside of a curve: `ux = gain speed -
-    lever_y wz`. The uncertainty is NaN if all curves were alike.
+    `ux = gain speed - lever_y wz`, faster outside of curves; NaN if all curves were alike.
     """
     along = rotate(motion.twist[:, :2], -rotation)[:, 0]
     chi = np.stack([speed, motion.twist[:, 2]], axis=1)

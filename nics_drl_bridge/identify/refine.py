@@ -184,11 +184,10 @@ class _Free:
 
     @classmethod
     def of(cls, model: TaylorModel, calibration: Calibration, spec: RobotSpec) -> _Free:
-        """Frees what is fixed neither by definition nor by measurement.
+        """Frees what neither definition nor measurement fixes.
 
-        A time estimated from a measured state is fixed. The rotation is defined by the direction in
-        which a robot can't move: an omnidirectional robot can be described equally well in any
-        other frame, with other coefficients.
+        The rotation is defined by the direction without motion, of which an omnidirectional robot
+        has none; a time from a measured state is fixed.
         """
         known, time = calibration.uncertainty, None
         if calibration.responses and "clock_offset_s" in known:
@@ -215,8 +214,7 @@ class _Free:
 def free_coefficients(model: TaylorModel, calibration: Calibration) -> Mask:
     """Selects the free coefficients (D, K): kept, and not fixed by the definition of a state.
 
-    An inferred speed is by definition the speed along the direction of travel, so that
-    vx = 1 speed; its lag is fixed if the wheels showed it.
+    An inferred speed is that along the direction of travel: vx = 1 speed; measured lags are fixed.
     """
     free = model.coefficients != 0.0
     if not calibration.responses:

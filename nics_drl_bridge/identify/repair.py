@@ -176,9 +176,8 @@ def check_units(drive: Drive) -> None:
 def check_axes(drive: Drive) -> None:
     """Refuses poses, with a RecordingError, whose heading turns against the direction of travel.
 
-    In its own frame, a robot without sideways motion always travels in the same direction; that
-    of an omnidirectional robot depends on its state. If this is true only with the heading
-    mirrored, then x, y or heading is reversed.
+    In its own frame a robot travels in the same direction, or in that of its state. If only
+    mirrored headings make this true, then x, y or heading is reversed.
     """
     recording = drive.recording
     path = np.append(0.0, np.cumsum(np.hypot(*np.diff(drive.dated.values[:, :2], axis=0).T)))

@@ -191,11 +191,8 @@ def estimates(identified: Identified) -> dict[str, CalibratedValue]:
 def is_useless(error: float, standing: float, path: float, radius: float) -> bool:
     """True if predictions are hardly better than assuming that the robot stands still.
 
-    Given are the median errors of the predictions (NaN or inf if they diverge) and of standing
-    still, the mean length of the path and the robot's radius [m]. Persistence is the usual baseline
-    of a forecast (Murphy: Skill scores based on the mean square error, Monthly Weather Review,
-    1988). A robot that drives in circles or turns on the spot returns to its start: there the path
-    and the robot's size set the scale.
+    Given are the median errors (NaN or inf if they diverge) of both, the mean path and the robot's
+    radius [m], which set the scale for circles. Persistence is a usual baseline (Murphy 1988).
     """
     return not error <= max(MOST_LEFT * standing, FAR_OFF * path, radius)
 

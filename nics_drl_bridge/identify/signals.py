@@ -25,9 +25,8 @@ def held(
 ) -> Array:  # fmt: skip
     """Returns the mean (..., C) of held commands over intervals (...) on the commands' clock [s].
 
-    Given powers (K, C), the mean (..., K) of these features of the commands. Before its first
-    command a robot stands still: commands that ever change are zero then. A command that never
-    changes is assumed to have had that value before.
+    Given powers (K, C), the mean (..., K) of these features. Before its first command a robot
+    stands still: commands that ever change are zero then, others as always.
     """
     still = np.clip(0.0, spec.command_low, spec.command_high)
     before = np.where(moved_commands(command), still, command.values[0])

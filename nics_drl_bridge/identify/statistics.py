@@ -43,8 +43,7 @@ def minimise(
 ) -> tuple[Array, Array, Array]:
     """Minimises a residual of parameters (P,), which change by about `scale`, within bounds (P,).
 
-    Returns the parameters, and Jacobian (n, P) and residual (n,) there. The Jacobian comes from
-    finite differences if none is given.
+    Returns them with Jacobian (n, P), by finite differences if not given, and residual (n,) there.
     """
     low, high = bounds or (np.full(len(start), -np.inf), np.full(len(start), np.inf))
     slope: Any = "2-point"
@@ -75,9 +74,7 @@ def _deviations(covariance: Array) -> Array:
 def standard_errors(chi: Array, residual: Array) -> Array:
     """Returns standard errors (K,) of least squares for unequal and correlated residuals.
 
-    The residual (T,) of the fit to features (T, K) is in order of time. Newey, West: A simple,
-    positive semi-definite, heteroskedasticity and autocorrelation consistent covariance matrix,
-    Econometrica 1987.
+    The residual (T,) is in order of time (Newey, West, Econometrica 1987).
     """
     count, terms = chi.shape
     if terms == 0 or count <= terms:
@@ -154,8 +151,7 @@ def errors_of(model: TaylorModel, samples: Samples) -> tuple[Array, Array]:
 def significant(chi: Array, target: Array) -> NDArray[np.bool_]:
     """Selects the significant features (K,) of a noisy target (T,).
 
-    The least certain one is removed until each coefficient is at least `CERTAIN` times its
-    standard error, which is widened for autocorrelated residuals.
+    The least certain go until each coefficient is `CERTAIN` times its (autocorrelated) error.
     """
     rest = target - chi @ np.linalg.lstsq(chi, target, rcond=None)[0]
     power = max(float(rest @ rest), np.finfo(np.float64).tiny)
@@ -177,9 +173,8 @@ def significant(chi: Array, target: Array) -> NDArray[np.bool_]:
 def instrumental(chi: Array, instruments: Array, target: Array) -> tuple[Array, Array] | None:
     """Returns coefficients (K,) by instrumental variables, and their standard errors (K,).
 
-    The instruments (T, K) are the noisy features (T, K) of variables whose noise is independent;
-    None if they are too weak. Two-stage least squares (Soederstroem, Stoica: Instrumental variable
-    methods for system identification, 1983).
+    The instruments (T, K) are features with independent noise; None if they are too weak. Two-stage
+    least squares (Soederstroem, Stoica 1983).
     """
     scale, size = np.linalg.norm(chi, axis=0), np.linalg.norm(instruments, axis=0)
     chi, instruments = chi / scale, instruments / size
@@ -225,8 +220,7 @@ def knee(error: Array, sigma: Array) -> int:
 def cross_validated(chi: Array, target: Array) -> Array:
     """Returns mean squared errors (B, n + 1) of the first 0..n features on B blocks in time.
 
-    Each block is predicted by a fit to the others. Blocks are compressed to triangles (QR) first,
-    so that all numbers of terms share one factorisation.
+    Each is predicted by a fit to the others, compressed (QR) to share one factorisation.
     """
     rows = np.array_split(np.arange(len(target)), BLOCKS)
     both = np.concatenate([chi, target[:, None]], axis=1)

@@ -34,9 +34,8 @@ CONFIDENCE = 0.95
 class Episode:
     """Record of one episode.
 
-    The result is `success`, `collision`, `time-out`, or `elsewhere` if the robot wrongly believed
-    to be at its goal. Result and path are true ones if the backend knows them, else estimates.
-    `believed` is the result by the robot's own knowledge; None if nothing else is known.
+    The result is `success`, `collision`, `time-out`, or `elsewhere` for a wrongly believed success,
+    by the truth if the backend knows it; `believed` is the robot's own, None if the same.
     """
 
     seed: int
@@ -103,8 +102,7 @@ def drive(
 ) -> Episode:
     """Drives one episode to its end; halts the robot if the policy or a callback raises.
 
-    `on_start` is called when the robot stands at its start. `touched` returns at the end whether
-    the robot truly touched something, if `info` does not.
+    `on_start` is called at its start; `touched` tells at its end of contacts that `info` does not.
     """
     with _halted_on_error(env):
         observation, info = env.reset(seed=seed, options=options)
@@ -181,10 +179,9 @@ class Outcomes:
 
 
 def drive_worlds(env: BridgeVectorEnv, act: Act, seeds: Sequence[int]) -> Outcomes:
-    """Drives one episode per seed, as many at once as the env has worlds.
+    """Drives one episode per seed, as many at once as the env has worlds (`NextStep`).
 
-    The episodes are bit-identical to those of `BridgeEnv.reset(seed=...)` without estimator. The
-    env's `autoreset_mode` is `NextStep`, the default.
+    They are bit-identical to those of `BridgeEnv.reset(seed=...)` without estimator.
     """
     width, given = env.num_envs, checked_seeds(seeds)
     # The last batch is padded with seeds that are driven but not counted.
@@ -291,8 +288,7 @@ def summarise(outcomes: Outcomes, control_period: float) -> Summary:
 class Tally(Summary):
     """Figures of the episodes of one world, by the truth if it is known.
 
-    `deviation` is the mean of the maximum distance [m] between the true path and that in the first
-    world at the same step.
+    `deviation` is the mean of the maximum distance [m] from the path in the first world per step.
     """
 
     same: float  # share of the episodes that ended as in the first world

@@ -78,12 +78,11 @@ class RandomActions:
 class DynamicWindow:
     """The dynamic-window approach (Fox, Burgard, Thrun 1997) on scan, goal and twist.
 
-    Tries the twists that the commands allow and that the robot can reach from its present one in a
-    period; each is held for the look-ahead. A twist with a contact before the robot could stop is
-    inadmissible; the best of the others in distance, aim, clearance and time to contact is chosen.
-    It plans no path: behind a long wall it stays. Which twist a command leads to follows from the
-    robot's kind and parameters. Raises ConfigError if it is not known where the robot's commands
-    lead, see `steady_twist`.
+    Tries the twists that commands allow and the robot can reach in a period, each held for the
+    look-ahead. One with a contact before the robot could stop is inadmissible; the best in
+    distance, aim, clearance and time to contact is chosen. It plans no path: behind a long wall it
+    stays. Raises ConfigError if it is not known where the robot's commands lead, see
+    `steady_twist`.
     """
 
     task: Navigation
@@ -160,11 +159,9 @@ def is_policy_file(name: str) -> bool:
 
 
 def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None) -> Policy:
-    """Makes a policy by name.
+    """Makes a policy by a key of `POLICIES`, the name of a shipped policy file, or a path.
 
-    The name is a key of `POLICIES`, a shipped policy file, or the path of a policy file, which is
-    checked against the task and the model of the robot. Raises ConfigError for an unknown name,
-    PolicyError, with the field, if the file can't be used or does not fit.
+    A file is checked against task and model. ConfigError: unknown name; PolicyError: wrong field.
     """
     if not is_policy_file(name):
         return POLICIES[name](task)

@@ -88,10 +88,9 @@ class PolicyFile:
         return options
 
     def make_task(self, model: SimulatorModel, kind: str | type[Task] | None = None) -> Task:
-        """Makes the policy's task for a robot that it fits.
+        """Makes the policy's task for a robot; PolicyError names a field that does not fit.
 
-        For a task that is not shipped, `kind` is its class or `path/to/file.py:ClassName`. Raises
-        PolicyError if the policy does not fit; names the field.
+        Of a task that is not shipped, `kind` is its class or `path/to/file.py:ClassName`.
         """
         name = self.contract.task.name
         if kind is None and name not in TASKS:

@@ -42,10 +42,9 @@ class Shadow:
     skipped: Mapping[str, int]  # reason -> number of times that were not compared
 
     def differences(self) -> dict[str, dict[str, float]]:
-        """Differences between policy and drive, for each command.
+        """Differences between policy and drive, for each command, in its unit.
 
-        Mean of policy minus drive; mean, percentiles and maximum of its magnitude, in the command's
-        unit; and the share of opposite signs among the times at which both have a sign.
+        Their mean; mean, percentiles and maximum of their magnitude; the share of opposite signs.
         """
         found = {}
         for c, name in enumerate(self.names):
@@ -83,10 +82,8 @@ def shadow(
 
     The policy acts when `policy_node` would: once per scan, with odometry at least as new, at most
     once per control period of the stamps. Its command is compared with the first one recorded after
-    that, or else with the one that still applied.
-
-    The goal (2,) [m] is in `map`, in which the first odometry is taken at face value. None uses the
-    robot's position `ahead_s` later instead: the driver's intention, in hindsight. `topics` are by
+    that, or else with the one that still applied. The goal (2,) [m] is in `map`, where the first
+    odometry is taken at face value; None: the robot's position `ahead_s` later. `topics` are by
     role, see `playback.chosen`. Raises RecordingError if the bag can't be used, or lacks scans or
     commands, another BridgeError if the policy can't be used, or does not fit.
     """

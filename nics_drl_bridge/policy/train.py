@@ -59,10 +59,8 @@ def train(
 ) -> Trained:
     """Trains one policy; checkpoint and TensorBoard logs are in `folder`.
 
-    An interrupted and resumed training gives bit-identical weights to an uninterrupted one: a
-    checkpoint contains the network, the optimiser, all random generators and all worlds. `tell` is
-    called with the progress, a few times per second. Raises ConfigError if the settings are
-    inconsistent, or no checkpoint fits them.
+    A resumed training gives bit-identical weights to an uninterrupted one. `tell` is called with
+    the progress a few times per second. ConfigError: no such settings, or no checkpoint fits them.
     """
     begin, path = time.perf_counter(), folder / CHECKPOINT
     content = checkpoints.read_checkpoint(path) if resumed else None
@@ -183,10 +181,9 @@ def run(
     done: Callable[[SeedResult], None] = lambda _: None,
     learn: Learn = train,
 ) -> list[SeedResult]:
-    """Trains seed after seed and evaluates each in its training worlds.
+    """Trains seed after seed and evaluates each in its worlds; `tell` and `done` are told of it.
 
-    `tell` is called with the progress, `done` with the result of each seed. Raises ConfigError if
-    the folder already contains a run, or none to resume.
+    Raises ConfigError if the folder already contains a run, or none to resume.
     """
     _check(order.seeds, order.out, order.resumed)
     settings, model = order.settings, open_model(order.settings.robot)

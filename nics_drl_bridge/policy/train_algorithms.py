@@ -103,11 +103,9 @@ class Normaliser(BaseFeaturesExtractor):
 
 
 def observed(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Mean and standard deviation (O,) of the observations under random actions.
+    """Mean and standard deviation (O,), at least 0.05, of observations under random actions.
 
-    Each world holds its action for several steps, because otherwise a robot with inertia would stay
-    in place. A part that hardly varies gets a deviation of 0.05. The state of the env is arbitrary
-    afterwards.
+    Each world holds its action for several steps: a robot with inertia would else stay in place.
     """
     seen = [np.array(env.reset())]
     for k in range(OBSERVED_STEPS):

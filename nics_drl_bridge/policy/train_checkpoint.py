@@ -1,7 +1,6 @@
 """Checkpoints of a training: all that it needs to continue bit-identically.
 
-A checkpoint is for training only and is never deployed. It contains only tensors, numbers and text
-and is read by PyTorch's `weights_only` reader, which builds no other objects: it can't run code.
+A checkpoint is never deployed. PyTorch's `weights_only` reader builds no objects: no code runs.
 """
 
 from __future__ import annotations
@@ -179,11 +178,7 @@ Tell = Callable[[Progress], None]
 
 
 class Companion(BaseCallback):
-    """Callback that monitors each step and roll-out of a training.
-
-    It calls `tell` with the progress, and `save` about every `checkpoint_every` environment steps,
-    between two roll-outs only.
-    """
+    """Callback that monitors each step and roll-out: calls `tell`, and `save` between roll-outs."""
 
     def __init__(
         self, env: TrainVecEnv, seed: int, settings: TrainingSettings, save: Save, tell: Tell

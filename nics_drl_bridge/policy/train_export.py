@@ -62,8 +62,7 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
 def actor_of(model: Any) -> torch.nn.Module:
     """Returns the acting part of a trained model, without exploration.
 
-    The model is an algorithm or policy of Stable-Baselines3 (PPO, A2C, SAC), or any module that
-    maps observations (n, O) to raw actions (n, C) or logits (n, A); else ConfigError is raised.
+    That is a PPO, A2C or SAC, or a module from (n, O) to raw actions or logits; else ConfigError.
     """
     policy = getattr(model, "policy", model)
     if hasattr(policy, "action_net") and hasattr(policy, "mlp_extractor"):
@@ -89,10 +88,9 @@ def export_policy(
 ) -> PolicyFile:
     """Writes a trained model (see `actor_of`) as a policy file, and loads it as a robot would.
 
-    Task and simulator model are those of its training. The normaliser is the mean (O,), standard
-    deviation (O,) and limit of the normalised observations; None if the model has its own. The
-    provenance is command, seed and so on, as strings and numbers. Raises ConfigError if the model
-    can't be exported, PolicyError if the file does not reproduce its outputs.
+    Task and simulator model are those of its training; the normaliser is mean (O,), deviation (O,)
+    and limit, None if the model has its own; the provenance holds strings and numbers. ConfigError:
+    it can't be exported; PolicyError: the file does not reproduce its outputs.
     """
     file = Path(path)
     if file.suffix != SUFFIX:

@@ -61,8 +61,7 @@ def is_storage(path: Path) -> bool:
 def opened(path: str | Path) -> Iterator[BagFile]:
     """Opens a bag, given its folder or its only file.
 
-    Raises RecordingError if there is no such bag, it is damaged, empty or was not closed, or a
-    library is not installed; any exception of rosbags on a damaged bag becomes one sentence.
+    RecordingError: it is missing, damaged, empty or not closed, or a library is not installed.
     """
     path = Path(path)
     check_libraries(path, "reading")
@@ -199,11 +198,7 @@ def times_of(messages: Sequence[Message]) -> tuple[Nanoseconds, Nanoseconds | No
 
 
 class BagFile:
-    """A bag in `opened`, whose topics are read completely or not at all.
-
-    A topic raises ValueError, which becomes the RecordingError of `opened`, if messages of it are
-    missing, outside of the bag's time span, or damaged.
-    """
+    """A bag in `opened`; ValueError if a topic's messages are not all there and whole."""
 
     def __init__(self, reader: Reader, place: str) -> None:
         self._reader, self._store = reader, typestore()

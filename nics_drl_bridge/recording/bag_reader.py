@@ -45,9 +45,8 @@ SPANNED = 0.9  # share of a uniform distribution between the first and last of t
 def load_bag(path: str | Path, spec: RobotSpec | None, mapping: TopicRoles) -> Recording:
     """Reads a drive of a robot from a bag: its folder or its only file.
 
-    Missing roles of topics are guessed; for the clocks see `stamping.streams`. RecordingError, one
-    sentence with place and fix: the bag is damaged or incomplete, a topic is missing or ambiguous,
-    or the data can't be used for this robot.
+    Missing roles of topics are guessed; for the clocks see `stamping.streams`. RecordingError, with
+    place and fix: the bag is damaged, a topic missing or ambiguous, or of another robot.
     """
     if spec is None:
         raise RecordingError(f"{path}: is a bag; say of which robot, with a RobotSpec.")
@@ -171,10 +170,9 @@ def gather(topic: str, messages: Sequence[Message]) -> Joints:
 
 
 def state_of(joints: Joints, spec: RobotSpec, mapping: TopicRoles, place: str) -> TopicData | None:
-    """Returns the measured state (T, S), from the messages that contain all of it.
+    """Returns the measured state (T, S); None without all its joints if each follows a command.
 
-    None if joints of some state variables are missing, but each follows a command. RecordingError
-    if a named joint does not exist, or a required state was not measured.
+    RecordingError if a named joint does not exist, or a required state was not measured.
     """
     known = [v.name for v in spec.state]
     for name in sorted(mapping.state.keys() - set(known)):
@@ -252,8 +250,7 @@ def _complete(joints: Joints, values: Array, names: Sequence[str], place: str) -
 def latency_of(bag: BagFile, odom: str | None = None) -> Latency:
     """Measures the delays of scan and odometry in a bag, by stamps of the recorder's own clock.
 
-    If a topic is missing, has too few messages or is stamped by another clock, its delay is
-    unknown. The odometry topic is by default the one of that type or name.
+    A delay is unknown if the topic is missing, short, ambiguous, or stamped by another clock.
     """
     odom = odom or _topic(bag, roles.ODOMETRY, "odom")
     return Latency(scan=_delay(bag, _topic(bag, SCAN, "scan")), odom=_delay(bag, odom))

@@ -31,10 +31,8 @@ LONGEST_ROW = 1000  # in characters
 def load_csv_folder(path: str | Path) -> Recording:
     """Reads a drive of a car, recorded as up to five CSV files without header lines.
 
-    `cmd.csv` (linear.x, angular.z) and `vrpn.csv` are required; wheels are read if both files
-    exist. The heading is the yaw of the quaternion. Commands and wheels are stamped by the robot's
-    clock, the pose by that of the motion capture; calibration estimates the offset between them.
-    RecordingError names the file, the row and the fix.
+    `cmd.csv` (linear.x, angular.z) and `vrpn.csv` are required, wheels are read in pairs. Pose and
+    robot have clocks of their own. RecordingError names the file, the row and the fix.
     """
     path = Path(path)
     if not path.is_dir():

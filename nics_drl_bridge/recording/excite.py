@@ -52,9 +52,7 @@ ATTEMPTS = 8
 class Exploration:
     """Generator of a robot's commands, one per period, that tracks the robot's pose.
 
-    It drives within the circle of its plan around the start, which contains the whole robot, with
-    1 s of standstill at both ends, at up to the plan's share of the greatest speeds and rates;
-    angles use their full range.
+    It keeps the whole robot in the circle of its plan, and stands still for 1 s at both ends.
     """
 
     def __init__(self, plan: DrivePlan, rng: np.random.Generator) -> None:

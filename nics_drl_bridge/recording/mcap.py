@@ -172,8 +172,7 @@ class _Walk:
 def check_mcap(path: Path) -> None:
     """Checks a file (https://mcap.dev/spec) from its first byte to its last.
 
-    Counts, times and index must agree, and every checksum present must match. Raises DamageError:
-    it is truncated, a checksum is wrong, or two of its parts disagree.
+    DamageError: it is truncated, a checksum is wrong, or counts, times and index disagree.
     """
     if path.stat().st_size < len(MAGIC):
         raise DamageError(0, "the file is empty or ends at once")
@@ -291,8 +290,7 @@ def _zstd() -> Any:
 def unpack(data: bytes, compression: str, most: int = MOST_UNPACKED) -> bytes:
     """Decompresses the content of a chunk by `lz4` or `zstd`: a few bytes can unpack to terabytes.
 
-    Raises ValueError: the result is larger than `most` bytes, or the data is truncated. Other
-    exceptions of the libraries on damaged data are passed on.
+    ValueError: cut off, or larger than `most` bytes; the libraries' own exceptions are passed on.
     """
     if compression == "zstd":
         unpacker = _zstd().ZstdDecompressor()

@@ -39,8 +39,7 @@ def read_recording(
 ) -> Recording:
     """Reads a recording of any of `FORMATS`; RecordingError if there is none, or it can't be read.
 
-    The robot defines the meaning of a bag's `cmd_vel` and joints; the roles of its topics are
-    guessed by default.
+    A bag needs the robot, for its `cmd_vel` and joints; its topics' roles are guessed by default.
     """
     path, topics = Path(path), topics or TopicRoles()
     found = next((each for each in FORMATS if each.recognises(path)), None)

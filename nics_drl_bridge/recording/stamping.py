@@ -50,11 +50,10 @@ def streams(data: Mapping[str, TopicData], stamps: Stamps, place: str) -> dict[s
     """Assigns a time axis, which begins near 0, to each stream with messages.
 
     With `auto`, a stream is stamped by its headers if it has any. Headers less than 50 ms before
-    their receipt are of the recorder's clock, which also stamps streams without header (clock
-    `receive`). Others are of a foreign clock (`header`): their stamps are shifted by the median
-    delay, so that only a small offset is left for calibration. Command, state, wheels and IMU are
-    put on one clock, by receipt if need be. The few messages that arrived after one with a later
-    stamp are sorted, and those before a simulation's first time are dropped. RecordingError if
+    their receipt are of the recorder's clock (`receive`), as streams without header. Others are of
+    a foreign clock (`header`): shifted by the median delay, they leave a small offset for
+    calibration. Command, state, wheels and IMU share one clock, by receipt if need be. Late
+    messages are sorted; those before a simulation's first time are dropped. RecordingError if
     headers are missing, of several clocks, or run backwards.
     """
     if stamps != "receive":

@@ -99,8 +99,7 @@ def assign(
 ) -> dict[str, str]:
     """Assigns topics to roles: a `cmd_vel`, and a `pose` or an `odom` or both.
 
-    RecordingError if a topic is missing, of a wrong type, or several fit a role; one sentence with
-    the available topics and the fix.
+    RecordingError lists the topics: one is missing, of a wrong type, or several fit a role.
     """
     table = _Topics(types, empty, place)
     found = {}

@@ -49,8 +49,7 @@ CHUNK_BYTES = 1 << 16  # damage costs a whole chunk, since each checksum covers 
 def check_out(path: str | Path) -> Path:
     """Checks an output path of a recording: an `.npz` file or the folder of a rosbag2.
 
-    Raises ConfigError: it exists already, or has another suffix. Raises RecordingError: it needs a
-    library that is missing.
+    ConfigError: it exists, or has another suffix. RecordingError: a library is missing.
     """
     path = Path(path)
     if path.exists():
@@ -76,9 +75,8 @@ def write_bag(
 ) -> None:
     """Writes a recording as a bag, in a folder to create, that `load_bag` reads back.
 
-    Commands become `/cmd_vel`, the pose `/odom`; or `/pose` if it has a separate clock or if
-    there is odometry, whose twist is then in `/odom`. State, or else wheels, become
-    `/joint_states`, the IMU `/imu`. Headers contain the streams' stamps. For errors see `bag_sink`.
+    Commands become `/cmd_vel`, state or wheels `/joint_states`, the IMU `/imu`, the pose `/odom`;
+    or `/pose` on its own clock or beside odometry. For errors see `bag_sink`.
     """
     with bag_sink(path, storage) as sink:
         messages, command = _Messages(store := sink.store), recording.command
@@ -192,8 +190,7 @@ class BagSink:
     ) -> None:
         """Adds a topic with messages of a type such as `nav_msgs/msg/Odometry`.
 
-        A type that rosbags does not know needs the `.msg` texts of it and its components, or its
-        complete definition as stored in a bag.
+        A type unknown to rosbags needs `.msg` texts of it and its parts, or its whole definition.
         """
         from rosbags.typesys import get_types_from_msg
 
@@ -231,10 +228,9 @@ class BagSink:
 def bag_sink(path: str | Path, storage: Storage = "mcap") -> Iterator[BagSink]:
     """Yields a bag to write to, a folder made at `path` when the block ends without error.
 
-    It is written to a hidden folder `.NAME.*` next to `path`. After an error nothing is left; a
-    killed process or a full disk leaves that folder, from which `salvage` recovers the flushed
-    messages. MCAP has checksums, so that any damage is found; SQLite has none. Raises
-    RecordingError: the folder exists already or can't be written, or a library is missing.
+    Until then it is in a hidden folder `.NAME.*` beside it, of which an error leaves nothing; after
+    a kill or on a full disk `salvage` recovers flushed messages. MCAP has checksums, SQLite has
+    none. RecordingError: the folder exists or can't be written, or a library is missing.
     """
     path = Path(path)
     check_libraries(path, "writing")
