@@ -22,9 +22,7 @@ RESPONSE = 0.1  # least share of the commanded distance or angle that a robot co
 LEAST_PATH, LEAST_TURN = 0.03, 0.25
 """Least motion commanded within the window for the robot to be judged [m, rad]."""
 WINDOW = 0.75  # length of the window as a share of `stuck_s`; the rest is for the delay of odometry
-MARK_S = 0.05
-PAUSE_S = 0.2
-"""Time between two marks, and least time without commanded motion between two pushes [s]."""
+MARK_S, PAUSE_S = 0.05, 0.2  # between two marks; least time without motion between pushes [s]
 STILL_LINEAR, STILL_TURN = 0.05, 0.1
 """A robot slower than this, plus the noise of its odometry, stands still [m/s, rad/s]."""
 NOISE = 3.0  # noise of odometry that is allowed for, in standard deviations
@@ -119,13 +117,10 @@ def no_motion(config: GateConfig, state: GateState, now: float) -> Cause | None:
     return Cause("no_motion", ODOM, detail)
 
 
-SAME_SHARE = 0.99
-"""Two scans with this share of equal beams are the same; of few beams, one may differ."""
-TELLING_SHARE = 0.9
-"""A scan with this share unchanged, of the beams that must have changed, is an old one."""
+SAME_SHARE = 0.99  # two scans with this share of equal beams are the same; one may always differ
+TELLING_SHARE = 0.9  # a scan is old if this share of the beams that must have changed did not
 CHANGE = 0.02  # least change of a beam that must have changed [m]
-HEADINGS = (-0.03, 0.0, 0.03)
-"""Errors of odometry's heading for all of which the beam must have changed [rad]."""
+HEADINGS = (-0.03, 0.0, 0.03)  # errors of odometry for all of which a beam must have changed [rad]
 NEIGHBOURS = 1.5  # an old beam is compared with beams at most this many beam spacings away
 LEAST_BEAMS = 3
 

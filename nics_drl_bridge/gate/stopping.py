@@ -19,8 +19,7 @@ ANGLE = "rad"
 UNKNOWN_LAG_S = 0.5  # lag of a robot whose model shows none [s]
 SLOWEST_LAG_S = 5.0  # slower modes are not lags but combinations that no command moves [s]
 UNKNOWN_DECELERATION = 0.5  # deceleration of a robot whose limits are not known [m/s^2]
-LEAST_DATA = 2
-"""Least number of data that must arrive while the gate settles, for their rate to be known."""
+LEAST_DATA = 2  # least number that must arrive while the gate settles, for a rate to be known
 
 
 def shield_config(
@@ -119,10 +118,8 @@ def require_possible(config: GateConfig) -> None:
 
 def doubtful(config: GateConfig, control_period_s: float) -> str:
     """Returns a warning about an age limit that only suits a policy with a shorter period [s]."""
-    if config.command_age_s > control_period_s:
-        return ""
-    return (
-        f"parameter 'command_age': {config.command_age_s:g} s: a policy commands every "
-        f"{control_period_s:g} s unless it is told otherwise, and the robot would stop between any "
-        f"two commands; give more than {control_period_s:g}."
-    )
+    age, period = f"{config.command_age_s:g} s", f"{control_period_s:g}"
+    every = f"a policy commands every {period} s unless it is told otherwise"
+    advice = f"the robot would stop between any two commands; give more than {period}."
+    late = config.command_age_s <= control_period_s
+    return f"parameter 'command_age': {age}: {every}, and {advice}" if late else ""

@@ -19,8 +19,7 @@ KEPT = 64  # number of remembered stamps; a command on an older scan is on an un
 MARK_S = 0.05  # time between two marks [s]
 DRIFT = 1e-3  # greatest drift between two clocks [s/s]; that of real machines is 1e-4
 SIMULATED_LAG = 0.2  # share of real time that a simulator may lose
-AHEAD_S = 0.1
-"""Data of an armed gate whose lead exceeds the envelope by this are from the future [s]."""
+AHEAD_S = 0.1  # data of an armed gate that lead the envelope by this are from the future [s]
 FROZEN_INPUTS = 20  # a running clock does not give this many inputs in a row the same time
 
 

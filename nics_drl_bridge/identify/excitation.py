@@ -217,12 +217,13 @@ def coverage(recording: Recording, spec: RobotSpec) -> tuple[CommandCoverage, ..
     found, own = Excitation.of(samples, spec.model_copy(update={"state": ()})), _own(samples.x)
     low, high = np.percentile(command, ENDS, axis=0)
     share = (high - low) / (spec.command_high - spec.command_low)
-    faults = dict.fromkeys(found.together, "moved only together with others")
+    faults = dict.fromkeys(found.levels, "")
+    faults |= dict.fromkeys(found.together, "moved only together with others")
     faults |= dict.fromkeys(found.unmoved, "never moved")
     figures = zip(spec.command, np.stack([low, high, share, own], axis=1).tolist(), strict=True)
     return tuple(
-        CommandCoverage(c.name, c.unit, *each, found.levels[c.name], faults.get(c.name, ""))
-        for c, each in figures
+        CommandCoverage(c.name, c.unit, low, high, share, own, found.levels[c.name], faults[c.name])
+        for c, (low, high, share, own) in figures
     )
 
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,7 +34,7 @@ class Episode:
     """Record of one episode.
 
     The result is `success`, `collision`, `time-out`, or `elsewhere` for a wrongly believed success,
-    by the truth if the backend knows it; `believed` is the robot's own, None if the same.
+    by the truth if the backend knows it; `believed` is then the robot's own, else None.
     """
 
     seed: int
@@ -81,17 +80,6 @@ class Episode:
         }
 
 
-@contextmanager
-def _halted_on_error(env: gymnasium.Env[Any, Any]) -> Iterator[None]:
-    try:
-        yield
-    except BaseException:
-        if isinstance(env.unwrapped, BridgeEnv):  # it does not see errors of a policy
-            with uninterrupted():
-                env.unwrapped.halt()
-        raise
-
-
 def drive(
     env: gymnasium.Env[Any, Any],
     policy: Policy,
@@ -104,7 +92,7 @@ def drive(
 
     `on_start` is called at its start; `touched` tells at its end of contacts that `info` does not.
     """
-    with _halted_on_error(env):
+    try:
         observation, info = env.reset(seed=seed, options=options)
         on_start()
         goal, bodies = info["goal"], info["bodies"]
@@ -125,6 +113,11 @@ def drive(
         there = truly_near(getattr(env.unwrapped, "task", None), info["true_pose"], goal).all()
         true = ELSEWHERE if believed == "success" and not there else believed
         return Episode(seed, "collision" if hit else true, *driven, believed)
+    except BaseException:
+        if isinstance(env.unwrapped, BridgeEnv):  # it does not see errors of a policy
+            with uninterrupted():
+                env.unwrapped.halt()
+        raise
 
 
 def truly_near(task: Any, poses: Array, goals: Array) -> Flags:
@@ -312,10 +305,8 @@ def _finite(value: float) -> float | None:
 
 def tally(episodes: Sequence[Episode], first: Sequence[Episode], control_period: float) -> Tally:
     """Computes the figures of episodes, compared with the same seeds in the first world."""
-    seeds, results, *figures = map(
-        np.array,
-        zip(*((e.seed, e.result, e.steps, e.length, e.reward) for e in episodes), strict=True),
-    )
+    rows = ((e.seed, e.result, e.steps, e.length, e.reward) for e in episodes)
+    seeds, results, *figures = map(np.array, zip(*rows, strict=True))
     outcomes = Outcomes(seeds, results == "success", results == "collision", *figures)
     pairs = list(zip(episodes, first, strict=True))
     gaps = [deviation(one, other) for one, other in pairs]

@@ -23,8 +23,7 @@ from nics_drl_bridge.robot.spec import RobotSpec
 Array = NDArray[np.float64]
 
 FULL_TURN_RAD = 0.8  # bearing of the goal from which a robot turns as fast as it can
-CREEP = 0.3
-"""Share of the maximum speed for a robot that can't turn on the spot and has its goal behind."""
+CREEP = 0.3  # share of full speed if a robot can't turn on the spot and has its goal behind
 
 
 class Policy(Protocol):

@@ -33,10 +33,8 @@ from nics_drl_bridge.sim.world import World
 CHECKPOINT, SETTINGS = "checkpoint.pt", "settings.yaml"
 EVALUATION, POLICY = "evaluation.json", "policy.onnx"
 SEEDS = 2**40
-GREATEST_SEED = 2**32 - 1
-"""Largest seed of numpy's global generator, from which Stable-Baselines3 draws."""
-LOG_EVERY = {"ppo": 1, "sac": 1000}
-"""Roll-outs (PPO) or episodes (SAC) between two entries of TensorBoard."""
+GREATEST_SEED = 2**32 - 1  # of numpy's global generator, from which Stable-Baselines3 draws
+LOG_EVERY = {"ppo": 1, "sac": 1000}  # roll-outs or episodes between two entries of TensorBoard
 Tell = checkpoints.Tell
 
 
@@ -105,12 +103,9 @@ def make_train_env(
 
 
 def _again(
-    content: dict[str, Any],
-    about: dict[str, Any],
-    settings: TrainingSettings,
-    env: TrainVecEnv,
+    content: dict[str, Any], about: dict[str, Any], settings: TrainingSettings, env: TrainVecEnv,
     path: Path,
-) -> BaseAlgorithm:
+) -> BaseAlgorithm:  # fmt: skip
     """Restores the algorithm of a checkpoint. Raises ConfigError if it is of another training."""
     check_same(content["about"], about, path)
     size = int(np.prod(env.observation_space.shape))
@@ -150,8 +145,7 @@ def evaluate(
     return drive_worlds(env, act_of(algorithm), range(FIRST_SEED, FIRST_SEED + episodes))
 
 
-Learn = Callable[[TrainingSettings, int, Path, Tell, bool], Trained]
-"""A function like `train`: of settings, seed, folder, progress callback and `resumed`."""
+Learn = Callable[[TrainingSettings, int, Path, Tell, bool], Trained]  # a function like `train`
 
 
 @dataclass(frozen=True)

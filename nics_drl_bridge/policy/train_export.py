@@ -25,8 +25,7 @@ Rows = NDArray[np.float32]
 Normaliser = tuple[ArrayLike, ArrayLike, float]
 OPSET = 17
 GOLDEN_SEED = 0
-GOLDEN_SPREAD = 3.0
-"""Golden observations lie within this distance of zero if their limits are wider."""
+GOLDEN_SPREAD = 3.0  # golden observations lie this near to zero if their limits are wider
 
 
 class Deployed(torch.nn.Module):  # type: ignore[misc]

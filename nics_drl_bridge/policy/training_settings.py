@@ -13,8 +13,7 @@ Share = Annotated[float, Field(gt=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=1, le=10**12)]
 MOST_WORLDS = 65_536  # maximum number of copies of all worlds together
 MOST_LAYERS, MOST_WIDE = 16, 8_192
-MOST_KEPT = 2**26
-"""Maximum number of stored transitions: of a roll-out in all worlds, or of SAC's buffer."""
+MOST_KEPT = 2**26  # of stored transitions: of a roll-out in all worlds, or of SAC's buffer
 Width = Annotated[int, Field(ge=1, le=MOST_WIDE)]
 
 
@@ -68,7 +67,7 @@ class TrainingSettings(Schema):
     max_episode_steps: Count = 300  # an episode ends as a time-out after this many steps
     algorithm: Literal["ppo", "sac"] = "ppo"
     hidden: tuple[Width, ...] = Field(default=(64, 64), min_length=1, max_length=MOST_LAYERS)
-    threads: Annotated[int, Field(ge=1, le=1024)] = 1
+    threads: Annotated[int, Field(ge=1, le=1024)] = 1  # sums over several round differently
     checkpoint_every: Count = 200_000  # environment steps between two checkpoints
     ppo: PpoSettings = PpoSettings()
     sac: SacSettings = SacSettings()

@@ -16,19 +16,9 @@ import numpy as np
 from nics_drl_bridge.errors import RecordingError, nearest
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import S_PER_NS
+from nics_drl_bridge.recording import messages as msgs
 from nics_drl_bridge.recording import topic_roles as roles
 from nics_drl_bridge.recording.bag_file import BagFile, Message, opened, times_of
-from nics_drl_bridge.recording.messages import (
-    POSITION_UNITS,
-    WHEELS,
-    Row,
-    command_row,
-    frames,
-    imu_row,
-    pose_row,
-    quaternion,
-    twist_row,
-)
 from nics_drl_bridge.recording.recording import Recording, check
 from nics_drl_bridge.recording.stamping import SAME_CLOCK_S, Nanoseconds, TopicData, streams
 from nics_drl_bridge.recording.topic_roles import JointSource, TopicRoles
@@ -57,11 +47,11 @@ def load_bag(path: str | Path, spec: RobotSpec | None, mapping: TopicRoles) -> R
             "pose": _pose(bag, topics.get("pose") or topics["odom"], mapping),
         }
         if "pose" in topics and "odom" in topics:
-            data["odometry"] = _table(bag, topics["odom"], twist_row)
+            data["odometry"] = _table(bag, topics["odom"], msgs.twist_row)
         if topic := topics.get("joint_states"):
             data |= joint_streams(topic, bag.messages(topic), spec, mapping, bag.place)
         if "imu" in topics:
-            data["imu"] = _table(bag, topics["imu"], imu_row)
+            data["imu"] = _table(bag, topics["imu"], msgs.imu_row)
         latency = latency_of(bag, topics.get("odom"))
     made = streams(data, mapping.stamps, str(path))
     recording = Recording(**made, source=str(path), variables=spec.variable_names, latency=latency)
@@ -69,9 +59,9 @@ def load_bag(path: str | Path, spec: RobotSpec | None, mapping: TopicRoles) -> R
 
 
 def _table(
-    bag: BagFile, topic: str, row: Callable[[Any], Row], messages: Sequence[Message] | None = None
+    bag: BagFile, topic: str, row: Callable[[Any], msgs.Row], some: Sequence[Message] | None = None
 ) -> TopicData:
-    messages = bag.messages(topic) if messages is None else messages
+    messages = bag.messages(topic) if some is None else some
     receive, header = times_of(messages)
     values = np.array([row(m.content) for m in messages], dtype=np.float64)
     for k in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1]:
@@ -90,7 +80,7 @@ def _command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
                 f"of robot {spec.name!r} is in {variable.unit}; choose the robot that drove, or "
                 "another topic."
             )
-    data = _table(bag, topic, command_row)
+    data = _table(bag, topic, msgs.command_row)
     return replace(data, values=spec.from_cmd_vel(data.values))
 
 
@@ -98,7 +88,7 @@ def _pose(bag: BagFile, topic: str, mapping: TopicRoles) -> TopicData:
     messages = bag.messages(topic)
     if bag.types[topic] in (roles.TRANSFORM, roles.TRANSFORMS):
         messages = _of_one_body(bag, topic, messages, mapping)
-    quaternions = np.array([quaternion(m.content) for m in messages])
+    quaternions = np.array([msgs.quaternion(m.content) for m in messages])
     with np.errstate(over="ignore"):
         length = np.linalg.norm(quaternions, axis=1)
     for k in np.flatnonzero(~(np.abs(length - 1.0) < QUATERNION_TOLERANCE))[:1]:
@@ -106,7 +96,7 @@ def _pose(bag: BagFile, topic: str, mapping: TopicRoles) -> TopicData:
             f"{bag.place}: topic {topic!r}: message {k}: the quaternion has the length "
             f"{length[k]:.3f} and not 1; check its publisher, or choose another topic."
         )
-    return _table(bag, topic, pose_row, messages)
+    return _table(bag, topic, msgs.pose_row, messages)
 
 
 def _of_one_body(
@@ -114,7 +104,7 @@ def _of_one_body(
 ) -> list[Message]:
     """Returns the transforms between the two frames of the mapping, or the only two frames."""
     single = [
-        (frames(transform), Message(message.receive_ns, transform))
+        (msgs.frames(transform), Message(message.receive_ns, transform))
         for message in messages
         for transform in getattr(message.content, "transforms", (message.content,))
     ]
@@ -184,7 +174,7 @@ def state_of(joints: Joints, spec: RobotSpec, mapping: TopicRoles, place: str) -
     if spec.state and len(found) == len(sources):
         columns = []
         for variable, source in zip(spec.state, found, strict=True):
-            usual = "position" if variable.unit in POSITION_UNITS else "velocity"
+            usual = "position" if variable.unit in msgs.POSITION_UNITS else "velocity"
             table = joints.position if (source.field or usual) == "position" else joints.velocity
             columns.append(source.scale * table[:, joints.names.index(source.joint)])
         return _complete(joints, np.stack(columns, axis=1), [s.joint for s in found], place)
@@ -200,9 +190,9 @@ def state_of(joints: Joints, spec: RobotSpec, mapping: TopicRoles, place: str) -
 
 def wheels_of(joints: Joints, mapping: TopicRoles, place: str) -> TopicData | None:
     """Returns the speeds (T, 2) of the left and right wheel; None without such joints."""
-    guesses = (_alike(joints.names, wheel) for wheel in WHEELS)
+    guesses = (_alike(joints.names, wheel) for wheel in msgs.WHEELS)
     chosen = list(mapping.wheels or (name for name in guesses if name is not None))
-    if len(chosen) < len(WHEELS):
+    if len(chosen) < len(msgs.WHEELS):
         return None
     values = joints.velocity[:, [_index(joints, name, place) for name in chosen]]
     if mapping.wheels is None and not np.isfinite(values).all(axis=1).any():

@@ -198,10 +198,8 @@ def load_recording(path: str | Path) -> Recording:
             name: Stream(arrays[f"{name}_t"].astype(float), arrays[name].astype(float), clock)
             for name, clock in meta["clocks"].items()
         }
-        latency, variables = (
-            Latency.model_validate(meta.get("latency", {})),
-            tuple(meta["variables"]),
-        )
+        latency = Latency.model_validate(meta.get("latency", {}))
+        variables = tuple(meta["variables"])
         return Recording(**streams, source=str(path), variables=variables, latency=latency)
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file; check the path.") from None

@@ -19,15 +19,8 @@ from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.files import check_above, sync_folder
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.recording import messages as msgs
 from nics_drl_bridge.recording import topic_roles
-from nics_drl_bridge.recording.messages import (
-    POSITION_UNITS,
-    WHEELS,
-    Offer,
-    check_libraries,
-    profile_of,
-    typestore,
-)
 from nics_drl_bridge.recording.recording import Recording, Stream, save_recording
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -58,7 +51,7 @@ def check_out(path: str | Path) -> Path:
         advice = f"name a file *{NPZ}, or the folder of a rosbag2 without suffix"
         raise ConfigError(f"{path}: unknown kind of recording {path.suffix!r}; {advice}.")
     if path.suffix != NPZ:
-        check_libraries(path, "writing", f", or name a file *{NPZ}")
+        msgs.check_libraries(path, "writing", f", or name a file *{NPZ}")
     return path
 
 
@@ -95,20 +88,21 @@ def _topics(
     recording: Recording, spec: RobotSpec, messages: _Messages
 ) -> Iterator[tuple[str, str, Stream, Make]]:
     beside = recording.odometry is not None or recording.pose.clock != recording.command.clock
-    joints, names, still = recording.wheels, list(WHEELS), np.zeros(len(WHEELS), dtype=bool)
+    joints, names, still = recording.wheels, list(msgs.WHEELS), np.zeros(2, dtype=bool)
     if recording.state is not None:
         joints, names = recording.state, [v.name for v in spec.state]
-        still = np.array([v.unit in POSITION_UNITS for v in spec.state])
-    pose = ("/odom", topic_roles.ODOMETRY, recording.pose, messages.odometry)
-    if beside:
-        pose = ("/pose", topic_roles.POSE, recording.pose, messages.pose_stamped)
+        still = np.array([v.unit in msgs.POSITION_UNITS for v in spec.state])
     topics: list[tuple[str, str, Stream | None, Make]] = [
         (
             "/cmd_vel", topic_roles.TWIST, recording.command,
             lambda _, row: messages.twist(spec.to_cmd_vel(row)),
         ),
-        pose,
-        ("/odom", topic_roles.ODOMETRY, recording.odometry, messages.speeds),
+        ("/pose", topic_roles.POSE, recording.pose, messages.pose_stamped) if beside
+        else ("/odom", topic_roles.ODOMETRY, recording.pose, messages.odometry),
+        (
+            "/odom", topic_roles.ODOMETRY, recording.odometry,
+            lambda header, row: messages.odometry(header, row, pose_known=False),
+        ),
         (
             "/joint_states", topic_roles.JOINTS, joints,
             lambda header, row: messages.joints(header, names, row * still, row * ~still),
@@ -148,15 +142,11 @@ class _Messages:
     def pose_stamped(self, header: Any, row: Array) -> Any:
         return self._new("geometry_msgs/PoseStamped", header, self._pose(row))
 
-    def odometry(self, header: Any, row: Array) -> Any:
-        return self._odometry(header, row, np.zeros(3), np.zeros(36))
-
-    def speeds(self, header: Any, row: Array) -> Any:
-        """Makes an odometry message of which only the twist was recorded."""
-        return self._odometry(header, np.zeros(3), row, np.append(-1.0, np.zeros(35)))
-
-    def _odometry(self, header: Any, pose: Array, twist: Array, pose_covariance: Array) -> Any:
-        where = self._new("geometry_msgs/PoseWithCovariance", self._pose(pose), pose_covariance)
+    def odometry(self, header: Any, row: Array, pose_known: bool = True) -> Any:
+        """Makes an odometry message of which only the pose or only the twist was recorded."""
+        pose, twist = (row, np.zeros(3)) if pose_known else (np.zeros(3), row)
+        covariance = np.append(0.0 if pose_known else -1.0, np.zeros(35))
+        where = self._new("geometry_msgs/PoseWithCovariance", self._pose(pose), covariance)
         speed = self._new("geometry_msgs/TwistWithCovariance", self.twist(twist), np.zeros(36))
         return self._new("nav_msgs/Odometry", header, FRAMES[1], where, speed)
 
@@ -176,7 +166,7 @@ class BagSink:
     """An open bag, created by `bag_sink` with an open writer of rosbags."""
 
     def __init__(self, writer: Writer) -> None:
-        self._writer, self.store = writer, typestore()  # the known message types
+        self._writer, self.store = writer, msgs.typestore()  # the known message types
         self._connections: dict[str, Connection] = {}
         self.counts: dict[str, int] = {}  # number of messages by topic
 
@@ -184,7 +174,7 @@ class BagSink:
         self,
         topic: str,
         kind: str,
-        offers: Sequence[Offer] = (),
+        offers: Sequence[msgs.Offer] = (),
         texts: Mapping[str, str] | None = None,
         definition: str | None = None,
     ) -> None:
@@ -201,7 +191,7 @@ class BagSink:
         given = {} if kind in fields else {"msgdef": definition or "", "rihs01": NO_HASH}
         self._connections[topic] = self._writer.add_connection(
             topic, kind, typestore=self.store, **given,
-            offered_qos_profiles=[profile_of(offer) for offer in offers],
+            offered_qos_profiles=[msgs.profile_of(offer) for offer in offers],
         )  # fmt: skip
         self.counts[topic] = 0
 
@@ -233,7 +223,7 @@ def bag_sink(path: str | Path, storage: Storage = "mcap") -> Iterator[BagSink]:
     none. RecordingError: the folder exists or can't be written, or a library is missing.
     """
     path = Path(path)
-    check_libraries(path, "writing")
+    msgs.check_libraries(path, "writing")
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     from nics_drl_bridge.recording.mcap import seal
