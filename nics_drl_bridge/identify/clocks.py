@@ -54,12 +54,9 @@ class DelayEstimate:
 
 
 def delay_of_response(
-    command: Stream,
-    spec: RobotSpec,
-    target: Target,
-    centers: tuple[float, ...] = (0.0,),
+    command: Stream, spec: RobotSpec, target: Target, centers: tuple[float, ...] = (0.0,),
     lags: Array | None = None,
-) -> DelayEstimate:
+) -> DelayEstimate:  # fmt: skip
     """Estimates a signal's delay around centers [s], and the moved commands' lags if unknown."""
     moved = signals.moved_inputs(command, spec)[: len(spec.state)]
     free = np.flatnonzero(moved if lags is None else [])
@@ -166,10 +163,11 @@ def timing_of(drive: Drive) -> TimingEstimate:
     command, state, place = recording.command, recording.state, recording.source
     missing = [v.name for v in spec.state if v.follows is None]
     if state is None and missing:
-        raise RecordingError(
-            f"{place}: has no measured state, and {missing[0]!r} of robot {spec.name!r} follows no "
-            "command; record the state too, or add `follows:` to the robot's YAML file."
+        fault = (
+            f"has no measured state, and {missing[0]!r} of robot {spec.name!r} follows no command"
         )
+        advice = "record the state too, or add `follows:` to the robot's YAML file"
+        raise RecordingError(f"{place}: {fault}; {advice}.")
     if len(twists.start) < MIN_STAMPS:
         fault = f"pose: only {len(twists.start)} usable intervals"
         raise RecordingError(f"{place}: {fault}; record a drive of 20 s or more without long gaps.")
@@ -257,12 +255,6 @@ def expected_states(drive: Drive, twists: TwistIntervals, timing: TimingEstimate
     return signals.interval_means(grid, states, start, end)
 
 
-def expected_speed(drive: Drive, timing: TimingEstimate) -> Array | None:
-    """Returns the speed (n,) over the intervals of the twists, at gain 1; None if not unique."""
-    speed = signals.speed_index(drive.spec)
-    return None if speed is None else expected_states(drive, drive.twists, timing)[:, speed]
-
-
 def responses_of(
     drive: Drive, calibration: Calibration, timing: TimingEstimate, expected: Array | None
 ) -> tuple[Response, ...]:
@@ -308,12 +300,11 @@ def with_wheels(drive: Drive, calibration: Calibration) -> Calibration:
         swapped = agreement < 0.0 if abs(agreement) > 0.5 else None
         calibration = replace(calibration, wheels_swapped=swapped)
     sigma = dict(calibration.uncertainty)
-    rows = {
-        "wheel_scale": (wheels.mean(axis=1), speed_along(drive, calibration)),
-        "turn_scale": (difference, turn),
-    }
     scales: dict[str, Any] = {}
-    for name, (units, moved) in rows.items():
+    for name, units, moved in (
+        ("wheel_scale", wheels.mean(axis=1), speed_along(drive, calibration)),
+        ("turn_scale", difference, turn),
+    ):
         if not float(units @ units) > 0.0:
             continue
         scale = float(units @ moved / (units @ units))

@@ -20,7 +20,7 @@ from nics_drl_bridge.identify.calibration import Calibration, align
 from nics_drl_bridge.identify.clocks import (
     SEARCH_S,
     TimingEstimate,
-    expected_speed,
+    expected_states,
     nominal_timing,
     responses_of,
     timing_of,
@@ -33,6 +33,7 @@ from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
 from nics_drl_bridge.identify.open_loop import OpenLoop
 from nics_drl_bridge.identify.refine import refined
 from nics_drl_bridge.identify.repair import check_axes, check_units, repaired
+from nics_drl_bridge.identify.signals import speed_index
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream, check
 from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -108,8 +109,10 @@ def clocks(drive: Drive, findings: Findings) -> Findings:
 
 def mounting(drive: Drive, findings: Findings) -> Findings:
     """Finds where and how the tracked body is mounted on the robot."""
-    speed = expected_speed(findings.training, findings.timing)
-    found = mounting_of(findings.training, findings.timing, speed)
+    training, place = findings.training, speed_index(drive.spec)
+    states = None if place is None else expected_states(training, training.twists, findings.timing)
+    speed = None if states is None else states[:, place]
+    found = mounting_of(training, findings.timing, speed)
     calibration = mounted(findings.calibration, found)
     return replace(findings, speed=speed, mounting=found, calibration=calibration)
 
@@ -176,7 +179,9 @@ def judge(drive: Drive, findings: Findings) -> Findings:
     linear, model = _fitted(findings)
     spec, whole, calibration = drive.spec, findings.whole, findings.calibration
     samples = align(whole, calibration)
-    unseen = verdict.unseen_samples(samples, whole, calibration)
+    begin = whole.recording.pose.t[0] + calibration.clock_offset_s + drive.settings.train_until_s
+    rest = samples.rows(samples.t > begin)
+    unseen = rest if len(rest.t) >= verdict.MIN_ROWS else None
     held_out, trial = verdict.tried(model, calibration, whole)
     calibration = replace(calibration, notes=_sentences(findings))
     judged = verdict.with_quality(model, linear, unseen, held_out, spec)

@@ -50,24 +50,19 @@ def refined(
     """Refines a linear fit by its predictions, removes terms; a sentence tells of the result."""
     model, calibration = by_definition(linear.with_errors({}), calibration, drive.spec)
     problem = problem_of(model, calibration, drive)
-    why = (
-        "The training part is too short to refine the model by its errors over seconds; record a "
-        "longer drive."
-    )
+    why = "The training part is too short to refine the model by its errors over seconds"
+    note = f"{why}; record a longer drive."
     if problem is not None:
         try:
             best = simplify(problem, refine(problem, model, calibration))
             errors = replace(best.model, std_errors=best.std_errors).named_errors
-            return merged(best.model, linear, errors), best.calibration, (
-                "Coefficients and calibration were refined by the open-loop errors over up to 5 s: "
-                f"{best.error:.4f} m (root mean square) is left on the training part."
-            )  # fmt: skip
+            by = "Coefficients and calibration were refined by the open-loop errors over up to 5 s"
+            note = f"{by}: {best.error:.4f} m (root mean square) is left on the training part."
+            return merged(best.model, linear, errors), best.calibration, note
         except np.linalg.LinAlgError:  # the model is unstable: its slopes overflow
-            why = (
-                "The predictions of the fitted model run away on the training part, so that it "
-                "could not be refined."
-            )
-    return merged(model, linear, {}), calibration, why
+            why = "The predictions of the fitted model run away on the training part"
+            note = f"{why}, so that it could not be refined."
+    return merged(model, linear, {}), calibration, note
 
 
 def by_definition(
@@ -305,14 +300,12 @@ def _with_uncertainty(
     if lag_is_measured(calibration) and "clock_offset_s" in spread:
         both = np.hypot(spread["clock_offset_s"], known["command_latency_s"])
         spread["clock_offset_s"] = float(both)
-    rotation = calibration.rotation_rad
-    turned = float(geometry.wrap_angle(rotation)) if "rotation_rad" in free.names else rotation
-    return replace(
-        calibration,
-        rotation_rad=turned,
-        uncertainty={**known, **spread},
-        responses=tuple(_response(model, i, r) for i, r in enumerate(calibration.responses)),
-    )
+    turned = calibration.rotation_rad
+    if "rotation_rad" in free.names:
+        turned = float(geometry.wrap_angle(turned))
+    responses = tuple(_response(model, i, r) for i, r in enumerate(calibration.responses))
+    found = {**known, **spread}
+    return replace(calibration, rotation_rad=turned, uncertainty=found, responses=responses)
 
 
 def _response(model: TaylorModel, i: int, response: Response) -> Response:

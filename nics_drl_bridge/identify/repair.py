@@ -67,17 +67,14 @@ def _without_jumps(drive: Drive, notes: list[str]) -> Recording:
         found["state"] = _jumps_of_state(recording.state)
     for name, jump in found.items():
         share = float(jump.mean()) if len(jump) else 0.0
+        jumps, count = "jump away from their neighbours and back", int(jump.sum())
         if share > MOST:
-            raise RecordingError(
-                f"{recording.source}: {name}: {share:.0%} of the rows jump away from their "
-                "neighbours and back; look for two sources that are mixed in one stream."
-            )
-        if jump.any():
+            fault = f"{recording.source}: {name}: {share:.0%} of the rows {jumps}"
+            raise RecordingError(f"{fault}; look for two sources that are mixed in one stream.")
+        if count:
             recording = _with_rows(recording, name, ~jump)
-            notes.append(
-                f"{name}: {int(jump.sum())} of {len(jump)} rows ({share:.1%}) jump away from "
-                "their neighbours and back, and were left out as outliers."
-            )
+            some = f"{name}: {count} of {len(jump)} rows ({share:.1%})"
+            notes.append(f"{some} {jumps}, and were left out as outliers.")
     return recording
 
 

@@ -35,12 +35,12 @@ MIRRORED = -0.5  # correlation of yaw rate and steering below which the robot tu
 
 def about_stamps(drive: Drive) -> Iterator[str]:
     """Tells of the stamps and the noise of the poses."""
-    if drive.bursts is not None:
-        yield (
-            f"The poses arrive in bursts of about {drive.bursts.size:.0f} every "
-            f"{drive.bursts.period_s:.3f} s: their stamps are arrival times; the samples of a "
-            "burst were spread over the time since the one before."
+    if (bursts := drive.bursts) is not None:
+        finding = (
+            f"The poses arrive in bursts of about {bursts.size:.0f} every {bursts.period_s:.3f} s"
         )
+        spread = "the samples of a burst were spread over the time since the one before"
+        yield f"{finding}: their stamps are arrival times; {spread}."
     if drive.pose_noise is None:
         yield "The noise of the pose was not measured; let the robot stand still for 2 s at first."
 
@@ -50,11 +50,9 @@ def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate)
     sigma, recording = calibration.uncertainty, drive.recording
     clocks_differ = recording.pose.clock != recording.command.clock
     if clocks_differ and "clock_offset_s" in sigma:
-        yield (
-            f"Pose and commands are stamped by different clocks: {calibration.clock_offset_s:.4f} "
-            f"s (+- {sigma['clock_offset_s']:.4f} s) added to the pose's stamps gives the "
-            "commands' clock."
-        )
+        offset = f"{calibration.clock_offset_s:.4f} s (+- {sigma['clock_offset_s']:.4f} s)"
+        finding = "Pose and commands are stamped by different clocks"
+        yield f"{finding}: {offset} added to the pose's stamps gives the commands' clock."
     if not moved_commands(recording.command).any():
         yield "No command ever changed, so clock offset and latency could not be learnt."
     elif not timing.separated and clocks_differ:
@@ -64,10 +62,8 @@ def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate)
             "or the state to tell them apart."
         )
     if timing.separated and calibration.command_latency_s > 0.0:
-        yield (
-            f"Commands take effect {calibration.command_latency_s:.4f} s (+- "
-            f"{sigma['command_latency_s']:.4f} s) after their stamps."
-        )
+        late = f"{calibration.command_latency_s:.4f} s (+- {sigma['command_latency_s']:.4f} s)"
+        yield f"Commands take effect {late} after their stamps."
 
 
 def about_mounting(
@@ -84,10 +80,8 @@ def about_mounting(
     known_x, known_y = ~np.isnan(mounting.lever_sigma)
     if calibration.rotation_rad != 0.0:
         sigma = calibration.uncertainty.get("rotation_rad", mounting.rotation_sigma)
-        yield (
-            f"The direction of travel lies {calibration.rotation_rad:.4f} rad (+- {sigma:.4f} rad) "
-            "from the tracked body's heading."
-        )
+        turned = f"{calibration.rotation_rad:.4f} rad (+- {sigma:.4f} rad)"
+        yield f"The direction of travel lies {turned} from the tracked body's heading."
     if not known_x:
         why = "all of the path had one curvature" if mounting.turns else "the robot never turned"
         finding = f"Where the tracked point lies on the robot could not be learnt, since {why}"
@@ -114,11 +108,9 @@ def about_responses(
             finding = f"{command} never changed, so how {state} follows it could not be learnt"
             yield f"{finding}; drive with {command} changing over its whole range."
         else:
-            spread = "" if np.isnan(sigma) else f" (+- {sigma:.4f} s)"
-            yield (
-                f"{state} was not measured: it is taken to follow {command} with a lag of "
-                f"{response.lag_s:.4f} s{spread} and a gain of {response.gain:.4f}."
-            )
+            lag = f"{response.lag_s:.4f} s" + ("" if np.isnan(sigma) else f" (+- {sigma:.4f} s)")
+            taken = f"with a lag of {lag} and a gain of {response.gain:.4f}"
+            yield f"{state} was not measured: it is taken to follow {command} {taken}."
     if calibration.wheel_scale is not None:
         scale, sigma = calibration.wheel_scale, calibration.uncertainty["wheel_scale"]
         yield f"A unit of the wheels' speed is {scale:.4g} m/s (+- {sigma:.2g} m/s)."
@@ -131,13 +123,10 @@ def about_responses(
 
 def refuse_unexcited(excitation: Excitation, spec: RobotSpec) -> None:
     """Refuses a drive, with a FitError, that did not move every input independently."""
-    still, commands = excitation.unmoved, {c.name for c in spec.command}
+    commands = {c.name for c in spec.command}
+    still = [n for n in excitation.unmoved if n in commands] or excitation.unmoved
     for names, fault, way in (
-        (
-            [n for n in still if n in commands] or still,
-            "never moved",
-            "changing over the whole range",
-        ),
+        (still, "never moved", "changing over the whole range"),
         (excitation.together, "always moved together", "each changing on its own"),
     ):
         if told := _list(names):
@@ -217,13 +206,6 @@ def mirror_note(samples: Samples, spec: RobotSpec) -> Iterator[str]:
             return
 
 
-def unseen_samples(samples: Samples, drive: Drive, calibration: Calibration) -> Samples | None:
-    """Returns the samples of the part of a drive that the fit did not see; None if too few."""
-    begin = drive.recording.pose.t[0] + calibration.clock_offset_s + drive.settings.train_until_s
-    unseen = samples.rows(samples.t > begin)
-    return unseen if len(unseen.t) >= MIN_ROWS else None
-
-
 def tried(
     model: TaylorModel, calibration: Calibration, drive: Drive
 ) -> tuple[OpenLoop | None, list[str]]:
@@ -240,12 +222,9 @@ def tried(
 
 
 def with_quality(
-    model: TaylorModel,
-    linear: Fit,
-    unseen: Samples | None,
-    held_out: OpenLoop | None,
+    model: TaylorModel, linear: Fit, unseen: Samples | None, held_out: OpenLoop | None,
     spec: RobotSpec,
-) -> TaylorModel:
+) -> TaylorModel:  # fmt: skip
     """Returns the model with its figures of merit."""
 
     def by_dof(values: Array) -> dict[str, float]:

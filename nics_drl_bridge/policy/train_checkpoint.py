@@ -41,6 +41,11 @@ def save_checkpoint(
     path: Path, algorithm: BaseAlgorithm, env: TrainVecEnv, about: dict[str, Any]
 ) -> None:
     """Writes a checkpoint between two roll-outs; `about` identifies the training."""
+    replay: dict[str, Any] = {}
+    if isinstance(algorithm, OffPolicyAlgorithm):
+        buffer: Any = algorithm.replay_buffer
+        rows = {name: getattr(buffer, name)[: buffer.size()] for name in REPLAYED}
+        replay = {"pos": buffer.pos, "full": buffer.full, **_tensors(rows)}
     content = {
         "format": FORMAT,
         "about": json.dumps(about),
@@ -52,7 +57,7 @@ def save_checkpoint(
         "counters": {name: getattr(algorithm, name) for name in COUNTERS},
         "recent": list(algorithm.ep_success_buffer or ()),
         "last": _tensors({name: getattr(algorithm, name) for name in LAST}),
-        "replay": _replay(algorithm),
+        "replay": replay,
         "random": _random_state(algorithm),
         "envs": [_tensors(snapshot(one)) for one in env.envs],
     }
@@ -127,14 +132,6 @@ def resume(content: dict[str, Any], algorithm: BaseAlgorithm, env: TrainVecEnv) 
 
 def _tensors(arrays: dict[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
     return {name: torch.from_numpy(np.ascontiguousarray(rows)) for name, rows in arrays.items()}
-
-
-def _replay(algorithm: BaseAlgorithm) -> dict[str, Any]:
-    if not isinstance(algorithm, OffPolicyAlgorithm):
-        return {}
-    buffer: Any = algorithm.replay_buffer
-    rows = {name: getattr(buffer, name)[: buffer.size()] for name in REPLAYED}
-    return {"pos": buffer.pos, "full": buffer.full, **_tensors(rows)}
 
 
 def _random_state(algorithm: BaseAlgorithm) -> dict[str, Any]:

@@ -39,9 +39,8 @@ def load_csv_folder(path: str | Path) -> Recording:
         raise RecordingError(f"{path}: no such folder; check the path.")
     for name in REQUIRED:
         if not (path / name).is_file():
-            raise RecordingError(
-                f"{path}: the file {name!r} is missing; a folder needs {REQUIRED}."
-            )
+            fault = f"the file {name!r} is missing"
+            raise RecordingError(f"{path}: {fault}; a folder needs {REQUIRED}.")
     tables = {name: _read(path / name) for name in COLUMNS if (path / name).exists()}
     command, vrpn = tables["cmd.csv"], tables["vrpn.csv"]
     _check_units(path, tables)
@@ -50,12 +49,13 @@ def load_csv_folder(path: str | Path) -> Recording:
         left, right = tables["L_wheel.csv"], tables["R_wheel.csv"]
         at_left = np.interp(left[:, 1], right[:, 1], right[:, 0])
         wheels = Stream(left[:, 1], np.stack([left[:, 0], at_left], axis=1), ROBOT_CLOCK)
+    qx, qy, qz, qw = vrpn[:, 3:7].T
+    heading = np.arctan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy**2 + qz**2))
+    poses = np.stack([vrpn[:, 0], vrpn[:, 1], heading], axis=1)
     return Recording(
-        command=Stream(command[:, 2], command[:, :2], ROBOT_CLOCK),
-        pose=Stream(vrpn[:, 7] * 1e-9, _poses(vrpn), POSE_CLOCK),
-        wheels=wheels,
-        source=str(path),
-    )
+        Stream(command[:, 2], command[:, :2], ROBOT_CLOCK),
+        Stream(vrpn[:, 7] * 1e-9, poses, POSE_CLOCK), wheels=wheels, source=str(path),
+    )  # fmt: skip
 
 
 def _read(path: Path) -> Array:
@@ -117,12 +117,6 @@ def _numbers(line: int, row: list[str], columns: tuple[str, ...]) -> list[float]
     if not np.isfinite(values).all():
         raise ValueError(f"row {line} holds NaN or inf; remove the row")
     return values
-
-
-def _poses(vrpn: Array) -> Array:
-    qx, qy, qz, qw = vrpn[:, 3:7].T
-    heading = np.arctan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy**2 + qz**2))
-    return np.stack([vrpn[:, 0], vrpn[:, 1], heading], axis=1)
 
 
 def _check_units(path: Path, tables: dict[str, Array]) -> None:

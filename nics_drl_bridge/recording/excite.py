@@ -184,13 +184,11 @@ class Exploration:
 
     def _ways_back(self, factor: Array) -> Array:
         """Returns constant commands (E, T, C) for turning back: half a turn by the fastest one."""
-        ends = [
-            sorted({low, rest, high})
-            for low, rest, high in zip(
-                np.minimum(factor * self.low, self.rest), self.rest,
-                np.maximum(factor * self.high, self.rest), strict=True,
-            )
-        ]  # fmt: skip
+        low, high = (
+            np.minimum(factor * self.low, self.rest),
+            np.maximum(factor * self.high, self.rest),
+        )
+        ends = [sorted(set(three)) for three in zip(low, self.rest, high, strict=True)]
         ways = np.array(list(product(*ends)))[:, None]
         first, last = round(WAY_S[0] / WAY_STEP_S), round(1.0 / WAY_STEP_S)
         poses, _ = self._roll(np.repeat(ways, first, axis=1), WAY_STEP_S)
@@ -334,14 +332,12 @@ class DrivePlan:
     seed: int = 0  # of the pattern
 
     def __post_init__(self) -> None:
-        ranges = {
-            "bound": (self.robot.footprint_radius, 1000.0),
-            "duration": (SHORTEST_S, LONGEST_S),
-            "speed": (0.05, 1.0),
-        }
         checked_seeds(self.seed)
-        for name, (low, high) in ranges.items():
-            value = getattr(self, name)
+        for name, value, low, high in (
+            ("bound", self.bound, self.robot.footprint_radius, 1000.0),
+            ("duration", self.duration, SHORTEST_S, LONGEST_S),
+            ("speed", self.speed, 0.05, 1.0),
+        ):
             if not low <= value <= high:
                 raise ConfigError(f"{name} {value:g}: must be from {low:g} to {high:g}.")
 
@@ -364,8 +360,6 @@ class DrivePlan:
             pattern = drive.expected() if drive.keep_within > 0.0 else None
             if pattern is not None:
                 return number, pattern
-        raise ConfigError(
-            f"bound {self.bound:g}: a circle of {self.bound:g} m around the start is too small "
-            f"for robot {self.robot.name!r} to show its motion within {self.duration:g} s; give "
-            "it more space, less speed, or more time."
-        )
+        circle = f"bound {self.bound:g}: a circle of {self.bound:g} m around the start is too small"
+        motion = f"for robot {self.robot.name!r} to show its motion within {self.duration:g} s"
+        raise ConfigError(f"{circle} {motion}; give it more space, less speed, or more time.")
