@@ -116,15 +116,13 @@ def _check(key: str, limit: CommandLimit, variable: CommandVariable) -> None:
         value, most = getattr(limit, name), span / PERIOD_S**order
         reach = value * LONGEST_START_S**order / order
         if value > most:
-            raise ConfigError(
-                f"{key}.{name}': {value:g} {unit}{per} crosses the robot's whole range within a "
-                f"period of the gate, {PERIOD_S:g} s, and limits nothing; give at most {most:g}."
-            )
+            fault = f"{value:g} {unit}{per} crosses the robot's whole range"
+            within = f"within a period of the gate, {PERIOD_S:g} s, and limits nothing"
+            raise ConfigError(f"{key}.{name}': {fault} {within}; give at most {most:g}.")
         if reach < STARTED * far:
-            raise ConfigError(
-                f"{key}.{name}': {value:g} would never let it move: after {LONGEST_START_S:g} s it "
-                f"has come to {reach:.2g} of {far:g} {unit}; raise it."
-            )
+            come = f"after {LONGEST_START_S:g} s it has come to {reach:.2g} of {far:g} {unit}"
+            fault = f"{value:g} would never let it move: {come}"
+            raise ConfigError(f"{key}.{name}': {fault}; raise it.")
 
 
 def greatest(limits: Limits, which: NDArray[np.bool_]) -> float:

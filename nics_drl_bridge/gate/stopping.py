@@ -85,17 +85,15 @@ def wheelbase(robot: RobotSpec) -> float:
     """Returns the wheelbase [m] of a car, else 0; ConfigError without it or for unknown units."""
     for variable in robot.command:
         if variable.unit not in (SPEED, TURN, ANGLE):
-            raise ConfigError(
-                f"robot {robot.name!r}: the shield knows commands in m/s, rad/s and rad, and "
-                f"{variable.name!r} is in {variable.unit!r}; without it, set `shield: false`."
-            )
+            fault = f"{variable.name!r} is in {variable.unit!r}; without it, set `shield: false`"
+            known = f"robot {robot.name!r}: the shield knows commands in m/s, rad/s and rad"
+            raise ConfigError(f"{known}, and {fault}.")
     if not robot.steers:
         return 0.0
     if not robot.parameters.get("wheelbase", 0.0) > 0.0:
-        raise ConfigError(
-            f"robot {robot.name!r}: the shield needs the parameter 'wheelbase' of a car; add it "
-            "under `parameters:` of the robot, or drive without a shield by `shield: false`."
-        )
+        fault = f"robot {robot.name!r}: the shield needs the parameter 'wheelbase' of a car"
+        advice = "add it under `parameters:` of the robot"
+        raise ConfigError(f"{fault}; {advice}, or drive without a shield by `shield: false`.")
     return robot.parameters["wheelbase"]
 
 
@@ -110,10 +108,9 @@ def require_possible(config: GateConfig) -> None:
             fault = f"{age:g} s: {declared}, so the robot could never move"
             raise ConfigError(f"parameter '{topic}_age': {fault}; give more than {1.0 / rate:.3g}.")
         if rate * config.settle_s < LEAST_DATA:
-            raise ConfigError(
-                f"{declared}, too seldom to be judged within {config.settle_s:g} s, so the robot "
-                f"could never move; the gate needs {LEAST_DATA / config.settle_s:g} Hz or more."
-            )
+            fault = f"{declared}, too seldom to be judged within {config.settle_s:g} s"
+            needed = f"the gate needs {LEAST_DATA / config.settle_s:g} Hz or more"
+            raise ConfigError(f"{fault}, so the robot could never move; {needed}.")
 
 
 def doubtful(config: GateConfig, control_period_s: float) -> str:

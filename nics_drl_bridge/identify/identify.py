@@ -315,9 +315,8 @@ def cut(recording: Recording, until: float) -> Recording:
         return stream.rows(stream.t <= origin + until + margin)
 
     if not until > 0.0:
-        raise RecordingError(
-            f"{recording.source}: the training part ends at {until:g} s; use more than 0."
-        )
+        fault = f"{recording.source}: the training part ends at {until:g} s"
+        raise RecordingError(f"{fault}; use more than 0.")
     parts: dict[str, Any] = {name: part(stream) for name, stream in recording.streams.items()}
     parts["command"] = part(recording.command, SEARCH_S)
     return replace(recording, **parts)

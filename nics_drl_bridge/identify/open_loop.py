@@ -150,10 +150,9 @@ def open_loop_error(
     """Predicts a part of a drive [s] open-loop, every 0.1 s; RecordingError if it is too short."""
     chosen = windows(drive, calibration, start, stop, horizon, SPACING_S)
     if len(chosen.start_t) == 0:
-        raise RecordingError(
-            f"{drive.recording.source}: the {stop - start:.1f} s from {start:.1f} s on hold no "
-            f"window of {horizon:g} s; record a longer drive or shorten the horizon."
-        )
+        fault = f"the {stop - start:.1f} s from {start:.1f} s on hold no window of {horizon:g} s"
+        advice = "record a longer drive or shorten the horizon"
+        raise RecordingError(f"{drive.recording.source}: {fault}; {advice}.")
     error = predict(model, calibration, drive, chosen) - chosen.end
     position = np.hypot(error[:, 0], error[:, 1])
     moved = chosen.end - chosen.start

@@ -163,11 +163,10 @@ def check_units(drive: Drive) -> None:
         for variable, size in zip(variables, sizes, strict=True):
             limit = max(abs(variable.min), abs(variable.max))
             if size > WRONG_UNIT * limit:
-                raise RecordingError(
-                    f"{recording.source}: {variable.name} is {size:.4g} and more where its limit "
-                    f"is {limit:g} {variable.unit}; it must be in {variable.unit} (degrees, "
-                    "millimetres or revolutions per minute look like this)."
-                )
+                name, unit = f"{recording.source}: {variable.name}", variable.unit
+                fault = f"is {size:.4g} and more where its limit is {limit:g} {unit}"
+                alike = "degrees, millimetres or revolutions per minute look like this"
+                raise RecordingError(f"{name} {fault}; it must be in {unit} ({alike}).")
 
 
 def check_axes(drive: Drive) -> None:

@@ -56,11 +56,9 @@ def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate)
     if not moved_commands(recording.command).any():
         yield "No command ever changed, so clock offset and latency could not be learnt."
     elif not timing.separated and clocks_differ:
-        yield (
-            "Only the sum of clock offset and command latency can be known, since nothing measured "
-            "on the commands' clock follows them; the latency is taken as zero. Record the wheels "
-            "or the state to tell them apart."
-        )
+        why = "since nothing measured on the commands' clock follows them"
+        advice = "the latency is taken as zero. Record the wheels or the state to tell them apart"
+        yield f"Only the sum of clock offset and command latency can be known, {why}; {advice}."
     if timing.separated and calibration.command_latency_s > 0.0:
         late = f"{calibration.command_latency_s:.4f} s (+- {sigma['command_latency_s']:.4f} s)"
         yield f"Commands take effect {late} after their stamps."
@@ -71,10 +69,8 @@ def about_mounting(
 ) -> Iterator[str]:
     """Tells where and how the tracked body sits on the robot."""
     if mounting is None:
-        yield (
-            "How the tracked body sits on the robot could not be learnt, and is taken to be "
-            "exactly at base_link; drive in every direction and turn."
-        )
+        taken = "is taken to be exactly at base_link; drive in every direction and turn"
+        yield f"How the tracked body sits on the robot could not be learnt, and {taken}."
         return
     x, y = calibration.lever_arm_m
     known_x, known_y = ~np.isnan(mounting.lever_sigma)
@@ -90,10 +86,8 @@ def about_mounting(
     elif (x, y) != (0.0, 0.0):
         yield f"The tracked point lies at x {x:.4f} m, y {y:.4f} m of base_link."
     if known_x and not known_y and not drive.spec.moves_sideways:
-        yield (
-            "The tracked point's place along y could not be learnt, since no speed was known "
-            "apart from the tracked one; it is taken as zero."
-        )
+        why = "since no speed was known apart from the tracked one; it is taken as zero"
+        yield f"The tracked point's place along y could not be learnt, {why}."
 
 
 def about_responses(
@@ -115,10 +109,8 @@ def about_responses(
         scale, sigma = calibration.wheel_scale, calibration.uncertainty["wheel_scale"]
         yield f"A unit of the wheels' speed is {scale:.4g} m/s (+- {sigma:.2g} m/s)."
     if calibration.wheels_swapped:
-        yield (
-            "Left and right wheel look interchanged: the wheel recorded as the left one is the "
-            "faster one when the robot turns left, and the slower one when it turns right."
-        )
+        why = "is the faster one when the robot turns left, and the slower one when it turns right"
+        yield f"Left and right wheel look interchanged: the wheel recorded as the left one {why}."
 
 
 def refuse_unexcited(excitation: Excitation, spec: RobotSpec) -> None:
@@ -143,15 +135,11 @@ def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> Iterator
     if missing := ", ".join(name for name in excitation.unmoved if name not in already):
         yield f"Drive with {missing} changing over the whole range to learn them."
     if together := _list(excitation.together):
-        yield (
-            f"{together} always moved together, so their effects can't be told apart: the model "
-            "holds for this proportion only; drive with each changing on its own."
-        )
+        holds = "the model holds for this proportion only; drive with each changing on its own"
+        yield f"{together} always moved together, so their effects can't be told apart: {holds}."
     if copies := _list([v.name for v in spec.state if v.name in linear.regression.dependent]):
-        yield (
-            f"{copies} always followed from the other variables, so their effects can't be "
-            "told apart: the model does without, and holds for as long as that is so."
-        )
+        why = "always followed from the other variables, so their effects can't be told apart"
+        yield f"{copies} {why}: the model does without, and holds for as long as that is so."
     levels = {n: v for n, v in excitation.levels.items() if n not in excitation.unmoved}
     if coarse := _list([name for name, count in levels.items() if count == FEW_LEVELS]):
         finding = "between them the model is a straight line, whatever the robot does"
@@ -165,18 +153,15 @@ def doubts(linear: Fit, held_out: OpenLoop | None, exact: bool) -> Iterator[str]
         if outliers > MANY_OUTLIERS:
             yield f"{outliers:.1%} of the rows of {dof} were outliers and left out of the fit."
         if condition > ILL_CONDITIONED:
-            yield (
-                f"The terms of {dof} are nearly copies of each other on this drive (condition "
-                f"number {condition:.1g}): their coefficients are no use one by one; lower the "
-                "order or drive with more variety."
-            )
+            alike = f"nearly copies of each other on this drive (condition number {condition:.1g})"
+            advice = "lower the order or drive with more variety"
+            useless = "their coefficients are no use one by one"
+            yield f"The terms of {dof} are {alike}: {useless}; {advice}."
     fitted = {c.dof for c in linear.curves} - {"vy"} if exact else set()
     explained = zip(dofs, linear.r2, strict=True)
     if lost := _list([dof for dof, share in explained if share < UNEXPLAINED and dof in fitted]):
-        yield (
-            f"The model explains less than half of {lost}: the robot did not follow its commands "
-            "in a way that a polynomial can describe; do not trust its predictions."
-        )
+        why = "the robot did not follow its commands in a way that a polynomial can describe"
+        yield f"The model explains less than half of {lost}: {why}; do not trust its predictions."
     if held_out is None or not held_out.mean_path_m > 0.0:
         return
     share = held_out.mean_position_error_m / held_out.mean_path_m

@@ -73,9 +73,8 @@ def opened(path: str | Path) -> Iterator[BagFile]:
         # rosbags opens databases by URI, which these characters cut.
         sign = next((sign for sign in URI_SIGNS if sign in str(place)), None)
         if sign and any(DATABASE in file.suffixes for file in files):
-            raise RecordingError(
-                f"{place}: SQLite can't open what has {sign!r} in its path; rename the folder."
-            )
+            fault = f"SQLite can't open what has {sign!r} in its path"
+            raise RecordingError(f"{place}: {fault}; rename the folder.")
         for file in files:
             no_device(file)
         with TemporaryDirectory() as room:  # before rosbags, which unpacks chunks of any size
@@ -90,11 +89,10 @@ def opened(path: str | Path) -> Iterator[BagFile]:
         raise
     except Exception as error:  # noqa: BLE001 - the reader can raise anything on a damaged file
         why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-        raise RecordingError(
-            f"{path}: can't be read as a bag ({shortened(why, LONGEST_REASON)}); it is damaged or "
-            "was not closed: save the rest with `nics bag salvage`, try `ros2 bag reindex`, or "
-            "record anew."
-        ) from None
+        fault = f"can't be read as a bag ({shortened(why, LONGEST_REASON)})"
+        advice = "save the rest with `nics bag salvage`, try `ros2 bag reindex`, or record anew"
+        said = f"{path}: {fault}; it is damaged or was not closed: {advice}."
+        raise RecordingError(said) from None
 
 
 def _place(path: Path) -> Path:
@@ -110,9 +108,8 @@ def _place(path: Path) -> Path:
         raise RecordingError(f"{path}: {fault}; write it with `ros2 bag reindex`.")
     file = files[0] if path.is_dir() else path
     if file.suffix in COMPRESSED:
-        raise RecordingError(
-            f"{file}: is compressed; unpack it with `zstd -d`, or give the folder with {METADATA}."
-        )
+        advice = f"unpack it with `zstd -d`, or give the folder with {METADATA}"
+        raise RecordingError(f"{file}: is compressed; {advice}.")
     return file
 
 
@@ -248,7 +245,6 @@ class BagFile:
         if len(raw) != promised:
             raise ValueError(f"topic {topic!r} has {len(raw)} messages, by the summary {promised}")
         if any(not first <= ns <= last for _, ns, _ in raw):
-            raise ValueError(
-                f"topic {topic!r} has messages outside of the time span of its summary"
-            )
+            fault = f"topic {topic!r} has messages outside of the time span"
+            raise ValueError(f"{fault} of its summary")
         return raw

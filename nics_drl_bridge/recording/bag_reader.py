@@ -75,11 +75,10 @@ def _command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
     for variable in spec.command:
         steered = bag.types[topic] in (roles.ACKERMANN, roles.ACKERMANN_STAMPED)
         if steered and variable.turns and not variable.steers:
-            raise RecordingError(
-                f"{bag.place}: topic {topic!r} holds steering angles [rad], but {variable.name!r} "
-                f"of robot {spec.name!r} is in {variable.unit}; choose the robot that drove, or "
-                "another topic."
-            )
+            fault = f"{bag.place}: topic {topic!r} holds steering angles [rad]"
+            other = f"{variable.name!r} of robot {spec.name!r} is in {variable.unit}"
+            advice = "choose the robot that drove, or another topic"
+            raise RecordingError(f"{fault}, but {other}; {advice}.")
     data = _table(bag, topic, msgs.command_row)
     return replace(data, values=spec.from_cmd_vel(data.values))
 
@@ -92,10 +91,9 @@ def _pose(bag: BagFile, topic: str, mapping: TopicRoles) -> TopicData:
     with np.errstate(over="ignore"):
         length = np.linalg.norm(quaternions, axis=1)
     for k in np.flatnonzero(~(np.abs(length - 1.0) < QUATERNION_TOLERANCE))[:1]:
-        raise RecordingError(
-            f"{bag.place}: topic {topic!r}: message {k}: the quaternion has the length "
-            f"{length[k]:.3f} and not 1; check its publisher, or choose another topic."
-        )
+        fault = f"message {k}: the quaternion has the length {length[k]:.3f} and not 1"
+        advice = "check its publisher, or choose another topic"
+        raise RecordingError(f"{bag.place}: topic {topic!r}: {fault}; {advice}.")
     return _table(bag, topic, msgs.pose_row, messages)
 
 
@@ -119,10 +117,11 @@ def _of_one_body(
     problem = "several transforms" if pairs else "no transform"
     named = " with the given names" if any(wanted) else ""
     listed = ", ".join(sorted(f"{a} -> {b}" for a, b in there)) or "none"
-    raise RecordingError(
-        f"{bag.place}: topic {topic!r} holds {problem}{named}; write those of the robot into the "
-        f"topics file, as in `frame: world` and `child_frame: base_link`; it holds {listed}."
+    fault = f"{bag.place}: topic {topic!r} holds {problem}{named}"
+    advice = (
+        "write those of the robot into the topics file, as in `frame: world` and `child_frame: "
     )
+    raise RecordingError(f"{fault}; {advice}base_link`; it holds {listed}.")
 
 
 def joint_streams(
@@ -166,9 +165,8 @@ def state_of(joints: Joints, spec: RobotSpec, mapping: TopicRoles, place: str) -
     """
     known = [v.name for v in spec.state]
     for name in sorted(mapping.state.keys() - set(known)):
-        raise RecordingError(
-            f"{place}: topics: robot {spec.name!r} has no state {name!r}; {nearest(name, known)}"
-        )
+        fault = f"robot {spec.name!r} has no state {name!r}"
+        raise RecordingError(f"{place}: topics: {fault}; {nearest(name, known)}")
     sources = {v.name: _source(joints, v, mapping, place) for v in spec.state}
     found = [source for source in sources.values() if source is not None]
     if spec.state and len(found) == len(sources):
@@ -180,11 +178,10 @@ def state_of(joints: Joints, spec: RobotSpec, mapping: TopicRoles, place: str) -
         return _complete(joints, np.stack(columns, axis=1), [s.joint for s in found], place)
     if mapping.state or any(v.follows is None for v in spec.state):
         missing = next(name for name, source in sources.items() if source is None)
-        raise RecordingError(
-            f"{place}: no joint is known for the state {missing!r}; the joints of "
-            f"{joints.topic!r} are {', '.join(joints.names) or 'none'}: name it in the topics "
-            f"file, as in state: {{{missing}: JOINT}}."
-        )
+        fault = f"no joint is known for the state {missing!r}"
+        listed = f"the joints of {joints.topic!r} are {', '.join(joints.names) or 'none'}"
+        advice = f"name it in the topics file, as in state: {{{missing}: JOINT}}"
+        raise RecordingError(f"{place}: {fault}; {listed}: {advice}.")
     return None
 
 
@@ -214,9 +211,8 @@ def _source(
 
 def _index(joints: Joints, name: str, place: str) -> int:
     if name not in joints.names:
-        raise RecordingError(
-            f"{place}: topic {joints.topic!r} has no joint {name!r}; {nearest(name, joints.names)}"
-        )
+        fault = f"topic {joints.topic!r} has no joint {name!r}"
+        raise RecordingError(f"{place}: {fault}; {nearest(name, joints.names)}")
     return joints.names.index(name)
 
 
@@ -230,10 +226,9 @@ def _alike(names: Iterable[str], wanted: str) -> str | None:
 def _complete(joints: Joints, values: Array, names: Sequence[str], place: str) -> TopicData:
     keep = np.asarray(np.isfinite(values).all(axis=1))
     if not keep.any():
-        raise RecordingError(
-            f"{place}: topic {joints.topic!r}: no message tells the position or velocity that is "
-            f"needed of {', '.join(names)}; check what the joints' driver publishes."
-        )
+        fault = f"no message tells the position or velocity that is needed of {', '.join(names)}"
+        advice = "check what the joints' driver publishes"
+        raise RecordingError(f"{place}: topic {joints.topic!r}: {fault}; {advice}.")
     return TopicData(joints.topic, joints.receive_ns, joints.header_ns, values).rows(keep)
 
 

@@ -72,10 +72,9 @@ def _read(path: Path) -> Array:
         if path.name == "vrpn.csv":
             norm = np.linalg.norm(table[:, 3:7], axis=1)
             for k in np.flatnonzero(np.abs(norm - 1.0) > 0.05)[:1]:
-                raise ValueError(
-                    f"row {rows[k][0]}: the quaternion has the length {norm[k]:.3f} and not 1; "
-                    "check the order of the columns (x, y, z, qx, qy, qz, qw, time)"
-                )
+                fault = f"the quaternion has the length {norm[k]:.3f} and not 1"
+                advice = "check the order of the columns (x, y, z, qx, qy, qz, qw, time)"
+                raise ValueError(f"row {rows[k][0]}: {fault}; {advice}")
     except UnicodeDecodeError:
         why = "is not UTF-8 text; it must hold comma-separated numbers"
     except (OSError, csv.Error) as error:
@@ -102,10 +101,8 @@ def _lines(path: Path) -> list[str]:
 
 def _numbers(line: int, row: list[str], columns: tuple[str, ...]) -> list[float]:
     if len(row) != len(columns):
-        raise ValueError(
-            f"row {line} has {len(row)} columns where {len(columns)} are needed "
-            f"({', '.join(columns)}); mend the row, or remove it"
-        )
+        needed = f"{len(columns)} are needed ({', '.join(columns)})"
+        raise ValueError(f"row {line} has {len(row)} columns where {needed}; mend or remove it")
     values = []
     for name, text in zip(columns, row, strict=True):
         try:

@@ -312,10 +312,9 @@ def expected_motion(spec: RobotSpec) -> ExpectedMotion:
         )
     for command in spec.command:
         if not command.is_twist:
-            raise ConfigError(
-                f"robot {spec.name!r}: where {command.name!r} in {command.unit} leads can't be "
-                "predicted; add `textbook:` and its `parameters:` to the robot's YAML file."
-            )
+            fault = f"where {command.name!r} in {command.unit} leads can't be predicted"
+            advice = "add `textbook:` and its `parameters:` to the robot's YAML file"
+            raise ConfigError(f"robot {spec.name!r}: {fault}; {advice}.")
     return ExpectedMotion(
         len(spec.state), lambda state, *_: state, lambda _, command: spec.to_cmd_vel(command)
     )

@@ -105,9 +105,8 @@ class McapSummary:
         found = record.content
         if isinstance(found, kinds.Message):
             if found.channel_id not in self.channels:
-                raise DamageError(
-                    record.offset, f"a message of the unknown channel {found.channel_id}"
-                )
+                fault = f"a message of the unknown channel {found.channel_id}"
+                raise DamageError(record.offset, fault)
             first, last = self.span or (found.log_time, found.log_time)
             self.span = min(first, found.log_time), max(last, found.log_time)
             self.counts[found.channel_id] += 1
@@ -181,9 +180,8 @@ def check_mcap(path: Path) -> None:
     if data[: len(MAGIC)] != MAGIC:
         raise DamageError(0, "it does not begin as an MCAP file")
     if end <= len(MAGIC) or data[end:] != MAGIC:
-        raise DamageError(
-            len(data), "it does not end as an MCAP file: it is cut off or was not closed"
-        )
+        fault = "it does not end as an MCAP file: it is cut off or was not closed"
+        raise DamageError(len(data), fault)
     for record in records(data[:end], len(MAGIC)):
         if record.offset == len(MAGIC) and not isinstance(record.content, kinds.Header):
             raise DamageError(record.offset, "the header is missing")

@@ -190,10 +190,8 @@ def load_recording(path: str | Path) -> Recording:
         elif version == COMMENT_FORMAT and data[-64:] != files.sha256(data[:-64]).encode():
             raise ValueError("its checksum is missing or does not fit the rest")
         if version not in (FORMAT, COMMENT_FORMAT, UNSEALED_FORMAT):
-            raise RecordingError(
-                f"{path}: format {version!r} is not {FORMAT!r}; record it anew or use the version "
-                "of the package that wrote it."
-            )
+            advice = "record it anew or use the version of the package that wrote it"
+            raise RecordingError(f"{path}: format {version!r} is not {FORMAT!r}; {advice}.")
         streams = {
             name: Stream(arrays[f"{name}_t"].astype(float), arrays[name].astype(float), clock)
             for name, clock in meta["clocks"].items()
@@ -204,10 +202,9 @@ def load_recording(path: str | Path) -> Recording:
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file; check the path.") from None
     except (AttributeError, KeyError, RecursionError, TypeError) as error:
-        raise RecordingError(
-            f"{path}: is not a recording of this package ({error}); write it with "
-            "nics_drl_bridge.recording.recording.save_recording."
-        ) from None
+        advice = "write it with nics_drl_bridge.recording.recording.save_recording"
+        said = f"{path}: is not a recording of this package ({error}); {advice}."
+        raise RecordingError(said) from None
     except (ValueError, OSError) as error:
         why = f"can't be read as .npz ({error}); it may be damaged"
         raise RecordingError(f"{path}: {why}.") from None

@@ -245,10 +245,9 @@ def bag_sink(path: str | Path, storage: Storage = "mcap") -> Iterator[BagSink]:
             raise RecordingError(f"{path}: was made meanwhile; give the name of a new folder.")
         os.rename(unfinished, path)
     except OSError as error:
-        raise RecordingError(
-            f"{path}: {error.strerror or error}; what was written until then lies in {unfinished}, "
-            "save it with `nics bag salvage` where there is room."
-        ) from None
+        rest = f"what was written until then lies in {unfinished}"
+        advice = "save it with `nics bag salvage` where there is room"
+        raise RecordingError(f"{path}: {error.strerror or error}; {rest}, {advice}.") from None
     except BaseException:
         shutil.rmtree(beside)
         raise
