@@ -1,8 +1,7 @@
 """Data that arrive but are dead: repeated scans, jumps of odometry, no motion when commanded.
 
-A lidar without noise may well show the same between two long walls, or in the middle of a round
-room. So an old scan is moved by the motion from odometry, and only those of its beams count whose
-length must have changed by now, whatever the error of the heading.
+A lidar without noise may show the same between two long walls. So an old scan is moved by the
+motion from odometry, and only beams count whose length must have changed by now.
 """
 
 from __future__ import annotations
@@ -50,7 +49,9 @@ def look(
     path = max(float(np.hypot(moved[0], moved[1])), abs(float(moved[2])))
     if path <= config.frozen_distance:
         return (*others, known), ""
-    if shown_again(config, known.ranges, ranges, moved):
+    telling = must_differ(config, known.ranges, moved)
+    still = _but_for_one((known.ranges == ranges) & telling, telling, TELLING_SHARE)
+    if np.count_nonzero(telling) >= LEAST_BEAMS and still:
         why = f"{known.count} scans are the same over a motion of {path:.2f} m or rad"
         return (*others, known), why
     return (*others, Sameness(ranges, 1, pose)), ""  # the scene may really look the same
@@ -129,14 +130,6 @@ def same(one: Ranges, other: Ranges) -> bool:
     """True if two scans (B,) are bit-identical, but for a few of the beams that return in one."""
     returned = np.isfinite(one) | np.isfinite(other)
     return _but_for_one((one == other) & returned, returned, SAME_SHARE)
-
-
-def shown_again(config: GateConfig, old: Ranges, ranges: Ranges, moved: Array) -> bool:
-    """True if a scan (B,) repeats an old one (B,) although the robot has moved (3,) [m, m, rad]."""
-    telling = must_differ(config, old, moved)
-    if np.count_nonzero(telling) < LEAST_BEAMS:
-        return False
-    return _but_for_one((old == ranges) & telling, telling, TELLING_SHARE)
 
 
 def _but_for_one(same: Flags, counted: Flags, share: float) -> bool:

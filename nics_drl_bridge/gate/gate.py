@@ -1,9 +1,8 @@
 """The gate: one pure function from (time, state, input) to (state, decision).
 
-It reads no clock, uses no random numbers and has no side effects, so that a recording of its
-inputs replays to bit-identical decisions. It does nothing that is not in the tables of rules:
-`REFUSALS` of malformed data, which feed no watchdog; `CHECKS` before it is armed; `STOPS`; and
-`SHAPERS` of a motion. Their functions stand before each, or in `stops`, `frozen` and `shield`.
+It reads no clock, draws no numbers and has no side effects: a recording of its inputs replays to
+bit-identical decisions. All that it does is in the tables of rules: `REFUSALS` of malformed data,
+which feed no watchdog; `CHECKS` before it is armed; `STOPS`; and `SHAPERS` of a motion.
 """
 
 from __future__ import annotations

@@ -141,11 +141,7 @@ def within(value: Array, limits: Limits) -> bool:
 
 
 def saturate(command: Array, limits: Limits) -> Array:
-    """Returns the command (C,) within its limits, on the same path.
-
-    Speeds and turn rates are scaled by one common factor, which keeps the curvature of the path
-    and the direction of motion. A value whose limit is 0 is dropped.
-    """
+    """Returns the command (C,) within its limits, speeds and turns scaled alike: the same path."""
     speeds, factor = limits.linear | limits.turn, 1.0
     out = np.clip(command, -GREATEST, GREATEST)  # 0 times inf is NaN
     for i, value in enumerate(out):

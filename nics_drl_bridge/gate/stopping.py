@@ -36,7 +36,12 @@ def shield_config(
     """
     path = find_config(file, "limits") if file else None
     measured = load_yaml(path, LimitsFile).shield if path else None
-    values = (measured or _derived(model, limits)).model_copy(update=dict(given or {}))
+    if (stopping := measured) is None:  # one command per period; brakes no harder than its limits
+        rates = [] if limits is None else limits.rate[limits.linear].tolist()
+        delay = model.calibration.command_latency_s + lag(model.kinematics) + model.control_period
+        deceleration = min(rates, default=UNKNOWN_DECELERATION)
+        stopping = Stopping(latency=max(0.0, delay), deceleration=deceleration)
+    values = stopping.model_copy(update=dict(given or {}))
     for name, value in values.model_dump().items():
         least = "greater than 0" if name == "deceleration" else "at least 0"
         if not (np.isfinite(value) and value >= 0.0) or (value == 0.0 and name == "deceleration"):
@@ -58,14 +63,6 @@ def shield_config(
         source += f", but {', '.join(sorted(given))} by parameter"
     listed = ", ".join(f"{name} {value:g}" for name, value in values.model_dump().items())
     return config, f"the shield is on: {listed} ({source})"
-
-
-def _derived(model: SimulatorModel, limits: Limits | None) -> Stopping:
-    """Assumes that a base takes up one command per period, and brakes no harder than its limits."""
-    rates = [] if limits is None else limits.rate[limits.linear].tolist()
-    deceleration = min(rates, default=UNKNOWN_DECELERATION)
-    latency = model.calibration.command_latency_s + lag(model.kinematics) + model.control_period
-    return Stopping(latency=max(0.0, latency), deceleration=deceleration)
 
 
 def lag(kinematics: TaylorModel) -> float:

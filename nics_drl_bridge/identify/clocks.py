@@ -1,8 +1,7 @@
 """Clocks: offset, latency and lags of a drive; responses of states that were not measured.
 
-Each time is the shift that makes a signal a function of the commands, by a separable least
-squares: for a given delay (and lags) the best linear combination of the paper's features (Eq. 1)
-has a closed form, so the search is over the delay and the lags only.
+Each time is the shift that makes a signal a function of the commands, by separable least squares:
+the best combination of the paper's features (Eq. 1) for a given delay has a closed form.
 """
 
 from __future__ import annotations

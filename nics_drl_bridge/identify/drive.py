@@ -125,10 +125,7 @@ def find_bursts(t: Array) -> Bursts | None:
 
 
 def spread(t: Array, bursts: Bursts | None) -> Array:
-    """Estimates sample times (T,) from arrival stamps (T,) [s].
-
-    Those of a burst were taken since the one before; after a gap within a period, or more by size.
-    """
+    """Estimates sample times (T,) from arrivals (T,) [s]: a burst's lie since the one before."""
     if bursts is None:
         return t
     count = np.bincount(bursts.of)

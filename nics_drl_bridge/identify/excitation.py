@@ -1,8 +1,7 @@
 """Excitation: what a drive moved, and moved independently, and so what a fit can learn from it.
 
-Outliers are the rows that it can't learn from: least trimmed squares with concentration steps
-finds the bulk (Rousseeuw, Van Driessen: Computing LTS regression for large data sets), and rows
-far from it are dropped. Coverage is the range of each command, known before any fit.
+Outliers are the rows that it can't learn from: far from the bulk that least trimmed squares finds
+(Rousseeuw, Van Driessen: Computing LTS regression for large data sets).
 """
 
 from __future__ import annotations

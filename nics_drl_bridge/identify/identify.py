@@ -14,18 +14,10 @@ import numpy as np
 
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify import clocks as timings
 from nics_drl_bridge.identify import verdict
 from nics_drl_bridge.identify.assume import assume_textbook
 from nics_drl_bridge.identify.calibration import Calibration, align
-from nics_drl_bridge.identify.clocks import (
-    SEARCH_S,
-    TimingEstimate,
-    expected_states,
-    nominal_timing,
-    responses_of,
-    timing_of,
-    with_wheels,
-)
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.fit import ALPHA, ORDER, Alpha, Fit, Regression, pruned, regress
 from nics_drl_bridge.identify.mounting import Mounting, mounted, mounting_of
@@ -51,7 +43,7 @@ class Findings:
 
     training: Drive  # the part of the drive to learn from; repaired by `repair`
     whole: Drive  # repaired by `repair`
-    timing: TimingEstimate  # of `clocks`; nominal before
+    timing: timings.TimingEstimate  # of `clocks`; nominal before
     repairs: tuple[str, ...] = ()  # sentences of `repair`
     speed: Array | None = None  # (n,) expected over the training part's twists, of `mounting`
     mounting: Mounting | None = None  # of `mounting`
@@ -96,7 +88,7 @@ def repair(drive: Drive, findings: Findings) -> Findings:
 
 def clocks(drive: Drive, findings: Findings) -> Findings:
     """Finds the period of bursts, the offset between clocks, the latency of commands, and lags."""
-    training, found = findings.training, timing_of(findings.training)
+    training, found = findings.training, timings.timing_of(findings.training)
     calibration = replace(
         findings.calibration,
         clock_offset_s=found.offset,
@@ -109,9 +101,9 @@ def clocks(drive: Drive, findings: Findings) -> Findings:
 
 def mounting(drive: Drive, findings: Findings) -> Findings:
     """Finds where and how the tracked body is mounted on the robot."""
-    training, place = findings.training, speed_index(drive.spec)
-    states = None if place is None else expected_states(training, training.twists, findings.timing)
-    speed = None if states is None else states[:, place]
+    training, speed = findings.training, None
+    if (place := speed_index(drive.spec)) is not None:
+        speed = timings.expected_states(training, training.twists, findings.timing)[:, place]
     found = mounting_of(training, findings.timing, speed)
     calibration = mounted(findings.calibration, found)
     return replace(findings, speed=speed, mounting=found, calibration=calibration)
@@ -120,8 +112,8 @@ def mounting(drive: Drive, findings: Findings) -> Findings:
 def responses(drive: Drive, findings: Findings) -> Findings:
     """Finds how states that were not measured follow the commands, and the scale of the wheels."""
     training, calibration = findings.training, findings.calibration
-    found = responses_of(training, calibration, findings.timing, findings.speed)
-    calibration = with_wheels(training, replace(calibration, responses=found))
+    found = timings.responses_of(training, calibration, findings.timing, findings.speed)
+    calibration = timings.with_wheels(training, replace(calibration, responses=found))
     return replace(findings, calibration=calibration)
 
 
@@ -226,7 +218,7 @@ CALIBRATION: tuple[Stage, ...] = (clocks, mounting, responses, noise)
 def begun(drive: Drive) -> Findings:
     """Returns the findings on a drive before the first stage."""
     training = drive.part(cut(drive.recording, drive.settings.train_until_s))
-    return Findings(training, drive, nominal_timing(training))
+    return Findings(training, drive, timings.nominal_timing(training))
 
 
 def run(stages: Sequence[Stage], drive: Drive) -> Findings:
@@ -303,10 +295,7 @@ def calibrate(recording: Recording, spec: RobotSpec) -> Calibration:
 
 
 def cut(recording: Recording, until: float) -> Recording:
-    """Returns the part of a recording up to `until` seconds after its first pose.
-
-    Other streams end about then, as the offset is unknown; commands, without poses, a little later.
-    """
+    """Returns a recording up to `until` [s] after its first pose; commands last a little longer."""
     pose = recording.pose.t
 
     def part(stream: Stream, margin: float = 0.0) -> Stream:
@@ -318,5 +307,5 @@ def cut(recording: Recording, until: float) -> Recording:
         fault = f"{recording.source}: the training part ends at {until:g} s"
         raise RecordingError(f"{fault}; use more than 0.")
     parts: dict[str, Any] = {name: part(stream) for name, stream in recording.streams.items()}
-    parts["command"] = part(recording.command, SEARCH_S)
+    parts["command"] = part(recording.command, timings.SEARCH_S)
     return replace(recording, **parts)

@@ -1,8 +1,7 @@
 """Mounting: position and rotation of the tracked body on the robot.
 
-Its uncertainty on an omnidirectional robot is that of the delete-one-block jackknife (Efron,
-Tibshirani: An Introduction to the Bootstrap, ch. 11), which covers what least-squares formulas
-miss: wheel slip that is correlated over seconds, and errors of the regressors themselves.
+Uncertainty is that of the delete-one-block jackknife (Efron, Tibshirani: An Introduction to the
+Bootstrap, ch. 11), with correlated wheel slip, on an omnidirectional robot.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Noise of the sensors, and the motion that a model leaves unexplained.
 
-The drift is measured over a second: systematic errors of a model grow faster than noise, so over
-a longer horizon the same model seems to drift more. The noise of the odometry is the deviation of
-reported velocities from the motion.
+The drift is measured over a second, since systematic errors of a model grow faster than noise. The
+noise of the odometry is the deviation of reported velocities from the motion.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Refinement of a model by its open-loop errors over seconds (the output-error method).
 
-Least squares on rates predicts the next instant; a simulator must predict the next seconds.
-Ljung, System Identification, ch. 7; the paper's kept terms stay, their values change. Terms that
-then hardly improve the prediction are removed.
+A simulator must predict the next seconds, not the next instant (Ljung, System Identification, ch.
+7). Kept terms change their values; those that hardly improve the prediction are removed.
 """
 
 from __future__ import annotations

@@ -208,11 +208,10 @@ def why_useless(identified: Identified, spec: RobotSpec, order: int = ORDER) -> 
     if not is_useless(error, standing, held_out.mean_path_m, spec.footprint_radius):
         return ""
     end = f"end {error:.3g} m off" if np.isfinite(error) else "have run away"
-    return (
-        f"{recording.source}: the fitted model is of no use: on unseen data its predictions {end} "
-        f"after {held_out.horizon_s:g} s and a path of {held_out.mean_path_m:.2f} m, where a robot "
-        f"that stood still would be {standing:.2f} m off; {_suspicion(identified, spec, order)}."
-    )
+    way = f"after {held_out.horizon_s:g} s and a path of {held_out.mean_path_m:.2f} m"
+    still = f"where a robot that stood still would be {standing:.2f} m off"
+    fault = f"the fitted model is of no use: on unseen data its predictions {end} {way}, {still}"
+    return f"{recording.source}: {fault}; {_suspicion(identified, spec, order)}."
 
 
 def _suspicion(identified: Identified, spec: RobotSpec, order: int) -> str:
@@ -235,8 +234,6 @@ def _suspicion(identified: Identified, spec: RobotSpec, order: int) -> str:
         return f"{reason}, from which it is learnt, so change it from the beginning on"
     if identified.alpha != "auto" or order < ORDER:
         return f"it may lack terms, so leave the order at {ORDER} and alpha at `auto`"
-    return (
-        "the recording does not show why, so make sure that nothing held the robot up, that it got "
-        f"each command, that its pose did not jump and that rows {apart} show how it responds, and "
-        "record anew"
-    )
+    got = "that nothing held the robot up, that it got each command, that its pose did not jump"
+    shown = f"{got} and that rows {apart} show how it responds"
+    return f"the recording does not show why, so make sure {shown}, and record anew"

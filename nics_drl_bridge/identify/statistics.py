@@ -72,10 +72,7 @@ def _deviations(covariance: Array) -> Array:
 
 
 def standard_errors(chi: Array, residual: Array) -> Array:
-    """Returns standard errors (K,) of least squares for unequal and correlated residuals.
-
-    The residual (T,) is in order of time (Newey, West, Econometrica 1987).
-    """
+    """Returns standard errors (K,) for correlated residuals (T,) by time (Newey, West 1987)."""
     count, terms = chi.shape
     if terms == 0 or count <= terms:
         return np.full(terms, np.nan)
@@ -218,10 +215,7 @@ def knee(error: Array, sigma: Array) -> int:
 
 
 def cross_validated(chi: Array, target: Array) -> Array:
-    """Returns mean squared errors (B, n + 1) of the first 0..n features on B blocks in time.
-
-    Each is predicted by a fit to the others, compressed (QR) to share one factorisation.
-    """
+    """Returns mean squared errors (B, n + 1) of 0..n features on B blocks, fitted to the others."""
     rows = np.array_split(np.arange(len(target)), BLOCKS)
     both = np.concatenate([chi, target[:, None]], axis=1)
     triangles = [np.atleast_2d(qr(both[r], mode="r", check_finite=False)[0]) for r in rows]

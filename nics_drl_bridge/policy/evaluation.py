@@ -291,35 +291,28 @@ class Tally(Summary):
 
     def figures(self) -> dict[str, Any]:
         """The tally as plain data, an interval as a list; non-finite values become null."""
-        return {
-            name: [_finite(each) for each in vars(value).values()]
-            if isinstance(value, ConfidenceInterval)
-            else _finite(value)
-            for name, value in vars(self).items()
-        }
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def tally(episodes: Sequence[Episode], first: Sequence[Episode], control_period: float) -> Tally:
-    """Computes the figures of episodes, compared with the same seeds in the first world."""
-    rows = ((e.seed, e.result, e.steps, e.length, e.reward) for e in episodes)
-    seeds, results, *figures = map(np.array, zip(*rows, strict=True))
-    outcomes = Outcomes(seeds, results == "success", results == "collision", *figures)
-    pairs = list(zip(episodes, first, strict=True))
-    gaps = [deviation(one, other) for one, other in pairs]
-    return Tally(
-        **vars(summarise(outcomes, control_period)),
-        same=sum(one.result == other.result for one, other in pairs) / len(pairs),
-        deviation=mean(gaps),
-        greatest_deviation=max(gaps),
-        believed=rate(sum(episode.believed_success for episode in episodes), len(pairs)),
-    )
+        figures: dict[str, Any] = {}
+        for name, value in vars(self).items():
+            ends = vars(value).values() if isinstance(value, ConfidenceInterval) else [value]
+            known = [each if math.isfinite(each) else None for each in ends]
+            figures[name] = known if isinstance(value, ConfidenceInterval) else known[0]
+        return figures
 
 
 def tallies(runs: Mapping[str, Sequence[Episode]], control_period: float) -> dict[str, Tally]:
-    """Computes the figures of each world, compared with the first."""
-    first = next(iter(runs.values()))
-    return {place: tally(episodes, first, control_period) for place, episodes in runs.items()}
+    """Computes the figures of each world, compared with the same seeds in the first."""
+    first, found = next(iter(runs.values())), {}
+    for place, episodes in runs.items():
+        rows = ((e.seed, e.result, e.steps, e.length, e.reward) for e in episodes)
+        seeds, results, *figures = map(np.array, zip(*rows, strict=True))
+        outcomes = Outcomes(seeds, results == "success", results == "collision", *figures)
+        pairs = list(zip(episodes, first, strict=True))
+        gaps = [deviation(one, other) for one, other in pairs]
+        found[place] = Tally(
+            **vars(summarise(outcomes, control_period)),
+            same=sum(one.result == other.result for one, other in pairs) / len(pairs),
+            deviation=mean(gaps),
+            greatest_deviation=max(gaps),
+            believed=rate(sum(episode.believed_success for episode in episodes), len(pairs)),
+        )
+    return found

@@ -42,10 +42,7 @@ class Shadow:
     skipped: Mapping[str, int]  # reason -> number of times that were not compared
 
     def differences(self) -> dict[str, dict[str, float]]:
-        """Differences between policy and drive, for each command, in its unit.
-
-        Their mean; mean, percentiles and maximum of their magnitude; the share of opposite signs.
-        """
+        """Differences (policy minus drive) by command, in its unit, and share of opposite signs."""
         found = {}
         for c, name in enumerate(self.names):
             one, other, band = self.policy[:, c], self.driven[:, c], DEAD_BAND * self.scale[c]

@@ -59,10 +59,7 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
 
 
 def actor_of(model: Any) -> torch.nn.Module:
-    """Returns the acting part of a trained model, without exploration.
-
-    That is a PPO, A2C or SAC, or a module from (n, O) to raw actions or logits; else ConfigError.
-    """
+    """Returns the acting part of a PPO, A2C or SAC, or of any torch module; else ConfigError."""
     policy = getattr(model, "policy", model)
     if hasattr(policy, "action_net") and hasattr(policy, "mlp_extractor"):
         latent = policy.mlp_extractor.policy_net

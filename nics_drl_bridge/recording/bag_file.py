@@ -1,8 +1,7 @@
 """Opens a rosbag2 recording and verifies that it is complete.
 
-Bag readers return what they still find in a damaged bag, often silently. So its files are checked
-whole, and the messages of each topic are compared with the bag's summary. Data without a
-checksum, such as a flipped bit inside a number, can't be verified.
+Bag readers return what they still find in a damaged bag, often silently: here its files are checked
+whole, and its topics against its summary. A flipped bit without checksum is not found.
 """
 
 from __future__ import annotations

@@ -118,10 +118,9 @@ def _of_one_body(
     named = " with the given names" if any(wanted) else ""
     listed = ", ".join(sorted(f"{a} -> {b}" for a, b in there)) or "none"
     fault = f"{bag.place}: topic {topic!r} holds {problem}{named}"
-    advice = (
-        "write those of the robot into the topics file, as in `frame: world` and `child_frame: "
-    )
-    raise RecordingError(f"{fault}; {advice}base_link`; it holds {listed}.")
+    example = "as in `frame: world` and `child_frame: base_link`"
+    advice = f"write those of the robot into the topics file, {example}"
+    raise RecordingError(f"{fault}; {advice}; it holds {listed}.")
 
 
 def joint_streams(
@@ -129,8 +128,8 @@ def joint_streams(
 ) -> dict[str, TopicData]:
     """Returns state and wheels, each if the joints show it; for errors see `state_of`."""
     joints = gather(topic, messages)
-    found = {"state": state_of(joints, spec, mapping, place)}
-    found["wheels"] = wheels_of(joints, mapping, place)
+    state, wheels = state_of(joints, spec, mapping, place), wheels_of(joints, mapping, place)
+    found = {"state": state, "wheels": wheels}
     return {name: data for name, data in found.items() if data is not None}
 
 
@@ -233,10 +232,7 @@ def _complete(joints: Joints, values: Array, names: Sequence[str], place: str) -
 
 
 def latency_of(bag: BagFile, odom: str | None = None) -> Latency:
-    """Measures the delays of scan and odometry in a bag, by stamps of the recorder's own clock.
-
-    A delay is unknown if the topic is missing, short, ambiguous, or stamped by another clock.
-    """
+    """Measures delays of scan and odometry by the recorder's own clock, as far as a bag shows."""
     odom = odom or _topic(bag, roles.ODOMETRY, "odom")
     return Latency(scan=_delay(bag, _topic(bag, SCAN, "scan")), odom=_delay(bag, odom))
 

@@ -1,11 +1,10 @@
 """Excitation of a robot: a drive whose commands show its whole motion within a circle.
 
-A drive is a sequence of segments. At the end of each, the next is drawn at random: new levels for
-one or more commands, reached smoothly and held for a random time (amplitude-modulated
-pseudo-random steps; Nelles: Nonlinear System Identification, ch. 21). A segment is accepted only
-if the expected path stays within the circle and the robot can still turn back from its end. Rarely
-used levels are preferred, so that each command covers its range independently of the others, and
-so are end points from which a path leads close to the centre.
+A drive is a sequence of segments, each drawn at random: new levels for one or more commands,
+reached smoothly and held for a random time (amplitude-modulated pseudo-random steps; Nelles:
+Nonlinear System Identification, ch. 21). A segment is accepted only if the expected path stays
+within the circle and the robot can still turn back from its end. Rarely used levels and end points
+from which a path leads close to the centre are preferred.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Stamps: time axis and clock of each stream of a bag.
 
-A message has two times: its receipt by the bag, and, if it has a header, the sender's stamp. The
-header's is better, since it has no transport jitter; but a Twist has none, and the sender's clock
-may differ from the recorder's.
+A message has two times: its receipt by the bag, and the sender's stamp in its header, if any. That
+one is better, without transport jitter, but the sender's clock may differ.
 """
 
 from __future__ import annotations

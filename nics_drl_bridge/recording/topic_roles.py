@@ -97,10 +97,7 @@ def topic_roles(file: str | Path | None = None, options: Iterable[str] = ()) -> 
 def assign(
     roles: TopicRoles, types: Mapping[str, str], empty: Collection[str], place: str
 ) -> dict[str, str]:
-    """Assigns topics to roles: a `cmd_vel`, and a `pose` or an `odom` or both.
-
-    RecordingError lists the topics: one is missing, of a wrong type, or several fit a role.
-    """
+    """Assigns topics to roles, named or guessed; RecordingError lists them if that is unclear."""
     table = _Topics(types, empty, place)
     found = {}
     for role in ROLES:
