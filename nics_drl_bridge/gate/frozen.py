@@ -156,7 +156,7 @@ def must_differ(config: GateConfig, ranges: Ranges, moved: Array) -> Flags:
 
 
 def _changed(angles: Array, ranges: Ranges, seen: Array, open_: Flags) -> Flags:
-    """Returns which beams (B,) differ from moved old ends (K, 2); an open one: nothing nearer."""
+    """Returns which beams (B,) differ from moved old ends (K, 2); of open ones, the nearer."""
     bearing = np.arctan2(seen[:, 1], seen[:, 0])
     order = np.argsort(bearing)
     order = np.concatenate([order[-1:], order, order[:1]])  # the ends, once more around

@@ -128,7 +128,7 @@ def rehearse() -> None:
 
 
 def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
-    """Returns the greatest part of a motion that can be stopped, past limits of rate at need."""
+    """Returns the greatest part of a motion from which it can stop, braking harder if needed."""
     if config.shield is None or config.limits is None or state.obstacles is None:
         return motion
     speeds = config.limits.linear | config.limits.turn

@@ -185,7 +185,7 @@ Estimate = Callable[[Drive, TwistIntervals], Mounting | None]
 def jackknifed(
     drive: Drive, twists: TwistIntervals, offset: float, estimate: Estimate
 ) -> Mounting | None:
-    """Estimates a mounting; delete-one-block uncertainty. Its twists' clock is `offset` behind."""
+    """Estimates a mounting, as uncertain as its jackknife; twists' clock is `offset` behind."""
     whole = estimate(drive, twists)
     if whole is None:
         return None

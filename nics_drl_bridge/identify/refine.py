@@ -46,7 +46,7 @@ WORTH = 0.1  # terms are removed while the error rises by less than this share i
 def refined(
     linear: TaylorModel, calibration: Calibration, drive: Drive
 ) -> tuple[TaylorModel, Calibration, str]:
-    """Refines a linear fit by its predictions, removes terms; a sentence tells of the result."""
+    """Refines a linear fit by its predictions and removes terms; with a sentence on the result."""
     model, calibration = by_definition(linear.with_errors({}), calibration, drive.spec)
     problem = problem_of(model, calibration, drive)
     why = "The training part is too short to refine the model by its errors over seconds"

@@ -146,10 +146,7 @@ def errors_of(model: TaylorModel, samples: Samples) -> tuple[Array, Array]:
 
 
 def significant(chi: Array, target: Array) -> NDArray[np.bool_]:
-    """Selects the significant features (K,) of a noisy target (T,).
-
-    The least certain go until each coefficient is `CERTAIN` times its (autocorrelated) error.
-    """
+    """Selects features (K,) of a noisy target (T,) that are `CERTAIN` times their errors."""
     rest = target - chi @ np.linalg.lstsq(chi, target, rcond=None)[0]
     power = max(float(rest @ rest), np.finfo(np.float64).tiny)
     rho = min(max(float(rest[1:] @ rest[:-1]) / power, 0.0), 0.98)

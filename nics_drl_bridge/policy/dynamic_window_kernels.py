@@ -51,7 +51,7 @@ def choose_all(out, scans, goals, twists, candidates, rays, ahead, weights):  # 
 
 @kernel(allocates=True)
 def hits_of(hits, shares, rays):  # type: ignore[no-untyped-def]
-    """Writes a scan's end points into hits (P, 2) [m] by shares (P,) of the range; their number."""
+    """Writes a scan's end points, by range shares (P,), into hits (P, 2) [m]; returns the count."""
     count = 0
     for p in range(shares.shape[0]):
         if shares[p] < 1.0:
@@ -64,7 +64,7 @@ def hits_of(hits, shares, rays):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def choose(hits, goal, twist, candidates, ahead, weights):  # type: ignore[no-untyped-def]
-    """Returns the cheapest of candidates (K, 3), first within the window; all in `base_link`."""
+    """Returns the index of the cheapest candidate (K, 3), preferring those within the window."""
     best, least = 0, math.inf
     for k in range(candidates.shape[0]):
         far = False

@@ -354,7 +354,7 @@ def _work(node: Any, given: list[Shape], made: list[Shape]) -> tuple[int, int]:
 def _sizes(
     model: Any, rows: int, source: str, values: bool
 ) -> tuple[dict[str, int], dict[str, Shape]]:
-    """Type and known shape of every tensor for `rows` observations, or by integers' `values`."""
+    """Type and known shape of every tensor for `rows` observations; also by integers' `values`."""
     bare = _without_weights(model, rows)
     try:
         graph = onnx.shape_inference.infer_shapes(bare, strict_mode=True, data_prop=values).graph

@@ -32,7 +32,7 @@ ACTION_GAIN = 0.01  # initial gain of an actor's last layer: all its actions are
 def make_algorithm(
     settings: TrainingSettings, env: TrainVecEnv, seed: int, normaliser: tuple[Array, Array]
 ) -> BaseAlgorithm:
-    """Makes an untrained algorithm; mean, deviation (O,); ConfigError if it suits no such task."""
+    """Makes an untrained algorithm; ConfigError if it does not suit the task; see `Normaliser`."""
     check_serves(settings, env)
     torch.set_num_threads(settings.threads)
     shared: dict[str, Any] = {"seed": seed, "device": "cpu", "stats_window_size": RECENT}
@@ -87,7 +87,7 @@ def act_of(algorithm: BaseAlgorithm | Actor) -> Act:
 
 
 class Normaliser(BaseFeaturesExtractor):
-    """First layer of actor and critic: (observation - mean) / std, cut at +-5; not trained."""
+    """First layer: (observation - mean) / std, (O,) each of `observed`, cut at +-5; not trained."""
 
     mean: torch.Tensor
     std: torch.Tensor
