@@ -327,7 +327,7 @@ def test_a_model_is_opened_by_folder_or_by_the_name_of_a_robot(saved):
 
 
 def test_a_robots_file_is_a_model_by_any_path(tmp_path):
-    shutil.copy(config_dir() / "robots" / "differential.yaml", tmp_path / "mine.yaml")
+    shutil.copy(find_config("differential", "robots"), tmp_path / "mine.yaml")
     assert open_model(tmp_path / "mine.yaml").robot.name == "differential"
 
 

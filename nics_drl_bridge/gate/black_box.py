@@ -25,9 +25,9 @@ from nics_drl_bridge.gate.state import Decision, GateConfig, GateState
 FORMAT = "nics_drl_bridge/black_box/3"
 KEPT_S = 30.0
 LATEST_S = 1e12
+_SEAL = b'{"sha256": "%b"}\n'
 MOST_BYTES = 64 * 2**20  # greatest size of a file that is replayed
-MOST_VALUES = 1_000_000
-"""Greatest number of values in such a file; 30 s of a gate have some 100,000."""
+MOST_VALUES = 1_000_000  # greatest number of values in such a file; 30 s of a gate have 100,000
 MOST_INPUTS = 20_000  # greatest number of inputs that are decided on again; each takes some 30 us
 
 
@@ -72,11 +72,7 @@ def _lines_of(config: GateConfig, entries: tuple[Entry, ...]) -> Iterator[bytes]
         line = json.dumps({key: to_plain(part) for key, part in record.items()}).encode() + b"\n"
         digest.update(line)
         yield line
-    yield _seal(digest.hexdigest()).encode()
-
-
-def _seal(digest: str) -> str:
-    return json.dumps({"sha256": digest}) + "\n"
+    yield _SEAL % digest.hexdigest().encode()
 
 
 class Replay(NamedTuple):
@@ -106,10 +102,7 @@ class Replay(NamedTuple):
 
 
 def replay(path: str | Path) -> Replay:
-    """Decides again on every input in a file.
-
-    Raises ConfigError if the file is missing, damaged, or not a black box.
-    """
+    """Decides again on every input in a file; ConfigError if it is no whole black box."""
     head, *lines = _lines(path)
     try:
         config, state = from_plain(head["config"]), from_plain(head["state"])
@@ -161,8 +154,9 @@ def _lines(path: str | Path) -> list[dict[str, Any]]:
         raise ConfigError(f"{path}: is no JSON, line by line; it can't be replayed.") from None
     if not lines or not isinstance(lines[0], dict) or lines[0].get("format") != FORMAT:
         raise ConfigError(f"{path}: is no black box of the gate ({FORMAT}).")
-    rest = text[: -len(_seal(sha256(b"")))]
-    if text != rest + _seal(sha256(rest.encode())):
+    content = text.encode()
+    rest = content[: -len(_SEAL % sha256(b"").encode())]
+    if content != rest + _SEAL % sha256(rest).encode():
         raise ConfigError(f"{path}: is damaged (its checksum does not fit); it can't be replayed.")
     return lines[:-1]
 

@@ -1,8 +1,7 @@
 """Data that arrive but are dead: repeated scans, jumps of odometry, no motion when commanded.
 
-A lidar without noise may well show the same between two long walls, or in the middle of a round
-room. So an old scan is moved by the motion from odometry, and only those of its beams count whose
-length must have changed by now, whatever the error of the heading.
+A lidar without noise may show the same between two long walls. So an old scan is moved by the
+motion from odometry, and only beams count whose length must have changed by now.
 """
 
 from __future__ import annotations
@@ -22,9 +21,7 @@ RESPONSE = 0.1  # least share of the commanded distance or angle that a robot co
 LEAST_PATH, LEAST_TURN = 0.03, 0.25
 """Least motion commanded within the window for the robot to be judged [m, rad]."""
 WINDOW = 0.75  # length of the window as a share of `stuck_s`; the rest is for the delay of odometry
-MARK_S = 0.05
-PAUSE_S = 0.2
-"""Time between two marks, and least time without commanded motion between two pushes [s]."""
+MARK_S, PAUSE_S = 0.05, 0.2  # between two marks; least time without motion between pushes [s]
 STILL_LINEAR, STILL_TURN = 0.05, 0.1
 """A robot slower than this, plus the noise of its odometry, stands still [m/s, rad/s]."""
 NOISE = 3.0  # noise of odometry that is allowed for, in standard deviations
@@ -52,7 +49,9 @@ def look(
     path = max(float(np.hypot(moved[0], moved[1])), abs(float(moved[2])))
     if path <= config.frozen_distance:
         return (*others, known), ""
-    if shown_again(config, known.ranges, ranges, moved):
+    telling = must_differ(config, known.ranges, moved)
+    still = _but_for_one((known.ranges == ranges) & telling, telling, TELLING_SHARE)
+    if np.count_nonzero(telling) >= LEAST_BEAMS and still:
         why = f"{known.count} scans are the same over a motion of {path:.2f} m or rad"
         return (*others, known), why
     return (*others, Sameness(ranges, 1, pose)), ""  # the scene may really look the same
@@ -119,13 +118,10 @@ def no_motion(config: GateConfig, state: GateState, now: float) -> Cause | None:
     return Cause("no_motion", ODOM, detail)
 
 
-SAME_SHARE = 0.99
-"""Two scans with this share of equal beams are the same; of few beams, one may differ."""
-TELLING_SHARE = 0.9
-"""A scan with this share unchanged, of the beams that must have changed, is an old one."""
+SAME_SHARE = 0.99  # two scans with this share of equal beams are the same; one may always differ
+TELLING_SHARE = 0.9  # a scan is old if this share of the beams that must have changed did not
 CHANGE = 0.02  # least change of a beam that must have changed [m]
-HEADINGS = (-0.03, 0.0, 0.03)
-"""Errors of odometry's heading for all of which the beam must have changed [rad]."""
+HEADINGS = (-0.03, 0.0, 0.03)  # errors of odometry for all of which a beam must have changed [rad]
 NEIGHBOURS = 1.5  # an old beam is compared with beams at most this many beam spacings away
 LEAST_BEAMS = 3
 
@@ -134,14 +130,6 @@ def same(one: Ranges, other: Ranges) -> bool:
     """True if two scans (B,) are bit-identical, but for a few of the beams that return in one."""
     returned = np.isfinite(one) | np.isfinite(other)
     return _but_for_one((one == other) & returned, returned, SAME_SHARE)
-
-
-def shown_again(config: GateConfig, old: Ranges, ranges: Ranges, moved: Array) -> bool:
-    """True if a scan (B,) repeats an old one (B,) although the robot has moved (3,) [m, m, rad]."""
-    telling = must_differ(config, old, moved)
-    if np.count_nonzero(telling) < LEAST_BEAMS:
-        return False
-    return _but_for_one((old == ranges) & telling, telling, TELLING_SHARE)
 
 
 def _but_for_one(same: Flags, counted: Flags, share: float) -> bool:
@@ -168,10 +156,7 @@ def must_differ(config: GateConfig, ranges: Ranges, moved: Array) -> Flags:
 
 
 def _changed(angles: Array, ranges: Ranges, seen: Array, open_: Flags) -> Flags:
-    """Returns which beams (B,) differ from the moved end points (K, 2 or more) of the old ones.
-
-    An open beam only shows that nothing is nearer.
-    """
+    """Returns which beams (B,) differ from moved old ends (K, 2); of open ones, the nearer."""
     bearing = np.arctan2(seen[:, 1], seen[:, 0])
     order = np.argsort(bearing)
     order = np.concatenate([order[-1:], order, order[:1]])  # the ends, once more around

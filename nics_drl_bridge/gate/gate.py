@@ -1,9 +1,8 @@
 """The gate: one pure function from (time, state, input) to (state, decision).
 
-It reads no clock, uses no random numbers and has no side effects, so that a recording of its
-inputs replays to bit-identical decisions. It does nothing that is not in the tables of rules:
-`REFUSALS` of malformed data, which feed no watchdog; `CHECKS` before it is armed; `STOPS`; and
-`SHAPERS` of a motion. Their functions stand before each, or in `stops`, `frozen` and `shield`.
+It reads no clock, draws no numbers and has no side effects: a recording of its inputs replays to
+bit-identical decisions. All that it does is in the tables of rules: `REFUSALS` of malformed data,
+which feed no watchdog; `CHECKS` before it is armed; `STOPS`; and `SHAPERS` of a motion.
 """
 
 from __future__ import annotations
@@ -16,9 +15,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nics_drl_bridge.gate import frozen, inputs, limits, shield, stops
-from nics_drl_bridge.gate.inputs import (
-    Command,
-)  # fmt: skip
 from nics_drl_bridge.gate.state import (
     Arrivals,
     Cause,
@@ -57,7 +53,8 @@ def decide(
     state, refused = take(config, state, given, now)
     state, answer, granted = _serve(config, state, given, now)
     was_moving = bool(state.value.any())
-    cause, latches = first_cause(config, state, now)
+    judged = ((rule.judge(config, state, now), rule.latches) for rule in STOPS)
+    cause, latches = next((found for found in judged if found[0] is not None), (None, False))
     publish = shielded = False
     if cause is not None:
         if latches and state.armed:
@@ -65,17 +62,17 @@ def decide(
         publish = was_moving or isinstance(given, inputs.Tick)
         state = _stopped(config, state, now if publish else state.moved_s, disarm=latches)
     elif isinstance(given, inputs.Tick) and not now - state.moved_s < limits.LEAST_STEP_S:
-        publish, motion = True, _wish(config, state)
+        publish, still = True, np.zeros(len(config.fields))
+        wish = still if state.command is None else state.command.twist[list(config.fields)]
+        motion = Motion(wish.astype(np.float64), still)
         for shape in SHAPERS:
             motion = shape(config, state, motion, now)
         if motion.fault:
             cause = Cause("motion_unfit", "", motion.fault)
             state = _stopped(config, replace(state, latched=cause), now, disarm=True)
         else:
-            recent = _recent(config, state, motion.value, now)
-            state = replace(
-                state, value=motion.value, slope=motion.slope, moved_s=now, recent=recent
-            )
+            value, recent = motion.value, _recent(config, state, motion.value, now)
+            state = replace(state, value=value, slope=motion.slope, moved_s=now, recent=recent)
             state, shielded = frozen.watch_motion(config, state, now), motion.shielded
     twist = np.zeros(3)
     twist[list(config.fields)] = state.value
@@ -87,7 +84,8 @@ def _serve(
 ) -> tuple[GateState, str, bool]:
     """Arms or resets, if requested; returns also the answer, and whether it was granted."""
     if isinstance(given, inputs.Arm):
-        if failed := failures(config, state, given, now):
+        answers = ((name, check(config, state, given, now)) for name, check in CHECKS)
+        if failed := [f"{name}: {answer}" for name, answer in answers if answer]:
             return state, "; ".join(failed), False
         sensors = tuple(replace(each, arrivals=settled(each.arrivals)) for each in state.sensors)
         return replace(
@@ -188,8 +186,10 @@ def take(
     state = replace(state, jumped="", leap="")
     for kind, judge in REFUSALS:
         reason = judge(config, given) if isinstance(given, kind) else ""
+        if reason and kind is inputs.Command:
+            state = replace(state, malformed=reason)
         if reason:
-            return replace(state, malformed=reason) if kind is Command else state, reason
+            return state, reason
     if isinstance(given, inputs.Scan):
         return _take_scan(config, state, given, now)
     if isinstance(given, inputs.Odometry):
@@ -295,8 +295,10 @@ def _leap(config: GateConfig, state: GateState, odometry: inputs.Odometry, now: 
 
 
 def _fresh(topic: str, arrivals: Arrivals, limit_s: float, config: GateConfig, now: float) -> str:
-    fresh = stops.gap_free(arrivals, now, config.settle_s, limit_s)
-    return "" if fresh else f"{topic} has not been fresh for {config.settle_s} s"
+    unbroken = now - arrivals.unbroken_s >= config.settle_s
+    if arrivals.times and unbroken and now - arrivals.times[-1] <= limit_s:
+        return ""
+    return f"{topic} has not been fresh for {config.settle_s} s"
 
 
 def _sensors(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
@@ -313,10 +315,8 @@ def _rate(topic: str, arrivals: Arrivals, declared: float, config: GateConfig, n
     high = declared * (1.0 + config.rate_tolerance)
     if arriving >= low and low <= stamped <= high:
         return ""
-    return (
-        f"{topic} comes at {arriving:.1f} Hz, by its stamps {stamped:.1f} Hz, declared are "
-        f"{declared:.1f} Hz"
-    )
+    rates = f"{arriving:.1f} Hz, by its stamps {stamped:.1f} Hz, declared are {declared:.1f} Hz"
+    return f"{topic} comes at {rates}"
 
 
 def _clocks(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
@@ -332,10 +332,9 @@ def _clocks(config: GateConfig, state: GateState, request: inputs.Arm, now: floa
         ahead = stops.creep(arrivals)
         behind = 0.0 if config.simulated else -ahead
         if ahead > stops.AHEAD_S or behind > BEHIND_S:
-            return (
-                f"the stamps of {topic} run away from this machine's clock, by {ahead:+.3f} s in a "
-                "moment; a simulation that is not in real time needs the parameter 'clock_rate'"
-            )
+            away = f"run away from this machine's clock, by {ahead:+.3f} s in a moment"
+            advice = "a simulation that is not in real time needs the parameter 'clock_rate'"
+            return f"the stamps of {topic} {away}; {advice}"
     return ""
 
 
@@ -390,12 +389,6 @@ CHECKS: tuple[tuple[str, Check], ...] = (
 )
 
 
-def failures(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> list[str]:
-    """Returns a sentence for each failed check, with the check's name in front."""
-    answers = ((name, check(config, state, request, now)) for name, check in CHECKS)
-    return [f"{name}: {answer}" for name, answer in answers if answer]
-
-
 class Rule(NamedTuple):
     """A reason to stop; its name is that of the function that returns the cause, or None."""
 
@@ -435,21 +428,6 @@ STOPS: tuple[Rule, ...] = (
 """In order of evaluation; the first rule that returns a cause names the stop."""
 
 
-def first_cause(config: GateConfig, state: GateState, now: float) -> tuple[Cause | None, bool]:
-    """Returns the first cause to stop the robot, and whether it latches."""
-    for rule in STOPS:
-        cause = rule.judge(config, state, now)
-        if cause is not None:
-            return cause, rule.latches
-    return None, False
-
-
-def _wish(config: GateConfig, state: GateState) -> Motion:
-    still = np.zeros(len(config.fields))
-    wish = still if state.command is None else state.command.twist[list(config.fields)]
-    return Motion(wish.astype(np.float64), still)
-
-
 def saturate(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
     """Brings the value within its limits, see `limits.saturate`; without limits it is zero."""
     if config.limits is None:
@@ -472,9 +450,7 @@ def bounded(config: GateConfig, state: GateState, motion: Motion, now: float) ->
     if good and np.isfinite(motion.value).all() and np.isfinite(motion.slope).all():
         return motion
     zero = np.zeros_like(motion.value)
-    return replace(
-        motion, value=zero, slope=zero, fault=f"a motion of {motion.value.tolist()} came out"
-    )
+    return Motion(zero, zero, motion.shielded, f"a motion of {motion.value.tolist()} came out")
 
 
 # Stages that a passing command goes through.

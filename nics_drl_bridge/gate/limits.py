@@ -16,10 +16,8 @@ from nics_drl_bridge.interface import Array
 from nics_drl_bridge.robot.spec import CommandVariable, RobotSpec
 
 IMPLAUSIBLE = 10.0  # a command beyond this multiple of its limit is a fault, and refused
-LEAST_STEP_S = 1e-3
-"""Motions closer in time than this are not published: their derivatives would be noise."""
-PERIOD_S = 0.02
-"""Period of the gate's ticks [s]. A limit that allows the whole range within one is a typo."""
+LEAST_STEP_S = 1e-3  # motions closer in time are not published: their derivatives would be noise
+PERIOD_S = 0.02  # of the gate's ticks [s]; a limit that allows the whole range within one is a typo
 SNAP = 1e-12  # a value this close to its target, as a share of the greatest value, has reached it
 GREATEST = 1e300  # numbers are clipped to this before a multiplication: inf times 0 would be NaN
 STILL = 1e-9
@@ -76,17 +74,13 @@ class Limits:
 def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
     """Reads the limits of a robot from a shipped file in `config/limits`, or a YAML file.
 
-    Raises:
-        ConfigError: a key is missing or unknown; the file is for another robot; a limit exceeds
-            what the robot or a period of the gate allows, or would never let the robot move.
+    ConfigError names the key: missing, unknown, of another robot, beyond it, or too low to move.
     """
     path = find_config(name, "limits")
     file = load_yaml(path, LimitsFile)
     if file.robot != robot.name:
-        raise ConfigError(
-            f"{path}: key 'robot': the limits are for {file.robot!r}, not for {robot.name!r}; name "
-            "the file of this robot."
-        )
+        other = f"the limits are for {file.robot!r}, not for {robot.name!r}"
+        raise ConfigError(f"{path}: key 'robot': {other}; name the file of this robot.")
     names = [variable.name for variable in robot.command]
     for given in file.commands:
         if given not in names:
@@ -102,10 +96,8 @@ def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
     units = np.array([variable.unit for variable in robot.command])
     limits = Limits(low, high, rate, jerk, linear=units == SPEED, turn=units == TURN)
     if greatest(limits, limits.linear | limits.turn) < LEAST_MOTION:
-        raise ConfigError(
-            f"{path}: the robot could never move: none of its speeds and turn rates may reach "
-            f"{LEAST_MOTION:g}; raise a `max`."
-        )
+        fault = f"none of its speeds and turn rates may reach {LEAST_MOTION:g}"
+        raise ConfigError(f"{path}: the robot could never move: {fault}; raise a `max`.")
     return limits
 
 
@@ -117,23 +109,20 @@ def _check(key: str, limit: CommandLimit, variable: CommandVariable) -> None:
         ("max", limit.max, limit.max > high, f"at most {high:g}"),
     ):
         if beyond:
-            raise ConfigError(
-                f"{key}.{name}': {value:g} {unit} is beyond the robot's own limit; give {bound}."
-            )
+            fault = f"{value:g} {unit} is beyond the robot's own limit"
+            raise ConfigError(f"{key}.{name}': {fault}; give {bound}.")
     span, far = high - low, max(-limit.min, limit.max)
     for name, order, per in (("rate", 1, "/s"), ("jerk", 2, "/s^2")):
         value, most = getattr(limit, name), span / PERIOD_S**order
         reach = value * LONGEST_START_S**order / order
         if value > most:
-            raise ConfigError(
-                f"{key}.{name}': {value:g} {unit}{per} crosses the robot's whole range within a "
-                f"period of the gate, {PERIOD_S:g} s, and limits nothing; give at most {most:g}."
-            )
+            fault = f"{value:g} {unit}{per} crosses the robot's whole range"
+            within = f"within a period of the gate, {PERIOD_S:g} s, and limits nothing"
+            raise ConfigError(f"{key}.{name}': {fault} {within}; give at most {most:g}.")
         if reach < STARTED * far:
-            raise ConfigError(
-                f"{key}.{name}': {value:g} would never let it move: after {LONGEST_START_S:g} s it "
-                f"has come to {reach:.2g} of {far:g} {unit}; raise it."
-            )
+            come = f"after {LONGEST_START_S:g} s it has come to {reach:.2g} of {far:g} {unit}"
+            fault = f"{value:g} would never let it move: {come}"
+            raise ConfigError(f"{key}.{name}': {fault}; raise it.")
 
 
 def greatest(limits: Limits, which: NDArray[np.bool_]) -> float:
@@ -152,11 +141,7 @@ def within(value: Array, limits: Limits) -> bool:
 
 
 def saturate(command: Array, limits: Limits) -> Array:
-    """Returns the command (C,) within its limits, on the same path.
-
-    Speeds and turn rates are scaled by one common factor, which keeps the curvature of the path
-    and the direction of motion. A value whose limit is 0 is dropped.
-    """
+    """Returns the command (C,) within its limits, speeds and turns scaled alike: the same path."""
     speeds, factor = limits.linear | limits.turn, 1.0
     out = np.clip(command, -GREATEST, GREATEST)  # 0 times inf is NaN
     for i, value in enumerate(out):
@@ -172,11 +157,9 @@ def saturate(command: Array, limits: Limits) -> Array:
 def follow(
     value: Array, slope: Array, target: Array, dt: float, limits: Limits
 ) -> tuple[Array, Array]:
-    """Moves a command towards its target as fast as rate and jerk allow.
+    """Moves a command (C,) towards its target as fast as rate and jerk allow; with its slope.
 
-    The turn waits for the speed, so that an accelerating robot is on its path from the start. The
-    last command (C,) has changed by its slope (C,) per second; the target (C,) lies within the
-    limits; `dt` is the time since the last command [s]. Returns the next value and its slope.
+    The turn waits for the speed, so that an accelerating robot is on its path from the start.
     """
     wanted, after, change = target.copy(), value.copy(), slope.copy()
     given = (value, slope, wanted, limits.low, limits.high, limits.rate, limits.jerk)
@@ -204,11 +187,8 @@ def _follow_one(
     """Moves one command; see `follow`.
 
     A slope a can be brought back to zero within a change of a^2 / (2 jerk) whatever the coming
-    intervals, because the sum over them lies below the integral. So a value with
-    value + a^2 / (2 jerk) within the bounds stays within them.
-
-    The calculation uses shares of the greatest value and steps of this interval. No slope then
-    exceeds what one interval can do, the whole range, and no limit causes an overflow.
+    intervals, as the sum over them lies below the integral: a value that far within the bounds
+    stays so. In shares of the greatest value and steps of this interval, nothing overflows.
     """
     scale = max(-least_value, most_value)
     low, high = least_value / scale, most_value / scale

@@ -1,19 +1,14 @@
 """The shield: passes only commands from which the robot can stop before the nearest obstacle.
 
-The robot is assumed to do anything between its recent commands, its motion by odometry and the
-present command, for as long as the scan is old, the next decision takes and the robot needs to
-react, and then to brake. A new command must also leave room to brake calmly, so that an approach
-ends slowly instead of in a series of full stops. The footprint is swept along the arcs of that
-whole family; a command is scaled down, on its path, until no obstacle in the scan lies in the swept
-area. The dynamic window of Fox, Burgard and Thrun (1997) tests the same for one arc.
-
-An obstacle may approach if it is where the robot saw free space a moment ago: the newest scan is
-compared with some older ones by odometry.
+The robot may do anything between its recent commands, its motion by odometry and the present
+command, for as long as the scan is old, the next decision takes and it needs to react, and then
+brakes; a new command must also leave room to brake calmly. The footprint is swept along the arcs of
+that family; a command is scaled down, on its path, until no obstacle lies in the swept area (for
+one arc: the dynamic window of Fox, Burgard, Thrun 1997). An obstacle may approach if it is where
+the robot saw free space a moment ago, in older scans moved by odometry.
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,10 +49,7 @@ def remember(config: GateConfig, state: GateState, scan: Scan) -> tuple[View, ..
 
 
 def movers(config: GateConfig, shield: ShieldConfig, views: tuple[View, ...]) -> Flags:
-    """Returns which beams (B,) of the newest view end on something that moves.
-
-    A single beam is noise: a neighbour has to agree.
-    """
+    """Returns which beams (B,) of the newest view end on movers; a neighbour has to agree."""
     newest, angles = views[-1], config.beam_angles
     marked = np.zeros(len(newest.ranges), np.bool_)
     if len(angles) < 2 or shield.obstacle_speed == 0.0:
@@ -91,10 +83,7 @@ def too_close(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: F
 
 
 def unknown(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags) -> Array:
-    """Returns a wall (P, 3) on the footprint wherever too many beams, or all, are unknown.
-
-    So the robot does not drive into what it can't see, but can drive away from it.
-    """
+    """Returns a wall (P, 3) on the footprint wherever too many beams, or all, are unknown."""
     blocked = np.linspace(-np.pi, np.pi, len(ranges), endpoint=False)
     angles = config.beam_angles[~np.isnan(ranges)] + config.mount[2]
     known = np.sort(np.mod(angles + np.pi, 2.0 * np.pi) - np.pi)
@@ -109,8 +98,7 @@ def unknown(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Fla
     return np.stack([*wall, np.zeros_like(blocked)], axis=1)
 
 
-Evidence = Callable[[GateConfig, ShieldConfig, Ranges, Flags], Array]
-EVIDENCE: tuple[Evidence, ...] = (returns, too_close, unknown)
+EVIDENCE = (returns, too_close, unknown)
 
 
 def _ends(config: GateConfig, angles: Array, ranges: Array, speeds: Array | float) -> Array:
@@ -123,8 +111,7 @@ def _ends(config: GateConfig, angles: Array, ranges: Array, speeds: Array | floa
 def obstacles(config: GateConfig, ranges: Ranges, views: tuple[View, ...]) -> Array | None:
     """Returns all obstacles (P, 3) in a scan (B,): x, y in `base_link` [m], greatest speed [m/s].
 
-    The views are that of the scan and earlier ones, empty before the first odometry. None without
-    shield.
+    The views are that of the scan and earlier ones, empty before odometry. None without shield.
     """
     given = config.shield
     if given is None:
@@ -141,10 +128,7 @@ def rehearse() -> None:
 
 
 def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
-    """Returns the greatest part of a motion from which the robot can still stop in time.
-
-    If necessary, it brakes harder than the limits of rate and jerk allow.
-    """
+    """Returns the greatest part of a motion from which it can stop, braking harder if needed."""
     if config.shield is None or config.limits is None or state.obstacles is None:
         return motion
     speeds = config.limits.linear | config.limits.turn
@@ -203,10 +187,8 @@ def _family(
     if odometry is not None:
         twists = np.concatenate([twists, odometry[None]])
     low, high = twists.min(axis=0), twists.max(axis=0)
-    axes = [
-        np.linspace(least, greatest, most if greatest > least else 1)
-        for least, greatest, most in zip(low, high, (SPEEDS, SPEEDS, TURNS), strict=True)
-    ]
+    counts = np.where(high > low, (SPEEDS, SPEEDS, TURNS), 1)
+    axes = [np.linspace(*ends) for ends in zip(low, high, counts, strict=True)]
     return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
 
 

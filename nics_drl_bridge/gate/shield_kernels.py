@@ -27,11 +27,10 @@ def place(twist, time):  # type: ignore[no-untyped-def]
 def free(points, twists, blind, deceleration, room, step):  # type: ignore[no-untyped-def]
     """True if no point comes within `room` of any of the arcs before the robot rests on it.
 
-    A point that is already that near must not come nearer, so that the robot can leave it. A moving
-    point may be nearer by all that it can have moved, even one that the robot drives away from.
-    Points (P, 3) are x, y [m] and greatest speed [m/s], twists (K, 3) those of the arcs; the robot
-    keeps its twist for the time `blind` [s], then brakes with a deceleration [m/s^2]. Places are
-    checked at each `step` of the path [m].
+    A point that is already that near must not come nearer. A moving point may be nearer by all that
+    it can have moved. Points (P, 3) are x, y [m] and greatest speed [m/s], twists (K, 3) those of
+    the arcs; the robot keeps its twist for `blind` [s], then brakes with a deceleration [m/s^2].
+    Places are checked at each `step` of the path [m].
     """
     longest, rest = 0.0, 0.0
     for k in range(twists.shape[0]):
@@ -87,9 +86,8 @@ class MountedBeams(NamedTuple):
 def entered(out, ranges, old, lidar, moved, far, tolerance):  # type: ignore[no-untyped-def]
     """Marks, in `out` (B,), the beams of a scan (B,) that end where an old one (B,) saw free space.
 
-    The robot's own motion since, `moved` (3,), is compensated. Places hidden or unknown then are
-    not marked; other flags in `out` stay. `far` is the greatest range [m]; the tolerance for noise
-    is in metres and as a share of the range.
+    The robot's own motion, `moved` (3,), is compensated; hidden or unknown places, and other flags,
+    stay. `far` is the greatest range [m]; the tolerance is in metres and as a share of the range.
     """
     beams, circle = len(ranges), 2.0 * math.pi / abs(lidar.step)
     whole, wide = round(circle), math.ceil(WIDTH / abs(lidar.step))

@@ -20,9 +20,8 @@ INF = float("inf")
 def replace(record: Record, **changes: Any) -> Record:
     """Returns a copy of a frozen record with some fields changed, like `dataclasses.replace`.
 
-    That function walks through all fields in Python, for a state of thirty several times per
-    decision. The record must have no `__post_init__` and no slots. Raises TypeError for a field
-    that it does not have.
+    That one is slow: it walks through all fields in Python. The record must have no `__post_init__`
+    and no slots. Raises TypeError for a field that it does not have.
     """
     held = vars(record)
     if not changes.keys() <= held.keys():
@@ -111,8 +110,7 @@ Mark = tuple[float, int, int, float]
 class Arrivals:
     """Arrivals of the data of a topic, oldest first.
 
-    The lead of a datum is how far its stamp is ahead of the steady clock, counted from the first
-    datum: the offset of the two clocks minus the time the datum took to arrive.
+    The lead of a datum is how far its stamp is ahead of the steady clock, from the first datum on.
     """
 
     stamps_ns: tuple[int, ...] = ()  # of the latest headers

@@ -19,8 +19,7 @@ ANGLE = "rad"
 UNKNOWN_LAG_S = 0.5  # lag of a robot whose model shows none [s]
 SLOWEST_LAG_S = 5.0  # slower modes are not lags but combinations that no command moves [s]
 UNKNOWN_DECELERATION = 0.5  # deceleration of a robot whose limits are not known [m/s^2]
-LEAST_DATA = 2
-"""Least number of data that must arrive while the gate settles, for their rate to be known."""
+LEAST_DATA = 2  # least number that must arrive while the gate settles, for a rate to be known
 
 
 def shield_config(
@@ -31,15 +30,18 @@ def shield_config(
 ) -> tuple[ShieldConfig, str]:
     """Returns a robot's shield configuration, and a sentence with its values and their source.
 
-    The source is the `shield` of a file of limits, otherwise, with caution, model and limits; given
-    values, by their names in the file, override it.
-
-    Raises:
-        ConfigError: a value can't be used, or the shield does not know the robot's commands.
+    It is the `shield` of a file of limits, else, with caution, model and limits; given values
+    override it. ConfigError: a value can't be used, or the shield does not know the robot's
+    commands.
     """
     path = find_config(file, "limits") if file else None
     measured = load_yaml(path, LimitsFile).shield if path else None
-    values = (measured or _derived(model, limits)).model_copy(update=dict(given or {}))
+    if (stopping := measured) is None:  # one command per period; brakes no harder than its limits
+        rates = [] if limits is None else limits.rate[limits.linear].tolist()
+        delay = model.calibration.command_latency_s + lag(model.kinematics) + model.control_period
+        deceleration = min(rates, default=UNKNOWN_DECELERATION)
+        stopping = Stopping(latency=max(0.0, delay), deceleration=deceleration)
+    values = stopping.model_copy(update=dict(given or {}))
     for name, value in values.model_dump().items():
         least = "greater than 0" if name == "deceleration" else "at least 0"
         if not (np.isfinite(value) and value >= 0.0) or (value == 0.0 and name == "deceleration"):
@@ -63,19 +65,8 @@ def shield_config(
     return config, f"the shield is on: {listed} ({source})"
 
 
-def _derived(model: SimulatorModel, limits: Limits | None) -> Stopping:
-    """Assumes that a base takes up one command per period, and brakes no harder than its limits."""
-    rates = [] if limits is None else limits.rate[limits.linear].tolist()
-    deceleration = min(rates, default=UNKNOWN_DECELERATION)
-    latency = model.calibration.command_latency_s + lag(model.kinematics) + model.control_period
-    return Stopping(latency=max(0.0, latency), deceleration=deceleration)
-
-
 def lag(kinematics: TaylorModel) -> float:
-    """Returns the slowest time constant [s] of the model's states; a guess if none shows.
-
-    It comes from the eigenvalues, at rest, of the Jacobian of the state's rates by the state.
-    """
+    """Returns the slowest time constant [s] of the state's rates at rest; a guess if none shows."""
     states = kinematics.variables[: kinematics.state_size]
     names = [term_name(row, kinematics.variables) for row in kinematics.powers]
     own = np.zeros((len(states), len(states)))
@@ -88,23 +79,18 @@ def lag(kinematics: TaylorModel) -> float:
 
 
 def wheelbase(robot: RobotSpec) -> float:
-    """Returns the wheelbase of a robot commanded by steering angle [m]; 0 for other robots.
-
-    Raises ConfigError if the robot's file lacks it, or a command is no speed, turn rate or angle.
-    """
+    """Returns the wheelbase [m] of a car, else 0; ConfigError without it or for unknown units."""
     for variable in robot.command:
         if variable.unit not in (SPEED, TURN, ANGLE):
-            raise ConfigError(
-                f"robot {robot.name!r}: the shield knows commands in m/s, rad/s and rad, and "
-                f"{variable.name!r} is in {variable.unit!r}; without it, set `shield: false`."
-            )
+            fault = f"{variable.name!r} is in {variable.unit!r}; without it, set `shield: false`"
+            known = f"robot {robot.name!r}: the shield knows commands in m/s, rad/s and rad"
+            raise ConfigError(f"{known}, and {fault}.")
     if not robot.steers:
         return 0.0
     if not robot.parameters.get("wheelbase", 0.0) > 0.0:
-        raise ConfigError(
-            f"robot {robot.name!r}: the shield needs the parameter 'wheelbase' of a car; add it "
-            "under `parameters:` of the robot, or drive without a shield by `shield: false`."
-        )
+        fault = f"robot {robot.name!r}: the shield needs the parameter 'wheelbase' of a car"
+        advice = "add it under `parameters:` of the robot"
+        raise ConfigError(f"{fault}; {advice}, or drive without a shield by `shield: false`.")
     return robot.parameters["wheelbase"]
 
 
@@ -116,23 +102,18 @@ def require_possible(config: GateConfig) -> None:
     ):
         declared = f"{topic} comes every {1.0 / rate:.3g} s ({rate:g} Hz are declared)"
         if age <= 1.0 / rate:
-            raise ConfigError(
-                f"parameter '{topic}_age': {age:g} s: {declared}, so the robot could never move; "
-                f"give more than {1.0 / rate:.3g}."
-            )
+            fault = f"{age:g} s: {declared}, so the robot could never move"
+            raise ConfigError(f"parameter '{topic}_age': {fault}; give more than {1.0 / rate:.3g}.")
         if rate * config.settle_s < LEAST_DATA:
-            raise ConfigError(
-                f"{declared}, too seldom to be judged within {config.settle_s:g} s, so the robot "
-                f"could never move; the gate needs {LEAST_DATA / config.settle_s:g} Hz or more."
-            )
+            fault = f"{declared}, too seldom to be judged within {config.settle_s:g} s"
+            needed = f"the gate needs {LEAST_DATA / config.settle_s:g} Hz or more"
+            raise ConfigError(f"{fault}, so the robot could never move; {needed}.")
 
 
 def doubtful(config: GateConfig, control_period_s: float) -> str:
     """Returns a warning about an age limit that only suits a policy with a shorter period [s]."""
-    if config.command_age_s > control_period_s:
-        return ""
-    return (
-        f"parameter 'command_age': {config.command_age_s:g} s: a policy commands every "
-        f"{control_period_s:g} s unless it is told otherwise, and the robot would stop between any "
-        f"two commands; give more than {control_period_s:g}."
-    )
+    age, period = f"{config.command_age_s:g} s", f"{control_period_s:g}"
+    every = f"a policy commands every {period} s unless it is told otherwise"
+    advice = f"the robot would stop between any two commands; give more than {period}."
+    late = config.command_age_s <= control_period_s
+    return f"parameter 'command_age': {age}: {every}, and {advice}" if late else ""

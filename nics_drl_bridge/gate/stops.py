@@ -2,9 +2,8 @@
 
 The age of a datum is the time since its arrival on the steady clock, plus its delay. The lead of
 its stamp over that clock is the offset of the two clocks minus the delay; the greatest lead, the
-envelope, is that of the fastest data (the idea of one-way delay estimation by the lower envelope).
-It is found before the gate is armed and then fixed: it follows at most the drift of real clocks. So
-stamps that creep ahead, or fall behind, become neither the new present nor the new normal.
+envelope, is that of the fastest data. It is found before the gate is armed and then follows at most
+the drift of real clocks: stamps that creep ahead or fall behind do not become the new normal.
 """
 
 from __future__ import annotations
@@ -20,8 +19,7 @@ KEPT = 64  # number of remembered stamps; a command on an older scan is on an un
 MARK_S = 0.05  # time between two marks [s]
 DRIFT = 1e-3  # greatest drift between two clocks [s/s]; that of real machines is 1e-4
 SIMULATED_LAG = 0.2  # share of real time that a simulator may lose
-AHEAD_S = 0.1
-"""Data of an armed gate whose lead exceeds the envelope by this are from the future [s]."""
+AHEAD_S = 0.1  # data of an armed gate that lead the envelope by this are from the future [s]
 FROZEN_INPUTS = 20  # a running clock does not give this many inputs in a row the same time
 
 
@@ -30,8 +28,7 @@ def arrived(
 ) -> tuple[Arrivals, str]:
     """Accounts for a datum; if the gate is armed, the envelope is fixed.
 
-    Returns the arrivals, and why the datum is not used: `repeated`, `jumped` or "". After a jump
-    only the new datum counts.
+    Returns the arrivals, after a jump of the new datum only, and `repeated`, `jumped` or "".
     """
     fresh = Arrivals(
         (stamp_ns,), (now,), (0.0,), (stamp_ns, now), 1, 0.0, now, ((now, stamp_ns, 1, 0.0),)
@@ -48,7 +45,7 @@ def arrived(
     if lead - arrivals.envelope > (AHEAD_S if armed else config.clock_jump_s):
         return fresh, "jumped"
     marks = _marked(arrivals, stamp_ns, now, lead, config.settle_s)
-    passed, envelope = now - arrivals.times[-1], _envelope(marks)
+    passed, envelope = now - arrivals.times[-1], max(mark[3] for mark in marks)
     if armed:
         fall = SIMULATED_LAG if config.simulated else DRIFT
         lowest, highest = arrivals.envelope - fall * passed, arrivals.envelope + DRIFT * passed
@@ -78,11 +75,8 @@ def _marked(
 
 def settled(arrivals: Arrivals) -> Arrivals:
     """Returns the arrivals with the envelope of the marked data alone, whatever it was before."""
-    return replace(arrivals, envelope=_envelope(arrivals.marks)) if arrivals.marks else arrivals
-
-
-def _envelope(marks: tuple[Mark, ...]) -> float:
-    return max(mark[3] for mark in marks)
+    leads = [mark[3] for mark in arrivals.marks]
+    return replace(arrivals, envelope=max(leads, default=arrivals.envelope))
 
 
 def age(arrivals: Arrivals, now: float) -> float:
@@ -119,13 +113,6 @@ def stamps_jumped(config: GateConfig, state: GateState, now: float) -> Cause | N
     return Cause("stamps_jumped", state.jumped, detail) if state.jumped else None
 
 
-def gap_free(arrivals: Arrivals, now: float, settle_s: float, limit: float) -> bool:
-    """True if data have arrived for the settling time without a gap longer than a limit."""
-    if not arrivals.times:
-        return False
-    return now - arrivals.unbroken_s >= settle_s and now - arrivals.times[-1] <= limit
-
-
 def rate(arrivals: Arrivals, now: float, settle_s: float) -> tuple[float, float]:
     """Returns the rate by arrival and by stamps over the settling time [Hz]; 0 if unknown."""
     first = next((mark for mark in arrivals.marks if mark[0] >= now - settle_s), None)
@@ -138,8 +125,8 @@ def rate(arrivals: Arrivals, now: float, settle_s: float) -> tuple[float, float]
 
 def creep(arrivals: Arrivals) -> float:
     """Returns by how much the later half of the marks is further ahead of the steady clock [s]."""
-    marks, half = arrivals.marks, len(arrivals.marks) // 2
-    return _envelope(marks[half:]) - _envelope(marks[:half]) if half else 0.0
+    leads, half = [mark[3] for mark in arrivals.marks], len(arrivals.marks) // 2
+    return max(leads[half:]) - max(leads[:half]) if half else 0.0
 
 
 def take_time(config: GateConfig, state: GateState, given: Input, now: float) -> GateState:

@@ -20,10 +20,8 @@ def assume_textbook(
     """Adds terms for inputs that never moved, from the structure of the textbook kinematics.
 
     A fit at a constant input is a section through the whole model: `wz = c speed`, measured at the
-    steering angle s0, becomes `wz = (c/s0) speed*steering`. At s0 = 0 the section shows nothing of
-    the input's effect, so the coefficient comes from the spec's parameters. The model lists the new
-    terms in `assumed`; a sentence is returned per change. Raises ConfigError: the spec names no
-    textbook kinematics.
+    steering angle s0, becomes `wz = (c/s0) speed*steering`. At s0 = 0 the coefficient comes from
+    the spec's parameters. Each change gets a sentence. ConfigError: the spec names no textbook.
     """
     named = model.named
     rows = {dof: dict(terms) for dof, terms in named.terms.items()}

@@ -86,9 +86,8 @@ class Calibration:
 def align(drive: Drive, calibration: Calibration) -> Samples:
     """Puts a drive on one time axis, at `base_link` and on the clock of the commands.
 
-    A recording that needs no correction is used bit for bit. Otherwise the pose is smoothed by
-    local parabolas as far as its noise requires, and rows in gaps of the pose are dropped.
-    Raises RecordingError: the streams do not overlap in time.
+    A recording that needs no correction is used bit for bit; else noisy poses are smoothed by local
+    parabolas, and rows in gaps dropped. RecordingError: the streams do not overlap in time.
     """
     recording = drive.recording
     if calibration.is_identity and (shared := _shared_stamps(recording)) is not None:
@@ -158,10 +157,8 @@ def _grid(recording: Recording, calibration: Calibration) -> Array:
         first, last = max(first, recording.state.t[0]), min(last, recording.state.t[-1])
     count = int(np.floor((last - first) / step + 1e-6))
     if count < MIN_STAMPS:
-        raise RecordingError(
-            f"{recording.source}: commands and poses overlap for {max(last - first, 0.0):.2f} s "
-            "only; check that they are of one drive."
-        )
+        fault = f"commands and poses overlap for {max(last - first, 0.0):.2f} s only"
+        raise RecordingError(f"{recording.source}: {fault}; check that they are of one drive.")
     return np.asarray(first + step * np.arange(count + 1))
 
 

@@ -1,8 +1,7 @@
 """Clocks: offset, latency and lags of a drive; responses of states that were not measured.
 
-Each time is the shift that makes a signal a function of the commands, by a separable least
-squares: for a given delay (and lags) the best linear combination of the paper's features (Eq. 1)
-has a closed form, so the search is over the delay and the lags only.
+Each time is the shift that makes a signal a function of the commands, by separable least squares:
+the best combination of the paper's features (Eq. 1) for a given delay has a closed form.
 """
 
 from __future__ import annotations
@@ -54,16 +53,10 @@ class DelayEstimate:
 
 
 def delay_of_response(
-    command: Stream,
-    spec: RobotSpec,
-    target: Target,
-    centers: tuple[float, ...] = (0.0,),
+    command: Stream, spec: RobotSpec, target: Target, centers: tuple[float, ...] = (0.0,),
     lags: Array | None = None,
-) -> DelayEstimate:
-    """Estimates the delay, searched around `centers` [s], with which a signal follows commands.
-
-    Also the lags of the commands that moved, unless all `lags` (S,) are known.
-    """
+) -> DelayEstimate:  # fmt: skip
+    """Estimates a signal's delay around centers [s], and the moved commands' lags if unknown."""
     moved = signals.moved_inputs(command, spec)[: len(spec.state)]
     free = np.flatnonzero(moved if lags is None else [])
     base = signals.nominal_lags(spec) if lags is None else lags
@@ -169,15 +162,14 @@ def timing_of(drive: Drive) -> TimingEstimate:
     command, state, place = recording.command, recording.state, recording.source
     missing = [v.name for v in spec.state if v.follows is None]
     if state is None and missing:
-        raise RecordingError(
-            f"{place}: has no measured state, and {missing[0]!r} of robot {spec.name!r} follows no "
-            "command; record the state too, or add `follows:` to the robot's YAML file."
+        fault = (
+            f"has no measured state, and {missing[0]!r} of robot {spec.name!r} follows no command"
         )
+        advice = "record the state too, or add `follows:` to the robot's YAML file"
+        raise RecordingError(f"{place}: {fault}; {advice}.")
     if len(twists.start) < MIN_STAMPS:
-        raise RecordingError(
-            f"{place}: pose: only {len(twists.start)} usable intervals; record a drive of 20 s or "
-            "more without long gaps."
-        )
+        fault = f"pose: only {len(twists.start)} usable intervals"
+        raise RecordingError(f"{place}: {fault}; record a drive of 20 s or more without long gaps.")
     if state is not None:
         return _timing_of_measured_state(drive, state)
     if not signals.moved_commands(command).any():
@@ -262,19 +254,10 @@ def expected_states(drive: Drive, twists: TwistIntervals, timing: TimingEstimate
     return signals.interval_means(grid, states, start, end)
 
 
-def expected_speed(drive: Drive, timing: TimingEstimate) -> Array | None:
-    """Returns the speed (n,) over the intervals of the twists, at gain 1; None if not unique."""
-    speed = signals.speed_index(drive.spec)
-    return None if speed is None else expected_states(drive, drive.twists, timing)[:, speed]
-
-
 def responses_of(
     drive: Drive, calibration: Calibration, timing: TimingEstimate, expected: Array | None
 ) -> tuple[Response, ...]:
-    """Returns the inferred states; a speed is scaled to that along the direction of travel.
-
-    `expected` (n,) is that speed over the intervals of the twists at gain 1; None if unknown.
-    """
+    """Returns the inferred states, of which a speed is scaled by that `expected` (n,) at gain 1."""
     spec = drive.spec
     if drive.recording.state is not None:
         return ()
@@ -305,10 +288,7 @@ def wheel_means(drive: Drive, calibration: Calibration) -> Array | None:
 
 
 def with_wheels(drive: Drive, calibration: Calibration) -> Calibration:
-    """Adds the scales of the wheel speeds and interchanged wheels, as far as the drive shows them.
-
-    The left wheel of interchanged wheels is faster in left turns.
-    """
+    """Adds scales of wheel speeds; the left of interchanged wheels is faster in left turns."""
     wheels = wheel_means(drive, calibration)
     if wheels is None:
         return calibration
@@ -319,12 +299,11 @@ def with_wheels(drive: Drive, calibration: Calibration) -> Calibration:
         swapped = agreement < 0.0 if abs(agreement) > 0.5 else None
         calibration = replace(calibration, wheels_swapped=swapped)
     sigma = dict(calibration.uncertainty)
-    rows = {
-        "wheel_scale": (wheels.mean(axis=1), speed_along(drive, calibration)),
-        "turn_scale": (difference, turn),
-    }
     scales: dict[str, Any] = {}
-    for name, (units, moved) in rows.items():
+    for name, units, moved in (
+        ("wheel_scale", wheels.mean(axis=1), speed_along(drive, calibration)),
+        ("turn_scale", difference, turn),
+    ):
         if not float(units @ units) > 0.0:
             continue
         scale = float(units @ moved / (units @ units))

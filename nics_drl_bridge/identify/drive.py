@@ -78,10 +78,7 @@ class Drive:
 
     @cached_property
     def twists(self) -> TwistIntervals:
-        """Twists of the tracked body over intervals as long as the pose noise requires.
-
-        Between samples so far apart, motion stands out of the noise.
-        """
+        """Twists of the tracked body over spans in which motion stands out of the noise."""
         t, pose, stride, limit = self.dated.t, self.dated.values, 1, MAX_GAP_S
         if self.bursts is not None:
             limit = 1.8 * self.bursts.period_s
@@ -128,12 +125,7 @@ def find_bursts(t: Array) -> Bursts | None:
 
 
 def spread(t: Array, bursts: Bursts | None) -> Array:
-    """Estimates sample times (T,) from arrival stamps (T,) [s].
-
-    The samples of a burst were taken one after the other since the previous burst, the newest
-    just before its arrival. After a gap they are assumed to fill one period, or more if the
-    burst is larger than usual.
-    """
+    """Estimates sample times (T,) from arrivals (T,) [s]: a burst's lie since the one before."""
     if bursts is None:
         return t
     count = np.bincount(bursts.of)

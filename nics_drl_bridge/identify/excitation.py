@@ -1,8 +1,7 @@
 """Excitation: what a drive moved, and moved independently, and so what a fit can learn from it.
 
-Outliers are the rows that it can't learn from: least trimmed squares with concentration steps
-finds the bulk (Rousseeuw, Van Driessen: Computing LTS regression for large data sets), and rows
-far from it are dropped. Coverage is the range of each command, known before any fit.
+Outliers are the rows that it can't learn from: far from the bulk that least trimmed squares finds
+(Rousseeuw, Van Driessen: Computing LTS regression for large data sets).
 """
 
 from __future__ import annotations
@@ -55,10 +54,7 @@ class Excitation:
 
 
 def unmoved_variables(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
-    """Returns the variables of X that stayed constant for the whole drive.
-
-    A state whose command never moved did not move either if it shows nothing but noise.
-    """
+    """Returns the variables of X that stayed constant, or show only noise without a command."""
     limits = np.array([v.max - v.min for v in (*spec.state, *spec.command)])
     spread = samples.x.std(axis=0)
     still = spread < STILL * limits
@@ -72,11 +68,8 @@ def unmoved_variables(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
 
 def commands_together(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
     """Returns the commands that moved, but were linearly dependent."""
-    moved = [
-        i
-        for i, c in enumerate(spec.command, start=len(spec.state))
-        if samples.x[:, i].std() >= STILL * (c.max - c.min)
-    ]
+    commands = enumerate(spec.command, start=len(spec.state))
+    moved = [i for i, c in commands if samples.x[:, i].std() >= STILL * (c.max - c.min)]
     if len(moved) < 2:
         return ()
     unit = samples.x[:, moved] - samples.x[:, moved].mean(axis=0)
@@ -90,11 +83,8 @@ def commands_together(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
 
 def levels(samples: Samples, spec: RobotSpec) -> dict[str, int]:
     """Returns the number of different values of each command; more than ten count as ten."""
-    first = len(spec.state)
-    return {
-        c.name: min(10, len(np.unique(np.round(samples.x[:, first + i], 9))))
-        for i, c in enumerate(spec.command)
-    }
+    columns = zip(spec.command, samples.x[:, len(spec.state) :].T, strict=True)
+    return {c.name: min(10, len(np.unique(np.round(values, 9)))) for c, values in columns}
 
 
 def independent_columns(chi: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -111,10 +101,8 @@ def moved_terms(
     still = [names.index(name) for name in unmoved]
     moved: NDArray[np.int64] = powers[(powers[:, still] == 0).all(axis=1)]
     if len(samples.t) < MIN_SAMPLES_PER_TERM * len(moved):
-        raise FitError(
-            f"{len(samples.t)} samples are too few for {len(moved)} terms; drive for longer, or "
-            "lower the order."
-        )
+        few = f"{len(samples.t)} samples are too few for {len(moved)} terms"
+        raise FitError(f"{few}; drive for longer, or lower the order.")
     if len(unmoved) == len(names):
         raise FitError("no command ever changed, so nothing can be learnt; vary each command.")
     return moved
@@ -135,25 +123,19 @@ def terms_through_state(
 def moving_dofs(dq: Array) -> tuple[int, ...]:
     """Returns the indices of the rates (T, D) that move: vx, vy if not negligible, the others."""
     size = np.sqrt((dq**2).mean(axis=0))
-    moves = np.ones(len(size), dtype=np.bool_)
-    moves[:2] = size[:2] > NEGLIGIBLE * size[:2].max()
-    return tuple(map(int, np.flatnonzero(moves)))
+    return tuple(d for d in range(len(size)) if d > 1 or size[d] > NEGLIGIBLE * size[:2].max())
 
 
 def states_are_noisy(samples: Samples, spec: RobotSpec) -> bool:
     """True if the noise of a measured state would bias a fit."""
-    if not spec.state:
-        return False
-    size = len(spec.state)
     width = np.array([v.max - v.min for v in spec.state])
-    return bool((white_noise(samples.x[:, :size]) > NOISY * width).any())
+    return bool((white_noise(samples.x[:, : len(width)]) > NOISY * width).any())
 
 
 def inliers(chi: Array, target: Array, usual: float) -> NDArray[np.bool_]:
-    """Selects the rows of a regression of a target (T,) on features (T, K) that are no outliers.
+    """Selects the rows of a target (T,) on features (T, K) that are no outliers.
 
-    They are searched for if a residual exceeds the usual range of such rates (`usual_ranges`),
-    more than any misfit of the model.
+    They are searched for if a residual exceeds the usual range, more than any misfit of a model.
     """
     everything = np.ones(len(target), dtype=np.bool_)
     plain = _left(chi, target)
@@ -219,10 +201,9 @@ class CommandCoverage:
         """Returns one line for people."""
         if self.fault:
             return f"{self.name}: {self.fault}"
-        return (
-            f"{self.name}: moved from {self.low:.2f} to {self.high:.2f} {self.unit} "
-            f"({100.0 * self.share:.0f} % of its range), {100.0 * self.own:.0f} % of it on its own"
-        )
+        moved = f"from {self.low:.2f} to {self.high:.2f} {self.unit}"
+        share = f"{100.0 * self.share:.0f} % of its range"
+        return f"{self.name}: moved {moved} ({share}), {100.0 * self.own:.0f} % of it on its own"
 
 
 def coverage(recording: Recording, spec: RobotSpec) -> tuple[CommandCoverage, ...]:
@@ -235,16 +216,14 @@ def coverage(recording: Recording, spec: RobotSpec) -> tuple[CommandCoverage, ..
     found, own = Excitation.of(samples, spec.model_copy(update={"state": ()})), _own(samples.x)
     low, high = np.percentile(command, ENDS, axis=0)
     share = (high - low) / (spec.command_high - spec.command_low)
+    faults = dict.fromkeys(found.levels, "")
+    faults |= dict.fromkeys(found.together, "moved only together with others")
+    faults |= dict.fromkeys(found.unmoved, "never moved")
+    figures = zip(spec.command, np.stack([low, high, share, own], axis=1).tolist(), strict=True)
     return tuple(
-        CommandCoverage(
-            c.name, c.unit, float(low[i]), float(high[i]), float(share[i]), float(own[i]),
-            found.levels[c.name],
-            "never moved" if c.name in found.unmoved
-            else "moved only together with others" if c.name in found.together
-            else "",
-        )
-        for i, c in enumerate(spec.command)
-    )  # fmt: skip
+        CommandCoverage(c.name, c.unit, low, high, share, own, found.levels[c.name], faults[c.name])
+        for c, (low, high, share, own) in figures
+    )
 
 
 def _own(x: Array) -> Array:

@@ -15,26 +15,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.excitation import (
-    Excitation,
-    independent_columns,
-    inliers,
-    moved_terms,
-    moving_dofs,
-    plausible,
-    states_are_noisy,
-    terms_through_state,
-    usual_ranges,
-)
-from nics_drl_bridge.identify.statistics import (
-    Curve,
-    condition,
-    curve,
-    errors_of,
-    instrumental,
-    significant,
-    standard_errors,
-)
+from nics_drl_bridge.identify import excitation, statistics
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -50,10 +31,7 @@ SAME_STEP, ROUNDING_S = 1e-3, 1e-6
 
 
 def parse_alpha(text: str) -> Alpha:
-    """Parses a pruning threshold of Eq. 2.
-
-    Raises ConfigError: it is neither a number from 0 to 1 nor `auto`.
-    """
+    """Parses a pruning threshold: a number from 0 to 1, or `auto`; else ConfigError."""
     if text == "auto":
         return "auto"
     with suppress(ValueError):
@@ -72,7 +50,7 @@ class Regression:
     beta: Array  # (D, K) standardised coefficients; zero where not allowed or insignificant
     inliers: NDArray[np.bool_]  # (D, T) rows that are no outliers
     moving: tuple[int, ...]  # degrees of freedom that move; the others have no terms
-    excitation: Excitation  # of the variables by the drive
+    excitation: excitation.Excitation  # of the variables by the drive
     dependent: tuple[str, ...]  # terms that are copies of others on this drive
     terms_total: int  # D x K before anything was left out
     left_out: float  # share of the rows that were implausible
@@ -91,7 +69,7 @@ class Fit:
     regression: Regression  # on all features
     rmse: Array  # (D,) root mean square residual of dQ/dt, in the dof's unit, without outliers
     r2: Array  # (D,) share of the variance explained; 1 if the dof does not move
-    curves: tuple[Curve, ...]  # accuracy against the number of terms, for the dofs that move
+    curves: tuple[statistics.Curve, ...]  # accuracy against the number of terms, of moving dofs
     outliers: Array  # (D,) share of the rows that were dropped as outliers
     condition: Array  # (D,) condition number of the standardised kept features
 
@@ -114,38 +92,37 @@ def regress(
 ) -> Regression:
     """Finds the coefficients of all features by least squares (Eq. 1); outliers are dropped.
 
-    The order of the expansion is 1 to 4; the paper's is 2. `noisy` is any recording but an exact
-    one: insignificant terms are dropped before Eq. 2 is applied to the rest, and the body twist is
-    a function of the state alone, if there is one, and zero at zero speed, if the speed moved. For
-    within a step a command acts through the state, and in noise the two can't be told apart.
-    Raises FitError: too few samples, or nothing moved.
+    The order is 1 to 4; the paper's is 2. `noisy` is any recording but an exact one: insignificant
+    terms are dropped before Eq. 2, and the body twist is a function of the state alone, if any, and
+    zero at zero speed, if it moved: within a step a command acts through the state, and in noise
+    the two can't be told apart. Raises FitError: too few samples, or nothing moved.
     """
-    believed = plausible(samples.x, spec)
+    believed = excitation.plausible(samples.x, spec)
     samples = samples.rows(believed)
-    excitation, names = Excitation.of(samples, spec), spec.variable_names
+    excited, names = excitation.Excitation.of(samples, spec), spec.variable_names
     every = taylor.exponents(len(names), order)
-    powers = moved_terms(samples, every, names, excitation.unmoved)
+    powers = excitation.moved_terms(samples, every, names, excited.unmoved)
     chi = taylor.evaluate(samples.x, powers)
-    independent, dependent = independent_columns(chi)
+    independent, dependent = excitation.independent_columns(chi)
     chi, kept = chi[:, independent], powers[independent]
     beta = np.zeros((samples.dq.shape[1], len(kept)))
     used = np.ones(samples.dq.T.shape, dtype=np.bool_)
-    through_state = terms_through_state(kept, spec, excitation.unmoved)
-    usual, moving = usual_ranges(samples.dq), moving_dofs(samples.dq)
+    through_state = excitation.terms_through_state(kept, spec, excited.unmoved)
+    usual, moving = excitation.usual_ranges(samples.dq), excitation.moving_dofs(samples.dq)
     for d in moving:
         allowed = through_state if noisy and d < 3 else np.ones_like(through_state)
         some, target = chi[:, allowed], samples.dq[:, d]
-        used[d] = inliers(some / _scale(some), target, float(usual[d]))
+        used[d] = excitation.inliers(some / _scale(some), target, float(usual[d]))
         if not used[d].all():
             some, target = some[used[d]], target[used[d]]
         unit, used_terms = some / _scale(some), np.flatnonzero(allowed)
         if noisy:
-            candidates = significant(unit, target)
+            candidates = statistics.significant(unit, target)
             unit, used_terms = unit[:, candidates], used_terms[candidates]
         if len(used_terms):
             beta[d, used_terms] = np.linalg.lstsq(unit, target, rcond=None)[0]
     return Regression(
-        samples, kept, chi, beta, used, moving, excitation,
+        samples, kept, chi, beta, used, moving, excited,
         dependent=tuple(taylor.term_name(row, names) for row in powers[dependent]),
         terms_total=samples.dq.shape[1] * len(every),
         left_out=1.0 - float(believed.mean()),
@@ -172,75 +149,71 @@ def prune(beta: Array, alpha: float, noise_floor: float = 0.0) -> NDArray[np.boo
     """
     order = by_weight(beta, noise_floor)
     size = np.abs(beta[order])
-    keep = np.zeros(len(beta), dtype=np.bool_)
-    keep[order] = np.cumsum(size) - size < alpha * size.sum()
-    return keep
+    kept = order[np.cumsum(size) - size < alpha * size.sum()]
+    return np.isin(np.arange(len(beta)), kept)
 
 
 def pruned(regression: Regression, spec: RobotSpec, alpha: Alpha = ALPHA) -> Fit:
     """Prunes a regression (Eq. 2) and estimates the coefficients of the kept terms anew.
 
-    `alpha` is the share of the summed standardised coefficients that the kept terms of each
-    degree of freedom reach. The term that crosses the threshold is kept too: with a literal Eq. 2
-    a differential robot, whose wheels have equal weight, would lose one. `auto` keeps as many
-    terms, in the same order, as improve the cross-validated error (`statistics.knee`).
+    `alpha` is the share of the summed standardised coefficients that is kept per degree of freedom,
+    with the term that crosses it: else a differential robot would lose a wheel. `auto` keeps as
+    many terms, in the same order, as improve the cross-validated error (`statistics.knee`).
     """
     samples, shape = regression.samples, regression.beta.shape
     coefficients, errors, conditions = np.zeros(shape), np.zeros(shape), np.ones(shape[0])
-    curves, noisy_state = [], states_are_noisy(samples, spec)
+    curves, noisy_state = [], excitation.states_are_noisy(samples, spec)
     for d in regression.moving:
         chi, target = regression.rows(d)
         scale = _scale(chi)
         unit = chi / scale
-        keep, found = _kept(regression, d, unit, target, spec, alpha)
+        keep, curve = _kept(regression, d, unit, target, spec, alpha)
         if keep.any():
             beta = np.linalg.lstsq(unit[:, keep], target, rcond=None)[0]
             rest = target - unit[:, keep] @ beta
             coefficients[d, keep] = beta / scale[keep]
-            errors[d, keep] = standard_errors(unit[:, keep], rest) / scale[keep]
+            errors[d, keep] = statistics.standard_errors(unit[:, keep], rest) / scale[keep]
         if noisy_state and d >= 3:
             _reestimate(coefficients[d], errors[d], d, regression, len(spec.state))
-        conditions[d] = condition(chi[:, keep])
-        curves.append(found)
+        conditions[d] = statistics.condition(chi[:, keep])
+        curves.append(curve)
     used = np.abs(coefficients).sum(axis=0) > 0.0
     model = TaylorModel(
         spec.variable_names, spec.dof_names, spec.dof_units, regression.powers[used],
         coefficients[:, used], samples.dt, samples.x.min(axis=0), samples.x.max(axis=0),
         std_errors=errors[:, used],
     )  # fmt: skip
-    rmse, r2 = errors_of(model, samples)
+    rmse, r2 = statistics.errors_of(model, samples)
     for d in regression.moving:
         if not (inside := regression.inliers[d]).all():
-            rmse[d], r2[d] = (each[d] for each in errors_of(model, samples.rows(inside)))
+            found = statistics.errors_of(model, samples.rows(inside))
+            rmse[d], r2[d] = (each[d] for each in found)
     outliers = 1.0 - (1.0 - regression.left_out) * regression.inliers.mean(axis=1)
     return Fit(model, regression, rmse, r2, tuple(curves), outliers, conditions)
 
 
 def _kept(
     regression: Regression, d: int, unit: Array, target: Array, spec: RobotSpec, alpha: Alpha
-) -> tuple[NDArray[np.bool_], Curve]:
+) -> tuple[NDArray[np.bool_], statistics.Curve]:
     """Returns a mask (K,) of the terms that a degree of freedom keeps, and its accuracy curve."""
     beta = regression.beta[d]
     floor = ROUNDING * max(float(np.abs(target).max()), ROUNDING)
     order = by_weight(beta, floor)
     names = (taylor.term_name(row, spec.variable_names) for row in regression.powers[order])
-    found = curve(spec.dof_names[d], tuple(names), unit[:, order], target)
+    found = statistics.curve(spec.dof_names[d], tuple(names), unit[:, order], target)
     if alpha != "auto":
         keep = prune(beta, alpha, floor)
         return keep, replace(found, kept=int(keep.sum()))
-    keep = np.zeros(len(beta), dtype=np.bool_)
-    keep[order[: found.kept]] = True
-    return keep, found
+    return np.isin(np.arange(len(beta)), order[: found.kept]), found
 
 
 def _reestimate(
     coefficients: Array, errors: Array, d: int, regression: Regression, states: int
 ) -> None:
-    """Replaces the coefficients (K,) of a state's rate, and their errors, by instruments.
+    """Replaces a state's coefficients (K,) and errors by instruments, unless these are too weak.
 
     The noise of a state is both in X and in its rate, so that least squares would mistake it for a
-    fast decay. The noise of the state one step earlier is independent of the noise in dQ, so that
-    state serves as an instrument for X. They stay if the instruments are too weak.
+    fast decay; that of the state one step earlier is independent: it is an instrument for X.
     """
     samples, inside, kept = regression.samples, regression.inliers[d], np.flatnonzero(coefficients)
     follows = np.abs(np.diff(samples.t) - samples.dt) < SAME_STEP * samples.dt + ROUNDING_S
@@ -250,6 +223,6 @@ def _reestimate(
     earlier, powers = samples.x[now].copy(), regression.powers[kept]
     earlier[:, :states] = samples.x[now - 1, :states]
     chi, instruments = (taylor.evaluate(x, powers) for x in (samples.x[now], earlier))
-    found = instrumental(chi, instruments, samples.dq[now, d])
+    found = statistics.instrumental(chi, instruments, samples.dq[now, d])
     if found is not None:
         coefficients[kept], errors[kept] = found

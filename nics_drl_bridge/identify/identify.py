@@ -14,18 +14,10 @@ import numpy as np
 
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify import clocks as timings
 from nics_drl_bridge.identify import verdict
 from nics_drl_bridge.identify.assume import assume_textbook
 from nics_drl_bridge.identify.calibration import Calibration, align
-from nics_drl_bridge.identify.clocks import (
-    SEARCH_S,
-    TimingEstimate,
-    expected_speed,
-    nominal_timing,
-    responses_of,
-    timing_of,
-    with_wheels,
-)
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.fit import ALPHA, ORDER, Alpha, Fit, Regression, pruned, regress
 from nics_drl_bridge.identify.mounting import Mounting, mounted, mounting_of
@@ -33,6 +25,7 @@ from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
 from nics_drl_bridge.identify.open_loop import OpenLoop
 from nics_drl_bridge.identify.refine import refined
 from nics_drl_bridge.identify.repair import check_axes, check_units, repaired
+from nics_drl_bridge.identify.signals import speed_index
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream, check
 from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -46,14 +39,11 @@ TRAIN_SHARE = 2.0 / 3.0
 
 @dataclass(frozen=True)
 class Findings:
-    """Findings of the stages, in their order; None, empty or the default until they have run.
-
-    What a stage could not learn is None too, and a sentence in the notes.
-    """
+    """Findings of the stages in order; None or empty until they have run, or if not learnable."""
 
     training: Drive  # the part of the drive to learn from; repaired by `repair`
     whole: Drive  # repaired by `repair`
-    timing: TimingEstimate  # of `clocks`; nominal before
+    timing: timings.TimingEstimate  # of `clocks`; nominal before
     repairs: tuple[str, ...] = ()  # sentences of `repair`
     speed: Array | None = None  # (n,) expected over the training part's twists, of `mounting`
     mounting: Mounting | None = None  # of `mounting`
@@ -98,7 +88,7 @@ def repair(drive: Drive, findings: Findings) -> Findings:
 
 def clocks(drive: Drive, findings: Findings) -> Findings:
     """Finds the period of bursts, the offset between clocks, the latency of commands, and lags."""
-    training, found = findings.training, timing_of(findings.training)
+    training, found = findings.training, timings.timing_of(findings.training)
     calibration = replace(
         findings.calibration,
         clock_offset_s=found.offset,
@@ -111,8 +101,10 @@ def clocks(drive: Drive, findings: Findings) -> Findings:
 
 def mounting(drive: Drive, findings: Findings) -> Findings:
     """Finds where and how the tracked body is mounted on the robot."""
-    speed = expected_speed(findings.training, findings.timing)
-    found = mounting_of(findings.training, findings.timing, speed)
+    training, speed = findings.training, None
+    if (place := speed_index(drive.spec)) is not None:
+        speed = timings.expected_states(training, training.twists, findings.timing)[:, place]
+    found = mounting_of(training, findings.timing, speed)
     calibration = mounted(findings.calibration, found)
     return replace(findings, speed=speed, mounting=found, calibration=calibration)
 
@@ -120,8 +112,8 @@ def mounting(drive: Drive, findings: Findings) -> Findings:
 def responses(drive: Drive, findings: Findings) -> Findings:
     """Finds how states that were not measured follow the commands, and the scale of the wheels."""
     training, calibration = findings.training, findings.calibration
-    found = responses_of(training, calibration, findings.timing, findings.speed)
-    calibration = with_wheels(training, replace(calibration, responses=found))
+    found = timings.responses_of(training, calibration, findings.timing, findings.speed)
+    calibration = timings.with_wheels(training, replace(calibration, responses=found))
     return replace(findings, calibration=calibration)
 
 
@@ -179,7 +171,9 @@ def judge(drive: Drive, findings: Findings) -> Findings:
     linear, model = _fitted(findings)
     spec, whole, calibration = drive.spec, findings.whole, findings.calibration
     samples = align(whole, calibration)
-    unseen = verdict.unseen_samples(samples, whole, calibration)
+    begin = whole.recording.pose.t[0] + calibration.clock_offset_s + drive.settings.train_until_s
+    rest = samples.rows(samples.t > begin)
+    unseen = rest if len(rest.t) >= verdict.MIN_ROWS else None
     held_out, trial = verdict.tried(model, calibration, whole)
     calibration = replace(calibration, notes=_sentences(findings))
     judged = verdict.with_quality(model, linear, unseen, held_out, spec)
@@ -224,7 +218,7 @@ CALIBRATION: tuple[Stage, ...] = (clocks, mounting, responses, noise)
 def begun(drive: Drive) -> Findings:
     """Returns the findings on a drive before the first stage."""
     training = drive.part(cut(drive.recording, drive.settings.train_until_s))
-    return Findings(training, drive, nominal_timing(training))
+    return Findings(training, drive, timings.nominal_timing(training))
 
 
 def run(stages: Sequence[Stage], drive: Drive) -> Findings:
@@ -279,10 +273,8 @@ def identify(
 ) -> Identified:
     """Learns a robot's motion from the first part of a recording and tests it on the rest.
 
-    Every command must have varied. The first part ends at `train_until`, counted from the first
-    pose [s]; after two thirds of the drive when None. For the other options, see `Settings`. Raises
-    RecordingError: the recording can't be used for this robot. Raises FitError: the drive does not
-    contain enough information to fit a model.
+    That ends at `train_until` after the first pose [s], or after two thirds; for the other options
+    see `Settings`. RecordingError: it can't be used for this robot. FitError: it shows too little.
     """
     drive = Drive(check(recording, spec), spec)
     until = TRAIN_SHARE * drive.duration_s if train_until is None else train_until
@@ -297,20 +289,13 @@ def identify(
 
 @one_blas_thread
 def calibrate(recording: Recording, spec: RobotSpec) -> Calibration:
-    """Estimates the corrections that a recording needs before a fit; the identity if none.
-
-    Raises RecordingError: the recording can't be used for this robot.
-    """
+    """Estimates a recording's corrections before a fit; RecordingError if it can't be used."""
     found = run(CALIBRATION, Drive(check(recording, spec), spec))
     return replace(found.calibration, notes=_sentences(found))
 
 
 def cut(recording: Recording, until: float) -> Recording:
-    """Returns the part of a recording up to `until` seconds after its first pose.
-
-    The other streams end at about that time, since the clock offset is not known yet. Commands
-    last a little longer, since they reveal no pose.
-    """
+    """Returns a recording up to `until` [s] after its first pose; commands last a little longer."""
     pose = recording.pose.t
 
     def part(stream: Stream, margin: float = 0.0) -> Stream:
@@ -319,9 +304,8 @@ def cut(recording: Recording, until: float) -> Recording:
         return stream.rows(stream.t <= origin + until + margin)
 
     if not until > 0.0:
-        raise RecordingError(
-            f"{recording.source}: the training part ends at {until:g} s; use more than 0."
-        )
+        fault = f"{recording.source}: the training part ends at {until:g} s"
+        raise RecordingError(f"{fault}; use more than 0.")
     parts: dict[str, Any] = {name: part(stream) for name, stream in recording.streams.items()}
-    parts["command"] = part(recording.command, SEARCH_S)
+    parts["command"] = part(recording.command, timings.SEARCH_S)
     return replace(recording, **parts)

@@ -1,8 +1,7 @@
 """Mounting: position and rotation of the tracked body on the robot.
 
-Its uncertainty on an omnidirectional robot is that of the delete-one-block jackknife (Efron,
-Tibshirani: An Introduction to the Bootstrap, ch. 11), which covers what least-squares formulas
-miss: wheel slip that is correlated over seconds, and errors of the regressors themselves.
+Uncertainty is that of the delete-one-block jackknife (Efron, Tibshirani: An Introduction to the
+Bootstrap, ch. 11), with correlated wheel slip, on an omnidirectional robot.
 """
 
 from __future__ import annotations
@@ -49,8 +48,7 @@ def mounting_of(
 ) -> Mounting | None:
     """Estimates the mounting as far as the drive shows it; None if it does not.
 
-    The speed (n,) along the direction of travel is expected over the intervals of the twists, up to
-    one factor.
+    The speed (n,) along the direction of travel is that expected over the twists, up to a factor.
     """
     spec, twists = drive.spec, drive.twists
     if spec.moves_sideways:
@@ -81,13 +79,10 @@ def mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
 def mounting_without_lateral_motion(motion: TwistIntervals, forward: Array) -> Mounting | None:
     """Estimates the mounting on a robot whose `base_link` never moves sideways.
 
-    The lateral speed of the tracked point is then yaw rate x lever arm:
-    `cos(rotation) uy - sin(rotation) ux - lever_x wz = 0`, the direction in which the twists
-    have no extent. On a path of a single curvature, rotation and lever arm can't be separated,
-    and the lever arm is set to zero. The lever arm along y remains unknown. None if nothing
-    moved, or it moved sideways as freely as ahead.
-
-    Of the commanded or measured forward speed (n,) only the sign matters.
+    The lateral speed of the tracked point is then yaw rate x lever arm: `cos(rotation) uy -
+    sin(rotation) ux - lever_x wz = 0`, the direction in which the twists have no extent. On a
+    single curvature the lever arm is set to zero; along y it remains unknown. None if nothing
+    moved, or sideways as freely as ahead. Of the forward speed (n,) only the sign matters.
     """
     rows = motion.twist * np.array([1.0, 1.0, TURN_SCALE_M])
     size, axes = np.linalg.svd(rows, full_matrices=False)[1:]
@@ -118,8 +113,7 @@ def mounting_without_lateral_motion(motion: TwistIntervals, forward: Array) -> M
 def lateral_lever(motion: TwistIntervals, rotation: float, speed: Array) -> tuple[float, float]:
     """Estimates the lever arm along y and its uncertainty [m] from a speed (n,).
 
-    The tracked point is faster than `base_link` on the outside of a curve: `ux = gain speed -
-    lever_y wz`. The uncertainty is NaN if all curves were alike.
+    `ux = gain speed - lever_y wz`, faster outside of curves; NaN if all curves were alike.
     """
     along = rotate(motion.twist[:, :2], -rotation)[:, 0]
     chi = np.stack([speed, motion.twist[:, 2]], axis=1)
@@ -133,10 +127,7 @@ def lateral_lever(motion: TwistIntervals, rotation: float, speed: Array) -> tupl
 def _by_commands(
     timing: clocks.TimingEstimate, drive: Drive, twists: TwistIntervals
 ) -> Mounting | None:
-    """Estimates the mounting on an omnidirectional robot from its state, or else its commands.
-
-    None unless the robot moved along x and y and turned.
-    """
+    """Estimates an omnidirectional robot's mounting; None unless it moved along x, y and turned."""
     recording, spec = drive.recording, drive.spec
     if spec.state:
         expected = clocks.expected_states(drive, twists, timing)
@@ -197,10 +188,7 @@ Estimate = Callable[[Drive, TwistIntervals], Mounting | None]
 def jackknifed(
     drive: Drive, twists: TwistIntervals, offset: float, estimate: Estimate
 ) -> Mounting | None:
-    """Estimates a mounting, with at least the uncertainty of the delete-one-block jackknife.
-
-    The clock of the twists is `offset` [s] behind that of the drive's other streams.
-    """
+    """Estimates a mounting, as uncertain as its jackknife; twists' clock is `offset` behind."""
     whole = estimate(drive, twists)
     if whole is None:
         return None

@@ -1,8 +1,7 @@
 """Noise of the sensors, and the motion that a model leaves unexplained.
 
-The drift is measured over a second: systematic errors of a model grow faster than noise, so over
-a longer horizon the same model seems to drift more. The noise of the odometry is the deviation of
-reported velocities from the motion.
+The drift is measured over a second, since systematic errors of a model grow faster than noise. The
+noise of the odometry is the deviation of reported velocities from the motion.
 """
 
 from __future__ import annotations
@@ -54,10 +53,7 @@ def sensor_noise(drive: Drive) -> Noise:
 def motion_noise(
     sensor: Noise, drive: Drive, calibration: Calibration, model: TaylorModel, samples: Samples
 ) -> Noise:
-    """Adds drift and the noise of the odometry, measured or assumed, to that of the pose sensor.
-
-    The odometry's is that of the recorded one; else of the wheels, if their scale is known.
-    """
+    """Adds drift and odometry's noise, of recorded or scaled wheels' twists, to the sensor's."""
     measured: dict[str, Any] = {"state_drift": _state_drift(drive, model, samples)}
     rest = odometry_residual(drive, calibration, model, samples)
     if rest is not None:
@@ -73,10 +69,7 @@ def _measured(std: float, unit: str, uncertainty: float | None) -> Level:
 
 
 def level(variances: Array, unit: str) -> Level:
-    """Returns a measured level from squares (n,) in order of time, sensor noise subtracted.
-
-    The uncertainty comes from blocks of the drive.
-    """
+    """Returns a measured level from squares (n,) by time; its uncertainty comes from blocks."""
     std = float(np.sqrt(max(float(variances.mean()), 0.0)))
     means = np.array([part.mean() for part in np.array_split(variances, BLOCKS)])
     spread = float(means.std(ddof=1) / np.sqrt(BLOCKS))
@@ -132,10 +125,7 @@ def _pose_drift(
 def drift_growth(
     drive: Drive, calibration: Calibration, model: TaylorModel
 ) -> tuple[Array, Array, Array] | None:
-    """Returns horizons [s] and root mean square errors of position per axis [m] and heading [rad].
-
-    None if the drive is too short.
-    """
+    """Returns horizons [s], errors per axis [m] and of heading [rad]; None if it is too short."""
     rows = []
     for horizon in GROWTH_S:
         if (found := _errors(drive, calibration, model, horizon)) is None:

@@ -56,10 +56,7 @@ def windows(
     horizon: float,
     spacing: float,
 ) -> Windows:
-    """Selects the windows of a part of a drive, from `start` to `stop` after the first pose [s].
-
-    They are `horizon` long and their starts at least `spacing` apart [s].
-    """
+    """Selects windows of a `horizon` from `start` to `stop`, starts `spacing` apart, all in [s]."""
     t, pose = drive.dated.t, drive.dated.values
     origin, period = drive.recording.pose.t[0], float(np.median(np.diff(t)))
     first = origin + start
@@ -82,10 +79,7 @@ def windows(
 
 
 def predict(model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows) -> Array:
-    """Predicts poses (W, 3) of the tracked body at the ends of windows from the commands.
-
-    The state at the start is the measured one, or follows from the commands before it.
-    """
+    """Predicts poses (W, 3) at windows' ends by commands, from measured or commanded states."""
     if drive.recording.state is None:
         relative = _by_one_rollout(model, calibration, drive, chosen)
     else:
@@ -153,16 +147,12 @@ def open_loop_error(
     stop: float,
     horizon: float = HORIZON_S,
 ) -> OpenLoop:
-    """Predicts a part of a drive, from `start` to `stop` after the first pose [s], open-loop.
-
-    Windows start every 0.1 s. A part that is too short for any raises RecordingError.
-    """
+    """Predicts a part of a drive [s] open-loop, every 0.1 s; RecordingError if it is too short."""
     chosen = windows(drive, calibration, start, stop, horizon, SPACING_S)
     if len(chosen.start_t) == 0:
-        raise RecordingError(
-            f"{drive.recording.source}: the {stop - start:.1f} s from {start:.1f} s on hold no "
-            f"window of {horizon:g} s; record a longer drive or shorten the horizon."
-        )
+        fault = f"the {stop - start:.1f} s from {start:.1f} s on hold no window of {horizon:g} s"
+        advice = "record a longer drive or shorten the horizon"
+        raise RecordingError(f"{drive.recording.source}: {fault}; {advice}.")
     error = predict(model, calibration, drive, chosen) - chosen.end
     position = np.hypot(error[:, 0], error[:, 1])
     moved = chosen.end - chosen.start
@@ -196,10 +186,7 @@ def course_of(
 def relative_ends(
     course: Course, model: TaylorModel, free: NDArray[np.bool_] | None = None
 ) -> tuple[Array, Array]:
-    """Returns end poses (W, 3) relative to the starts, unwrapped, and their derivatives (W, 3, P).
-
-    These are by the `free` coefficients (D, K) of the body twist, even where they are zero.
-    """
+    """Returns relative ends (W, 3), unwrapped, their slopes (W, 3, P) by `free` coefficients."""
     free = np.zeros(model.coefficients.shape, dtype=np.bool_) if free is None else free
     used = (model.coefficients != 0.0) | free
     used[3:] = False

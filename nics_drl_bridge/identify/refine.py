@@ -1,8 +1,7 @@
 """Refinement of a model by its open-loop errors over seconds (the output-error method).
 
-Least squares on rates predicts the next instant; a simulator must predict the next seconds.
-Ljung, System Identification, ch. 7; the paper's kept terms stay, their values change. Terms that
-then hardly improve the prediction are removed.
+A simulator must predict the next seconds, not the next instant (Ljung, System Identification, ch.
+7). Kept terms change their values; those that hardly improve the prediction are removed.
 """
 
 from __future__ import annotations
@@ -47,39 +46,28 @@ WORTH = 0.1  # terms are removed while the error rises by less than this share i
 def refined(
     linear: TaylorModel, calibration: Calibration, drive: Drive
 ) -> tuple[TaylorModel, Calibration, str]:
-    """Refines a linear fit by its predictions of the training part, and removes terms.
-
-    The sentence returned says what was done, or why it could not be.
-    """
+    """Refines a linear fit by its predictions and removes terms; with a sentence on the result."""
     model, calibration = by_definition(linear.with_errors({}), calibration, drive.spec)
     problem = problem_of(model, calibration, drive)
-    why = (
-        "The training part is too short to refine the model by its errors over seconds; record a "
-        "longer drive."
-    )
+    why = "The training part is too short to refine the model by its errors over seconds"
+    note = f"{why}; record a longer drive."
     if problem is not None:
         try:
             best = simplify(problem, refine(problem, model, calibration))
             errors = replace(best.model, std_errors=best.std_errors).named_errors
-            return merged(best.model, linear, errors), best.calibration, (
-                "Coefficients and calibration were refined by the open-loop errors over up to 5 s: "
-                f"{best.error:.4f} m (root mean square) is left on the training part."
-            )  # fmt: skip
+            by = "Coefficients and calibration were refined by the open-loop errors over up to 5 s"
+            note = f"{by}: {best.error:.4f} m (root mean square) is left on the training part."
+            return merged(best.model, linear, errors), best.calibration, note
         except np.linalg.LinAlgError:  # the model is unstable: its slopes overflow
-            why = (
-                "The predictions of the fitted model run away on the training part, so that it "
-                "could not be refined."
-            )
-    return merged(model, linear, {}), calibration, why
+            why = "The predictions of the fitted model run away on the training part"
+            note = f"{why}, so that it could not be refined."
+    return merged(model, linear, {}), calibration, note
 
 
 def by_definition(
     model: TaylorModel, calibration: Calibration, spec: RobotSpec
 ) -> tuple[TaylorModel, Calibration]:
-    """Scales an inferred speed so that vx = 1 speed, and treats lateral motion as noise.
-
-    `base_link` of a robot without a lateral command is the point without lateral motion.
-    """
+    """Scales an inferred speed to vx = 1 speed; lateral motion is noise unless commanded."""
     coefficients = model.coefficients.copy()
     if not spec.moves_sideways:
         coefficients[1] = 0.0
@@ -97,11 +85,7 @@ def by_definition(
 
 
 def merged(model: TaylorModel, linear: TaylorModel, refined: Errors) -> TaylorModel:
-    """Returns the model with the standard errors of its coefficients.
-
-    Rows that are unchanged from the linear fit keep its errors; a refined coefficient has the
-    larger of both.
-    """
+    """Adds standard errors: the linear fit's where a row is unchanged, else the larger of both."""
     first, rows = linear.named_errors, {}
     for dof, old, new in zip(model.dofs, linear.coefficients, model.coefficients, strict=True):
         before = dict(zip(linear.term_names, old, strict=True))
@@ -194,11 +178,10 @@ class _Free:
 
     @classmethod
     def of(cls, model: TaylorModel, calibration: Calibration, spec: RobotSpec) -> _Free:
-        """Frees what is fixed neither by definition nor by measurement.
+        """Frees what neither definition nor measurement fixes.
 
-        A time estimated from a measured state is fixed. The rotation is defined by the direction in
-        which a robot can't move: an omnidirectional robot can be described equally well in any
-        other frame, with other coefficients.
+        The rotation is defined by the direction without motion, of which an omnidirectional robot
+        has none; a time from a measured state is fixed.
         """
         known, time = calibration.uncertainty, None
         if calibration.responses and "clock_offset_s" in known:
@@ -225,8 +208,7 @@ class _Free:
 def free_coefficients(model: TaylorModel, calibration: Calibration) -> Mask:
     """Selects the free coefficients (D, K): kept, and not fixed by the definition of a state.
 
-    An inferred speed is by definition the speed along the direction of travel, so that
-    vx = 1 speed; its lag is fixed if the wheels showed it.
+    An inferred speed is that along the direction of travel: vx = 1 speed; measured lags are fixed.
     """
     free = model.coefficients != 0.0
     if not calibration.responses:
@@ -317,14 +299,12 @@ def _with_uncertainty(
     if lag_is_measured(calibration) and "clock_offset_s" in spread:
         both = np.hypot(spread["clock_offset_s"], known["command_latency_s"])
         spread["clock_offset_s"] = float(both)
-    rotation = calibration.rotation_rad
-    turned = float(geometry.wrap_angle(rotation)) if "rotation_rad" in free.names else rotation
-    return replace(
-        calibration,
-        rotation_rad=turned,
-        uncertainty={**known, **spread},
-        responses=tuple(_response(model, i, r) for i, r in enumerate(calibration.responses)),
-    )
+    turned = calibration.rotation_rad
+    if "rotation_rad" in free.names:
+        turned = float(geometry.wrap_angle(turned))
+    responses = tuple(_response(model, i, r) for i, r in enumerate(calibration.responses))
+    found = {**known, **spread}
+    return replace(calibration, rotation_rad=turned, uncertainty=found, responses=responses)
 
 
 def _response(model: TaylorModel, i: int, response: Response) -> Response:
@@ -339,10 +319,7 @@ def _response(model: TaylorModel, i: int, response: Response) -> Response:
 
 
 def simplify(problem: Problem, refined: Refined) -> Refined:
-    """Removes terms of the body twist that hardly improve the prediction of the training part.
-
-    The term with the least weight is tried first; the rest is refined again.
-    """
+    """Removes terms of the twist that hardly improve predictions, least first; refines anew."""
     best, tried = refined, set[tuple[int, int]]()
     limit = refined.error * (1.0 + WORTH)
     while (weakest := _weakest(best, tried)) is not None:

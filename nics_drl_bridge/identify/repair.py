@@ -55,10 +55,8 @@ def _without_repetitions(drive: Drive, notes: list[str]) -> Recording:
         again = (np.diff(stream.t) == 0.0) & (np.diff(stream.values, axis=0) == 0.0).all(axis=1)
         if again.any():
             recording = _with_rows(recording, name, np.append(True, ~again))
-            notes.append(
-                f"{name}: {int(again.sum())} of {len(stream.t)} rows repeat the row before them, "
-                "stamp and all, and were left out."
-            )
+            finding = f"{int(again.sum())} of {len(stream.t)} rows repeat the row before them"
+            notes.append(f"{name}: {finding}, stamp and all, and were left out.")
     return recording
 
 
@@ -69,17 +67,14 @@ def _without_jumps(drive: Drive, notes: list[str]) -> Recording:
         found["state"] = _jumps_of_state(recording.state)
     for name, jump in found.items():
         share = float(jump.mean()) if len(jump) else 0.0
+        jumps, count = "jump away from their neighbours and back", int(jump.sum())
         if share > MOST:
-            raise RecordingError(
-                f"{recording.source}: {name}: {share:.0%} of the rows jump away from their "
-                "neighbours and back; look for two sources that are mixed in one stream."
-            )
-        if jump.any():
+            fault = f"{recording.source}: {name}: {share:.0%} of the rows {jumps}"
+            raise RecordingError(f"{fault}; look for two sources that are mixed in one stream.")
+        if count:
             recording = _with_rows(recording, name, ~jump)
-            notes.append(
-                f"{name}: {int(jump.sum())} of {len(jump)} rows ({share:.1%}) jump away from "
-                "their neighbours and back, and were left out as outliers."
-            )
+            some = f"{name}: {count} of {len(jump)} rows ({share:.1%})"
+            notes.append(f"{some} {jumps}, and were left out as outliers.")
     return recording
 
 
@@ -168,19 +163,17 @@ def check_units(drive: Drive) -> None:
         for variable, size in zip(variables, sizes, strict=True):
             limit = max(abs(variable.min), abs(variable.max))
             if size > WRONG_UNIT * limit:
-                raise RecordingError(
-                    f"{recording.source}: {variable.name} is {size:.4g} and more where its limit "
-                    f"is {limit:g} {variable.unit}; it must be in {variable.unit} (degrees, "
-                    "millimetres or revolutions per minute look like this)."
-                )
+                name, unit = f"{recording.source}: {variable.name}", variable.unit
+                fault = f"is {size:.4g} and more where its limit is {limit:g} {unit}"
+                alike = "degrees, millimetres or revolutions per minute look like this"
+                raise RecordingError(f"{name} {fault}; it must be in {unit} ({alike}).")
 
 
 def check_axes(drive: Drive) -> None:
     """Refuses poses, with a RecordingError, whose heading turns against the direction of travel.
 
-    In its own frame, a robot without sideways motion always travels in the same direction; that
-    of an omnidirectional robot depends on its state. If this is true only with the heading
-    mirrored, then x, y or heading is reversed.
+    In its own frame a robot travels in the same direction, or in that of its state. If only
+    mirrored headings make this true, then x, y or heading is reversed.
     """
     recording = drive.recording
     path = np.append(0.0, np.cumsum(np.hypot(*np.diff(drive.dated.values[:, :2], axis=0).T)))
@@ -197,11 +190,11 @@ def check_axes(drive: Drive) -> None:
     else:
         return
     if as_given < INCONSISTENT and mirrored > CONSISTENT:
-        raise RecordingError(
-            f"{recording.source}: pose: the heading turns one way and the path the other; one of "
-            "x, y and heading is reversed: they must be x forward, y left, heading "
-            "counter-clockwise (REP-103)."
+        fault = (
+            "the heading turns one way and the path the other; one of x, y and heading is reversed"
         )
+        advice = "they must be x forward, y left, heading counter-clockwise (REP-103)"
+        raise RecordingError(f"{recording.source}: pose: {fault}: {advice}.")
 
 
 def _steadiness(pose: Array) -> float:

@@ -77,10 +77,7 @@ def equations_with_errors(model: TaylorModel) -> list[str]:
 
 
 def with_error(value: float, error: float | None) -> str:
-    """Formats a number to the digits that its standard error leaves: `(4.63 +- 0.02)`.
-
-    An error that begins with a 1 has two digits. A mere rounding error is not shown.
-    """
+    """Formats a number to the digits that its standard error leaves: `(4.63 +- 0.02)`."""
     if error is None or error <= 1e-6 * value:
         return f"{value:.5g}"
     exponent = int(np.floor(np.log10(error)))
@@ -91,15 +88,11 @@ def with_error(value: float, error: float | None) -> str:
 
 def _pruning(alpha: Alpha) -> str:
     if alpha == "auto":
-        return (
-            "Pruned (Eq. 2) per degree of freedom at the knee of its accuracy curve: the fewest "
-            "terms, largest standardised coefficient first, whose cross-validated error can't be "
-            "told from the least."
-        )
-    return (
-        f"Pruned by Eq. 2 at alpha = {alpha:g}, for each degree of freedom on its own; the "
-        "term that crosses the threshold is kept too."
-    )
+        knee = "Pruned (Eq. 2) per degree of freedom at the knee of its accuracy curve"
+        fewest = "the fewest terms, largest standardised coefficient first"
+        return f"{knee}: {fewest}, whose cross-validated error can't be told from the least."
+    pruned = f"Pruned by Eq. 2 at alpha = {alpha:g}, for each degree of freedom on its own"
+    return f"{pruned}; the term that crosses the threshold is kept too."
 
 
 def _curve(curve: Curve) -> list[str]:
@@ -124,14 +117,10 @@ def _held_out(identified: Identified) -> Iterator[str]:
     if found is None:
         yield "the drive is too short to hold data out"
     else:
-        yield (
-            f"after {found.horizon_s:g} s: position error {found.mean_position_error_m:.3g} m on "
-            f"average, {found.max_position_error_m:.3g} m at most,"
-        )
-        yield (
-            f"heading error {found.mean_heading_error_rad:.3g} rad on average, over a mean path of "
-            f"{found.mean_path_m:.2f} m ({found.windows} windows)"
-        )
+        finding = f"position error {found.mean_position_error_m:.3g} m on average"
+        yield f"after {found.horizon_s:g} s: {finding}, {found.max_position_error_m:.3g} m at most,"
+        finding = f"heading error {found.mean_heading_error_rad:.3g} rad on average"
+        yield f"{finding}, over a mean path of {found.mean_path_m:.2f} m ({found.windows} windows)"
     if quality is not None and quality.held_out_rmse:
         yield "the rates there:"
         for unit, dof in zip(model.dof_units, quality.held_out_rmse, strict=True):
@@ -202,20 +191,14 @@ def estimates(identified: Identified) -> dict[str, CalibratedValue]:
 def is_useless(error: float, standing: float, path: float, radius: float) -> bool:
     """True if predictions are hardly better than assuming that the robot stands still.
 
-    Given are the median errors of the predictions (NaN or inf if they diverge) and of standing
-    still, the mean length of the path and the robot's radius [m]. Persistence is the usual baseline
-    of a forecast (Murphy: Skill scores based on the mean square error, Monthly Weather Review,
-    1988). A robot that drives in circles or turns on the spot returns to its start: there the path
-    and the robot's size set the scale.
+    Given are the median errors (NaN or inf if they diverge) of both, the mean path and the robot's
+    radius [m], which set the scale for circles. Persistence is a usual baseline (Murphy 1988).
     """
     return not error <= max(MOST_LEFT * standing, FAR_OFF * path, radius)
 
 
 def why_useless(identified: Identified, spec: RobotSpec, order: int = ORDER) -> str:
-    """Returns one sentence on why a model is useless; empty if it is useful or untested.
-
-    The median counts: a single permanent jump of the pose spoils only some of the predictions.
-    """
+    """Returns a sentence on why a model is useless, by median errors; empty if it is not."""
     held_out, recording = identified.held_out, identified.recording
     if held_out is None:
         return ""
@@ -225,11 +208,10 @@ def why_useless(identified: Identified, spec: RobotSpec, order: int = ORDER) -> 
     if not is_useless(error, standing, held_out.mean_path_m, spec.footprint_radius):
         return ""
     end = f"end {error:.3g} m off" if np.isfinite(error) else "have run away"
-    return (
-        f"{recording.source}: the fitted model is of no use: on unseen data its predictions {end} "
-        f"after {held_out.horizon_s:g} s and a path of {held_out.mean_path_m:.2f} m, where a robot "
-        f"that stood still would be {standing:.2f} m off; {_suspicion(identified, spec, order)}."
-    )
+    way = f"after {held_out.horizon_s:g} s and a path of {held_out.mean_path_m:.2f} m"
+    still = f"where a robot that stood still would be {standing:.2f} m off"
+    fault = f"the fitted model is of no use: on unseen data its predictions {end} {way}, {still}"
+    return f"{recording.source}: {fault}; {_suspicion(identified, spec, order)}."
 
 
 def _suspicion(identified: Identified, spec: RobotSpec, order: int) -> str:
@@ -245,19 +227,13 @@ def _suspicion(identified: Identified, spec: RobotSpec, order: int) -> str:
                 coarsest = max(coarsest, (float(step / size), variable.name))
     share, name = coarsest  # the greatest step between rows, as a share of its range
     if share > COARSE:
-        return (
-            f"{name} changes by {share:.0%} of its range between rows that are {apart}, so record "
-            "at a higher rate"
-        )
+        coarse = f"{name} changes by {share:.0%} of its range between rows that are {apart}"
+        return f"{coarse}, so record at a higher rate"
     if unmoved:
-        return (
-            f"{', '.join(unmoved)} never moved in its first {identified.train_until_s:.0f} s, from "
-            "which it is learnt, so change it from the beginning on"
-        )
+        reason = f"{', '.join(unmoved)} never moved in its first {identified.train_until_s:.0f} s"
+        return f"{reason}, from which it is learnt, so change it from the beginning on"
     if identified.alpha != "auto" or order < ORDER:
         return f"it may lack terms, so leave the order at {ORDER} and alpha at `auto`"
-    return (
-        "the recording does not show why, so make sure that nothing held the robot up, that it got "
-        f"each command, that its pose did not jump and that rows {apart} show how it responds, and "
-        "record anew"
-    )
+    got = "that nothing held the robot up, that it got each command, that its pose did not jump"
+    shown = f"{got} and that rows {apart} show how it responds"
+    return f"the recording does not show why, so make sure {shown}, and record anew"

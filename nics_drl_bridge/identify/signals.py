@@ -20,17 +20,13 @@ GAUSSIAN_MAD = 0.6745
 
 
 def held(
-    command: Stream,
-    spec: RobotSpec,
-    start: Array,
-    end: Array,
+    command: Stream, spec: RobotSpec, start: Array, end: Array,
     powers: NDArray[np.int64] | None = None,
-) -> Array:
+) -> Array:  # fmt: skip
     """Returns the mean (..., C) of held commands over intervals (...) on the commands' clock [s].
 
-    Given powers (K, C), the mean (..., K) of these features of the commands. Before its first
-    command a robot stands still: commands that ever change are zero then. A command that never
-    changes is assumed to have had that value before.
+    Given powers (K, C), the mean (..., K) of these features. Before its first command a robot
+    stands still: commands that ever change are zero then, others as always.
     """
     still = np.clip(0.0, spec.command_low, spec.command_high)
     before = np.where(moved_commands(command), still, command.values[0])
@@ -87,11 +83,7 @@ def nominal_lags(spec: RobotSpec) -> Array:
 def inferred_states(
     command: Stream, spec: RobotSpec, lags: Array, latency: float, grid: Array
 ) -> Array:
-    """Infers states (T, S) at uniform times (T,) on the commands' clock, with gain one.
-
-    Each is a first-order response to its command with a time constant of `lags` (S,) [s]; if the
-    command never changes, the state keeps its value.
-    """
+    """Infers states (T, S) at uniform times (T,) by first-order lags (S,) [s], with gain one."""
     dt, follows = float(grid[1] - grid[0]), followed(spec)
     target = held(command, spec, grid - latency, grid + dt - latency)[:, follows]
     long_ago = np.array([command.t[0] - 2.0])
@@ -116,10 +108,7 @@ def unwrapped(pose: Array) -> Array:
 
 
 def resample(t: Array, pose: Array, at: Array, half_width: float) -> Array:
-    """Resamples poses (T, 3) with unwrapped headings at times (n,); stamps (T,) never decrease.
-
-    `half_width` [s] is that of a local parabola fitted to noisy samples; 0 interpolates.
-    """
+    """Resamples unwrapped poses (T, 3) at (n,), by parabolas over `half_width` [s] unless 0."""
     distinct = np.concatenate([[True], np.diff(t) > 0.0])
     t, pose = t[distinct], pose[distinct]
     if half_width == 0.0:

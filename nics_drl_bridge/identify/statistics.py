@@ -25,10 +25,7 @@ WORTH = 1e-3  # terms that lower the error by less than this share of the rates'
 
 
 def unexplained(chi: Array, signal: Array) -> Array:
-    """Returns the residual of a signal (n, D) on features (n, K) by least squares, flattened.
-
-    It is in units of each component's spread.
-    """
+    """Returns the flat residual of a signal (n, D) on features (n, K), in units of its spread."""
     spread = signal.std(axis=0)
     scaled = (signal - signal.mean(axis=0)) / np.where(spread > 1e-9, spread, 1e9)
     norm = np.linalg.norm(chi, axis=0)
@@ -46,8 +43,7 @@ def minimise(
 ) -> tuple[Array, Array, Array]:
     """Minimises a residual of parameters (P,), which change by about `scale`, within bounds (P,).
 
-    Returns the parameters, and Jacobian (n, P) and residual (n,) there. The Jacobian comes from
-    finite differences if none is given.
+    Returns them with Jacobian (n, P), by finite differences if not given, and residual (n,) there.
     """
     low, high = bounds or (np.full(len(start), -np.inf), np.full(len(start), np.inf))
     slope: Any = "2-point"
@@ -76,12 +72,7 @@ def _deviations(covariance: Array) -> Array:
 
 
 def standard_errors(chi: Array, residual: Array) -> Array:
-    """Returns standard errors (K,) of least squares for unequal and correlated residuals.
-
-    The residual (T,) of the fit to features (T, K) is in order of time. Newey, West: A simple,
-    positive semi-definite, heteroskedasticity and autocorrelation consistent covariance matrix,
-    Econometrica 1987.
-    """
+    """Returns standard errors (K,) for correlated residuals (T,) by time (Newey, West 1987)."""
     count, terms = chi.shape
     if terms == 0 or count <= terms:
         return np.full(terms, np.nan)
@@ -104,11 +95,7 @@ def long_run(chi: Array, residual: Array) -> Array:
 
 
 def clustered_errors(jacobian: Array, residual: Array, cluster: NDArray[np.intp]) -> Array:
-    """Returns standard errors (P,) of least squares with residuals correlated within clusters (n,).
-
-    Cameron, Miller: A practitioner's guide to cluster-robust inference, 2015; corrected for few
-    clusters.
-    """
+    """Returns cluster-robust standard errors (P,) (Cameron, Miller 2015), also for few clusters."""
     groups = np.unique(cluster)
     count, terms = jacobian.shape
     if len(groups) < 2 or count <= terms:
@@ -159,11 +146,7 @@ def errors_of(model: TaylorModel, samples: Samples) -> tuple[Array, Array]:
 
 
 def significant(chi: Array, target: Array) -> NDArray[np.bool_]:
-    """Selects the significant features (K,) of a noisy target (T,).
-
-    The least certain one is removed until each coefficient is at least `CERTAIN` times its
-    standard error, which is widened for autocorrelated residuals.
-    """
+    """Selects features (K,) of a noisy target (T,) that are `CERTAIN` times their errors."""
     rest = target - chi @ np.linalg.lstsq(chi, target, rcond=None)[0]
     power = max(float(rest @ rest), np.finfo(np.float64).tiny)
     rho = min(max(float(rest[1:] @ rest[:-1]) / power, 0.0), 0.98)
@@ -184,9 +167,8 @@ def significant(chi: Array, target: Array) -> NDArray[np.bool_]:
 def instrumental(chi: Array, instruments: Array, target: Array) -> tuple[Array, Array] | None:
     """Returns coefficients (K,) by instrumental variables, and their standard errors (K,).
 
-    The instruments (T, K) are the noisy features (T, K) of variables whose noise is independent;
-    None if they are too weak. Two-stage least squares (Soederstroem, Stoica: Instrumental variable
-    methods for system identification, 1983).
+    The instruments (T, K) are features with independent noise; None if they are too weak. Two-stage
+    least squares (Soederstroem, Stoica 1983).
     """
     scale, size = np.linalg.norm(chi, axis=0), np.linalg.norm(instruments, axis=0)
     chi, instruments = chi / scale, instruments / size
@@ -215,10 +197,7 @@ class Curve:
 
 
 def curve(dof: str, terms: tuple[str, ...], chi: Array, target: Array) -> Curve:
-    """Returns the curve of one degree of freedom; `kept` is its knee.
-
-    The standardised features (T, n) of the n terms come with the largest weight first.
-    """
+    """Returns the curve of features (T, n), the largest weight first; `kept` is its knee."""
     squares = cross_validated(chi, target)
     error = np.sqrt(squares.mean(axis=0))
     sigma = squares.std(axis=0, ddof=1) / np.sqrt(len(squares)) / (2.0 * np.maximum(error, 1e-300))
@@ -226,22 +205,14 @@ def curve(dof: str, terms: tuple[str, ...], chi: Array, target: Array) -> Curve:
 
 
 def knee(error: Array, sigma: Array) -> int:
-    """Returns the fewest terms whose error is not significantly, or hardly, above the least.
-
-    Breiman's one-standard-error rule; Hastie, Tibshirani, Friedman: The Elements of Statistical
-    Learning, ch. 7.10.
-    """
+    """Returns the fewest terms within one standard error of the least (Breiman's rule)."""
     least = int(np.argmin(error))
     limit = error[least] + max(float(sigma[least]), WORTH * float(error[0]))
     return int(np.flatnonzero(error <= limit)[0])
 
 
 def cross_validated(chi: Array, target: Array) -> Array:
-    """Returns mean squared errors (B, n + 1) of the first 0..n features on B blocks in time.
-
-    Each block is predicted by a fit to the others. Blocks are compressed to triangles (QR) first,
-    so that all numbers of terms share one factorisation.
-    """
+    """Returns mean squared errors (B, n + 1) of 0..n features on B blocks, fitted to the others."""
     rows = np.array_split(np.arange(len(target)), BLOCKS)
     both = np.concatenate([chi, target[:, None]], axis=1)
     triangles = [np.atleast_2d(qr(both[r], mode="r", check_finite=False)[0]) for r in rows]

@@ -35,12 +35,12 @@ MIRRORED = -0.5  # correlation of yaw rate and steering below which the robot tu
 
 def about_stamps(drive: Drive) -> Iterator[str]:
     """Tells of the stamps and the noise of the poses."""
-    if drive.bursts is not None:
-        yield (
-            f"The poses arrive in bursts of about {drive.bursts.size:.0f} every "
-            f"{drive.bursts.period_s:.3f} s: their stamps are arrival times; the samples of a "
-            "burst were spread over the time since the one before."
+    if (bursts := drive.bursts) is not None:
+        finding = (
+            f"The poses arrive in bursts of about {bursts.size:.0f} every {bursts.period_s:.3f} s"
         )
+        spread = "the samples of a burst were spread over the time since the one before"
+        yield f"{finding}: their stamps are arrival times; {spread}."
     if drive.pose_noise is None:
         yield "The noise of the pose was not measured; let the robot stand still for 2 s at first."
 
@@ -50,24 +50,18 @@ def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate)
     sigma, recording = calibration.uncertainty, drive.recording
     clocks_differ = recording.pose.clock != recording.command.clock
     if clocks_differ and "clock_offset_s" in sigma:
-        yield (
-            f"Pose and commands are stamped by different clocks: {calibration.clock_offset_s:.4f} "
-            f"s (+- {sigma['clock_offset_s']:.4f} s) added to the pose's stamps gives the "
-            "commands' clock."
-        )
+        offset = f"{calibration.clock_offset_s:.4f} s (+- {sigma['clock_offset_s']:.4f} s)"
+        finding = "Pose and commands are stamped by different clocks"
+        yield f"{finding}: {offset} added to the pose's stamps gives the commands' clock."
     if not moved_commands(recording.command).any():
         yield "No command ever changed, so clock offset and latency could not be learnt."
     elif not timing.separated and clocks_differ:
-        yield (
-            "Only the sum of clock offset and command latency can be known, since nothing measured "
-            "on the commands' clock follows them; the latency is taken as zero. Record the wheels "
-            "or the state to tell them apart."
-        )
+        why = "since nothing measured on the commands' clock follows them"
+        advice = "the latency is taken as zero. Record the wheels or the state to tell them apart"
+        yield f"Only the sum of clock offset and command latency can be known, {why}; {advice}."
     if timing.separated and calibration.command_latency_s > 0.0:
-        yield (
-            f"Commands take effect {calibration.command_latency_s:.4f} s (+- "
-            f"{sigma['command_latency_s']:.4f} s) after their stamps."
-        )
+        late = f"{calibration.command_latency_s:.4f} s (+- {sigma['command_latency_s']:.4f} s)"
+        yield f"Commands take effect {late} after their stamps."
 
 
 def about_mounting(
@@ -75,33 +69,25 @@ def about_mounting(
 ) -> Iterator[str]:
     """Tells where and how the tracked body sits on the robot."""
     if mounting is None:
-        yield (
-            "How the tracked body sits on the robot could not be learnt, and is taken to be "
-            "exactly at base_link; drive in every direction and turn."
-        )
+        taken = "is taken to be exactly at base_link; drive in every direction and turn"
+        yield f"How the tracked body sits on the robot could not be learnt, and {taken}."
         return
     x, y = calibration.lever_arm_m
     known_x, known_y = ~np.isnan(mounting.lever_sigma)
     if calibration.rotation_rad != 0.0:
         sigma = calibration.uncertainty.get("rotation_rad", mounting.rotation_sigma)
-        yield (
-            f"The direction of travel lies {calibration.rotation_rad:.4f} rad (+- {sigma:.4f} rad) "
-            "from the tracked body's heading."
-        )
+        turned = f"{calibration.rotation_rad:.4f} rad (+- {sigma:.4f} rad)"
+        yield f"The direction of travel lies {turned} from the tracked body's heading."
     if not known_x:
         why = "all of the path had one curvature" if mounting.turns else "the robot never turned"
-        yield (
-            f"Where the tracked point lies on the robot could not be learnt, since {why}: it is "
-            "taken as base_link, and the rotation holds for this curvature; drive left, right and "
-            "straight on to learn it."
-        )
+        finding = f"Where the tracked point lies on the robot could not be learnt, since {why}"
+        advice = "it is taken as base_link, and the rotation holds for this curvature"
+        yield f"{finding}: {advice}; drive left, right and straight on to learn it."
     elif (x, y) != (0.0, 0.0):
         yield f"The tracked point lies at x {x:.4f} m, y {y:.4f} m of base_link."
     if known_x and not known_y and not drive.spec.moves_sideways:
-        yield (
-            "The tracked point's place along y could not be learnt, since no speed was known "
-            "apart from the tracked one; it is taken as zero."
-        )
+        why = "since no speed was known apart from the tracked one; it is taken as zero"
+        yield f"The tracked point's place along y could not be learnt, {why}."
 
 
 def about_responses(
@@ -113,35 +99,26 @@ def about_responses(
     for response, sigma in zip(calibration.responses, timing.lag_sigma, strict=False):
         state, command = response.state, response.command
         if command not in names:
-            yield (
-                f"{command} never changed, so how {state} follows it could not be learnt; drive "
-                f"with {command} changing over its whole range."
-            )
+            finding = f"{command} never changed, so how {state} follows it could not be learnt"
+            yield f"{finding}; drive with {command} changing over its whole range."
         else:
-            spread = "" if np.isnan(sigma) else f" (+- {sigma:.4f} s)"
-            yield (
-                f"{state} was not measured: it is taken to follow {command} with a lag of "
-                f"{response.lag_s:.4f} s{spread} and a gain of {response.gain:.4f}."
-            )
+            lag = f"{response.lag_s:.4f} s" + ("" if np.isnan(sigma) else f" (+- {sigma:.4f} s)")
+            taken = f"with a lag of {lag} and a gain of {response.gain:.4f}"
+            yield f"{state} was not measured: it is taken to follow {command} {taken}."
     if calibration.wheel_scale is not None:
         scale, sigma = calibration.wheel_scale, calibration.uncertainty["wheel_scale"]
         yield f"A unit of the wheels' speed is {scale:.4g} m/s (+- {sigma:.2g} m/s)."
     if calibration.wheels_swapped:
-        yield (
-            "Left and right wheel look interchanged: the wheel recorded as the left one is the "
-            "faster one when the robot turns left, and the slower one when it turns right."
-        )
+        why = "is the faster one when the robot turns left, and the slower one when it turns right"
+        yield f"Left and right wheel look interchanged: the wheel recorded as the left one {why}."
 
 
 def refuse_unexcited(excitation: Excitation, spec: RobotSpec) -> None:
     """Refuses a drive, with a FitError, that did not move every input independently."""
-    still, commands = excitation.unmoved, {c.name for c in spec.command}
+    commands = {c.name for c in spec.command}
+    still = [n for n in excitation.unmoved if n in commands] or excitation.unmoved
     for names, fault, way in (
-        (
-            [n for n in still if n in commands] or still,
-            "never moved",
-            "changing over the whole range",
-        ),
+        (still, "never moved", "changing over the whole range"),
         (excitation.together, "always moved together", "each changing on its own"),
     ):
         if told := _list(names):
@@ -149,35 +126,24 @@ def refuse_unexcited(excitation: Excitation, spec: RobotSpec) -> None:
 
 
 def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> Iterator[str]:
-    """Tells of inputs that the drive did not move, or not independently.
-
-    Also of states that depended on others, and of commands with two values only.
-    """
+    """Tells of inputs that were not moved, alone or at many levels, and of dependent states."""
     already = {name for r in calibration.responses for name in (r.command, r.state)}
     excitation = linear.regression.excitation
     if unmoved := ", ".join(excitation.unmoved):
-        yield (
-            f"The model has no terms of {unmoved}, which never moved: it holds for this drive's "
-            "constant value only."
-        )
+        finding = f"The model has no terms of {unmoved}, which never moved"
+        yield f"{finding}: it holds for this drive's constant value only."
     if missing := ", ".join(name for name in excitation.unmoved if name not in already):
         yield f"Drive with {missing} changing over the whole range to learn them."
     if together := _list(excitation.together):
-        yield (
-            f"{together} always moved together, so their effects can't be told apart: the model "
-            "holds for this proportion only; drive with each changing on its own."
-        )
+        holds = "the model holds for this proportion only; drive with each changing on its own"
+        yield f"{together} always moved together, so their effects can't be told apart: {holds}."
     if copies := _list([v.name for v in spec.state if v.name in linear.regression.dependent]):
-        yield (
-            f"{copies} always followed from the other variables, so their effects can't be "
-            "told apart: the model does without, and holds for as long as that is so."
-        )
+        why = "always followed from the other variables, so their effects can't be told apart"
+        yield f"{copies} {why}: the model does without, and holds for as long as that is so."
     levels = {n: v for n, v in excitation.levels.items() if n not in excitation.unmoved}
     if coarse := _list([name for name, count in levels.items() if count == FEW_LEVELS]):
-        yield (
-            f"{coarse} took two values only: between them the model is a straight line, "
-            "whatever the robot does; drive with values in between."
-        )
+        finding = "between them the model is a straight line, whatever the robot does"
+        yield f"{coarse} took two values only: {finding}; drive with values in between."
 
 
 def doubts(linear: Fit, held_out: OpenLoop | None, exact: bool) -> Iterator[str]:
@@ -187,27 +153,22 @@ def doubts(linear: Fit, held_out: OpenLoop | None, exact: bool) -> Iterator[str]
         if outliers > MANY_OUTLIERS:
             yield f"{outliers:.1%} of the rows of {dof} were outliers and left out of the fit."
         if condition > ILL_CONDITIONED:
-            yield (
-                f"The terms of {dof} are nearly copies of each other on this drive (condition "
-                f"number {condition:.1g}): their coefficients are no use one by one; lower the "
-                "order or drive with more variety."
-            )
+            alike = f"nearly copies of each other on this drive (condition number {condition:.1g})"
+            advice = "lower the order or drive with more variety"
+            useless = "their coefficients are no use one by one"
+            yield f"The terms of {dof} are {alike}: {useless}; {advice}."
     fitted = {c.dof for c in linear.curves} - {"vy"} if exact else set()
     explained = zip(dofs, linear.r2, strict=True)
     if lost := _list([dof for dof, share in explained if share < UNEXPLAINED and dof in fitted]):
-        yield (
-            f"The model explains less than half of {lost}: the robot did not follow its commands "
-            "in a way that a polynomial can describe; do not trust its predictions."
-        )
+        why = "the robot did not follow its commands in a way that a polynomial can describe"
+        yield f"The model explains less than half of {lost}: {why}; do not trust its predictions."
     if held_out is None or not held_out.mean_path_m > 0.0:
         return
     share = held_out.mean_position_error_m / held_out.mean_path_m
     if not share <= FAR_OFF:
         end = f"end {share:.0%} of their path away" if isfinite(share) else "run away"
-        yield (
-            f"On unseen data the predictions {end}: the response does not follow the commands as "
-            "the model has it; do not train with this model."
-        )
+        finding = "the response does not follow the commands as the model has it"
+        yield f"On unseen data the predictions {end}: {finding}; do not train with this model."
 
 
 def _list(names: Sequence[str]) -> str:
@@ -224,19 +185,10 @@ def mirror_note(samples: Samples, spec: RobotSpec) -> Iterator[str]:
         if command.steers:
             wanted = wanted * np.sign(samples.dq[:, 0])
         if min(turn.std(), wanted.std()) > 1e-3 and np.corrcoef(turn, wanted)[0, 1] < MIRRORED:
-            yield (
-                f"The robot turns right where {command.name} is positive: the recording is a "
-                "mirror image (y and heading reversed), or the sign of the command is; the model "
-                "moves as recorded."
-            )
+            finding = f"The robot turns right where {command.name} is positive"
+            cause = "the recording is a mirror image (y and heading reversed), or the sign of"
+            yield f"{finding}: {cause} the command is; the model moves as recorded."
             return
-
-
-def unseen_samples(samples: Samples, drive: Drive, calibration: Calibration) -> Samples | None:
-    """Returns the samples of the part of a drive that the fit did not see; None if too few."""
-    begin = drive.recording.pose.t[0] + calibration.clock_offset_s + drive.settings.train_until_s
-    unseen = samples.rows(samples.t > begin)
-    return unseen if len(unseen.t) >= MIN_ROWS else None
 
 
 def tried(
@@ -255,12 +207,9 @@ def tried(
 
 
 def with_quality(
-    model: TaylorModel,
-    linear: Fit,
-    unseen: Samples | None,
-    held_out: OpenLoop | None,
+    model: TaylorModel, linear: Fit, unseen: Samples | None, held_out: OpenLoop | None,
     spec: RobotSpec,
-) -> TaylorModel:
+) -> TaylorModel:  # fmt: skip
     """Returns the model with its figures of merit."""
 
     def by_dof(values: Array) -> dict[str, float]:

@@ -56,10 +56,7 @@ class ObservationEntry(Schema):
 
 
 class GoldenEntry(Schema):
-    """Sixteen pairs that must be reproduced; float32, little endian, in base 64.
-
-    Observations are (16, O); actions (16, C), or (16, 1) discrete; commands (16, C), SI.
-    """
+    """Sixteen pairs to reproduce, (16, O), (16, C or 1), (16, C) in SI; float32 in base 64."""
 
     observations: str
     actions: str
@@ -104,10 +101,7 @@ def contract_of(
     graph_sha256: str,
     provenance: Mapping[str, Any],
 ) -> str:
-    """Writes the contract of a policy as JSON; the golden arrays are named as in `GoldenEntry`.
-
-    Raises ConfigError if an entry has a wrong type.
-    """
+    """Writes the contract of a policy as JSON; ConfigError if an entry has a wrong type."""
     entry, observation = task_entry(task), observation_entry(task)
     data: dict[str, Any] = {
         "format": FORMAT,
@@ -179,11 +173,7 @@ def checksums(data: Mapping[str, Any]) -> dict[str, str]:
 
 
 def read_contract(text: str, source: str) -> Contract:
-    """Reads and checks the contract of a policy file.
-
-    Raises PolicyError if an entry is missing, unknown, of a wrong type, changed after the export,
-    or contradicts another; names the field.
-    """
+    """Reads a contract; PolicyError with the field that is wrong, changed or contradictory."""
     entries = sum(map(text.count, ",[{"))
     if entries > MOST_ENTRIES:
         reason = f"has {entries} entries, a contract at most {MOST_ENTRIES}; not read."

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,9 +33,8 @@ CONFIDENCE = 0.95
 class Episode:
     """Record of one episode.
 
-    The result is `success`, `collision`, `time-out`, or `elsewhere` if the robot wrongly believed
-    to be at its goal. Result and path are true ones if the backend knows them, else estimates.
-    `believed` is the result by the robot's own knowledge; None if nothing else is known.
+    The result is `success`, `collision`, `time-out`, or `elsewhere` for a wrongly believed success,
+    by the truth if the backend knows it; `believed` is then the robot's own, else None.
     """
 
     seed: int
@@ -82,17 +80,6 @@ class Episode:
         }
 
 
-@contextmanager
-def _halted_on_error(env: gymnasium.Env[Any, Any]) -> Iterator[None]:
-    try:
-        yield
-    except BaseException:
-        if isinstance(env.unwrapped, BridgeEnv):  # it does not see errors of a policy
-            with uninterrupted():
-                env.unwrapped.halt()
-        raise
-
-
 def drive(
     env: gymnasium.Env[Any, Any],
     policy: Policy,
@@ -103,10 +90,9 @@ def drive(
 ) -> Episode:
     """Drives one episode to its end; halts the robot if the policy or a callback raises.
 
-    `on_start` is called when the robot stands at its start. `touched` returns at the end whether
-    the robot truly touched something, if `info` does not.
+    `on_start` is called at its start; `touched` tells at its end of contacts that `info` does not.
     """
-    with _halted_on_error(env):
+    try:
         observation, info = env.reset(seed=seed, options=options)
         on_start()
         goal, bodies = info["goal"], info["bodies"]
@@ -127,13 +113,15 @@ def drive(
         there = truly_near(getattr(env.unwrapped, "task", None), info["true_pose"], goal).all()
         true = ELSEWHERE if believed == "success" and not there else believed
         return Episode(seed, "collision" if hit else true, *driven, believed)
+    except BaseException:
+        if isinstance(env.unwrapped, BridgeEnv):  # it does not see errors of a policy
+            with uninterrupted():
+                env.unwrapped.halt()
+        raise
 
 
 def truly_near(task: Any, poses: Array, goals: Array) -> Flags:
-    """True where robots at true poses (..., 3) are at their goals (..., 2), up to `DRIFT_M`.
-
-    Always True for tasks other than `Navigation`, whose robots have no individual goals.
-    """
+    """True where poses (..., 3) are at goals (..., 2), up to `DRIFT_M`; without goals always."""
     if not isinstance(task, Navigation):
         return np.ones(np.shape(poses)[:-1], np.bool_)
     gaps = np.hypot(*np.moveaxis(poses[..., :2] - goals, -1, 0))
@@ -184,10 +172,9 @@ class Outcomes:
 
 
 def drive_worlds(env: BridgeVectorEnv, act: Act, seeds: Sequence[int]) -> Outcomes:
-    """Drives one episode per seed, as many at once as the env has worlds.
+    """Drives one episode per seed, as many at once as the env has worlds (`NextStep`).
 
-    The episodes are bit-identical to those of `BridgeEnv.reset(seed=...)` without estimator. The
-    env's `autoreset_mode` is `NextStep`, the default.
+    They are bit-identical to those of `BridgeEnv.reset(seed=...)` without estimator.
     """
     width, given = env.num_envs, checked_seeds(seeds)
     # The last batch is padded with seeds that are driven but not counted.
@@ -233,10 +220,7 @@ def _robots(info: dict[str, Any], name: str) -> Flags:
 
 @dataclass(frozen=True)
 class ConfidenceInterval:
-    """A figure with its 95 % confidence interval.
-
-    `value` is NaN if nothing was observed; the ends are infinite for the mean of one observation.
-    """
+    """A figure, NaN if nothing was observed, with its 95 % interval, infinite for one value."""
 
     value: float
     low: float
@@ -297,8 +281,7 @@ def summarise(outcomes: Outcomes, control_period: float) -> Summary:
 class Tally(Summary):
     """Figures of the episodes of one world, by the truth if it is known.
 
-    `deviation` is the mean of the maximum distance [m] between the true path and that in the first
-    world at the same step.
+    `deviation` is the mean of the maximum distance [m] from the path in the first world per step.
     """
 
     same: float  # share of the episodes that ended as in the first world
@@ -308,37 +291,28 @@ class Tally(Summary):
 
     def figures(self) -> dict[str, Any]:
         """The tally as plain data, an interval as a list; non-finite values become null."""
-        return {
-            name: [_finite(each) for each in vars(value).values()]
-            if isinstance(value, ConfidenceInterval)
-            else _finite(value)
-            for name, value in vars(self).items()
-        }
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def tally(episodes: Sequence[Episode], first: Sequence[Episode], control_period: float) -> Tally:
-    """Computes the figures of episodes, compared with the same seeds in the first world."""
-    seeds, results, *figures = map(
-        np.array,
-        zip(*((e.seed, e.result, e.steps, e.length, e.reward) for e in episodes), strict=True),
-    )
-    outcomes = Outcomes(seeds, results == "success", results == "collision", *figures)
-    pairs = list(zip(episodes, first, strict=True))
-    gaps = [deviation(one, other) for one, other in pairs]
-    return Tally(
-        **vars(summarise(outcomes, control_period)),
-        same=sum(one.result == other.result for one, other in pairs) / len(pairs),
-        deviation=mean(gaps),
-        greatest_deviation=max(gaps),
-        believed=rate(sum(episode.believed_success for episode in episodes), len(pairs)),
-    )
+        figures: dict[str, Any] = {}
+        for name, value in vars(self).items():
+            ends = vars(value).values() if isinstance(value, ConfidenceInterval) else [value]
+            known = [each if math.isfinite(each) else None for each in ends]
+            figures[name] = known if isinstance(value, ConfidenceInterval) else known[0]
+        return figures
 
 
 def tallies(runs: Mapping[str, Sequence[Episode]], control_period: float) -> dict[str, Tally]:
-    """Computes the figures of each world, compared with the first."""
-    first = next(iter(runs.values()))
-    return {place: tally(episodes, first, control_period) for place, episodes in runs.items()}
+    """Computes the figures of each world, compared with the same seeds in the first."""
+    first, found = next(iter(runs.values())), {}
+    for place, episodes in runs.items():
+        rows = ((e.seed, e.result, e.steps, e.length, e.reward) for e in episodes)
+        seeds, results, *figures = map(np.array, zip(*rows, strict=True))
+        outcomes = Outcomes(seeds, results == "success", results == "collision", *figures)
+        pairs = list(zip(episodes, first, strict=True))
+        gaps = [deviation(one, other) for one, other in pairs]
+        found[place] = Tally(
+            **vars(summarise(outcomes, control_period)),
+            same=sum(one.result == other.result for one, other in pairs) / len(pairs),
+            deviation=mean(gaps),
+            greatest_deviation=max(gaps),
+            believed=rate(sum(episode.believed_success for episode in episodes), len(pairs)),
+        )
+    return found

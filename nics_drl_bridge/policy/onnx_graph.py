@@ -30,10 +30,8 @@ MOST_NODES = 1000  # maximum number of nodes; an exported network has some dozen
 MOST_DIMENSIONS = 8  # maximum number of dimensions of an array of weights
 CONTRACT_LIMIT = 4 * 2**20  # maximum size of the contract [bytes], mostly golden observations
 MOST_NUMBERS = 1_000_000  # maximum output of all nodes together for one observation
-MOST_WORK = 20_000_000
-"""Maximum number of multiplications, or of numbers read and written, for one observation."""
-MOST_AT_ONCE = 64 * MOST_NUMBERS
-"""Maximum output of all nodes together in one run, so at most 256 MB of float32."""
+MOST_WORK = 20_000_000  # multiplications, or numbers read and written, for one observation
+MOST_AT_ONCE = 64 * MOST_NUMBERS  # of all nodes' outputs in one run: at most 256 MB of float32
 ROWS = 16  # observations for which the sizes are computed, as many as there are golden ones
 SMALL = 1024  # maximum length of an integer array that may be a shape, an axis or an index
 GREATEST_SETTING = 65_536  # maximum size, stride, padding or dilation of a kernel
@@ -68,10 +66,7 @@ Fault = tuple[str, str]  # faulty field, and the reason
 
 
 def parse(data: bytes, source: str) -> Any:
-    """Parses and checks the ModelProto of a policy file's content.
-
-    Raises PolicyError if it is not an ONNX model, or one that this package does not run.
-    """
+    """Parses and checks a policy file's ModelProto; PolicyError if it is not one to be run."""
     for start, kind in OTHER_FORMATS:
         if data.startswith(start):
             reason = f"is {kind}, which is never opened; export the policy with `export_policy`."
@@ -88,11 +83,6 @@ def parse(data: bytes, source: str) -> Any:
     metadata(model, source)
     check_graph(model, source)
     return model
-
-
-def _refuse(faults: Iterator[Fault], source: str) -> None:
-    for field, reason in faults:
-        raise PolicyError(source, field, reason)
 
 
 def metadata(model: Any, source: str) -> str:
@@ -116,10 +106,7 @@ def graph_hash(model: Any) -> str:
 
 
 def sealed(data: bytes) -> bytes:
-    """Appends to a model's bytes their checksum, as another metadata entry.
-
-    Parts of a protobuf message may be concatenated, so other programs read the file as usual.
-    """
+    """Appends a model's checksum as another metadata entry, as messages may be concatenated."""
     end = onnx.ModelProto()
     entry = end.metadata_props.add()
     entry.key, entry.value = SEAL, sha256(data)
@@ -190,7 +177,8 @@ def _varint(view: memoryview, start: int, end: int) -> tuple[int, int]:
 
 def check_graph(model: Any, source: str) -> None:
     """Raises PolicyError for a graph that is not self-contained, or has other operators."""
-    _refuse(itertools.chain(_graph_faults(model), _weight_faults(model.graph)), source)
+    for field, reason in itertools.chain(_graph_faults(model), _weight_faults(model.graph)):
+        raise PolicyError(source, field, reason)
     try:
         onnx.checker.check_model(model)
     except (onnx.checker.ValidationError, ValueError) as error:
@@ -225,10 +213,11 @@ def _graph_faults(model: Any) -> Iterator[Fault]:
             name = f"{node.domain}.{node.op_type}" if node.domain else node.op_type
             reason = f"the operator {name} is not one of a feed-forward network; not run."
             yield "graph.node", reason
-        if any(a.HasField("g") or len(a.graphs) for a in node.attribute):
-            yield "graph.node", f"{node.op_type} holds a graph of its own."
-        if any(a.HasField("sparse_tensor") or len(a.sparse_tensors) for a in node.attribute):
-            yield "graph.node", f"{node.op_type} holds sparse weights."
+        for a in node.attribute:
+            if a.HasField("g") or len(a.graphs):
+                yield "graph.node", f"{node.op_type} holds a graph of its own."
+            if a.HasField("sparse_tensor") or len(a.sparse_tensors):
+                yield "graph.node", f"{node.op_type} holds sparse weights."
 
 
 def _weight_faults(graph: Any) -> Iterator[Fault]:
@@ -258,10 +247,7 @@ def _tensors(graph: Any) -> Iterator[Any]:
 
 
 def check_ends(model: Any, widths: dict[str, int | None], source: str) -> None:
-    """Raises PolicyError unless inputs and outputs are those of a policy.
-
-    `widths` are those of `observation`, `action` and `command`; None: integers (n,).
-    """
+    """Raises PolicyError unless inputs and outputs have their widths; None: integers (n,)."""
     weights = {tensor.name for tensor in model.graph.initializer}
     inputs = [one for one in model.graph.input if one.name not in weights]
     for kind, ends, names in (
@@ -283,19 +269,15 @@ def check_ends(model: Any, widths: dict[str, int | None], source: str) -> None:
 
 
 def rows_at_once(model: Any, source: str) -> int:
-    """Number of observations that a graph of known operators may be given in one run.
-
-    Raises PolicyError if a size is unknown, or is more than any policy needs.
-    """
-    _refuse(_setting_faults(model.graph), source)
-    _refuse(_integer_faults(model, source), source)
+    """Number of observations for one run; PolicyError if a size is unknown or far too large."""
+    faults = itertools.chain(_setting_faults(model.graph), _integer_faults(model, source))
+    for field, reason in faults:
+        raise PolicyError(source, field, reason)
     numbers, work = _costs(model, ROWS, source)
     if max(numbers / MOST_NUMBERS, work / MOST_WORK) > ROWS:
-        reason = (
-            f"needs {numbers / ROWS:.3g} numbers and {work / ROWS:.3g} multiplications for an "
-            f"observation, where a policy has {MOST_NUMBERS:.0e} and {MOST_WORK:.0e}; not run."
-        )
-        raise PolicyError(source, "graph", reason)
+        needs = f"needs {numbers / ROWS:.3g} numbers and {work / ROWS:.3g} multiplications"
+        limits = f"for an observation, where a policy has {MOST_NUMBERS:.0e} and {MOST_WORK:.0e}"
+        raise PolicyError(source, "graph", f"{needs} {limits}; not run.")
     more_numbers, more_work = _costs(model, 2 * ROWS, source)
     if more_numbers > 2 * numbers or more_work > 2 * work:
         reason = "grows faster than the number of its observations; not run."
@@ -372,10 +354,7 @@ def _work(node: Any, given: list[Shape], made: list[Shape]) -> tuple[int, int]:
 def _sizes(
     model: Any, rows: int, source: str, values: bool
 ) -> tuple[dict[str, int], dict[str, Shape]]:
-    """Type and, if known, shape of every tensor for `rows` observations.
-
-    `values`: also what follows from the values of integers.
-    """
+    """Type and known shape of every tensor for `rows` observations; also by integers' `values`."""
     bare = _without_weights(model, rows)
     try:
         graph = onnx.shape_inference.infer_shapes(bare, strict_mode=True, data_prop=values).graph

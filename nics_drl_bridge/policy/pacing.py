@@ -8,8 +8,7 @@ from enum import Enum
 class ActionPace:
     """Allows at most one action per period, as soon as there are data to act on; 0 acts on all.
 
-    Due times are a period apart, so that jitter of the data makes it neither faster nor slower;
-    if data come late, the next due time is a period after them.
+    Due times are a period apart, whatever the jitter of data, or a period after data that are late.
     """
 
     def __init__(self, period_s: float) -> None:
@@ -34,10 +33,9 @@ class Answer(Enum):
 
 
 class Deadline:
-    """Judges the duration of each inference, and counts those in time and the late ones.
+    """Judges the duration of each inference; counts those in time, the late, and the longest.
 
-    A late command is dropped, because the world has moved on. After `patience` in a row the robot
-    is stopped until one is in time again. `longest_s` is the maximum duration so far.
+    A late command is dropped; after `patience` in a row the robot stops until one is in time again.
     """
 
     def __init__(self, limit_s: float, patience: int) -> None:

@@ -23,8 +23,7 @@ from nics_drl_bridge.robot.spec import RobotSpec
 Array = NDArray[np.float64]
 
 FULL_TURN_RAD = 0.8  # bearing of the goal from which a robot turns as fast as it can
-CREEP = 0.3
-"""Share of the maximum speed for a robot that can't turn on the spot and has its goal behind."""
+CREEP = 0.3  # share of full speed if a robot can't turn on the spot and has its goal behind
 
 
 class Policy(Protocol):
@@ -78,12 +77,11 @@ class RandomActions:
 class DynamicWindow:
     """The dynamic-window approach (Fox, Burgard, Thrun 1997) on scan, goal and twist.
 
-    Tries the twists that the commands allow and that the robot can reach from its present one in a
-    period; each is held for the look-ahead. A twist with a contact before the robot could stop is
-    inadmissible; the best of the others in distance, aim, clearance and time to contact is chosen.
-    It plans no path: behind a long wall it stays. Which twist a command leads to follows from the
-    robot's kind and parameters. Raises ConfigError if it is not known where the robot's commands
-    lead, see `steady_twist`.
+    Tries the twists that commands allow and the robot can reach in a period, each held for the
+    look-ahead. One with a contact before the robot could stop is inadmissible; the best in
+    distance, aim, clearance and time to contact is chosen. It plans no path: behind a long wall it
+    stays. Raises ConfigError if it is not known where the robot's commands lead, see
+    `steady_twist`.
     """
 
     task: Navigation
@@ -160,11 +158,9 @@ def is_policy_file(name: str) -> bool:
 
 
 def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None) -> Policy:
-    """Makes a policy by name.
+    """Makes a policy by a key of `POLICIES`, the name of a shipped policy file, or a path.
 
-    The name is a key of `POLICIES`, a shipped policy file, or the path of a policy file, which is
-    checked against the task and the model of the robot. Raises ConfigError for an unknown name,
-    PolicyError, with the field, if the file can't be used or does not fit.
+    A file is checked against task and model. ConfigError: unknown name; PolicyError: wrong field.
     """
     if not is_policy_file(name):
         return POLICIES[name](task)
@@ -176,10 +172,7 @@ def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None
 
 
 def open_policy(name: str, model: SimulatorModel) -> tuple[Policy, Navigation]:
-    """Opens a policy by name, with the navigation task that it is for.
-
-    Raises ConfigError, PolicyError: see `make_policy`; or the policy was trained for another task.
-    """
+    """Opens a policy as `make_policy`, with its task; PolicyError if that is no navigation."""
     if not is_policy_file(name):
         task = Navigation(model.robot, model.lidar)
         return POLICIES[name](task), task

@@ -20,16 +20,9 @@ from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.sectors import plan_of
 from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.policy import contract as contracts
 from nics_drl_bridge.policy import onnx_graph
-from nics_drl_bridge.policy.contract import (
-    SUFFIX,
-    Contract,
-    leaves,
-    observation_entry,
-    read_contract,
-    shipped,
-    task_entry,
-)
+from nics_drl_bridge.policy.contract import Contract, leaves
 from nics_drl_bridge.robot.spec import RobotSpec
 
 GOLDEN_TOLERANCE = 1e-5
@@ -88,10 +81,9 @@ class PolicyFile:
         return options
 
     def make_task(self, model: SimulatorModel, kind: str | type[Task] | None = None) -> Task:
-        """Makes the policy's task for a robot that it fits.
+        """Makes the policy's task for a robot; PolicyError names a field that does not fit.
 
-        For a task that is not shipped, `kind` is its class or `path/to/file.py:ClassName`. Raises
-        PolicyError if the policy does not fit; names the field.
+        Of a task that is not shipped, `kind` is its class or `path/to/file.py:ClassName`.
         """
         name = self.contract.task.name
         if kind is None and name not in TASKS:
@@ -110,17 +102,18 @@ class PolicyFile:
         """
         if model is not None:
             self._check_robot(model.robot, model.lidar)
-            self._check_sensors(model)
+            known = {sensor.name: sensor.model_dump(mode="json") for sensor in model.sensors}
+            self._compare({"sensors": [known.get(each.name) for each in self.contract.sensors]})
             period = model.control_period
             if abs(self.contract.control_period - period) > PERIOD_TOLERANCE:
                 self._compare({"control_period": period})
         if task is not None:
             self._check_robot(task.robot, task.lidar)
             self._compare({
-                "task": {"name": task_entry(task)["name"]},
+                "task": {"name": contracts.task_entry(task)["name"]},
                 "actions": task.actions,
                 "scan": None if task.scan is None else task.scan.model_dump(mode="json"),
-                "observation": observation_entry(task),
+                "observation": contracts.observation_entry(task),
             })  # fmt: skip
 
     def _check_robot(self, robot: RobotSpec, lidar: LidarSpec) -> None:
@@ -133,11 +126,6 @@ class PolicyFile:
             except ConfigError as error:
                 raise PolicyError(str(self.path), "scan", str(error)) from None
         self._compare(theirs)
-
-    def _check_sensors(self, model: SimulatorModel) -> None:
-        """The further sensors that the policy observes are those of the model."""
-        known = {sensor.name: sensor.model_dump(mode="json") for sensor in model.sensors}
-        self._compare({"sensors": [known.get(each.name) for each in self.contract.sensors]})
 
     def _compare(self, theirs: Mapping[str, Any]) -> None:
         """Raises PolicyError for the first of some entries that differs from the contract's."""
@@ -152,18 +140,11 @@ class PolicyFile:
                     raise PolicyError(str(self.path), path, reason)
 
 
-def find_policy(name: str) -> Path:
-    """Path of a policy file, by its path or by the name of a shipped one."""
-    path = Path(name)
-    return path if name.endswith(SUFFIX) or path.is_file() else shipped() / f"{name}{SUFFIX}"
-
-
 def load_policy(path: str | Path) -> PolicyFile:
-    """Loads a policy file, by its path or the name of a shipped one, and runs every check.
-
-    Raises PolicyError if a check fails; names the field.
-    """
-    file = find_policy(str(path))
+    """Loads a policy file, by path or shipped name, with all checks; PolicyError has the field."""
+    file, suffix = Path(path), contracts.SUFFIX
+    if not (str(path).endswith(suffix) or file.is_file()):
+        file = contracts.shipped() / f"{path}{suffix}"
     source = str(file)
     try:
         size, limit = file.stat().st_size, onnx_graph.SIZE_LIMIT
@@ -182,7 +163,7 @@ def policy_of(data: bytes, path: Path) -> PolicyFile:
     """Makes a policy from a file's content; see `load_policy`."""
     source = str(path)
     model = onnx_graph.parse(data, source)
-    contract = read_contract(onnx_graph.metadata(model, source), source)
+    contract = contracts.read_contract(onnx_graph.metadata(model, source), source)
     commands = len(contract.robot.command)
     action = None if contract.actions == "discrete" else commands
     widths = {"observation": contract.observation.size, "command": commands, "action": action}
@@ -199,10 +180,7 @@ def policy_of(data: bytes, path: Path) -> PolicyFile:
 
 
 def open_session(data: bytes, source: str) -> Any:
-    """An onnxruntime session on one thread.
-
-    Raises ConfigError if onnxruntime is missing, PolicyError if it can't run the graph.
-    """
+    """An onnxruntime session on one thread; ConfigError without it, PolicyError by the graph."""
     try:
         import onnxruntime
     except ImportError:

@@ -42,11 +42,7 @@ class Shadow:
     skipped: Mapping[str, int]  # reason -> number of times that were not compared
 
     def differences(self) -> dict[str, dict[str, float]]:
-        """Differences between policy and drive, for each command.
-
-        Mean of policy minus drive; mean, percentiles and maximum of its magnitude, in the command's
-        unit; and the share of opposite signs among the times at which both have a sign.
-        """
+        """Differences (policy minus drive) by command, in its unit, and share of opposite signs."""
         found = {}
         for c, name in enumerate(self.names):
             one, other, band = self.policy[:, c], self.driven[:, c], DEAD_BAND * self.scale[c]
@@ -83,10 +79,8 @@ def shadow(
 
     The policy acts when `policy_node` would: once per scan, with odometry at least as new, at most
     once per control period of the stamps. Its command is compared with the first one recorded after
-    that, or else with the one that still applied.
-
-    The goal (2,) [m] is in `map`, in which the first odometry is taken at face value. None uses the
-    robot's position `ahead_s` later instead: the driver's intention, in hindsight. `topics` are by
+    that, or else with the one that still applied. The goal (2,) [m] is in `map`, where the first
+    odometry is taken at face value; None: the robot's position `ahead_s` later. `topics` are by
     role, see `playback.chosen`. Raises RecordingError if the bag can't be used, or lacks scans or
     commands, another BridgeError if the policy can't be used, or does not fit.
     """
@@ -101,7 +95,13 @@ def shadow(
     moments = _moments(playback, messages, model)
     if not moments:
         raise RecordingError(f"{path}: no scan with an odometry could be used; see nics bag info.")
-    goals = _goals(moments, goal, ahead_s)
+    if goal is None:
+        times = np.array([moment.stamp_ns for moment in moments]) * S_PER_NS
+        places = np.array([moment.view.pose[:2] for moment in moments])
+        ahead = [np.interp(times + ahead_s, times, place) for place in places.T]
+        goals = np.stack(ahead, axis=-1)
+    else:
+        goals = np.broadcast_to(np.asarray(goal, np.float64), (len(moments), 2))
     return _answered(moments, goals, policy, replace(model, lidar=playback.lidar))
 
 
@@ -139,14 +139,6 @@ def _hold(moments: list[_Moment], held: tuple[int, Array] | None) -> None:
     if moments and moments[-1].driven is None and held is not None:
         age_s = (moments[-1].receive_ns - held[0]) * S_PER_NS
         moments[-1].driven = held[1] if age_s <= HELD_S else None
-
-
-def _goals(moments: list[_Moment], goal: ArrayLike | None, ahead_s: float) -> Array:
-    if goal is not None:
-        return np.broadcast_to(np.asarray(goal, np.float64), (len(moments), 2))
-    times = np.array([moment.stamp_ns for moment in moments]) * S_PER_NS
-    places = np.array([moment.view.pose[:2] for moment in moments])
-    return np.stack([np.interp(times + ahead_s, times, place) for place in places.T], axis=-1)
 
 
 def _answered(moments: list[_Moment], goals: Array, name: str, model: SimulatorModel) -> Shadow:

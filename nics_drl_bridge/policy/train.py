@@ -33,10 +33,8 @@ from nics_drl_bridge.sim.world import World
 CHECKPOINT, SETTINGS = "checkpoint.pt", "settings.yaml"
 EVALUATION, POLICY = "evaluation.json", "policy.onnx"
 SEEDS = 2**40
-GREATEST_SEED = 2**32 - 1
-"""Largest seed of numpy's global generator, from which Stable-Baselines3 draws."""
-LOG_EVERY = {"ppo": 1, "sac": 1000}
-"""Roll-outs (PPO) or episodes (SAC) between two entries of TensorBoard."""
+GREATEST_SEED = 2**32 - 1  # of numpy's global generator, from which Stable-Baselines3 draws
+LOG_EVERY = {"ppo": 1, "sac": 1000}  # roll-outs or episodes between two entries of TensorBoard
 Tell = checkpoints.Tell
 
 
@@ -59,10 +57,8 @@ def train(
 ) -> Trained:
     """Trains one policy; checkpoint and TensorBoard logs are in `folder`.
 
-    An interrupted and resumed training gives bit-identical weights to an uninterrupted one: a
-    checkpoint contains the network, the optimiser, all random generators and all worlds. `tell` is
-    called with the progress, a few times per second. Raises ConfigError if the settings are
-    inconsistent, or no checkpoint fits them.
+    A resumed training gives bit-identical weights to an uninterrupted one. `tell` is called with
+    the progress a few times per second. ConfigError: no such settings, or no checkpoint fits them.
     """
     begin, path = time.perf_counter(), folder / CHECKPOINT
     content = checkpoints.read_checkpoint(path) if resumed else None
@@ -107,12 +103,9 @@ def make_train_env(
 
 
 def _again(
-    content: dict[str, Any],
-    about: dict[str, Any],
-    settings: TrainingSettings,
-    env: TrainVecEnv,
+    content: dict[str, Any], about: dict[str, Any], settings: TrainingSettings, env: TrainVecEnv,
     path: Path,
-) -> BaseAlgorithm:
+) -> BaseAlgorithm:  # fmt: skip
     """Restores the algorithm of a checkpoint. Raises ConfigError if it is of another training."""
     check_same(content["about"], about, path)
     size = int(np.prod(env.observation_space.shape))
@@ -152,8 +145,7 @@ def evaluate(
     return drive_worlds(env, act_of(algorithm), range(FIRST_SEED, FIRST_SEED + episodes))
 
 
-Learn = Callable[[TrainingSettings, int, Path, Tell, bool], Trained]
-"""A function like `train`: of settings, seed, folder, progress callback and `resumed`."""
+Learn = Callable[[TrainingSettings, int, Path, Tell, bool], Trained]  # a function like `train`
 
 
 @dataclass(frozen=True)
@@ -183,10 +175,9 @@ def run(
     done: Callable[[SeedResult], None] = lambda _: None,
     learn: Learn = train,
 ) -> list[SeedResult]:
-    """Trains seed after seed and evaluates each in its training worlds.
+    """Trains seed after seed and evaluates each in its worlds; `tell` and `done` are told of it.
 
-    `tell` is called with the progress, `done` with the result of each seed. Raises ConfigError if
-    the folder already contains a run, or none to resume.
+    Raises ConfigError if the folder already contains a run, or none to resume.
     """
     _check(order.seeds, order.out, order.resumed)
     settings, model = order.settings, open_model(order.settings.robot)

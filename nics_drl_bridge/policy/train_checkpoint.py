@@ -1,7 +1,6 @@
 """Checkpoints of a training: all that it needs to continue bit-identically.
 
-A checkpoint is for training only and is never deployed. It contains only tensors, numbers and text
-and is read by PyTorch's `weights_only` reader, which builds no other objects: it can't run code.
+A checkpoint is never deployed. PyTorch's `weights_only` reader builds no objects: no code runs.
 """
 
 from __future__ import annotations
@@ -42,6 +41,11 @@ def save_checkpoint(
     path: Path, algorithm: BaseAlgorithm, env: TrainVecEnv, about: dict[str, Any]
 ) -> None:
     """Writes a checkpoint between two roll-outs; `about` identifies the training."""
+    replay: dict[str, Any] = {}
+    if isinstance(algorithm, OffPolicyAlgorithm):
+        buffer: Any = algorithm.replay_buffer
+        rows = {name: getattr(buffer, name)[: buffer.size()] for name in REPLAYED}
+        replay = {"pos": buffer.pos, "full": buffer.full, **_tensors(rows)}
     content = {
         "format": FORMAT,
         "about": json.dumps(about),
@@ -53,7 +57,7 @@ def save_checkpoint(
         "counters": {name: getattr(algorithm, name) for name in COUNTERS},
         "recent": list(algorithm.ep_success_buffer or ()),
         "last": _tensors({name: getattr(algorithm, name) for name in LAST}),
-        "replay": _replay(algorithm),
+        "replay": replay,
         "random": _random_state(algorithm),
         "envs": [_tensors(snapshot(one)) for one in env.envs],
     }
@@ -68,10 +72,7 @@ def write_content(path: Path, content: dict[str, Any]) -> None:
 
 
 def read_checkpoint(path: Path, kind: str = FORMAT) -> dict[str, Any]:
-    """Reads the content of a checkpoint of a format; `about` is that of `save_checkpoint`.
-
-    Raises ConfigError if there is none, or it is damaged or of another format.
-    """
+    """Reads a checkpoint of a format; ConfigError if it is missing, damaged, or another kind."""
     if not path.is_file():
         raise ConfigError(f"{path}: no such checkpoint; leave out --resume to begin anew.")
     try:
@@ -133,14 +134,6 @@ def _tensors(arrays: dict[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
     return {name: torch.from_numpy(np.ascontiguousarray(rows)) for name, rows in arrays.items()}
 
 
-def _replay(algorithm: BaseAlgorithm) -> dict[str, Any]:
-    if not isinstance(algorithm, OffPolicyAlgorithm):
-        return {}
-    buffer: Any = algorithm.replay_buffer
-    rows = {name: getattr(buffer, name)[: buffer.size()] for name in REPLAYED}
-    return {"pos": buffer.pos, "full": buffer.full, **_tensors(rows)}
-
-
 def _random_state(algorithm: BaseAlgorithm) -> dict[str, Any]:
     """State of all random generators: PyTorch's, numpy's global one, the action space's."""
     shared = np.random.get_state(legacy=False)  # noqa: NPY002 - Stable-Baselines3 draws from it
@@ -182,11 +175,7 @@ Tell = Callable[[Progress], None]
 
 
 class Companion(BaseCallback):
-    """Callback that monitors each step and roll-out of a training.
-
-    It calls `tell` with the progress, and `save` about every `checkpoint_every` environment steps,
-    between two roll-outs only.
-    """
+    """Callback that monitors each step and roll-out: calls `tell`, and `save` between roll-outs."""
 
     def __init__(
         self, env: TrainVecEnv, seed: int, settings: TrainingSettings, save: Save, tell: Tell
@@ -238,10 +227,7 @@ MEMORY, DRAWN = "memory.", "drawn."
 
 
 def snapshot(env: BridgeVectorEnv) -> Arrays:
-    """Copies all that changes in a vector env, by name.
-
-    An env with the same arguments continues bit-identically from it after `restore`.
-    """
+    """Copies all that changes in a vector env, from which `restore` continues bit-identically."""
     found = dict(env.changing)
     found |= {MEMORY + name: rows for name, rows in env.memory.items()}
     found |= {DRAWN + name: rows for name, rows in env.simulator.drawn.items()}
@@ -249,10 +235,7 @@ def snapshot(env: BridgeVectorEnv) -> Arrays:
 
 
 def restore(env: BridgeVectorEnv, state: Mapping[str, NDArray[Any]]) -> None:
-    """Puts a snapshot into a vector env with the same arguments.
-
-    Raises ConfigError if the snapshot is of an env with other worlds, robots, lidar or task.
-    """
+    """Puts a snapshot into a vector env; ConfigError if its worlds, robots or task are others."""
     parts: dict[str, Arrays] = {"": {}, MEMORY: {}, DRAWN: {}}
     for name, rows in state.items():
         prefix = next((p for p in (MEMORY, DRAWN) if name.startswith(p)), "")

@@ -22,11 +22,9 @@ Observation = NDArray[np.float32]
 class TrainVecEnv(VecEnv):
     """Feeds Stable-Baselines3 from a `BridgeVectorEnv`, or from several with equal spaces.
 
-    The observations are the vector env's own array of the step; only worlds that ended are handled
-    one by one: their `terminal_observation`, `TimeLimit.truncated`, `is_success` and `collision` in
-    `infos`. The envs have the `autoreset_mode` `SameStep`, and `copy`, as the algorithms keep the
-    last observation over a step. `stepping_s` is the wall time spent in them [s]. Raises
-    ConfigError for an env with other arguments, or envs that do not fit together.
+    Observations are not copied; only worlds that ended get `infos`: `terminal_observation`,
+    `TimeLimit.truncated`, `is_success`, `collision`. `stepping_s` is the wall time in the envs [s].
+    ConfigError unless they fit, with `autoreset_mode='SameStep'` and `copy=True`.
     """
 
     def __init__(self, *envs: BridgeVectorEnv) -> None:
@@ -98,7 +96,8 @@ class TrainVecEnv(VecEnv):
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """An attribute of the vector env of each world."""
-        return [getattr(self._env_of(n), attr_name) for n in self._get_indices(indices)]
+        every = [getattr(env, attr_name) for env in self.envs for _ in range(env.num_envs)]
+        return [every[n] for n in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Sets an attribute of the vector envs, which all their worlds share."""
@@ -109,13 +108,10 @@ class TrainVecEnv(VecEnv):
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
         """Calls a method of each vector env once; returns its result for each of its worlds."""
-        results = {
-            id(env): getattr(env, method_name)(*method_args, **method_kwargs) for env in self.envs
-        }
-        return [results[id(self._env_of(n))] for n in self._get_indices(indices)]
-
-    def _env_of(self, n: int) -> BridgeVectorEnv:
-        return next(env for env, rows in zip(self.envs, self._rows, strict=True) if n < rows.stop)
+        every: list[Any] = []
+        for env in self.envs:
+            every += [getattr(env, method_name)(*method_args, **method_kwargs)] * env.num_envs
+        return [every[n] for n in self._get_indices(indices)]
 
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper[Any, Any, Any, Any]], indices: Any = None

@@ -13,17 +13,15 @@ Share = Annotated[float, Field(gt=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=1, le=10**12)]
 MOST_WORLDS = 65_536  # maximum number of copies of all worlds together
 MOST_LAYERS, MOST_WIDE = 16, 8_192
-MOST_KEPT = 2**26
-"""Maximum number of stored transitions: of a roll-out in all worlds, or of SAC's buffer."""
+MOST_KEPT = 2**26  # of stored transitions: of a roll-out in all worlds, or of SAC's buffer
 Width = Annotated[int, Field(ge=1, le=MOST_WIDE)]
 
 
 class PpoSettings(Schema):
     """Proximal policy optimisation (Schulman and others 2017), as in Stable-Baselines3.
 
-    The learning rate is that at the start and falls linearly to a fiftieth. `rollout` is the steps
-    in each world between two updates, `batch` the transitions of one gradient step, `epochs` the
-    passes of an update through the roll-outs, `log_std` that of the actions at the start.
+    The learning rate falls linearly to a fiftieth. `rollout`: steps of a world between updates;
+    `batch`: transitions of a gradient step; `epochs`: passes of an update; `log_std`: at the start.
     """
 
     learning_rate: float = Field(default=1e-3, gt=0.0)
@@ -40,9 +38,8 @@ class PpoSettings(Schema):
 class SacSettings(Schema):
     """Soft actor-critic (Haarnoja and others 2018), as in Stable-Baselines3.
 
-    `buffer` is the transitions that are stored of all worlds together, `batch` those of one
-    gradient step, `begin_after` those of random actions before the first update. `updates` gradient
-    steps follow each step of the worlds; each moves the target critics by the share `soft_update`.
+    `buffer`: transitions kept, `batch`: those of a gradient step, `begin_after`: random ones before
+    the first update; `updates` follow each step of the worlds, targets move by `soft_update`.
     """
 
     learning_rate: float = Field(default=1e-3, gt=0.0)
@@ -57,9 +54,8 @@ class SacSettings(Schema):
 class TrainingSettings(Schema):
     """A training, as in `config/training/*.yaml`.
 
-    `worlds` maps names of shipped ones or YAML files to numbers of copies. Actor and critic have
-    hidden layers of the same widths, but share none. Sums over several threads of PyTorch round
-    differently from those of one.
+    `worlds` maps names or YAML files to numbers of copies; actor and critic have `hidden` layers
+    each.
     """
 
     task: str = "navigation"  # a name, or `path/to/file.py:ClassName`
@@ -71,7 +67,7 @@ class TrainingSettings(Schema):
     max_episode_steps: Count = 300  # an episode ends as a time-out after this many steps
     algorithm: Literal["ppo", "sac"] = "ppo"
     hidden: tuple[Width, ...] = Field(default=(64, 64), min_length=1, max_length=MOST_LAYERS)
-    threads: Annotated[int, Field(ge=1, le=1024)] = 1
+    threads: Annotated[int, Field(ge=1, le=1024)] = 1  # sums over several round differently
     checkpoint_every: Count = 200_000  # environment steps between two checkpoints
     ppo: PpoSettings = PpoSettings()
     sac: SacSettings = SacSettings()
@@ -106,19 +102,15 @@ class TrainingSettings(Schema):
 
 
 def load_training(name: str | Path) -> TrainingSettings:
-    """Loads settings by the name of a shipped file (`navigation_differential`), or by path.
-
-    Raises ConfigError if there is no such file, or something in it is wrong.
-    """
+    """Loads settings by the name of a shipped file, or by path; ConfigError if it is wrong."""
     return load_yaml(find_config(name, "training"), TrainingSettings)
 
 
 def chosen_settings(task: str, name: str | None, changes: dict[str, Any]) -> TrainingSettings:
-    """Settings chosen by the user.
+    """Settings of a shipped name or YAML file; by default those of task and robot if shipped.
 
-    `name` is that of shipped settings, or a YAML file; by default those of task and robot if they
-    are shipped, else the defaults. `changes` are further keys of `TrainingSettings`; and `world`,
-    names that share the number of worlds. Raises ConfigError for an unknown name or a wrong value.
+    `changes` are keys of `TrainingSettings`, or `world`: names that share the number of worlds.
+    Raises ConfigError for an unknown name or a wrong value.
     """
     robot = str(changes.get("robot", "differential"))
     shipped = {path.stem for path in (share_folder() / "config" / "training").glob("*.yaml")}

@@ -1,8 +1,7 @@
 """Opens a rosbag2 recording and verifies that it is complete.
 
-Bag readers return what they still find in a damaged bag, often silently. So its files are checked
-whole, and the messages of each topic are compared with the bag's summary. Data without a
-checksum, such as a flipped bit inside a number, can't be verified.
+Bag readers return what they still find in a damaged bag, often silently: here its files are checked
+whole, and its topics against its summary. A flipped bit without checksum is not found.
 """
 
 from __future__ import annotations
@@ -61,8 +60,7 @@ def is_storage(path: Path) -> bool:
 def opened(path: str | Path) -> Iterator[BagFile]:
     """Opens a bag, given its folder or its only file.
 
-    Raises RecordingError if there is no such bag, it is damaged, empty or was not closed, or a
-    library is not installed; any exception of rosbags on a damaged bag becomes one sentence.
+    RecordingError: it is missing, damaged, empty or not closed, or a library is not installed.
     """
     path = Path(path)
     check_libraries(path, "reading")
@@ -74,9 +72,8 @@ def opened(path: str | Path) -> Iterator[BagFile]:
         # rosbags opens databases by URI, which these characters cut.
         sign = next((sign for sign in URI_SIGNS if sign in str(place)), None)
         if sign and any(DATABASE in file.suffixes for file in files):
-            raise RecordingError(
-                f"{place}: SQLite can't open what has {sign!r} in its path; rename the folder."
-            )
+            fault = f"SQLite can't open what has {sign!r} in its path"
+            raise RecordingError(f"{place}: {fault}; rename the folder.")
         for file in files:
             no_device(file)
         with TemporaryDirectory() as room:  # before rosbags, which unpacks chunks of any size
@@ -91,11 +88,10 @@ def opened(path: str | Path) -> Iterator[BagFile]:
         raise
     except Exception as error:  # noqa: BLE001 - the reader can raise anything on a damaged file
         why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
-        raise RecordingError(
-            f"{path}: can't be read as a bag ({shortened(why, LONGEST_REASON)}); it is damaged or "
-            "was not closed: save the rest with `nics bag salvage`, try `ros2 bag reindex`, or "
-            "record anew."
-        ) from None
+        fault = f"can't be read as a bag ({shortened(why, LONGEST_REASON)})"
+        advice = "save the rest with `nics bag salvage`, try `ros2 bag reindex`, or record anew"
+        said = f"{path}: {fault}; it is damaged or was not closed: {advice}."
+        raise RecordingError(said) from None
 
 
 def _place(path: Path) -> Path:
@@ -107,23 +103,17 @@ def _place(path: Path) -> Path:
     if (folder / METADATA).is_file() and (path.is_dir() or len(files) == 1):
         return folder
     if path.is_dir() and len(files) != 1:
-        raise RecordingError(
-            f"{path}: holds {len(files)} bag files and no {METADATA}; write it with "
-            "`ros2 bag reindex`."
-        )
+        fault = f"holds {len(files)} bag files and no {METADATA}"
+        raise RecordingError(f"{path}: {fault}; write it with `ros2 bag reindex`.")
     file = files[0] if path.is_dir() else path
     if file.suffix in COMPRESSED:
-        raise RecordingError(
-            f"{file}: is compressed; unpack it with `zstd -d`, or give the folder with {METADATA}."
-        )
+        advice = f"unpack it with `zstd -d`, or give the folder with {METADATA}"
+        raise RecordingError(f"{file}: is compressed; {advice}.")
     return file
 
 
 def metadata_of(folder: Path) -> dict[str, Any]:
-    """Returns a bag's metadata, read within the limits of `parse_yaml`, which rosbags lacks.
-
-    Raises ValueError if they are not such YAML, or lack the part that rosbag2 writes.
-    """
+    """Returns a bag's metadata within `parse_yaml`'s limits; ValueError if they are not whole."""
     try:
         about = parse_yaml(read_text(folder / METADATA), METADATA).get(ABOUT)
     except BridgeError as error:
@@ -156,10 +146,8 @@ def _check_storage(file: Path) -> None:
         return
     journal = file.with_name(f"{file.name}-wal")
     if journal.is_file() and journal.stat().st_size > 0:
-        raise ValueError(
-            f"part of it is still in {journal.name}; stop the recorder, or close it with `sqlite3 "
-            f"{file.name} .quit`"
-        )
+        advice = f"stop the recorder, or close it with `sqlite3 {file.name} .quit`"
+        raise ValueError(f"part of it is still in {journal.name}; {advice}")
     place = f"{file.absolute().as_uri()}?mode=ro&immutable=1"
     with closing(sqlite3.connect(place, uri=True)) as base:
         (verdict,) = base.execute("PRAGMA integrity_check(1)").fetchone()
@@ -182,10 +170,8 @@ def _check_summary(reader: Reader) -> None:
     for topic, kind in sorted(set(summary + held), key=str):
         if (promised := summary[topic, kind]) != (found := held[topic, kind]):
             names = (repr(shortened(str(name), LONGEST_NAME)) for name in (topic, kind))
-            raise ValueError(
-                f"topic {' of type '.join(names)} has {found} messages in its files, {promised} by "
-                "its summary"
-            )
+            fault = f"topic {' of type '.join(names)} has {found} messages in its files"
+            raise ValueError(f"{fault}, {promised} by its summary")
     if reader.compression_mode == "message":
         for storage in storages:
             for _, _, data in storage.messages(storage.connections):
@@ -208,11 +194,7 @@ def times_of(messages: Sequence[Message]) -> tuple[Nanoseconds, Nanoseconds | No
 
 
 class BagFile:
-    """A bag in `opened`, whose topics are read completely or not at all.
-
-    A topic raises ValueError, which becomes the RecordingError of `opened`, if messages of it are
-    missing, outside of the bag's time span, or damaged.
-    """
+    """A bag in `opened`; ValueError if a topic's messages are not all there and whole."""
 
     def __init__(self, reader: Reader, place: str) -> None:
         self._reader, self._store = reader, typestore()
@@ -262,7 +244,6 @@ class BagFile:
         if len(raw) != promised:
             raise ValueError(f"topic {topic!r} has {len(raw)} messages, by the summary {promised}")
         if any(not first <= ns <= last for _, ns, _ in raw):
-            raise ValueError(
-                f"topic {topic!r} has messages outside of the time span of its summary"
-            )
+            fault = f"topic {topic!r} has messages outside of the time span"
+            raise ValueError(f"{fault} of its summary")
         return raw

@@ -16,19 +16,9 @@ import numpy as np
 from nics_drl_bridge.errors import RecordingError, nearest
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import S_PER_NS
+from nics_drl_bridge.recording import messages as msgs
 from nics_drl_bridge.recording import topic_roles as roles
 from nics_drl_bridge.recording.bag_file import BagFile, Message, opened, times_of
-from nics_drl_bridge.recording.messages import (
-    POSITION_UNITS,
-    WHEELS,
-    Row,
-    command_row,
-    frames,
-    imu_row,
-    pose_row,
-    quaternion,
-    twist_row,
-)
 from nics_drl_bridge.recording.recording import Recording, check
 from nics_drl_bridge.recording.stamping import SAME_CLOCK_S, Nanoseconds, TopicData, streams
 from nics_drl_bridge.recording.topic_roles import JointSource, TopicRoles
@@ -45,9 +35,8 @@ SPANNED = 0.9  # share of a uniform distribution between the first and last of t
 def load_bag(path: str | Path, spec: RobotSpec | None, mapping: TopicRoles) -> Recording:
     """Reads a drive of a robot from a bag: its folder or its only file.
 
-    Missing roles of topics are guessed; for the clocks see `stamping.streams`. RecordingError, one
-    sentence with place and fix: the bag is damaged or incomplete, a topic is missing or ambiguous,
-    or the data can't be used for this robot.
+    Missing roles of topics are guessed; for the clocks see `stamping.streams`. RecordingError, with
+    place and fix: the bag is damaged, a topic missing or ambiguous, or of another robot.
     """
     if spec is None:
         raise RecordingError(f"{path}: is a bag; say of which robot, with a RobotSpec.")
@@ -58,11 +47,11 @@ def load_bag(path: str | Path, spec: RobotSpec | None, mapping: TopicRoles) -> R
             "pose": _pose(bag, topics.get("pose") or topics["odom"], mapping),
         }
         if "pose" in topics and "odom" in topics:
-            data["odometry"] = _table(bag, topics["odom"], twist_row)
+            data["odometry"] = _table(bag, topics["odom"], msgs.twist_row)
         if topic := topics.get("joint_states"):
             data |= joint_streams(topic, bag.messages(topic), spec, mapping, bag.place)
         if "imu" in topics:
-            data["imu"] = _table(bag, topics["imu"], imu_row)
+            data["imu"] = _table(bag, topics["imu"], msgs.imu_row)
         latency = latency_of(bag, topics.get("odom"))
     made = streams(data, mapping.stamps, str(path))
     recording = Recording(**made, source=str(path), variables=spec.variable_names, latency=latency)
@@ -70,16 +59,15 @@ def load_bag(path: str | Path, spec: RobotSpec | None, mapping: TopicRoles) -> R
 
 
 def _table(
-    bag: BagFile, topic: str, row: Callable[[Any], Row], messages: Sequence[Message] | None = None
+    bag: BagFile, topic: str, row: Callable[[Any], msgs.Row], some: Sequence[Message] | None = None
 ) -> TopicData:
-    messages = bag.messages(topic) if messages is None else messages
+    messages = bag.messages(topic) if some is None else some
     receive, header = times_of(messages)
     values = np.array([row(m.content) for m in messages], dtype=np.float64)
     for k in np.flatnonzero(~np.isfinite(values).all(axis=1))[:1]:
-        raise RecordingError(
-            f"{bag.place}: topic {topic!r}: message {k} holds NaN or inf; find out why it was "
-            "sent, cut the bag there, or choose another topic."
-        )
+        fault = f"topic {topic!r}: message {k} holds NaN or inf"
+        advice = "find out why it was sent, cut the bag there, or choose another topic"
+        raise RecordingError(f"{bag.place}: {fault}; {advice}.")
     return TopicData(topic, receive, header, values)
 
 
@@ -87,12 +75,11 @@ def _command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
     for variable in spec.command:
         steered = bag.types[topic] in (roles.ACKERMANN, roles.ACKERMANN_STAMPED)
         if steered and variable.turns and not variable.steers:
-            raise RecordingError(
-                f"{bag.place}: topic {topic!r} holds steering angles [rad], but {variable.name!r} "
-                f"of robot {spec.name!r} is in {variable.unit}; choose the robot that drove, or "
-                "another topic."
-            )
-    data = _table(bag, topic, command_row)
+            fault = f"{bag.place}: topic {topic!r} holds steering angles [rad]"
+            other = f"{variable.name!r} of robot {spec.name!r} is in {variable.unit}"
+            advice = "choose the robot that drove, or another topic"
+            raise RecordingError(f"{fault}, but {other}; {advice}.")
+    data = _table(bag, topic, msgs.command_row)
     return replace(data, values=spec.from_cmd_vel(data.values))
 
 
@@ -100,15 +87,14 @@ def _pose(bag: BagFile, topic: str, mapping: TopicRoles) -> TopicData:
     messages = bag.messages(topic)
     if bag.types[topic] in (roles.TRANSFORM, roles.TRANSFORMS):
         messages = _of_one_body(bag, topic, messages, mapping)
-    quaternions = np.array([quaternion(m.content) for m in messages])
+    quaternions = np.array([msgs.quaternion(m.content) for m in messages])
     with np.errstate(over="ignore"):
         length = np.linalg.norm(quaternions, axis=1)
     for k in np.flatnonzero(~(np.abs(length - 1.0) < QUATERNION_TOLERANCE))[:1]:
-        raise RecordingError(
-            f"{bag.place}: topic {topic!r}: message {k}: the quaternion has the length "
-            f"{length[k]:.3f} and not 1; check its publisher, or choose another topic."
-        )
-    return _table(bag, topic, pose_row, messages)
+        fault = f"message {k}: the quaternion has the length {length[k]:.3f} and not 1"
+        advice = "check its publisher, or choose another topic"
+        raise RecordingError(f"{bag.place}: topic {topic!r}: {fault}; {advice}.")
+    return _table(bag, topic, msgs.pose_row, messages)
 
 
 def _of_one_body(
@@ -116,7 +102,7 @@ def _of_one_body(
 ) -> list[Message]:
     """Returns the transforms between the two frames of the mapping, or the only two frames."""
     single = [
-        (frames(transform), Message(message.receive_ns, transform))
+        (msgs.frames(transform), Message(message.receive_ns, transform))
         for message in messages
         for transform in getattr(message.content, "transforms", (message.content,))
     ]
@@ -131,10 +117,10 @@ def _of_one_body(
     problem = "several transforms" if pairs else "no transform"
     named = " with the given names" if any(wanted) else ""
     listed = ", ".join(sorted(f"{a} -> {b}" for a, b in there)) or "none"
-    raise RecordingError(
-        f"{bag.place}: topic {topic!r} holds {problem}{named}; write those of the robot into the "
-        f"topics file, as in `frame: world` and `child_frame: base_link`; it holds {listed}."
-    )
+    fault = f"{bag.place}: topic {topic!r} holds {problem}{named}"
+    example = "as in `frame: world` and `child_frame: base_link`"
+    advice = f"write those of the robot into the topics file, {example}"
+    raise RecordingError(f"{fault}; {advice}; it holds {listed}.")
 
 
 def joint_streams(
@@ -142,8 +128,8 @@ def joint_streams(
 ) -> dict[str, TopicData]:
     """Returns state and wheels, each if the joints show it; for errors see `state_of`."""
     joints = gather(topic, messages)
-    found = {"state": state_of(joints, spec, mapping, place)}
-    found["wheels"] = wheels_of(joints, mapping, place)
+    state, wheels = state_of(joints, spec, mapping, place), wheels_of(joints, mapping, place)
+    found = {"state": state, "wheels": wheels}
     return {name: data for name, data in found.items() if data is not None}
 
 
@@ -172,40 +158,37 @@ def gather(topic: str, messages: Sequence[Message]) -> Joints:
 
 
 def state_of(joints: Joints, spec: RobotSpec, mapping: TopicRoles, place: str) -> TopicData | None:
-    """Returns the measured state (T, S), from the messages that contain all of it.
+    """Returns the measured state (T, S); None without all its joints if each follows a command.
 
-    None if joints of some state variables are missing, but each follows a command. RecordingError
-    if a named joint does not exist, or a required state was not measured.
+    RecordingError if a named joint does not exist, or a required state was not measured.
     """
     known = [v.name for v in spec.state]
     for name in sorted(mapping.state.keys() - set(known)):
-        raise RecordingError(
-            f"{place}: topics: robot {spec.name!r} has no state {name!r}; {nearest(name, known)}"
-        )
+        fault = f"robot {spec.name!r} has no state {name!r}"
+        raise RecordingError(f"{place}: topics: {fault}; {nearest(name, known)}")
     sources = {v.name: _source(joints, v, mapping, place) for v in spec.state}
     found = [source for source in sources.values() if source is not None]
     if spec.state and len(found) == len(sources):
         columns = []
         for variable, source in zip(spec.state, found, strict=True):
-            usual = "position" if variable.unit in POSITION_UNITS else "velocity"
+            usual = "position" if variable.unit in msgs.POSITION_UNITS else "velocity"
             table = joints.position if (source.field or usual) == "position" else joints.velocity
             columns.append(source.scale * table[:, joints.names.index(source.joint)])
         return _complete(joints, np.stack(columns, axis=1), [s.joint for s in found], place)
     if mapping.state or any(v.follows is None for v in spec.state):
         missing = next(name for name, source in sources.items() if source is None)
-        raise RecordingError(
-            f"{place}: no joint is known for the state {missing!r}; the joints of "
-            f"{joints.topic!r} are {', '.join(joints.names) or 'none'}: name it in the topics "
-            f"file, as in state: {{{missing}: JOINT}}."
-        )
+        fault = f"no joint is known for the state {missing!r}"
+        listed = f"the joints of {joints.topic!r} are {', '.join(joints.names) or 'none'}"
+        advice = f"name it in the topics file, as in state: {{{missing}: JOINT}}"
+        raise RecordingError(f"{place}: {fault}; {listed}: {advice}.")
     return None
 
 
 def wheels_of(joints: Joints, mapping: TopicRoles, place: str) -> TopicData | None:
     """Returns the speeds (T, 2) of the left and right wheel; None without such joints."""
-    guesses = (_alike(joints.names, wheel) for wheel in WHEELS)
+    guesses = (_alike(joints.names, wheel) for wheel in msgs.WHEELS)
     chosen = list(mapping.wheels or (name for name in guesses if name is not None))
-    if len(chosen) < len(WHEELS):
+    if len(chosen) < len(msgs.WHEELS):
         return None
     values = joints.velocity[:, [_index(joints, name, place) for name in chosen]]
     if mapping.wheels is None and not np.isfinite(values).all(axis=1).any():
@@ -227,9 +210,8 @@ def _source(
 
 def _index(joints: Joints, name: str, place: str) -> int:
     if name not in joints.names:
-        raise RecordingError(
-            f"{place}: topic {joints.topic!r} has no joint {name!r}; {nearest(name, joints.names)}"
-        )
+        fault = f"topic {joints.topic!r} has no joint {name!r}"
+        raise RecordingError(f"{place}: {fault}; {nearest(name, joints.names)}")
     return joints.names.index(name)
 
 
@@ -243,19 +225,14 @@ def _alike(names: Iterable[str], wanted: str) -> str | None:
 def _complete(joints: Joints, values: Array, names: Sequence[str], place: str) -> TopicData:
     keep = np.asarray(np.isfinite(values).all(axis=1))
     if not keep.any():
-        raise RecordingError(
-            f"{place}: topic {joints.topic!r}: no message tells the position or velocity that is "
-            f"needed of {', '.join(names)}; check what the joints' driver publishes."
-        )
+        fault = f"no message tells the position or velocity that is needed of {', '.join(names)}"
+        advice = "check what the joints' driver publishes"
+        raise RecordingError(f"{place}: topic {joints.topic!r}: {fault}; {advice}.")
     return TopicData(joints.topic, joints.receive_ns, joints.header_ns, values).rows(keep)
 
 
 def latency_of(bag: BagFile, odom: str | None = None) -> Latency:
-    """Measures the delays of scan and odometry in a bag, by stamps of the recorder's own clock.
-
-    If a topic is missing, has too few messages or is stamped by another clock, its delay is
-    unknown. The odometry topic is by default the one of that type or name.
-    """
+    """Measures delays of scan and odometry by the recorder's own clock, as far as a bag shows."""
     odom = odom or _topic(bag, roles.ODOMETRY, "odom")
     return Latency(scan=_delay(bag, _topic(bag, SCAN, "scan")), odom=_delay(bag, odom))
 

@@ -31,19 +31,16 @@ LONGEST_ROW = 1000  # in characters
 def load_csv_folder(path: str | Path) -> Recording:
     """Reads a drive of a car, recorded as up to five CSV files without header lines.
 
-    `cmd.csv` (linear.x, angular.z) and `vrpn.csv` are required; wheels are read if both files
-    exist. The heading is the yaw of the quaternion. Commands and wheels are stamped by the robot's
-    clock, the pose by that of the motion capture; calibration estimates the offset between them.
-    RecordingError names the file, the row and the fix.
+    `cmd.csv` (linear.x, angular.z) and `vrpn.csv` are required, wheels are read in pairs. Pose and
+    robot have clocks of their own. RecordingError names the file, the row and the fix.
     """
     path = Path(path)
     if not path.is_dir():
         raise RecordingError(f"{path}: no such folder; check the path.")
     for name in REQUIRED:
         if not (path / name).is_file():
-            raise RecordingError(
-                f"{path}: the file {name!r} is missing; a folder needs {REQUIRED}."
-            )
+            fault = f"the file {name!r} is missing"
+            raise RecordingError(f"{path}: {fault}; a folder needs {REQUIRED}.")
     tables = {name: _read(path / name) for name in COLUMNS if (path / name).exists()}
     command, vrpn = tables["cmd.csv"], tables["vrpn.csv"]
     _check_units(path, tables)
@@ -52,12 +49,13 @@ def load_csv_folder(path: str | Path) -> Recording:
         left, right = tables["L_wheel.csv"], tables["R_wheel.csv"]
         at_left = np.interp(left[:, 1], right[:, 1], right[:, 0])
         wheels = Stream(left[:, 1], np.stack([left[:, 0], at_left], axis=1), ROBOT_CLOCK)
+    qx, qy, qz, qw = vrpn[:, 3:7].T
+    heading = np.arctan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy**2 + qz**2))
+    poses = np.stack([vrpn[:, 0], vrpn[:, 1], heading], axis=1)
     return Recording(
-        command=Stream(command[:, 2], command[:, :2], ROBOT_CLOCK),
-        pose=Stream(vrpn[:, 7] * 1e-9, _poses(vrpn), POSE_CLOCK),
-        wheels=wheels,
-        source=str(path),
-    )
+        Stream(command[:, 2], command[:, :2], ROBOT_CLOCK),
+        Stream(vrpn[:, 7] * 1e-9, poses, POSE_CLOCK), wheels=wheels, source=str(path),
+    )  # fmt: skip
 
 
 def _read(path: Path) -> Array:
@@ -69,17 +67,14 @@ def _read(path: Path) -> Array:
             raise ValueError("is empty; record the drive anew")
         table = np.array([_numbers(line, row, COLUMNS[path.name]) for line, row in rows])
         for k in np.flatnonzero(np.diff(table[:, -1]) < 0.0)[:1]:
-            raise ValueError(
-                f"row {rows[k + 1][0]}: time runs backwards ({table[k, -1]:.6f}, then "
-                f"{table[k + 1, -1]:.6f}); sort the rows, or cut the file there"
-            )
+            fault = f"time runs backwards ({table[k, -1]:.6f}, then {table[k + 1, -1]:.6f})"
+            raise ValueError(f"row {rows[k + 1][0]}: {fault}; sort the rows, or cut the file there")
         if path.name == "vrpn.csv":
             norm = np.linalg.norm(table[:, 3:7], axis=1)
             for k in np.flatnonzero(np.abs(norm - 1.0) > 0.05)[:1]:
-                raise ValueError(
-                    f"row {rows[k][0]}: the quaternion has the length {norm[k]:.3f} and not 1; "
-                    "check the order of the columns (x, y, z, qx, qy, qz, qw, time)"
-                )
+                fault = f"the quaternion has the length {norm[k]:.3f} and not 1"
+                advice = "check the order of the columns (x, y, z, qx, qy, qz, qw, time)"
+                raise ValueError(f"row {rows[k][0]}: {fault}; {advice}")
     except UnicodeDecodeError:
         why = "is not UTF-8 text; it must hold comma-separated numbers"
     except (OSError, csv.Error) as error:
@@ -106,28 +101,19 @@ def _lines(path: Path) -> list[str]:
 
 def _numbers(line: int, row: list[str], columns: tuple[str, ...]) -> list[float]:
     if len(row) != len(columns):
-        raise ValueError(
-            f"row {line} has {len(row)} columns where {len(columns)} are needed "
-            f"({', '.join(columns)}); mend the row, or remove it"
-        )
+        needed = f"{len(columns)} are needed ({', '.join(columns)})"
+        raise ValueError(f"row {line} has {len(row)} columns where {needed}; mend or remove it")
     values = []
     for name, text in zip(columns, row, strict=True):
         try:
             values.append(float(text))
         except ValueError:
-            raise ValueError(
-                f"row {line}: {name} is {text[:40]!r}, which is no number; mend the row, or "
-                "remove it (these files have no header)"
-            ) from None
+            fault = f"row {line}: {name} is {text[:40]!r}, which is no number"
+            advice = "mend the row, or remove it (these files have no header)"
+            raise ValueError(f"{fault}; {advice}") from None
     if not np.isfinite(values).all():
         raise ValueError(f"row {line} holds NaN or inf; remove the row")
     return values
-
-
-def _poses(vrpn: Array) -> Array:
-    qx, qy, qz, qw = vrpn[:, 3:7].T
-    heading = np.arctan2(2.0 * (qw * qz + qx * qy), 1.0 - 2.0 * (qy**2 + qz**2))
-    return np.stack([vrpn[:, 0], vrpn[:, 1], heading], axis=1)
 
 
 def _check_units(path: Path, tables: dict[str, Array]) -> None:
@@ -139,12 +125,8 @@ def _check_units(path: Path, tables: dict[str, Array]) -> None:
         lasted = np.ptp(table[:, -1]) * factor
         alike = seconds == 0.0 or 1 / MAX_DURATION_RATIO < lasted / seconds < MAX_DURATION_RATIO
         if seconds > MAX_DURATION_S or (not alike and step > SLOWEST_SAMPLING_S):
-            raise RecordingError(
-                f"{path / 'cmd.csv'}: lasts {seconds:.3g} s, with {step:.3g} s from one command to "
-                "the next; its stamps must be in seconds."
-            )
+            fault = f"lasts {seconds:.3g} s, with {step:.3g} s from one command to the next"
+            raise RecordingError(f"{path / 'cmd.csv'}: {fault}; its stamps must be in seconds.")
         if not alike:
-            raise RecordingError(
-                f"{path / name}: lasts {lasted:.3g} s where the commands last {seconds:.3g} s; "
-                f"its stamps must be in {unit}."
-            )
+            fault = f"lasts {lasted:.3g} s where the commands last {seconds:.3g} s"
+            raise RecordingError(f"{path / name}: {fault}; its stamps must be in {unit}.")

@@ -1,11 +1,10 @@
 """Excitation of a robot: a drive whose commands show its whole motion within a circle.
 
-A drive is a sequence of segments. At the end of each, the next is drawn at random: new levels for
-one or more commands, reached smoothly and held for a random time (amplitude-modulated
-pseudo-random steps; Nelles: Nonlinear System Identification, ch. 21). A segment is accepted only
-if the expected path stays within the circle and the robot can still turn back from its end. Rarely
-used levels are preferred, so that each command covers its range independently of the others, and
-so are end points from which a path leads close to the centre.
+A drive is a sequence of segments, each drawn at random: new levels for one or more commands,
+reached smoothly and held for a random time (amplitude-modulated pseudo-random steps; Nelles:
+Nonlinear System Identification, ch. 21). A segment is accepted only if the expected path stays
+within the circle and the robot can still turn back from its end. Rarely used levels and end points
+from which a path leads close to the centre are preferred.
 """
 
 from __future__ import annotations
@@ -52,9 +51,7 @@ ATTEMPTS = 8
 class Exploration:
     """Generator of a robot's commands, one per period, that tracks the robot's pose.
 
-    It drives within the circle of its plan around the start, which contains the whole robot, with
-    1 s of standstill at both ends, at up to the plan's share of the greatest speeds and rates;
-    angles use their full range.
+    It keeps the whole robot in the circle of its plan, and stands still for 1 s at both ends.
     """
 
     def __init__(self, plan: DrivePlan, rng: np.random.Generator) -> None:
@@ -186,13 +183,11 @@ class Exploration:
 
     def _ways_back(self, factor: Array) -> Array:
         """Returns constant commands (E, T, C) for turning back: half a turn by the fastest one."""
-        ends = [
-            sorted({low, rest, high})
-            for low, rest, high in zip(
-                np.minimum(factor * self.low, self.rest), self.rest,
-                np.maximum(factor * self.high, self.rest), strict=True,
-            )
-        ]  # fmt: skip
+        low, high = (
+            np.minimum(factor * self.low, self.rest),
+            np.maximum(factor * self.high, self.rest),
+        )
+        ends = [sorted(set(three)) for three in zip(low, self.rest, high, strict=True)]
         ways = np.array(list(product(*ends)))[:, None]
         first, last = round(WAY_S[0] / WAY_STEP_S), round(1.0 / WAY_STEP_S)
         poses, _ = self._roll(np.repeat(ways, first, axis=1), WAY_STEP_S)
@@ -290,10 +285,7 @@ class ExpectedMotion:
     twist: Callable[[Array, Array], Array]  # state, command -> body twist
 
     def roll(self, pose: Array, state: Array, command: Array, period: float) -> tuple[Array, Array]:
-        """Rolls out commands (K, T, C), one arc each at the state in the middle of its period [s].
-
-        Returns poses (K, T + 1, 3) and states (K, T + 1, S), the given ones first.
-        """
+        """Rolls commands (K, T, C) out to poses (K, T + 1, 3) and states; one arc a period [s]."""
         poses, states = [pose], [state]
         for n in range(command.shape[1]):
             now = command[:, n]
@@ -319,10 +311,9 @@ def expected_motion(spec: RobotSpec) -> ExpectedMotion:
         )
     for command in spec.command:
         if not command.is_twist:
-            raise ConfigError(
-                f"robot {spec.name!r}: where {command.name!r} in {command.unit} leads can't be "
-                "predicted; add `textbook:` and its `parameters:` to the robot's YAML file."
-            )
+            fault = f"where {command.name!r} in {command.unit} leads can't be predicted"
+            advice = "add `textbook:` and its `parameters:` to the robot's YAML file"
+            raise ConfigError(f"robot {spec.name!r}: {fault}; {advice}.")
     return ExpectedMotion(
         len(spec.state), lambda state, *_: state, lambda _, command: spec.to_cmd_vel(command)
     )
@@ -339,14 +330,12 @@ class DrivePlan:
     seed: int = 0  # of the pattern
 
     def __post_init__(self) -> None:
-        ranges = {
-            "bound": (self.robot.footprint_radius, 1000.0),
-            "duration": (SHORTEST_S, LONGEST_S),
-            "speed": (0.05, 1.0),
-        }
         checked_seeds(self.seed)
-        for name, (low, high) in ranges.items():
-            value = getattr(self, name)
+        for name, value, low, high in (
+            ("bound", self.bound, self.robot.footprint_radius, 1000.0),
+            ("duration", self.duration, SHORTEST_S, LONGEST_S),
+            ("speed", self.speed, 0.05, 1.0),
+        ):
             if not low <= value <= high:
                 raise ConfigError(f"{name} {value:g}: must be from {low:g} to {high:g}.")
 
@@ -355,10 +344,7 @@ class DrivePlan:
         return self._attempt(self._found[0])
 
     def preview(self) -> Pattern:
-        """Returns the pattern of the drive under the expected motion.
-
-        Raises ConfigError: the circle is too small for the robot to show its motion in it.
-        """
+        """Returns the pattern by the expected motion; ConfigError if the circle is too small."""
         return self._found[1]
 
     def _attempt(self, number: int) -> Exploration:
@@ -372,8 +358,6 @@ class DrivePlan:
             pattern = drive.expected() if drive.keep_within > 0.0 else None
             if pattern is not None:
                 return number, pattern
-        raise ConfigError(
-            f"bound {self.bound:g}: a circle of {self.bound:g} m around the start is too small "
-            f"for robot {self.robot.name!r} to show its motion within {self.duration:g} s; give "
-            "it more space, less speed, or more time."
-        )
+        circle = f"bound {self.bound:g}: a circle of {self.bound:g} m around the start is too small"
+        motion = f"for robot {self.robot.name!r} to show its motion within {self.duration:g} s"
+        raise ConfigError(f"{circle} {motion}; give it more space, less speed, or more time.")

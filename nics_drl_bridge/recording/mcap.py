@@ -62,10 +62,7 @@ class _View:
 
 
 def records(data: memoryview, place: int = 0) -> Iterator[Record]:
-    """Yields the records from an offset on, until the end of the data or a footer.
-
-    Raises DamageError: a record is truncated, of an unknown kind, or shorter than its fields.
-    """
+    """Yields the records from an offset until a footer or the end; DamageError at a broken one."""
     stream = _View(data, place)
     source = cast("IO[bytes]", stream)
     reader = StreamReader(source, skip_magic=True, emit_chunks=True, record_size_limit=None)
@@ -108,9 +105,8 @@ class McapSummary:
         found = record.content
         if isinstance(found, kinds.Message):
             if found.channel_id not in self.channels:
-                raise DamageError(
-                    record.offset, f"a message of the unknown channel {found.channel_id}"
-                )
+                fault = f"a message of the unknown channel {found.channel_id}"
+                raise DamageError(record.offset, fault)
             first, last = self.span or (found.log_time, found.log_time)
             self.span = min(first, found.log_time), max(last, found.log_time)
             self.counts[found.channel_id] += 1
@@ -175,8 +171,7 @@ class _Walk:
 def check_mcap(path: Path) -> None:
     """Checks a file (https://mcap.dev/spec) from its first byte to its last.
 
-    Counts, times and index must agree, and every checksum present must match. Raises DamageError:
-    it is truncated, a checksum is wrong, or two of its parts disagree.
+    DamageError: it is truncated, a checksum is wrong, or counts, times and index disagree.
     """
     if path.stat().st_size < len(MAGIC):
         raise DamageError(0, "the file is empty or ends at once")
@@ -185,9 +180,8 @@ def check_mcap(path: Path) -> None:
     if data[: len(MAGIC)] != MAGIC:
         raise DamageError(0, "it does not begin as an MCAP file")
     if end <= len(MAGIC) or data[end:] != MAGIC:
-        raise DamageError(
-            len(data), "it does not end as an MCAP file: it is cut off or was not closed"
-        )
+        fault = "it does not end as an MCAP file: it is cut off or was not closed"
+        raise DamageError(len(data), fault)
     for record in records(data[:end], len(MAGIC)):
         if record.offset == len(MAGIC) and not isinstance(record.content, kinds.Header):
             raise DamageError(record.offset, "the header is missing")
@@ -294,8 +288,7 @@ def _zstd() -> Any:
 def unpack(data: bytes, compression: str, most: int = MOST_UNPACKED) -> bytes:
     """Decompresses the content of a chunk by `lz4` or `zstd`: a few bytes can unpack to terabytes.
 
-    Raises ValueError: the result is larger than `most` bytes, or the data is truncated. Other
-    exceptions of the libraries on damaged data are passed on.
+    ValueError: cut off, or larger than `most` bytes; the libraries' own exceptions are passed on.
     """
     if compression == "zstd":
         unpacker = _zstd().ZstdDecompressor()

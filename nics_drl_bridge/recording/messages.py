@@ -32,10 +32,8 @@ WHEELS = ("left_wheel", "right_wheel")
 def check_libraries(path: Path, what: str, instead: str = "") -> None:
     """Raises RecordingError if a library that `reading` or `writing` a bag needs is missing."""
     for library in (each for each in LIBRARIES if find_spec(each) is None):
-        raise RecordingError(
-            f"{path}: {what} a bag needs the library {library}; install it with "
-            f"pip install 'nics_drl_bridge[bags]'{instead}."
-        )
+        advice = f"install it with pip install 'nics_drl_bridge[bags]'{instead}"
+        raise RecordingError(f"{path}: {what} a bag needs the library {library}; {advice}.")
 
 
 def typestore() -> Typestore:

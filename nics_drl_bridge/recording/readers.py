@@ -39,23 +39,19 @@ def read_recording(
 ) -> Recording:
     """Reads a recording of any of `FORMATS`; RecordingError if there is none, or it can't be read.
 
-    The robot defines the meaning of a bag's `cmd_vel` and joints; the roles of its topics are
-    guessed by default.
+    A bag needs the robot, for its `cmd_vel` and joints; its topics' roles are guessed by default.
     """
     path, topics = Path(path), topics or TopicRoles()
     found = next((each for each in FORMATS if each.recognises(path)), None)
     if topics != TopicRoles() and not (found and found.has_topics):
-        raise RecordingError(
-            f"{path}: is no bag; leave out --topics and --topic, which are for bags only."
-        )
+        advice = "leave out --topics and --topic, which are for bags only"
+        raise RecordingError(f"{path}: is no bag; {advice}.")
     if found is not None:
         return found.read(path, spec, topics)
     if not path.exists():
         raise RecordingError(f"{path}: no such file or folder; check the path.")
     if path.suffix == ROS_1:
-        raise RecordingError(
-            f"{path}: is a bag of ROS 1; make a rosbag2 of it with `rosbags-convert --src "
-            f"{path.name} --dst {path.stem}`."
-        )
+        command = f"rosbags-convert --src {path.name} --dst {path.stem}"
+        raise RecordingError(f"{path}: is a bag of ROS 1; make a rosbag2 of it with `{command}`.")
     names = " nor ".join(each.name for each in FORMATS)
     raise RecordingError(f"{path}: is neither {names}; give one of these.")

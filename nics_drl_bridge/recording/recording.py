@@ -87,10 +87,7 @@ class Samples:
 
 
 def samples_on_one_clock(t: Array, pose: Array, state: Array, command: Array) -> Samples:
-    """Builds Samples from poses of `base_link`, states and held commands with shared stamps [s].
-
-    There is a row for each step of about the median length; gaps and repeated stamps are omitted.
-    """
+    """Builds Samples of shared stamps [s], a row per regular step, without gaps and repetitions."""
     span = np.diff(t)
     dt = float(np.median(span[span > 0.0])) if (span > 0.0).any() else 0.0
     regular = np.abs(span - dt) < IRREGULAR * dt
@@ -114,11 +111,9 @@ def check(recording: Recording, spec: RobotSpec) -> Recording:
     backwards or has the wrong width, or the pose has wrong units.
     """
     if recording.variables and recording.variables != spec.variable_names:
-        raise RecordingError(
-            f"{recording.source}: is a drive of a robot with {', '.join(recording.variables)}; "
-            f"the robot {spec.name!r} has {', '.join(spec.variable_names)}: choose the robot that "
-            "drove."
-        )
+        problem = f"{recording.source}: is a drive of a robot with {', '.join(recording.variables)}"
+        advice = f"the robot {spec.name!r} has {', '.join(spec.variable_names)}"
+        raise RecordingError(f"{problem}; {advice}: choose the robot that drove.")
     width = {"command": len(spec.command), "state": len(spec.state), "wheels": 2}
     for name, stream in recording.streams.items():
         if fault := _fault(stream, width.get(name, 3)):
@@ -132,53 +127,40 @@ def _wrong_unit(pose: Stream, spec: RobotSpec) -> str:
     """Tells of a pose that only degrees, millimetres or milliseconds can explain."""
     turn = np.percentile(np.abs(geometry.wrap_angle(np.diff(pose.values[:, 2]))), 95)
     if turn > LARGEST_TURN:
-        return (
-            f"the heading jumps by {turn:.1f} rad between neighbouring samples; it must be in "
-            "radians (degrees look like this)"
-        )
+        reason = f"the heading jumps by {turn:.1f} rad between neighbouring samples"
+        return f"{reason}; it must be in radians (degrees look like this)"
     speeds = [v for v in spec.command if v.unit == "m/s"]
     fastest = max((max(abs(v.min), abs(v.max)) for v in speeds), default=np.inf)
     every = np.unique(np.searchsorted(pose.t, np.arange(pose.t[0], pose.t[-1], SPEED_OVER_S)))
     step, took = np.diff(pose.values[every, :2], axis=0), np.diff(pose.t[every])
     speed = np.percentile(np.hypot(*step.T) / np.maximum(took, 1e-9), 90) if len(took) else 0.0
     if speed > TOO_FAST * fastest:
-        return (
-            f"moves at {speed:.3g} m/s, a robot whose commands end at {fastest:g} m/s; positions "
-            "must be in metres and stamps in seconds"
-        )
+        reason = f"moves at {speed:.3g} m/s, a robot whose commands end at {fastest:g} m/s"
+        return f"{reason}; positions must be in metres and stamps in seconds"
     span = np.median(np.diff(pose.t))
     if span > SLOWEST_SAMPLING_S:
-        return (
-            f"there are {span:.3g} s between samples; stamps must be in seconds (milliseconds "
-            "look like this)"
-        )
+        reason = f"there are {span:.3g} s between samples"
+        return f"{reason}; stamps must be in seconds (milliseconds look like this)"
     return ""
 
 
 def _fault(stream: Stream, width: int) -> str:
     t, values = stream.t, stream.values
     if values.shape != (len(t), width):
-        return (
-            f"has the shape {values.shape} where ({len(t)}, {width}) is needed; check that the "
-            "recording is of this robot"
-        )
+        reason = f"has the shape {values.shape} where ({len(t)}, {width}) is needed"
+        return f"{reason}; check that the recording is of this robot"
     if len(t) < 2:
         return f"has {len(t)} samples; record a drive of 20 s or more"
     for row in np.flatnonzero(~np.isfinite(values).all(axis=1) | ~np.isfinite(t))[:1]:
         return f"row {row} holds NaN or inf; remove the row, or find out why it was recorded"
     for row in np.flatnonzero(np.diff(t) < 0.0)[:1]:
-        return (
-            f"time runs backwards at row {row + 1} ({t[row]:.6f} s, then {t[row + 1]:.6f} s); sort "
-            "the rows, or cut the file there"
-        )
+        reason = f"time runs backwards at row {row + 1} ({t[row]:.6f} s, then {t[row + 1]:.6f} s)"
+        return f"{reason}; sort the rows, or cut the file there"
     return ""
 
 
 def save_recording(recording: Recording, path: str | Path) -> None:
-    """Writes a recording as `.npz`: `NAME_t` and `NAME` per stream, and `meta` as JSON text.
-
-    A checksum follows the archive, which `numpy.load` reads nevertheless.
-    """
+    """Writes `.npz`: `NAME_t`, `NAME` per stream, JSON `meta`; a checksum follows the archive."""
     streams = recording.streams
     arrays: dict[str, NDArray[Any]] = {}
     for name, stream in streams.items():
@@ -197,10 +179,7 @@ def save_recording(recording: Recording, path: str | Path) -> None:
 
 
 def load_recording(path: str | Path) -> Recording:
-    """Reads a recording written by `save_recording`.
-
-    Raises RecordingError if there is no such file, or it is not an `.npz`, damaged or incomplete.
-    """
+    """Reads a recording of `save_recording`; RecordingError if it is missing or not a whole one."""
     try:
         data = files.read_file(no_device(Path(path)))
         arrays = _arrays(data)
@@ -211,26 +190,21 @@ def load_recording(path: str | Path) -> Recording:
         elif version == COMMENT_FORMAT and data[-64:] != files.sha256(data[:-64]).encode():
             raise ValueError("its checksum is missing or does not fit the rest")
         if version not in (FORMAT, COMMENT_FORMAT, UNSEALED_FORMAT):
-            raise RecordingError(
-                f"{path}: format {version!r} is not {FORMAT!r}; record it anew or use the version "
-                "of the package that wrote it."
-            )
+            advice = "record it anew or use the version of the package that wrote it"
+            raise RecordingError(f"{path}: format {version!r} is not {FORMAT!r}; {advice}.")
         streams = {
             name: Stream(arrays[f"{name}_t"].astype(float), arrays[name].astype(float), clock)
             for name, clock in meta["clocks"].items()
         }
-        latency, variables = (
-            Latency.model_validate(meta.get("latency", {})),
-            tuple(meta["variables"]),
-        )
+        latency = Latency.model_validate(meta.get("latency", {}))
+        variables = tuple(meta["variables"])
         return Recording(**streams, source=str(path), variables=variables, latency=latency)
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file; check the path.") from None
     except (AttributeError, KeyError, RecursionError, TypeError) as error:
-        raise RecordingError(
-            f"{path}: is not a recording of this package ({error}); write it with "
-            "nics_drl_bridge.recording.recording.save_recording."
-        ) from None
+        advice = "write it with nics_drl_bridge.recording.recording.save_recording"
+        said = f"{path}: is not a recording of this package ({error}); {advice}."
+        raise RecordingError(said) from None
     except (ValueError, OSError) as error:
         why = f"can't be read as .npz ({error}); it may be damaged"
         raise RecordingError(f"{path}: {why}.") from None

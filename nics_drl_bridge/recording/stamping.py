@@ -1,8 +1,7 @@
 """Stamps: time axis and clock of each stream of a bag.
 
-A message has two times: its receipt by the bag, and, if it has a header, the sender's stamp. The
-header's is better, since it has no transport jitter; but a Twist has none, and the sender's clock
-may differ from the recorder's.
+A message has two times: its receipt by the bag, and the sender's stamp in its header, if any. That
+one is better, without transport jitter, but the sender's clock may differ.
 """
 
 from __future__ import annotations
@@ -50,11 +49,10 @@ def streams(data: Mapping[str, TopicData], stamps: Stamps, place: str) -> dict[s
     """Assigns a time axis, which begins near 0, to each stream with messages.
 
     With `auto`, a stream is stamped by its headers if it has any. Headers less than 50 ms before
-    their receipt are of the recorder's clock, which also stamps streams without header (clock
-    `receive`). Others are of a foreign clock (`header`): their stamps are shifted by the median
-    delay, so that only a small offset is left for calibration. Command, state, wheels and IMU are
-    put on one clock, by receipt if need be. The few messages that arrived after one with a later
-    stamp are sorted, and those before a simulation's first time are dropped. RecordingError if
+    their receipt are of the recorder's clock (`receive`), as streams without header. Others are of
+    a foreign clock (`header`): shifted by the median delay, they leave a small offset for
+    calibration. Command, state, wheels and IMU share one clock, by receipt if need be. Late
+    messages are sorted; those before a simulation's first time are dropped. RecordingError if
     headers are missing, of several clocks, or run backwards.
     """
     if stamps != "receive":
@@ -110,16 +108,12 @@ def _header(part: TopicData, stamps: Stamps, place: str) -> Nanoseconds | None:
     ns, topic = part.header_ns, f"{place}: topic {part.topic!r}"
     if ns is None or not ns.any():
         if stamps == "header":
-            raise RecordingError(
-                f"{topic}: its messages have no header stamps; write `stamps: auto` into the "
-                "topics file."
-            )
+            fault = "its messages have no header stamps"
+            raise RecordingError(f"{topic}: {fault}; write `stamps: auto` into the topics file.")
         return None
     if not ns.all():
-        raise RecordingError(
-            f"{topic}: {(ns == 0).sum()} of {len(ns)} headers have no stamp; write `stamps: "
-            "receive` into the topics file."
-        )
+        fault = f"{(ns == 0).sum()} of {len(ns)} headers have no stamp"
+        raise RecordingError(f"{topic}: {fault}; write `stamps: receive` into the topics file.")
     return ns
 
 
@@ -136,11 +130,9 @@ def _in_order(part: TopicData, place: str) -> TopicData:
     late = np.maximum.accumulate(ns) - ns
     if np.mean(late > 0) > MAX_LATE or late.max() * S_PER_NS > MAX_WANDER_S:
         k = int(np.argmax(late > 0))
-        raise RecordingError(
-            f"{place}: topic {part.topic!r}: the header stamps run backwards at message {k}, by "
-            f"{late[k] * S_PER_NS:.3f} s; write `stamps: receive` into the topics file, or cut the "
-            "bag there."
-        )
+        fault = f"the header stamps run backwards at message {k}, by {late[k] * S_PER_NS:.3f} s"
+        advice = "write `stamps: receive` into the topics file, or cut the bag there"
+        raise RecordingError(f"{place}: topic {part.topic!r}: {fault}; {advice}.")
     return part.rows(np.argsort(ns, kind="stable"))
 
 

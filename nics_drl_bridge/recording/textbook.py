@@ -48,10 +48,7 @@ def record(
     dt: float = 0.01,
     hold: float = 0.5,
 ) -> Recording:
-    """Drives a textbook robot for a duration [s] and records command, pose and state without noise.
-
-    Commands, uniform within their limits, are drawn every `hold` [s], and sampled every `dt` [s].
-    """
+    """Records a textbook robot without noise; commands last `hold`, rows are `dt` apart [s]."""
     book = textbook(spec)
     inner = max(1, int(np.ceil(dt / INTEGRATION_STEP_S - 1e-9)))
     h, per_hold = dt / inner, round(hold / dt)

@@ -97,11 +97,7 @@ def topic_roles(file: str | Path | None = None, options: Iterable[str] = ()) -> 
 def assign(
     roles: TopicRoles, types: Mapping[str, str], empty: Collection[str], place: str
 ) -> dict[str, str]:
-    """Assigns topics to roles: a `cmd_vel`, and a `pose` or an `odom` or both.
-
-    RecordingError if a topic is missing, of a wrong type, or several fit a role; one sentence with
-    the available topics and the fix.
-    """
+    """Assigns topics to roles, named or guessed; RecordingError lists them if that is unclear."""
     table = _Topics(types, empty, place)
     found = {}
     for role in ROLES:
@@ -134,10 +130,8 @@ class _Topics:
             listed = self._listed((role,))
             raise RecordingError(f"{self.place}: {lack} topic {topic!r} ({role}); {listed}")
         if self.types[topic] not in TYPES[role]:
-            raise RecordingError(
-                f"{self.place}: the topic {topic!r} is of type {self.types[topic]}; {role} must "
-                f"be one of {', '.join(TYPES[role])}."
-            )
+            fault = f"{self.place}: the topic {topic!r} is of type {self.types[topic]}"
+            raise RecordingError(f"{fault}; {role} must be one of {', '.join(TYPES[role])}.")
         return topic
 
     def _guess(self, role: str) -> str | None:
@@ -149,10 +143,8 @@ class _Topics:
             if len(found) > 1:
                 without = "" if role == REQUIRED else f", or {role}={NONE} for none"
                 several = ", ".join(f"{t} ({self.types[t]})" for t in found)
-                raise RecordingError(
-                    f"{self.place}: each of several topics could be {role}: {several}; say which "
-                    f"with --topic {role}={found[0]}{without}."
-                )
+                fault = f"{self.place}: each of several topics could be {role}: {several}"
+                raise RecordingError(f"{fault}; say which with --topic {role}={found[0]}{without}.")
             if found:
                 return found[0]
         return None

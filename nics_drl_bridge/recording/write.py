@@ -19,15 +19,8 @@ from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.files import check_above, sync_folder
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.recording import messages as msgs
 from nics_drl_bridge.recording import topic_roles
-from nics_drl_bridge.recording.messages import (
-    POSITION_UNITS,
-    WHEELS,
-    Offer,
-    check_libraries,
-    profile_of,
-    typestore,
-)
 from nics_drl_bridge.recording.recording import Recording, Stream, save_recording
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -49,19 +42,16 @@ CHUNK_BYTES = 1 << 16  # damage costs a whole chunk, since each checksum covers 
 def check_out(path: str | Path) -> Path:
     """Checks an output path of a recording: an `.npz` file or the folder of a rosbag2.
 
-    Raises ConfigError: it exists already, or has another suffix. Raises RecordingError: it needs a
-    library that is missing.
+    ConfigError: it exists, or has another suffix. RecordingError: a library is missing.
     """
     path = Path(path)
     if path.exists():
         raise ConfigError(f"{path}: is there already; give another name, or remove it.")
     if path.suffix not in (NPZ, ""):
-        raise ConfigError(
-            f"{path}: unknown kind of recording {path.suffix!r}; name a file *{NPZ}, or the "
-            "folder of a rosbag2 without suffix."
-        )
+        advice = f"name a file *{NPZ}, or the folder of a rosbag2 without suffix"
+        raise ConfigError(f"{path}: unknown kind of recording {path.suffix!r}; {advice}.")
     if path.suffix != NPZ:
-        check_libraries(path, "writing", f", or name a file *{NPZ}")
+        msgs.check_libraries(path, "writing", f", or name a file *{NPZ}")
     return path
 
 
@@ -78,9 +68,8 @@ def write_bag(
 ) -> None:
     """Writes a recording as a bag, in a folder to create, that `load_bag` reads back.
 
-    Commands become `/cmd_vel`, the pose `/odom`; or `/pose` if it has a separate clock or if
-    there is odometry, whose twist is then in `/odom`. State, or else wheels, become
-    `/joint_states`, the IMU `/imu`. Headers contain the streams' stamps. For errors see `bag_sink`.
+    Commands become `/cmd_vel`, state or wheels `/joint_states`, the IMU `/imu`, the pose `/odom`;
+    or `/pose` on its own clock or beside odometry. For errors see `bag_sink`.
     """
     with bag_sink(path, storage) as sink:
         messages, command = _Messages(store := sink.store), recording.command
@@ -99,20 +88,21 @@ def _topics(
     recording: Recording, spec: RobotSpec, messages: _Messages
 ) -> Iterator[tuple[str, str, Stream, Make]]:
     beside = recording.odometry is not None or recording.pose.clock != recording.command.clock
-    joints, names, still = recording.wheels, list(WHEELS), np.zeros(len(WHEELS), dtype=bool)
+    joints, names, still = recording.wheels, list(msgs.WHEELS), np.zeros(2, dtype=bool)
     if recording.state is not None:
         joints, names = recording.state, [v.name for v in spec.state]
-        still = np.array([v.unit in POSITION_UNITS for v in spec.state])
-    pose = ("/odom", topic_roles.ODOMETRY, recording.pose, messages.odometry)
-    if beside:
-        pose = ("/pose", topic_roles.POSE, recording.pose, messages.pose_stamped)
+        still = np.array([v.unit in msgs.POSITION_UNITS for v in spec.state])
     topics: list[tuple[str, str, Stream | None, Make]] = [
         (
             "/cmd_vel", topic_roles.TWIST, recording.command,
             lambda _, row: messages.twist(spec.to_cmd_vel(row)),
         ),
-        pose,
-        ("/odom", topic_roles.ODOMETRY, recording.odometry, messages.speeds),
+        ("/pose", topic_roles.POSE, recording.pose, messages.pose_stamped) if beside
+        else ("/odom", topic_roles.ODOMETRY, recording.pose, messages.odometry),
+        (
+            "/odom", topic_roles.ODOMETRY, recording.odometry,
+            lambda header, row: messages.odometry(header, row, pose_known=False),
+        ),
         (
             "/joint_states", topic_roles.JOINTS, joints,
             lambda header, row: messages.joints(header, names, row * still, row * ~still),
@@ -152,15 +142,11 @@ class _Messages:
     def pose_stamped(self, header: Any, row: Array) -> Any:
         return self._new("geometry_msgs/PoseStamped", header, self._pose(row))
 
-    def odometry(self, header: Any, row: Array) -> Any:
-        return self._odometry(header, row, np.zeros(3), np.zeros(36))
-
-    def speeds(self, header: Any, row: Array) -> Any:
-        """Makes an odometry message of which only the twist was recorded."""
-        return self._odometry(header, np.zeros(3), row, np.append(-1.0, np.zeros(35)))
-
-    def _odometry(self, header: Any, pose: Array, twist: Array, pose_covariance: Array) -> Any:
-        where = self._new("geometry_msgs/PoseWithCovariance", self._pose(pose), pose_covariance)
+    def odometry(self, header: Any, row: Array, pose_known: bool = True) -> Any:
+        """Makes an odometry message of which only the pose or only the twist was recorded."""
+        pose, twist = (row, np.zeros(3)) if pose_known else (np.zeros(3), row)
+        covariance = np.append(0.0 if pose_known else -1.0, np.zeros(35))
+        where = self._new("geometry_msgs/PoseWithCovariance", self._pose(pose), covariance)
         speed = self._new("geometry_msgs/TwistWithCovariance", self.twist(twist), np.zeros(36))
         return self._new("nav_msgs/Odometry", header, FRAMES[1], where, speed)
 
@@ -180,7 +166,7 @@ class BagSink:
     """An open bag, created by `bag_sink` with an open writer of rosbags."""
 
     def __init__(self, writer: Writer) -> None:
-        self._writer, self.store = writer, typestore()  # the known message types
+        self._writer, self.store = writer, msgs.typestore()  # the known message types
         self._connections: dict[str, Connection] = {}
         self.counts: dict[str, int] = {}  # number of messages by topic
 
@@ -188,14 +174,13 @@ class BagSink:
         self,
         topic: str,
         kind: str,
-        offers: Sequence[Offer] = (),
+        offers: Sequence[msgs.Offer] = (),
         texts: Mapping[str, str] | None = None,
         definition: str | None = None,
     ) -> None:
         """Adds a topic with messages of a type such as `nav_msgs/msg/Odometry`.
 
-        A type that rosbags does not know needs the `.msg` texts of it and its components, or its
-        complete definition as stored in a bag.
+        A type unknown to rosbags needs `.msg` texts of it and its parts, or its whole definition.
         """
         from rosbags.typesys import get_types_from_msg
 
@@ -206,7 +191,7 @@ class BagSink:
         given = {} if kind in fields else {"msgdef": definition or "", "rihs01": NO_HASH}
         self._connections[topic] = self._writer.add_connection(
             topic, kind, typestore=self.store, **given,
-            offered_qos_profiles=[profile_of(offer) for offer in offers],
+            offered_qos_profiles=[msgs.profile_of(offer) for offer in offers],
         )  # fmt: skip
         self.counts[topic] = 0
 
@@ -233,13 +218,12 @@ class BagSink:
 def bag_sink(path: str | Path, storage: Storage = "mcap") -> Iterator[BagSink]:
     """Yields a bag to write to, a folder made at `path` when the block ends without error.
 
-    It is written to a hidden folder `.NAME.*` next to `path`. After an error nothing is left; a
-    killed process or a full disk leaves that folder, from which `salvage` recovers the flushed
-    messages. MCAP has checksums, so that any damage is found; SQLite has none. Raises
-    RecordingError: the folder exists already or can't be written, or a library is missing.
+    Until then it is in a hidden folder `.NAME.*` beside it, of which an error leaves nothing; after
+    a kill or on a full disk `salvage` recovers flushed messages. MCAP has checksums, SQLite has
+    none. RecordingError: the folder exists or can't be written, or a library is missing.
     """
     path = Path(path)
-    check_libraries(path, "writing")
+    msgs.check_libraries(path, "writing")
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     from nics_drl_bridge.recording.mcap import seal
@@ -261,10 +245,9 @@ def bag_sink(path: str | Path, storage: Storage = "mcap") -> Iterator[BagSink]:
             raise RecordingError(f"{path}: was made meanwhile; give the name of a new folder.")
         os.rename(unfinished, path)
     except OSError as error:
-        raise RecordingError(
-            f"{path}: {error.strerror or error}; what was written until then lies in {unfinished}, "
-            "save it with `nics bag salvage` where there is room."
-        ) from None
+        rest = f"what was written until then lies in {unfinished}"
+        advice = "save it with `nics bag salvage` where there is room"
+        raise RecordingError(f"{path}: {error.strerror or error}; {rest}, {advice}.") from None
     except BaseException:
         shutil.rmtree(beside)
         raise
