@@ -149,7 +149,7 @@ def builtin_model(robot: str) -> SimulatorModel:
 
 
 def open_model(name: str | Path) -> SimulatorModel:
-    """Opens a model by its folder, or that of a shipped robot (`ackermann`) or robot's YAML file."""
+    """Opens a model by its folder, by a shipped robot (`ackermann`), or by a robot's YAML file."""
     name = str(name)
     if Path(name).is_dir():
         return load_model(name)

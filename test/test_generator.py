@@ -12,7 +12,7 @@ import pytest
 from robots import circles, direct_model, field
 
 from nics_drl_bridge import generator
-from nics_drl_bridge.config import dump_yaml, parse_yaml
+from nics_drl_bridge.config import dump_yaml, find_config, parse_yaml
 from nics_drl_bridge.errors import BridgeError, ConfigError, ModelError
 from nics_drl_bridge.files import SUMS
 from nics_drl_bridge.generator import (
