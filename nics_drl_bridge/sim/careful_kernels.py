@@ -92,7 +92,6 @@ def _leave(
 
 @kernel
 def _within(p: int, b: int, until: float, moving: Moving) -> bool:
-    """True if robot p may come near body b within the substep."""
     world, flights, a = moving.world, moving.flights, moving.first + p
     dx, dy = world[a, X] - world[b, X], world[a, Y] - world[b, Y]
     paths = impact.speed_at(a, -1.0, flights) + impact.speed_at(b, -1.0, flights)
@@ -139,7 +138,6 @@ def _settle(
 def _arrive(
     n: int, any_moves: bool, motion: Dynamics, state: State, nearby: Nearby, single: Single
 ) -> None:
-    """Moves robots to the end of the substep, and rests the obstacles that stopped within it."""
     bodies, velocity, start = state.bodies[n], state.velocity[n], single.start
     for m in range(nearby.meets.shape[0]):
         if nearby.meets[m] != contacts.FREE:

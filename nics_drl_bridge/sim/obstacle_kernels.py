@@ -1,15 +1,14 @@
-"""Compiled motion of obstacles: one call at reset, and one per world and control period.
+"""Compiled motion of obstacles, each a circle: one call at reset, and one per world and period.
 
-The columns of the obstacles' memory `marks` and of their plans are in `separation_kernels`. Each
-obstacle is represented by its enclosing circle. All draws depend on seed, step and k alone.
+The columns of `marks` and plans are in `separation_kernels`; draws depend on seed, step and k
+alone.
 
-Pedestrians move by the social force model of Helbing and Molnar (1995), "Social force model for
-pedestrian dynamics", Phys. Rev. E 51, 4282; equation numbers are theirs. A walker is driven towards
-its goal (2), repelled by others along ellipses that anticipate their next step (3, 4) and by walls
-(5), less by what is out of sight (8), and disturbed by a fluctuation. Bodies are discs of any size,
-so distances are between surfaces. The anticipated step is that of the relative motion (Johansson,
-Helbing, Shukla 2007): with the other's motion alone, a walker reacts too late to a robot that
-stands in its way, and pushes against it.
+Pedestrians move by the social force model of Helbing and Molnar (1995), Phys. Rev. E 51, 4282,
+whose equation numbers are used: a drive towards the goal (2), repulsion by others along ellipses
+that anticipate their next step (3, 4) and by walls (5), less by what is out of sight (8), and a
+fluctuation. Distances are between surfaces. The anticipated step is that of the relative motion
+(Johansson, Helbing, Shukla 2007): with the other's motion alone, a walker pushes against a robot
+that stands in its way.
 """
 
 from __future__ import annotations
@@ -36,8 +35,7 @@ STRONGEST = 5.0  # Greatest acceleration [m/s^2]: people reach no more, and the 
 ARRIVED = 0.3  # A goal is reached within this distance [m]
 ROOM = 0.2  # Free space around a walker at a new goal [m]
 LEAST_WALK = 1.0  # Least distance of a new goal [m], if such a goal is found
-PATIENCE = 5.0
-"""A walker gives up a goal after twice the time of the straight path plus this time [s]."""
+PATIENCE = 5.0  # A goal is given up after twice the time of the straight path plus this [s]
 CANDIDATES = 16
 
 
@@ -65,11 +63,10 @@ def begin(n: int, state: State, plans: Array) -> None:
 
 @kernel
 def steer(n: int, state: State, scene: Surroundings, period: float, speeds: Array) -> None:
-    """Sets the velocities of the obstacles of world n for the period [s] that begins.
+    """Sets the obstacles' velocities for a period [s]; `speeds` (M, 2) are the robots' [m/s].
 
-    Moving by its velocity for the period, an obstacle neither leaves the field nor crosses a wall
-    nor touches another obstacle, and does not run into a robot that keeps its velocity; `speeds`
-    (M, 2) are the robots' [m/s] in `map`.
+    An obstacle then neither leaves the field nor touches a wall or another obstacle, nor runs into
+    a robot that keeps its velocity.
     """
     velocity, seed, step, movers = state.velocity[n], state.seeds[n], state.steps[n], scene.movers
     count, plans, bodies = velocity.shape[0], movers.plans, state.bodies[n]

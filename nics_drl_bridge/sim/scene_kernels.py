@@ -1,12 +1,9 @@
 """Compiled drawing of scenes: obstacles, starts and goals of one seed after the other.
 
-The scene of a seed does not depend on the batch: every number is drawn from its own counter.
-Obstacles are placed one after the other where they overlap nothing, then starts and goals in pairs;
-if placement fails, the scene is restarted with fresh numbers. Points are drawn in the cells of a
-grid that are known to be free; free poses are decided by true distances between outlines.
-
-Shared arguments: `seed` and `counter` are those of the next draw, `plan` is the ScenePlan of the
-world, `scratch` the SceneScratch, `disc` a body without corners.
+Every number is drawn from its own counter, so a seed's scene is the same in any batch. Obstacles
+are placed one by one where they overlap nothing, in cells known to be free, then starts and goals
+in pairs; if that fails, with fresh numbers. Shared arguments: `seed` and `counter` are those of the
+next draw, `plan` is the ScenePlan, `scratch` the SceneScratch, `disc` a body without corners.
 """
 
 from __future__ import annotations
@@ -26,12 +23,10 @@ from nics_drl_bridge.sim.state import Array, Integers, MapField
 
 TRIES = 2000
 RESTARTS = 50
-DETOURS = 4
-"""Number of pairs of start and goal without a path after which the obstacles are redrawn."""
+DETOURS = 4  # Pairs of start and goal without a path after which the obstacles are redrawn
 MARGIN = 1e-9  # Least distance of obstacles from walls and from each other [m]
 DRAWN, NO_OBSTACLES, NO_ROBOTS = 0, 1, 2
-LEAST, GREATEST, GAP, FIRST_SHAPE, SHAPES, FIXED, MOVING, GROUP = range(8)
-"""Columns of a group of obstacles."""
+LEAST, GREATEST, GAP, FIRST_SHAPE, SHAPES, FIXED, MOVING, GROUP = range(8)  # columns of a group
 X1, Y1, X2, Y2, LEAST_HEADING, GREATEST_HEADING, SHARE, PLACE = range(8)
 """Columns of a place: a region [m], headings [rad], cumulative share of the places up to it."""
 

@@ -272,7 +272,7 @@ def _cells_of(world: World) -> MapField:
 
 def _centres(cells: MapField) -> Array:
     rows, columns = np.indices(cells.distances.shape) + 0.5
-    return np.array(kernels.place_in.py_func(rows, columns, cells))
+    return np.array(kernels.place_in.py_func(rows, columns, cells))  # type: ignore[attr-defined]
 
 
 def _large_enough(area: NDArray[np.int32], cell: float, least: float) -> NDArray[np.int32]:

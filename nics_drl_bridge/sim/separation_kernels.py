@@ -24,10 +24,7 @@ from nics_drl_bridge.sim.state import Array, MapField
     RELAXATION, REPULSION, RANGE, WALL_REPULSION, WALL_RANGE, FORESIGHT, VIEW, BEHIND,
     FLUCTUATION, PLAN,
 ) = range(17)  # fmt: skip
-
-# Values of the column KIND.
-STILL, WANDER, PATROL, PEDESTRIAN = range(4)
-
+STILL, WANDER, PATROL, PEDESTRIAN = range(4)  # values of the column KIND
 # Memory of an obstacle, a row of marks (N, K, F).
 SPEED, VX, VY, DIRECTION, AIM, GOAL_X, GOAL_Y, UNTIL, INDEX, WAY, REST, MARK = range(12)
 

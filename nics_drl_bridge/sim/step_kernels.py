@@ -64,10 +64,7 @@ def _send(history: Array, commands: Array, begin: int) -> None:
 
 @kernel
 def move_freely(begin: int, end: int, state: State, motion: Dynamics, lanes: Lanes) -> None:
-    """Moves the robots of the worlds [begin, end) over one period as if nothing were in the way.
-
-    The results stay in the lanes: robot m of world n is in lane (n - begin) M + m.
-    """
+    """Moves robot m of world n of [begin, end) one period freely, in lane (n - begin) M + m."""
     robots, size = state.pose.shape[1], state.state.shape[2]
     substeps, history = motion.substeps, state.history
     where, x, late = lanes.pose, lanes.x, lanes.late
