@@ -16,12 +16,11 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.sectors import layout_of
 from nics_drl_bridge.lidar.sensor import Sensor
 
-TASKS = {
+TASKS = {  # module and class of each
     "navigation": "nics_drl_bridge.env.navigation:Navigation",
     "cooperative_reaching": "nics_drl_bridge.env.teams:CooperativeReaching",
     "pursuit_evasion": "nics_drl_bridge.env.teams:PursuitEvasion",
 }
-"""Module and class of each shipped task."""
 
 
 def make_task(
@@ -29,9 +28,8 @@ def make_task(
 ) -> Task:
     """Makes a task for the robot of a model. Raises ConfigError if it does not fit.
 
-    The task is the name of a shipped one (`navigation`), `path/to/file.py:ClassName`, a class, or a
-    Task. Options are further arguments of the class; `scan` may also be a number of sectors, the
-    name of a layout or its fields, see `sectors.layout_of`; `sensors` are names.
+    `task` is the name of a shipped one (`navigation`), `path/to/file.py:ClassName`, a class, or a
+    Task. Options are arguments of the class; `scan` as in `sectors.layout_of`; `sensors` are names.
     """
     if isinstance(task, Task):
         return _checked(task, model, options)
@@ -71,12 +69,11 @@ def _check_options(found: type[Task], options: dict[str, Any]) -> None:
             raise ConfigError(f"task option {name}={value!r}: must be {KINDS[kind][1]}.")
 
 
-KINDS: dict[str, tuple[tuple[type, ...], str]] = {
+KINDS: dict[str, tuple[tuple[type, ...], str]] = {  # annotation -> types, name in errors
     "bool": ((bool, np.bool_), "True or False"),
     "int": ((int, np.integer), "a whole number"),
     "float": ((int, np.integer, float, np.floating), "a finite number"),
 }
-"""Annotation of an option -> its types, and their name in errors."""
 
 
 def _fits(value: Any, kind: str) -> bool:
@@ -92,9 +89,8 @@ def _checked(task: Task, model: SimulatorModel, options: dict[str, Any] | None) 
         raise ConfigError(f"task {name} is already made; give {sorted(options)} to it, not beside.")
     if task.robot != model.robot or task.lidar != model.lidar:
         raise ConfigError(
-            f"task {name} is of the robot {task.robot.name!r} with {task.lidar.beams} beams, the "
-            f"model of {model.robot.name!r} with {model.lidar.beams}; make it with model.robot and "
-            "model.lidar."
+            f"task {name} is of the robot {task.robot.name!r} with {task.lidar.beams} beams, not "
+            f"of {model.robot.name!r} with {model.lidar.beams}; give it the model's own."
         )
     return task
 
@@ -120,11 +116,10 @@ NAVIGATION = "NicsBridge/Navigation-v0"
 COOPERATIVE_REACHING = "NicsBridge/CooperativeReaching-v0"
 PURSUIT_EVASION = "NicsBridge/PursuitEvasion-v0"
 TASK = "NicsBridge/Task-v0"
-ENVIRONMENTS = {
+ENVIRONMENTS = {  # id -> arguments that define it
     NAVIGATION: {"task": "navigation"}, COOPERATIVE_REACHING: {"task": "cooperative_reaching"},
     PURSUIT_EVASION: {"task": "pursuit_evasion"}, TASK: {},
 }  # fmt: skip
-"""Id -> arguments that define the environment."""
 MAX_EPISODE_STEPS = 300
 
 

@@ -60,10 +60,7 @@ def along(angle, corners, radius, distance, cos, sin):  # type: ignore[no-untype
 
 @kernel(allocates=True)
 def row(fine, beams, corners, radius, distance, cos, sin, edge):  # type: ignore[no-untyped-def]
-    """Writes ranges (P,) [m] of a shape straight ahead, continued beyond its edges (2,) [rad].
-
-    Corners (V, 2) [m], none for a circle, turned by (cos, sin), with the origin at a distance [m].
-    """
+    """Writes ranges (P,) [m] of a shape straight ahead, continued beyond its edges (2,) [rad]."""
     fine[:] = np.inf
     if corners.shape[0] == 0:
         exact_kernels.circle(fine, beams, distance, 0.0, radius, np.inf)
@@ -116,10 +113,7 @@ def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # 
 
 @kernel(allocates=True)
 def incidences(angles, step, corners, radius, distance, c, s):  # type: ignore[no-untyped-def]
-    """Cosines (P,) of the incidence on a shape straight ahead, 0 where a ray misses it.
-
-    On a segment, where it is nearest, it is the distance of its line over the range.
-    """
+    """Cosines (P,) of the incidence on a shape straight ahead, 0 where a ray misses it."""
     directions = np.stack((np.cos(angles), np.sin(angles)), axis=1)
     beams, count = Beams(directions, angles[0], step, False), len(angles)
     nearest, cosines = np.full(count, np.inf, np.float32), np.zeros(count, np.float32)

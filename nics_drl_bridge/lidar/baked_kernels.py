@@ -138,8 +138,7 @@ def seen_at(dx, dy, c, s):  # type: ignore[no-untyped-def]
 def silhouette(pair, hull, shape, hulls, seen, side):  # type: ignore[no-untyped-def]
     """Direction of the right (side 1) or left (-1) silhouette of a shape from its bearing [rad].
 
-    It may be either corner of a pair, from the first one `hull` on; a negative one is minus the
-    stride of climbing the hull from the other.
+    It is either corner of a pair; a negative one is minus the stride of climbing from the other.
     """
     first, other = hull + (pair & 0xFFFF), pair >> 16
     if other < 0:

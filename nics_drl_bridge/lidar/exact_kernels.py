@@ -146,7 +146,6 @@ def edge(out, beams, x1, y1, angle1, x2, y2, angle2, one_sided):  # type: ignore
 
 @kernel(inline=True)
 def _cross(out, directions, begin, end, cross, ex, ey):  # type: ignore[no-untyped-def]
-    """Fuses a straight line into the beams from `begin` to `end`, in a vectorised loop."""
     for k in range(end - begin):
         i = np.uintp(begin + k)
         distance = np.float32(cross / (directions[i, 0] * ey - directions[i, 1] * ex))

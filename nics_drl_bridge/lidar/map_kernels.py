@@ -61,7 +61,6 @@ def free_squares(blocked):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def _line(at, step, cell):  # type: ignore[no-untyped-def]
-    """Distance along a beam to where it leaves `cell` along one axis [cells]."""
     if step == 0.0:
         return np.inf
     return (cell + (1 if step > 0.0 else 0) - at) / step

@@ -100,5 +100,4 @@ def _seen(r, direction, plan):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def _nearer(one, other):  # type: ignore[no-untyped-def]
-    """Returns the lesser of two; `other` if `one` is NaN."""
     return one if one <= other else other

@@ -26,8 +26,8 @@ from nics_drl_bridge.lidar.shapes import Shape
 
 Array = NDArray[np.float64]
 Readings = NDArray[np.float32]
+# Topics of a robot that are no sensor's.
 TAKEN = ("scan", "odom", "pose", "imu", "joint_states", "ground_truth", "cmd_vel")
-"""Topics of a robot that are no sensor's."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class SensedWorlds:
     renderer: Renderer  # of the lidar
 
 
+# Writes the readings (N, M, S) of some worlds (n,) in place, of all their robots.
 Render = Callable[[Readings, NDArray[np.int64]], None]
-"""Writes the readings (N, M, S) of some worlds (n,) in place, of all their robots."""
 
 
 class Sensor(Schema, ABC):
@@ -105,10 +105,7 @@ class Sensor(Schema, ABC):
 
 
 def sensor_of(given: Sensor | Mapping[str, Any]) -> Sensor:
-    """Returns a sensor, made from its entries if it is none yet.
-
-    Raises ConfigError: an unknown kind, or wrong entries.
-    """
+    """Returns a sensor, made from its entries if it is none. Raises ConfigError if it can't be."""
     if isinstance(given, Sensor):
         return given
     if not isinstance(given, Mapping) or "kind" not in given:
@@ -156,9 +153,5 @@ def _validated(given: Any) -> Sensor:
         raise ValueError(str(error)) from None
 
 
-AnySensor = Annotated[
-    Sensor,
-    PlainValidator(_validated),
-    PlainSerializer(lambda sensor: sensor.model_dump(mode="json"), return_type=dict),
-]
-"""A sensor of any kind, as a field of a schema."""
+_dumped = PlainSerializer(lambda sensor: sensor.model_dump(mode="json"), return_type=dict)
+AnySensor = Annotated[Sensor, PlainValidator(_validated), _dumped]  # a field of a schema

@@ -22,23 +22,16 @@ state as a share of its range [1 / sqrt(s)]."""
 LEAST_TWIST_STD = LEAST_POSE_STD = START_STD = 1e-3
 """Lower bounds on the standard deviations of a twist [m/s, rad/s] and of a pose [m, rad], and that
 of the pose at a reset."""
-GYRO_STD = 0.02
-"""Standard deviation of a yaw rate without a covariance [rad/s]: a cheap gyro with its bias."""
+GYRO_STD = 0.02  # of a yaw rate without a covariance [rad/s]: a cheap gyro with its bias
+# Gates on the squared, normalised innovation: 99.9 % of chi-squared with 3, 1 degrees of freedom.
 GATE = {Kind.TWIST: 16.27, Kind.YAW_RATE: 10.83, Kind.POSE: 16.27}
-"""Gate on the squared, normalised innovation, exceeded once in a thousand measurements. (99.9 % of
-chi-squared with three degrees of freedom, or one.)"""
+# Consecutive outliers after which they are believed. A gyro never is: odometry has precedence.
 PATIENCE: dict[Kind, float] = {Kind.TWIST: 3, Kind.YAW_RATE: np.inf, Kind.POSE: 5}
-"""Number of consecutive outliers after which they are believed. A gyro never is: odometry has
-precedence."""
-NEWS = 0.5
-"""Possible error of the state of a robot that is stuck or pushed, as a share of its range."""
-REACHABLE = 2.0
-"""States and commands are limited to this many times their range: the model is invalid beyond."""
+NEWS = 0.5  # Possible error of the state of a stuck or pushed robot, as a share of its range
+REACHABLE = 2.0  # States and commands are cut at this many times their range
 FARTHEST = 1e8  # Innovations beyond this [m, rad, m/s, rad/s] are never believed
-ANYWHERE = (100.0, 100.0, np.pi)
-"""Standard deviation of the pose in the map of a pose sensor, by odometry alone [m, rad]."""
-LONGEST_GAP_S = 10.0
-"""Longest gap that is predicted [s]: in a longer one, the robot may have driven anywhere."""
+ANYWHERE = (100.0, 100.0, np.pi)  # Std of a pose in a pose sensor's map, by odometry [m, rad]
+LONGEST_GAP_S = 10.0  # Longest gap that is predicted [s]: beyond, the robot may be anywhere
 
 
 class Estimator:
@@ -141,9 +134,8 @@ class Estimator:
 
     def at(self, time_ns: int) -> tuple[Array, Array]:
         """Predicts pose (3,) and body twist (3,) at a time, without moving the estimate."""
-        mean, twist = kernels.look_ahead(
-            self._filter.x, self.time_ns, time_ns, self._motion, self._log
-        )
+        now, motion = self.time_ns, self._motion
+        mean, twist = kernels.look_ahead(self._filter.x, now, time_ns, motion, self._log)
         return mean[:3], twist
 
     def predict(self, time_ns: int) -> None:
@@ -170,12 +162,10 @@ class Estimator:
             self._foreseen = foreseen._replace(update=(trial.K, trial.P))
 
     def _forecast(self, time_ns: int) -> Foreseen:
-        own, motion, log = self._filter, self._motion, self._log
-        mean, covariance = kernels.forecast(
-            own.x, own.P, self._process, self.time_ns, time_ns, motion, log
-        )
-        if time_ns - self.time_ns > motion.longest_ns:
-            covariance = self.unseen.doubted(covariance, (time_ns - self.time_ns) / NS_PER_S)
+        own, motion, log, now = self._filter, self._motion, self._log, self.time_ns
+        mean, covariance = kernels.forecast(own.x, own.P, self._process, now, time_ns, motion, log)
+        if time_ns - now > motion.longest_ns:
+            covariance = self.unseen.doubted(covariance, (time_ns - now) / NS_PER_S)
         return Foreseen(time_ns, mean, covariance, kernels.expect(mean, time_ns, motion, log))
 
     def update(self, kind: Kind, value: ArrayLike, std: ArrayLike | None = None) -> Judgement:
@@ -229,7 +219,6 @@ class Estimator:
         return Judgement(distance, outcome)
 
     def _expect(self, kind: Kind) -> tuple[Array, Array]:
-        """Returns the expected measurement (n,) and its derivative (n, 3 + S)."""
         if kind is Kind.POSE:
             return self._filter.x[:3], self._observe_pose
         if (here := self._foreseen_here) is not None:

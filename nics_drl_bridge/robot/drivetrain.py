@@ -2,10 +2,8 @@
 
 Commands are identified by their field of `cmd_vel`, speed and steering angle in the state by their
 units. An actuator is of first order (parameters `wheel_lag`, `speed_lag`, `steering_lag` [s]) or
-rate-limited (`wheel_rate`, `speed_rate`, `steering_rate` [its unit/s]).
-
-Siegwart, Nourbakhsh, Scaramuzza: Introduction to Autonomous Mobile Robots, ch. 3; the paper's
-reference for Table I.
+rate-limited (`wheel_rate`, `speed_rate`, `steering_rate` [its unit/s]). Siegwart, Nourbakhsh,
+Scaramuzza: Introduction to Autonomous Mobile Robots, ch. 3; the paper's reference for Table I.
 """
 
 from __future__ import annotations
@@ -67,7 +65,6 @@ def wheeled(
 
 
 def _commands(spec: RobotSpec, fields: tuple[CmdVelField, ...]) -> list[int]:
-    """Returns the indices of the commands for fields of `cmd_vel`; in order if they name none."""
     have = [c.cmd_vel for c in spec.command]
     if not any(have):
         return list(range(len(have)))

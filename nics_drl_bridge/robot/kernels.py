@@ -31,8 +31,7 @@ class Terms(NamedTuple):
 
     dof: NDArray[np.int64]  # (T,) degree of freedom of each
     coefficient: Array  # (T,), or (T, n) of n robots
-    # (T, order) indices into `x`; unused ones point to its last entry, which is 1
-    factors: NDArray[np.int64]
+    factors: NDArray[np.int64]  # (T, order) indices into `x`; unused ones of its last entry, 1
     degree: NDArray[np.int64]  # (T,) number of factors
 
 
@@ -99,7 +98,6 @@ def _chord(vx, vy, a, b, dt):  # type: ignore[no-untyped-def]
 
 @kernel
 def _end(x, y, c, s, ahead, aside, sine, versine):  # type: ignore[no-untyped-def]
-    """Returns position and direction at the end of a chord, after a turn of that sine."""
     x, y = x + (c * ahead - s * aside), y + (s * ahead + c * aside)
     return x, y, c - (c * versine + s * sine), s - (s * versine - c * sine)
 

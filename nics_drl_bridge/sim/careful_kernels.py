@@ -40,7 +40,6 @@ def rates_at(n: int, m: int, j: int, state: State, motion: Dynamics, single: Sin
 
 @kernel
 def _fly(body: Array, base: Array, flight: Array, time: float, series: Array) -> None:
-    """Writes to `body` (7,) a robot that began at `base` (7,), after `time` [s]."""
     turn = flight[TURN] * time
     body[X], body[Y], body[COS], body[SIN] = move(
         base[X], base[Y], base[COS], base[SIN], flight[VX], flight[VY], turn, time, series
@@ -75,7 +74,6 @@ def _first_touch(
 def _leave(
     m: int, until: float, scene: Surroundings, nearby: Nearby, single: Single, moving: Moving
 ) -> None:
-    """Moves a robot that overlaps something for as long as it gets no deeper."""
     world, events, me = moving.world, single.events, moving.first + m
     flight = moving.flights[me]
     path = math.sqrt(flight[VX] ** 2 + flight[VY] ** 2) + abs(flight[TURN]) * world[me, RADIUS]
@@ -209,7 +207,6 @@ def move_carefully(
 def _check_overlap(
     m: int, scene: Surroundings, nearby: Nearby, single: Single, touched: Array, moving: Moving
 ) -> None:
-    """Records how deep robot m overlaps anything as the period begins; marks it if it does."""
     events, body = single.events, moving.world[moving.first + m]
     depth, whom = contacts.contact(
         body, m, moving.world, scene, nearby, single.spare, 2.0 * impact.NOTHING

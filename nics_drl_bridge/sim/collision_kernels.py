@@ -126,7 +126,6 @@ def _next_cut(ax, ay, ex, ey, after, q):  # type: ignore[no-untyped-def]
 
 @kernel
 def _deepest(p, q):  # type: ignore[no-untyped-def]
-    """Depth of the edges of outline p within outline q [m]; 0 if they do not overlap."""
     depth = 0.0
     if q.end - q.begin == 2:
         return depth

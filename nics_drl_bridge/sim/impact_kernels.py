@@ -6,9 +6,8 @@ their nearest points, a corner approaches by at most its velocity times the time
 greatest acceleration times the time squared. The bound is exact to first order, so that sliding
 along a wall takes few iterations, and no contact is missed at any speed.
 
-Two features touch when they are within `SLACK` and approach each other. Bodies that overlap at the
-outset are up to `careful_kernels`. Times are in the substep [s]; body -1 is the map, which is
-still.
+Features touch when they are within `SLACK` and approach each other; bodies that overlap before are
+left to `careful_kernels`. Times are in the substep [s]; body -1 is the map.
 """
 
 from __future__ import annotations
@@ -143,7 +142,6 @@ def _reach(edge: Edge) -> float:
 
 @kernel
 def _next_stop(b: int, time: float, until: float, flights: Array) -> float:
-    """Returns when a body stops, if it does between two times; otherwise the later one."""
     return flights[b, STOP] if b >= 0 and time < flights[b, STOP] < until else until
 
 
@@ -215,7 +213,6 @@ def _edges(outline: collision.Outline) -> int:
 
 @kernel
 def _edge_of(v: int, outline: collision.Outline) -> Edge:
-    """Returns edge v of an outline, or the origin of a circle's, which has none."""
     corners, begin, end = outline.corners, outline.begin, outline.end
     if begin == end:
         return Edge(0.0, 0.0, 0.0, 0.0)

@@ -127,7 +127,6 @@ def _within(x, y, space):  # type: ignore[no-untyped-def]
 
 @kernel
 def _clear_of_walls(body, room, plan, spare):  # type: ignore[no-untyped-def]
-    """True if a body lies in the field and keeps `room` [m] from walls and map."""
     space, outlines = plan.space, plan.outlines
     inside, low, high = _within(body[X], body[Y], space)
     if inside and low >= body[RADIUS] + room:
@@ -159,7 +158,6 @@ def _clear_of(body, other, room, outlines, spare):  # type: ignore[no-untyped-de
 
 @kernel
 def _is_clear(x, y, room, moving, plan, bodies, scratch):  # type: ignore[no-untyped-def]
-    """True if a robot at a point keeps `room` [m] from all static, or also `moving`, obstacles."""
     disc = scratch.disc
     disc[X], disc[Y] = x, y
     for k in range(bodies.shape[0]):
@@ -247,7 +245,6 @@ def _put(body, x, y, heading, shape, plan):  # type: ignore[no-untyped-def]
 
 @kernel
 def _choose(seed, wanted, size, plan, bodies, active):  # type: ignore[no-untyped-def]
-    """Draws which obstacles exist and the shape of each; returns the next counter."""
     groups = plan.groups
     counter, total, before, k = 0, 0, 0, 0
     for g in range(groups.shape[0]):
@@ -307,7 +304,6 @@ def _place_obstacles(seed, counter, plan, bodies, scratch):  # type: ignore[no-u
 
 @kernel
 def _is_apart(k, plan, bodies, scratch):  # type: ignore[no-untyped-def]
-    """True if obstacle k, placed as `scratch.trial`, keeps the gaps to all that are placed."""
     trial, gaps = scratch.trial, scratch.gaps
     for other in range(bodies.shape[0]):
         if bodies[other, RADIUS] > 0.0:
@@ -336,7 +332,6 @@ def _spot(seed, counter, places, space):  # type: ignore[no-untyped-def]
 
 @kernel
 def _apart(x, y, others, m, least):  # type: ignore[no-untyped-def]
-    """True if a point is farther than `least` [m] from the first m of others (M, 2 or more)."""
     for other in range(m):
         dx, dy = x - others[other, 0], y - others[other, 1]
         if dx * dx + dy * dy <= least * least:

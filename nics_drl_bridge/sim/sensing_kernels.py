@@ -170,7 +170,6 @@ def _scan_alone(
     n: int, m: int, state: State, scene: Surroundings, lidar: LidarArrays, motion: Dynamics,
     scratch: Scratch,
 ) -> None:  # fmt: skip
-    """Scans one robot from its own place and time, maybe skewed."""
     scans, beams = scratch.scans, state.ranges.shape[2]
     spot, drive, skew = scans.spot, scans.drive, state.faults[n, m, fault_kernels.SKEW]
     past, steps, substeps, here = state.past, state.steps[n], motion.substeps, spot[0, 0]

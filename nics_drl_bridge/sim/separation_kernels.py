@@ -120,7 +120,6 @@ def _hold(dx, dy, nx, ny, room, bend):  # type: ignore[no-untyped-def]
 
 @kernel
 def _hold_bodies(dx, dy, k, traffic, bend):  # type: ignore[no-untyped-def]
-    """Limits the displacement of body k to the room that the other bodies leave."""
     bodies, first, speeds, period = traffic.bodies, traffic.first, traffic.speeds, traffic.period
     x, y, radius = bodies[k, X], bodies[k, Y], bodies[k, RADIUS]
     length = math.sqrt(dx * dx + dy * dy)
@@ -149,7 +148,6 @@ def _hold_bodies(dx, dy, k, traffic, bend):  # type: ignore[no-untyped-def]
 
 @kernel
 def _hold_walls(dx, dy, body, traffic, bend):  # type: ignore[no-untyped-def]
-    """Limits a displacement to the field and to this side of the walls."""
     x, y, radius, walls, half = body[X], body[Y], body[RADIUS], traffic.walls, traffic.half
     reach = radius + math.sqrt(dx * dx + dy * dy) + 2.0 * SLACK
     for side in (-1.0, 1.0):
@@ -167,7 +165,6 @@ def _hold_walls(dx, dy, body, traffic, bend):  # type: ignore[no-untyped-def]
 
 @kernel
 def _hold_map(dx, dy, body, grid, bend):  # type: ignore[no-untyped-def]
-    """Limits a displacement to keep clear of the static map, by marching along the path."""
     x, y, radius = body[X], body[Y], body[RADIUS]
     length = math.sqrt(dx * dx + dy * dy)
     here = map_distance(x, y, grid) - radius
