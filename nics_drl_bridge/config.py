@@ -257,11 +257,7 @@ for _kind, _type, _pattern, _first in (
 
 
 def parse_yaml(text: str, source: str) -> dict[str, Any]:
-    """Reads a YAML mapping; the source is the file's name.
-
-    Raises ConfigError if it is no YAML, has a duplicate key or no mapping at the top level, is
-    empty, or is more than `MAX_BYTES`, `MAX_DEPTH` and `MAX_VALUES` allow.
-    """
+    """Reads a YAML mapping from the text of `source`; ConfigError if it is none, or too large."""
     if len(text) > MAX_BYTES:
         reason = f"is larger than {MAX_BYTES // 2**20} MB; give a configuration instead."
         raise ConfigError(f"{source}: {reason}")

@@ -79,9 +79,8 @@ def check_above(path: Path) -> None:
 def whole_folder(path: str | Path, marker: str) -> Iterator[Path]:
     """Yields a temporary folder that replaces `path` if the block succeeds, else is removed.
 
-    An existing folder is replaced only if it is empty or contains `marker`, a file of every folder
-    of this kind, so that a wrong `--out` never deletes a user's work. A symbolic link stays; the
-    folder that it points to is replaced. Raises ConfigError: see `check_folder`.
+    It replaces only an empty folder or one with `marker`, a file of all of this kind, so that a
+    wrong `--out` never deletes work; a symbolic link stays. Raises ConfigError, see `check_folder`.
     """
     path = check_folder(path, marker)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -23,10 +23,9 @@ def _pool(process: int) -> ThreadPoolExecutor:
 
 
 def run_parts(function: Callable[[T], R], parts: Sequence[T]) -> list[R]:
-    """Returns a function's result for each part, in order, each from a thread of its own.
+    """Returns a function's result for each part, in order; threads run all but the first part.
 
-    The caller runs the first part. It helps only if the work is in compiled functions that release
-    the interpreter lock (`nogil`). An exception is raised after all parts have ended.
+    It helps if the work releases the interpreter lock. Exceptions are raised when all have ended.
     """
     others = [_pool(os.getpid()).submit(function, part) for part in parts[1:]]
     try:

@@ -141,9 +141,8 @@ def _candidates(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Two corners (T, D, 2) that can be an edge within each cell; or where to climb from.
 
-    Along a line and around a circle outside the shape the corner changes monotonically, so those at
-    the rim of a cell enclose all others. If there are more than two, those at one quarter and three
-    quarters represent all. To climb there are the corner in the middle, and minus the first stride.
+    Along a line and around a circle outside, the corner changes monotonically: those at the rim of
+    a cell enclose all others. If more than two, those at one and three quarters represent all.
     """
     low, high = _within(wound, parts, np.minimum), _within(wound, parts, np.maximum)
     quarter, first = (high - low) // 4, wound[parts // 2 :: parts]

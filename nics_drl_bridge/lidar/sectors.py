@@ -1,7 +1,6 @@
 """The canonical scan: sectors around the robot, independent of the lidar.
 
-A policy learns on the sectors of one `ScanLayout`. The scan of any lidar is resampled into them by
-angle: simulator, middleware and deployment all use this module.
+A policy learns on the sectors of one `ScanLayout`, into which any lidar's scan is resampled.
 """
 
 from __future__ import annotations
@@ -62,10 +61,9 @@ LAYOUTS = {  # the full circle, and the 270 deg that most front-mounted lidars c
 
 
 def layout_of(given: Any, lidar: LidarSpec) -> ScanLayout | None:
-    """Returns the layout for a user's setting.
+    """Returns the layout for a user's setting; ConfigError if it is none.
 
-    It is None, a ScanLayout, the name of one of `LAYOUTS`, its fields, or a number of sectors over
-    the lidar's field of view, seen from its mount. Raises ConfigError for anything else.
+    None, a ScanLayout, a name in `LAYOUTS`, fields, or a number of sectors over the lidar's view.
     """
     if given is None or isinstance(given, ScanLayout):
         return given
@@ -94,11 +92,7 @@ NO_PLAN = SectorPlan(  # for policies that observe the beams themselves
 
 
 def plan_of(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
-    """Returns the plan by which a lidar fills a layout.
-
-    Raises ConfigError if the lidar does not cover every sector, its range is too short, or its
-    beams are more than `COARSEST_RAD` apart.
-    """
+    """Returns the plan by which a lidar fills a layout; ConfigError if it is unfit for it."""
     x, y, heading = lidar.mount
     angles = lidar.angles + heading
     _check(lidar, layout, angles)
@@ -166,9 +160,8 @@ class Reader:
 def reader_of(header: ScanHeader, beams: int, like: LidarSpec, upside_down: bool = False) -> Reader:
     """Returns the reader for scans of B beams with the header of a LaserScan.
 
-    A negative `angle_increment` means clockwise beams, and so does a device that is mounted with
-    its z axis down. `like` provides what headers lack: mount, frame, the value for no return.
-    Raises ConfigError if the header describes no lidar.
+    A negative `angle_increment` means clockwise beams, and so does `upside_down`. `like` gives
+    mount, frame and value for no return. Raises ConfigError if the header describes no lidar.
     """
     begin, step = header.angle_min, header.angle_increment
     if upside_down:

@@ -1,8 +1,7 @@
 """Sensor: what a robot has beside its lidar. A kind of sensor is one file with one class.
 
-The model names the sensors of a robot; everything else asks them: the simulator renders their
-readings, the nodes publish and read their messages, the middleware caches them by name, views hold
-them in `sensed`, tasks observe their `shares`, and the gate keeps clear of their `points`.
+The simulator renders its readings, the nodes publish and read its messages, the middleware caches
+them by name, views hold them in `sensed`, tasks observe `shares`, the gate keeps clear of `points`.
 """
 
 from __future__ import annotations
@@ -34,9 +33,8 @@ TAKEN = ("scan", "odom", "pose", "imu", "joint_states", "ground_truth", "cmd_vel
 class SensedWorlds:
     """All that a sensor can see in N worlds of M robots and K other bodies.
 
-    Its `state`, which the simulator changes in place, has the true `pose` (N, M, 3) of `base_link`
-    in `map`, `bodies` (N, K + M, 7) as in `lidar.exact_kernels`, robots last, the `seeds` (N,) of
-    the episodes, and the `steps` (N,), control periods since the reset.
+    `state`, changed in place, has the true `pose` (N, M, 3) of `base_link` in `map`, `bodies` (N, K
+    + M, 7) as in `lidar.exact_kernels`, robots last, `seeds` and `steps` (N,) of the episodes.
     """
 
     state: Any

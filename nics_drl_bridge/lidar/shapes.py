@@ -150,10 +150,7 @@ def _reach(outline: Array) -> float:
 
 
 def place(poses: ArrayLike, radii: ArrayLike, shapes: ArrayLike) -> Array:
-    """Places shapes in a world as bodies (..., 7), see `BODY`.
-
-    Each has a pose (..., 3), a radius (...) [m], 0 if absent, and the index (...) of its shape.
-    """
+    """Bodies (..., 7) of shapes (...) at poses (..., 3), of radii (...) [m], 0 if absent."""
     poses = np.asarray(poses, dtype=np.float64)
     bodies = np.empty((*poses.shape[:-1], BODY))
     bodies[..., :3] = poses

@@ -146,9 +146,7 @@ def to_device(ranges: ArrayLike, spec: LidarSpec) -> Ranges:
 def from_device(values: ArrayLike, spec: LidarSpec) -> Ranges:
     """Converts ranges (..., B) of a device to those of the package.
 
-    A finite value below range_min means that something is too close, unless it is the device's
-    value for no return: it must not be taken for free space. If a device reports NaN for no return,
-    invalid measurements cannot be distinguished from it.
+    A finite value below range_min is too close, unless it means no return: that is not free space.
     """
     out, none = np.array(values, dtype=np.float32), _no_return(spec)
     lost = np.isnan(out) if np.isnan(none) else out == none

@@ -37,9 +37,8 @@ LONGEST_GAP_S = 10.0  # Longest gap that is predicted [s]: beyond, the robot may
 class Estimator:
     """Pose and state of one robot, predicted by the fitted model, corrected by measurements.
 
-    The model's drift is the Q and its sensors' noise the R of the filter; its latency delays the
-    commands. Time is in integer nanoseconds, so that the results of the same messages are
-    bit-identical. Measurements apply at the time of the estimate; `Timeline` inserts late ones.
+    The model's drift is Q, its sensors' noise R, its latency delays the commands. Time is in whole
+    nanoseconds, for identical bits. Measurements apply now; `Timeline` inserts late ones.
     """
 
     def __init__(self, model: SimulatorModel) -> None:
@@ -150,8 +149,7 @@ class Estimator:
     def foresee(self, time_ns: int) -> None:
         """Computes in advance the prediction to a time and the update by a twist measured then.
 
-        `predict` and `correct` then only take over the results, and the estimate is bit-identical.
-        1.14 times as many lock-step steps a second (measured in turns on two cores).
+        `predict`, `correct` take over the same bits; 1.14 times as many lock-step steps a second.
         """
         self._foreseen = None
         if time_ns > self.time_ns:

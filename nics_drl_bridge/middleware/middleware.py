@@ -123,8 +123,7 @@ class Middleware:
     ) -> bool:
         """Takes a command (C,) that was sent to the robot; True if it was used.
 
-        Without a stamp it counts as sent at that of the newest datum, and after every earlier
-        command without a stamp. Own commands have no arrival: their stamps need no check.
+        Without a stamp it is after the newest datum and all earlier ones; own ones have no arrival.
         """
         if stamp_ns is None:
             stamp_ns = max(self.newest_ns or self._start_ns, self._unstamped_ns + 1)

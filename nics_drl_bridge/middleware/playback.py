@@ -88,8 +88,7 @@ def played(path: str | Path, topics: Mapping[str, str]) -> dict[str, list[Messag
 def chosen(bag: BagFile, topics: Mapping[str, str]) -> dict[str, str]:
     """Returns the topic of each role that is played; RecordingError if it is missing or wrong.
 
-    Those of `scan`, `odom` and `cmd_vel` are by default the topics of these names; `pose` and `imu`
-    are left out unless `topics` names them.
+    By default, `ALWAYS` are topics of these names; the others play only if `topics` names them.
     """
     roles = {}
     for role, kinds in TYPES.items():

@@ -130,9 +130,8 @@ class Timeline:
 class Stamps:
     """Compares the progress of time stamps with that of the receiver's clock.
 
-    Only differences count: the clock of a robot may be off by any amount, and a simulation may run
-    slower, or faster if no two data are farther apart than the tolerance. The first datum after a
-    reset gives the offset of the two clocks. The control period [ns] widens the tolerance.
+    Only differences count: a clock may be off, a simulation slower, or faster within the tolerance,
+    which the control period [ns] widens. The first datum after a reset gives the offset.
     """
 
     def __init__(self, period_ns: int = 0) -> None:

@@ -23,9 +23,8 @@ Array = NDArray[np.float64]
 def steered(spec: RobotSpec, twist: Callable[[Array, Array], Array]) -> Textbook:
     """Builds the kinematics of a robot that is driven by a speed and a steering angle.
 
-    Its state and its commands are both of these, in any order; its turn rate is, up to the second
-    order, a multiple of their product, and its speed one of the speed. `twist` gives the body twist
-    (..., 3) for speeds [m/s] and steering angles [rad] (...).
+    Both are its state and its commands, in any order; its turn rate is, to second order, a multiple
+    of their product. `twist` is (..., 3) for speeds [m/s] and angles [rad] (...).
     """
     v, phi = _states(spec)
     command, order = _commands(spec, ("linear.x", "angular.z")), np.argsort([v, phi])
