@@ -26,7 +26,6 @@ from nics_drl_bridge.sim.scenes import Scene, sample_scene
 from nics_drl_bridge.sim.world import World, load_world
 
 Array = NDArray[np.float64]
-
 RENDER_FPS = 10
 
 

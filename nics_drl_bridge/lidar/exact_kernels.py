@@ -177,7 +177,7 @@ def beside_convex(x, y, c, s, corners):  # type: ignore[no-untyped-def]
     for v in range(last + 1):
         bx, by = turned(x, y, c, s, corners[v])
         gx, gy, cross = bx - ax, by - ay, ax * by - ay * bx
-        if ex * gy - ey * gx < 0.0 or cross == 0.0:
+        if ex * gy - ey * gx < 0.0 or cross == 0.0:  # the lidar may lie on a side towards it
             return False
         if (ay <= 0.0) != (by <= 0.0):  # it crosses the ray ahead, or the one behind
             rounds += int(ay <= 0.0 and cross > 0.0) - int(ay > 0.0 and cross < 0.0)

@@ -13,7 +13,6 @@ from nics_drl_bridge.lidar import fault_kernels as kernels
 
 TooClose = Literal["minus_inf", "range_min", "no_return", "ghost"]
 Skew = Literal["none", "counter_clockwise", "clockwise"]
-
 TOO_CLOSE: dict[TooClose, int] = {
     "minus_inf": kernels.AS_MINUS_INF, "range_min": kernels.AS_RANGE_MIN,
     "no_return": kernels.AS_NO_RETURN, "ghost": kernels.AS_GHOST,

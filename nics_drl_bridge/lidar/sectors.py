@@ -23,7 +23,6 @@ from nics_drl_bridge.lidar.spec import FULL_CIRCLE_TOLERANCE, LidarSpec, ScanHea
 
 Array = NDArray[np.float64]
 Ranges = NDArray[np.float32]
-
 COARSEST_RAD = 0.21  # Beams farther apart are rejected: at 1 m they miss objects 0.2 m wide
 BORDER_RAD = 1e-4  # A beam this near to a border counts in both: headers have angles in float32
 RANGE_TOLERANCE = 1e-5  # Share by which a lidar's range may be less than the layout's, by float32
@@ -92,7 +91,7 @@ NO_PLAN = SectorPlan(  # for policies that observe the beams themselves
 
 
 def plan_of(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
-    """Returns the plan by which a lidar fills a layout; ConfigError if it is unfit for it."""
+    """Returns the plan by which a lidar fills a layout; ConfigError if it sees too little."""
     x, y, heading = lidar.mount
     angles = lidar.angles + heading
     _check(lidar, layout, angles)

@@ -141,7 +141,6 @@ def load_shapes(path: str | Path) -> tuple[Shape, ...]:
 
 SQUARE = Rectangle(size=(0.3, 0.3))
 STRIP = Rectangle(size=(0.6, 0.06))
-
 BODY = 7  # number of columns of a placed body
 
 

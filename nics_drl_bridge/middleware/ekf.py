@@ -15,7 +15,6 @@ from nics_drl_bridge.middleware.measurement import Acceptance, Judgement, Kind, 
 from nics_drl_bridge.robot.kernels import SERIES, term_arrays, wrap
 
 Array = NDArray[np.float64]
-
 LEAST_POSE_DRIFT, LEAST_STATE_DRIFT = 2e-3, 5e-3
 """Lower bounds on the model's error after a second, of the pose [m or rad / sqrt(s)], and of the
 state as a share of its range [1 / sqrt(s)]."""

@@ -17,7 +17,6 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.robot.kernels import Terms, advance, rates, wrap
 
 Array = NDArray[np.float64]
-
 RUNAWAY = 1e9  # Bound on poses, states and their derivatives; beyond, the model has diverged
 LEAST_PIVOT = 1e-12  # Lower bound on a variance given the variables before, as a share of its own
 LEAST_VARIANCE = 1e-18  # Absolute lower bound on that variance

@@ -20,7 +20,6 @@ from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, SCAN, Kind, Me
 from nics_drl_bridge.middleware.timeline import ReportedPose, Stamps
 
 Array = NDArray[np.float64]
-
 NOT_FINITE = "NaN or inf"
 LEAST_STD = {Kind.YAW_RATE: LEAST_TWIST_STD, Kind.POSE: LEAST_POSE_STD}
 RATE_OVER = 32  # Number of arrivals over which rates are computed
@@ -123,7 +122,7 @@ class Middleware:
     ) -> bool:
         """Takes a command (C,) that was sent to the robot; True if it was used.
 
-        Without a stamp it is after the newest datum and all earlier ones; own ones have no arrival.
+        Without a stamp it counts as sent with the newest datum. Own commands have no arrival.
         """
         if stamp_ns is None:
             stamp_ns = max(self.newest_ns or self._start_ns, self._unstamped_ns + 1)

@@ -25,7 +25,6 @@ from nics_drl_bridge.recording.bag_file import BagFile, Message, opened
 from nics_drl_bridge.recording.messages import command_row, pose_row, stamp, twist_row
 
 Array = NDArray[np.float64]
-
 SCAN_TYPE = "sensor_msgs/msg/LaserScan"
 TYPES: Mapping[str, tuple[str, ...]] = {
     SCAN: (SCAN_TYPE,), ODOM: (topic_roles.ODOMETRY,), CMD_VEL: topic_roles.TYPES["cmd_vel"],

@@ -19,7 +19,6 @@ from nics_drl_bridge.middleware.ekf import Estimator
 from nics_drl_bridge.middleware.measurement import Acceptance, Judgement, Kind, Measurement
 
 Array = NDArray[np.float64]
-
 HISTORY_NS = NS_PER_S  # Length of the past that may still change [ns]
 BEFORE_START = "not after the reset"
 TOO_OLD = f"older than {HISTORY_NS / NS_PER_S:g} s"
@@ -33,7 +32,6 @@ IN_STEP = 5  # Odometries in a row in step with their stamps, before arrivals me
 # Between odometry's pose and twist: greatest standard deviations, and always allowed [m, rad].
 SIGMA, LEAST = 6.0, 0.01
 STILL = 0.02  # Slower motion [m/s, rad/s] gives no information about time
-
 Moment = tuple[int, int]  # Stamp [ns] and kind: the order of measurements, however they arrive
 
 

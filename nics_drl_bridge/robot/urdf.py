@@ -11,7 +11,6 @@ from nics_drl_bridge.robot.spec import RobotSpec
 
 Element = ElementTree.Element
 Place = tuple[float, float, float]
-
 COLOURS = {"body": "0.2 0.4 0.7 1", "wheel": "0.1 0.1 0.1 1", "laser": "0.7 0.1 0.1 1"}
 BODY_HEIGHT = 0.04
 

@@ -25,7 +25,6 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.seeds import checked_seeds
 
 __all__ = ["Draws", "LidarRanges", "Randomisation", "Sampler", "load_randomisation"]
-
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Bounds = tuple[Array, Array]

@@ -23,7 +23,6 @@ from nics_drl_bridge.sim.state import NO_FIELD, MapField
 from nics_drl_bridge.sim.world import Goals, Starts, World, check_places
 
 __all__ = ["Scene", "SceneSampler", "Scenes", "sample_scene", "scaled"]
-
 Array = NDArray[np.float64]
 CELL = 0.1  # Side of cells without a map [m]; larger in large fields, smaller in small ones
 FEWEST_CELLS = 20

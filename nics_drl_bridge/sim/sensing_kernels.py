@@ -104,7 +104,7 @@ def measure(
 
 @kernel
 def drift_of(n: int, m: int, state: State, period: float) -> tuple[float, float, float]:
-    """Draws drift: ahead, aside [m], each at most std sqrt(3 period), and turn [rad]."""
+    """Draws ahead, aside [m], at most std sqrt(3 period), and turn [rad]; moves the state."""
     std, counter = state.noise, state.steps[n] * state.pose.shape[1] + m
     # It grows with root time. Uniform draws are cheap, and over some periods they add up to normal.
     count, scale = std.shape[2] - 2, math.sqrt(12.0 * period)

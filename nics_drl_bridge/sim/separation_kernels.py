@@ -27,7 +27,6 @@ from nics_drl_bridge.sim.state import Array, MapField
 STILL, WANDER, PATROL, PEDESTRIAN = range(4)  # values of the column KIND
 # Memory of an obstacle, a row of marks (N, K, F).
 SPEED, VX, VY, DIRECTION, AIM, GOAL_X, GOAL_Y, UNTIL, INDEX, WAY, REST, MARK = range(12)
-
 SLACK = 1e-6  # Margin that is never used [m]: rounding must not make two bodies touch
 PASSES = 3  # Number of times a displacement is bent before the remaining excess is shortened
 FINEST = 0.25  # Least step along a path through a static map, in cells
