@@ -89,8 +89,9 @@ def _checked(task: Task, model: SimulatorModel, options: dict[str, Any] | None) 
         raise ConfigError(f"task {name} is already made; give {sorted(options)} to it, not beside.")
     if task.robot != model.robot or task.lidar != model.lidar:
         raise ConfigError(
-            f"task {name} is of the robot {task.robot.name!r} with {task.lidar.beams} beams, not of "
-            f"{model.robot.name!r}, {model.lidar.beams}; make it with model.robot and model.lidar."
+            f"task {name} is of the robot {task.robot.name!r} with {task.lidar.beams} beams, the "
+            f"model of {model.robot.name!r} with {model.lidar.beams}; make it with model.robot and "
+            "model.lidar."
         )
     return task
 
