@@ -1,9 +1,8 @@
 """Strict configuration: YAML files checked against a schema.
 
-Every error names file, key and the nearest valid name. PyYAML alone reads `1e-3` as a string, keeps
-the last of two equal keys, lets a few lines of aliases and merge keys grow to gigabytes, and builds
-objects from tags. Here the first is a number, the second an error, the third is counted while
-reading, and tags are refused.
+Errors name file, key and the nearest valid name. Unlike with PyYAML alone, `1e-3` is a number, a
+key that stands twice an error, aliases and merge keys are counted while reading, as a few lines can
+grow to gigabytes, and tags, which build objects, are refused.
 """
 
 from __future__ import annotations
@@ -24,8 +23,7 @@ from nics_drl_bridge.errors import ConfigError, nearest, shortened
 PACKAGE = "nics_drl_bridge"
 MAX_DEPTH = 32
 MAX_BYTES = 2**20  # maximum size of a YAML file
-MAX_VALUES = 50_000
-"""Maximum number of keys, values and lists; an alias counts as everything it stands for."""
+MAX_VALUES = 50_000  # keys, values and lists; an alias counts as everything it stands for
 _LONGEST_PROBLEM = 200
 
 
@@ -63,8 +61,7 @@ def _coerced_to_numbers(given: Any, found: Any, place: str = "") -> Iterator[tup
         yield from _coerced_to_numbers(value, made, f"{place}.{key}")
 
 
-_UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")
-"""Errors of pydantic about an unknown key, of a model and of a dataclass."""
+_UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")  # keys of a model, of a dataclass
 _SHORT = reprlib.Repr()  # a value made of YAML aliases may not fit into memory in full
 _SHORT.maxstring = _SHORT.maxother = 80
 
@@ -108,7 +105,6 @@ def _fields_at(schema: type[BaseModel], location: tuple[int | str, ...]) -> list
 
 
 def _annotations_of(model: Any) -> dict[Any, Any]:
-    """Types of the fields of a model or dataclass; empty for any other type."""
     if is_dataclass(model):
         return dict(get_type_hints(model))
     fields: dict[str, Any] = getattr(model, "model_fields", {})
@@ -164,10 +160,7 @@ def share_folder() -> Path:
 
 
 def find_config(name: str | Path, kind: str) -> Path:
-    """Finds a configuration: `arena` for `config/KIND/arena.yaml`, or the path of a YAML file.
-
-    Raises ConfigError if there is none of this name; suggests the nearest.
-    """
+    """Finds `arena` in `config/KIND`, or a YAML file by its path; ConfigError names the nearest."""
     name = str(name)
     if name.endswith((".yaml", ".yml")):
         return Path(name)
@@ -194,7 +187,6 @@ class _Loader(*_BASES):  # type: ignore[misc]
         self._sizes: dict[str, int] = {}
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        """Composes a node as PyYAML does, and counts depth and values."""
         event: Any = self.peek_event()
         is_alias = isinstance(event, yaml.AliasEvent)
         before, self._depth = self._values, self._depth + 1
@@ -215,7 +207,6 @@ class _Loader(*_BASES):  # type: ignore[misc]
         return node
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        """Constructs a mapping as PyYAML does, but refuses duplicate keys."""
         if not isinstance(node, yaml.MappingNode):
             self._refuse(node, "`<<` must be followed by the alias of a mapping")
         seen: set[Any] = set()
@@ -266,11 +257,7 @@ for _kind, _type, _pattern, _first in (
 
 
 def parse_yaml(text: str, source: str) -> dict[str, Any]:
-    """Reads a YAML mapping; the source is the file's name.
-
-    Raises ConfigError if it is no YAML, has a duplicate key or no mapping at the top level, is
-    empty, or is more than `MAX_BYTES`, `MAX_DEPTH` and `MAX_VALUES` allow.
-    """
+    """Reads a YAML mapping from the text of `source`; ConfigError if it is none, or too large."""
     if len(text) > MAX_BYTES:
         reason = f"is larger than {MAX_BYTES // 2**20} MB; give a configuration instead."
         raise ConfigError(f"{source}: {reason}")

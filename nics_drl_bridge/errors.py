@@ -1,28 +1,18 @@
-"""Errors that a user can cause and fix.
-
-Each carries one sentence: what was wrong, where, and what to do. The command line prints
-that sentence and exits with code 2; a library caller catches `BridgeError`.
-"""
+"""Errors that a user can cause and fix, each of one sentence: what was wrong, where, what to do."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
 
-MISSING_ROS = (
-    "needs the module {module!r}; source your ROS 2 installation, or "
-    "pip install 'nics_drl_bridge[ros]'."
-)
+MISSING_ROS = "needs the module {module!r}; source your ROS 2 installation, or "
+MISSING_ROS += "pip install 'nics_drl_bridge[ros]'."
 LONGEST = 800  # maximum length of a sentence [characters]; a longer one loses its middle
 LONGEST_NAME = 100  # characters of a name that are compared with the known names
 
 
 def shortened(text: str, most: int) -> str:
-    """Returns a text on one line, without its middle if it is longer than `most` characters.
-
-    Messages quote what the user gave, which may be megabytes or contain line feeds and control
-    characters.
-    """
+    """One printable line of about `most` characters: messages quote whatever users gave."""
     if len(text) > most:
         text = f"{text[: most // 2]} ... {text[-(most // 2) :]}"
     text = " ".join(text.splitlines())

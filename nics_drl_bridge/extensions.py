@@ -1,7 +1,4 @@
-"""Extensions by name: entry points of other packages, and of this one's own extras.
-
-A group is `nics_drl_bridge.GROUP`; `docs/extensions.md` says what each expects.
-"""
+"""Extensions by name, in groups of entry points `nics_drl_bridge.GROUP`: `docs/extensions.md`."""
 
 from __future__ import annotations
 
@@ -19,11 +16,10 @@ from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
 
 PACKAGE = "nics_drl_bridge"
 ROS = ("rclpy", "_msgs", "std_srvs", "builtin_interfaces")
-INSTALL = {
+INSTALL = {  # libraries, and the extra of this package that brings each
     "mcap": "bags", "mujoco": "mujoco", "ray": "train,distributed", "rosbags": "bags",
     "torch": "train",
 }  # fmt: skip
-"""Libraries, and the extra of this package that brings each."""
 
 
 @cache
@@ -35,10 +31,7 @@ def known(group: str) -> dict[str, EntryPoint]:
 
 
 def load(group: str, name: str) -> Any:
-    """An extension by its group and its name.
-
-    Raises ConfigError if there is none of that name, or a library that it needs is missing.
-    """
+    """An extension by group and name; ConfigError if it, or a library that it needs, is missing."""
     extensions = known(group)
     if name not in extensions:
         raise ConfigError(f"unknown {group.rstrip('s')} {name!r}; {nearest(name, extensions)}")
@@ -59,10 +52,7 @@ def missing(module: str) -> str:
 
 
 def module_at(place: str, what: str) -> Any:
-    """A module by its name, or by the path of its file; a file that has changed is loaded anew.
-
-    Raises ConfigError: it is missing, or fails to run as Python; names what needs it and the line.
-    """
+    """A module by name, or file, anew if it has changed; ConfigError if it is missing or fails."""
     if place.endswith(".py"):
         return _load(Path(place), what)
     try:

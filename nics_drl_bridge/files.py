@@ -1,7 +1,4 @@
-"""Atomic writes and checksums.
-
-A reader finds either the old file or the new one, complete, and notices any damage to it.
-"""
+"""Atomic writes and checksums: a reader finds the old file or the new, and notices any damage."""
 
 from __future__ import annotations
 
@@ -58,10 +55,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def check_folder(path: str | Path, marker: str) -> Path:
-    """Checks that `whole_folder` can create a folder, without creating anything; resolves it.
-
-    Raises ConfigError if `path` is a file, a folder of another kind, or not in a writable place.
-    """
+    """Resolves a path, creating nothing; ConfigError if `whole_folder` could not create it."""
     path = Path(path).resolve()
     if path.exists() and not path.is_dir():
         raise ConfigError(f"{path}: is a file, not a folder; give the name of a folder.")
@@ -85,9 +79,8 @@ def check_above(path: Path) -> None:
 def whole_folder(path: str | Path, marker: str) -> Iterator[Path]:
     """Yields a temporary folder that replaces `path` if the block succeeds, else is removed.
 
-    An existing folder is replaced only if it is empty or contains `marker`, a file of every folder
-    of this kind, so that a wrong `--out` never deletes a user's work. A symbolic link stays; the
-    folder that it points to is replaced. Raises ConfigError: see `check_folder`.
+    It replaces only an empty folder or one with `marker`, a file of all of this kind, so that a
+    wrong `--out` never deletes work; a symbolic link stays. Raises ConfigError, see `check_folder`.
     """
     path = check_folder(path, marker)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -141,8 +134,7 @@ def sync_folder(folder: Path) -> None:
 
 
 SUMS = "SHA256SUMS"  # manifest of a folder, which `sha256sum -c SHA256SUMS` checks as well
-MOST_BYTES = 256 * 2**20
-"""Greatest size of a file of arrays: a day of driving, or the table of a thousand shapes."""
+MOST_BYTES = 256 * 2**20  # of a file of arrays: a day of driving, or a table of a thousand shapes
 _SEAL = b"sha256 "
 _PART = 2**20
 
@@ -167,10 +159,7 @@ def sealed(data: bytes) -> bytes:
 
 
 def check_sealed(file: BinaryIO) -> None:
-    """Verifies the checksum that `sealed` appended, without reading the whole file at once.
-
-    The file is left at its beginning. Raises ValueError if the data have changed.
-    """
+    """Verifies in parts the checksum that `sealed` appended, and rewinds; ValueError if wrong."""
     size = file.seek(0, os.SEEK_END) - len(_SEAL) - 64
     file.seek(0)
     digest = _sha256_of(file, size)
@@ -189,18 +178,15 @@ def read_file(path: Path) -> bytes:
 def write_sums(folder: Path) -> None:
     """Writes the SHA-256 of every file in a folder and below to its `SHA256SUMS`."""
     files = sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / SUMS)
-    write_parts(
-        folder / SUMS, [_line_of(folder, path.relative_to(folder).as_posix()) for path in files]
-    )
+    names = [path.relative_to(folder).as_posix() for path in files]
+    write_parts(folder / SUMS, [_line_of(folder, name) for name in names])
 
 
 def check_sums(folder: Path, names: Sequence[str], editable: str = "") -> None:
     """Checks files of a model or a lidar table against the `SHA256SUMS` of their folder.
 
-    The names are all that the manifest lists; other files in the folder are ignored. `editable` is
-    the one that needs no line, since a user may have removed it to edit the file. Raises ModelError
-    if a file is missing, too large or different from its line, or the manifest does not list
-    exactly these files.
+    All names must be listed, but `editable`, whose line a user may have removed to edit it. Raises
+    ModelError if a file is missing, too large or different, or another is listed.
     """
     with _opened(folder / SUMS) as file:
         listed = file.readlines(_PART)

@@ -31,8 +31,7 @@ from nics_drl_bridge.robot.taylor import NamedTaylorModel, TaylorModel
 FORMAT = "nics_drl_bridge/simulator_model/4"
 MODEL_FILE, TABLE_FOLDER, REPORT_FILE = "model.yaml", "lidar_table", "report.txt"
 _OF_TABLE = (f"{TABLE_FOLDER}/{name}" for name in (files.SUMS, *TABLE_FILES))
-MODEL_FILES = (MODEL_FILE, REPORT_FILE, *_OF_TABLE)
-"""The files of a model, in addition to its manifest."""
+MODEL_FILES = (MODEL_FILE, REPORT_FILE, *_OF_TABLE)  # and a manifest
 CONTROL_PERIOD_S = 0.1
 DEFAULT_LIDAR = "paper"
 BUILTIN_SEED = 0
@@ -116,10 +115,9 @@ def generate(
     The shapes of obstacles are baked, and the robot's own footprint. `order` is that of the Taylor
     model, `alpha` the pruning threshold of Eq. 2. `assume` fills in from the textbook what the
     drive did not show, marked as assumed; `strict` refuses a drive that did not excite every input
-    on its own; `anyway` accepts predictions of unseen data hardly better than those of a standing
-    robot; `sensors` are what the robot has beside its lidar. Raises RecordingError if the recording
-    can't be used for this robot, FitError if it does not contain enough to fit a model, or the
-    model is useless.
+    alone; `anyway` accepts predictions hardly better than a standing robot's; `sensors` are beside
+    its lidar. Raises RecordingError for a recording that is unfit for the robot, FitError for a
+    useless model.
     """
     identified = identify(recording, robot, order=order, alpha=alpha, assume=assume, strict=strict)
     if (reason := why_useless(identified, robot, order)) and not anyway:
@@ -177,10 +175,7 @@ def save_model(model: SimulatorModel, folder: str | Path) -> None:
 
 
 def load_model(folder: str | Path) -> SimulatorModel:
-    """Reads a model that `save_model` wrote.
-
-    Raises ConfigError, ModelError if a file is missing, damaged or of another format.
-    """
+    """Reads a model that `save_model` wrote; ConfigError, ModelError if it is not whole."""
     folder = Path(folder)
     path = folder / MODEL_FILE
     if not path.is_file():

@@ -40,10 +40,7 @@ def between(pose: ArrayLike, other: ArrayLike) -> Array:
 
 
 def exp(twist: ArrayLike) -> Array:
-    """The relative pose (..., 3) that a constant body twist x duration (..., 3) leads to.
-
-    The exponential map of SE(2): motion along the exact arc.
-    """
+    """Relative pose (..., 3) along the exact arc of a body twist x duration (..., 3), in SE(2)."""
     twist = np.asarray(twist, dtype=np.float64)
     w = twist[..., 2]
     small = np.abs(w) < 1e-4
@@ -55,10 +52,7 @@ def exp(twist: ArrayLike) -> Array:
 
 
 def log(relative: ArrayLike) -> Array:
-    """The body twist x duration (..., 3) whose exact arc leads to a relative pose (..., 3).
-
-    The inverse of `exp` for turns of less than half a circle.
-    """
+    """Inverse of `exp` below half turns: body twist x duration (..., 3) to a pose (..., 3)."""
     relative = np.asarray(relative, dtype=np.float64)
     w = wrap_angle(relative[..., 2])
     small = np.abs(w) < 1e-4

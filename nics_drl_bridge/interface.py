@@ -17,9 +17,8 @@ NS_PER_S, S_PER_NS = 1_000_000_000, 1e-9
 class RobotView:
     """All that a task or a policy may know about a robot, or about a batch of robots.
 
-    The leading dimensions `...` are empty for one robot and (N, M) in a vector simulator. The time
-    stamp is that of the newest data, the ages are those at the time of the view. A range of NaN is
-    unknown.
+    The leading dimensions `...` are empty for one robot and (N, M) in a vector simulator. The stamp
+    is the newest data's, ages are at the time of the view; a range of NaN is unknown.
     """
 
     pose: Array  # (..., 3) estimate of x [m], y [m], heading [rad] of `base_link` in `map`
@@ -59,8 +58,7 @@ class BackendFacts(TypedDict, total=False):
     true_collision: bool | NDArray[np.bool_]  # True after a contact; (M,) of a team
     bodies: Array  # (K, 7) obstacles where they are now, see `sim.scenes.Scene`
     randomisation: dict[str, Any]  # name -> value that was drawn for the episode, where any was
-    scenes: Callable[[ArrayLike], Any]
-    """Gives the scenes of episodes for their seeds (n,), where the world alone does not."""
+    scenes: Callable[[ArrayLike], Any]  # gives scenes for seeds (n,), if the world alone does not
 
 
 @runtime_checkable
@@ -71,20 +69,13 @@ class Backend(Protocol):
         """Begins an episode and returns its first view."""
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
-        """Applies a command (C,), in the units and the order of the RobotSpec, for one period.
-
-        Returns the view at the end of the period, and facts for `info` (stamps, sequence numbers,
-        and the true pose where a simulator knows it).
-        """
+        """Applies a command (C,) of the RobotSpec for one period: view at its end, and `info`."""
 
     def facts(self) -> BackendFacts:
         """Returns what this backend alone knows at present; it may be called at any time."""
 
     def halt(self) -> None:
-        """Stops the robot with a zero command and ends the episode.
-
-        It may be called at any time: after an error of the backend, twice, and after `close`.
-        """
+        """Stops the robot and ends the episode, at any time: after an error, twice, when closed."""
 
     def close(self) -> None:
         """Stops the robot with a zero command and frees all resources."""

@@ -1,13 +1,8 @@
 """`@kernel`: the one decorator by which functions are compiled, kept on disk, and kept up to date.
 
-numba keeps machine code beside the source and checks the file of the function itself. A kernel
-calls others and uses constants of others, so here the code is kept as long as nothing changed in
-any module that its own module imports, directly or not: of this package, or of the folders in which
-a kernel of your own lies. This is decided by content: an edit, an update and another branch compile
-what they must, and nothing else.
-
-When compiling takes longer than `PATIENCE_S`, a line on standard error says how many kernels are
-compiled, and about how long that takes.
+numba checks the file of the function itself only. Here, machine code on disk is kept as long as no
+module that its own module imports, directly or not, has changed its content: of this package, or of
+the folders in which a kernel of your own lies.
 """
 
 from __future__ import annotations
@@ -22,7 +17,7 @@ import time
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 from llvmlite import binding as llvm
 from numba.core import event
@@ -34,10 +29,9 @@ from numba.core.registry import CPUDispatcher
 from numba.core.sigutils import normalize_signature
 
 PACKAGE = Path(__file__).parent
-PATIENCE_S = 2.0
+PATIENCE_S = 2.0  # Compiling that takes longer is announced, on standard error
 SECONDS_EACH = 0.5  # typical for a kernel with what only it calls [s]
-KERNELS: list[Any] = []
-"""Every kernel that was imported so far, as numba's dispatchers."""
+KERNELS: list[Any] = []  # every kernel that was imported so far, as numba's dispatchers
 _IMPORT = re.compile(
     r"^[ \t]*(?:from[ \t]+([.\w]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)|import[ \t]+([^\n]*))",
     re.MULTILINE,
@@ -45,26 +39,15 @@ _IMPORT = re.compile(
 _ALIAS = re.compile(r"\bas\s+\w+")
 
 
-@overload
-def kernel(function: Callable[..., Any]) -> Any: ...
-
-
-@overload
-def kernel(
-    *, allocates: bool = ..., contracts: bool = ..., inline: bool = ...
-) -> Callable[[Callable[..., Any]], Any]: ...
-
-
 def kernel(
     function: Callable[..., Any] | None = None, *, allocates: bool = False, contracts: bool = False,
     inline: bool = False,
-) -> Any:  # fmt: skip
+) -> Callable[..., Any]:  # fmt: skip
     """Compiles a function with numba when it is first called, or loads what was compiled before.
 
-    It runs without the interpreter's lock; a division by zero gives inf or NaN, as with arrays. It
-    `allocates` if it makes arrays or other objects, or calls what does; with `contracts`, products
-    and sums may be fused, which rounds once instead of twice; `inline` compiles it into its callers
-    always, for the few where that was measured to pay. Without a function, returns a decorator.
+    It runs without the interpreter's lock; a division by zero gives inf or NaN. It `allocates` if
+    it makes arrays or other objects, or calls what does; `contracts` lets products and sums be
+    fused, with one rounding; `inline` compiles it into all callers, where that was measured to pay.
     """
     if function is None:
         return partial(kernel, allocates=allocates, contracts=contracts, inline=inline)
@@ -73,8 +56,9 @@ def kernel(
     options |= {} if allocates else {"_nrt": False}
     options |= {"fastmath": {"contract"}} if contracts else {}
     options |= {"forceinline": True} if inline else {}
-    KERNELS.append(_Kernel(function, targetoptions=options))
-    return KERNELS[-1]
+    compiled: Callable[..., Any] = _Kernel(function, targetoptions=options)
+    KERNELS.append(compiled)
+    return compiled
 
 
 class _InnerLibrary(JITCodeLibrary):  # type: ignore[misc]
@@ -89,12 +73,10 @@ class _InnerLibrary(JITCodeLibrary):  # type: ignore[misc]
         """Does nothing, see `_Kernel.add_overload`."""
 
     def get_pointer_to_function(self, name: str) -> int:
-        """Null."""
         self._ensure_finalized()
         return 0
 
     def serialize_using_object_code(self) -> Any:
-        """There is bitcode only."""
         return self.serialize_using_bitcode()
 
     def _optimize_final_module(self) -> None:
@@ -123,7 +105,6 @@ class _InnerCacheImpl(CompileResultCacheImpl):  # type: ignore[misc]
 
 class _Compiler(Compiler):  # type: ignore[misc]
     def define_pipelines(self) -> Any:
-        """Gives what only kernels call a library of its own kind."""
         state = self.state
         if state.flags.no_cpython_wrapper:
             state.library = _InnerLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
@@ -131,11 +112,7 @@ class _Compiler(Compiler):  # type: ignore[misc]
 
 
 class _Kernel(CPUDispatcher):  # type: ignore[misc]
-    """numba's dispatcher, which makes a function callable from Python only when Python calls it.
-
-    Most kernels are called by kernels alone; what unpacks their arguments from Python objects would
-    take a third of the time of compiling.
-    """
+    """numba's dispatcher; callable from Python, a third of compiling, only where that calls it."""
 
     def __init__(self, function: Callable[..., Any], targetoptions: dict[str, Any]) -> None:
         super().__init__(function, targetoptions=targetoptions, pipeline_class=_Compiler)
@@ -144,7 +121,6 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
 
     @property
     def is_warm(self) -> bool:
-        """It was compiled before, for whichever arguments."""
         return any(cache.is_warm for cache in (self._cache, self._inner_cache))
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
@@ -159,7 +135,6 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
             self.targetoptions["no_cpython_wrapper"] = self._inner
 
     def compile(self, sig: Any) -> Any:
-        """Compiles for a signature, or finds it in memory or on disk."""
         with global_compiler_lock:
             args = tuple(normalize_signature(sig)[0])
             if not self._inner and args in self._inner_only:
@@ -168,8 +143,7 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
             return super().compile(sig)
 
     def add_overload(self, cres: Any) -> None:
-        """Takes what was compiled; Python does not see what only kernels can call."""
-        if not self._inner:
+        if not self._inner:  # Python does not see what only kernels can call
             super().add_overload(cres)
             for env in cres._find_referenced_environments():
                 cres.library.codegen.set_env(env.env_name, env)
@@ -193,7 +167,6 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 
     @property
     def is_warm(self) -> bool:
-        """Something usable is on disk."""
         return bool(self._cache_file._load_index())
 
 
@@ -251,7 +224,6 @@ class _Compiling(event.Listener):  # type: ignore[misc]
         self._begun = self._begun_cpu = self._spent = 0.0
 
     def on_start(self, event: event.Event) -> None:
-        """A function begins to be compiled, maybe for another that is."""
         with self._lock:
             if self._depth == 0:
                 self._begun, self._begun_cpu = time.monotonic(), time.thread_time()
@@ -269,7 +241,6 @@ class _Compiling(event.Listener):  # type: ignore[misc]
                 )
 
     def on_end(self, event: event.Event) -> None:
-        """It was compiled, or could not be."""
         with self._lock:
             self._depth, self.count = self._depth - 1, self.count + 1
             if self._depth == 0:

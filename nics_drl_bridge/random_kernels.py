@@ -1,8 +1,7 @@
 """Counter-based random numbers: the same draw for the same (seed, stream, counter).
 
-No state is kept, so a world draws the same numbers whatever batch or thread it runs in.
-SplitMix64 (Steele, Lea, Flood 2014) mixes the counters; Box-Muller makes normals. The streams
-of the package are named here, so that no two purposes share their draws.
+No state is kept, so a world draws the same numbers in any batch and thread. SplitMix64 (Steele,
+Lea, Flood 2014) mixes the counters; Box-Muller makes normals. Each purpose has a stream of its own.
 """
 
 from __future__ import annotations
@@ -53,10 +52,7 @@ def episode_seed(seed, number):  # type: ignore[no-untyped-def]
 
 @kernel
 def uniform_between(out, low, high, seeds, stream, first, stride):  # type: ignore[no-untyped-def]
-    """Fills out (n, M, Q) with draws between low (Q,) and high (Q,), or these where both are equal.
-
-    That of seed n (n,), row m and column q has the counter first + m stride + q.
-    """
+    """Draws out (n, M, Q) in [low, high) (Q,), by seeds (n,) and counters first + m stride + q."""
     for n in range(out.shape[0]):
         for m in range(out.shape[1]):
             for q in range(out.shape[2]):

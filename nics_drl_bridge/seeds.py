@@ -16,10 +16,7 @@ _SHORT.maxlong = _SHORT.maxstring = _SHORT.maxother = 40
 
 
 def checked_seeds(seeds: ArrayLike | Any, greatest: int = GREATEST_SEED) -> NDArray[np.int64]:
-    """Returns one or several seeds as (n,), as the kernels take them.
-
-    Raises ConfigError if a seed is negative, too large, or not an integer.
-    """
+    """Returns seeds as (n,); ConfigError if one is negative, too large or not an integer."""
     if isinstance(seeds, np.ndarray) and seeds.dtype == np.int64 and greatest == GREATEST_SEED:
         numbers = np.atleast_1d(seeds)
         if not (numbers < 0).any():

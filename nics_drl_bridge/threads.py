@@ -23,10 +23,9 @@ def _pool(process: int) -> ThreadPoolExecutor:
 
 
 def run_parts(function: Callable[[T], R], parts: Sequence[T]) -> list[R]:
-    """Returns a function's result for each part, in order, each from a thread of its own.
+    """Returns a function's result for each part, in order; threads run all but the first part.
 
-    The caller runs the first part. It helps only if the work is in compiled functions that release
-    the interpreter lock (`nogil`). An exception is raised after all parts have ended.
+    It helps if the work releases the interpreter lock. Exceptions are raised when all have ended.
     """
     others = [_pool(os.getpid()).submit(function, part) for part in parts[1:]]
     try:
@@ -37,10 +36,6 @@ def run_parts(function: Callable[[T], R], parts: Sequence[T]) -> list[R]:
 
 
 def one_blas_thread(function: Callable[P, R]) -> Callable[P, R]:
-    """Limits a function to one BLAS thread, and restores their number afterwards.
-
-    A fit solves thousands of small least-squares problems. Several threads would synchronise at
-    each of them, which takes ten times as long on a busy machine.
-    """
+    """Limits a function to one BLAS thread: for thousands of small problems, ten times as fast."""
     limited: Callable[P, R] = threadpool_limits.wrap(limits=1, user_api="blas")(function)
     return limited

@@ -26,7 +26,6 @@ from nics_drl_bridge.sim.scenes import Scene, sample_scene
 from nics_drl_bridge.sim.world import World, load_world
 
 Array = NDArray[np.float64]
-
 RENDER_FPS = 10
 
 
@@ -94,9 +93,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's own declaration
-        "render_modes": ["human", "rgb_array"],
-        "render_fps": RENDER_FPS,
-    }
+        "render_modes": ["human", "rgb_array"], "render_fps": RENDER_FPS,
+    }  # fmt: skip
 
     def __init__(
         self, backend: str | Backend = "sim", model: str | SimulatorModel = "ackermann",
@@ -201,8 +199,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     ) -> tuple[NDArray[np.float32], dict[str, Array], dict[str, Any]]:
         """Advances one period: observations (M, O), reward terms (M,) by name, and `info`.
 
-        `ended` (M,) marks the robots whose episode is over; in a team they get the command nearest
-        to zero and no further reward.
+        `ended` (M,) robots of a team get the command nearest to zero and no further reward.
         """
         before = self._view
         if before is None:
@@ -232,7 +229,6 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self._backend.halt()
 
     def _lifted(self, view: RobotView) -> RobotView:
-        """A view as a batch of one, as the task expects it: leading (1, M)."""
         lead = (1, self.robots, -1)
         arrays = {name: getattr(view, name).reshape(lead) for name in ("pose", "twist", "ranges")}
         sensed = {name: reading.reshape(lead) for name, reading in view.sensed.items()}

@@ -1,9 +1,8 @@
 """Compiled inner loops of the tasks: actions, observations, and the navigation task.
 
-The batched loops call a scalar function per robot, so that results are bit-identical for one robot
-and for thousands. Shapes: R robots of any worlds, B beams, C commands, P parts of a scan in an
-observation. Bearings are computed here because numpy's vectorised functions round the remainder of
-a batch differently from its body.
+The batched loops call a scalar function per robot, bearings included: numpy's vectorised functions
+round the remainder of a batch differently from its body. Shapes: R robots of any worlds, B beams, C
+commands, P parts of a scan in an observation.
 """
 
 from __future__ import annotations

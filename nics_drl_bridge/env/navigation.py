@@ -68,9 +68,8 @@ class Navigation(Task):
     @cached_property
     def observation_space(self) -> gymnasium.spaces.Box:
         """Box of one robot's observation."""
-        return self.box(
-            [0.0, -1.0, -1.0, -LIMIT, -LIMIT, -LIMIT], [LIMIT, 1.0, 1.0, LIMIT, LIMIT, LIMIT]
-        )
+        low, high = [0.0, -1.0, -1.0, *[-LIMIT] * 3], [LIMIT, 1.0, 1.0, *[LIMIT] * 3]
+        return self.box(low, high)
 
     def reset(self, episodes: Episodes) -> Memory:
         """Returns a memory with the goal that the world drew."""

@@ -43,11 +43,9 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - PettingZoo's own declaration
-        "name": "nics_bridge_v0",
-        "render_modes": ["human", "rgb_array"],
-        "render_fps": RENDER_FPS,
-        "is_parallelizable": True,
-    }
+        "name": "nics_bridge_v0", "render_modes": ["human", "rgb_array"],
+        "render_fps": RENDER_FPS, "is_parallelizable": True,
+    }  # fmt: skip
 
     def __init__(
         self, model: str | SimulatorModel = "ackermann", world: str | World = "arena",

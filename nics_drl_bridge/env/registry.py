@@ -16,12 +16,11 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.sectors import layout_of
 from nics_drl_bridge.lidar.sensor import Sensor
 
-TASKS = {
+TASKS = {  # module and class of each
     "navigation": "nics_drl_bridge.env.navigation:Navigation",
     "cooperative_reaching": "nics_drl_bridge.env.teams:CooperativeReaching",
     "pursuit_evasion": "nics_drl_bridge.env.teams:PursuitEvasion",
 }
-"""Module and class of each shipped task."""
 
 
 def make_task(
@@ -29,9 +28,8 @@ def make_task(
 ) -> Task:
     """Makes a task for the robot of a model. Raises ConfigError if it does not fit.
 
-    The task is the name of a shipped one (`navigation`), `path/to/file.py:ClassName`, a class, or a
-    Task. Options are further arguments of the class; `scan` may also be a number of sectors, the
-    name of a layout or its fields, see `sectors.layout_of`; `sensors` are names.
+    `task` is the name of a shipped one (`navigation`), `path/to/file.py:ClassName`, a class, or a
+    Task. Options are arguments of the class; `scan` as in `sectors.layout_of`; `sensors` are names.
     """
     if isinstance(task, Task):
         return _checked(task, model, options)
@@ -71,12 +69,11 @@ def _check_options(found: type[Task], options: dict[str, Any]) -> None:
             raise ConfigError(f"task option {name}={value!r}: must be {KINDS[kind][1]}.")
 
 
-KINDS: dict[str, tuple[tuple[type, ...], str]] = {
+KINDS: dict[str, tuple[tuple[type, ...], str]] = {  # annotation -> types, name in errors
     "bool": ((bool, np.bool_), "True or False"),
     "int": ((int, np.integer), "a whole number"),
     "float": ((int, np.integer, float, np.floating), "a finite number"),
 }
-"""Annotation of an option -> its types, and their name in errors."""
 
 
 def _fits(value: Any, kind: str) -> bool:
@@ -120,11 +117,10 @@ NAVIGATION = "NicsBridge/Navigation-v0"
 COOPERATIVE_REACHING = "NicsBridge/CooperativeReaching-v0"
 PURSUIT_EVASION = "NicsBridge/PursuitEvasion-v0"
 TASK = "NicsBridge/Task-v0"
-ENVIRONMENTS = {
+ENVIRONMENTS = {  # id -> arguments that define it
     NAVIGATION: {"task": "navigation"}, COOPERATIVE_REACHING: {"task": "cooperative_reaching"},
     PURSUIT_EVASION: {"task": "pursuit_evasion"}, TASK: {},
 }  # fmt: skip
-"""Id -> arguments that define the environment."""
 MAX_EPISODE_STEPS = 300
 
 

@@ -23,13 +23,10 @@ Array = NDArray[np.float64]
 class SimBackend:
     """One world of the fast simulator, in this process.
 
-    With `estimator`, scan and odometry of each robot pass through its middleware as in the nodes,
-    so that this backend and the one over DDS give the same numbers for the same seed and commands.
-    Without it, the pose is that of the wheel odometry: bit-identical to a world of the vector env,
-    and several times faster.
-
-    Views and commands have a leading (M,) if M > 1 `robots`; `simulation` are further arguments of
-    the FastSimulator.
+    With `estimator`, each robot's scan and odometry pass through its middleware as in the nodes, so
+    that this backend and the one over DDS give the same numbers. Without, the pose is that of the
+    odometry: bit-identical to a world of the vector env, and several times faster. Views and
+    commands have a leading (M,) if M > 1 `robots`; `simulation` are arguments of the FastSimulator.
     """
 
     def __init__(
@@ -84,7 +81,6 @@ class SimBackend:
         }
 
     def _of_episode(self, draws: NDArray[Any]) -> Any:
-        """Returns a draw of the scene (1,), or of its robots (1, M), as it is for `info`."""
         drawn = draws[0] if draws.ndim == 1 else draws[self._row]
         return drawn.copy() if drawn.ndim else drawn.item()
 

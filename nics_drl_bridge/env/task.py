@@ -25,15 +25,11 @@ Array = NDArray[np.float64]
 Observation = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 Actions = Literal["continuous", "discrete"]
+# Memory of a task during an episode: name -> array with leading (n, M), or (n,) per world.
 Memory = dict[str, NDArray[Any]]
-"""Memory of a task during an episode: name -> array with leading (n, M), or (n,) per world."""
-
 DRIVES = ((0, 0, 0), (1, 0, 0), (1, 0, 1), (1, 0, -1), (-1, 0, 0), (-1, 0, 1), (-1, 0, -1))
-"""The seven drives of the paper's cars: stop; ahead, ahead to the left, to the right; and back.
-
-They are those of the authors' code (efc-robot/MultiVehicleEnv), as signs of `cmd_vel`: linear.x,
-linear.y, angular.z. A robot that can't reverse stays in place, and turns if it can on the spot.
-"""
+"""Stop; ahead, to the left, to the right; and back: signs of linear.x, linear.y, angular.z, as in
+the authors' code (efc-robot/MultiVehicleEnv). What can't reverse stays, and turns if it can."""
 SIDEWAYS = ((0, 1, 0), (0, -1, 0))  # Two more for a robot that moves sideways
 
 
@@ -41,8 +37,7 @@ SIDEWAYS = ((0, 1, 0), (0, -1, 0))  # Two more for a robot that moves sideways
 class Episodes:
     """Episodes at their start, in n worlds with M robots."""
 
-    # (n,); all that a task draws must follow from them, see `random_kernels.uniform`
-    seeds: NDArray[np.int64]
+    seeds: NDArray[np.int64]  # (n,); all draws must follow from them, by `random_kernels.uniform`
     starts: Array  # (n, M, 3) poses of the robots: x [m], y [m], heading [rad] in `map`
     goals: Array  # (n, M, 2) free points that the world drew, one per robot [m]
 
@@ -76,20 +71,16 @@ class Task(ABC):
     `bearing` and `distance` instead of numpy's trigonometric functions.
     """
 
-    # True if `reward`, `update` or `step_into` use `before.ranges`; otherwise these may be the new
-    # ranges, which saves a copy
+    # True if a method uses `before.ranges`; otherwise these may be the new ones, without a copy
     keeps_last_scan: ClassVar[bool] = True
-    # True if it observes further sensors, `sensors`; they are in all views in any case
-    observes_sensors: ClassVar[bool] = False
+    observes_sensors: ClassVar[bool] = False  # True if it observes the further `sensors`
     shown: ClassVar[tuple[str, ...]] = ()  # names of memory arrays that `info` always contains
 
     robot: RobotSpec  # gives commands, their limits, and the footprint
     lidar: LidarSpec  # gives the scan
-    # `continuous` (Box) or `discrete` (the paper's drives, see `DRIVES`)
-    actions: Actions = "continuous"
+    actions: Actions = "continuous"  # a Box, or `discrete`: the paper's drives, see `DRIVES`
     contact_margin: float = 0.02  # a return this close to the footprint counts as a contact [m]
-    # sectors that observations contain instead of the lidar's beams, so that they mean the same for
-    # any lidar; None keeps the beams. Contact is always judged from the beams
+    # sectors instead of beams, to mean the same for any lidar; contact is judged from the beams
     scan: ScanLayout | None = None
     sensors: tuple[Sensor, ...] = ()  # further ones, whose shares end each observation
 
@@ -226,11 +217,7 @@ class Task(ABC):
 
 
 def discrete_commands(robot: RobotSpec) -> Array:
-    """(A, C) commands of the discrete actions: `DRIVES` at the commands' limits.
-
-    A robot whose commands do not name fields of `cmd_vel` gets a stop, and each command alone at
-    its maximum and its minimum.
-    """
+    """(A, C) commands of the discrete actions, at limits: `DRIVES`, or each command by itself."""
     if any(command.cmd_vel is None for command in robot.command):
         each = np.eye(len(robot.command), dtype=np.int64)
         signs = np.concatenate([0 * each[:1], each, -each])

@@ -125,10 +125,8 @@ class CooperativeReaching(Task):
     def reward(self, before: RobotView, after: RobotView, memory: Memory) -> dict[str, Array]:
         """The terms (..., M)."""
         lead = after.pose.shape[:-1]
-        gaps = [
-            task.distance(*pairs(view.pose, memory["goal"])).min(axis=-2)
-            for view in (before, after)
-        ]
+        ways = (task.distance(*pairs(view.pose, memory["goal"])) for view in (before, after))
+        gaps = [way.min(axis=-2) for way in ways]
         # A goal just reached still pays its last approach.
         open_goals = ~memory["reached"] | memory["newly"]
         approach = np.where(open_goals, gaps[0] - gaps[1], 0.0)
@@ -212,9 +210,8 @@ class PursuitEvasion(Task):
     def __post_init__(self) -> None:
         super().__post_init__()
         if min(self.pursuers, self.evaders) < 1:
-            raise ConfigError(
-                f"task options pursuers={self.pursuers}, evaders={self.evaders}: at least 1 each."
-            )
+            given = f"pursuers={self.pursuers}, evaders={self.evaders}"
+            raise ConfigError(f"task options {given}: at least 1 each.")
 
     @property
     def robots(self) -> int:
@@ -286,7 +283,6 @@ class PursuitEvasion(Task):
         }
 
     def _collided(self, view: RobotView, memory: Memory) -> Flags:
-        """True for a contact that is no capture."""
         return np.asarray(self.touches(view.ranges) & ~memory["newly"])
 
     def end(self, view: RobotView, memory: Memory) -> Flags:

@@ -26,8 +26,7 @@ from nics_drl_bridge.sim.world import World, load_world
 Array = NDArray[np.float64]
 Observation = NDArray[np.float32]
 Flags = NDArray[np.bool_]
-Facts = Mapping[str, Any]
-"""Name -> array whose first dimension is the world, or another such mapping."""
+Facts = Mapping[str, Any]  # name -> array whose first dimension is the world, or such a mapping
 Rows = slice | NDArray[np.intp] | Flags
 MODES = {mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)}
 
@@ -61,10 +60,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium's own declaration
-        "render_modes": ["rgb_array"],
-        "render_fps": RENDER_FPS,
+        "render_modes": ["rgb_array"], "render_fps": RENDER_FPS,
         "autoreset_mode": AutoresetMode.NEXT_STEP,
-    }
+    }  # fmt: skip
 
     def __init__(
         self, num_envs: int = 1, model: str | SimulatorModel = "ackermann",
@@ -144,7 +142,6 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     def _begin(
         self, worlds: NDArray[np.intp], out: Observation, options: dict[str, Any] | None = None
     ) -> None:
-        """Begins the next episode in some worlds and writes their observations into their rows."""
         if not len(worlds):
             return
         self._episode[worlds] += 1
@@ -206,7 +203,6 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     def _advance(
         self, part: slice, actions: NDArray[Any], out: Observation, begun: Flags
     ) -> Outcome:
-        """Advances the worlds of a part, or resets those in `begun` (N,); writes observations."""
         data, ended = self.simulator.data, self.ended[part]
         command = self.task.command(actions)
         if self.robots > 1 and ended.any():
@@ -237,13 +233,11 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
                 shown[n] = flat(out)[n].copy()
             infos |= masked({"final_obs": shown}, over)
             infos |= masked({"final_info": self._known() | facts}, over, True)
-            self.simulator.run_parts(
-                lambda part: self._begin(part.start + np.flatnonzero(over[part]), out)
-            )
+            run = self.simulator.run_parts
+            run(lambda part: self._begin(part.start + np.flatnonzero(over[part]), out))
         self._tell(infos, facts, over)
 
     def _tell(self, infos: dict[str, Any], facts: dict[str, Any], begun: Flags) -> None:
-        """Adds to `infos` the facts of every world, and the beginnings of those in `begun`."""
         infos |= masked(self._known(), np.ones_like(begun))
         if some := bool(begun.any()):
             infos |= masked(self._beginnings(), begun, True)
@@ -258,7 +252,6 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         return {**shown, "pose": pose, "scan_age_s": ages[0], "odom_age_s": ages[1]}
 
     def _beginnings(self) -> dict[str, Any]:
-        """Facts of episodes that begin, with the values that the randomisation drew."""
         drawn = {
             name: self._row(values) if values.ndim > 1 else values
             for name, values in self.simulator.drawn.items()
@@ -341,10 +334,7 @@ def named_seeds(
 
 
 def masked(facts: Facts, mask: Flags, alone: bool = False) -> dict[str, Any]:
-    """Pairs each fact (N, ...) with the mask (N,) of its worlds, `_name`, as Gymnasium does.
-
-    With `alone`, they are new arrays that are zero for the other worlds.
-    """
+    """Pairs facts (N, ...) with masks `_name` (N,), as Gymnasium; zero elsewhere if `alone`."""
     paired: dict[str, Any] = {}
     for name, values in facts.items():
         paired[name], paired[f"_{name}"] = values, mask.copy()

@@ -1,7 +1,4 @@
-"""Baking: scans of every shape on the lidar's main axis, stored in a table (Sec. IV-B).
-
-Application of a sensor model to a freshly baked table.
-"""
+"""Baking: scans of every shape on the lidar's main axis, stored in a table (Sec. IV-B)."""
 
 from __future__ import annotations
 
@@ -24,12 +21,10 @@ from nics_drl_bridge.lidar.table import MOST_WIDE, Density, LidarTable, padding
 
 Array = NDArray[np.float64]
 TOUCHING = 1e-6  # excess of the nearest grid distance over the radius, as a share of the radius
-COARSE = np.radians(2.0)
-"""Shapes are evaluated between grid rotations in steps of at most half of this [rad]."""
+COARSE = np.radians(2.0)  # between grid rotations, steps are of at most half of this [rad]
 MOST_NUMBERS = 2**31 - 2**20
 FIRST_BEAM = -(2**15)  # least first beam of a row, relative to the bearing
-MISS = 0.02
-"""An edge that two corners would miss by more than this [beams] is found by climbing the hull."""
+MISS = 0.02  # an edge that two corners miss by more [beams] is found by climbing the hull
 
 
 @dataclass(frozen=True)
@@ -49,10 +44,9 @@ def bake(
     """Scans shapes straight ahead, on a grid of distances and rotations, with the exact scanner.
 
     Equal shapes are baked once, by default at `Density.for_beams`. The sensor model is that of the
-    lidar, or other named models, or a function of ranges and incidence that returns `inf` where the
-    device gets no return. It is baked in and has no run-time cost; a beam that it loses passes
-    through to objects behind. Raises ConfigError if the table would be too large, or a shape covers
-    too many beams.
+    lidar, or other named models, or a function of ranges and incidence; where it gives `inf`, a
+    beam passes through to objects behind. It costs nothing at run time. Raises ConfigError if the
+    table would be too large, or a shape covers too many beams.
     """
     shapes = tuple(dict.fromkeys(shapes))
     density = density or Density.for_beams(spec.angle_increment)
@@ -118,10 +112,7 @@ def grid_of(spec: LidarSpec, outlines: Outlines, h: int, density: Density) -> Gr
 
 
 def _within(values: NDArray[Any], parts: int, outer: np.ufunc) -> NDArray[Any]:
-    """Outermost value in each cell (T, D), from values (T * parts + 1, D) around and between.
-
-    The kernels blend two distances: a cell extends to the next one.
-    """
+    """Outermost value in each cell (T, D); as two distances are blended, it extends to the next."""
     count = len(values) // parts
     turned = outer.reduce([values[k:][: count * parts : parts] for k in range(parts + 1)])
     result = turned.copy()
@@ -137,11 +128,7 @@ def _reach_of(edge: Array, parts: int, outer: np.ufunc) -> Array:
 
 
 def _wound(hull: Array, hints: NDArray[np.int64], along: Array) -> NDArray[np.int64]:
-    """Unwraps the corners at an edge (...): indices continue around the hull as the shape rotates.
-
-    `along` is the direction of the edge in the shape's frame, with the hull to its left [rad]; it
-    lies between those of the hull's sides before and after the corner.
-    """
+    """Unwraps corners at an edge (...), which points `along` in the shape's frame [rad]."""
     x, y = (np.roll(hull, -1, axis=0) - hull).T
     after = np.arctan2(y, x)
     middle = after - np.mod(after - np.roll(after, 1), 2.0 * np.pi) / 2.0
@@ -154,9 +141,8 @@ def _candidates(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Two corners (T, D, 2) that can be an edge within each cell; or where to climb from.
 
-    Along a line and around a circle outside the shape the corner changes monotonically, so those at
-    the rim of a cell enclose all others. If there are more than two, those at one quarter and three
-    quarters represent all. To climb there are the corner in the middle, and minus the first stride.
+    Along a line and around a circle outside, the corner changes monotonically: those at the rim of
+    a cell enclose all others. If more than two, those at one and three quarters represent all.
     """
     low, high = _within(wound, parts, np.minimum), _within(wound, parts, np.maximum)
     quarter, first = (high - low) // 4, wound[parts // 2 :: parts]
@@ -187,7 +173,6 @@ def _miss(
 def _fill(
     kernel: Callable[..., None], out: NDArray[np.float32], table: LidarTable, grids: Sequence[Grid]
 ) -> None:
-    """Computes values laid out as the table's rows (R,), one rotation after the other."""
     outlines, distances, done = table.outlines, table.density.distances, 0
     for h, grid in enumerate(grids):
         shape = outlines.corners[outlines.corner[h] : outlines.corner[h + 1]], outlines.radii[h]
@@ -204,10 +189,7 @@ def _fill(
 def apply_model(
     table: LidarTable, grids: Sequence[Grid], model: Function | Sequence[SensorModel]
 ) -> LidarTable:
-    """Returns a table without a model as measured by the device; its rows are overwritten.
-
-    All of several named models act; a function is given one row in the order of its angles.
-    """
+    """Returns a table as the device measures, by all models or one function; overwrites rows."""
     cosines = np.zeros(table.rows.shape, np.float32)
     _fill(bake_kernels.cosines_of_turn, cosines, table, grids)
     cosines = np.minimum(cosines, np.float32(1.0))
@@ -215,9 +197,8 @@ def apply_model(
     ends = table.start + table.widths * phases
     if callable(model):
         for begin, end in zip(table.start, ends, strict=True):
-            row, cosine = (
-                a[begin:end].reshape(phases, -1).T.ravel() for a in (table.rows, cosines)
-            )
+            both = (a[begin:end].reshape(phases, -1).T.ravel() for a in (table.rows, cosines))
+            row, cosine = both
             changed = model(row, np.arccos(cosine.astype(np.float64)))
             table.rows[begin:end] = np.asarray(changed, np.float32).reshape(-1, phases).T.ravel()
         return table

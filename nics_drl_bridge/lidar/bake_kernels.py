@@ -60,11 +60,7 @@ def along(angle, corners, radius, distance, cos, sin):  # type: ignore[no-untype
 
 @kernel(allocates=True)
 def row(fine, beams, corners, radius, distance, cos, sin, edge):  # type: ignore[no-untyped-def]
-    """Writes ranges (P,) [m] of a shape straight ahead, continued beyond its edges (2,) [rad].
-
-    The outline has corners (V, 2) [m], none for a circle of a radius [m]; its origin is at a
-    distance [m], and it is turned by (cos, sin).
-    """
+    """Writes ranges (P,) [m] of a shape straight ahead, continued beyond its edges (2,) [rad]."""
     fine[:] = np.inf
     if corners.shape[0] == 0:
         exact_kernels.circle(fine, beams, distance, 0.0, radius, np.inf)
@@ -117,11 +113,7 @@ def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # 
 
 @kernel(allocates=True)
 def incidences(angles, step, corners, radius, distance, c, s):  # type: ignore[no-untyped-def]
-    """Cosines (P,) of the incidence on a shape straight ahead, 0 where a ray misses it.
-
-    The normal of a circle is the direction from its centre; the cosine on a segment, where it is
-    nearest, is the distance of its line over the range.
-    """
+    """Cosines (P,) of the incidence on a shape straight ahead, 0 where a ray misses it."""
     directions = np.stack((np.cos(angles), np.sin(angles)), axis=1)
     beams, count = Beams(directions, angles[0], step, False), len(angles)
     nearest, cosines = np.full(count, np.inf, np.float32), np.zeros(count, np.float32)
@@ -148,10 +140,7 @@ def incidences(angles, step, corners, radius, distance, c, s):  # type: ignore[n
 
 @kernel(allocates=True)
 def cosines_of_turn(cosines, layout, shape, distances, turn, edges, step, phases):  # type: ignore[no-untyped-def]
-    """Writes the cosine (R,) of the incidence at every point of one rotation, see `rows_of_turn`.
-
-    Beyond the edges of the shape it is that at the edge, as for the ranges.
-    """
+    """Writes cosines (R,), see `rows_of_turn`; beyond the edges they are as at the edge."""
     c, s = math.cos(turn), math.sin(turn)
     corners, radius = shape
     for d in range(distances.shape[0]):

@@ -1,9 +1,8 @@
 """Compiled look-up of one body (Eq. 3), step by step; `scan_kernels` takes each for many bodies.
 
-A plain look-up takes the nearest row of the table. Here the rows of the two grid distances around
-the true one are blended, and in each the two points around a beam; and the beams that hit follow
-from the true silhouette: one on the wrong side of a beam is by far the largest error of a plain
-look-up.
+Not the nearest row of the table, but the two around the true distance are blended, in each the two
+points around a beam; and the beams that hit follow from the true silhouette, as one on the wrong
+side of a beam is by far the largest error of a plain look-up.
 """
 
 from __future__ import annotations
@@ -19,15 +18,14 @@ from nics_drl_bridge.lidar import exact_kernels
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE, Beams, OutlineArrays, X, Y
 from nics_drl_bridge.lidar.map_kernels import GridArrays
 
-ABOVE_ZERO = 2.0**24
-"""Added before truncation to an integer, so that numbers are rounded down."""
+ABOVE_ZERO = 2.0**24  # Added before truncation to an integer: numbers are rounded down
 PER_TURN = 0.5 / math.pi
 UNSEEN, LOOKED_UP, COMPUTED = range(3)
 ATAN = tuple(map(np.float32, (
     0.999999881, -0.333319604, 0.199692354, -0.140165851, 0.0990609676, -0.0593671016,
     0.0241661891, -0.00466877315,
 )))  # fmt: skip
-TABLE_SHAPE = np.dtype([
+TABLE_SHAPE = np.dtype([  # parameters of a shape in the table
     ("per_metre", np.float64),  # grid distances per metre
     ("rotations", np.float64),  # in a full turn, 0 for a circle
     ("parts_per_rotation", np.float64),  # periods of the rotational symmetry
@@ -36,7 +34,6 @@ TABLE_SHAPE = np.dtype([
     ("corners_per_part", np.int64), ("corners", np.int64),
     ("round_radius", np.float64),  # of a circle [m], 0 for others
 ])  # fmt: skip
-"""Parameters of a shape in the table."""
 
 
 class TableArrays(NamedTuple):
@@ -111,10 +108,7 @@ def polar(dx, dy):  # type: ignore[no-untyped-def]
 
 @kernel(contracts=True, inline=True)
 def nearest_cell(distance, bearing, radius, heading, shape, table):  # type: ignore[no-untyped-def]
-    """Returns the cell below a distance, at the nearest rotation of a shape.
-
-    Also the first corner of its hull, and the share of the next cell's row.
-    """
+    """Cell below a distance at the nearest rotation, first hull corner, share of the next cell."""
     place = (distance - radius) * shape.per_metre
     ring = np.int32(max(min(np.int32(place), np.int32(table.distances - 2)), np.int32(0)))
     share = (heading - bearing) * PER_TURN
@@ -144,8 +138,7 @@ def seen_at(dx, dy, c, s):  # type: ignore[no-untyped-def]
 def silhouette(pair, hull, shape, hulls, seen, side):  # type: ignore[no-untyped-def]
     """Direction of the right (side 1) or left (-1) silhouette of a shape from its bearing [rad].
 
-    It may be either corner of a pair, from the first one `hull` on; a negative one is minus the
-    stride of climbing the hull from the other.
+    It is either corner of a pair; a negative one is minus the stride of climbing from the other.
     """
     first, other = hull + (pair & 0xFFFF), pair >> 16
     if other < 0:
@@ -187,11 +180,7 @@ def in_beams(right, left, bearing, heading, beams):  # type: ignore[no-untyped-d
 
 @kernel(contracts=True, inline=True)
 def beams_between(middle, low, high, count, shift):  # type: ignore[no-untyped-def]
-    """Returns the first beam of `count` between two silhouettes [beams], and how many there are.
-
-    With them come the point of a row before the first beam, counted from the bearing, and the share
-    of the point after it.
-    """
+    """First beam between silhouettes, hits; the point before it from the bearing, and share."""
     begin = np.int32(low)  # conversion is faster than rounding up
     begin = np.int32(max(np.int32(begin + np.int32(low > begin)), np.int32(0)))
     hits = np.int32(min(np.int32(high), np.int32(count - 1)) - begin + 1)

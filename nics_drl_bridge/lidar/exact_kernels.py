@@ -1,8 +1,7 @@
 """Compiled exact scanner: the ranges of one object in one scan.
 
-Each function lowers the beams that hit its object in a scan `out` (B,), float32, in metres, and
-leaves the others unchanged: calling them one after the other is the minimum of Eq. 4. Positions are
-in the frame of the lidar.
+Each function lowers the beams that hit its object in a scan `out` (B,), float32 [m]: one after the
+other they are the minimum of Eq. 4. Positions are in the frame of the lidar.
 """
 
 from __future__ import annotations
@@ -55,10 +54,7 @@ class OutlineArrays(NamedTuple):
 
 @kernel(inline=True)
 def arctan2(y, x):  # type: ignore[no-untyped-def]
-    """Angle of (x, y) within 3e-10 rad, without branches, so that loops over it are vectorised.
-
-    A polynomial in the square of the ratio of smaller to larger, fitted at Chebyshev nodes.
-    """
+    """Angle of (x, y) within 3e-10 rad, branchless: a polynomial fitted at Chebyshev nodes."""
     ax, ay = abs(x), abs(y)
     ratio = min(ax, ay) / (max(ax, ay) + TINY)
     s = ratio * ratio
@@ -80,10 +76,7 @@ def arctan2(y, x):  # type: ignore[no-untyped-def]
 
 @kernel
 def beam_span(low, high, beams):  # type: ignore[no-untyped-def]
-    """Returns the first beam and the number of beams in the angles [low, high].
-
-    In a full circle the beams may cross the seam: indices are modulo the count.
-    """
+    """First beam and number of beams in [low, high]; in a full circle modulo the count."""
     count = beams.directions.shape[0]
     first = math.ceil((low - beams.first) / beams.step - ROUNDING)
     last = math.floor((high - beams.first) / beams.step + ROUNDING)
@@ -153,7 +146,6 @@ def edge(out, beams, x1, y1, angle1, x2, y2, angle2, one_sided):  # type: ignore
 
 @kernel(inline=True)
 def _cross(out, directions, begin, end, cross, ex, ey):  # type: ignore[no-untyped-def]
-    """Fuses a straight line into the beams from `begin` to `end`, in a vectorised loop."""
     for k in range(end - begin):
         i = np.uintp(begin + k)
         distance = np.float32(cross / (directions[i, 0] * ey - directions[i, 1] * ex))
@@ -177,11 +169,7 @@ def polygon(out, beams, x, y, c, s, corners):  # type: ignore[no-untyped-def]
 
 @kernel
 def beside_convex(x, y, c, s, corners):  # type: ignore[no-untyped-def]
-    """True if an outline is convex and does not enclose the lidar; see `polygon`.
-
-    Then a ray first meets a side that has the lidar to its right. False if a side points at the
-    lidar, which may lie on it.
-    """
+    """True if an outline is convex, the lidar outside: rays first meet sides from their right."""
     last, rounds = corners.shape[0] - 1, 0
     bx, by = turned(x, y, c, s, corners[max(last - 1, 0)])
     ax, ay = turned(x, y, c, s, corners[last])
@@ -189,7 +177,7 @@ def beside_convex(x, y, c, s, corners):  # type: ignore[no-untyped-def]
     for v in range(last + 1):
         bx, by = turned(x, y, c, s, corners[v])
         gx, gy, cross = bx - ax, by - ay, ax * by - ay * bx
-        if ex * gy - ey * gx < 0.0 or cross == 0.0:
+        if ex * gy - ey * gx < 0.0 or cross == 0.0:  # the lidar may lie on a side towards it
             return False
         if (ay <= 0.0) != (by <= 0.0):  # it crosses the ray ahead, or the one behind
             rounds += int(ay <= 0.0 and cross > 0.0) - int(ay > 0.0 and cross < 0.0)
@@ -215,11 +203,7 @@ def finish(out, range_min, range_max):  # type: ignore[no-untyped-def]
 
 @kernel
 def walls_into(out, beams, lidar, walls, range_max):  # type: ignore[no-untyped-def]
-    """Fuses straight walls (W, 4), given in the world, into a scan from a `LidarPose`.
-
-    Only beams that can meet the part of a wall within `range_max` are computed. Returns the number
-    of walls within range.
-    """
+    """Fuses walls (W, 4) into a scan from a `LidarPose`; returns how many are in range."""
     near, c, s = 0, lidar.c, lidar.s
     for w in range(walls.shape[0]):
         ax, ay = walls[w, 0] - lidar.x, walls[w, 1] - lidar.y

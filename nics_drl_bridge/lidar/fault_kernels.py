@@ -1,9 +1,8 @@
 """Compiled faults of a lidar: deviations of a real device from the exact ranges.
 
 The order is that of the device: skew (beams are measured from different poses), geometry (the
-scanner), then returns that are too close, noise, quantisation and dropouts, by `distort`. The
-faults of one robot are a row (P,) of numbers, so that each robot of a batch may have its own; a
-fault whose numbers are 0 takes no time and draws nothing.
+scanner), then too close, noise, quantisation and dropouts, by `distort`. The faults of one robot
+are a row (P,) of numbers; one whose numbers are 0 takes no time and draws nothing.
 """
 
 from __future__ import annotations
@@ -18,13 +17,8 @@ from nics_drl_bridge.kernels import kernel
 # Columns of a row of faults; `faults.LidarFaults` explains them.
 NOISE_STD, NOISE_PROPORTIONAL, DROPOUT, DROPOUT_FAR, TOO_CLOSE, QUANTISATION, SKEW = range(7)
 PARAMETERS = 7
-
-# Values of the column TOO_CLOSE.
-AS_MINUS_INF, AS_RANGE_MIN, AS_NO_RETURN, AS_GHOST = range(4)
-
-# Values of the column SKEW.
-CLOCKWISE, AT_ONCE, COUNTER_CLOCKWISE = -1, 0, 1
-
+AS_MINUS_INF, AS_RANGE_MIN, AS_NO_RETURN, AS_GHOST = range(4)  # values of TOO_CLOSE
+CLOCKWISE, AT_ONCE, COUNTER_CLOCKWISE = -1, 0, 1  # values of SKEW
 ROUNDING = 1e-9  # rounding error of a multiple of the quantisation step [m]
 
 
@@ -32,8 +26,7 @@ ROUNDING = 1e-9  # rounding error of a multiple of the quantisation step [m]
 def distort(ranges, limits, faults, seed, counter):  # type: ignore[no-untyped-def]
     """Applies faults (P,) of the device to one exact scan (B,) float32, REP-117, in place [m].
 
-    A return stays within the limits, range_min and range_max [m]. `counter` is that of the scan:
-    for equal seed and counter the result is bit-identical in any batch.
+    A return stays within the limits, range_min and range_max [m]; `counter` is that of the scan.
     """
     if faults[TOO_CLOSE] != AS_MINUS_INF:
         _too_close(ranges, limits, faults[TOO_CLOSE], seed, counter)
@@ -95,10 +88,7 @@ def _drop(ranges, limits, share, far, seed, counter):  # type: ignore[no-untyped
 
 @kernel(allocates=True)
 def slice_pose(out, pose, twist, ago):  # type: ignore[no-untyped-def]
-    """Writes the pose (3,) `ago` seconds before a pose, along the exact arc of a body twist (3,).
-
-    The heading is not wrapped.
-    """
+    """Writes the pose (3,) `ago` [s] before, along the arc of a twist (3,); heading unwrapped."""
     turn = -twist[2] * ago
     half = 0.5 * turn
     # The chord of the arc is rotated by half the turn: |chord| = arc * sin(half) / half.
@@ -114,10 +104,9 @@ def slice_pose(out, pose, twist, ago):  # type: ignore[no-untyped-def]
 def slice_poses(out, pose, twist, sweep, direction):  # type: ignore[no-untyped-def]
     """Writes the poses (G, 3) of the robot at which G equal groups of beams were measured.
 
-    Group g consists of the beams from `g * B // G` to `(g + 1) * B // G`; its pose is that of the
-    middle of its interval, its heading not wrapped. The sweep, of a duration from the first beam to
-    the last [s], ends at `pose`: the newest beam is the last one, or beam 0 for a device that turns
-    clockwise. `direction` is a value of the column SKEW, `twist` (3,) that of the body meanwhile.
+    Group g has the beams from `g * B // G` to `(g + 1) * B // G`, and the pose of its interval's
+    middle, heading unwrapped. The `sweep` [s] ends at `pose`: the newest beam is the last, or beam
+    0 for one that turns clockwise. `direction` is a value of SKEW, `twist` (3,) that of the body.
     """
     count = out.shape[0]
     for g in range(count):

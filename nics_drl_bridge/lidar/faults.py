@@ -13,27 +13,24 @@ from nics_drl_bridge.lidar import fault_kernels as kernels
 
 TooClose = Literal["minus_inf", "range_min", "no_return", "ghost"]
 Skew = Literal["none", "counter_clockwise", "clockwise"]
-
 TOO_CLOSE: dict[TooClose, int] = {
     "minus_inf": kernels.AS_MINUS_INF, "range_min": kernels.AS_RANGE_MIN,
     "no_return": kernels.AS_NO_RETURN, "ghost": kernels.AS_GHOST,
 }  # fmt: skip
 SKEW: dict[Skew, int] = {
-    "none": kernels.AT_ONCE,
+    "none": kernels.AT_ONCE, "clockwise": kernels.CLOCKWISE,
     "counter_clockwise": kernels.COUNTER_CLOCKWISE,
-    "clockwise": kernels.CLOCKWISE,
-}
+}  # fmt: skip
 
 
 class LidarFaults(Schema):
     """The faults of a device, in addition to the `noise_std` of its LidarSpec.
 
     They act in this order: skew, geometry, too_close, noise, quantisation, dropout. With a skew the
-    device turns in this direction while the robot moves, and its newest beam is measured at the
-    time of the scan; without, all beams are measured at once. A return nearer than range_min is
-    reported as `-inf` (REP-117), as `range_min`, as no return, or as a `ghost` anywhere within the
-    limits. Less light returns from afar: `dropout_far` acts with the square of the range, in full
-    at range_max.
+    device turns while the robot moves, and its newest beam is measured at the time of the scan;
+    without, all are at once. A return nearer than range_min is reported as `-inf` (REP-117), as
+    `range_min`, as no return, or as a `ghost` anywhere within the limits. `dropout_far` acts with
+    the square of the range, in full at range_max.
     """
 
     skew: Skew = "none"

@@ -14,15 +14,11 @@ from nics_drl_bridge.lidar.scanner import make_scanner
 from nics_drl_bridge.lidar.sensor import Readings, Render, SensedWorlds, Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device, to_device
 
-ANGLE_TOLERANCE = 1e-3
-"""Greatest deviation of the last beam from the declared angle [rad]."""
+ANGLE_TOLERANCE = 1e-3  # greatest deviation of the last beam from the declared angle [rad]
 
 
 class FurtherLidar(Sensor):
-    """A planar lidar; a reading is its scan (B,) [m], REP-117.
-
-    All beams are measured at once, at the end of a control period.
-    """
+    """A planar lidar, read at the end of a control period: a scan (B,) [m], REP-117."""
 
     message = "sensor_msgs/msg/LaserScan"
 

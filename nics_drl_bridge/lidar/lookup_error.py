@@ -10,18 +10,13 @@ from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.shapes import place
 
 Array = NDArray[np.float64]
+# Rings around the lidar, placements in each, bands of range; rings and bands grow geometrically.
 RINGS, PLACES, BANDS, SEED = 13, 256, 8, 0
-"""Rings around the lidar in which a shape is placed, placements in each, and bands of range into
-which the errors are sorted; rings and bands grow geometrically. Last, the seed."""
-TOUCHING = 1e-3
-"""Outer distance of the nearest ring from the shape's circle, as a share of the lidar's range."""
+TOUCHING = 1e-3  # of the nearest ring from the shape's circle, as a share of the lidar's range
 OUTLIER = 0.3  # greatest allowed error of any beam [m]
-DEVIATIONS = 2.0
-"""Safety margin on the measured squared error, in standard deviations: rare beams dominate it."""
+DEVIATIONS = 2.0  # safety margin on the squared error, in standard deviations: rare beams dominate
 SLANT = np.radians(1.5)  # between line of sight and edge at most, in the search for outliers [rad]
-NARROWEST = 0.1
-"""Least width of an interval of distances that is looked up, as a share of the lidar's range:
-narrower ones have too few samples."""
+NARROWEST = 0.1  # least interval of looked-up distances, as a share of the lidar's range
 NO_WALLS = np.zeros((0, 4))
 
 
@@ -30,15 +25,12 @@ def lookup_distances(
 ) -> tuple[float, float]:
     """Finds the distances between which looking up a shape has an RMSE of at most `greatest` [m].
 
-    This is required in each ring of distances between them and in each band of ranges over all
-    these rings, and no beam may be off by more than `OUTLIER`: long thin shapes err when near and
-    seen at a slant, and distant ones where a beam grazes them, which an error over the whole range
-    would hide. Only beams with a return both in the look-up and in the exact scan count: the beams
-    that hit follow from the silhouette, which is exact. Placements are the same for all shapes.
-
-    `exact` and `baked` are `Scanner.arguments` of these renderers, the shape is an index in the
-    table with its radius [m]. Returns the least and the greatest distance from the lidar to the
-    shape's origin [m]; both inf if it may not be looked up.
+    So it must be in each ring of distances and each band of ranges over all rings, and no beam off
+    by more than `OUTLIER`: long thin shapes err when near and seen at a slant, distant ones where a
+    beam grazes them. Only beams with a return in both count: which ones hit is exact. Placements
+    are the same for all shapes. `exact` and `baked` are `Scanner.arguments` of these renderers, the
+    shape is an index in the table with its radius [m]. Returns the least and the greatest distance
+    to its origin [m]; both inf if it may not be looked up.
     """
     low, high, (corners, first) = exact.range_min, exact.range_max, exact.outlines
     outline = corners[first[shape] : first[shape + 1]]
@@ -73,10 +65,7 @@ def _widest(rings: Array, squares: Array, counts: Array, greatest: Array) -> tup
 
 
 def _small(squares: Array, counts: Array, greatest: float) -> bool:
-    """True if the RMSE is small in each ring and in each band, with a margin for chance.
-
-    The sums of squared errors, and the counts of beams, are of rings, places, bands (R, P, B).
-    """
+    """True if the RMSE is small in each ring and band, from sums and counts (R, P, B)."""
     rings = squares.sum(axis=2), counts.sum(axis=2)
     bands = squares.reshape(-1, BANDS).T, counts.reshape(-1, BANDS).T
     for square, count in (rings, bands):
@@ -89,7 +78,6 @@ def _small(squares: Array, counts: Array, greatest: float) -> bool:
 
 
 def _scans(bodies: Array, exact: LidarArrays, baked: LidarArrays) -> tuple[Array, Array]:
-    """Ranges (P, B) to one body (P, 1, 7) in each of P places: exact, and looked up."""
     mount, directions = exact.mount, exact.beams.directions
     robots = np.tile([-mount[0], -mount[1], 0.0], (PLACES, 1, 1))  # the lidar is at the origin
     scans = np.empty((2, PLACES, 1, len(directions)), np.float32)
@@ -101,7 +89,6 @@ def _scans(bodies: Array, exact: LidarArrays, baked: LidarArrays) -> tuple[Array
 
 
 def _around(exact: LidarArrays, between: Array, seed: int) -> Array:
-    """Draws poses (PLACES, 3) of a body in the lidar's field of view, between two distances."""
     rng, beams = np.random.default_rng(seed), exact.beams
     distance = rng.uniform(between[0], between[1], PLACES)
     bearing = exact.mount[2] + beams.first
@@ -111,11 +98,7 @@ def _around(exact: LidarArrays, between: Array, seed: int) -> Array:
 
 
 def _slanted(poses: Array, outline: Array, seed: int) -> Array:
-    """Draws poses at which the lidar, at the origin, is nearly on the line of an edge.
-
-    There a beam may run along the edge, and a look-up be off by its length: too rare to occur among
-    random poses, and too large to be ignored.
-    """
+    """Draws poses with the lidar nearly on the line of an edge: rare, and off by its length."""
     rng = np.random.default_rng(seed)
     along = np.roll(outline, -1, axis=0) - outline
     length = np.hypot(*along.T)

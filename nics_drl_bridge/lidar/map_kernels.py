@@ -1,14 +1,11 @@
 """Compiled static maps: the ranges of one scan in a grid of solid squares.
 
-Both ways below find the same ranges. `walk` goes from cell to cell in float64 (Amanatides and Woo,
-1987). `jump` goes over free squares: for each free cell and each of the four quadrants of
-directions, the bake stores the side of the largest free square that begins at the cell and opens
-towards the quadrant (an anisotropic chessboard distance; Sramek and Kaufman, 2000). A beam within
-its quadrant can only leave the square through its two far sides, which lie on grid lines. So a jump
-ends where a walk would, and no range is blended or rounded to a cell.
-
-`jump` works in float32 and relative to the cell of the lidar: the relative error of a range is at
-most 3e-7. A beam that passes the corner of a cell within 1e-6 of a cell may pass on its other side.
+`walk` goes from cell to cell in float64 (Amanatides and Woo, 1987). `jump` goes over free squares:
+for each free cell and quadrant of directions, the bake stores the side of the largest free square
+that opens towards the quadrant (an anisotropic chessboard distance; Sramek and Kaufman, 2000). A
+beam leaves it through its two far sides only, which are grid lines: no range is blended or rounded
+to a cell. `jump` works in float32 relative to the lidar's cell: the relative error of a range is at
+most 3e-7, and a beam within 1e-6 cells of a corner may pass on its other side.
 """
 
 from __future__ import annotations
@@ -21,8 +18,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
 
-LANES = 48
-"""Beams that jump together: several vector registers wide, to hide the latency of the look-ups."""
+LANES = 48  # Beams that jump together: several vector registers, to hide the look-ups' latency
 DU, DV, PER_U, PER_V, U, V, T = (np.uintp(k * LANES) for k in range(7))
 COLUMN, ROW, ASIDE, ABOVE, QUADRANT, SIDE = (np.uintp(k * LANES) for k in range(6))
 """Where the quantities of a lane begin: direction, its inverses, place in the cell of the lidar and
@@ -34,13 +30,10 @@ SLACK = 1.0 + 1e-6  # a return at exactly range_max must not be lost to rounding
 
 
 class GridArrays(NamedTuple):
-    """A static map for the kernels; without cells where there is none.
+    """A static map for the kernels; without cells where there is none."""
 
-    Of each cell the squares have one byte per quadrant, 0 in cells that stop a beam and in the
-    border of one cell around the map.
-    """
-
-    squares: NDArray[np.uint32]  # (rows + 2, columns + 2)
+    # (rows + 2, columns + 2), a byte per quadrant: 0 in solid cells and the border around the map
+    squares: NDArray[np.uint32]
     frame: NDArray[np.float64]  # (5,) x, y [m], cosine, sine of its origin, resolution [m]
 
 
@@ -68,7 +61,6 @@ def free_squares(blocked):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def _line(at, step, cell):  # type: ignore[no-untyped-def]
-    """Distance along a beam to where it leaves `cell` along one axis [cells]."""
     if step == 0.0:
         return np.inf
     return (cell + (1 if step > 0.0 else 0) - at) / step
@@ -87,8 +79,7 @@ def _entry(at, step, size):  # type: ignore[no-untyped-def]
 def walk(squares, u, v, du, dv, limit):  # type: ignore[no-untyped-def]
     """Exact distance [cells] from (u, v) to the boundary of the solid cells, `inf` beyond `limit`.
 
-    From a free place this is where the beam enters a solid cell, from within a solid cell where it
-    leaves it. Everything outside the map is free.
+    Where the beam enters one, or from within, where it leaves it. All outside the map is free.
     """
     rows, columns = squares.shape[0] - 2, squares.shape[1] - 2
     x, y, t = math.floor(u), math.floor(v), 0.0
@@ -123,10 +114,7 @@ def walk(squares, u, v, du, dv, limit):  # type: ignore[no-untyped-def]
 
 @kernel
 def map_into(out, beams, lidar, range_max, grid, exact, lanes):  # type: ignore[no-untyped-def]
-    """Fuses a map (`GridArrays`) into a scan (B,) float32 [m] from a `LidarPose`.
-
-    It walks if `exact`, else jumps, and searches up to `range_max` [m].
-    """
+    """Fuses a map (`GridArrays`) into a scan (B,) float32 [m]: walks if `exact`, else jumps."""
     squares, frame = grid.squares, grid.frame
     if squares.size == 0:
         return

@@ -22,8 +22,7 @@ from nics_drl_bridge.lidar import map_kernels
 from nics_drl_bridge.lidar.shapes import Coordinate, Heading
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
-NO_MAP = map_kernels.GridArrays(np.zeros((0, 0), np.uint32), np.zeros(0))
-"""Argument of the kernels without a map."""
+NO_MAP = map_kernels.GridArrays(np.zeros((0, 0), np.uint32), np.zeros(0))  # for the kernels
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +48,7 @@ class GridMap:
     @cached_property
     def blocked(self) -> NDArray[np.bool_]:
         """(rows, columns) cells that stop a beam."""
-        occupied = self.cells >= self.occupied_from
-        return np.asarray(~self.free if self.unknown_stops else occupied)
+        return ~self.free if self.unknown_stops else np.asarray(self.cells >= self.occupied_from)
 
     @cached_property
     def arrays(self) -> map_kernels.GridArrays:
@@ -93,10 +91,9 @@ class GridMap:
         return np.asarray(steps * (self.resolution / 2.0), dtype=np.float32)
 
     def reachable(self, start: ArrayLike, radius: float) -> NDArray[np.bool_]:
-        """Finds the cells (rows, columns) that a disc [m] can reach from a start (2,) [m].
+        """Finds the cells (rows, columns) that a disc [m] reaches from a start (2,) [m] if it fits.
 
-        It moves between the centres of neighbouring free cells (four each) and stays in the map;
-        all are False if it does not fit at the cell of the start.
+        It moves between the centres of neighbouring free cells (four each) and stays in the map.
         """
         fits = self.free & (self.distance_field > radius)
         row, column = self.world_to_cell(start)
@@ -110,8 +107,7 @@ class GridMap:
 MAX_CELLS = 64_000_000
 MAX_BYTES = 4 * MAX_CELLS + 2**20  # of an image file; larger files are not opened
 FORMATS = {"PPM": (".pgm", ".pnm", ".ppm", ".pbm"), "PNG": (".png",), "BMP": (".bmp",)}
-LUMA = np.array([0.212656, 0.715158, 0.072186])
-"""Luma weights of red, green, blue (Rec. 709), as used by ImageMagick for Nav2."""
+LUMA = np.array([0.212656, 0.715158, 0.072186])  # of R, G, B (Rec. 709), as ImageMagick for Nav2
 
 
 class MapFile(Schema):
@@ -142,9 +138,8 @@ def load_map(
     """Loads a shipped map by name (`room`), or any other by the path of its YAML file.
 
     Cells equal those of Nav2's map_server: pixels exactly on a threshold are occupied or free,
-    colours count by their brightness (Rec. 709) in 256 steps, and pixels that are not opaque are
-    unknown unless the mode is `raw`. Raises ConfigError if the YAML file or the image is missing,
-    invalid or too large.
+    colours count by brightness (Rec. 709) in 256 steps, and pixels that are not opaque are unknown
+    unless the mode is `raw`. Raises ConfigError if file or image is missing, invalid or too large.
     """
     path = find_config(name, "maps")
     file = load_yaml(path, MapFile)
@@ -175,10 +170,9 @@ def cells_of(
 
 
 def read_image(path: Path, source: str) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-    """Reads brightness (rows, columns) of an image and, if it has an alpha channel, its opacity.
+    """Reads brightness (rows, columns), and opacity if any, of a PGM (8, 16 bit), PNG or BMP.
 
-    It is a PGM (binary or plain, 8 or 16 bit), PNG or BMP file, which `source` names in its YAML.
-    Raises ConfigError if it is missing, not such an image, damaged or too large.
+    Raises ConfigError, with the `source` that names it, if it is missing, damaged or too large.
     """
     if not path.is_file():
         raise ConfigError(f"{source}: key 'image': there is no file {str(path)!r}; {_near(path)}")

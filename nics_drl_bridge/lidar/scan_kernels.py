@@ -1,10 +1,9 @@
 """Scans of whole worlds; and the fast path of the look-up, which goes through many bodies at once.
 
-Nearly all time of a look-up goes into cache misses, branch mispredictions and latencies. So the
-visible bodies of several scans go through each step of `baked_kernels` together, in loops without
-branches that LLVM turns into vector instructions. Steps hand on their results in lanes: one array
-for each type of number, in which every quantity has `LANES` places from a constant on, so that LLVM
-can prove that they do not overlap. A scan is the same to the bit in any batch.
+A look-up's time goes into cache misses, branch mispredictions and latencies. So the visible bodies
+of several scans go through each step of `baked_kernels` together, in loops without branches that
+LLVM vectorises. Steps hand on their results in lanes: one array per type of number, with `LANES`
+places for each quantity from a constant on, which LLVM can prove not to overlap.
 """
 
 from __future__ import annotations
@@ -20,10 +19,8 @@ from nics_drl_bridge.lidar import baked_kernels as baked
 from nics_drl_bridge.lidar import exact_kernels, map_kernels
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, LidarPose, X, Y
 
-BLOCK = 16
-"""Beams that are fused at once."""
-LANES = 9 * BLOCK
-"""Bodies that are looked up together: few enough that their scans stay in the L1 cache."""
+BLOCK = 16  # Beams that are fused at once
+LANES = 9 * BLOCK  # Bodies looked up together: so few that their scans stay in the L1 cache
 DX, DY, TURNED, COSINE, SINE, SIZE, BEARING_0, AT, MIDDLE, LOW, HIGH = (
     np.uintp(k * LANES) for k in range(11)
 )
@@ -98,10 +95,7 @@ def scan_worlds(ranges, poses, chosen, bodies, first, walls, lidar, lanes):  # t
 
 @kernel(contracts=True, inline=True)
 def select(found, begin, end, bodies, me, device, lidar, lanes):  # type: ignore[no-untyped-def]
-    """Puts the bodies [begin, end) that a device looks up into the lanes from `found` on.
-
-    Returns the number of lanes in use, and of bodies that are computed, see `baked_kernels.way_of`.
-    """
+    """Lanes the bodies [begin, end) to look up; returns lanes in use, and bodies computed."""
     wide, computed = lanes.wide, 0
     for j in range(begin, end):
         b, k = np.uintp(j), np.uintp(found)
@@ -219,9 +213,8 @@ def climb(k, lidar, lanes):  # type: ignore[no-untyped-def]
 def aim(k, turn, count, shift, lanes):  # type: ignore[no-untyped-def]
     """Finds the beams and the points of one body.
 
-    The beams are fused in whole blocks, at least two, which most bodies need: a number of blocks
-    that varies would mean a branch misprediction for every other one. Blocks that would go beyond
-    the last of `count` beams begin `BACK` beams earlier.
+    Whole blocks of beams are fused, at least two, which most bodies need: a varying number would
+    often mispredict a branch. Blocks beyond the last of `count` beams begin `BACK` earlier.
     """
     wide, whole, zero = lanes.wide, lanes.whole, np.int32(0)
     middle, low, high = wide[k + MIDDLE] - turn, wide[k + LOW] - turn, wide[k + HIGH] - turn

@@ -26,13 +26,9 @@ Renderer = Literal["auto", "baked", "exact"]
 RENDERERS: tuple[Renderer, ...] = ("auto", "baked", "exact")
 Array = NDArray[np.float64]
 NO_WALLS = np.zeros((0, 4))
-GREATEST_ERROR = 0.01
-"""The renderer `auto` looks a shape up at distances where its ranges have at most this RMSE [m]."""
-_MEASURED: dict[tuple[Any, ...], tuple[float, float]] = {}
-"""Cached results of `lookup_distances`, by everything they depend on."""
-WIDEST_BEAMS = 0.2
-"""Beams farther apart than this are scanned exactly by `auto`: there are few, and rows of so few
-points are inaccurate [rad]."""
+GREATEST_ERROR = 0.01  # `auto` looks up at distances where the ranges' RMSE is at most this [m]
+_MEASURED: dict[tuple[Any, ...], tuple[float, float]] = {}  # cache of `lookup_distances`
+WIDEST_BEAMS = 0.2  # `auto` scans beams farther apart exactly: rows of few points err [rad]
 
 
 @dataclass(frozen=True)
@@ -84,7 +80,6 @@ class Scanner:
         )  # fmt: skip
 
     def _looked_up(self) -> Array:
-        """(H, 2) squares of the distances between which a shape is looked up [m^2]."""
         spec, table, radii = self.spec, self.table, self.table.outlines.radii
         between = np.full((len(radii), 2), np.inf)
         if self.renderer == "baked":
@@ -102,10 +97,7 @@ class Scanner:
         return np.asarray(np.square(between))
 
     def place(self, shapes: Sequence[Shape], poses: ArrayLike) -> NDArray[np.float64]:
-        """Returns bodies (..., K, 7) of K shapes at poses (..., K, 3): x, y [m], heading [rad].
-
-        Raises ModelError if a shape is not in the table.
-        """
+        """Bodies (..., K, 7) of K shapes at poses (..., K, 3); ModelError if one is not baked."""
         index = [self.table.outlines.index_of(shape) for shape in shapes]
         return place(poses, self.table.outlines.radii[index], index)
 
@@ -134,7 +126,6 @@ class Scanner:
         return out
 
     def _scene(self, poses: ArrayLike, bodies: ArrayLike, walls: ArrayLike) -> tuple[Array, ...]:
-        """Returns poses (N, 3), bodies (N, K, 7), walls (W, 4), checked; raises as `scan` does."""
         poses = np.atleast_2d(np.asarray(poses, dtype=np.float64))
         bodies = np.asarray(bodies, dtype=np.float64)
         if bodies.size == 0:
@@ -149,10 +140,8 @@ class Scanner:
             raise ConfigError(f"walls {walls.shape} must be (W, 4).")
         index, known = bodies[..., SHAPE], len(self.table.shapes)
         if index.size and not (index.min() >= 0 and index.max() < known):
-            raise ModelError(  # the kernels would read beyond the table
-                f"a body is of a shape that is none of the {known} in the lidar table; make "
-                "bodies by `place` of the scanner that scans them."
-            )
+            reason = f"none of the {known} in the lidar table"  # the kernels would read beyond it
+            raise ModelError(f"a body's shape is {reason}; make bodies by `place` of its scanner.")
         return poses, bodies, walls
 
 
@@ -160,9 +149,6 @@ def make_scanner(
     spec: LidarSpec, shapes: Sequence[Shape], renderer: Renderer = "auto",
     grid: GridMap | None = None,
 ) -> Scanner:  # fmt: skip
-    """Returns a scanner with a table for the shapes, baked now if needed, and a static map.
-
-    Raises ConfigError if the renderer is unknown, or the table would be too large.
-    """
+    """Returns a scanner of shapes, baked now if needed; ConfigError as `Scanner` and `bake`."""
     table = LidarTable.without_rows(spec, shapes) if renderer == "exact" else bake(spec, shapes)
     return Scanner(spec, table, renderer, grid)

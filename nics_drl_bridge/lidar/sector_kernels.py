@@ -32,10 +32,9 @@ class SectorPlan(NamedTuple):
 
 @kernel(allocates=True)
 def resample(out, ranges, plan):  # type: ignore[no-untyped-def]
-    """Writes the nearest return in each sector (S,) of one scan (B,) [m], REP-117.
+    """Writes the nearest return in each sector (S,) of one scan (B,) [m], REP-117; NaN is unknown.
 
-    A sector without a beam takes the nearer return of the two adjacent beams. NaN stays where
-    nothing was measured.
+    A sector without a beam takes the nearer return of the two adjacent beams.
     """
     if plan.shift[0] != 0.0 or plan.shift[1] != 0.0:
         _by_place(out, ranges, plan)
@@ -45,7 +44,6 @@ def resample(out, ranges, plan):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def _by_beam(out, ranges, first, count):  # type: ignore[no-untyped-def]
-    """Fills each sector from `count` beams from `first` on, wrapping around to beam 0."""
     beams = ranges.shape[0]
     for s in range(out.shape[0]):
         near, known = np.float32(np.inf), np.int32(0)
@@ -61,10 +59,7 @@ def _by_beam(out, ranges, first, count):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def _by_place(out, ranges, plan):  # type: ignore[no-untyped-def]
-    """Fills each sector from the returns that lie in it as seen from the layout's viewpoint.
-
-    A sector left empty between the returns of two neighbouring beams takes the nearer of the two.
-    """
+    """Fills each sector from its returns, or the nearer of the neighbouring beams around it."""
     sectors, beams = out.shape[0], ranges.shape[0]
     where, value = np.empty(beams, np.int32), np.empty(beams, np.float32)
     own = np.zeros(sectors, np.bool_)
@@ -105,5 +100,4 @@ def _seen(r, direction, plan):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def _nearer(one, other):  # type: ignore[no-untyped-def]
-    """Returns the lesser of two; `other` if `one` is NaN."""
     return one if one <= other else other

@@ -1,7 +1,6 @@
 """The canonical scan: sectors around the robot, independent of the lidar.
 
-A policy learns on the sectors of one `ScanLayout`. The scan of any lidar is resampled into them by
-angle: simulator, middleware and deployment all use this module.
+A policy learns on the sectors of one `ScanLayout`, into which any lidar's scan is resampled.
 """
 
 from __future__ import annotations
@@ -24,24 +23,16 @@ from nics_drl_bridge.lidar.spec import FULL_CIRCLE_TOLERANCE, LidarSpec, ScanHea
 
 Array = NDArray[np.float64]
 Ranges = NDArray[np.float32]
-
-COARSEST_RAD = 0.21
-"""Beams farther apart than this are rejected: at 1 m they would miss objects 0.2 m wide."""
-BORDER_RAD = 1e-4
-"""A beam this near to a border counts in both sectors; headers carry angles in float32."""
-RANGE_TOLERANCE = 1e-5
-"""Share by which a lidar's range may be less than the layout's, as rounded to float32."""
+COARSEST_RAD = 0.21  # Beams farther apart are rejected: at 1 m they miss objects 0.2 m wide
+BORDER_RAD = 1e-4  # A beam this near to a border counts in both: headers have angles in float32
+RANGE_TOLERANCE = 1e-5  # Share by which a lidar's range may be less than the layout's, by float32
 
 
 class ScanLayout(Schema):
-    """The scan that a policy sees: the nearest return in each sector.
-
-    Sector 0 begins at `angle_min`, the others follow counter-clockwise. The angles are those of
-    `base_link`, seen from the viewpoint.
-    """
+    """The scan that a policy sees: the nearest return in each sector, seen from the viewpoint."""
 
     sectors: int = Field(ge=4, le=1440)  # S
-    angle_min: float = -np.pi  # begin of the first sector [rad]
+    angle_min: float = -np.pi  # begin of the first, counter-clockwise, in `base_link` [rad]
     angle_max: float = np.pi  # end of the last sector [rad]
     range_max: float = Field(ge=1e-3, le=LARGEST)  # farther returns count as none [m]
     viewpoint: tuple[Place, Place] = (0.0, 0.0)  # x, y in `base_link` [m]
@@ -62,18 +53,16 @@ class ScanLayout(Schema):
         return np.asarray(self.angle_min + self.width * (np.arange(self.sectors) + 0.5))
 
 
-LAYOUTS = {
+LAYOUTS = {  # the full circle, and the 270 deg that most front-mounted lidars cover
     "around": ScanLayout(sectors=72, range_max=3.0),
     "front": ScanLayout(sectors=54, angle_min=-0.75 * np.pi, angle_max=0.75 * np.pi, range_max=3.0),
 }
-"""Layouts by name: the full circle, and the 270 deg that most front-mounted lidars cover."""
 
 
 def layout_of(given: Any, lidar: LidarSpec) -> ScanLayout | None:
-    """Returns the layout for a user's setting.
+    """Returns the layout for a user's setting; ConfigError if it is none.
 
-    It is None, a ScanLayout, the name of one of `LAYOUTS`, its fields, or a number of sectors over
-    the lidar's field of view, seen from its mount. Raises ConfigError for anything else.
+    None, a ScanLayout, a name in `LAYOUTS`, fields, or a number of sectors over the lidar's view.
     """
     if given is None or isinstance(given, ScanLayout):
         return given
@@ -95,19 +84,14 @@ def layout_of(given: Any, lidar: LidarSpec) -> ScanLayout | None:
     return validate(dict(given), ScanLayout, "task option scan")
 
 
-NO_PLAN = SectorPlan(
+NO_PLAN = SectorPlan(  # for policies that observe the beams themselves
     np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros(2),
     angle_min=0.0, width=0.0, range_min=0.0, range_max=0.0, closed=False,
 )  # fmt: skip
-"""Plan without sectors, for policies that observe the beams themselves."""
 
 
 def plan_of(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
-    """Returns the plan by which a lidar fills a layout.
-
-    Raises ConfigError if the lidar does not cover every sector, its range is too short, or its
-    beams are more than `COARSEST_RAD` apart.
-    """
+    """Returns the plan by which a lidar fills a layout; ConfigError if it sees too little."""
     x, y, heading = lidar.mount
     angles = lidar.angles + heading
     _check(lidar, layout, angles)
@@ -124,10 +108,7 @@ def plan_of(lidar: LidarSpec, layout: ScanLayout) -> SectorPlan:
 
 
 def _beams_of(away: Array, half: float) -> tuple[int, int]:
-    """First beam and number of beams within `half` of a direction, or the adjacent beams if none.
-
-    `away` (B,) is the angle of each beam from that direction, wrapped [rad].
-    """
+    """First beam and number of beams `away` (B,) by at most `half` [rad], or the adjacent ones."""
     inside = np.abs(away) <= half
     if not inside.any():
         below = int(np.argmax(np.where(away < 0.0, away, -np.inf)))
@@ -178,9 +159,8 @@ class Reader:
 def reader_of(header: ScanHeader, beams: int, like: LidarSpec, upside_down: bool = False) -> Reader:
     """Returns the reader for scans of B beams with the header of a LaserScan.
 
-    A negative `angle_increment` means clockwise beams, and so does a device that is mounted with
-    its z axis down. `like` provides what headers lack: mount, frame, the value for no return.
-    Raises ConfigError if the header describes no lidar.
+    A negative `angle_increment` means clockwise beams, and so does `upside_down`. `like` gives
+    mount, frame and value for no return. Raises ConfigError if the header describes no lidar.
     """
     begin, step = header.angle_min, header.angle_increment
     if upside_down:
@@ -213,9 +193,8 @@ def reader_beside(
     """Like `reader_of`, but returns exactly the expected lidar if the header agrees with it."""
     found = reader_of(header, beams, like, upside_down)
     limits = np.array([found.lidar.range_min, found.lidar.range_max])
-    same = found.lidar.beams == like.beams and np.allclose(
-        limits, [like.range_min, like.range_max], rtol=1e-4, atol=1e-4
-    )
+    near = np.allclose(limits, [like.range_min, like.range_max], rtol=1e-4, atol=1e-4)
+    same = near and found.lidar.beams == like.beams
     turned = found.lidar.angles - like.angles if same else np.ones(1)
     whole = 2.0 * np.pi * np.round(turned[0] / (2.0 * np.pi))  # the same beams, off by full turns
     if same and np.abs(turned - whole).max() < 0.1 * like.angle_increment:

@@ -1,8 +1,7 @@
 """Sensor: what a robot has beside its lidar. A kind of sensor is one file with one class.
 
-The model names the sensors of a robot; everything else asks them: the simulator renders their
-readings, the nodes publish and read their messages, the middleware caches them by name, views hold
-them in `sensed`, tasks observe their `shares`, and the gate keeps clear of their `points`.
+The simulator renders its readings, the nodes publish and read its messages, the middleware caches
+them by name, views hold them in `sensed`, tasks observe `shares`, the gate keeps clear of `points`.
 """
 
 from __future__ import annotations
@@ -26,17 +25,16 @@ from nics_drl_bridge.lidar.shapes import Shape
 
 Array = NDArray[np.float64]
 Readings = NDArray[np.float32]
+# Topics of a robot that are no sensor's.
 TAKEN = ("scan", "odom", "pose", "imu", "joint_states", "ground_truth", "cmd_vel")
-"""Topics of a robot that are no sensor's."""
 
 
 @dataclass(frozen=True)
 class SensedWorlds:
     """All that a sensor can see in N worlds of M robots and K other bodies.
 
-    Its `state`, which the simulator changes in place, has the true `pose` (N, M, 3) of `base_link`
-    in `map`, `bodies` (N, K + M, 7) as in `lidar.exact_kernels`, robots last, the `seeds` (N,) of
-    the episodes, and the `steps` (N,), control periods since the reset.
+    `state`, changed in place, has the true `pose` (N, M, 3) of `base_link` in `map`, `bodies` (N, K
+    + M, 7) as in `lidar.exact_kernels`, robots last, `seeds` and `steps` (N,) of the episodes.
     """
 
     state: Any
@@ -47,8 +45,8 @@ class SensedWorlds:
     renderer: Renderer  # of the lidar
 
 
+# Writes the readings (N, M, S) of some worlds (n,) in place, of all their robots.
 Render = Callable[[Readings, NDArray[np.int64]], None]
-"""Writes the readings (N, M, S) of some worlds (n,) in place, of all their robots."""
 
 
 class Sensor(Schema, ABC):
@@ -105,10 +103,7 @@ class Sensor(Schema, ABC):
 
 
 def sensor_of(given: Sensor | Mapping[str, Any]) -> Sensor:
-    """Returns a sensor, made from its entries if it is none yet.
-
-    Raises ConfigError: an unknown kind, or wrong entries.
-    """
+    """Returns a sensor, made from its entries if it is none. Raises ConfigError if it can't be."""
     if isinstance(given, Sensor):
         return given
     if not isinstance(given, Mapping) or "kind" not in given:
@@ -163,9 +158,5 @@ def _validated(given: Any) -> Sensor:
         raise ValueError(str(error)) from None
 
 
-AnySensor = Annotated[
-    Sensor,
-    PlainValidator(_validated),
-    PlainSerializer(lambda sensor: sensor.model_dump(mode="json"), return_type=dict),
-]
-"""A sensor of any kind, as a field of a schema."""
+_dumped = PlainSerializer(lambda sensor: sensor.model_dump(mode="json"), return_type=dict)
+AnySensor = Annotated[Sensor, PlainValidator(_validated), _dumped]  # a field of a schema

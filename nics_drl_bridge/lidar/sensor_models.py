@@ -1,7 +1,4 @@
-"""Sensor models: the returns that a device loses.
-
-A sensor model is baked into the rows of a table, so that it does not slow down rendering.
-"""
+"""Sensor models, the returns that a device loses: baked into a table, they cost no time."""
 
 from __future__ import annotations
 
@@ -26,8 +23,7 @@ class IncidenceDropout(Schema):
     """Loses returns at oblique incidence, as from polished metal."""
 
     kind: Literal["incidence_dropout"] = "incidence_dropout"
-    # between the ray and the normal of the surface [rad]
-    greatest_incidence: float = Field(gt=0.0, lt=math.pi / 2.0)
+    greatest_incidence: float = Field(gt=0.0, lt=math.pi / 2.0)  # of the ray to the normal [rad]
 
     def __str__(self) -> str:
         """In a few words."""
@@ -69,11 +65,7 @@ class Intensity(Schema):
     def lost(
         self, ranges: Ranges, incidence: NDArray[np.float64], reflectivity: float | None
     ) -> NDArray[np.bool_]:
-        """True for the points (P,) whose return is below the threshold.
-
-        The incidence is between the ray and the normal of the surface [rad]; a reflectivity of None
-        is that of the model.
-        """
+        """True for the points (P,) below the threshold, by angle to the surface's normal [rad]."""
         light = self.gain * self.reflectance(np.cos(incidence), reflectivity)
         return np.asarray(light / np.square(np.maximum(ranges, NEAREST)) < self.threshold)
 

@@ -18,8 +18,7 @@ from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SHAPE, SIN, Outline
 Array = NDArray[np.float64]
 MOST_CORNERS = 16_384
 MOST_SHAPES = 1_000  # in one file, or in one group of obstacles
-SMALLEST, LARGEST = 1e-6, 1e4
-"""Extent of a shape [m]: anything smaller is invisible, anything larger does not fit in a world."""
+SMALLEST, LARGEST = 1e-6, 1e4  # Extent of a shape [m]: less is invisible, more fits in no world
 SAME_PLACE = 1e-9  # corners within this distance, as a share of the shape's radius, coincide
 FARTHEST = 1e8  # greatest coordinate in a map [m], enough for UTM
 Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
@@ -29,12 +28,9 @@ Size = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
 
 
 class Surface(Schema):
-    """Properties of a shape's surface, common to all shapes.
+    """Properties of a shape's surface, common to all shapes."""
 
-    The reflectivity is for a sensor model of intensity: 1 is that of a white diffuse surface, a
-    retroreflector has more; by default it is that of the lidar's sensor model.
-    """
-
+    # for a model of intensity, by default its own; 1 is white and diffuse, a retroreflector > 1
     reflectivity: float | None = Field(default=None, gt=0.0, le=1e6)
 
 
@@ -85,12 +81,10 @@ class Rectangle(Outlined):
 
 
 class Polygon(Outlined):
-    """An outline of straight edges, convex or concave; the last corner is joined to the first.
-
-    The points are in the shape's own frame, in either orientation [m].
-    """
+    """An outline of straight edges, convex or concave; the last corner is joined to the first."""
 
     kind: Literal["polygon"] = "polygon"
+    # in the shape's own frame, in either orientation [m]
     points: tuple[tuple[Place, Place], ...] = Field(min_length=3, max_length=MOST_CORNERS)
 
     @field_validator("points")
@@ -147,7 +141,6 @@ def load_shapes(path: str | Path) -> tuple[Shape, ...]:
 
 SQUARE = Rectangle(size=(0.3, 0.3))
 STRIP = Rectangle(size=(0.6, 0.06))
-
 BODY = 7  # number of columns of a placed body
 
 
@@ -156,11 +149,7 @@ def _reach(outline: Array) -> float:
 
 
 def place(poses: ArrayLike, radii: ArrayLike, shapes: ArrayLike) -> Array:
-    """Places shapes in a world as bodies (..., 7), see `BODY`.
-
-    Each has a pose (..., 3) of its own frame, a radius (...) [m], 0 if it is absent, and the index
-    (...) of its shape.
-    """
+    """Bodies (..., 7) of shapes (...) at poses (..., 3), of radii (...) [m], 0 if absent."""
     poses = np.asarray(poses, dtype=np.float64)
     bodies = np.empty((*poses.shape[:-1], BODY))
     bodies[..., :3] = poses
@@ -171,10 +160,7 @@ def place(poses: ArrayLike, radii: ArrayLike, shapes: ArrayLike) -> Array:
 
 
 def convex_hull(points: Array) -> Array:
-    """Returns the corners (P, 2) of the convex hull, counter-clockwise, without collinear ones.
-
-    Andrew's monotone chain (1979).
-    """
+    """Corners (P, 2) of the convex hull, counter-clockwise; Andrew's monotone chain (1979)."""
     ordered = sorted({(float(x), float(y)) for x, y in points})
     if len(ordered) < 3:
         return np.array(ordered)
@@ -215,16 +201,12 @@ def rotational_order(outline: Array, hull: Array) -> int:
 
 @dataclass(frozen=True)
 class Outlines:
-    """A set of shapes as flat arrays.
-
-    Convex hulls are stored twice, so that an index may run past the end; that of a circle is its
-    centre.
-    """
+    """A set of shapes as flat arrays; hulls are stored twice, so an index may run past the end."""
 
     shapes: tuple[Shape, ...]  # H
     corners: Array  # (sum V, 2) of all outlines, one after the other [m]
     corner: NDArray[np.int64]  # (H + 1,) first corner of each outline; a circle has none
-    hulls: Array  # (sum 2 V, 2) corners of all convex hulls [m]
+    hulls: Array  # (sum 2 V, 2) corners of all convex hulls [m]; a circle's is its centre
     hull: NDArray[np.int64]  # (H + 1,) first corner of each hull
     radii: Array  # (H,) [m]
     orders: NDArray[np.int64]  # (H,) rotational order

@@ -1,11 +1,9 @@
 """LidarSpec: the single definition of a lidar's beams, limits and header fields.
 
-Conversion of ranges between a device's convention and the package's own, which is REP-117.
-
-In the package, `inf` is no return, `-inf` too close, NaN an invalid measurement, and everything
-else lies within the limits. Devices differ; `LidarSpec.no_return` names the convention, and only
-this module handles it. Limits are compared in float32, as in the message: 0.16 m is a little less
-there, and still a return.
+In the package ranges follow REP-117: `inf` is no return, `-inf` too close, NaN an invalid
+measurement, everything else within the limits. Devices differ; `LidarSpec.no_return` names the
+convention, and only this module handles it. Limits are compared in float32, as in the message: 0.16
+m is a little less there, and still a return.
 """
 
 from __future__ import annotations
@@ -48,11 +46,9 @@ def check_angles(angle_min: float, angle_max: float) -> None:
 
 
 class LidarSpec(Schema):
-    """A planar lidar.
+    """A planar lidar. Beam 0 points at `angle_min`, the others follow counter-clockwise.
 
-    Beam 0 points at `angle_min`, the others follow counter-clockwise. When the limits span a
-    full circle the last beam stops one increment short of it, so that no direction is
-    measured twice.
+    If the limits span a full circle, the last beam is one increment short of it.
     """
 
     name: str = "lidar"
@@ -141,10 +137,7 @@ Ranges = NDArray[np.float32]
 
 
 def to_device(ranges: ArrayLike, spec: LidarSpec) -> Ranges:
-    """Converts ranges (..., B) of the package to the device's convention.
-
-    Only `inf` is replaced. For a device that cannot report `-inf`, set `LidarFaults.too_close`.
-    """
+    """Converts ranges (..., B) to the device's convention; only `inf` is replaced."""
     out = np.array(ranges, dtype=np.float32)
     out[out == np.inf] = _no_return(spec)
     return out
@@ -153,9 +146,7 @@ def to_device(ranges: ArrayLike, spec: LidarSpec) -> Ranges:
 def from_device(values: ArrayLike, spec: LidarSpec) -> Ranges:
     """Converts ranges (..., B) of a device to those of the package.
 
-    A finite value below range_min means that something is too close, unless it is the device's
-    value for no return: it must not be taken for free space. If a device reports NaN for no return,
-    invalid measurements cannot be distinguished from it.
+    A finite value below range_min is too close, unless it means no return: that is not free space.
     """
     out, none = np.array(values, dtype=np.float32), _no_return(spec)
     lost = np.isnan(out) if np.isnan(none) else out == none

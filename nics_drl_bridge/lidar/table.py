@@ -25,10 +25,8 @@ from nics_drl_bridge.lidar.spec import LidarSpec
 
 FORMAT = "nics_drl_bridge/lidar_table/4"
 ABOUT_FILE, ARRAYS = "about.json", ("grid", "start", "cell", "rows")
-TABLE_FILES = (ABOUT_FILE, *(f"{name}.npy" for name in ARRAYS))
-"""The files of a table, in addition to its manifest."""
-POINT_ANGLE = 0.01
-"""Greatest default angle between the points of a row, as far as `MOST_PHASES` allows [rad]."""
+TABLE_FILES = (ABOUT_FILE, *(f"{name}.npy" for name in ARRAYS))  # and a manifest
+POINT_ANGLE = 0.01  # greatest default angle of points in a row, as `MOST_PHASES` allows [rad]
 MOST_PHASES = 8
 MOST_WIDE = 0xFFFF  # greatest number of beams in a row
 
@@ -58,10 +56,7 @@ class TableAbout(Schema):
 
 
 def padding(beam_angle: float) -> int:
-    """Greatest number of values that a look-up reads from the begin of a row.
-
-    Half a turn, as a shape that does not enclose the lidar covers less, and a block.
-    """
+    """Greatest number of values that a look-up reads from a row's begin: half a turn, a block."""
     return math.ceil(math.pi / beam_angle) + 1 + 16
 
 
@@ -159,10 +154,7 @@ class LidarTable:
         return digest.hexdigest()
 
     def save(self, folder: str | Path) -> None:
-        """Writes the table as a folder of `.npy` files, completely or not at all.
-
-        Raises ConfigError if the folder contains something else.
-        """
+        """Writes the table as a folder, whole or not at all; ConfigError if not of its kind."""
         with whole_folder(folder, ABOUT_FILE) as temporary:
             write_text(temporary / ABOUT_FILE, self._about)
             for name, array in self._arrays.items():
@@ -171,10 +163,9 @@ class LidarTable:
 
     @classmethod
     def load(cls, folder: str | Path, checked: bool = False) -> LidarTable:
-        """Memory-maps a table that `save` wrote; processes share the memory.
+        """Memory-maps a table that `save` wrote, `checked` if its checksums were compared already.
 
-        `checked` is True if the caller has compared its files with their checksums. Raises
-        ConfigError, ModelError if a file is missing, damaged or of another format.
+        Raises ConfigError, ModelError if a file is missing, damaged or of another format.
         """
         folder = Path(folder)
         if not checked:
@@ -198,7 +189,6 @@ class LidarTable:
         return table
 
     def _check(self) -> None:
-        """Raises ValueError if the kernels would read beyond an array."""
         arrays: tuple[NDArray[Any], ...] = (self.grid, self.start, self.cell, self.rows)
         types = [array.dtype for array in arrays if array.flags.c_contiguous]
         if types != [np.float64, np.int32, np.int16, np.float32]:

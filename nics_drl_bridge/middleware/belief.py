@@ -12,11 +12,9 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import SimulatorModel
 
 Array = NDArray[np.float64]
-
 JITTER_S = 0.2  # Uncertainty of the unobserved time: transmission takes longer now and then [s]
 MARGIN = 1.2  # Factor by which odometry, through noise or slip, may exceed the greatest speed
-LEVELS, MOST_CORNERS = 3, 4096
-"""Values tried per variable for the greatest speed, and greatest number of combinations."""
+LEVELS, MOST_CORNERS = 3, 4096  # values tried per variable for the greatest speed; combinations
 
 
 class Anchor(NamedTuple):
@@ -29,32 +27,24 @@ class Anchor(NamedTuple):
 
 
 class Belief(NamedTuple):
-    """Complete state of the filter at a time; its arrays are never modified in place.
-
-    The mean (3 + S,) is x [m], y [m], heading [rad] in `map`, then the state of the RobotSpec. The
-    consecutive `outliers` are counted by kind. The anchor is None before the first odometry; the
-    robot is `lost` if it may have moved unobserved since.
-    """
+    """Complete state of the filter at a time; its arrays are never modified in place."""
 
     time_ns: int
-    mean: Array
+    mean: Array  # (3 + S,) x [m], y [m], heading [rad] in `map`, then the state of the RobotSpec
     covariance: Array
-    outliers: tuple[int, ...]
-    anchor: Anchor | None
-    lost: bool
+    outliers: tuple[int, ...]  # consecutive ones, by kind
+    anchor: Anchor | None  # None before the first odometry
+    lost: bool  # True if the robot may have moved unobserved since
 
 
 class Foreseen(NamedTuple):
-    """Result of a prediction: time [ns], mean, covariance, and the expected twist measurement.
-
-    If computed in advance, `update` is the gain (3 + S, 3) and the covariance after it.
-    """
+    """Result of a prediction: time [ns], mean, covariance, and the expected twist measurement."""
 
     time_ns: int
     mean: Array
     covariance: Array
     expected: tuple[Array, Array]
-    update: tuple[Array, Array] | None = None
+    update: tuple[Array, Array] | None = None  # gain (3 + S, 3), covariance after; if in advance
 
 
 def parted(covariance: Array) -> Array:
@@ -80,9 +70,8 @@ def greatest_twist(model: SimulatorModel) -> tuple[float, float]:
 class Unseen:
     """Bounds the unobserved motion of a robot, and bridges it by odometry.
 
-    The filter's covariance grows by `process` (3 + S, 3 + S) per second; `noise` (3, 3) is that of
-    the measured twist, `news` (3 + S,) the variance of the state after possible news, see
-    `Acceptance`.
+    The covariance grows by `process` (3 + S, 3 + S) per second; `noise` (3, 3) is the measured
+    twist's, `news` (3 + S,) the variance of the state after possible news, see `Acceptance`.
     """
 
     def __init__(self, model: SimulatorModel, process: Array, noise: Array, news: Array) -> None:

@@ -15,38 +15,29 @@ from nics_drl_bridge.middleware.measurement import Acceptance, Judgement, Kind, 
 from nics_drl_bridge.robot.kernels import SERIES, term_arrays, wrap
 
 Array = NDArray[np.float64]
-
 LEAST_POSE_DRIFT, LEAST_STATE_DRIFT = 2e-3, 5e-3
 """Lower bounds on the model's error after a second, of the pose [m or rad / sqrt(s)], and of the
 state as a share of its range [1 / sqrt(s)]."""
 LEAST_TWIST_STD = LEAST_POSE_STD = START_STD = 1e-3
 """Lower bounds on the standard deviations of a twist [m/s, rad/s] and of a pose [m, rad], and that
 of the pose at a reset."""
-GYRO_STD = 0.02
-"""Standard deviation of a yaw rate without a covariance [rad/s]: a cheap gyro with its bias."""
+GYRO_STD = 0.02  # of a yaw rate without a covariance [rad/s]: a cheap gyro with its bias
+# Gates on the squared, normalised innovation: 99.9 % of chi-squared with 3, 1 degrees of freedom.
 GATE = {Kind.TWIST: 16.27, Kind.YAW_RATE: 10.83, Kind.POSE: 16.27}
-"""Gate on the squared, normalised innovation, exceeded once in a thousand measurements. (99.9 % of
-chi-squared with three degrees of freedom, or one.)"""
+# Consecutive outliers after which they are believed. A gyro never is: odometry has precedence.
 PATIENCE: dict[Kind, float] = {Kind.TWIST: 3, Kind.YAW_RATE: np.inf, Kind.POSE: 5}
-"""Number of consecutive outliers after which they are believed. A gyro never is: odometry has
-precedence."""
-NEWS = 0.5
-"""Possible error of the state of a robot that is stuck or pushed, as a share of its range."""
-REACHABLE = 2.0
-"""States and commands are limited to this many times their range: the model is invalid beyond."""
+NEWS = 0.5  # Possible error of the state of a stuck or pushed robot, as a share of its range
+REACHABLE = 2.0  # States and commands are cut at this many times their range
 FARTHEST = 1e8  # Innovations beyond this [m, rad, m/s, rad/s] are never believed
-ANYWHERE = (100.0, 100.0, np.pi)
-"""Standard deviation of the pose in the map of a pose sensor, by odometry alone [m, rad]."""
-LONGEST_GAP_S = 10.0
-"""Longest gap that is predicted [s]: in a longer one, the robot may have driven anywhere."""
+ANYWHERE = (100.0, 100.0, np.pi)  # Std of a pose in a pose sensor's map, by odometry [m, rad]
+LONGEST_GAP_S = 10.0  # Longest gap that is predicted [s]: beyond, the robot may be anywhere
 
 
 class Estimator:
     """Pose and state of one robot, predicted by the fitted model, corrected by measurements.
 
-    The model's drift is the Q and its sensors' noise the R of the filter; its latency delays the
-    commands. Time is in integer nanoseconds, so that the results of the same messages are
-    bit-identical. Measurements apply at the time of the estimate; `Timeline` inserts late ones.
+    The model's drift is Q, its sensors' noise R, its latency delays the commands. Time is in whole
+    nanoseconds, for identical bits. Measurements apply now; `Timeline` inserts late ones.
     """
 
     def __init__(self, model: SimulatorModel) -> None:
@@ -141,9 +132,8 @@ class Estimator:
 
     def at(self, time_ns: int) -> tuple[Array, Array]:
         """Predicts pose (3,) and body twist (3,) at a time, without moving the estimate."""
-        mean, twist = kernels.look_ahead(
-            self._filter.x, self.time_ns, time_ns, self._motion, self._log
-        )
+        now, motion = self.time_ns, self._motion
+        mean, twist = kernels.look_ahead(self._filter.x, now, time_ns, motion, self._log)
         return mean[:3], twist
 
     def predict(self, time_ns: int) -> None:
@@ -158,8 +148,7 @@ class Estimator:
     def foresee(self, time_ns: int) -> None:
         """Computes in advance the prediction to a time and the update by a twist measured then.
 
-        `predict` and `correct` then only take over the results, and the estimate is bit-identical.
-        1.14 times as many lock-step steps a second (measured in turns on two cores).
+        `predict`, `correct` take over the same bits; 1.14 times as many lock-step steps a second.
         """
         self._foreseen = None
         if time_ns > self.time_ns:
@@ -170,12 +159,10 @@ class Estimator:
             self._foreseen = foreseen._replace(update=(trial.K, trial.P))
 
     def _forecast(self, time_ns: int) -> Foreseen:
-        own, motion, log = self._filter, self._motion, self._log
-        mean, covariance = kernels.forecast(
-            own.x, own.P, self._process, self.time_ns, time_ns, motion, log
-        )
-        if time_ns - self.time_ns > motion.longest_ns:
-            covariance = self.unseen.doubted(covariance, (time_ns - self.time_ns) / NS_PER_S)
+        own, motion, log, now = self._filter, self._motion, self._log, self.time_ns
+        mean, covariance = kernels.forecast(own.x, own.P, self._process, now, time_ns, motion, log)
+        if time_ns - now > motion.longest_ns:
+            covariance = self.unseen.doubted(covariance, (time_ns - now) / NS_PER_S)
         return Foreseen(time_ns, mean, covariance, kernels.expect(mean, time_ns, motion, log))
 
     def update(self, kind: Kind, value: ArrayLike, std: ArrayLike | None = None) -> Judgement:
@@ -229,7 +216,6 @@ class Estimator:
         return Judgement(distance, outcome)
 
     def _expect(self, kind: Kind) -> tuple[Array, Array]:
-        """Returns the expected measurement (n,) and its derivative (n, 3 + S)."""
         if kind is Kind.POSE:
             return self._filter.x[:3], self._observe_pose
         if (here := self._foreseen_here) is not None:

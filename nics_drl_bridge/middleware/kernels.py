@@ -17,12 +17,8 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.robot.kernels import Terms, advance, rates, wrap
 
 Array = NDArray[np.float64]
-
-RUNAWAY = 1e9
-"""Bound on poses and states [m, rad, its unit] and on their derivatives; beyond, the model has
-diverged."""
-LEAST_PIVOT = 1e-12
-"""Lower bound on a variable's variance given those before it, as a share of its own variance."""
+RUNAWAY = 1e9  # Bound on poses, states and their derivatives; beyond, the model has diverged
+LEAST_PIVOT = 1e-12  # Lower bound on a variance given the variables before, as a share of its own
 LEAST_VARIANCE = 1e-18  # Absolute lower bound on that variance
 
 
@@ -120,10 +116,9 @@ def in_effect(log, time):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def carry(mean, transition, begin, end, motion, log):  # type: ignore[no-untyped-def]
-    """Moves a mean from one time to another, command by command, in place, see `predict`.
+    """Moves a mean between two times, command by command, in place, see `predict`.
 
-    Over a gap that is too long, the pose is kept and the state set to zero. The same is done if
-    the model diverges, which none does within its range.
+    Over a gap that is too long, or if the model diverges, the pose is kept and the state zero.
     """
     step, commands = motion.step_ns, log.commands
     if end - begin > motion.longest_ns:
@@ -186,10 +181,7 @@ def distance(innovation, derivative, covariance, noise):  # type: ignore[no-unty
 
 @kernel(allocates=True)
 def settle(mean, covariance, low, high):  # type: ignore[no-untyped-def]
-    """Wraps the heading, clips the state to its limits (S,), makes the covariance symmetric.
-
-    Where rounding left a pivot of its Cholesky factor too small, the variance is raised.
-    """
+    """Wraps the heading, clips the state to [low, high] (S,), repairs the covariance's rounding."""
     size = mean.shape[0]
     mean[2] = wrap(mean[2])
     for i in range(3, size):

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
-
 SCAN, ODOM, CMD_VEL, POSE, IMU = "scan", "odom", "cmd_vel", "pose", "imu"
 
 
@@ -28,29 +27,21 @@ class Kind(IntEnum):
 
 
 class Measurement(NamedTuple):
-    """One measurement: body twist (3,), yaw rate (1,), or pose (3,) in `map`.
-
-    The noise is the covariance of the value, the model's if it is None. With a twist came the pose
-    (3,) in `odom`, which bridges unobserved motion.
-    """
+    """One measurement: body twist (3,), yaw rate (1,), or pose (3,) in `map`."""
 
     kind: Kind
     value: Array
-    noise: Array | None = None
-    odom: Array | None = None
+    noise: Array | None = None  # covariance of the value; None for the model's
+    odom: Array | None = None  # (3,) pose that came with a twist, which bridges unobserved motion
 
 
 class Acceptance(IntEnum):
-    """Outcome of a measurement.
+    """Outcome of a measurement."""
 
-    `USED`: within its gate. `NEWS`: beyond it, but plausible for a robot that is stuck or pushed;
-    used. `JUMP`: beyond it so many times in a row that it is believed. `OUTLIER`: rejected.
-    """
-
-    USED = 0
-    NEWS = 1
-    JUMP = 2
-    OUTLIER = 3
+    USED = 0  # within its gate
+    NEWS = 1  # beyond it, but plausible for a robot that is stuck or pushed; used
+    JUMP = 2  # beyond it so many times in a row that it is believed
+    OUTLIER = 3  # rejected
 
 
 class Judgement(NamedTuple):
@@ -61,10 +52,9 @@ class Judgement(NamedTuple):
 
 
 def checked_covariance(covariance: ArrayLike | None, size: int, least_std: float) -> Array | None:
-    """Returns a covariance (size, size) that the filter can use; None if it is unknown (or zeros).
+    """Returns a covariance that the filter can use, of at least `least_std` in any direction.
 
-    The standard deviation in any direction is raised to `least_std`. Raises ValueError if it is no
-    covariance.
+    None if it is unknown (or zeros). Raises ValueError if it is no covariance (size, size).
     """
     if covariance is None:
         return None
@@ -84,26 +74,19 @@ def checked_covariance(covariance: ArrayLike | None, size: int, least_std: float
 
 @dataclass(frozen=True)
 class TopicHealth:
-    """Accepted data of one topic, their rate of arrival (0 before the second) and age by arrival.
-
-    The innovation is the distance of the newest `Judgement`; NaN for topics that correct nothing.
-    """
+    """Accepted data of a topic, their rate of arrival (0 before the second) and age by arrival."""
 
     received: int
     rate_hz: float
     age_s: float
-    innovation: float = float("nan")
+    innovation: float = float("nan")  # distance of the newest `Judgement`; NaN if none corrects
 
 
 @dataclass(frozen=True)
 class Health:
-    """Health of all topics of a robot that have data.
-
-    Numbers of data `rejected`, by reasons that begin with the topic; `noticed`, which surprised but
-    were used (`odom: news`); and `replayed`, which were late and inserted at their time.
-    """
+    """Health of all topics of a robot that have data."""
 
     topics: dict[str, TopicHealth] = field(default_factory=dict)
-    rejected: dict[str, int] = field(default_factory=dict)
-    noticed: dict[str, int] = field(default_factory=dict)
-    replayed: int = 0
+    rejected: dict[str, int] = field(default_factory=dict)  # by reasons that begin with the topic
+    noticed: dict[str, int] = field(default_factory=dict)  # surprised but used (`odom: news`)
+    replayed: int = 0  # late ones, inserted at their time

@@ -20,7 +20,6 @@ from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, SCAN, Kind, Me
 from nics_drl_bridge.middleware.timeline import ReportedPose, Stamps
 
 Array = NDArray[np.float64]
-
 NOT_FINITE = "NaN or inf"
 LEAST_STD = {Kind.YAW_RATE: LEAST_TWIST_STD, Kind.POSE: LEAST_POSE_STD}
 RATE_OVER = 32  # Number of arrivals over which rates are computed
@@ -85,10 +84,9 @@ class TopicCache:
 class Middleware:
     """Caches the newest datum of a robot's topics and estimates its state.
 
-    The simulator in process, the nodes and the vehicle all feed this one class, so that the
-    same data give the same view. Times are stamps in nanoseconds; arrivals are on the clock of
-    the receiver, which need not be that of the stamps. Data that cannot be used are counted by
-    reason, see `health`, and change nothing else.
+    Simulator, nodes and vehicle all feed this class: the same data give the same view. Times are
+    stamps [ns]; arrivals are on the receiver's clock, which need not be that of the stamps. Data
+    that cannot be used are counted by reason, see `health`, and change nothing else.
     """
 
     def __init__(self, model: SimulatorModel) -> None:
@@ -110,7 +108,6 @@ class Middleware:
         self._begin(time_ns)
 
     def _begin(self, time_ns: int) -> None:
-        """Continues from a time with the present state of the estimator."""
         self._start_ns, self._unstamped_ns = time_ns, time_ns - 1
         self._stamps.reset()
         self._timeline.reset()
@@ -125,8 +122,7 @@ class Middleware:
     ) -> bool:
         """Takes a command (C,) that was sent to the robot; True if it was used.
 
-        Without a stamp it counts as sent at that of the newest datum, and after every earlier
-        command without a stamp. Own commands have no arrival: their stamps need no check.
+        Without a stamp it counts as sent with the newest datum. Own commands have no arrival.
         """
         if stamp_ns is None:
             stamp_ns = max(self.newest_ns or self._start_ns, self._unstamped_ns + 1)
@@ -221,7 +217,6 @@ class Middleware:
     def _optional(
         self, kind: Kind, stamp_ns: int, arrival_ns: int, given: ArrayLike, about: ArrayLike | None
     ) -> bool:
-        """Takes a measurement that came with its own covariance; True if it was accepted."""
         value = np.array(given, dtype=np.float64)
         if not np.isfinite(value).all():
             return self.cache.reject(f"{kind.topic}: {NOT_FINITE}")
@@ -244,10 +239,7 @@ class Middleware:
         return reason
 
     def _follow_clock(self, odometry: ReportedPose) -> None:
-        """Continues from an odometry to whose stamp the clock was set, by the motion that it shows.
-
-        If odometry is not continuous, the robot may be anywhere within reach.
-        """
+        """Continues from an odometry to whose stamp the clock was set, by the motion it shows."""
         seconds, continuous = self._trail.seconds(odometry), self._trail.continuous(odometry)
         self.estimator.lose(odometry.stamp_ns, seconds, continuous, self._commanded)
         self.estimator.correct(Measurement(Kind.TWIST, odometry.twist, odom=odometry.pose))
@@ -265,33 +257,25 @@ class Middleware:
     def view(self, now_ns: int) -> RobotView:
         """Returns the view of the robot at a time; NaN ranges before the first scan."""
         scan, newest_ns = self.cache.newest.get(SCAN), self.newest_ns
-        sensed = unread(self._sensors)
-        sensed |= {
-            name: self.cache.newest[name].value for name in sensed if name in self.cache.newest
-        }
+        sensed, newest = unread(self._sensors), self.cache.newest
+        sensed |= {name: newest[name].value for name in sensed if name in newest}
+        oldest_s = max((self.cache.age_s(name, now_ns) for name in sensed), default=0.0)
         return RobotView(
-            *self.estimator.at(now_ns),
+            *self.estimator.at(now_ns), sensed=sensed, sensed_age_s=oldest_s,
             ranges=np.full(self._beams, np.nan, np.float32) if scan is None else scan.value,
             stamp_s=(now_ns if newest_ns is None else newest_ns) * S_PER_NS,
-            scan_age_s=self.cache.age_s(SCAN, now_ns),
-            odom_age_s=self.cache.age_s(ODOM, now_ns),
-            sensed=sensed,
-            sensed_age_s=max((self.cache.age_s(name, now_ns) for name in sensed), default=0.0),
-        )
+            scan_age_s=self.cache.age_s(SCAN, now_ns), odom_age_s=self.cache.age_s(ODOM, now_ns),
+        )  # fmt: skip
 
     def health(self, arrival_ns: int) -> measured.Health:
         """Returns the health of all topics at a time of the receiver's clock [ns]."""
         cache, outcomes = self.cache, +self._timeline.outcomes  # those that are not 0
         distances = {kind.topic: d for kind, d in self._timeline.distances.items()}
-        topics = {
-            topic: measured.TopicHealth(
-                received,
-                cache.rate_hz(topic, arrival_ns),
-                (arrival_ns - cache.arrivals[topic][-1]) * S_PER_NS,
-                distances.get(topic, math.nan),
-            )
-            for topic, received in cache.received.items()
-        }
+        topics = {}
+        for topic, received in cache.received.items():
+            age_s = (arrival_ns - cache.arrivals[topic][-1]) * S_PER_NS
+            known = received, cache.rate_hz(topic, arrival_ns), age_s
+            topics[topic] = measured.TopicHealth(*known, distances.get(topic, math.nan))
         rejected, noticed = dict(cache.rejected), dict[str, int]()
         for (kind, outcome), count in outcomes.items():
             if outcome is not measured.Acceptance.USED:

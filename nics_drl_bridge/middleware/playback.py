@@ -1,8 +1,4 @@
-"""Runs a recorded drive through the middleware: the estimate of a bag is bit-identical.
-
-Messages are played in the order of receipt, at equal times in the order of the roles' names; time
-is the bag's, so that nothing depends on the machine or its load.
-"""
+"""Runs a recorded drive, in the order of receipt, through the middleware, to identical bits."""
 
 from __future__ import annotations
 
@@ -29,14 +25,12 @@ from nics_drl_bridge.recording.bag_file import BagFile, Message, opened
 from nics_drl_bridge.recording.messages import command_row, pose_row, stamp, twist_row
 
 Array = NDArray[np.float64]
-
 SCAN_TYPE = "sensor_msgs/msg/LaserScan"
 TYPES: Mapping[str, tuple[str, ...]] = {
     SCAN: (SCAN_TYPE,), ODOM: (topic_roles.ODOMETRY,), CMD_VEL: topic_roles.TYPES["cmd_vel"],
     POSE: (topic_roles.POSE, topic_roles.POSE_COVARIANCE), IMU: (topic_roles.IMU,),
 }  # fmt: skip
-ALWAYS = (SCAN, ODOM, CMD_VEL)
-"""Roles whose topics are used if the bag has them; the others only on request."""
+ALWAYS = (SCAN, ODOM, CMD_VEL)  # roles used if the bag has them; the others only on request
 APART_S = 1.0  # Greatest difference between stamps of one clock at the same time of receipt [s]
 COLUMNS = ("x", "y", "heading", "vx", "vy", "wz")
 
@@ -59,13 +53,10 @@ class EstimatedDrive:
 
 
 def estimate(path: str | Path, model: SimulatorModel, topics: Mapping[str, str]) -> EstimatedDrive:
-    """Runs a bag through the middleware, in process.
+    """Runs a bag through the middleware, with `topics` by role, see `chosen`.
 
-    The estimate is identical in every run and on every machine with the same versions. `topics` are
-    by role, see `chosen`.
-
-    Raises RecordingError if the bag is damaged, a topic is missing or of a wrong type, or the data
-    are stamped by several clocks.
+    The estimate is identical on every machine with the same versions. Raises RecordingError if the
+    bag is damaged, a topic missing or of a wrong type, or the data are stamped by several clocks.
     """
     messages = played(path, topics)
     playback, rows = Playback(model, POSE in messages), []
@@ -96,8 +87,7 @@ def played(path: str | Path, topics: Mapping[str, str]) -> dict[str, list[Messag
 def chosen(bag: BagFile, topics: Mapping[str, str]) -> dict[str, str]:
     """Returns the topic of each role that is played; RecordingError if it is missing or wrong.
 
-    Those of `scan`, `odom` and `cmd_vel` are by default the topics of these names; `pose` and `imu`
-    are left out unless `topics` names them.
+    By default, `ALWAYS` are topics of these names; the others play only if `topics` names them.
     """
     roles = {}
     for role, kinds in TYPES.items():
@@ -147,8 +137,7 @@ def _check_clocks(
 class Playback:
     """Feeds the middleware as the nodes do.
 
-    With `posed`, a pose sensor gives the start of the robot. With `any_lidar`, the first scan fixes
-    the `lidar`, as in `policy_node`; otherwise it is the model's.
+    With `posed`, a pose sensor gives the start; with `any_lidar`, the first scan fixes the `lidar`.
     """
 
     def __init__(self, model: SimulatorModel, posed: bool, any_lidar: bool = False) -> None:

@@ -19,37 +19,24 @@ from nics_drl_bridge.middleware.ekf import Estimator
 from nics_drl_bridge.middleware.measurement import Acceptance, Judgement, Kind, Measurement
 
 Array = NDArray[np.float64]
-
 HISTORY_NS = NS_PER_S  # Length of the past that may still change [ns]
 BEFORE_START = "not after the reset"
 TOO_OLD = f"older than {HISTORY_NS / NS_PER_S:g} s"
 DUPLICATE = "duplicate"
 NO_STAMP = "stamp is no number"
-FUTURE_NS = NS_PER_S
-"""Tolerance by which a stamp may be ahead of its due time [ns], at least two control periods."""
-CLOCK_JUMP = 10
-"""Number of consecutive odometries rejected for their stamps that shows that the robot's clock was
-set, or its simulation restarted."""
-NEAR_NS = HISTORY_NS + 2 * NS_PER_S
-"""Stamps farther back than this [ns] are all rejected, which `Stamps` detects."""
-CONTRADICTED_NS = 200_000_000
-"""A smaller error of a stamp [ns] cannot be distinguished from a longer transmission."""
-IN_STEP = 5
-"""Number of consecutive odometries that arrived in step with their stamps, before arrivals count as
-a measure of time."""
+FUTURE_NS = NS_PER_S  # By which a stamp may be early [ns], or two control periods if longer
+CLOCK_JUMP = 10  # Odometries rejected in a row for their stamps that show that a clock was set
+NEAR_NS = HISTORY_NS + 2 * NS_PER_S  # Stamps farther back [ns] are all rejected, see `Stamps`
+CONTRADICTED_NS = 200_000_000  # A smaller error of a stamp [ns] may be a longer transmission
+IN_STEP = 5  # Odometries in a row in step with their stamps, before arrivals measure time
+# Between odometry's pose and twist: greatest standard deviations, and always allowed [m, rad].
 SIGMA, LEAST = 6.0, 0.01
-"""Greatest difference between odometry's pose and twist, in standard deviations, and the one that
-is always allowed [m, rad]."""
 STILL = 0.02  # Slower motion [m/s, rad/s] gives no information about time
-
-Moment = tuple[int, int]
-"""Stamp [ns] and kind: the order of measurements, whatever the order of their arrival."""
+Moment = tuple[int, int]  # Stamp [ns] and kind: the order of measurements, however they arrive
 
 
 @dataclass(slots=True)
 class _Entry:
-    """A measurement, its verdict, and the state of the filter after it."""
-
     moment: Moment
     belief: Belief
     measurement: Measurement | None = None
@@ -57,12 +44,10 @@ class _Entry:
 
 
 class Timeline:
-    """Feeds measurements and commands to the estimator in the order of their stamps.
+    """Feeds the estimator, as nothing else may, with measurements and commands by their stamps.
 
-    A late one is inserted at its time, and the filter is re-run from before it. The arithmetic is
-    the same as if it had arrived in time, so the result is bit-identical, unless something is
-    later than `HISTORY_NS`. Going back to a snapshot of the filter is the idea of
-    robot_localization's `smooth_lagged_data`. The estimator must not be fed otherwise.
+    A late one is inserted at its time and the filter re-run from a snapshot before, as in
+    robot_localization's `smooth_lagged_data`: the same bits, if not older than `HISTORY_NS`.
     """
 
     def __init__(self, estimator: Estimator) -> None:
@@ -143,9 +128,8 @@ class Timeline:
 class Stamps:
     """Compares the progress of time stamps with that of the receiver's clock.
 
-    Only differences count: the clock of a robot may be off by any amount, and a simulation may run
-    slower, or faster if no two data are farther apart than the tolerance. The first datum after a
-    reset gives the offset of the two clocks. The control period [ns] widens the tolerance.
+    Only differences count: a clock may be off, a simulation slower, or faster within the tolerance,
+    which the control period [ns] widens. The first datum after a reset gives the offset.
     """
 
     def __init__(self, period_ns: int = 0) -> None:
@@ -197,9 +181,8 @@ class Trail:
     """Follows the odometries since the last one that was used.
 
     If the robot moves, the path between two odometries and their twists give the time between them.
-    If the arrivals agree with that time and the stamp does not, the odometry is neither late nor
-    did it follow a loss of data: the clock was set. `walk` (3,) is the variance per second by which
-    pose and twist of odometry differ [m^2/s, rad^2/s].
+    If arrivals agree with it and the stamp does not, the clock was set. `walk` (3,) is the variance
+    per second by which pose and twist of odometry differ [m^2/s, rad^2/s].
     """
 
     def __init__(self, walk: Array) -> None:
@@ -242,7 +225,6 @@ class Trail:
         )
 
     def _in_step(self, before: ReportedPose, after: ReportedPose) -> bool:
-        """True if both the arrivals and the path agree with the time between two stamps."""
         passed, waited = after.stamp_ns - before.stamp_ns, after.arrival_ns - before.arrival_ns
         return 2 * abs(waited - passed) <= passed and self._fits(before, after, passed / NS_PER_S)
 

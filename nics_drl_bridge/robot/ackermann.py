@@ -1,7 +1,6 @@
-"""A car: the rear axle drives, the front wheels steer.
+"""A car: the rear axle drives, the front wheels steer; `base_link` is the middle of the rear axle.
 
-Its commands are the speed of the rear axle [m/s] and the steering angle [rad] of a virtual wheel in
-the middle of the front axle. `base_link` is the middle of the rear axle.
+Commanded are the rear axle's speed [m/s] and the steering angle [rad] of a virtual middle wheel.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
-"""A robot with two driven wheels on one axle, left and right in this order.
+"""A robot with two driven wheels on one axle, left and right; `base_link` is the axle's middle.
 
-Its commands are the forward speed [m/s] and the turn rate [rad/s] of the base, which turns them
-into wheel speeds. `base_link` is the middle of the axle.
+Its commands are the base's forward speed [m/s] and turn rate [rad/s].
 """
 
 from __future__ import annotations

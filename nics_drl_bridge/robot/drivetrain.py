@@ -2,10 +2,8 @@
 
 Commands are identified by their field of `cmd_vel`, speed and steering angle in the state by their
 units. An actuator is of first order (parameters `wheel_lag`, `speed_lag`, `steering_lag` [s]) or
-rate-limited (`wheel_rate`, `speed_rate`, `steering_rate` [its unit/s]).
-
-Siegwart, Nourbakhsh, Scaramuzza: Introduction to Autonomous Mobile Robots, ch. 3; the paper's
-reference for Table I.
+rate-limited (`wheel_rate`, `speed_rate`, `steering_rate` [its unit/s]). Siegwart, Nourbakhsh,
+Scaramuzza: Introduction to Autonomous Mobile Robots, ch. 3; the paper's reference for Table I.
 """
 
 from __future__ import annotations
@@ -25,9 +23,8 @@ Array = NDArray[np.float64]
 def steered(spec: RobotSpec, twist: Callable[[Array, Array], Array]) -> Textbook:
     """Builds the kinematics of a robot that is driven by a speed and a steering angle.
 
-    Its state and its commands are both of these, in any order; its turn rate is, up to the second
-    order, a multiple of their product, and its speed one of the speed. `twist` gives the body twist
-    (..., 3) for speeds [m/s] and steering angles [rad] (...).
+    Both are its state and its commands, in any order; its turn rate is, to second order, a multiple
+    of their product. `twist` is (..., 3) for speeds [m/s] and angles [rad] (...).
     """
     v, phi = _states(spec)
     command, order = _commands(spec, ("linear.x", "angular.z")), np.argsort([v, phi])
@@ -67,7 +64,6 @@ def wheeled(
 
 
 def _commands(spec: RobotSpec, fields: tuple[CmdVelField, ...]) -> list[int]:
-    """Returns the indices of the commands for fields of `cmd_vel`; in order if they name none."""
     have = [c.cmd_vel for c in spec.command]
     if not any(have):
         return list(range(len(have)))

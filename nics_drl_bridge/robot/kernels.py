@@ -1,9 +1,7 @@
 """Compiled motion: the pruned model's rates, and the exact arc of a body twist.
 
-Only the kept terms cost time. A step of one robot consists of scalar functions, `rates` then
-`move`; `run` does the same for a batch of robots, term by term, so that vector instructions
-process several robots at a time. Both give bit-identical results for every batch size.
-
+A step of one robot is `rates` then `move`; `run` does the same for a batch, term by term, so that
+vector instructions process several robots at a time. Both give the same bits for every batch size.
 Shared arguments: `terms` are `Terms`; `x` contains state, command and a last entry of 1; `dq` are
 the rates; `series` is `SERIES` in the type of the other arrays.
 """
@@ -22,11 +20,9 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 
 Array = NDArray[np.float64]
 
+# Of sin(t) / t and (1 - cos(t)) / t: to 1e-14 for a turn below 0.1 rad, 1e-8 below WIDE_TURN.
 SERIES: Array = np.array([1 / 6, 1 / 120, 1 / 5040, 1 / 2, 1 / 24, 1 / 720])
-"""Coefficients of sin(t) / t and (1 - cos(t)) / t; exact to 1e-14 for turns below 0.1 rad per
-step, to 1e-8 below `WIDE_TURN`."""
-WIDE_TURN = 0.5
-"""For larger turns per step the series are inaccurate and sine and cosine are used [rad]."""
+WIDE_TURN = 0.5  # For larger turns per step sine and cosine are used, not the series [rad]
 GREATEST_ORDER = 4
 
 
@@ -35,8 +31,7 @@ class Terms(NamedTuple):
 
     dof: NDArray[np.int64]  # (T,) degree of freedom of each
     coefficient: Array  # (T,), or (T, n) of n robots
-    # (T, order) indices into `x`; unused ones point to its last entry, which is 1
-    factors: NDArray[np.int64]
+    factors: NDArray[np.int64]  # (T, order) indices into `x`; unused ones of its last entry, 1
     degree: NDArray[np.int64]  # (T,) number of factors
 
 
@@ -76,11 +71,7 @@ def rates(dq, x, terms):  # type: ignore[no-untyped-def]
 
 @kernel
 def move(x, y, c, s, vx, vy, turn, dt, series):  # type: ignore[no-untyped-def]
-    """Returns position and direction after the exact arc of a constant body twist.
-
-    Position x, y [m] and the heading's cosine c and sine s; body velocity vx, vy [m/s]; turn rate
-    x duration `turn` [rad], duration dt [s].
-    """
+    """Returns x, y [m], cosine and sine of the heading after an arc of `turn` [rad] in dt [s]."""
     if abs(turn) > WIDE_TURN:
         one = series[3] + series[3]
         sine, versine = math.sin(turn), one - math.cos(turn)
@@ -107,7 +98,6 @@ def _chord(vx, vy, a, b, dt):  # type: ignore[no-untyped-def]
 
 @kernel
 def _end(x, y, c, s, ahead, aside, sine, versine):  # type: ignore[no-untyped-def]
-    """Returns position and direction at the end of a chord, after a turn of that sine."""
     x, y = x + (c * ahead - s * aside), y + (s * ahead + c * aside)
     return x, y, c - (c * versine + s * sine), s - (s * versine - c * sine)
 
@@ -129,11 +119,10 @@ def advance(pose, twist, dt, series):  # type: ignore[no-untyped-def]
 
 @kernel
 def run(pose, x, dq, terms, series, dt, steps):  # type: ignore[no-untyped-def]
-    """Moves a batch of robots by the same number of steps of dt [s], under constant commands.
+    """Moves n robots in place by the same number of steps of dt [s], under constant commands.
 
-    Updated in place are `pose` (6, n), x, y [m], cosine, sine and value of the heading, unwrapped,
-    and an upper bound of the path length [m], and the state in `x` (S + C + 1, n). `dq` (3 + S, n)
-    are the rates of the last step; coefficients are (T, n).
+    `pose` (6, n) is x, y [m], cosine, sine, unwrapped heading, and an upper bound of the path
+    length [m]; `x` is (S + C + 1, n), `dq` (3 + S, n) the last step's rates, coefficients (T, n).
     """
     for _ in range(steps):
         _rates_of_all(dq, x, terms)

@@ -23,10 +23,8 @@ class Textbook:
     twist: Callable[[Array], Array]  # gives the body twist (..., 3) for a state (..., S)
     target: Callable[[Array], Array]  # gives the state (..., S) that a command (..., C) requests
     lag: Array  # (S,) time constants of first-order actuators [s]
-    # (S,) greatest rates of rate-limited actuators [its unit/s]; inf for first-order ones
-    rate: Array
-    # possible products of state variables in each degree of freedom of the twist
-    structure: dict[str, tuple[str, ...]]
+    rate: Array  # (S,) of rate-limited actuators [its unit/s]; inf for first-order ones
+    structure: dict[str, tuple[str, ...]]  # possible products of states, by component of the twist
 
     def respond(self, state: Array, goal: Array, t: Array | float) -> Array:
         """Returns the exact state (..., S) at time t [s] on its way from `state` to `goal`."""
@@ -51,14 +49,11 @@ class Pivot:
 
 @dataclass(frozen=True)
 class Wheel:
-    """A wheel that stands on the ground, with its place x, y in `base_link` and its radius [m].
-
-    Its name is that of its joint, which `turns` by the state variable of that name if there is one.
-    """
+    """A wheel that stands on the ground; its joint `turns` by the state variable of its name."""
 
     name: str
-    place: tuple[float, float]
-    radius: float
+    place: tuple[float, float]  # x, y in `base_link` [m]
+    radius: float  # [m]
     turns: bool = False
     pivot: Pivot | None = None
 
@@ -81,10 +76,7 @@ class RobotKind:
 
 
 def textbook(spec: RobotSpec) -> Textbook:
-    """Returns the textbook kinematics of a robot, with the parameters of its spec.
-
-    Raises ConfigError if the spec names none, lacks a parameter, or has other variables.
-    """
+    """Returns a robot's textbook kinematics; ConfigError if its spec names none or does not fit."""
     return _made(spec, lambda kind: kind.kinematics(spec))
 
 

@@ -12,8 +12,7 @@ from nics_drl_bridge.config import Schema
 from nics_drl_bridge.robot.spec import RobotSpec
 
 MEASURED: Literal["measured"] = "measured"
-ASSUMED_STATE_DRIFT = 0.1
-"""Assumed drift of an unmeasured state within a second, as a share of its range."""
+ASSUMED_STATE_DRIFT = 0.1  # of an unmeasured state within a second, as a share of its range
 
 
 class Level(Schema):
@@ -38,10 +37,9 @@ def assumed(std: float, unit: str) -> Level:
 class Noise(Schema):
     """Noise of a robot's odometry and pose sensor, and drift of its pose and its state by name.
 
-    The drift is motion that the model does not explain; it grows with the square root of time.
-    The simulator draws the odometry noise, and the drift if it was measured: an assumed drift is
-    a margin for the estimator, not a motion of the robot. The estimator takes its R from odometry
-    and pose, its Q from the drift.
+    Drift is motion that the model does not explain; it grows with the square root of time. The
+    simulator draws the odometry noise, and the drift if it was measured: if assumed, it is a margin
+    for the estimator, which takes its R from odometry and pose, its Q from the drift.
     """
 
     odom_linear: Level = assumed(0.01, "m/s")

@@ -1,8 +1,7 @@
 """RobotSpec: the single definition of a robot's state and command: order, units and limits.
 
-A module of this folder that defines `KIND`, a `kinds.RobotKind`, adds a kind of the module's name,
-which a robot's YAML file selects by `textbook:`. Other packages add kinds by entry points of the
-group `nics_drl_bridge.kinds`.
+A module here that defines `KIND`, a `kinds.RobotKind`, adds a kind of its name for `textbook:` in
+YAML files. Other packages add kinds by entry points of the group `nics_drl_bridge.kinds`.
 """
 
 from __future__ import annotations
@@ -29,10 +28,9 @@ CMD_VEL_FIELDS: tuple[CmdVelField, ...] = ("linear.x", "linear.y", "angular.z")
 POSE_RATES = ("vx", "vy", "wz")
 POSE_UNITS = ("m/s", "m/s", "rad/s")
 TWIST_UNITS = dict(zip(CMD_VEL_FIELDS, POSE_UNITS, strict=True))
+# SI units of a state or a command; 1 for a ratio or a count.
 Unit = Literal["m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N*m", "V", "A", "1"]
-"""SI units of a state or a command; 1 for a ratio or a count."""
-MOST_CORNERS, MOST_VARIABLES = 512, 32
-"""Greatest number of corners of a footprint, and of variables of a state or a command."""
+MOST_CORNERS, MOST_VARIABLES = 512, 32  # of a footprint; of a state or a command
 FASTEST = 1e6  # Greatest absolute value of a variable, in its unit
 
 
@@ -104,20 +102,17 @@ class RobotSpec(Schema):
 
     name: str
     description: str = ""
-    # its kind: the textbook kinematics for its synthetic recordings, whose structure may also be
-    # assumed for motion that a drive did not show
+    # its kind: textbook kinematics, to make recordings, or to assume what a drive did not show
     textbook: str | None = None
-    # of the textbook kinematics [m, s], see the module of that kind
-    parameters: dict[str, float] = Field(default_factory=dict)
+    parameters: dict[str, float] = Field(default_factory=dict)  # [m, s], see the module of its kind
     # of a circle around `base_link` [m]; optional with a `footprint`, which it then circumscribes
     footprint_radius: float = Field(ge=1e-3, le=1e3)
     # corners of a polygon instead, in `base_link` [m], in either direction
     footprint: tuple[tuple[float, float], ...] | None = Field(
         default=None, min_length=3, max_length=MOST_CORNERS
     )
-    # S components, in the order of every state vector
+    # S and C components, in the order of every state and command vector
     state: tuple[StateVariable, ...] = Field(default=(), max_length=MOST_VARIABLES)
-    # C components, in the order of every command vector
     command: tuple[CommandVariable, ...] = Field(min_length=1, max_length=MOST_VARIABLES)
 
     @field_validator("textbook")
@@ -234,13 +229,11 @@ def _reach(outline: ArrayLike) -> float:
 
 
 def _edges_cross(corners: NDArray[np.float64]) -> bool:
-    """True if two edges of an outline (V, 2) meet anywhere but at their common corner."""
     start, stop = corners, np.roll(corners, -1, axis=0)
     if (start == stop).all(axis=1).any():
         return True
 
     def side(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Returns the side (V, V) of each edge (rows) on which each point lies."""
         along, to = (stop - start)[:, None], points[None] - start[:, None]
         return np.sign(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])
 
@@ -253,9 +246,8 @@ def _edges_cross(corners: NDArray[np.float64]) -> bool:
     # An edge may not run back along its predecessor.
     folded = side(stop)[index, (index + 1) % len(corners)] == 0.0
     ahead = ((stop - start) * (np.roll(stop - start, -1, axis=0))).sum(axis=1) > 0.0
-    return bool(
-        (boxes & (apart <= 0.0) & (apart.T <= 0.0) & distant).any() or (folded & ~ahead).any()
-    )
+    crossing = boxes & (apart <= 0.0) & (apart.T <= 0.0) & distant
+    return bool(crossing.any() or (folded & ~ahead).any())
 
 
 def load_robot(name: str | Path) -> RobotSpec:

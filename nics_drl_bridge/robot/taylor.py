@@ -22,18 +22,15 @@ class TaylorModel:
     """`dQ/dt = A chi(X)` without the pruned terms (Eq. 1, 2)."""
 
     variables: tuple[str, ...]  # V names of X = [state, command]
-    # D = 3 + S names of dQ/dt: vx, vy, wz of the body twist, then the state's rates
-    dofs: tuple[str, ...]
+    dofs: tuple[str, ...]  # D = 3 + S names of dQ/dt: vx, vy, wz, then the state's rates
     dof_units: tuple[str, ...]
     powers: NDArray[np.int64]  # (K, V) exponents of the terms that any degree of freedom keeps
     coefficients: Array  # (D, K); zero where a degree of freedom does not keep a term
     dt: float  # the step for which the rates are valid [s]; the simulator's step
     low: Array  # `low`, `high`: (V,) the box of X that the recording covered
     high: Array
-    # terms (dof, term) that the drive could not show, of the textbook's structure
-    assumed: tuple[tuple[str, str], ...] = ()
-    # (D, K) of the coefficients; NaN for a kept one that was not estimated but assumed or fixed by
-    # definition. Empty, (0, 0), if none is known
+    assumed: tuple[tuple[str, str], ...] = ()  # terms (dof, term) of the textbook, not of the drive
+    # (D, K); NaN for a kept coefficient that was assumed or defined; (0, 0) if none is known
     std_errors: Array = field(default_factory=lambda: np.zeros((0, 0)))
     quality: Quality | None = None
 
@@ -116,10 +113,9 @@ class TaylorModel:
 
 
 def exponents(variables: int, order: int) -> NDArray[np.int64]:
-    """Returns the exponents (K, V) of the distinct products of up to `order` of V variables.
+    """Exponents (K, V) of the distinct products of up to `order` of V variables, constant first.
 
-    The constant comes first, then by order. `chi = vec([1, X] (x) [1, X])` of Eq. 1, of order 2,
-    contains every mixed product twice; here each occurs once.
+    `chi = vec([1, X] (x) [1, X])` of Eq. 1 contains every mixed product twice; here it occurs once.
     """
     rows = [
         np.bincount(np.array(chosen, dtype=np.int64), minlength=variables)
@@ -180,8 +176,7 @@ class Quality:
     # `held_out_rmse`, `held_out_r2`: the same on data that the fit never saw; empty if none
     held_out_rmse: dict[str, float]
     held_out_r2: dict[str, float]
-    # length of the open-loop predictions on that data; 0 if none. The mean errors at their ends
-    # follow, and the mean length of the measured path
+    # of open-loop predictions on that data, 0 if none; mean errors at the ends, mean path length
     open_loop_horizon_s: float = 0.0
     open_loop_position_error_m: float = 0.0
     open_loop_heading_error_rad: float = 0.0

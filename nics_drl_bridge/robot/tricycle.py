@@ -1,7 +1,6 @@
-"""A tricycle: one wheel at the front drives and steers, two at the rear roll.
+"""A tricycle: the front wheel drives and steers, two roll; `base_link` is amid the rear axle.
 
-Its commands are the speed of the front wheel along its own direction [m/s], and its steering angle
-[rad]. `base_link` is the middle of the rear axle.
+Its commands are the front wheel's speed along its own direction [m/s] and steering angle [rad].
 """
 
 from __future__ import annotations

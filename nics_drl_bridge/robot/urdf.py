@@ -11,7 +11,6 @@ from nics_drl_bridge.robot.spec import RobotSpec
 
 Element = ElementTree.Element
 Place = tuple[float, float, float]
-
 COLOURS = {"body": "0.2 0.4 0.7 1", "wheel": "0.1 0.1 0.1 1", "laser": "0.7 0.1 0.1 1"}
 BODY_HEIGHT = 0.04
 
@@ -22,12 +21,10 @@ def urdf_of(
 ) -> str:  # fmt: skip
     """Returns the text of a robot's URDF.
 
-    `base_link` lies on the ground, where its pose is measured; wheels stand on the ground and
-    `laser` is at its mount, at the height of `base_link`, since the package's world is flat.
-    Moving joints have the names of the state variables in `joint_states`. A robot without
-    textbook kinematics has no wheels here, since its spec does not contain their positions.
-    The lidar's frame is `laser`, its mount x [m], y [m], heading [rad] in the frame `base`, as are
-    those of the `further` sensors by frame.
+    `base_link` and wheels stand on the ground; `laser` is at the height of `base_link`, as the
+    package's world is flat. Moving joints have the names of the state variables in `joint_states`.
+    A robot without textbook kinematics has no wheels here. Mounts are x [m], y [m], heading [rad]
+    in `base`, of the lidar's frame `laser` and of the `further` sensors by frame.
     """
     robot = Element("robot", name=spec.name)
     for name, colour in COLOURS.items():
@@ -100,7 +97,6 @@ def _visual(
 
 
 def _geometry(parent: Element, size: tuple[float, ...], at: Place, roll: float = 0.0) -> None:
-    """Adds a box of length, width and height, or a cylinder of radius and length."""
     _add(parent, "origin", xyz=_numbers(*at), rpy=_numbers(roll, 0.0, 0.0))
     shape = _add(parent, "geometry")
     if len(size) == 3:

@@ -24,13 +24,9 @@ from nics_drl_bridge.sim.world import World
 
 SLICES = 16  # Number of groups of beams in which a skewed scan is rendered
 LANES = 256  # Number of robots moved side by side: their arrays stay in the L1 cache
-CROWD = 4096
-"""Least number of pairs of a robot and a body for sorting the bodies of a world into cells."""
-FEWEST_OF_A_CROWD = 8
-"""Least number of robots: for fewer, sorting takes longer than testing all bodies."""
-SCATTERED = 64
-"""Least number of bodies in cells for scanning each robot only among those around it; for fewer,
-testing all of them takes less time than a separate scan for each robot."""
+CROWD = 4096  # Least number of pairs of a robot and a body for sorting bodies into cells
+FEWEST_OF_A_CROWD = 8  # Least number of robots: for fewer, testing all bodies takes less time
+SCATTERED = 64  # Least number of bodies in cells for a separate scan of each robot among those near
 
 
 @dataclass(frozen=True)
@@ -126,11 +122,9 @@ def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int)
     x, dq = scratch(kinematics)
     return arrays.Scratch(
         lanes=arrays.Lanes(
-            pose=np.zeros((6, lanes)),
-            x=np.ones((len(kinematics.variables) + 1, lanes)),
-            dq=np.zeros((len(kinematics.dofs), lanes)),
+            pose=np.zeros((6, lanes)), x=np.ones((len(kinematics.variables) + 1, lanes)),
+            dq=np.zeros((len(kinematics.dofs), lanes)), late=np.zeros(lanes, np.int64),
             coefficient=np.zeros((np.count_nonzero(kinematics.coefficients), lanes)),
-            late=np.zeros(lanes, np.int64),
         ),
         single=arrays.Single(
             x=x, dq=dq, trial=np.zeros(BODY), spare=np.zeros((corners, 2)),

@@ -40,7 +40,6 @@ def rates_at(n: int, m: int, j: int, state: State, motion: Dynamics, single: Sin
 
 @kernel
 def _fly(body: Array, base: Array, flight: Array, time: float, series: Array) -> None:
-    """Writes to `body` (7,) a robot that began at `base` (7,), after `time` [s]."""
     turn = flight[TURN] * time
     body[X], body[Y], body[COS], body[SIN] = move(
         base[X], base[Y], base[COS], base[SIN], flight[VX], flight[VY], turn, time, series
@@ -75,7 +74,6 @@ def _first_touch(
 def _leave(
     m: int, until: float, scene: Surroundings, nearby: Nearby, single: Single, moving: Moving
 ) -> None:
-    """Moves a robot that overlaps something for as long as it gets no deeper."""
     world, events, me = moving.world, single.events, moving.first + m
     flight = moving.flights[me]
     path = math.sqrt(flight[VX] ** 2 + flight[VY] ** 2) + abs(flight[TURN]) * world[me, RADIUS]
@@ -92,7 +90,6 @@ def _leave(
 
 @kernel
 def _within(p: int, b: int, until: float, moving: Moving) -> bool:
-    """True if robot p may come near body b within the substep."""
     world, flights, a = moving.world, moving.flights, moving.first + p
     dx, dy = world[a, X] - world[b, X], world[a, Y] - world[b, Y]
     paths = impact.speed_at(a, -1.0, flights) + impact.speed_at(b, -1.0, flights)
@@ -139,7 +136,6 @@ def _settle(
 def _arrive(
     n: int, any_moves: bool, motion: Dynamics, state: State, nearby: Nearby, single: Single
 ) -> None:
-    """Moves robots to the end of the substep, and rests the obstacles that stopped within it."""
     bodies, velocity, start = state.bodies[n], state.velocity[n], single.start
     for m in range(nearby.meets.shape[0]):
         if nearby.meets[m] != contacts.FREE:
@@ -211,7 +207,6 @@ def move_carefully(
 def _check_overlap(
     m: int, scene: Surroundings, nearby: Nearby, single: Single, touched: Array, moving: Moving
 ) -> None:
-    """Records how deep robot m overlaps anything as the period begins; marks it if it does."""
     events, body = single.events, moving.world[moving.first + m]
     depth, whom = contacts.contact(
         body, m, moving.world, scene, nearby, single.spare, 2.0 * impact.NOTHING

@@ -1,13 +1,10 @@
 """Compiled collision: the signed clearance between bodies, straight walls and a static map.
 
-A clearance is the distance between two outlines that are apart. Where they overlap it is negative:
-the depth at which the deepest point of one lies within the other, taken over their corners and
-the midpoints of the pieces of their edges that lie within. Circles are compared by their centres,
-and outlines only where the circles around both are near.
-
-Shared arguments: a body (7,) has the columns of `state`, a wall (4,) two ends. Clearances beyond
-`limit` [m] are not measured: the result is `limit`. The distances of a map are 0 in solid cells.
-`spare` (F, 2) is scratch for the corners of the first body, at least 4.
+It is the distance between two outlines that are apart, at most `limit` [m]. Where they overlap it
+is negative: the depth at which the deepest point of one lies within the other, over their corners
+and the midpoints of the pieces of edges within. Shared arguments: a body (7,) has the columns of
+`state`, a wall (4,) two ends; the distances of a map are 0 in solid cells; `spare` (F, 2), at least
+4, is scratch for the corners of the first body.
 """
 
 from __future__ import annotations
@@ -21,8 +18,7 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SHAPE, SIN, X, Y
 from nics_drl_bridge.sim.state import Array
 
-TOUCHING = 1e-12
-"""Outlines within this distance touch; their depth then decides whether they overlap [m]."""
+TOUCHING = 1e-12  # Outlines this near touch; their depth then decides about an overlap [m]
 ON_EDGE = 1e-9  # Tolerance beyond the ends of an edge for intersections, as a share of its length
 FLOAT32 = 1e-6  # Relative rounding error of the distances of a map
 
@@ -130,7 +126,6 @@ def _next_cut(ax, ay, ex, ey, after, q):  # type: ignore[no-untyped-def]
 
 @kernel
 def _deepest(p, q):  # type: ignore[no-untyped-def]
-    """Depth of the edges of outline p within outline q [m]; 0 if they do not overlap."""
     depth = 0.0
     if q.end - q.begin == 2:
         return depth

@@ -1,11 +1,8 @@
 """Compiled contacts: which robots may touch something within a period, and what they touch.
 
-A robot whose circle cannot meet anything within the period moves freely. For the others, `near`
-lists the bodies that they may meet, so that each substep tests only those.
-
-In a crowded world the bodies are sorted into square cells, rebuilt each period by a counting sort.
-A robot then tests only the bodies around it, and the cost per robot does not depend on how many
-share the world. Bodies larger than a cell are in no cell and are always tested.
+A robot whose circle cannot meet anything within the period moves freely; for the others, `near`
+lists the bodies that each substep tests. In a crowded world the bodies are sorted into square cells
+each period, and a robot tests only those around it; bodies larger than a cell are always tested.
 """
 
 from __future__ import annotations
@@ -21,8 +18,7 @@ from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim.state import Array, Cells, Nearby, State, Surroundings
 
 FREE, BODIES, WALLS, MAP = 0, 1, 2, 4  # Bit flags of what a robot may meet
-SEVERAL = 32
-"""Greatest number of bodies listed near a robot; if there are more, all bodies are tested."""
+SEVERAL = 32  # Most bodies that are listed near a robot; if there are more, all are tested
 LEFT, BOTTOM, PER_METRE, LARGEST, MOVED, FRAME = range(6)
 """Columns of `Cells.frame`: x, y of the first cell [m], cells per metre, greatest radius of the
 bodies in cells [m], greatest distance moved since by any body [m]."""
@@ -30,10 +26,7 @@ bodies in cells [m], greatest distance moved since by any body [m]."""
 
 @kernel
 def reaches(n: int, state: State, nearby: Nearby, period: float) -> tuple[float, bool]:
-    """Writes to `nearby.reach` how far each body of world n may reach in a period [s]; 0 for none.
-
-    Given `nearby.way`; returns the longest path of any body [m], and whether an obstacle moves.
-    """
+    """Writes how far each body reaches in a period [s]; longest path, and if an obstacle moves."""
     reach, way, bodies, velocity = nearby.reach, nearby.way, state.bodies, state.velocity
     longest, moving = 0.0, False
     obstacles = velocity.shape[1]
@@ -83,9 +76,7 @@ def contact(
     body: Array, m: int, world: Array, scene: Surroundings, nearby: Nearby, spare: Array,
     limit: float,
 ) -> tuple[float, int]:  # fmt: skip
-    """Returns the clearance of robot m, placed as `body` (7,), to all that it may meet, at most
-    `limit` [m]; and the nearest body, or -1. `world` (K + M, 7) are the bodies of its world.
-    """  # noqa: D205
+    """Clearance [m], up to `limit`, of robot m placed as `body` (7,), and nearest body or -1."""
     outlines, near, least, whom = scene.outlines, nearby.near, limit, -1
     if nearby.meets[m] & BODIES:
         me = world.shape[0] - near.shape[0] + m

@@ -81,16 +81,15 @@ class DeviceWorld:
     def sensed(self, robot: int) -> Sensed:
         """Returns the present values of one robot; the next step may overwrite them."""
         data = self._simulator.data
+        readings = {name: each[0, robot] for name, each in self._simulator.readings.items()}
         return Sensed(
             data.odom[0, robot], self._covariance[robot], data.twist[0, robot],
-            data.state[0, robot], data.ranges[0, robot], data.pose[0, robot], self._before[robot],
-            self._period,
-            {name: each[0, robot] for name, each in self._simulator.readings.items()},
+            data.state[0, robot], data.ranges[0, robot], data.pose[0, robot],
+            self._before[robot], self._period, readings,
         )  # fmt: skip
 
 
-LEAST_VARIANCE = 1e-9
-"""Variance of odometry without noise: in ROS, a covariance of zeros means unknown."""
+LEAST_VARIANCE = 1e-9  # Of odometry without noise: in ROS, a covariance of zeros means unknown
 
 
 def variances(std: tuple[float, float]) -> Array:
@@ -107,9 +106,8 @@ def step_covariance(std: tuple[float, float], period: float) -> Array:
 def propagate(covariance: Array, before: ArrayLike, after: ArrayLike, added: Array) -> Array:
     """Propagates the covariances (M, 3, 3) of poses by odometry (M, 3) from before to after.
 
-    A heading error rotates the motion that follows: P' = F P F^T + Q, with F the derivative of the
-    new pose with respect to the old one (Thrun et al., Probabilistic Robotics, Sec. 5.4), Q
-    `added`.
+    A heading error rotates the motion that follows: P' = F P F^T + Q, F the new pose's derivative
+    to the old one (Thrun et al., Probabilistic Robotics, Sec. 5.4), Q `added`.
     """
     p, (x, y, _) = np.array(covariance, np.float64), np.subtract(before, after).T
     turned = np.stack([y, -x], axis=1)  # F differs from the identity only in its last column
@@ -121,9 +119,8 @@ def propagate(covariance: Array, before: ArrayLike, after: ArrayLike, added: Arr
 class DrivenSimulator(FastSimulator):
     """One world of the fast simulator whose robots are moved from outside, by other physics.
 
-    Scenes, motion of the obstacles, noise, faults and scans are those of the FastSimulator for the
-    same seed. Odometry is the wheel odometry, `wheels` (M, 3) from the start pose, with the model's
-    noise. A subclass steps.
+    Scenes, obstacles, noise, faults and scans are those of the FastSimulator. Odometry is that of
+    the `wheels` (M, 3) since the start, with the model's noise. A subclass steps.
     """
 
     def reset(
@@ -157,8 +154,7 @@ class DrivenSimulator(FastSimulator):
         data = self.data
         data.pose[0], data.state[0] = pose, state
         data.collided[0] |= touched.astype(np.uint8)
-        step_kernels.end_period(
-            self.packed[0], twist[None], self.wheels[None], wheels[None], counted[None]
-        )
+        given = twist[None], self.wheels[None], wheels[None], counted[None]
+        step_kernels.end_period(self.packed[0], *given)
         self.sense(np.zeros(1, np.int64))
         self.wheels = wheels.copy()

@@ -1,16 +1,13 @@
 """Compiled times of impact: the first contact of a moving body with another within a substep.
 
-Conservative advancement: two features, each a corner or an edge with a radius around it, are
-advanced by a time in which they cannot meet, again and again until they touch or the substep ends.
-Along the direction between their nearest points, a corner approaches by at most its velocity times
-the time plus half of its greatest acceleration times the time squared. The bound is exact to first
-order, so that a body sliding along a wall or passing a corner takes few iterations. No contact is
-missed, at any speed.
+Conservative advancement: two features, a corner or an edge with a radius around it, are advanced by
+a time in which they cannot meet, until they touch or the substep ends. Along the direction between
+their nearest points, a corner approaches by at most its velocity times the time plus half its
+greatest acceleration times the time squared. The bound is exact to first order, so that sliding
+along a wall takes few iterations, and no contact is missed at any speed.
 
-Two features touch when they are within `SLACK` and approach each other; they do not overlap then.
-Bodies that overlap at the outset are not handled here, see `careful_kernels`.
-
-Times are those of the substep [s]. Body index -1 is the map, which does not move.
+Features touch when they are within `SLACK` and approach each other; bodies that overlap before are
+left to `careful_kernels`. Times are in the substep [s]; body -1 is the map.
 """
 
 from __future__ import annotations
@@ -34,8 +31,7 @@ and of the other's nearest point along the direction between them, negative if a
 and the clearance, negative where it overlaps something, before and after the substep [m]."""
 SLACK = 1e-7  # Bodies touch if they are nearer than this to each other and approach [m]
 NOTHING = 1e-12  # Distances up to this count as zero [m]
-MOST_LOOKS = 2000
-"""Iterations after which a pair counts as touching: only absurdly fast rotations need more."""
+MOST_LOOKS = 2000  # After so many a pair counts as touching: only absurdly fast turns need more
 
 
 class Moving(NamedTuple):
@@ -88,7 +84,6 @@ def pose_at(b: int, time: float, moving: Moving) -> tuple[float, float, float, f
 
 @kernel
 def _placed_at(b: int, edge: Edge, time: float, moving: Moving) -> Placed:
-    """Returns an edge, given in the frame of its body, in the map at a time."""
     x, y, c, s = pose_at(b, time, moving)
     there = _in_map(edge, x, y, c, s)
     if b < 0 or time >= moving.flights[b, STOP]:
@@ -147,7 +142,6 @@ def _reach(edge: Edge) -> float:
 
 @kernel
 def _next_stop(b: int, time: float, until: float, flights: Array) -> float:
-    """Returns when a body stops, if it does between two times; otherwise the later one."""
     return flights[b, STOP] if b >= 0 and time < flights[b, STOP] < until else until
 
 
@@ -161,10 +155,7 @@ def _rate(nx: float, ny: float, body: Placed, x: float, y: float) -> float:
 def _free_time(
     p: Placed, q: Placed, nx: float, ny: float, gap: float, bend: float
 ) -> tuple[float, float, float]:
-    """Returns a time in which two edges cannot meet, and the rates of the corners that bound it.
-
-    They are `gap` [m] apart along n, from q to p; `bend` bounds their acceleration [m/s^2].
-    """
+    """Time in which edges `gap` [m] apart along n (q to p) cannot meet, with its corners' rates."""
     far, far2 = nx * p.edge.ax + ny * p.edge.ay, nx * p.edge.bx + ny * p.edge.by
     near, near2 = nx * q.edge.ax + ny * q.edge.ay, nx * q.edge.bx + ny * q.edge.by
     rate_p, rate_p2 = _rate(nx, ny, p, p.edge.ax, p.edge.ay), _rate(nx, ny, p, p.edge.bx, p.edge.by)
@@ -222,7 +213,6 @@ def _edges(outline: collision.Outline) -> int:
 
 @kernel
 def _edge_of(v: int, outline: collision.Outline) -> Edge:
-    """Returns edge v of an outline, or the origin of a circle's, which has none."""
     corners, begin, end = outline.corners, outline.begin, outline.end
     if begin == end:
         return Edge(0.0, 0.0, 0.0, 0.0)
@@ -234,10 +224,7 @@ def _edge_of(v: int, outline: collision.Outline) -> Edge:
 def touch_edge(
     event: Array, a: int, b: int, other: Edge, round_b: float, begin: float, moving: Moving
 ) -> None:
-    """Makes `event` (EVENT,) the first contact of body a with an edge of body b, if it is sooner.
-
-    The edge, in the frame of body b, has a radius [m] around it; the search is from `begin` [s] on.
-    """
+    """Makes `event` (EVENT,) a's first contact from `begin` on with an edge, in b's frame."""
     world, flights = moving.world, moving.flights
     x, y, _, _ = pose_at(a, begin, moving)
     ox, oy, oc, os = pose_at(b, begin, moving)

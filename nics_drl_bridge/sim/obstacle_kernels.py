@@ -1,15 +1,11 @@
-"""Compiled motion of obstacles: one call at reset, and one per world and control period.
+"""Compiled motion of obstacles, each a circle: one call at reset, and one per world and period.
 
-The columns of the obstacles' memory `marks` and of their plans are in `separation_kernels`. Each
-obstacle is represented by its enclosing circle. All draws depend on seed, step and k alone.
-
-Pedestrians move by the social force model of Helbing and Molnar (1995), "Social force model for
-pedestrian dynamics", Phys. Rev. E 51, 4282; equation numbers are theirs. A walker is driven towards
-its goal (2), repelled by others along ellipses that anticipate their next step (3, 4) and by walls
-(5), less by what is out of sight (8), and disturbed by a fluctuation. Bodies are discs of any size,
-so distances are between surfaces. The anticipated step is that of the relative motion (Johansson,
-Helbing, Shukla 2007): with the other's motion alone, a walker reacts too late to a robot that
-stands in its way, and pushes against it.
+Columns of `marks`, plans: `separation_kernels`. Draws depend on seed, step and k alone. Pedestrians
+move by the social force model of Helbing and Molnar (1995), Phys. Rev. E 51, 4282, whose equation
+numbers are used: a drive towards the goal (2), repulsion by others along ellipses that anticipate
+their next step (3, 4) and by walls (5), less by what is out of sight (8), and a fluctuation.
+Distances are between surfaces. The anticipated step is that of the relative motion (Johansson,
+Helbing, Shukla 2007): by the other's alone, a walker pushes against a robot in its way.
 """
 
 from __future__ import annotations
@@ -36,8 +32,7 @@ STRONGEST = 5.0  # Greatest acceleration [m/s^2]: people reach no more, and the 
 ARRIVED = 0.3  # A goal is reached within this distance [m]
 ROOM = 0.2  # Free space around a walker at a new goal [m]
 LEAST_WALK = 1.0  # Least distance of a new goal [m], if such a goal is found
-PATIENCE = 5.0
-"""A walker gives up a goal after twice the time of the straight path plus this time [s]."""
+PATIENCE = 5.0  # A goal is given up after twice the time of the straight path plus this [s]
 CANDIDATES = 16
 
 
@@ -65,11 +60,9 @@ def begin(n: int, state: State, plans: Array) -> None:
 
 @kernel
 def steer(n: int, state: State, scene: Surroundings, period: float, speeds: Array) -> None:
-    """Sets the velocities of the obstacles of world n for the period [s] that begins.
+    """Sets the obstacles' velocities for a period [s]; `speeds` (M, 2) are the robots' [m/s].
 
-    Moving by its velocity for the period, an obstacle neither leaves the field nor crosses a wall
-    nor touches another obstacle, and does not run into a robot that keeps its velocity; `speeds`
-    (M, 2) are the robots' [m/s] in `map`.
+    An obstacle stays in the field, off walls and others, and off robots that keep their velocity.
     """
     velocity, seed, step, movers = state.velocity[n], state.seeds[n], state.steps[n], scene.movers
     count, plans, bodies = velocity.shape[0], movers.plans, state.bodies[n]
@@ -103,7 +96,6 @@ def steer(n: int, state: State, scene: Surroundings, period: float, speeds: Arra
 
 @kernel
 def _blocked(x, y, angle, reach, here, room, k, traffic):  # type: ignore[no-untyped-def]
-    """True if something is near the path ahead, and nearer than at the outset."""
     for part in (0.5, 1.0):
         way = part * reach
         free, _, _ = at.clearance(x + way * math.cos(angle), y + way * math.sin(angle), k, traffic)
@@ -114,7 +106,6 @@ def _blocked(x, y, angle, reach, here, room, k, traffic):  # type: ignore[no-unt
 
 @kernel
 def _wander(mark, k, traffic, seed, counter):  # type: ignore[no-untyped-def]
-    """Displacement of a wandering obstacle: ahead, turning to a free direction if blocked."""
     body, speed, period = traffic.bodies[k], mark[at.SPEED], traffic.period
     x, y, radius = body[X], body[Y], body[RADIUS]
     here, nx, ny = at.clearance(x, y, k, traffic)
@@ -180,7 +171,6 @@ def repulsion(rx, ry, vx, vy, foresight, strength, reach):  # type: ignore[no-un
 
 @kernel
 def _from_bodies(k, ex, ey, marks, traffic):  # type: ignore[no-untyped-def]
-    """Sums the forces of all other bodies on walker k: walkers, obstacles, robots."""
     bodies, first, row, ax, ay = traffic.bodies, traffic.first, traffic.plans[k], 0.0, 0.0
     for j in range(bodies.shape[0]):
         if j == k or bodies[j, RADIUS] <= 0.0:
@@ -210,7 +200,6 @@ def _from_bodies(k, ex, ey, marks, traffic):  # type: ignore[no-untyped-def]
 
 @kernel
 def _from_walls(k, traffic):  # type: ignore[no-untyped-def]
-    """Sums the forces (5) of the nearest point of each wall, and of the static map."""
     body, row, walls, ax, ay = traffic.bodies[k], traffic.plans[k], traffic.walls, 0.0, 0.0
     x, y, radius, reach = body[X], body[Y], body[RADIUS], row[at.WALL_RANGE]
     far = radius + FAR * reach
@@ -232,7 +221,6 @@ def _from_walls(k, traffic):  # type: ignore[no-untyped-def]
 
 @kernel
 def _new_goal(mark, k, traffic, seed, counter, step):  # type: ignore[no-untyped-def]
-    """Draws the next goal of walker k; the last draw is kept if none is free."""
     body, half = traffic.bodies[k], traffic.half
     x, y, radius = body[X], body[Y], body[RADIUS]
     wide, deep = max(half[0] - radius - ROOM, 0.0), max(half[1] - radius - ROOM, 0.0)

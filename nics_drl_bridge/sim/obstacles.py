@@ -16,10 +16,8 @@ from nics_drl_bridge.lidar.shapes import Coordinate
 from nics_drl_bridge.sim import separation_kernels as at
 
 __all__ = ["Motion", "Patrol", "Pedestrian", "Wander", "plan_arrays"]
-
 Array = NDArray[np.float64]
-FASTEST = 10.0
-"""Greatest speed of an obstacle [m/s]; beyond it a control period would be too coarse."""
+FASTEST = 10.0  # Greatest speed of an obstacle [m/s]; beyond, a control period is too coarse
 STRONGEST = 1e3  # Upper bound on the parameters of the social force model, each in its unit
 
 
@@ -62,29 +60,22 @@ class Patrol(Schema):
 class Pedestrian(Schema):
     """Walks to random goals, by the social force model of Helbing and Molnar (1995).
 
-    The symbols and defaults are those of "Social force model for pedestrian dynamics", Phys. Rev.
-    E 51, 4282, with two exceptions. The ellipses of the repulsion follow the relative velocity, as
-    in Johansson, Helbing and Shukla (2007), and distances are between the surfaces of the discs,
-    as in Helbing, Farkas and Vicsek (2000). The speeds are the paper's 1.34 m/s, plus or minus one
-    standard deviation of 0.26 m/s.
+    Symbols and defaults are those of "Social force model for pedestrian dynamics", Phys. Rev. E 51,
+    4282, but the ellipses of the repulsion follow the relative velocity (Johansson, Helbing, Shukla
+    2007), and distances are between the surfaces of the discs (Helbing, Farkas, Vicsek 2000). The
+    speeds are the paper's 1.34 m/s, plus or minus one standard deviation of 0.26 m/s.
     """
 
     kind: Literal["pedestrian"] = "pedestrian"
-    # least and greatest desired speed, and the walker's greatest; drawn per episode [m/s]
-    speed: Speed = (1.08, 1.6)
-    # tau, the time constant of approaching the desired velocity [s]
-    relaxation: float = Field(default=0.5, ge=0.1, le=10.0)
-    # `repulsion`, `range`: V0 [m^2/s^2] and sigma [m], of walkers, obstacles and robots
-    repulsion: Strength = 2.1
-    range: Distance = 0.3
-    # `wall_repulsion`, `wall_range`: U0 [m^2/s^2] and R [m], of walls
-    wall_repulsion: Strength = 10.0
-    wall_range: Distance = 0.2
+    speed: Speed = (1.08, 1.6)  # range of the desired one, per episode; its end is a limit [m/s]
+    relaxation: float = Field(default=0.5, ge=0.1, le=10.0)  # tau, to the desired velocity [s]
+    repulsion: Strength = 2.1  # V0 [m^2/s^2] of walkers, obstacles and robots
+    range: Distance = 0.3  # sigma [m]
+    wall_repulsion: Strength = 10.0  # U0 [m^2/s^2]
+    wall_range: Distance = 0.2  # R [m]
     foresight: Strength = 1.0  # delta t, the time by which the others' motion is extrapolated [s]
-    # 2 phi, the angle of sight [rad]
-    view: float = Field(default=math.radians(200.0), ge=0.0, le=2.0 * math.pi)
-    # c, the weight of forces from outside the angle of sight
-    behind: float = Field(default=0.5, ge=0.0, le=1.0)
+    view: float = Field(default=math.radians(200.0), ge=0.0, le=2.0 * math.pi)  # 2 phi [rad]
+    behind: float = Field(default=0.5, ge=0.0, le=1.0)  # c, weight of forces from out of sight
     fluctuation: Strength = 0.1  # standard deviation of a random acceleration [m/s^2]
 
 

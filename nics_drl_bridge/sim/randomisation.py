@@ -1,8 +1,4 @@
-"""Domain randomisation: robot, sensors and scene of an episode, drawn from ranges in YAML.
-
-Each number is fixed by seed, robot, group and column alone, so that no group shifts the draws of
-another. A column whose bounds are equal takes that value.
-"""
+"""Domain randomisation: robot, sensors and scene of an episode, drawn from ranges in YAML."""
 
 from __future__ import annotations
 
@@ -29,29 +25,24 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.seeds import checked_seeds
 
 __all__ = ["Draws", "LidarRanges", "Randomisation", "Sampler", "load_randomisation"]
-
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Bounds = tuple[Array, Array]
 MOST_OBSTACLES = 10_000
+# Columns of the noise, before those of the state; the drift of y equals that of x.
 NOISE_NAMES = ("odom_linear", "odom_angular", "position_drift", None, "heading_drift")
-"""Columns of the noise, before those of the state; the drift of y equals that of x."""
-SCALED = {
+SCALED = {  # columns that a factor scales, and the levels that may be given instead
     "noise": (slice(0, 2), ("odom_linear", "odom_angular")),
     "drift": (slice(2, None), ("position_drift", "heading_drift")),
 }
-"""Columns that a factor scales, and the levels that may be given instead."""
 CORNERS = 256  # Number of mixtures of least and greatest factors that are checked for stability
-FAULT_COLUMNS = (
+FAULT_COLUMNS = (  # see `lidar.fault_kernels`
     "noise_std", "noise_proportional", "dropout", "dropout_far", "too_close", "quantisation",
     "skew",
 )  # fmt: skip
-"""Columns of the faults, see `lidar.fault_kernels`."""
-CHOICES: dict[str, tuple[int, Mapping[Any, int]]] = {
-    "skew": (fault_kernels.SKEW, SKEW),
-    "too_close": (fault_kernels.TOO_CLOSE, TOO_CLOSE),
-}
-"""Faults that are drawn from several words, with their columns and values."""
+CHOICES: dict[str, tuple[int, Mapping[Any, int]]] = {  # faults drawn from words: column, values
+    "skew": (fault_kernels.SKEW, SKEW), "too_close": (fault_kernels.TOO_CLOSE, TOO_CLOSE)
+}  # fmt: skip
 KINEMATICS_GROUP, LATENCY_GROUP, ODOMETRY_GROUP, LIDAR_GROUP, CHOICES_GROUP, SCENE_GROUP = range(6)
 GROUPS = 8
 PLACES = 1 << 20  # More than a group has columns; the counters of two groups never collide
@@ -77,8 +68,7 @@ class KinematicRanges(Schema):
     """Factors on the coefficients of the Taylor model, drawn independently for each coefficient."""
 
     scale: Factor = AS_IT_IS  # for every coefficient
-    # overrides `scale` for the coefficients of a rate, by its name in `model.yaml` (`wz`)
-    dofs: dict[str, Factor] = Field(default_factory=dict)
+    dofs: dict[str, Factor] = Field(default_factory=dict)  # overrides it, by name of a rate (`wz`)
     # overrides both, by rate and term: `{wz: {speed*steering: [0.8, 1.2]}}`
     terms: dict[str, dict[str, Factor]] = Field(default_factory=dict)
 
@@ -87,15 +77,11 @@ class OdometryRanges(Schema):
     """Errors of odometry and motion: factors on the model's levels, or levels instead."""
 
     noise: Factor | None = None  # factor on the noise of the measured twist
-    # factor on the part of the motion that the model does not explain; only a drift that was found
-    # in the recording can be scaled
-    drift: Factor | None = None
-    # `odom_linear`, `odom_angular`: noise of velocity [m/s] and yaw rate [rad/s]
-    odom_linear: Level | None = None
-    odom_angular: Level | None = None
-    # `position_drift`, `heading_drift`: of x and y [m/sqrt(s)], and [rad/sqrt(s)]
-    position_drift: Level | None = None
-    heading_drift: Level | None = None
+    drift: Factor | None = None  # on the motion that the model does not explain, if measured
+    odom_linear: Level | None = None  # noise of velocity [m/s]
+    odom_angular: Level | None = None  # of yaw rate [rad/s]
+    position_drift: Level | None = None  # of x and y [m/sqrt(s)]
+    heading_drift: Level | None = None  # [rad/sqrt(s)]
 
     @model_validator(mode="after")
     def _once(self) -> OdometryRanges:
@@ -110,7 +96,6 @@ class LidarRanges(Schema):
     """The lidar's noise and faults, instead of the model's; the fields of `LidarFaults`."""
 
     noise_std: Level | None = None  # see `LidarSpec` [m]
-    # `noise_proportional`, `quantisation`, `dropout`, `dropout_far`: [least, greatest]
     noise_proportional: Level | None = None
     quantisation: Level | None = None
     dropout: Level | None = None
@@ -132,8 +117,7 @@ class ObstacleRanges(Schema):
 
     count: tuple[int, int] | None = None  # [least, greatest], instead of the world's
     size: Factor = AS_IT_IS  # factor on the size of every obstacle, one per episode
-    # number of sizes to draw from, evenly spaced: each is baked beforehand
-    rungs: int = Field(default=5, ge=2, le=100)
+    rungs: int = Field(default=5, ge=2, le=100)  # number of sizes, evenly spaced: each is baked
 
     @model_validator(mode="after")
     def _countable(self) -> ObstacleRanges:
@@ -194,10 +178,7 @@ class Draws:
 
 
 class Sampler:
-    """Draws the randomised numbers of episodes; a seed is bit-identical in any batch.
-
-    `longest_delay` of a command and `longest_age` of an observation are the greatest [substeps].
-    """
+    """Draws an episode's numbers, each fixed by seed, robot, group, column: alike in any batch."""
 
     def __init__(
         self, randomisation: Randomisation, model: SimulatorModel, robots: int = 1
@@ -217,6 +198,7 @@ class Sampler:
         least, most = randomisation.obstacles.count or (0, 0)
         self._scene = np.array([least, 0.0]), np.array([most + 1.0, len(randomisation.sizes)])
         self._sizes = np.array(randomisation.sizes)
+        # The greatest of a command, and of an observation [substeps].
         self.longest_delay, self.longest_age = (int(most) for most in self._timing[1])
         self._labels = tuple(self._name(model))
 
@@ -271,7 +253,6 @@ def _between(bounds: Bounds, seeds: Integers, robots: int, group: int, column: i
 
 
 def _coefficients(ranges: KinematicRanges, model: TaylorModel, where: str) -> Bounds:
-    """Bounds (T,) of the coefficients. Raises ConfigError for an invalid name or range."""
     spans = np.tile(ranges.scale, (*model.coefficients.shape, 1))
     for key, named in (("dofs", ranges.dofs), ("terms", ranges.terms)):
         place = f"{where}: key 'kinematics.{key}'"
@@ -299,7 +280,6 @@ def _term(d: int, name: str, model: TaylorModel, where: str) -> int:
 
 
 def _check_stable(model: TaylorModel, spans: Array, where: str) -> None:
-    """Raises ConfigError if the linear part of the state's step would grow for some factors."""
     if not (size := model.state_size):
         return
     linear, low, high = np.zeros((size, size)), np.ones((size, size)), np.ones((size, size))
@@ -313,8 +293,8 @@ def _check_stable(model: TaylorModel, spans: Array, where: str) -> None:
     worst = np.abs(np.linalg.eigvals(steps)).max()
     if worst > max(1.0, nominal) + 1e-9:
         raise ConfigError(
-            f"{where}: key 'kinematics': with some of these factors the state of the robot grows "
-            f"by itself (eigenvalue {worst:.4g} of a step of {model.dt:g} s); narrow the ranges."
+            f"{where}: key 'kinematics': with some factors the state of the robot grows by itself "
+            f"(eigenvalue {worst:.4g} of a step of {model.dt:g} s); narrow the ranges."
         )
 
 

@@ -1,12 +1,9 @@
 """Compiled drawing of scenes: obstacles, starts and goals of one seed after the other.
 
-The scene of a seed does not depend on the batch: every number is drawn from its own counter.
-Obstacles are placed one after the other where they overlap nothing, then starts and goals in pairs;
-if placement fails, the scene is restarted with fresh numbers. Points are drawn in the cells of a
-grid that are known to be free; free poses are decided by true distances between outlines.
-
-Shared arguments: `seed` and `counter` are those of the next draw, `plan` is the ScenePlan of the
-world, `scratch` the SceneScratch, `disc` a body without corners.
+Every number is drawn from its own counter, so a seed's scene is the same in any batch. Obstacles
+are placed one by one where they overlap nothing, in cells known to be free, then starts and goals
+in pairs; if that fails, with fresh numbers. Shared arguments: `seed` and `counter` are those of the
+next draw, `plan` is the ScenePlan, `scratch` the SceneScratch, `disc` a body without corners.
 """
 
 from __future__ import annotations
@@ -26,12 +23,10 @@ from nics_drl_bridge.sim.state import Array, Integers, MapField
 
 TRIES = 2000
 RESTARTS = 50
-DETOURS = 4
-"""Number of pairs of start and goal without a path after which the obstacles are redrawn."""
+DETOURS = 4  # Pairs of start and goal without a path after which the obstacles are redrawn
 MARGIN = 1e-9  # Least distance of obstacles from walls and from each other [m]
 DRAWN, NO_OBSTACLES, NO_ROBOTS = 0, 1, 2
-LEAST, GREATEST, GAP, FIRST_SHAPE, SHAPES, FIXED, MOVING, GROUP = range(8)
-"""Columns of a group of obstacles."""
+LEAST, GREATEST, GAP, FIRST_SHAPE, SHAPES, FIXED, MOVING, GROUP = range(8)  # columns of a group
 X1, Y1, X2, Y2, LEAST_HEADING, GREATEST_HEADING, SHARE, PLACE = range(8)
 """Columns of a place: a region [m], headings [rad], cumulative share of the places up to it."""
 
@@ -132,7 +127,6 @@ def _within(x, y, space):  # type: ignore[no-untyped-def]
 
 @kernel
 def _clear_of_walls(body, room, plan, spare):  # type: ignore[no-untyped-def]
-    """True if a body lies in the field and keeps `room` [m] from walls and map."""
     space, outlines = plan.space, plan.outlines
     inside, low, high = _within(body[X], body[Y], space)
     if inside and low >= body[RADIUS] + room:
@@ -164,7 +158,6 @@ def _clear_of(body, other, room, outlines, spare):  # type: ignore[no-untyped-de
 
 @kernel
 def _is_clear(x, y, room, moving, plan, bodies, scratch):  # type: ignore[no-untyped-def]
-    """True if a robot at a point keeps `room` [m] from all static, or also `moving`, obstacles."""
     disc = scratch.disc
     disc[X], disc[Y] = x, y
     for k in range(bodies.shape[0]):
@@ -252,7 +245,6 @@ def _put(body, x, y, heading, shape, plan):  # type: ignore[no-untyped-def]
 
 @kernel
 def _choose(seed, wanted, size, plan, bodies, active):  # type: ignore[no-untyped-def]
-    """Draws which obstacles exist and the shape of each; returns the next counter."""
     groups = plan.groups
     counter, total, before, k = 0, 0, 0, 0
     for g in range(groups.shape[0]):
@@ -312,7 +304,6 @@ def _place_obstacles(seed, counter, plan, bodies, scratch):  # type: ignore[no-u
 
 @kernel
 def _is_apart(k, plan, bodies, scratch):  # type: ignore[no-untyped-def]
-    """True if obstacle k, placed as `scratch.trial`, keeps the gaps to all that are placed."""
     trial, gaps = scratch.trial, scratch.gaps
     for other in range(bodies.shape[0]):
         if bodies[other, RADIUS] > 0.0:
@@ -341,7 +332,6 @@ def _spot(seed, counter, places, space):  # type: ignore[no-untyped-def]
 
 @kernel
 def _apart(x, y, others, m, least):  # type: ignore[no-untyped-def]
-    """True if a point is farther than `least` [m] from the first m of others (M, 2 or more)."""
     for other in range(m):
         dx, dy = x - others[other, 0], y - others[other, 1]
         if dx * dx + dy * dy <= least * least:

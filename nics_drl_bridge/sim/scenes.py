@@ -23,10 +23,8 @@ from nics_drl_bridge.sim.state import NO_FIELD, MapField
 from nics_drl_bridge.sim.world import Goals, Starts, World, check_places
 
 __all__ = ["Scene", "SceneSampler", "Scenes", "sample_scene", "scaled"]
-
 Array = NDArray[np.float64]
-CELL = 0.1
-"""Side of the cells of a field without a map [m]; larger in large fields, smaller in small ones."""
+CELL = 0.1  # Side of cells without a map [m]; larger in large fields, smaller in small ones
 FEWEST_CELLS = 20
 MOST_CELLS = 4_000_000
 
@@ -35,9 +33,7 @@ MOST_CELLS = 4_000_000
 class Scene:
     """Scene of one seed in a world."""
 
-    # (K, 7) obstacles as in `lidar.shapes.BODY`; the index of the shape is that in
-    # `SceneSampler.shapes`, the radius is 0 for an absent obstacle
-    bodies: Array
+    bodies: Array  # (K, 7) obstacles, see `shapes.place`; shapes are of `SceneSampler.shapes`
     starts: Array  # (M, 3) pose of each robot
     goals: Array  # (M, 2) position of each goal [m]
 
@@ -58,11 +54,10 @@ class Scenes(Scene):
 class SceneSampler:
     """Draws scenes of a world for M robots of a radius [m].
 
-    A start and its goal are free, with the clearance of the world around the robot, and a robot
-    that keeps this clearance can move from one to the other among walls, map and all static
-    obstacles. Obstacles overlap neither each other nor walls nor map, and keep their gaps. They may
-    be scaled by `sizes`; `most` random ones may be requested if that is more than the world has.
-    ConfigError is raised if the world has no free space for such a robot.
+    Start and goal are free, with the world's clearance, and a robot that keeps it can move from one
+    to the other among walls, map and static obstacles. Obstacles keep their gaps, from each other,
+    walls and map; they may be scaled by `sizes`, and `most` random ones requested if that is more
+    than the world has. Raises ConfigError if the world has no free space for such a robot.
     """
 
     def __init__(
@@ -149,7 +144,6 @@ def scaled(shape: Shape, factor: float) -> Shape:
 
 
 def _with_room(world: World, most: int) -> World:
-    """Returns the world with `most` random obstacles, distributed over groups as in the world."""
     at_random = [group for group in world.obstacles if not group.at]
     if most and not at_random:
         raise ConfigError(
@@ -170,7 +164,6 @@ def _with_room(world: World, most: int) -> World:
 def _plan(
     world: World, footprint: float, slots: Sequence[int], shapes: Sequence[Shape], sizes: int
 ) -> ScenePlan:
-    """Prepares a world for the kernels; obstacle k belongs to group `slots[k]`."""
     space = _free_space(world, footprint)
     outlines = Outlines.of((*shapes, Circle(radius=1.0)))
     groups = np.zeros((len(world.obstacles), kernels.GROUP))
@@ -218,11 +211,6 @@ def _scratch(plan: ScenePlan) -> SceneScratch:
 
 
 def _free_space(world: World, footprint: float) -> FreeSpace:
-    """Finds the free space of a world and the areas within which a robot can move.
-
-    A robot moves between the centres of neighbouring cells, with the clearance of the world around
-    it. Areas too small for a start and a goal are dropped; if none is left, ConfigError is raised.
-    """
     check_places(world)
     grid = NO_FIELD if world.grid is None else _closed(world.grid)
     cells = _cells_of(world) if world.grid is None else grid
@@ -272,11 +260,10 @@ def _cells_of(world: World) -> MapField:
 
 def _centres(cells: MapField) -> Array:
     rows, columns = np.indices(cells.distances.shape) + 0.5
-    return np.array(kernels.place_in.py_func(rows, columns, cells))
+    return np.array(kernels.place_in.py_func(rows, columns, cells))  # type: ignore[attr-defined]
 
 
 def _large_enough(area: NDArray[np.int32], cell: float, least: float) -> NDArray[np.int32]:
-    """Keeps areas whose bounding box has a diagonal >= `least` [m]; zeroes the others."""
     keep = [0]
     for number, parts in enumerate(ndimage.find_objects(area), 1):
         span = cell * math.hypot(*(part.stop - part.start for part in parts))

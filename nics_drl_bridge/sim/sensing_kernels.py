@@ -1,8 +1,7 @@
 """Compiled inner loops of the simulator: odometry, drift of the motion, and scans.
 
-Observations may be delayed: `past` (N, M, R, 12) is a ring buffer of the values at the ends of the
-last R periods, step i in row i % R: true pose, true twist, pose by odometry, measured twist.
-Between two rows, values are interpolated linearly.
+Observations may be delayed: `past` (N, M, R, 12) is a ring buffer of the last R periods' ends, step
+i in row i % R: true pose, true twist, pose by odometry, measured twist, interpolated linearly.
 """
 
 from __future__ import annotations
@@ -55,7 +54,6 @@ def at_lag(
 
 @kernel
 def _odometry_noise(n: int, m: int, axis: int, state: State) -> float:
-    """Draws the noise of one axis of the measured twist [m/s, m/s, rad/s]."""
     std = state.noise[n, m, axis // 2]
     if std <= 0.0:
         return 0.0
@@ -70,8 +68,7 @@ def measure(
 ) -> None:
     """Measures a robot's odometry of one period: a drifting pose and a noisy twist, maybe delayed.
 
-    Updates `odom`, `twist` and `past` of the state, given by the wheels the poses (N, M, 3) at the
-    end of the period, the pose (3,) `before` it, and the rates (3 + S,) `now`, at its end.
+    From the pose (3,) `before`, poses (N, M, 3) by the wheels, and rates (3 + S,) at the end.
     """
     steps, rows, substeps = state.steps[n], state.past.shape[2], motion.substeps
     this = steps % rows
@@ -107,11 +104,7 @@ def measure(
 
 @kernel
 def drift_of(n: int, m: int, state: State, period: float) -> tuple[float, float, float]:
-    """Draws the motion of a robot in a period [s] that its model does not explain.
-
-    Returns the way ahead and aside [m], at most sqrt(3 period) times the deviation, and turn [rad];
-    updates the state.
-    """
+    """Draws ahead, aside [m], at most std sqrt(3 period), and turn [rad]; moves the state."""
     std, counter = state.noise, state.steps[n] * state.pose.shape[1] + m
     # It grows with root time. Uniform draws are cheap, and over some periods they add up to normal.
     count, scale = std.shape[2] - 2, math.sqrt(12.0 * period)
@@ -177,7 +170,6 @@ def _scan_alone(
     n: int, m: int, state: State, scene: Surroundings, lidar: LidarArrays, motion: Dynamics,
     scratch: Scratch,
 ) -> None:  # fmt: skip
-    """Scans one robot from its own place and time, maybe skewed."""
     scans, beams = scratch.scans, state.ranges.shape[2]
     spot, drive, skew = scans.spot, scans.drive, state.faults[n, m, fault_kernels.SKEW]
     past, steps, substeps, here = state.past, state.steps[n], motion.substeps, spot[0, 0]

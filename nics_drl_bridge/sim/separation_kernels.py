@@ -24,13 +24,9 @@ from nics_drl_bridge.sim.state import Array, MapField
     RELAXATION, REPULSION, RANGE, WALL_REPULSION, WALL_RANGE, FORESIGHT, VIEW, BEHIND,
     FLUCTUATION, PLAN,
 ) = range(17)  # fmt: skip
-
-# Values of the column KIND.
-STILL, WANDER, PATROL, PEDESTRIAN = range(4)
-
+STILL, WANDER, PATROL, PEDESTRIAN = range(4)  # values of the column KIND
 # Memory of an obstacle, a row of marks (N, K, F).
 SPEED, VX, VY, DIRECTION, AIM, GOAL_X, GOAL_Y, UNTIL, INDEX, WAY, REST, MARK = range(12)
-
 SLACK = 1e-6  # Margin that is never used [m]: rounding must not make two bodies touch
 PASSES = 3  # Number of times a displacement is bent before the remaining excess is shortened
 FINEST = 0.25  # Least step along a path through a static map, in cells
@@ -123,7 +119,6 @@ def _hold(dx, dy, nx, ny, room, bend):  # type: ignore[no-untyped-def]
 
 @kernel
 def _hold_bodies(dx, dy, k, traffic, bend):  # type: ignore[no-untyped-def]
-    """Limits the displacement of body k to the room that the other bodies leave."""
     bodies, first, speeds, period = traffic.bodies, traffic.first, traffic.speeds, traffic.period
     x, y, radius = bodies[k, X], bodies[k, Y], bodies[k, RADIUS]
     length = math.sqrt(dx * dx + dy * dy)
@@ -152,7 +147,6 @@ def _hold_bodies(dx, dy, k, traffic, bend):  # type: ignore[no-untyped-def]
 
 @kernel
 def _hold_walls(dx, dy, body, traffic, bend):  # type: ignore[no-untyped-def]
-    """Limits a displacement to the field and to this side of the walls."""
     x, y, radius, walls, half = body[X], body[Y], body[RADIUS], traffic.walls, traffic.half
     reach = radius + math.sqrt(dx * dx + dy * dy) + 2.0 * SLACK
     for side in (-1.0, 1.0):
@@ -170,7 +164,6 @@ def _hold_walls(dx, dy, body, traffic, bend):  # type: ignore[no-untyped-def]
 
 @kernel
 def _hold_map(dx, dy, body, grid, bend):  # type: ignore[no-untyped-def]
-    """Limits a displacement to keep clear of the static map, by marching along the path."""
     x, y, radius = body[X], body[Y], body[RADIUS]
     length = math.sqrt(dx * dx + dy * dy)
     here = map_distance(x, y, grid) - radius

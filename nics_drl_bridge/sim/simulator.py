@@ -31,11 +31,9 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 R = TypeVar("R")
 MOST_ROBOTS = 1_000  # Greatest number of robots in one world; each is tested against every other
-MOST_NUMBERS = 2**30
-"""Greatest number of values in all worlds, some GB: beams of robots, states of obstacles."""
+MOST_NUMBERS = 2**30  # Most values in all worlds, some GB: beams of robots, states of obstacles
 PER_BODY = 64
-TOLERANCE = 0.05
-"""Tolerance beyond the range of commands that was recorded, as a share of their limits."""
+TOLERANCE = 0.05  # Beyond the range of commands that was recorded, as a share of their limits
 EVERY = 16  # Commands are checked in the first step after a reset and then at this interval [steps]
 
 
@@ -80,10 +78,8 @@ class CommandBox:
             self._armed, i = False, int(np.argmax(outside))
             value = least[i] if least[i] < self._low[i] else most[i]
             fitted = f"{self._range[0][i]:.4g} to {self._range[1][i]:.4g} only"
-            fix = "its motion there is extrapolated; record a drive that covers it."
-            self._tell(
-                f"{self._names[i]} is {value:.4g}, but the model was fitted to {fitted}: {fix}"
-            )
+            found = f"{self._names[i]} is {value:.4g}, but the model was fitted to {fitted}"
+            self._tell(f"{found}: its motion there is extrapolated; record a drive that covers it.")
 
 
 def _check_speed(model: TaylorModel, robot: RobotSpec, world: World) -> None:
@@ -115,15 +111,13 @@ def _check_memory(model: SimulatorModel, world: World, worlds: int, robots: int)
 class FastSimulator:
     """The simulator that a SimulatorModel describes, in a world.
 
-    A world is bit-identical in a batch of any size and with any number of threads. The M robots of
-    a world scan and collide with each other.
-
-    The renderer is `auto`, `baked` or `exact`, see `lidar.scanner.Scanner`; `threads` parts of the
-    worlds are stepped in parallel. The randomisation, drawn from in each episode, may be the name
-    of a shipped one, or a YAML file. `longest_delay` and `longest_age` are the greatest values that
+    A world is bit-identical in any batch and any number of threads. Its M robots scan and hit each
+    other. The renderer is `auto`, `baked` or `exact`, see `lidar.scanner.Scanner`; `threads` parts
+    of the worlds are stepped in parallel. The randomisation of each episode may be the name of a
+    shipped one, or a YAML file. `longest_delay` and `longest_age` are the greatest values that
     `data.delay` of commands (by default the model's) and `data.age` of scan and odometry may be set
-    to [substeps], raised to the randomisation's. `tell` is called with a message when commands
-    leave the range that the model was fitted to.
+    to [substeps], raised to the randomisation's. `tell` gets a message when commands leave the
+    range of the fit.
     """
 
     def __init__(
@@ -198,8 +192,7 @@ class FastSimulator:
         """Begins episodes in `worlds` (n,), all by default, at `starts` (n, M, 3) if given.
 
         A seed (n,) fixes scene, start, goal, noise and randomisation. Threads may call it in
-        parallel, each for worlds of a different part. Raises ConfigError if seeds, starts or a
-        scene do not fit.
+        parallel for different parts. Raises ConfigError if seeds, starts or a scene do not fit.
         """
         chosen = np.arange(len(self.data.steps)) if worlds is None else np.asarray(worlds, np.int64)
         scenes, draws = self._draw(seeds)
@@ -278,7 +271,6 @@ class FastSimulator:
             self.sense(np.arange(part.start, part.stop))
 
     def _checked(self, part: slice, commands: ArrayLike) -> Array:
-        """Returns commands as the kernels read them. Raises ConfigError for another shape."""
         checked = np.ascontiguousarray(commands, dtype=np.float64)
         robots, _, width = self.data.history.shape[1:]
         expected = (part.stop - part.start, robots, width)

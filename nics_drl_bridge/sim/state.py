@@ -37,8 +37,7 @@ class State(NamedTuple):
     coefficient: Array  # (N, M, T), in the order of `robot.kernels.term_arrays`
     delay: Integers  # (N, M) latency of the commands [substeps], at most `longest_delay`
     age: Integers  # (N, M) of scan and odometry when reported [substeps], at most `longest_age`
-    # (N, M, 2 + 3 + S) standard deviation of the odometry, linear [m/s] and angular [rad/s]; and,
-    # after a second, of the drift along x, y [m], heading [rad], and state
+    # (N, M, 2 + 3 + S) std of odometry [m/s, rad/s]; after a second, of x, y, heading, state
     noise: Array
     velocity: Array  # (N, K, 3) of the obstacles in `map`, for a period [m/s, m/s, rad/s]
     past: Array  # (N, M, R, 12) of the last periods, see `sensing_kernels`

@@ -52,7 +52,6 @@ def pack(part: Part) -> Any:
 
 @kernel
 def _send(history: Array, commands: Array, begin: int) -> None:
-    """Puts the commands (n, M, C) of the worlds from `begin` on in front of those sent before."""
     for i in range(commands.shape[0]):
         for m in range(commands.shape[1]):
             for h in range(history.shape[2] - 1, 0, -1):
@@ -64,10 +63,7 @@ def _send(history: Array, commands: Array, begin: int) -> None:
 
 @kernel
 def move_freely(begin: int, end: int, state: State, motion: Dynamics, lanes: Lanes) -> None:
-    """Moves the robots of the worlds [begin, end) over one period as if nothing were in the way.
-
-    The results stay in the lanes: robot m of world n is in lane (n - begin) M + m.
-    """
+    """Moves robot m of world n of [begin, end) one period freely, in lane (n - begin) M + m."""
     robots, size = state.pose.shape[1], state.state.shape[2]
     substeps, history = motion.substeps, state.history
     where, x, late = lanes.pose, lanes.x, lanes.late
@@ -102,7 +98,6 @@ def move_freely(begin: int, end: int, state: State, motion: Dynamics, lanes: Lan
 def _move_world(
     n: int, skip: int, state: State, scene: Surroundings, motion: Dynamics, scratch: Scratch
 ) -> None:
-    """Moves the bodies of world n; `move_freely` has moved its robots in lanes `skip` and on."""
     lanes, nearby, single = scratch.lanes, scratch.nearby, scratch.single
     pose, period = state.pose, motion.dt * motion.substeps
     robots, first = pose.shape[1], state.velocity.shape[1]
@@ -172,7 +167,6 @@ def _step(
 def _begin_period(
     low: int, high: int, state: State, scene: Surroundings, motion: Dynamics, scratch: Scratch
 ) -> None:
-    """Sets the velocities of the obstacles of the worlds [low, high), and notes the poses."""
     pose, before, speeds = state.pose, scratch.scans.before, scratch.nearby.speeds
     for n in range(low, high):
         for m in range(pose.shape[1]):
@@ -191,7 +185,6 @@ def _begin_period(
 
 @kernel(inline=True)
 def _measure(n: int, skip: int, state: State, motion: Dynamics, scratch: Scratch) -> None:
-    """Puts the bodies of the robots of world n where they are, and reads their wheels."""
     frame, pose, first = scratch.cells.frame, state.pose, state.velocity.shape[1]
     for m in range(pose.shape[1]):
         contacts.put_body(state.bodies, n, first + m, pose[n, m])

@@ -33,10 +33,8 @@ Region = tuple[Coordinate, Coordinate, Coordinate, Coordinate]
 class Obstacles(Schema):
     """A group of obstacles with common properties."""
 
-    # each obstacle of the group takes one of them at random
-    shapes: tuple[Shape, ...] = Field(min_length=1, max_length=MOST_SHAPES)
-    # number of obstacles, or [least, greatest], from which each episode draws
-    count: int | tuple[int, int] | None = None
+    shapes: tuple[Shape, ...] = Field(min_length=1, max_length=MOST_SHAPES)  # each takes any
+    count: int | tuple[int, int] | None = None  # or [least, greatest], drawn per episode
     gap: Distance = 0.0  # free space between one of them and any other obstacle [m]
     at: tuple[Pose, ...] = ()  # fixed poses, x, y [m], heading [rad], instead of `count` at random
     motion: Motion | None = None  # their motion, see `sim.obstacles`; by default they stand still
@@ -94,18 +92,14 @@ class World(Schema):
     """World of the episodes; everything is in the frame `map`."""
 
     name: str  # the name users refer to it by
-    # width along x and depth along y of a walled field around the origin [m]
-    size: tuple[Side, Side] | None = None
+    size: tuple[Side, Side] | None = None  # along x, y of a walled field around the origin [m]
     # further straight walls, x1, y1, x2, y2 [m]
     walls: tuple[Region, ...] = Field(default=(), max_length=MOST_WALLS)
-    # a static map, the YAML file of Nav2's map_server: the name of a shipped one, or a path
-    # relative to the folder of the world file. A world has a `size`, a `map`, or both
+    # a static map beside or instead of a `size`: a shipped one, or Nav2's YAML, from this folder
     map: str | None = None
     obstacles: tuple[Obstacles, ...] = ()  # groups of obstacles, see `Obstacles`
-    # free space around the footprint at start and goal, and on a path between [m]
-    clearance: Distance = 0.3
-    # least and greatest straight-line distance from start to goal [m]
-    goal_distance: tuple[Distance, Distance]
+    clearance: Distance = 0.3  # around the footprint at start, goal, and on a path between [m]
+    goal_distance: tuple[Distance, Distance]  # least and greatest, from start straight to goal [m]
     starts: Starts | None = None  # `starts`, `goals`: by default anywhere
     goals: Goals | None = None
     _file: str | None = PrivateAttr(default=None)
