@@ -202,7 +202,6 @@ def _drive(plan: DemoPlan, place: str, policy: str, say: Say) -> list[Episode]:
 
 
 def _deploy(plan: DemoPlan, model: SimulatorModel, policy: str, seed: int, say: Say) -> Episode:
-    """Runs a robot's nodes in real time in the scene of a seed; BackendError if one ends."""
     scene = sample_scene(load_world(plan.world), model.robot.footprint_radius, seed)
     goal = [float(value) for value in scene.goals[0]]
     folder = str(plan.model)
@@ -230,7 +229,6 @@ def _deploy(plan: DemoPlan, model: SimulatorModel, policy: str, seed: int, say: 
 def _watched(
     nodes: dict[str, dict[str, Any]], logs: Path, goal: list[float], near: float, say: Say
 ) -> tuple[bool, Any]:
-    """Starts the nodes, arms the gate, waits; returns arrival and the robot's path (T, 3)."""
     from nics_drl_bridge.nodes.processes import NodeProcess, Witness, free_domain_id
 
     domain_id = free_domain_id()
@@ -256,7 +254,6 @@ def _watched(
 
 
 def _write_limits(robot: RobotSpec, path: Path) -> Path:
-    """Writes limits that allow a simulated robot all its commands, with limited rate and jerk."""
     commands = {}
     for variable in robot.command:
         low, high = min(variable.min, 0.0), max(variable.max, 0.0)

@@ -185,7 +185,6 @@ def judged(
 
 
 def _model_name(order: EvaluationOrder) -> str:
-    """The model that the episodes are driven with. Raises ConfigError for unknown policies."""
     if order.model is not None:
         for policy in order.policies:
             is_policy_file(policy)
@@ -292,7 +291,6 @@ def drive_vehicle(
 
 
 def _placed(scene: Scene, goal: tuple[float, float] | None, present: bool, armed: bool) -> str:
-    """Instruction before an episode: where to place the vehicle, and where it will drive."""
     x, y = scene.goals[0] if goal is None else goal
     where = f"it will drive to ({x:.2f} m, {y:.2f} m)"
     order = "" if armed else f"; arm {GATE}"

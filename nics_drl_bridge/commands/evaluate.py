@@ -123,7 +123,6 @@ def _shadow(
     bag: Path, policies: list[str], model: str | None, topics: list[str],
     goal: tuple[float, float] | None, ahead: float, out: Path,
 ) -> None:  # fmt: skip
-    """Compares policies with a recorded drive; writes `shadow_POLICY.png` and `.json`."""
     from nics_drl_bridge.commands.episodes import robot_of
     from nics_drl_bridge.files import write_bytes, write_text
     from nics_drl_bridge.generator import open_model

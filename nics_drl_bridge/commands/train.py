@@ -86,7 +86,6 @@ def train(
 def _learner(
     engine: str, address: str | None, env_runners: int | None, worlds: int
 ) -> Iterator[Any]:
-    """Yields the function that trains one policy; on Ray while connected to its cluster."""
     engines = (SB3, *extensions.known("engines"))
     if engine not in engines:
         raise ConfigError(f"unknown engine {engine!r}; {nearest(engine, engines)}")

@@ -57,7 +57,6 @@ class _Mailbox:
         self._failure: Exception | None = None
 
     def put(self, topic: str, message: bytes) -> object:
-        """Takes a message; returns `HANDED_OVER` if the caller now continues."""
         with self._lock:
             try:
                 stamp_ns = _read(topic, wire.stamp_of, message)
@@ -76,14 +75,12 @@ class _Mailbox:
             self._work(*self._mail[ODOM])
 
     def _late(self, stamp_ns: int) -> str | None:
-        """Returns the first topic whose newest message is older than a stamp; None if none is."""
         return next((topic for topic, mail in self._mail.items() if mail.stamp_ns < stamp_ns), None)
 
     def stamp_ns(self, topic: str) -> int:
         return self._mail[topic].stamp_ns
 
     def wait(self, stamp_ns: int, timeout_s: float) -> dict[str, _Mail]:
-        """Waits until each topic is at least as new as a stamp; StaleDataError if one is not."""
         with self._lock:
             self._awaited_ns, self._failure = stamp_ns, None
             self._complete.clear()
@@ -212,7 +209,6 @@ class DdsBackend:
         return self._middleware.view(now), facts
 
     def _await(self, stamp_ns: int) -> dict[str, _Mail]:
-        """Returns the mailbox's data for a stamp; what does not arrive is requested again."""
         deadline = time.monotonic() + self.timeout_s
         while True:
             try:
@@ -237,7 +233,6 @@ class DdsBackend:
 
 
 def _read(topic: str, read: Callable[[bytes], T], message: bytes) -> T:
-    """Returns the content of a message. Raises BackendError if it is not of that type."""
     try:
         return read(message)
     except wire.UNREADABLE as error:

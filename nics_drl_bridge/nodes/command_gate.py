@@ -72,7 +72,6 @@ def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
 
 
 def _declare_rules(node: Node, model: SimulatorModel) -> dict[str, Any]:
-    """Declares the parameters of the rules; returns their values by the field of the config."""
     scan_age = max(GateConfig.scan_age_s, SCAN_PERIODS / model.lidar.rate)
     heard = "Whether e_stop must have been heard before arming; false in simulations alone."
     default, seconds = GateConfig, (0.01, 10.0)
@@ -107,7 +106,6 @@ def declare_black_box(node: Node) -> Path:
 def _declare_shield(
     node: Node, model: SimulatorModel, limits: Limits | None, file: str
 ) -> ShieldConfig | None:
-    """Returns the shield, None if it is off, and logs a sentence about it."""
     on = runner.declare(node, "shield", True, "Whether to stop before obstacles.", read_only=True)
     values = {}
     for name, about in (
@@ -282,7 +280,6 @@ class CommandGate(qos.QosWatch):
         return None
 
     def _look(self) -> runner.Condition:
-        """Returns the finding for `/diagnostics`; other publishers are reported, not prevented."""
         found = self._log.finding(self._state)
         others = self.count_publishers(self._out.topic_name) - 1
         if others < 1:

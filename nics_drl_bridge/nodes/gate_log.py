@@ -229,7 +229,6 @@ class BoxWriter:
 
 
 def _live(write: Callable[[], object], told: mmap) -> NoReturn:
-    """Runs in the copy; never returns to the code that it was copied from."""
     code = 1
     try:
         gc.disable()  # which would touch, and so copy, all memory
@@ -244,7 +243,6 @@ def _live(write: Callable[[], object], told: mmap) -> NoReturn:
 
 
 def _let_go() -> None:
-    """Releases sockets, files, priority and signals that belong to the original."""
     for name in os.listdir("/proc/self/fd"):
         with contextlib.suppress(OSError):
             os.close(int(name))

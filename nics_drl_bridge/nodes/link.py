@@ -182,7 +182,6 @@ def _shut_down(context: Context, timeout: CommandTimeout, thread: threading.Thre
 
 
 def _end_orderly_on_sigterm() -> None:
-    """Makes SIGTERM end Python like an exception, unless the program handles it itself."""
     in_main = threading.current_thread() is threading.main_thread()
     if in_main and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
         signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))

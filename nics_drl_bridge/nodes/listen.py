@@ -47,7 +47,6 @@ def listen(seconds: float, namespace: str = "", domain_id: int | None = None) ->
 
 
 def _look(node: Node, facts: Facts, subscribed: set[str]) -> None:
-    """Notes the publishers and subscribers; subscribes to topics of types that can be judged."""
     for topic, kinds in node.get_topic_names_and_types():
         offers = node.get_publishers_info_by_topic(topic)
         asks = [i for i in node.get_subscriptions_info_by_topic(topic) if i.node_name != NAME]

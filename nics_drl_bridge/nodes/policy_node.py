@@ -104,7 +104,6 @@ class PolicyNode(ManagedNode):
         self._asked(view, np.zeros(2))
 
     def _on_lidar(self, lidar: LidarSpec) -> None:
-        """Switches to another lidar. Raises ConfigError if that is not possible."""
         self._open_policy(replace(self._model, lidar=lidar))
         begin, end = np.degrees([lidar.angles[0], lidar.angles[-1]])
         done = "used" if self._task.scan is None else "resampled"
@@ -117,7 +116,6 @@ class PolicyNode(ManagedNode):
         self.get_logger().info(f"new goal ({self._goal[0]:.2f}, {self._goal[1]:.2f}) m")
 
     def _act(self, _: int = 0) -> None:
-        """Acts when due, once per scan, with an odometry at least as new."""
         if self.state != ACTIVE:
             return
         newest, begin_s = self._topics.middleware.cache.newest, time.monotonic()
@@ -149,7 +147,6 @@ class PolicyNode(ManagedNode):
         return runner.Condition(f"{self.state}; {done.late} late inferences", done.late > 0, facts)
 
     def _twist(self) -> Array:
-        """Returns the command (3,); zero without a pose or goal, at the goal, or on contact."""
         if not (self._topics.located and np.isfinite(self._goal).all()):
             return np.zeros(3)
         view = self._topics.view()
@@ -162,7 +159,6 @@ class PolicyNode(ManagedNode):
         return self._asked(view, self._goal)
 
     def _asked(self, view: RobotView, goal: Array) -> Array:
-        """Returns the policy's command (3,). Its errors become BridgeError, which ends the node."""
         try:
             action = self._policy.act(self._task.observation(view, {"goal": goal}))
             return self._task.robot.to_cmd_vel(self._task.command(action))

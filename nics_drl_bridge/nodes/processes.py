@@ -49,7 +49,6 @@ def free_domain_id() -> int:
 
 
 def _dies_with_parent() -> Callable[[], None] | None:
-    """Returns what a child does first, on Linux: request SIGTERM for any death of its parent."""
     if sys.platform != "linux":
         return None
     prctl, parent = ctypes.CDLL(None).prctl, os.getpid()

@@ -120,7 +120,6 @@ class QosWatch(Node):
         timer = self.create_timer(MOMENT_S, say, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _misfit(self, topic: str, ours: QoSProfile, publishing: bool) -> tuple[str, Any]:
-        """Returns name and profile of the last peer that does not fit, as far as known."""
         kind = "subscriptions" if publishing else "publishers"
         for peer in reversed(getattr(self, f"get_{kind}_info_by_topic")(topic)):
             pair = (ours, peer.qos_profile) if publishing else (peer.qos_profile, ours)

@@ -125,14 +125,12 @@ class RealtimeBackend:
         return self._fresh_view()[0]
 
     def _is_vehicle(self) -> bool:
-        """True for a vehicle: by the options, or if it has never shown services of a simulator."""
         if self._options.vehicle is not None:
             return self._options.vehicle
         self._simulated = self._simulated or self._episodes.there
         return not self._simulated
 
     def _await_start(self, start: Start) -> None:
-        """Waits until a vehicle stands at its start, telling what is missing, or is a simulator."""
         say = self._options.say or self._link.node.get_logger().info
         began, said = time.monotonic(), -math.inf
         while self._is_vehicle() and (missing := self._missing(start)):
@@ -148,7 +146,6 @@ class RealtimeBackend:
             time.sleep(POLL_S)
 
     def _missing(self, start: Start) -> str:
-        """Returns what is missing before an episode may begin, as a clause; empty if nothing is."""
         topic, silence_s = self._oldest()
         if math.isinf(silence_s):
             return f"no {topic} yet"
@@ -171,7 +168,6 @@ class RealtimeBackend:
         )
 
     def _oldest(self) -> tuple[str, float]:
-        """Returns the topic with the oldest datum, and its age or lag [s]; inf without one."""
         with self._topics.lock:
             newest, now = dict(self._topics.middleware.cache.newest), time.monotonic_ns()
         latest = max((datum.stamp_ns for datum in newest.values()), default=0)
@@ -204,7 +200,6 @@ class RealtimeBackend:
         return self._fresh_view()
 
     def _fresh_view(self) -> tuple[RobotView, dict[str, Any]]:
-        """Returns the newest view, with facts. Raises StaleDataError if it is too old."""
         topic, age_s = self._oldest()
         if age_s > self._options.stale_after_s:
             raise StaleDataError(topic, age_s, self._options.stale_after_s)

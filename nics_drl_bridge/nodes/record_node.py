@@ -206,7 +206,6 @@ class RecordNode(qos.QosWatch):
         steadily(self, POLL_S, self._on_time)
 
     def _now_ns(self) -> int:
-        """Returns simulated time, or the system time at the start plus steady time [ns]."""
         if self._sim_time:
             # Odometry may arrive before its tick of /clock.
             return max(int(self.get_clock().now().nanoseconds), self._stamp_ns)
@@ -238,7 +237,6 @@ class RecordNode(qos.QosWatch):
                 self._end(None, complete=True)
 
     def _ready(self) -> bool:
-        """True if the robot listens and reports its pose; raises BackendError after 10 s."""
         listeners = self._topic.get_subscription_count()
         if self._pose is not None and listeners > 0 and self._now_ns() > 0:
             others = self.count_publishers(self._topic.topic_name) - 1

@@ -149,7 +149,6 @@ class RobotTopics:
             self._on_scan(stamp)
 
     def _reader_for(self, message: LaserScan) -> Reader | None:
-        """Returns the reader of a scan; None if it can't be used, logged once for each header."""
         fields = [message.angle_min, message.angle_increment, message.range_min, message.range_max]
         header = np.array([*fields, len(message.ranges)], np.float32).tobytes()
         if header == self._header or self._on_lidar is None:

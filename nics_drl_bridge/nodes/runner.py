@@ -174,7 +174,6 @@ def sole(context: Context, name: str) -> Iterator[None]:
 
 
 def _seen(probe: Node, whole: str) -> bool:
-    """True if the graph shows another node of the probe's name within `SETTLE_S`."""
 
     def shows() -> bool:
         nodes = probe.get_node_names_and_namespaces()

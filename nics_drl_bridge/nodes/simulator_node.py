@@ -292,7 +292,6 @@ class DeviceNode(qos.QosWatch):
         runner.diagnose(self, "simulator", self._look)
 
     def _open_transforms(self) -> None:
-        """Publishes what never changes; if tf2_msgs is not installed, it logs that instead."""
         self._transforms: Any = conversions.message_type("tf2_msgs/msg/TFMessage")
         if self._transforms is None:
             self.get_logger().warning(
@@ -326,7 +325,6 @@ class DeviceNode(qos.QosWatch):
             runner.steadily(self, 0.0, self._on_free_time)
 
     def _watch(self) -> None:
-        """Warns once of commands of another type, and of other nodes that publish the time."""
         for inlet in self._inlets:
             inlet.watch()
         ends = self.get_publishers_info_by_topic(CLOCK)
@@ -393,7 +391,6 @@ class DeviceNode(qos.QosWatch):
         self._publish()
 
     def _begin(self) -> None:
-        """Begins an episode. Raises BridgeError if the parameters do not fit the world."""
         given = bool(self.get_parameter("episode_start_given").value)
         start = np.array(self.get_parameter("episode_start").value, dtype=np.float64)
         seed = int(device_parameters.number(self, "episode_seed"))
@@ -407,7 +404,6 @@ class DeviceNode(qos.QosWatch):
         self._publish()
 
     def _go_on(self) -> None:
-        """Restarts real time at the present."""
         self._real_time.begin(time.monotonic_ns(), self._now_ns)
         if self._timer is not None:
             self._timer.reset()
@@ -427,7 +423,6 @@ class DeviceNode(qos.QosWatch):
         return response
 
     def _repeat(self) -> tuple[bool, str]:
-        """Publishes the present data again, if some were lost; in real time new ones follow."""
         if not self._time.lockstep:
             return False, "data are repeated in lock-step alone"
         self._publish_data(odom_due=True, scan_due=True)

@@ -136,7 +136,6 @@ def _maps() -> bytes:
 
 
 def _is_in_force(context: Context) -> bool:
-    """True if a node in a context has neither shared memory nor the multicast of its domain."""
     try:
         node = Node(
             "transport_probe", context=context, use_global_arguments=False,
@@ -177,7 +176,6 @@ def domains_in_use() -> set[int]:
 
 
 def _sockets() -> list[tuple[str, int]]:
-    """Returns name and port of each UDP socket; none where Linux does not report them."""
     lines = TABLE.read_text(encoding="ascii").splitlines()[1:] if TABLE.is_file() else []
     rows = [line.split() for line in lines]
     return [(f"socket:[{row[9]}]", int(row[1].split(":")[1], 16)) for row in rows]

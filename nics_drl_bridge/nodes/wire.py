@@ -36,7 +36,6 @@ SCAN_FIELDS = 7  # floats of a scan between its header and its ranges
 
 
 def _order(content: Bytes) -> str:
-    """Returns the byte order, for `struct`. Raises ValueError if it is not plain CDR."""
     if len(content) < HEAD or content[0] != 0 or content[1] not in PLAIN:
         raise ValueError(f"the bytes {bytes(content[:HEAD]).hex()} begin no plain CDR")
     return "<" if content[1] else ">"

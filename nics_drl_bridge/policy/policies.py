@@ -35,7 +35,6 @@ class Policy(Protocol):
 
 
 def _actions(robot: RobotSpec, commands: Array) -> Array:
-    """Commands (..., C), scaled to [-1, 1]."""
     low, high = robot.command_low, robot.command_high
     return np.asarray(2.0 * (commands - low) / (high - low) - 1.0)
 
@@ -109,7 +108,6 @@ class DynamicWindow:
 
     @cached_property
     def _search(self) -> tuple[Array, kernels.ScanRays, kernels.LookAhead, kernels.TwistWeights]:
-        """(K, 3) body twist of each command; what is seen, how far it looks, what it weighs."""
         robot, sight = self.task.robot, self.task.sight
         twists = steady_twist(robot, self._commands)
         directions = np.stack([np.cos(sight.angles), np.sin(sight.angles)], axis=-1)
@@ -124,7 +122,6 @@ class DynamicWindow:
 
     @cached_property
     def _commands(self) -> Array:
-        """(K, C) grid of commands between their limits, including zero."""
         robot = self.task.robot
         counts = {1: (15,), 2: (7, 15), 3: (7, 7, 5)}.get(len(robot.command))
         axes = [
@@ -135,7 +132,6 @@ class DynamicWindow:
 
     @cached_property
     def _scaled(self) -> NDArray[np.float32]:
-        """(K, C) action of each command."""
         return _actions(self.task.robot, self._commands).astype(np.float32)
 
 

@@ -135,12 +135,10 @@ class PolicyFile:
         self._compare(theirs)
 
     def _check_sensors(self, model: SimulatorModel) -> None:
-        """The further sensors that the policy observes are those of the model."""
         known = {sensor.name: sensor.model_dump(mode="json") for sensor in model.sensors}
         self._compare({"sensors": [known.get(each.name) for each in self.contract.sensors]})
 
     def _compare(self, theirs: Mapping[str, Any]) -> None:
-        """Raises PolicyError for the first of some entries that differs from the contract's."""
         for name, entry in theirs.items():
             only: Any = {name: set(entry) if isinstance(entry, dict) else True}
             ours = dict(leaves(self.contract.model_dump(mode="json", include=only)))

@@ -135,7 +135,6 @@ def _moments(
 
 
 def _hold(moments: list[_Moment], held: tuple[int, Array] | None) -> None:
-    """Gives the newest moment the command that still applied, if none came after it."""
     if moments and moments[-1].driven is None and held is not None:
         age_s = (moments[-1].receive_ns - held[0]) * S_PER_NS
         moments[-1].driven = held[1] if age_s <= HELD_S else None

@@ -113,7 +113,6 @@ def _again(
     env: TrainVecEnv,
     path: Path,
 ) -> BaseAlgorithm:
-    """Restores the algorithm of a checkpoint. Raises ConfigError if it is of another training."""
     check_same(content["about"], about, path)
     size = int(np.prod(env.observation_space.shape))
     algorithm = make_algorithm(settings, env, about["seed"], (np.zeros(size), np.ones(size)))

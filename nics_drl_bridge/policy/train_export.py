@@ -113,7 +113,6 @@ def export_policy(
 
 
 def _golden(deployed: Deployed, graph: Any, task: Task, source: str) -> dict[str, Rows]:
-    """The golden pairs. Raises PolicyError unless the graph reproduces the module's outputs."""
     space = task.observation_space
     low = np.maximum(space.low, -GOLDEN_SPREAD)
     high = np.minimum(space.high, GOLDEN_SPREAD)

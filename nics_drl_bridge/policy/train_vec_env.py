@@ -79,7 +79,6 @@ class TrainVecEnv(VecEnv):
     def _step_env(
         self, env: BridgeVectorEnv, rows: slice
     ) -> tuple[Observation, NDArray[np.float64], NDArray[np.bool_]]:
-        """Steps one of the envs and fills the infos of its worlds that ended."""
         observation, reward, terminated, truncated, info = env.step(self._actions[rows])
         done = terminated | truncated
         for n in np.flatnonzero(done):
@@ -134,5 +133,4 @@ class TrainVecEnv(VecEnv):
 
 
 def _together(parts: list[NDArray[Any]]) -> NDArray[Any]:
-    """Concatenates the rows of several envs; those of one are returned unchanged."""
     return parts[0] if len(parts) == 1 else np.concatenate(parts)

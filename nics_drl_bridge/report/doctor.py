@@ -177,7 +177,6 @@ def latency(facts: Facts, _: Expected) -> Findings:
 
 
 def _here(facts: Facts, arrivals: Sequence[int]) -> NDArray[np.int64]:
-    """Arrivals (T,) on the clock that the stamps should use [ns]."""
     times = np.array(arrivals, dtype=np.int64)
     if not facts.clock_ns:
         return times
@@ -300,7 +299,6 @@ def _slope(x: Array, y: Array) -> float:
 
 
 def _scale(facts: Facts) -> float | None:
-    """Slope of the turns per odometry step over the commanded turn rates; None if undetermined."""
     heard, odometry = facts.heard.get(CMD_VEL), facts.heard.get(ODOM)
     if heard is None or odometry is None or len(facts.poses) < LEAST_STEPS:
         return None

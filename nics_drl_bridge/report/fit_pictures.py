@@ -167,7 +167,6 @@ def alignment(spec: RobotSpec, identified: Identified) -> bytes:
 def _response(
     axes: Axes, samples: Samples, shown: NDArray[np.bool_], variable: int, identified: Identified
 ) -> None:
-    """Draws the component of the body twist that correlates most with a variable of X."""
     twist, wanted = samples.dq[:, :3], samples.x[:, variable]
     with np.errstate(all="ignore"):
         alike = np.abs([np.corrcoef(twist[:, d], wanted)[0, 1] for d in range(3)])

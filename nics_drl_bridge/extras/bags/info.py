@@ -73,7 +73,6 @@ def _received(bag: BagFile, topic: str) -> tuple[Nanoseconds, Nanoseconds | str]
 
 
 def _topic(topic: str, kind: str, since: Nanoseconds, delays: Nanoseconds | str) -> BagTopic:
-    """Describes a topic from receipts since the bag's start (T,) and delays (T,), both [ns]."""
     clock, delay, jitter, backwards = delays if isinstance(delays, str) else "", None, None, 0
     if not isinstance(delays, str):
         low, middle, high = np.percentile(delays * S_PER_NS, (5.0, 50.0, 95.0))

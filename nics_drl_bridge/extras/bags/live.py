@@ -104,7 +104,6 @@ class BagRecorder(QosWatch):
                 self._listen(topic, kinds)
 
     def _listen(self, topic: str, kinds: Sequence[str]) -> None:
-        """Subscribes to a topic, or again if a new publisher offers less."""
         publishers = self.get_publishers_info_by_topic(topic)
         if not publishers or topic in self.skipped:
             return
@@ -177,7 +176,6 @@ class _Player:
             self._barrier = node.create_client(GetParameters, service)
 
     def offer(self, topic: str, kind: str, offers: tuple[Offer, ...]) -> bool:
-        """Opens a topic; returns False if its type is not installed."""
         found = message_type(kind)
         if found is None:
             return False
@@ -192,7 +190,6 @@ class _Player:
         return True
 
     def ready(self) -> None:
-        """Waits for the node in lock-step, or a while for subscribers."""
         publishers, known = self.publishers.values(), self._node.count_subscribers
         self._stopping.wait(DISCOVERY_S)
         self._wait(lambda: any(each.get_subscription_count() for each in publishers), ALONE_S)
@@ -210,7 +207,6 @@ class _Player:
         return holds(lambda: condition() or self._stopping.is_set(), patience_s, NAP_S)
 
     def play(self, messages: list[Timed]) -> int:
-        """Publishes all messages; returns their number, fewer if it is stopped."""
         now = first = messages[0][0]
         began, rate = time.monotonic_ns(), self._rate
         for sent, (due, topic, data) in enumerate(messages):

@@ -145,7 +145,6 @@ def _decodable(found: _Found) -> Iterator[tuple[str, int, bytes]]:
 
 
 def _promised(path: Path) -> dict[str, int] | None:
-    """Returns the messages per topic by the bag's metadata; None if it can't be read."""
     try:
         about = metadata_of(path if path.is_dir() else path.parent)
         topics = about["topics_with_message_count"]
@@ -155,7 +154,6 @@ def _promised(path: Path) -> dict[str, int] | None:
 
 
 def _read_mcap(file: Path, found: _Found) -> None:
-    """Reads all intact messages of an MCAP file; after damage it is searched for the next chunk."""
     told, waiting, promised = mcap.McapSummary(), list[mcap.Record](), dict[int, int]()
     data = mcap.mapped(file) if file.stat().st_size else memoryview(b"")
     place = len(mcap.MAGIC)
@@ -208,7 +206,6 @@ def _cut_chunk(data: memoryview, place: int) -> list[mcap.Record]:
 
 
 def _until_damage(data: memoryview, span_ns: tuple[int, int]) -> Iterator[mcap.Record]:
-    """Yields records up to the first wrong length; messages only within the chunk's time span."""
     place: int | None = 0
     while place is not None:
         try:
@@ -224,7 +221,6 @@ def _until_damage(data: memoryview, span_ns: tuple[int, int]) -> Iterator[mcap.R
 
 
 def _next_chunk(data: memoryview, start: int, end: int) -> int:
-    """Returns the offset of the next record with the consistent lengths of a chunk, or the end."""
     file, place = data.obj, start - 1
     while isinstance(file, mmap) and (place := file.find(CHUNK_OP, place + 1, end)) >= 0:
         if _looks_like_chunk(data, place):
@@ -278,7 +274,6 @@ def _drop_cut_page(copy: Path) -> None:
 
 
 def _rows(base: sqlite3.Connection, bound: int) -> list[tuple[Any, ...]]:
-    """Reads messages: topic, time, data. Ranges that can't be read are halved."""
     ask = "SELECT topic_id, timestamp, data FROM messages WHERE id BETWEEN ? AND ?"
     rows, waiting = list[tuple[Any, ...]](), [(1, bound)]
     with suppress(sqlite3.Error):

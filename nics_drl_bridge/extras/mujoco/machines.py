@@ -106,7 +106,6 @@ def _chassis(mass: float, centre: tuple[float, float, float], size: tuple[float,
 
 
 def _wheel(name: str, radius: float, width: float, physics: Physics, damping: float = 0.0) -> str:
-    """MJCF inside a wheel's body: a hinge about y, a hub with the mass, a round tread."""
     return f"""
         <joint name="{name}" axis="0 1 0" damping="{damping}"/>
         <geom type="cylinder" mass="{physics.wheel_mass}" size="{radius:.6g} {0.5 * width:.6g}"
@@ -212,7 +211,6 @@ def _car_actuators(engine: str) -> str:
 
 
 def _differential(p: Parameters, step: float, physics: Physics) -> Machine:
-    """Builds a robot of two driven wheels and a ball caster; `base_link` is the axle's centre."""
     radius, track = p["wheel_radius"], p["track"]
     behind, ball = -0.5 * track, 0.4 * radius
     total = physics.mass + 2 * physics.wheel_mass

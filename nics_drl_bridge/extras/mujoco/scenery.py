@@ -70,8 +70,6 @@ def bumpers(model: Any, robots: int) -> NDArray[np.int64]:
 
 
 class _Maker:
-    """Adds geoms to an MjSpec."""
-
     def __init__(self, mujoco: Any, spec: Any, physics: Physics) -> None:
         self._kinds, self._spec = mujoco.mjtGeom, spec
         self._solref = [physics.softness, 1.0]
@@ -151,12 +149,10 @@ def convex_parts(outline: Array) -> list[Array]:
 
 
 def _area(a: Array, b: Array, c: Array) -> float:
-    """Twice the signed area of a triangle; positive counter-clockwise."""
     return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
 
 
 def _is_ear(outline: Array, rest: list[int], i: int) -> bool:
-    """True if corner i of `rest` can be cut off: convex, with no other corner within."""
     before, here, after = rest[i - 1], rest[i], rest[(i + 1) % len(rest)]
     a, b, c = outline[before], outline[here], outline[after]
     if _area(a, b, c) <= 0.0:

@@ -138,7 +138,6 @@ class WorldsRunner(SingleAgentEnvRunner):
         return list(Rollout(whole, actions, logits, logp, rewards, final).episodes())
 
     def _step(self, t: int) -> tuple[Any, ...]:
-        """Steps every world once; returns a row of `Rollout`."""
         seen = self._seen
         out = self.module.forward_exploration({Columns.OBS: torch.as_tensor(seen)})
         logits = out[Columns.ACTION_DIST_INPUTS]
@@ -371,7 +370,6 @@ class Learning:
 
 
 def _algorithm(settings: TrainingSettings, seed: int, done: int, runners: int) -> PPO:
-    """RLlib's PPO, after `done` steps of the training."""
     torch.set_num_threads(settings.threads)
     model = open_model(settings.robot)
     scenes = {name: load_world(name) for name in settings.worlds}
