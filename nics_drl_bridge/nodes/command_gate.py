@@ -38,11 +38,9 @@ from nics_drl_bridge.nodes.conversions import is_rotation, sensor_from_ros, sens
 from nics_drl_bridge.nodes.gate_log import GateLog
 
 STALE_S = 0.05  # a motion that was decided on longer ago than this is decided on again [s]
-SCAN_PERIODS = 1.75
-"""For a slow lidar, the default age limit of a command's scan, in periods of the lidar."""
+SCAN_PERIODS = 1.75  # for a slow lidar, default age limit of a command's scan, in its periods
 ROTATION = slice(3, 7)  # position of an odometry's quaternion among its numbers
-VARIANCES = [wire.POSE_COVARIANCE, wire.POSE_COVARIANCE + 7, wire.POSE_COVARIANCE + 35]
-"""Positions of the variances of x, y and heading."""
+VARIANCES = [wire.POSE_COVARIANCE + k for k in (0, 7, 35)]  # positions: of x, y and heading
 HIGHEST = 99
 REFUSED = (
     "parameter 'priority': the system does not allow a real-time priority of {priority} ({error}); "
@@ -165,11 +163,7 @@ def e_stop(content: bytes) -> inputs.EStop:
 
 
 def take_priority(priority: int) -> str:
-    """Gives all threads of this process priority over every ordinary one (SCHED_FIFO), if not 0.
-
-    Those of the middleware, too, for which the gate waits. Threads created later have the priority
-    of their creator. Returns a sentence with the reason and the fix if it fails, otherwise "".
-    """
+    """Gives all present threads SCHED_FIFO, if not 0; returns reason and fix if refused, or ""."""
     if priority == 0:
         return ""
     try:
@@ -186,8 +180,7 @@ class CommandGate(qos.QosWatch):
     """Stands between `cmd_vel_raw` and `cmd_vel`, in its own process.
 
     It starts disarmed. `~/arm` lets commands pass if all checks succeed, `~/e_stop` presses the
-    emergency stop, `~/reset` clears a latched stop and leaves the gate disarmed. All decisions are
-    made by `gate.gate.decide`, on the steady clock.
+    emergency stop, `~/reset` clears a latched stop. `gate.gate.decide` decides, on a steady clock.
     """
 
     def __init__(self, context: Context) -> None:
@@ -264,11 +257,8 @@ class CommandGate(qos.QosWatch):
         return decision
 
     def _say(self, decision: Decision, now: float) -> inputs.Input | None:
-        """Publishes a decision, the only path to the robot except `stop`, or returns another input.
-
-        What is not finite is sent as zero and presses the e-stop. A motion that was decided on too
-        long ago, in a process frozen since, is not sent; so the clock is read immediately before.
-        """
+        # The only path to the robot except `stop`. A motion that was decided on too long ago, in a
+        # process frozen since, is not sent; so the clock is read immediately before.
         content = wire.twist_to_bytes(decision.twist)
         if not np.isfinite(decision.twist).all():
             self._out.publish(self._zero)

@@ -22,27 +22,21 @@ from rclpy.waitable import NumberOfEntities
 
 from nics_drl_bridge.interface import NS_PER_S
 
-PARTS_MISSING = (AttributeError, TypeError)
-"""Raised by Python if rclpy differs from what is known here."""
+PARTS_MISSING = (AttributeError, TypeError)  # raised if rclpy differs from what is known here
 Received = tuple[Callable[..., Any], tuple[Any, ...]]  # a callback and its arguments
 HANDED_OVER, REST_S = object(), 1e-4
 """Returned by a callback that has woken another thread of this process. The executor then rests,
 for less than an exchange of messages takes, to keep out of that thread's way."""
-MOST_AT_ONCE = 32
-"""A timer without a period is always ready, and the spinning thread has other work, too."""
+MOST_AT_ONCE = 32  # a timer without a period is always ready, and the thread has other work, too
 
 
 class StandingExecutor(SingleThreadedExecutor):
     """Waits for all entities of its nodes; handles subscriptions and timers, and leaves the rest.
 
-    rclpy's executors gather the entities of all nodes, open their handles and build a new wait set
-    each time they wait, and they wait three times for one message. Here that is done only when an
-    entity is added or removed. Services, clients, events and tasks are left to rclpy's executor.
-
-    Callbacks are called in the spinning thread, one after the other: those of subscriptions with
-    the message, or the message and its info, and may return `HANDED_OVER`; those of timers without
-    arguments, others are left to rclpy, too. This needs parts of rclpy that are not public. If one
-    is missing, it logs that once, and is rclpy's own executor from then on.
+    rclpy's executors build a new wait set each time they wait, three times for one message; this
+    one only when an entity is added or removed. Callbacks are called one after the other in the
+    spinning thread; those of subscriptions may return `HANDED_OVER`. This needs parts of rclpy that
+    are not public. If one is missing, it logs that once, and is rclpy's own executor from then on.
     """
 
     def __init__(self, context: Context) -> None:

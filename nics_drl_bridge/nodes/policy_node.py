@@ -31,11 +31,10 @@ LONGEST_REASON = 300  # greatest length of a policy's error text, in characters
 class PolicyNode(ManagedNode):
     """Answers scans with `cmd_vel_raw`, with the stamp of the scan, until the goal is reached.
 
-    It observes through the same task as the Gymnasium env, at a fixed rate of the steady clock: it
-    acts at most once per control period and per scan. An inference that exceeds the deadline is
-    dropped; after several in a row it commands zero. The goal, in `map`, is a parameter at the
-    start and the topic `goal_pose` afterwards. It listens when configured and commands when active;
-    its last command before deactivation is zero.
+    It observes through the same task as the Gymnasium env, and acts at most once per control period
+    and per scan. An inference that exceeds the deadline is dropped; after several in a row it
+    commands zero. The goal, in `map`, is a parameter at the start and the topic `goal_pose`
+    afterwards. It listens when configured and commands when active; its last command is zero.
     """
 
     def __init__(self, context: Context) -> None:
@@ -87,19 +86,16 @@ class PolicyNode(ManagedNode):
             self.get_parameter(name).value for name in ("rate", "deadline", "late_limit")
         )
         if rate < 0.0 or limit <= 0.0 or patience < 1:
-            raise ConfigError(
-                f"parameters rate {rate}, deadline {limit}, late_limit {patience}: must be at "
-                "least 0, more than 0, and at least 1."
-            )
+            given = f"parameters rate {rate}, deadline {limit}, late_limit {patience}"
+            raise ConfigError(f"{given}: must be at least 0, more than 0, and at least 1.")
         period = control_period if np.isnan(rate) else 1.0 / rate if rate > 0.0 else 0.0
         limit = 0.5 * control_period if np.isnan(limit) else limit
         return ActionPace(period), Deadline(limit, patience)
 
     def _open_policy(self, model: SimulatorModel) -> None:
-        """Opens the policy for a model, and runs it once, so that it compiles now."""
         name = str(self.get_parameter("policy").value)
         self._policy, self._task = open_policy(name, model)
-        view = rehearse(model)
+        view = rehearse(model)  # so that all compiles now
         self._task.judge(view, {"goal": np.zeros(2)})
         self._asked(view, np.zeros(2))
 
@@ -168,10 +164,12 @@ class PolicyNode(ManagedNode):
             self.get_logger().debug(traceback.format_exc())
             place = traceback.extract_tb(error.__traceback__)[-1]
             words = shortened(f"{type(error).__name__}: {error}", LONGEST_REASON)
-            raise BridgeError(
-                f"policy {self.get_parameter('policy').value!r} raised {words} ({place.filename}, "
-                f"line {place.lineno}); the robot is stopped, mend the policy."
-            ) from error
+            where, name = (
+                f"{place.filename}, line {place.lineno}",
+                self.get_parameter("policy").value,
+            )
+            fix = "the robot is stopped, mend the policy."
+            raise BridgeError(f"policy {name!r} raised {words} ({where}); {fix}") from error
 
     def _message(self, twist: Array, stamp_ns: int) -> TwistStamped:
         frame = str(self.get_parameter("base_frame").value)

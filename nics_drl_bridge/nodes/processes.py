@@ -41,10 +41,8 @@ def free_domain_id() -> int:
         every = range(1, LAST_DOMAIN_ID + 1)
         return random.SystemRandom().choice(sorted(set(every) - domains_in_use()) or every)
     if not given.isdecimal() or int(given) > GREATEST_DOMAIN_ID:
-        raise ConfigError(
-            f"the environment variable ROS_DOMAIN_ID is {given!r}; it must be a number from 0 to "
-            f"{GREATEST_DOMAIN_ID}, or unset."
-        )
+        fix = f"it must be a number from 0 to {GREATEST_DOMAIN_ID}, or unset."
+        raise ConfigError(f"the environment variable ROS_DOMAIN_ID is {given!r}; {fix}")
     return int(given)
 
 
@@ -62,10 +60,9 @@ def _dies_with_parent() -> Callable[[], None] | None:
 
 
 class NodeProcess(AbstractContextManager["NodeProcess", None]):
-    """One node in its own process; a context manager that ends it.
+    """One node in its own process, with log and parameters in a folder, which `close` ends.
 
-    The folder gets its log and its parameter file; `remap` maps names; `discovery` is LOCALHOST or
-    SUBNET. On Linux the node also ends when the thread that started it does.
+    `discovery` is LOCALHOST or SUBNET. On Linux the node also ends when its parent thread does.
     """
 
     def __init__(
@@ -96,9 +93,8 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
         if code is not None:
             lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
             last = " | ".join(lines[-LOG_LINES:]) or "no output"
-            raise BackendError(
-                f"{self.node} ended with code {code}: {last} (its log is {self.log})."
-            )
+            reason = f"ended with code {code}: {last} (its log is {self.log})."
+            raise BackendError(f"{self.node} {reason}")
 
     def close(self) -> int:
         """Ends the node: SIGINT, then SIGKILL if it does not react. Returns its exit code."""

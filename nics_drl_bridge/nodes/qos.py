@@ -50,24 +50,16 @@ SENSOR = profile_of(Offer(5, reliable=False))
 link a reliable scan arrives half a second late and looks fresh. It matches every publisher. Also in
 lock-step: acknowledging each datum takes a tenth of a step, and lost data are requested again."""
 
-SENSOR_RELIABLE = profile_of(Offer(10))
-"""Publishers of the same, so that subscribers of both kinds match."""
+SENSOR_RELIABLE = profile_of(Offer(10))  # publishers of the same: subscribers of both kinds match
 
 EVERY_COMMAND = profile_of(Offer(10))
 """Commands in lock-step: each moves the world, and a second publisher must not replace the
 first one's unnoticed. Also `e_stop`, of which no press may be overwritten."""
 
 COMMAND = profile_of(Offer(1))  # commands and goals: only the newest counts, and it has to arrive
-
-TRANSFORMS = profile_of(Offer(100))
-"""`/tf`: like tf2's own broadcasters, whose listeners request reliable."""
-
-FIXED_TRANSFORMS = profile_of(Offer(1, transient_local=True))
-"""`/tf_static`: published once, and delivered to late joiners too."""
-
-DIAGNOSTICS = profile_of(Offer(10))
-"""`/diagnostics`: rare and small, and each message may concern something else; as the diagnostic
-aggregator expects it."""
+TRANSFORMS = profile_of(Offer(100))  # `/tf`: like tf2's own, whose listeners request reliable
+FIXED_TRANSFORMS = profile_of(Offer(1, transient_local=True))  # `/tf_static`: for late joiners too
+DIAGNOSTICS = profile_of(Offer(10))  # as the diagnostic aggregator expects `/diagnostics`
 
 MOMENT_S, UNKNOWN = 0.5, "_UNKNOWN_"
 

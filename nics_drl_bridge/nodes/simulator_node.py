@@ -7,7 +7,7 @@ import itertools
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, cast
 
@@ -87,10 +87,7 @@ class Outbox:
 
 
 class RobotPort:
-    """Publishes `scan`, `odom`, further sensors, `joint_states`, `ground_truth` of one robot.
-
-    The last two cost nothing without subscribers. The namespace is empty or ends with a slash.
-    """
+    """Publishes `scan`, `odom`, further sensors, `joint_states`, `ground_truth` of one robot."""
 
     def __init__(
         self, node: Node, namespace: str, model: SimulatorModel, frames: device_parameters.Frames,
@@ -162,9 +159,8 @@ class RobotPort:
 class CommandInlet:
     """Listens to `cmd_vel`, and to `ackermann_cmd` if the robot steers and the message exists.
 
-    The node's parameter `enable_stamped_cmd_vel` selects the type. A stamped command is treated as
-    by ros2_control's drive controllers: a stamp of zero counts as now, and one older than the
-    command timeout is ignored. `take` gets each command (C,) whose stamp [ns] is not `too_old`.
+    A stamped command is treated as by ros2_control's drive controllers: a stamp of zero counts as
+    now. `take` gets each command (C,) whose stamp [ns] is not `too_old`.
     """
 
     def __init__(
@@ -190,7 +186,7 @@ class CommandInlet:
         except wire.UNREADABLE as error:
             self._complain(f"a message that can't be read ({error}) is ignored")
 
-    def _obey(self, twist: tuple[float, float, float]) -> None:
+    def _obey(self, twist: Sequence[float]) -> None:
         if all(map(math.isfinite, twist)):
             self._take(self._robot.from_cmd_vel(twist))
         else:
@@ -198,8 +194,7 @@ class CommandInlet:
 
     def _on_stamped(self, message: TwistStamped) -> None:
         if self._is_fresh(message.header.stamp):
-            twist = message.twist
-            self._obey((twist.linear.x, twist.linear.y, twist.angular.z))
+            self._obey(conversions.twist_from_ros(message).tolist())
 
     def _on_ackermann(self, message: Any) -> None:
         if self._is_fresh(message.header.stamp):
@@ -246,11 +241,10 @@ class DeviceNode(qos.QosWatch):
     """Takes `cmd_vel`; publishes `scan`, `odom`, `joint_states`, `ground_truth`, `/clock`, `/tf`.
 
     With the parameter `robots` it is a fleet in one world, each robot in a namespace below the
-    node's own. Stamps are simulated time, as on `/clock`: it begins at the system's time and never
-    runs backwards, not even at a reset. `~/reset` begins the episode of the parameters
-    `episode_seed` and `episode_start`; its answer is JSON with the stamp of the first data. In
-    lock-step the world moves when each robot has a command, and `~/repeat` publishes its present
-    data again. `~/touched` reports which robots have truly touched something in this episode.
+    node's own. Stamps are simulated time: it begins at the system's time and never runs backwards.
+    `~/reset` begins an episode; its answer is JSON with the stamp of the first data. In lock-step
+    the world moves when each robot has a command, and `~/repeat` publishes the present data again.
+    `~/touched` reports which robots have truly touched something in this episode.
     """
 
     def __init__(self, name: str, context: Context, make: MakeSimulator) -> None:

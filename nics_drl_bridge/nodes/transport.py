@@ -81,11 +81,9 @@ class Transport:
             stay_on_this_machine(os.environ)
             here = stays_here(os.environ)
             if self._in_force and not here:
-                raise BackendError(
-                    f"{RANGE} is {os.environ[RANGE]}, but an earlier node in this process keeps "
-                    "its discovery on this machine; set it before the first, or use another "
-                    "process."
-                )
+                earlier = "an earlier node in this process keeps its discovery on this machine"
+                fix = "set it before the first, or use another process."
+                raise BackendError(f"{RANGE} is {os.environ[RANGE]}, but {earlier}; {fix}")
             fast_dds = str(get_rmw_implementation_identifier()).startswith("rmw_fast")
             if sys.platform != "linux" or not fast_dds or chosen(os.environ):
                 return make()
@@ -120,7 +118,7 @@ class Transport:
 
 @contextlib.contextmanager
 def _changed(environment: MutableMapping[str, str], words: Mapping[str, str]) -> Iterator[None]:
-    """Sets variables for a while, without the older discovery variable, which overrides them."""
+    # Without the older discovery variable, which overrides the others.
     kept = {key: environment.pop(key, None) for key in (ONLY_LOCAL, *words)}
     environment.update(words)
     try:
