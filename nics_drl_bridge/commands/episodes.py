@@ -1,8 +1,4 @@
-"""The same episodes in process, over DDS, in MuJoCo over DDS, and on the vehicle.
-
-Compares the worlds as Fig. 7 of the paper does, with a table. The vehicle is driven in real time,
-through the command gate.
-"""
+"""The same episodes in process, over DDS, in MuJoCo, and on the vehicle, compared as in Fig. 7."""
 
 from __future__ import annotations
 
@@ -54,12 +50,7 @@ def drive_in(
     place: str, policy: str, name: str, world: str, seeds: Sequence[int], logs: Path,
     on_episode: Callable[[Episode], None], say: Say = lambda _: None,
 ) -> list[Episode]:  # fmt: skip
-    """Drives episodes with the model of a name in one of `PLACES`; `on_episode` hears of each.
-
-    The node that a place needs runs in its own process, in lock-step, with its log in a folder, and
-    has ended when this returns or raises. Raises BridgeError for a bad name or file, or a node that
-    does not start.
-    """
+    """Drives episodes in one of `PLACES`, whose node, if any, has then ended. BridgeError."""
     check_place(place)
     model = open_model(name)
     if place == FAST:
@@ -146,12 +137,7 @@ class Evaluated:
 
 
 def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
-    """Drives every policy through the same episodes in every place.
-
-    `tell` is called with what is being driven, the number of episodes done, and the total. Returns
-    the results of each policy; `evaluation.json` and a picture per policy are in `order.out`.
-    Raises BridgeError for a bad name or file, or a node that does not start.
-    """
+    """Drives all policies through the same episodes everywhere; writes results, pictures."""
     name, seeds, logs = _model_name(order), order.seeds, order.out / "logs"
     model, world = open_model(name), load_world(order.world)
     for place in order.places:
@@ -245,13 +231,11 @@ def drive_vehicle(
 ) -> Evaluated:  # fmt: skip
     """Checks that the vehicle fits its model, drives the first policy, and compares.
 
-    Commands go to `cmd_vel_raw`, so that only an armed `command_gate` lets them pass; `arm` arms it
-    before each episode, otherwise the user does. A goal in `map` [m] takes the place of the
-    world's. Afterwards the fast simulator drives the same episodes from the vehicle's actual
-    starting poses. `ask` is called before each episode with where to place the vehicle, and returns
-    when it may begin; the options are those of `RealtimeBackend`. Returns the episodes of both;
-    `evaluation.json` and a picture are in `order.out`. Raises BackendError if the vehicle does not
-    fit its model, or does not answer, another BridgeError for a bad name or file.
+    Commands go to `cmd_vel_raw`, so that only an armed `command_gate` lets them pass. Afterwards
+    the fast simulator drives the same episodes from the vehicle's actual starting poses. `ask` is
+    called before each episode with where to place the vehicle, and returns when it may begin; the
+    options are those of `RealtimeBackend`. Raises BackendError if the vehicle does not fit its
+    model, or does not answer, another BridgeError for a bad name or file.
     """
     policy = order.policies[0]
     name, namespace = order.model or robot_of(policy), options.get("namespace", "")

@@ -191,7 +191,6 @@ def urdf(
 
         opened = open_model(model)
         file = out or Path(f"{opened.robot.name}.urdf")
-        lidar = opened.lidar
-        further = {each.frame: each.mount for each in opened.sensors}
+        lidar, further = opened.lidar, {each.frame: each.mount for each in opened.sensors}
         write_text(file, urdf_of(opened.robot, lidar.mount, lidar.frame, further=further))
         typer.echo(f"{file}: the URDF of {opened.robot.name}")

@@ -51,10 +51,7 @@ def choose_all(out, scans, goals, twists, candidates, rays, ahead, weights):  # 
 
 @kernel(allocates=True)
 def hits_of(hits, shares, rays):  # type: ignore[no-untyped-def]
-    """Writes the end points of a scan into hits (P, 2) [m] in `base_link`; returns their number.
-
-    `shares` (P,) are of the maximum range; 1 is free.
-    """
+    """Writes the ends of shares (P,), 1 is free, into hits (P, 2) [m]; returns their number."""
     count = 0
     for p in range(shares.shape[0]):
         if shares[p] < 1.0:
@@ -67,10 +64,7 @@ def hits_of(hits, shares, rays):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def choose(hits, goal, twist, candidates, ahead, weights):  # type: ignore[no-untyped-def]
-    """Returns the index of the cheapest candidate (K, 3), preferring those within the window.
-
-    Hits (H, 2) [m] and goal (2,) [m] are in `base_link`; `twist` (3,) is the present one.
-    """
+    """Index of the cheapest candidate (K, 3) for hits (H, 2), goal (2,) and present twist (3,)."""
     best, least = 0, math.inf
     for k in range(candidates.shape[0]):
         far = False

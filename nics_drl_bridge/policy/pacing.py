@@ -6,11 +6,7 @@ from enum import Enum
 
 
 class ActionPace:
-    """Allows at most one action per period, as soon as there are data to act on; 0 acts on all.
-
-    Due times are a period apart, so that jitter of the data makes it neither faster nor slower;
-    if data come late, the next due time is a period after them.
-    """
+    """Allows at most one action per period, as soon as there are data to act on; 0 acts on all."""
 
     def __init__(self, period_s: float) -> None:
         self._period_s, self._due_s = period_s, -float("inf")
@@ -21,6 +17,7 @@ class ActionPace:
 
     def acted(self, now_s: float) -> None:
         """Records the start of an action."""
+        # Due times are a period apart: jitter of the data makes it neither faster nor slower.
         late = now_s - self._due_s > 0.5 * self._period_s
         self._due_s = (now_s if late else self._due_s) + self._period_s
 
@@ -34,11 +31,7 @@ class Answer(Enum):
 
 
 class Deadline:
-    """Judges the duration of each inference, and counts those in time and the late ones.
-
-    A late command is dropped, because the world has moved on. After `patience` in a row the robot
-    is stopped until one is in time again. `longest_s` is the maximum duration so far.
-    """
+    """Judges the duration of each inference; after `patience` late ones in a row it says stop."""
 
     def __init__(self, limit_s: float, patience: int) -> None:
         self._limit_s, self._patience = limit_s, patience

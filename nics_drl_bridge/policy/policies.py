@@ -23,8 +23,7 @@ from nics_drl_bridge.robot.spec import RobotSpec
 Array = NDArray[np.float64]
 
 FULL_TURN_RAD = 0.8  # bearing of the goal from which a robot turns as fast as it can
-CREEP = 0.3
-"""Share of the maximum speed for a robot that can't turn on the spot and has its goal behind."""
+CREEP = 0.3  # share of the speed for a robot that can't turn on the spot and has its goal behind
 
 
 class Policy(Protocol):
@@ -77,12 +76,10 @@ class RandomActions:
 class DynamicWindow:
     """The dynamic-window approach (Fox, Burgard, Thrun 1997) on scan, goal and twist.
 
-    Tries the twists that the commands allow and that the robot can reach from its present one in a
-    period; each is held for the look-ahead. A twist with a contact before the robot could stop is
-    inadmissible; the best of the others in distance, aim, clearance and time to contact is chosen.
-    It plans no path: behind a long wall it stays. Which twist a command leads to follows from the
-    robot's kind and parameters. Raises ConfigError if it is not known where the robot's commands
-    lead, see `steady_twist`.
+    Each twist that the robot can reach in a period is held for the look-ahead. One with a contact
+    before the robot could stop is inadmissible; the best of the others in distance, aim, clearance
+    and time to contact is chosen. It plans no path: behind a long wall it stays. Raises ConfigError
+    if it is not known where the robot's commands lead, see `steady_twist`.
     """
 
     task: Navigation
@@ -156,12 +153,7 @@ def is_policy_file(name: str) -> bool:
 
 
 def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None) -> Policy:
-    """Makes a policy by name.
-
-    The name is a key of `POLICIES`, a shipped policy file, or the path of a policy file, which is
-    checked against the task and the model of the robot. Raises ConfigError for an unknown name,
-    PolicyError, with the field, if the file can't be used or does not fit.
-    """
+    """Makes a policy by name, or the path of a file. Raises ConfigError, PolicyError."""
     if not is_policy_file(name):
         return POLICIES[name](task)
     from nics_drl_bridge.policy.policy_file import load_policy  # the others need no onnxruntime
@@ -172,10 +164,7 @@ def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None
 
 
 def open_policy(name: str, model: SimulatorModel) -> tuple[Policy, Navigation]:
-    """Opens a policy by name, with the navigation task that it is for.
-
-    Raises ConfigError, PolicyError: see `make_policy`; or the policy was trained for another task.
-    """
+    """Opens a policy and its navigation task; PolicyError if it was trained for another task."""
     if not is_policy_file(name):
         task = Navigation(model.robot, model.lidar)
         return POLICIES[name](task), task

@@ -88,11 +88,7 @@ class PolicyFile:
         return options
 
     def make_task(self, model: SimulatorModel, kind: str | type[Task] | None = None) -> Task:
-        """Makes the policy's task for a robot that it fits.
-
-        For a task that is not shipped, `kind` is its class or `path/to/file.py:ClassName`. Raises
-        PolicyError if the policy does not fit; names the field.
-        """
+        """Makes the policy's task, if need be of a class or `file.py:ClassName`; PolicyError."""
         name = self.contract.task.name
         if kind is None and name not in TASKS:
             reason = f"{name!r} is no shipped task; give path/to/file.py:{name}."
@@ -110,7 +106,8 @@ class PolicyFile:
         """
         if model is not None:
             self._check_robot(model.robot, model.lidar)
-            self._check_sensors(model)
+            known = {sensor.name: sensor.model_dump(mode="json") for sensor in model.sensors}
+            self._compare({"sensors": [known.get(each.name) for each in self.contract.sensors]})
             period = model.control_period
             if abs(self.contract.control_period - period) > PERIOD_TOLERANCE:
                 self._compare({"control_period": period})
@@ -134,10 +131,6 @@ class PolicyFile:
                 raise PolicyError(str(self.path), "scan", str(error)) from None
         self._compare(theirs)
 
-    def _check_sensors(self, model: SimulatorModel) -> None:
-        known = {sensor.name: sensor.model_dump(mode="json") for sensor in model.sensors}
-        self._compare({"sensors": [known.get(each.name) for each in self.contract.sensors]})
-
     def _compare(self, theirs: Mapping[str, Any]) -> None:
         for name, entry in theirs.items():
             only: Any = {name: set(entry) if isinstance(entry, dict) else True}
@@ -150,18 +143,11 @@ class PolicyFile:
                     raise PolicyError(str(self.path), path, reason)
 
 
-def find_policy(name: str) -> Path:
-    """Path of a policy file, by its path or by the name of a shipped one."""
-    path = Path(name)
-    return path if name.endswith(SUFFIX) or path.is_file() else shipped() / f"{name}{SUFFIX}"
-
-
 def load_policy(path: str | Path) -> PolicyFile:
-    """Loads a policy file, by its path or the name of a shipped one, and runs every check.
-
-    Raises PolicyError if a check fails; names the field.
-    """
-    file = find_policy(str(path))
+    """Loads and checks a policy file, by path or shipped name; PolicyError names the field."""
+    file = Path(path)
+    if not file.name.endswith(SUFFIX) and not file.is_file():
+        file = shipped() / f"{path}{SUFFIX}"
     source = str(file)
     try:
         size, limit = file.stat().st_size, onnx_graph.SIZE_LIMIT
@@ -197,10 +183,7 @@ def policy_of(data: bytes, path: Path) -> PolicyFile:
 
 
 def open_session(data: bytes, source: str) -> Any:
-    """An onnxruntime session on one thread.
-
-    Raises ConfigError if onnxruntime is missing, PolicyError if it can't run the graph.
-    """
+    """An onnxruntime session on one thread. Raises ConfigError without it, else PolicyError."""
     try:
         import onnxruntime
     except ImportError:

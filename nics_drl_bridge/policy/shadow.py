@@ -42,11 +42,7 @@ class Shadow:
     skipped: Mapping[str, int]  # reason -> number of times that were not compared
 
     def differences(self) -> dict[str, dict[str, float]]:
-        """Differences between policy and drive, for each command.
-
-        Mean of policy minus drive; mean, percentiles and maximum of its magnitude, in the command's
-        unit; and the share of opposite signs among the times at which both have a sign.
-        """
+        """Mean of policy minus drive by command; its magnitude; the share of opposite signs."""
         found = {}
         for c, name in enumerate(self.names):
             one, other, band = self.policy[:, c], self.driven[:, c], DEAD_BAND * self.scale[c]
@@ -72,23 +68,16 @@ class _Moment:
 
 
 def shadow(
-    path: str | Path,
-    model: SimulatorModel,
-    policy: str,
-    topics: Mapping[str, str],
-    goal: ArrayLike | None = None,
-    ahead_s: float = 4.0,
-) -> Shadow:
+    path: str | Path, model: SimulatorModel, policy: str, topics: Mapping[str, str],
+    goal: ArrayLike | None = None, ahead_s: float = 4.0,
+) -> Shadow:  # fmt: skip
     """Runs a policy on a recorded drive, in process and deterministically.
 
-    The policy acts when `policy_node` would: once per scan, with odometry at least as new, at most
-    once per control period of the stamps. Its command is compared with the first one recorded after
-    that, or else with the one that still applied.
-
-    The goal (2,) [m] is in `map`, in which the first odometry is taken at face value. None uses the
-    robot's position `ahead_s` later instead: the driver's intention, in hindsight. `topics` are by
-    role, see `playback.chosen`. Raises RecordingError if the bag can't be used, or lacks scans or
-    commands, another BridgeError if the policy can't be used, or does not fit.
+    The policy acts when `policy_node` would; its command is compared with the first one recorded
+    after that, or else with the one that still applied. The goal (2,) [m] is in `map`; None uses
+    the robot's position `ahead_s` later: the driver's intention. `topics`: see `playback.chosen`.
+    Raises RecordingError if the bag can't be used, or lacks scans or commands, another BridgeError
+    if the policy can't be used, or does not fit.
     """
     if goal is None and not ahead_s > 0.0:
         raise ConfigError(f"--ahead {ahead_s:g}: must be more than 0 s.")
@@ -153,8 +142,7 @@ def _answered(moments: list[_Moment], goals: Array, name: str, model: SimulatorM
     robot, rows = model.robot, list[tuple[Any, ...]]()
     skipped = {"no command was driven": 0, "at the goal": 0, "touching something": 0}
     for moment, goal in zip(moments, goals, strict=True):
-        memory = {"goal": goal}
-        verdict = task.judge(moment.view, memory)
+        verdict = task.judge(moment.view, memory := {"goal": goal})
         if moment.driven is None:
             skipped["no command was driven"] += 1
         elif verdict.touched:

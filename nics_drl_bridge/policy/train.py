@@ -33,10 +33,8 @@ from nics_drl_bridge.sim.world import World
 CHECKPOINT, SETTINGS = "checkpoint.pt", "settings.yaml"
 EVALUATION, POLICY = "evaluation.json", "policy.onnx"
 SEEDS = 2**40
-GREATEST_SEED = 2**32 - 1
-"""Largest seed of numpy's global generator, from which Stable-Baselines3 draws."""
-LOG_EVERY = {"ppo": 1, "sac": 1000}
-"""Roll-outs (PPO) or episodes (SAC) between two entries of TensorBoard."""
+GREATEST_SEED = 2**32 - 1  # of numpy's global generator, from which Stable-Baselines3 draws
+LOG_EVERY = {"ppo": 1, "sac": 1000}  # roll-outs or episodes between two entries of TensorBoard
 Tell = checkpoints.Tell
 
 
@@ -51,18 +49,14 @@ class Trained:
 
 
 def train(
-    settings: TrainingSettings,
-    seed: int,
-    folder: Path,
-    tell: Tell = lambda _: None,
+    settings: TrainingSettings, seed: int, folder: Path, tell: Tell = lambda _: None,
     resumed: bool = False,
-) -> Trained:
+) -> Trained:  # fmt: skip
     """Trains one policy; checkpoint and TensorBoard logs are in `folder`.
 
-    An interrupted and resumed training gives bit-identical weights to an uninterrupted one: a
-    checkpoint contains the network, the optimiser, all random generators and all worlds. `tell` is
-    called with the progress, a few times per second. Raises ConfigError if the settings are
-    inconsistent, or no checkpoint fits them.
+    A resumed training gives bit-identical weights to an uninterrupted one. `tell` is called with
+    the progress, a few times per second. Raises ConfigError if the settings are inconsistent, or no
+    checkpoint fits them.
     """
     begin, path = time.perf_counter(), folder / CHECKPOINT
     content = checkpoints.read_checkpoint(path) if resumed else None
@@ -90,10 +84,9 @@ def train(
 
 
 def make_train_env(
-    settings: TrainingSettings,
-    model: SimulatorModel | None = None,
+    settings: TrainingSettings, model: SimulatorModel | None = None,
     scenes: Mapping[str, World] | None = None,
-) -> TrainVecEnv:
+) -> TrainVecEnv:  # fmt: skip
     """Makes the worlds of the settings in one env; model and worlds may already be open."""
     model = model or open_model(settings.robot)
     envs = (
@@ -107,12 +100,9 @@ def make_train_env(
 
 
 def _again(
-    content: dict[str, Any],
-    about: dict[str, Any],
-    settings: TrainingSettings,
-    env: TrainVecEnv,
+    content: dict[str, Any], about: dict[str, Any], settings: TrainingSettings, env: TrainVecEnv,
     path: Path,
-) -> BaseAlgorithm:
+) -> BaseAlgorithm:  # fmt: skip
     check_same(content["about"], about, path)
     size = int(np.prod(env.observation_space.shape))
     algorithm = make_algorithm(settings, env, about["seed"], (np.zeros(size), np.ones(size)))
@@ -137,12 +127,9 @@ def check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
 
 
 def evaluate(
-    algorithm: BaseAlgorithm | Actor,
-    settings: TrainingSettings,
-    world: str,
-    episodes: int,
+    algorithm: BaseAlgorithm | Actor, settings: TrainingSettings, world: str, episodes: int,
     model: SimulatorModel | None = None,
-) -> Outcomes:
+) -> Outcomes:  # fmt: skip
     """Drives the episodes of the evaluation protocol in a world with an algorithm's policy."""
     env = BridgeVectorEnv(
         episodes, model or open_model(settings.robot), world, settings.task,
@@ -151,8 +138,7 @@ def evaluate(
     return drive_worlds(env, act_of(algorithm), range(FIRST_SEED, FIRST_SEED + episodes))
 
 
-Learn = Callable[[TrainingSettings, int, Path, Tell, bool], Trained]
-"""A function like `train`: of settings, seed, folder, progress callback and `resumed`."""
+Learn = Callable[[TrainingSettings, int, Path, Tell, bool], Trained]  # a function like `train`
 
 
 @dataclass(frozen=True)
@@ -177,16 +163,10 @@ class TrainOrder:
 
 
 def run(
-    order: TrainOrder,
-    tell: Tell = lambda _: None,
-    done: Callable[[SeedResult], None] = lambda _: None,
-    learn: Learn = train,
-) -> list[SeedResult]:
-    """Trains seed after seed and evaluates each in its training worlds.
-
-    `tell` is called with the progress, `done` with the result of each seed. Raises ConfigError if
-    the folder already contains a run, or none to resume.
-    """
+    order: TrainOrder, tell: Tell = lambda _: None,
+    done: Callable[[SeedResult], None] = lambda _: None, learn: Learn = train,
+) -> list[SeedResult]:  # fmt: skip
+    """Trains and evaluates seed after seed; ConfigError for a run in the folder, or none there."""
     _check(order.seeds, order.out, order.resumed)
     settings, model = order.settings, open_model(order.settings.robot)
     write_text(order.out / SETTINGS, dump_yaml(settings.model_dump(mode="json")))
@@ -224,8 +204,8 @@ def _check(seeds: Sequence[int], out: Path, resumed: bool) -> None:
         raise ConfigError(f"seeds {list(seeds)}: give one or more, none twice.")
     begun = any((out / f"seed_{seed}" / CHECKPOINT).is_file() for seed in seeds)
     if begun and not resumed:
-        reason = "holds checkpoints of these seeds; add --resume, or choose another --out."
-        raise ConfigError(f"{out}: {reason}")
+        fix = "add --resume, or choose another --out."
+        raise ConfigError(f"{out}: holds checkpoints of these seeds; {fix}")
     if resumed and not begun:
         raise ConfigError(f"{out}: holds no checkpoint of these seeds; leave out --resume.")
 

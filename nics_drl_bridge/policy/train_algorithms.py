@@ -32,10 +32,7 @@ ACTION_GAIN = 0.01  # initial gain of an actor's last layer: all its actions are
 def make_algorithm(
     settings: TrainingSettings, env: TrainVecEnv, seed: int, normaliser: tuple[Array, Array]
 ) -> BaseAlgorithm:
-    """Makes an untrained algorithm; `normaliser` is mean and deviation (O,) of observations.
-
-    Raises ConfigError if the algorithm does not suit the task.
-    """
+    """Makes an untrained algorithm; `normaliser` is mean and deviation (O,). See `check_serves`."""
     check_serves(settings, env)
     torch.set_num_threads(settings.threads)
     shared: dict[str, Any] = {"seed": seed, "device": "cpu", "stats_window_size": RECENT}
@@ -90,10 +87,7 @@ def act_of(algorithm: BaseAlgorithm | Actor) -> Act:
 
 
 class Normaliser(BaseFeaturesExtractor):
-    """First layer of actor and critic: (observation - mean) / std, cut at +-5; not trained.
-
-    Mean and std (O,) are those of `observed`; a part of the network, they can't get lost.
-    """
+    """First layer of actor and critic: (observation - mean) / std (O,), cut at +-5; not trained."""
 
     mean: torch.Tensor
     std: torch.Tensor
@@ -109,15 +103,10 @@ class Normaliser(BaseFeaturesExtractor):
 
 
 def observed(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Mean and standard deviation (O,) of the observations under random actions.
-
-    Each world holds its action for several steps, because otherwise a robot with inertia would stay
-    in place. A part that hardly varies gets a deviation of 0.05. The state of the env is arbitrary
-    afterwards.
-    """
+    """Mean and standard deviation (O,), at least 0.05, of observations under random actions."""
     seen = [np.array(env.reset())]
     for k in range(OBSERVED_STEPS):
-        if k % 8 == 0:
+        if k % 8 == 0:  # else a robot with inertia would stay in place
             space: Any = env.action_space
             if isinstance(space, gymnasium.spaces.Discrete):
                 actions: NDArray[Any] = rng.integers(space.n, size=env.num_envs)
@@ -129,18 +118,13 @@ def observed(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Array]:
 
 
 class Actor(torch.nn.Module):
-    """Maps observations (n, O) to raw actions (n, C), or to logits (n, A) of discrete ones.
-
-    `hidden` are the widths of the hidden layers, `normaliser` is as in `make_algorithm`.
-    """
+    """Maps observations (n, O) to raw actions (n, C), or to logits (n, A) of discrete ones."""
 
     def __init__(
-        self,
-        observations: gymnasium.spaces.Box,
-        actions: gymnasium.spaces.Box | gymnasium.spaces.Discrete,
-        hidden: Sequence[int],
+        self, observations: gymnasium.spaces.Box,
+        actions: gymnasium.spaces.Box | gymnasium.spaces.Discrete, hidden: Sequence[int],
         normaliser: tuple[Array, Array],
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__()
         self.discrete, size = isinstance(actions, gymnasium.spaces.Discrete), actions.shape or ()
         count = int(actions.n if isinstance(actions, gymnasium.spaces.Discrete) else np.prod(size))
@@ -159,10 +143,7 @@ class Actor(torch.nn.Module):
 
 
 def layers_of(widths: Sequence[int], gain: float) -> torch.nn.Sequential:
-    """Linear layers with tanh in between, initialised orthogonally as in Stable-Baselines3.
-
-    The gain is that of the last layer.
-    """
+    """Linear layers with tanh in between, initialised as in Stable-Baselines3, the last by gain."""
     layers: list[torch.nn.Module] = []
     for ins, outs in itertools.pairwise(widths):
         layers += [torch.nn.Linear(ins, outs), torch.nn.Tanh()]

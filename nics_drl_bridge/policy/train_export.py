@@ -25,15 +25,11 @@ Rows = NDArray[np.float32]
 Normaliser = tuple[ArrayLike, ArrayLike, float]
 OPSET = 17
 GOLDEN_SEED = 0
-GOLDEN_SPREAD = 3.0
-"""Golden observations lie within this distance of zero if their limits are wider."""
+GOLDEN_SPREAD = 3.0  # distance from zero of golden observations, if their limits are wider
 
 
 class Deployed(torch.nn.Module):  # type: ignore[misc]
-    """Computation of the graph of a policy file, for an actor as `actor_of` returns it.
-
-    Stable-Baselines3's own recipe for ONNX omits clipping, unscaling and the normaliser.
-    """
+    """The graph of a policy file; Stable-Baselines3's recipe omits clipping, scale, normaliser."""
 
     def __init__(self, actor: torch.nn.Module, task: Task, normaliser: Normaliser | None) -> None:
         super().__init__()
@@ -63,11 +59,7 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
 
 
 def actor_of(model: Any) -> torch.nn.Module:
-    """Returns the acting part of a trained model, without exploration.
-
-    The model is an algorithm or policy of Stable-Baselines3 (PPO, A2C, SAC), or any module that
-    maps observations (n, O) to raw actions (n, C) or logits (n, A); else ConfigError is raised.
-    """
+    """Returns the acting part of a PPO, A2C or SAC, or module like `Actor`, else ConfigError."""
     policy = getattr(model, "policy", model)
     if hasattr(policy, "action_net") and hasattr(policy, "mlp_extractor"):
         latent = policy.mlp_extractor.policy_net
@@ -83,19 +75,14 @@ def actor_of(model: Any) -> torch.nn.Module:
 
 
 def export_policy(
-    model: Any,
-    task: Task,
-    simulator_model: SimulatorModel,
-    path: str | Path,
-    normaliser: Normaliser | None = None,
-    provenance: Mapping[str, Any] | None = None,
-) -> PolicyFile:
+    model: Any, task: Task, simulator_model: SimulatorModel, path: str | Path,
+    normaliser: Normaliser | None = None, provenance: Mapping[str, Any] | None = None,
+) -> PolicyFile:  # fmt: skip
     """Writes a trained model (see `actor_of`) as a policy file, and loads it as a robot would.
 
-    Task and simulator model are those of its training. The normaliser is the mean (O,), standard
-    deviation (O,) and limit of the normalised observations; None if the model has its own. The
-    provenance is command, seed and so on, as strings and numbers. Raises ConfigError if the model
-    can't be exported, PolicyError if the file does not reproduce its outputs.
+    The normaliser is mean (O,), standard deviation (O,) and limit of the normalised observations;
+    None if the model has its own. Raises ConfigError if the model can't be exported, PolicyError if
+    the file does not reproduce its outputs.
     """
     file = Path(path)
     if file.suffix != SUFFIX:

@@ -22,11 +22,9 @@ Observation = NDArray[np.float32]
 class TrainVecEnv(VecEnv):
     """Feeds Stable-Baselines3 from a `BridgeVectorEnv`, or from several with equal spaces.
 
-    The observations are the vector env's own array of the step; only worlds that ended are handled
-    one by one: their `terminal_observation`, `TimeLimit.truncated`, `is_success` and `collision` in
-    `infos`. The envs have the `autoreset_mode` `SameStep`, and `copy`, as the algorithms keep the
-    last observation over a step. `stepping_s` is the wall time spent in them [s]. Raises
-    ConfigError for an env with other arguments, or envs that do not fit together.
+    Only worlds that ended are handled one by one: their `terminal_observation`, `is_success`,
+    `TimeLimit.truncated` and `collision` in `infos`. `stepping_s` is the wall time spent in the
+    envs [s]. Raises ConfigError for envs without `SameStep` and `copy`, or that differ.
     """
 
     def __init__(self, *envs: BridgeVectorEnv) -> None:

@@ -13,54 +13,38 @@ Share = Annotated[float, Field(gt=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=1, le=10**12)]
 MOST_WORLDS = 65_536  # maximum number of copies of all worlds together
 MOST_LAYERS, MOST_WIDE = 16, 8_192
-MOST_KEPT = 2**26
-"""Maximum number of stored transitions: of a roll-out in all worlds, or of SAC's buffer."""
+MOST_KEPT = 2**26  # stored transitions: of a roll-out in all worlds, or of SAC's buffer
 Width = Annotated[int, Field(ge=1, le=MOST_WIDE)]
 
 
 class PpoSettings(Schema):
-    """Proximal policy optimisation (Schulman and others 2017), as in Stable-Baselines3.
+    """Proximal policy optimisation (Schulman and others 2017), as in Stable-Baselines3."""
 
-    The learning rate is that at the start and falls linearly to a fiftieth. `rollout` is the steps
-    in each world between two updates, `batch` the transitions of one gradient step, `epochs` the
-    passes of an update through the roll-outs, `log_std` that of the actions at the start.
-    """
-
-    learning_rate: float = Field(default=1e-3, gt=0.0)
-    rollout: Count = 32
-    batch: Count = 2048
-    epochs: Count = 5
+    learning_rate: float = Field(default=1e-3, gt=0.0)  # at the start; falls linearly to a fiftieth
+    rollout: Count = 32  # steps in each world between two updates
+    batch: Count = 2048  # transitions of one gradient step
+    epochs: Count = 5  # passes of an update through the roll-outs
     discount: Share = 0.98
     gae_lambda: Share = 0.95
     clip: float = Field(default=0.2, gt=0.0)
     entropy: float = Field(default=0.0, ge=0.0)
-    log_std: float = -0.5
+    log_std: float = -0.5  # of the actions at the start
 
 
 class SacSettings(Schema):
-    """Soft actor-critic (Haarnoja and others 2018), as in Stable-Baselines3.
-
-    `buffer` is the transitions that are stored of all worlds together, `batch` those of one
-    gradient step, `begin_after` those of random actions before the first update. `updates` gradient
-    steps follow each step of the worlds; each moves the target critics by the share `soft_update`.
-    """
+    """Soft actor-critic (Haarnoja and others 2018), as in Stable-Baselines3."""
 
     learning_rate: float = Field(default=1e-3, gt=0.0)
-    buffer: Count = 300_000
-    batch: Count = 512
-    updates: Count = 8
-    begin_after: Count = 5_000
+    buffer: Count = 300_000  # transitions that are stored of all worlds together
+    batch: Count = 512  # transitions of one gradient step
+    updates: Count = 8  # gradient steps after each step of the worlds
+    begin_after: Count = 5_000  # transitions of random actions before the first update
     discount: Share = 0.98
-    soft_update: Share = 0.01
+    soft_update: Share = 0.01  # by which each gradient step moves the target critics
 
 
 class TrainingSettings(Schema):
-    """A training, as in `config/training/*.yaml`.
-
-    `worlds` maps names of shipped ones or YAML files to numbers of copies. Actor and critic have
-    hidden layers of the same widths, but share none. Sums over several threads of PyTorch round
-    differently from those of one.
-    """
+    """A training, as in `config/training/*.yaml`; `worlds` maps names or files to their copies."""
 
     task: str = "navigation"  # a name, or `path/to/file.py:ClassName`
     task_options: dict[str, Any] = Field(default_factory=dict)  # of the task's class
@@ -106,19 +90,14 @@ class TrainingSettings(Schema):
 
 
 def load_training(name: str | Path) -> TrainingSettings:
-    """Loads settings by the name of a shipped file (`navigation_differential`), or by path.
-
-    Raises ConfigError if there is no such file, or something in it is wrong.
-    """
+    """Loads settings by the name of a shipped file, or by path. Raises ConfigError."""
     return load_yaml(find_config(name, "training"), TrainingSettings)
 
 
 def chosen_settings(task: str, name: str | None, changes: dict[str, Any]) -> TrainingSettings:
-    """Settings chosen by the user.
+    """Settings by name or file, else those shipped for task and robot, with changes by the user.
 
-    `name` is that of shipped settings, or a YAML file; by default those of task and robot if they
-    are shipped, else the defaults. `changes` are further keys of `TrainingSettings`; and `world`,
-    names that share the number of worlds. Raises ConfigError for an unknown name or a wrong value.
+    `changes` are keys of `TrainingSettings`, and `world`: names that share the number of worlds.
     """
     robot = str(changes.get("robot", "differential"))
     shipped = {path.stem for path in (share_folder() / "config" / "training").glob("*.yaml")}

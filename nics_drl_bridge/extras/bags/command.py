@@ -46,10 +46,9 @@ def record(
         kind = _storage(storage)
         with needs_ros("nics bag record"):
             from nics_drl_bridge.extras.bags.live import BagOrder, record_bag
-        order = BagOrder(
-            out, tuple(topics or ()), everything, namespace, duration, kind, use_sim_time
-        )
-        counts = record_bag(order, lambda line: typer.echo(line, err=True))
+        names, say = tuple(topics or ()), partial(typer.echo, err=True)
+        order = BagOrder(out, names, everything, namespace, duration, kind, use_sim_time)
+        counts = record_bag(order, say)
         for topic, count in sorted(counts.items()):
             typer.echo(f"{topic}: {count} messages")
         typer.echo(f"bag written to {out}")

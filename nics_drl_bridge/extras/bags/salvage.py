@@ -77,8 +77,7 @@ def salvage(path: str | Path, out: str | Path, storage: Storage = "mcap") -> Sal
 
     From an MCAP file these are all chunks with a correct checksum, or, in chunks without one, all
     messages before the damage; from an SQLite file all readable rows. Messages that can't be
-    decoded are dropped. The hidden folder that a killed recorder leaves is accepted too.
-    Raises RecordingError: nothing is intact, or `out` exists already.
+    decoded are dropped. Raises RecordingError: nothing is intact, or `out` exists already.
     """
     path, found = Path(path), _Found()
     for file in _files(path):
@@ -110,7 +109,7 @@ def salvaged(path: Path) -> Iterator[tuple[Path, tuple[str, ...]]]:
 
 
 def _files(path: Path) -> list[Path]:
-    """Returns the files of a bag; in the folder of a killed recorder they are one level deeper."""
+    # In the hidden folder that a killed recorder leaves, the files are one level deeper.
     if not path.exists():
         raise RecordingError(f"{path}: no such bag; check the path.")
     files = [path] if path.is_file() else sorted(path.rglob("*"), key=_number)
@@ -124,8 +123,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _number(file: Path) -> tuple[int, str]:
-    """Sorts `drive_10` after `drive_9`."""
-    digits = file.stem.rpartition("_")[2]
+    digits = file.stem.rpartition("_")[2]  # `drive_10` comes after `drive_9`
     return int(digits) if digits.isdecimal() else -1, str(file)
 
 
@@ -194,7 +192,6 @@ def _read_mcap(file: Path, found: _Found) -> None:
 
 
 def _cut_chunk(data: memoryview, place: int) -> list[mcap.Record]:
-    """Returns the records of a plain chunk that is cut off or whose length is wrong."""
     start = place + mcap.PREFIX + 40
     if data[place] != Opcode.CHUNK or start >= len(data):
         return []
@@ -265,8 +262,7 @@ def _read_database(file: Path, found: _Found) -> None:
 
 
 def _drop_cut_page(copy: Path) -> None:
-    """Removes a truncated last page, which SQLite would silently fill with zeros."""
-    with copy.open("r+b") as file:
+    with copy.open("r+b") as file:  # SQLite would silently fill a cut page with zeros
         size = int.from_bytes(file.read(18)[16:], "big")
         size = 65536 if size == 1 else size
         if size >= SMALLEST_PAGE and size & (size - 1) == 0:

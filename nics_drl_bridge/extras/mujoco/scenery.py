@@ -38,10 +38,7 @@ def compile_scene(
     mujoco: Any, machine: Machine, physics: Physics, footprint: Shape, robots: int, world: World,
     sampler: SceneSampler, bodies: Array,
 ) -> Any:  # fmt: skip
-    """Compiles the model of robots of one kind, with a circle or polygon as footprint, in a world.
-
-    Obstacles (K, 7), as in `lidar.shapes.BODY`, that move have prescribed poses (mocap).
-    """
+    """Compiles robots of one kind in a world; bodies (K, 7) that move have prescribed poses."""
     spec = mujoco.MjSpec.from_string(machine.xml)
     maker = _Maker(mujoco, spec, physics)
     maker.bumper(spec.body("base_link"), footprint)
@@ -75,7 +72,7 @@ class _Maker:
         self._solref = [physics.softness, 1.0]
 
     def bumper(self, base: Any, footprint: Shape) -> None:
-        """Adds the footprint of a robot, without mass, which belongs to the chassis."""
+        # Without mass, which belongs to the chassis.
         half, own = 0.5 * float(base.pos[2]), {"contype": BUMPER, "mass": 0.0}
         if isinstance(footprint, Circle):
             # Its round edge touches a wall in one point, at the height of the axles.
@@ -164,11 +161,7 @@ def _is_ear(outline: Array, rest: list[int], i: int) -> bool:
 
 
 def rectangles(blocked: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Rectangles (R, 4) that together cover exactly the blocked cells (rows, columns) of a map.
-
-    Each is first row, first column, and those after the last. They are runs along the rows; equal
-    runs in consecutive rows are merged.
-    """
+    """Rectangles (R, 4) of blocked cells: first row, first column, and those after the last."""
     done: list[tuple[int, int, int, int]] = []
     open_runs: dict[tuple[int, int], int] = {}
     framed = np.pad(blocked, ((0, 1), (1, 1)))

@@ -99,11 +99,7 @@ class Rollout:
 
 
 class WorldsRunner(SingleAgentEnvRunner):
-    """Steps its share of the worlds of a training.
-
-    `env_config` contains `make` (a reference to a function of runner and number of runners that
-    makes a TrainVecEnv), `rollout` (T), `seed` (two numbers) and `threads`.
-    """
+    """Steps its share of the worlds of a training; `env_config` is made by `_algorithm`."""
 
     def make_env(self) -> None:
         """Makes the worlds of this runner; each runner draws different episodes."""
@@ -205,8 +201,7 @@ def connected(address: str | None, runners: int | None, worlds: int) -> Iterator
     """Connects with a cluster, and yields the number of env runners, by default its CPUs.
 
     The address is `auto` (the cluster that this machine is part of) or `HOST:PORT`; None starts one
-    on this machine, which ends with the training. Raises ConfigError if no cluster answers there,
-    or it is too small.
+    here, for the training. Raises ConfigError if none answers there, or it is too small.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     # A lost worker is no error here, and Ray's messages about it would disturb the progress bar.
@@ -220,10 +215,9 @@ def connected(address: str | None, runners: int | None, worlds: int) -> Iterator
         ray.init(address or "local", log_to_driver=False, logging_level="ERROR", **local)
     except (OSError, OverflowError, ValueError, RuntimeError) as error:
         first = str(error).strip().partition("\n")[0].rstrip(".")
-        raise ConfigError(
-            f"--address {address}: no Ray cluster answers ({first}); start one on the first "
-            "machine with 'ray start --head', and name the HOST:PORT that it prints."
-        ) from None
+        fix = "start one with 'ray start --head', and name the HOST:PORT that it prints."
+        reason = f"no Ray cluster answers ({first}); {fix}"
+        raise ConfigError(f"--address {address}: {reason}") from None
     try:
         yield _runners(runners, int(ray.cluster_resources().get("CPU", 0)), worlds)
     finally:
@@ -234,15 +228,11 @@ def _runners(runners: int | None, cpus: int, worlds: int) -> int:
     if runners is None:
         return max(1, min(cpus, worlds))
     if runners > cpus:
-        raise ConfigError(
-            f"--env-runners {runners}: the cluster has {cpus} CPUs, and each env runner takes one; "
-            "add machines with 'ray start', or ask for fewer."
-        )
+        fix = "each env runner takes one; add machines with 'ray start', or ask for fewer."
+        raise ConfigError(f"--env-runners {runners}: the cluster has {cpus} CPUs, and {fix}")
     if runners > worlds:
-        raise ConfigError(
-            f"--env-runners {runners}: the settings have {worlds} worlds to share; give them more, "
-            "or ask for fewer."
-        )
+        fix = "give them more, or ask for fewer."
+        raise ConfigError(f"--env-runners {runners}: the settings have {worlds} worlds; {fix}")
     return runners
 
 
@@ -252,15 +242,14 @@ def train_on_ray(
 ) -> train.Trained:  # fmt: skip
     """Trains one policy on the cluster that this process is connected to.
 
-    An env runner whose process or machine is lost is restarted, if necessary on another machine;
-    the others continue meanwhile. The steps that are learned from then depend on the time of the
-    loss: two runs with one seed agree only as long as no runner is lost. The arguments are those of
-    `policy.train.train`; `tell` is called after each roll-out. Raises ConfigError if the settings
-    are inconsistent, no checkpoint fits them, or no env runner answers.
+    A lost env runner is restarted, if necessary on another machine; two runs with one seed agree
+    only as long as none is lost. The arguments are those of `policy.train.train`. Raises
+    ConfigError if the settings are inconsistent, no checkpoint fits them, or no runner answers.
     """
     if settings.algorithm != "ppo":
-        given = settings.algorithm
-        raise ConfigError(f"--engine ray learns with ppo, not {given!r}; leave it out.")
+        raise ConfigError(
+            f"--engine ray learns with ppo, not {settings.algorithm!r}; leave it out."
+        )
     begin, path = time.perf_counter(), folder / train.CHECKPOINT
     about: dict[str, Any] = {"seed": seed, "settings": settings.model_dump(mode="json")}
     content = read_checkpoint(path, FORMAT) if resumed else None
@@ -341,10 +330,8 @@ class Learning:
     def _check_silence(self, silent_s: float, about: dict[str, Any]) -> None:
         if silent_s > SILENCE_S:
             self.save(about)
-            raise ConfigError(
-                f"no env runner has answered for {silent_s:.0f} s; look at the machines with "
-                f"'ray status', and go on from {self.path} with --resume."
-            )
+            fix = f"look at 'ray status', and go on from {self.path} with --resume."
+            raise ConfigError(f"no env runner has answered for {silent_s:.0f} s; {fix}")
 
     def _progress(self, first: int, taken: float) -> Progress:
         ended, *counts = np.sum(list(self.recent), axis=0)
