@@ -19,10 +19,11 @@ WIDEST = 10_000
 
 RobotOption = Annotated[str, Option(help="A shipped robot (ackermann) or a YAML file.")]
 WorldOption = Annotated[
-    str, Option("--world", "--scene", help="A shipped world (arena) or a YAML file.")
+    str, Option("--world", "--scene", help="Shipped world (arena) or YAML file.")
 ]
-TopicsOption = Annotated[
-    Path | None, Option(help="YAML file that says which topic of a bag plays which role.")
+TopicsOption = Annotated[Path | None, Option(help="YAML file: a bag's topic for each role.")]
+SalvageOption = Annotated[
+    bool, Option("--salvage", help="Take what is intact of a damaged bag, and tell the rest.")
 ]
 TopicOption = Annotated[
     list[str] | None,

@@ -9,37 +9,36 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
-from nics_drl_bridge.commands.console import intact, needs_ros, one_sentence, roles_of, table
+from nics_drl_bridge.commands.console import (
+    SalvageOption,
+    intact,
+    needs_ros,
+    one_sentence,
+    roles_of,
+    table,
+)
 
 bag = typer.Typer(help="Records, describes, replays and saves bags.", no_args_is_help=True)
 
 STORAGES = ("mcap", "sqlite3")
-BagArgument = Annotated[Path, typer.Argument(help="Folder or file of a rosbag2.")]
-SalvageOption = Annotated[
-    bool, typer.Option("--salvage", help="Take what is intact of a damaged bag, and tell the rest.")
-]
-StorageOption = Annotated[
-    str, typer.Option(help="mcap, which carries checksums, or sqlite3.", metavar="mcap|sqlite3")
-]
-NamespaceOption = Annotated[str, typer.Option(help="Namespace of the robot's topics.")]
+BagArgument = Annotated[Path, Argument(help="Folder or file of a rosbag2.")]
+StorageOption = Annotated[str, Option(help="mcap (checksums) or sqlite3.", metavar="mcap|sqlite3")]
+NamespaceOption = Annotated[str, Option(help="Namespace of the robot's topics.")]
 
 
 @bag.command()
 def record(
-    out: Annotated[Path, typer.Argument(help="Folder of the bag to write.")],
-    topics: Annotated[
-        list[str] | None, typer.Option(help="A topic to record; may be given several times.")
-    ] = None,
-    everything: Annotated[bool, typer.Option("--all", help="Record every topic.")] = False,
+    out: Annotated[Path, Argument(help="Folder of the bag to write.")],
+    topics: Annotated[list[str] | None, Option(help="A topic to record; repeatable.")] = None,
+    everything: Annotated[bool, Option("--all", help="Record every topic.")] = False,
     namespace: NamespaceOption = "",
     duration: Annotated[
-        float | None, typer.Option(min=0.0, help="Stop after so long [s]; else at Ctrl-C.")
+        float | None, Option(min=0.0, help="Stop after so long [s]; else at Ctrl-C.")
     ] = None,
     storage: StorageOption = "mcap",
-    use_sim_time: Annotated[
-        bool, typer.Option("--use-sim-time", help="Take times of receipt from /clock.")
-    ] = False,
+    use_sim_time: Annotated[bool, Option("--use-sim-time", help="Receipts by /clock.")] = False,
 ) -> None:
     """Records the topics of a robot as they are, without driving it."""
     with one_sentence():
@@ -57,7 +56,7 @@ def record(
 @bag.command()
 def info(
     path: BagArgument,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: Annotated[bool, Option("--json", help="Print one JSON object.")] = False,
     salvage: SalvageOption = False,
 ) -> None:
     """Tells what is in a bag: topics, rates, gaps, and whose clock stamped them."""
@@ -78,33 +77,28 @@ def info(
 @bag.command()
 def replay(
     path: BagArgument,
-    rate: Annotated[float, typer.Option(min=0.001, help="Seconds of the bag per second.")] = 1.0,
-    loop: Annotated[bool, typer.Option("--loop", help="Begin anew at the end.")] = False,
-    clock: Annotated[bool, typer.Option(help="Publish the bag's time on /clock.")] = True,
-    topics: Annotated[
-        list[str] | None, typer.Option(help="Play this topic only; may be given several times.")
-    ] = None,
-    namespace: Annotated[str, typer.Option(help="Put in front of the topics' names.")] = "",
+    rate: Annotated[float, Option(min=0.001, help="Seconds of the bag per second.")] = 1.0,
+    loop: Annotated[bool, Option("--loop", help="Begin anew at the end.")] = False,
+    clock: Annotated[bool, Option(help="Publish the bag's time on /clock.")] = True,
+    topics: Annotated[list[str] | None, Option(help="Play this topic only; repeatable.")] = None,
+    namespace: Annotated[str, Option(help="Put in front of the topics' names.")] = "",
     lockstep: Annotated[
-        str | None,
-        typer.Option(metavar="NODE", help="Wait after each message until this node has taken it."),
+        str | None, Option(metavar="NODE", help="Wait after each message till this node has it.")
     ] = None,
     estimate: Annotated[
-        bool, typer.Option("--estimate", help="Run the middleware on it in process instead.")
+        bool, Option("--estimate", help="Run the middleware on it in process instead.")
     ] = False,
     model: Annotated[
-        str, typer.Option(help="For --estimate: folder of a model, or a shipped robot.")
+        str, Option(help="For --estimate: folder of a model, or a shipped robot.")
     ] = "ackermann",
     topic: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="ROLE=TOPIC",
             help="For --estimate: as odom=/wheel_odom. Roles: scan, odom, cmd_vel, pose, imu.",
         ),
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="For --estimate: .npz or .csv file to write.")
-    ] = None,
+    out: Annotated[Path | None, Option(help="For --estimate: .npz or .csv to write.")] = None,
     salvage: SalvageOption = False,
 ) -> None:
     """Plays a bag over ROS 2, or gives the estimate that the middleware makes of it."""
@@ -132,7 +126,7 @@ def replay(
 @bag.command()
 def salvage(
     path: BagArgument,
-    out: Annotated[Path, typer.Argument(help="Folder of the bag to write.")],
+    out: Annotated[Path, Argument(help="Folder of the bag to write.")],
     storage: StorageOption = "mcap",
 ) -> None:
     """Writes what is intact of a damaged bag as a new one, and says how much is lost."""
