@@ -291,11 +291,10 @@ class FleetBackend:
 
 def together(facts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Merges the facts of M robots: equal values stay as they are, others become (M, ...)."""
+    values = {name: [each[name] for each in facts] for name in facts[0]}
     return {
-        name: value
-        if all(np.array_equal(value, each[name]) for each in facts)
-        else np.stack([each[name] for each in facts])
-        for name, value in facts[0].items()
+        name: every[0] if all(np.array_equal(every[0], one) for one in every) else np.stack(every)
+        for name, every in values.items()
     }
 
 

@@ -191,9 +191,9 @@ class CommandGate(qos.QosWatch):
         self._state = begin(self._config)
         self._log = GateLog(self._config, declare_black_box(self), model.robot.name, logger)
         if not self._config.e_stop_required:
+            risk = "an e_stop that was never heard does not stop the robot"
             logger.warning(
-                "e_stop_required is false: an e_stop that was never heard does not stop the robot. "
-                "That is for simulations; set it on a vehicle."
+                f"e_stop_required is false: {risk}. For simulations; set it on a vehicle."
             )
         if self._config.shield is not None:
             shield.rehearse()

@@ -128,9 +128,8 @@ class Link:
     ) -> None:
         """Waits until all peers are matched. Raises BackendError with what is missing."""
         node, commands = self.node, self.commands
-        needed: dict[str, Callable[[], Any]] = {
-            f"subscriber of {commands.topic_name}": commands.get_subscription_count
-        }
+        needed = dict[str, Callable[[], Any]]()
+        needed[f"subscriber of {commands.topic_name}"] = commands.get_subscription_count
         for name in map(node.resolve_topic_name, topics):
             needed[f"publisher of {name}"] = partial(node.count_publishers, name)
         for client in clients:
@@ -232,13 +231,10 @@ class EpisodeServices:
 
     def begin(self, start: Start, timeout_s: float) -> int:
         """Begins an episode; returns the stamp of its first data [ns]. Raises BridgeError."""
-        chosen = {
-            "episode_seed": int(start.seed), "episode_start": start.pose.ravel().tolist(),
-            "episode_start_given": True,
-        }  # fmt: skip
-        request = SetParametersAtomically.Request(
-            parameters=[Parameter(name, value=it).to_parameter_msg() for name, it in chosen.items()]
-        )
+        seed, pose = int(start.seed), start.pose.ravel().tolist()
+        chosen = {"episode_seed": seed, "episode_start": pose, "episode_start_given": True}
+        given = [Parameter(name, value=it).to_parameter_msg() for name, it in chosen.items()]
+        request = SetParametersAtomically.Request(parameters=given)
         result = self._link.call(self._parameters, request, timeout_s).result
         if not result.successful:
             raise BackendError(f"the simulator refused the episode: {result.reason}")

@@ -70,9 +70,7 @@ class PolicyNode(ManagedNode):
         self._raw = self.create_lifecycle_publisher(TwistStamped, "cmd_vel_raw", qos.COMMAND)
         goals = self.create_subscription(PoseStamped, "goal_pose", self._on_goal, qos.COMMAND)
         self.undo.callback(self.destroy_subscription, goals)
-        self._topics = RobotTopics(
-            self, model, on_odometry=self._act, on_scan=self._act, on_lidar=self._on_lidar
-        )
+        self._topics = RobotTopics(self, model, self._act, self._act, self._on_lidar)
         self.undo.callback(self._topics.close)
         timer = runner.steadily(self, POLLS * model.control_period, self._act)
         self.undo.callback(self.destroy_timer, timer)
@@ -82,9 +80,8 @@ class PolicyNode(ManagedNode):
         runner.last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
 
     def _declared_pace(self, control_period: float) -> tuple[ActionPace, Deadline]:
-        rate, limit, patience = (
-            self.get_parameter(name).value for name in ("rate", "deadline", "late_limit")
-        )
+        names = ("rate", "deadline", "late_limit")
+        rate, limit, patience = (self.get_parameter(name).value for name in names)
         if rate < 0.0 or limit <= 0.0 or patience < 1:
             given = f"parameters rate {rate}, deadline {limit}, late_limit {patience}"
             raise ConfigError(f"{given}: must be at least 0, more than 0, and at least 1.")
@@ -103,9 +100,8 @@ class PolicyNode(ManagedNode):
         self._open_policy(replace(self._model, lidar=lidar))
         begin, end = np.degrees([lidar.angles[0], lidar.angles[-1]])
         done = "used" if self._task.scan is None else "resampled"
-        self.get_logger().info(
-            f"scans of {lidar.beams} beams from {begin:.4g} to {end:.4g} deg are {done}"
-        )
+        span = f"from {begin:.4g} to {end:.4g} deg"
+        self.get_logger().info(f"scans of {lidar.beams} beams {span} are {done}")
 
     def _on_goal(self, message: PoseStamped) -> None:
         self._goal = np.array([message.pose.position.x, message.pose.position.y])
@@ -127,10 +123,8 @@ class PolicyNode(ManagedNode):
         twist = self._twist()
         answer = self._deadline.judge(time.monotonic() - begin_s)
         if answer is not Answer.SEND:
-            self.get_logger().warning(
-                f"inference was late ({self._deadline.late} so far), its command is dropped",
-                throttle_duration_sec=5.0,
-            )
+            told = f"inference was late ({self._deadline.late} so far), its command is dropped"
+            self.get_logger().warning(told, throttle_duration_sec=5.0)
         if answer is not Answer.DROP:
             sent = twist if answer is Answer.SEND and np.isfinite(twist).all() else np.zeros(3)
             self._raw.publish(self._message(sent, scan_ns))
@@ -164,9 +158,9 @@ class PolicyNode(ManagedNode):
             self.get_logger().debug(traceback.format_exc())
             place = traceback.extract_tb(error.__traceback__)[-1]
             words = shortened(f"{type(error).__name__}: {error}", LONGEST_REASON)
-            where, name = (
-                f"{place.filename}, line {place.lineno}",
+            name, where = (
                 self.get_parameter("policy").value,
+                f"{place.filename}, line {place.lineno}",
             )
             fix = "the robot is stopped, mend the policy."
             raise BridgeError(f"policy {name!r} raised {words} ({where}); {fix}") from error

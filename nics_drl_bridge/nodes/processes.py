@@ -118,9 +118,8 @@ class Witness(AbstractContextManager["Witness", None]):
         self._context = open_context(domain_id=domain_id)
         self._node = Node("witness", context=self._context, start_parameter_services=False)
         self._node.create_subscription(Odometry, topic, self._take, qos.SENSOR_RELIABLE)
-        self._thread = threading.Thread(
-            target=spin, args=(self._node, threading.Event()), daemon=True, name="witness"
-        )
+        given = self._node, threading.Event()
+        self._thread = threading.Thread(target=spin, args=given, daemon=True, name="witness")
         self._thread.start()
 
     def _take(self, message: Odometry) -> None:

@@ -8,6 +8,7 @@ for late joiners (volatile): a robot's old data mislead.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 from rclpy import qos as rclpy_qos
@@ -74,18 +75,15 @@ class QosWatch(Node):
 
     def publisher_events(self, topic: str, qos: Any) -> PublisherEventCallbacks:
         """Returns the callbacks for a publisher that rclpy makes without `create_publisher`."""
-        return PublisherEventCallbacks(
-            incompatible_qos=lambda event: self._warn(event, topic, qos, publishing=True)
-        )
+        warn = partial(self._warn, topic=topic, qos=qos, publishing=True)
+        return PublisherEventCallbacks(incompatible_qos=warn)
 
     def create_subscription(
         self, kind: Any, topic: str, callback: Any, qos: Any, **options: Any
     ) -> Subscription:
         """Creates a subscription; see rclpy."""
-        watched = SubscriptionEventCallbacks(
-            incompatible_qos=lambda event: self._warn(event, topic, qos, publishing=False)
-        )
-        options = {"event_callbacks": watched} | options
+        warn = partial(self._warn, topic=topic, qos=qos, publishing=False)
+        options = {"event_callbacks": SubscriptionEventCallbacks(incompatible_qos=warn)} | options
         return super().create_subscription(kind, topic, callback, qos, **options)
 
     def _warn(self, event: Any, topic: str, qos: Any, publishing: bool) -> None:
@@ -98,15 +96,12 @@ class QosWatch(Node):
             ours = qos if isinstance(qos, QoSProfile) else QoSProfile(depth=qos)
             name, theirs = self._misfit(resolved, ours, publishing)
             own, other = (_value(profile, policy) for profile in (ours, theirs))
-            offered, asked, cure = (
-                (own, other, f"{name} ask for {own}")
-                if publishing
-                else (other, own, f"{name} offer {own}, or put a relay between")
-            )
+            offered, asked = (own, other) if publishing else (other, own)
+            cure = f"ask for {own}" if publishing else f"offer {own}, or put a relay between"
             self.get_logger().warning(
                 f"{resolved}: no message passes between this node and {name}: the {policy.lower()} "
                 f"that the publisher offers ({offered}) is less than what the subscription asks "
-                f"for ({asked}); let {cure}."
+                f"for ({asked}); let {name} {cure}."
             )
 
         timer = self.create_timer(MOMENT_S, say, clock=Clock(clock_type=ClockType.STEADY_TIME))

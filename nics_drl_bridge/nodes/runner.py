@@ -270,9 +270,8 @@ def diagnose(node: Node, part: str, look: Callable[[], Condition]) -> None:
         found = look()
         level = DiagnosticStatus.WARN if found.warns else DiagnosticStatus.OK
         values = [KeyValue(key=key, value=str(value)) for key, value in found.facts.items()]
-        status = DiagnosticStatus(
-            level=level, name=name, message=found.message, hardware_id=found.hardware, values=values
-        )
+        status = DiagnosticStatus(level=level, name=name, message=found.message, values=values)
+        status.hardware_id = found.hardware
         message = DiagnosticArray(status=[status])
         message.header.stamp = node.get_clock().now().to_msg()
         topic.publish(message)

@@ -204,10 +204,8 @@ class CommandInlet:
         stamp_ns = conversions.stamp_from_ros(stamp)
         if not stamp_ns or not self._too_old(stamp_ns):
             return True
-        self._complain(
-            "a command is ignored, because its stamp is older than command_timeout; do both ends "
-            "take their time from the same clock (use_sim_time)?"
-        )
+        why = "its stamp is older than command_timeout; do both ends use one clock (use_sim_time)?"
+        self._complain(f"a command is ignored, because {why}")
         return False
 
     def _complain(self, what: str) -> None:
@@ -288,10 +286,10 @@ class DeviceNode(qos.QosWatch):
     def _open_transforms(self) -> None:
         self._transforms: Any = conversions.message_type("tf2_msgs/msg/TFMessage")
         if self._transforms is None:
-            self.get_logger().warning(
-                "the message package tf2_msgs is not installed, so that neither /tf nor /tf_static "
-                "is published; install it with your ROS 2 distribution."
-            )
+            silent = "so that neither /tf nor /tf_static is published"
+            fix = "install it with your ROS 2 distribution."
+            told = f"the message package tf2_msgs is not installed, {silent}; {fix}"
+            self.get_logger().warning(told)
             return
         self._moving = self.create_publisher(self._transforms, "/tf", qos.TRANSFORMS)
         fixed = self.create_publisher(self._transforms, "/tf_static", qos.FIXED_TRANSFORMS)
@@ -302,10 +300,8 @@ class DeviceNode(qos.QosWatch):
         # Steady: with use_sim_time the node's clock would wait for this very node.
         runner.steadily(self, WATCH_S, self._watch)
         step_ns = self._time.step_ns
-        self._odom_pace, self._scan_pace = (
-            device_parameters.TopicPace(period_ns, step_ns)
-            for period_ns in (self._time.odom_ns, self._time.scan_ns)
-        )
+        self._odom_pace = device_parameters.TopicPace(self._time.odom_ns, step_ns)
+        self._scan_pace = device_parameters.TopicPace(self._time.scan_ns, step_ns)
         self._real_time = device_parameters.RealTime(step_ns, self._time.rate)
         self._timer = None
         self._soon = self.create_guard_condition(self._on_time)
@@ -358,11 +354,9 @@ class DeviceNode(qos.QosWatch):
         steady_ns = time.monotonic_ns()
         if self._real_time.lost(steady_ns, self._now_ns):
             self._lags += 1
-            self.get_logger().warning(
-                "this machine does not keep up with real time; ask for a smaller rate, scan_rate "
-                "or odom_rate, or fewer robots",
-                throttle_duration_sec=5.0,
-            )
+            fix = "ask for a smaller rate, scan_rate or odom_rate, or fewer robots"
+            told = f"this machine does not keep up with real time; {fix}"
+            self.get_logger().warning(told, throttle_duration_sec=5.0)
             self._real_time.begin(steady_ns, self._now_ns + self._time.step_ns)
         behind = self._real_time.behind(steady_ns, self._now_ns)
         if behind:

@@ -133,10 +133,8 @@ class DynamicWindow:
 
 
 POLICIES: dict[str, Callable[[Navigation], Policy]] = {
-    "dynamic_window": DynamicWindow,
-    "random": RandomActions,
-    "straight": StraightToGoal,
-}
+    "dynamic_window": DynamicWindow, "random": RandomActions, "straight": StraightToGoal,
+}  # fmt: skip
 
 
 def shipped_policies() -> list[str]:

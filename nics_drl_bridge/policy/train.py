@@ -175,11 +175,10 @@ def run(
         folder = order.out / f"seed_{seed}"
         begun = (folder / CHECKPOINT).is_file()
         trained = learn(settings, seed, folder, tell, order.resumed and begun)
-        driven = {
-            world: evaluate(trained.algorithm, settings, world, order.episodes, model)
-            for world in settings.worlds
-        }
-        summaries = {w: summarise(one, model.control_period) for w, one in driven.items()}
+        summaries = {}
+        for world in settings.worlds:
+            driven = evaluate(trained.algorithm, settings, world, order.episodes, model)
+            summaries[world] = summarise(driven, model.control_period)
         result = SeedResult(seed, trained, summaries)
         plain = {world: dataclasses.asdict(one) for world, one in summaries.items()}
         write_text(folder / EVALUATION, json.dumps(plain, indent=2) + "\n")

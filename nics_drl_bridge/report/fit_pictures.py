@@ -96,9 +96,8 @@ def held_out_paths(identified: Identified) -> bytes:
     """Draws open-loop predictions on unseen data and the measured paths, from the same start."""
     drive, calibration, pose = identified.drive, identified.calibration, identified.recording.pose
     free = max(drive.duration_s - identified.train_until_s - HORIZON_S, 0.0)
-    chosen = windows(
-        drive, calibration, identified.train_until_s, drive.duration_s, HORIZON_S, free / PATHS
-    )
+    span = identified.train_until_s, drive.duration_s
+    chosen = windows(drive, calibration, *span, HORIZON_S, free / PATHS)
     predicted = _predicted(identified, chosen)
     count = min(len(predicted), PATHS)
     rows, columns = -(-count // 3), min(count, 3)

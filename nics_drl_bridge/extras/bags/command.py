@@ -11,14 +11,8 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge.commands.console import (
-    SalvageOption,
-    intact,
-    needs_ros,
-    one_sentence,
-    roles_of,
-    table,
-)
+from nics_drl_bridge.commands import console
+from nics_drl_bridge.commands.console import SalvageOption, intact, needs_ros, one_sentence
 
 bag = typer.Typer(help="Records, describes, replays and saves bags.", no_args_is_help=True)
 
@@ -71,7 +65,7 @@ def info(
         span, size = f"{told.duration_s:.3f} s", f"{told.size_bytes / 1e6:.2f} MB"
         typer.echo(f"{path}: {told.messages} messages in {span}, {size}")
         heads = ("topic", "type", "count", "Hz", "from, to [s]", "gaps", "clock", "delay [ms]")
-        typer.echo(table(heads, [_row(each) for each in told.topics]))
+        typer.echo(console.table(heads, [_row(each) for each in told.topics]))
 
 
 @bag.command()
@@ -107,7 +101,7 @@ def replay(
             from nics_drl_bridge.generator import open_model
             from nics_drl_bridge.middleware import playback
 
-            made = playback.estimate(whole, open_model(model), roles_of(topic or []))
+            made = playback.estimate(whole, open_model(model), console.roles_of(topic or []))
             if out is not None:
                 playback.write_estimate(made, out)
             for reason, count in sorted(made.rejected.items()):

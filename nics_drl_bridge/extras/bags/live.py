@@ -106,9 +106,8 @@ class BagRecorder(QosWatch):
         if not publishers or topic in self.skipped:
             return
         offers = [offer_of(info.qos_profile) for info in publishers]
-        wanted = Offer(
-            QUEUE, all(o.reliable for o in offers), all(o.transient_local for o in offers)
-        )
+        lasting = all(each.transient_local for each in offers)
+        wanted = Offer(QUEUE, all(each.reliable for each in offers), lasting)
         known = self._heard.get(topic)
         if known is not None and known[0] in (wanted, Offer(QUEUE, False)):
             return
@@ -278,8 +277,5 @@ def _wanted(bag: BagFile, topics: Sequence[str], clock: bool) -> list[str]:
     for name in names:
         if name not in bag.types:
             raise RecordingError(f"{bag.place}: has no topic {name!r}; {nearest(name, bag.types)}")
-    return [
-        topic
-        for topic in sorted(names or bag.types)
-        if topic not in bag.empty and not (clock and topic == CLOCK)
-    ]
+    left_out = {*bag.empty, *([CLOCK] if clock else [])}
+    return [topic for topic in sorted(names or bag.types) if topic not in left_out]

@@ -55,12 +55,9 @@ class Salvage:
             share = 100.0 * self.lost / max(total, 1)
             lost = f" and {self.lost} of {total} are lost ({share:.1f} %)"
         head = f"{sum(self.kept.values())} messages are kept{lost}; they span {self.span_s:.3f} s"
-        topics = (
-            f"  {topic}: {self.kept.get(topic, 0)}"
-            + (f" of {promised[topic]}" if topic in promised else "")
-            for topic in sorted({*self.kept, *promised})
-        )
-        return head, *topics
+        of = {topic: f" of {count}" for topic, count in promised.items()}
+        names = sorted({*self.kept, *promised})
+        return head, *(f"  {name}: {self.kept.get(name, 0)}{of.get(name, '')}" for name in names)
 
 
 @dataclass

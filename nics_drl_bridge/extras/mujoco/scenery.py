@@ -116,9 +116,8 @@ class _Maker:
 
     def _prism(self, body: Any, corners: Array, z: tuple[float, float], **others: Any) -> None:
         mesh = self._spec.add_mesh(name=f"prism_{len(self._spec.meshes)}")
-        mesh.uservert = np.concatenate(
-            [np.column_stack([corners, np.full(len(corners), height)]) for height in z]
-        ).ravel()
+        layers = [np.column_stack([corners, np.full(len(corners), height)]) for height in z]
+        mesh.uservert = np.concatenate(layers).ravel()
         self._add(body, type=self._kinds.mjGEOM_MESH, meshname=mesh.name, **others)
 
     def _add(self, body: Any, **values: Any) -> None:

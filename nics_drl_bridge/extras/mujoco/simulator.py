@@ -212,10 +212,8 @@ class MujocoSimulator(DrivenSimulator):
             bumped = self._bumper_of[data.contact.geom.ravel()]
             touched[bumped[bumped >= 0]] = True
             before, turned = turned, [rig.encoders(data) for rig in rigs]
-            means = [
-                self._machine.state(0.5 * (first + last), (last - first) / part_s)
-                for first, last in zip(before, turned, strict=True)
-            ]
+            both, mean = zip(before, turned, strict=True), self._machine.state
+            means = [mean(0.5 * (first + last), (last - first) / part_s) for first, last in both]
             counted = self._twist(np.array(means))
             wheels = geometry.compose(wheels, geometry.exp(counted * part_s))
         readings = [rig.read(data) for rig in rigs]

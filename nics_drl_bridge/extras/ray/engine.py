@@ -161,12 +161,10 @@ class ActorCritic(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
 
     def setup(self) -> None:
         """Builds the layers."""
-        chosen, size = self.model_config, int(self.observation_space.shape[0])
+        chosen, seen = self.model_config, self.observation_space
         hidden, normaliser = list(chosen["hidden"]), chosen["normaliser"]
-        self.actor = train_algorithms.Actor(
-            self.observation_space, self.action_space, hidden, normaliser
-        )
-        self.critic = train_algorithms.layers_of([size, *hidden, 1], 1.0)
+        self.actor = train_algorithms.Actor(seen, self.action_space, hidden, normaliser)
+        self.critic = train_algorithms.layers_of([int(seen.shape[0]), *hidden, 1], 1.0)
         if not self.actor.discrete:
             spread = torch.full(self.action_space.shape, float(chosen["log_std"]))
             self.log_std = torch.nn.Parameter(spread)
@@ -284,9 +282,8 @@ class Learning:
     @property
     def learner(self) -> Any:
         """RLlib's learner, which runs in this process."""
-        return (
-            self.algorithm.learner_group.foreach_learner(lambda one: one).result_or_errors[0].get()
-        )
+        found = self.algorithm.learner_group.foreach_learner(lambda one: one)
+        return found.result_or_errors[0].get()
 
     @property
     def module(self) -> ActorCritic:
@@ -368,10 +365,8 @@ def _algorithm(settings: TrainingSettings, seed: int, done: int, runners: int) -
     spaces = env.observation_space, env.action_space
     env.close()
     make = ray.put(functools.partial(share_of_worlds, settings, model, scenes))
-    env_config = {
-        "make": make, "rollout": settings.ppo.rollout, "seed": (seed, done),
-        "threads": settings.threads,
-    }  # fmt: skip
+    env_config = {"make": make, "seed": (seed, done), "threads": settings.threads}
+    env_config["rollout"] = settings.ppo.rollout
     config = _config(settings, seed, done, normaliser, spaces).env_runners(
         env_runner_cls=WorldsRunner, num_env_runners=runners, rollout_fragment_length="auto",
         sample_timeout_s=SILENCE_S,
