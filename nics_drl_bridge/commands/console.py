@@ -19,7 +19,7 @@ WIDEST = 10_000
 
 RobotOption = Annotated[str, Option(help="A shipped robot (ackermann) or a YAML file.")]
 WorldOption = Annotated[
-    str, Option("--world", "--scene", help="Shipped world (arena) or YAML file.")
+    str, Option("--world", "--scene", help="A shipped world (arena) or a YAML file.")
 ]
 TopicsOption = Annotated[Path | None, Option(help="YAML file: a bag's topic for each role.")]
 SalvageOption = Annotated[
@@ -120,9 +120,8 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
 
     console = Console(stderr=True)
     columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as progress:
+    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+    with bar as progress:
         task = progress.add_task("", total=None)
         yield lambda what, done, total: progress.update(
             task, description=what, completed=done, total=total or None

@@ -161,10 +161,8 @@ def _trained(plan: DemoPlan, say: Say) -> Learned:
         before = curve[-1].steps if curve else 0
         curve.append(pictures.Point(progress.steps, progress.success, progress.collision))
         if progress.steps * LINES // settings.steps > before * LINES // settings.steps:
-            say(
-                f"  {progress.steps:,} steps: success {100 * progress.success:.1f} %, "
-                f"{progress.steps_per_s:,.0f} steps/s"
-            )
+            speed = f"{progress.steps_per_s:,.0f} steps/s"
+            say(f"  {progress.steps:,} steps: success {100 * progress.success:.1f} %, {speed}")
 
     trained = train(settings, TRAINING_SEED, plan.out / "training", tell)
     result, file = SeedResult(TRAINING_SEED, trained, {}), plan.out / "policy.onnx"
@@ -269,10 +267,9 @@ def _policy(plan: DemoPlan, learned: Learned, summary: Summary) -> list[str]:
     if learned.curve:
         caption = "Success and collisions while it explores; all episodes are new ones."
         blocks.append(pictures.picture(pictures.training_curve(learned.curve), caption))
-    rows = [
-        (name, *(f"{100 * value:.1f} %" for value in astuple(share)))
-        for name, share in summary.shares.items()
-    ]
+    rows = []
+    for name, share in summary.shares.items():
+        rows.append((name, *(f"{100 * value:.1f} %" for value in astuple(share))))
     for name, amount in (("path [m]", summary.length), ("time [s]", summary.time)):
         rows.append((name, *(f"{value:.2f}" for value in astuple(amount))))
     text = (
@@ -319,7 +316,5 @@ def _deployed(
         "processes of their own; nobody stepped them. The robot "
         f"{'reached' if live.result == 'success' else 'did not reach'} its goal."
     )
-    return [
-        pictures.paragraph(text),
-        pictures.picture(drawn, "The true path of the deployed robot beside the lock-step one."),
-    ]
+    caption = "The true path of the deployed robot beside the lock-step one."
+    return [pictures.paragraph(text), pictures.picture(drawn, caption)]

@@ -82,10 +82,8 @@ def env_of(
     """Makes the env of a policy's task with a backend, and opens the policy."""
     register_envs()
     opened, task = open_policy(policy, model)
-    env = gymnasium.make(
-        NAVIGATION, backend=backend, model=model, world=world, task=task, **arguments
-    )
-    return env, opened
+    given = {"backend": backend, "model": model, "world": world, "task": task, **arguments}
+    return gymnasium.make(NAVIGATION, **given), opened
 
 
 def check_place(place: str) -> None:
@@ -265,10 +263,8 @@ def drive_vehicle(
             say(f"  {driven.result}, {driven.steps} steps, {episodes[-1].length:.2f} m")
     env, driver = env_of(policy, model, order.world, "sim", estimator=True)
     with closing(env):
-        again = [
-            drive(env, driver, one.seed, {"start": one.path[0], "goal": one.goal})
-            for one in episodes
-        ]
+        starts = [(one.seed, {"start": one.path[0], "goal": one.goal}) for one in episodes]
+        again = [drive(env, driver, *each) for each in starts]
     made = judged(policy, {VEHICLE: episodes, FAST: again}, model, world, order.out)
     write_evaluation(order.out, name, model, order.world, order.seed, [made])
     return made

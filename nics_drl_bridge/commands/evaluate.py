@@ -67,9 +67,8 @@ def evaluate(
         if hardware:
             options = {"start": start, "namespace": namespace, "pose_type": pose_type}
             with needs_ros("nics evaluate --hardware"):
-                evaluated = [
-                    driving.drive_vehicle(order, place, arm, tell, partial(_ask, yes), **options)
-                ]
+                ask = partial(_ask, yes)
+                evaluated = [driving.drive_vehicle(order, place, arm, tell, ask, **options)]
         else:
             with progress_bar() as advance:
                 evaluated = driving.evaluate(order, tell, advance)

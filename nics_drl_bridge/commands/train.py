@@ -134,9 +134,8 @@ def info(
 
 def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
     lidar, scan, seen = facts["lidar"], facts["scan"], facts["observation"]
-    commands = [
-        f"{c['name']} {c['min']:g} to {c['max']:g} {c['unit']}" for c in facts["robot"]["command"]
-    ]
+    limits = "{name} {min:g} to {max:g} {unit}"
+    commands = [limits.format(**command) for command in facts["robot"]["command"]]
     observed = "the beams of this lidar"
     if scan is not None:
         observed = (
