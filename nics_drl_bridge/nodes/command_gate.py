@@ -191,10 +191,8 @@ class CommandGate(qos.QosWatch):
         self._state = begin(self._config)
         self._log = GateLog(self._config, declare_black_box(self), model.robot.name, logger)
         if not self._config.e_stop_required:
-            risk = "an e_stop that was never heard does not stop the robot"
-            logger.warning(
-                f"e_stop_required is false: {risk}. For simulations; set it on a vehicle."
-            )
+            risk = "an e_stop that was never heard does not stop the robot. That is for simulations"
+            logger.warning(f"e_stop_required is false: {risk}; set it on a vehicle.")
         if self._config.shield is not None:
             shield.rehearse()
         self._out = self.create_publisher(Twist, "cmd_vel", qos.COMMAND)

@@ -104,9 +104,9 @@ def reader_from_ros(message: LaserScan, like: LidarSpec, upside_down: bool = Fal
 
 def odometry_to_ros(
     pose: ArrayLike, twist: ArrayLike, time_ns: int, frames: Sequence[str],
-    variance: tuple[float, float, float, float],
+    variance: tuple[float, float, float, float],  # of position, heading, linear, angular [SI]
 ) -> Odometry:  # fmt: skip
-    """Returns pose (3,), body twist (3,); `variance` of position, heading, linear, angular [SI]."""
+    """Returns pose (3,) and body twist (3,), in a fixed and a body frame, as an Odometry message."""
     x, y, heading = np.asarray(pose, np.float64).tolist()
     message = Odometry(child_frame_id=frames[1])
     message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frames[0]

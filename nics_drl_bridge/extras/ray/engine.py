@@ -213,7 +213,7 @@ def connected(address: str | None, runners: int | None, worlds: int) -> Iterator
         ray.init(address or "local", log_to_driver=False, logging_level="ERROR", **local)
     except (OSError, OverflowError, ValueError, RuntimeError) as error:
         first = str(error).strip().partition("\n")[0].rstrip(".")
-        fix = "start one with 'ray start --head', and name the HOST:PORT that it prints."
+        fix = "start one on the first machine with 'ray start --head', and name its HOST:PORT."
         reason = f"no Ray cluster answers ({first}); {fix}"
         raise ConfigError(f"--address {address}: {reason}") from None
     try:
@@ -245,9 +245,8 @@ def train_on_ray(
     ConfigError if the settings are inconsistent, no checkpoint fits them, or no runner answers.
     """
     if settings.algorithm != "ppo":
-        raise ConfigError(
-            f"--engine ray learns with ppo, not {settings.algorithm!r}; leave it out."
-        )
+        given = settings.algorithm
+        raise ConfigError(f"--engine ray learns with ppo, not {given!r}; leave it out.")
     begin, path = time.perf_counter(), folder / train.CHECKPOINT
     about: dict[str, Any] = {"seed": seed, "settings": settings.model_dump(mode="json")}
     content = read_checkpoint(path, FORMAT) if resumed else None
