@@ -106,7 +106,7 @@ def odometry_to_ros(
     pose: ArrayLike, twist: ArrayLike, time_ns: int, frames: Sequence[str],
     variance: tuple[float, float, float, float],  # of position, heading, linear, angular [SI]
 ) -> Odometry:  # fmt: skip
-    """Returns pose (3,) and body twist (3,), in a fixed and a body frame, as an Odometry message."""
+    """Returns pose (3,) and body twist (3,), in a fixed and a body frame, as an Odometry."""
     x, y, heading = np.asarray(pose, np.float64).tolist()
     message = Odometry(child_frame_id=frames[1])
     message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frames[0]
