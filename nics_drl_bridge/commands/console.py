@@ -21,8 +21,9 @@ RobotOption = Annotated[str, Option(help="A shipped robot (ackermann) or a YAML 
 WorldOption = Annotated[
     str, Option("--world", "--scene", help="A shipped world (arena) or a YAML file.")
 ]
-TopicsOption = Annotated[
-    Path | None, Option(help="YAML file that says which topic of a bag plays which role.")
+TopicsOption = Annotated[Path | None, Option(help="YAML file: a bag's topic for each role.")]
+SalvageOption = Annotated[
+    bool, Option("--salvage", help="Take what is intact of a damaged bag, and tell the rest.")
 ]
 TopicOption = Annotated[
     list[str] | None,
@@ -119,9 +120,8 @@ def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
 
     console = Console(stderr=True)
     columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as progress:
+    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
+    with bar as progress:
         task = progress.add_task("", total=None)
         yield lambda what, done, total: progress.update(
             task, description=what, completed=done, total=total or None

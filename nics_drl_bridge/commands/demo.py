@@ -15,17 +15,12 @@ def demo(
     recording: Annotated[Path | None, Option(help="A drive; by default a textbook one.")] = None,
     out: Annotated[Path, Option(help="Folder for everything the demo writes.")] = Path("runs/demo"),
     robot: Annotated[
-        str | None,
-        Option(
-            help="A shipped robot or a YAML file; by default differential, and the car, ackermann, "
-            "for a recording."
-        ),
+        str | None, Option(help="Shipped, or a YAML file; differential, for a recording ackermann.")
     ] = None,
     world: WorldOption = "arena",
     episodes: Annotated[int, Option(min=1, help="How many, in process and again over DDS.")] = 5,
     policy: Annotated[
-        str | None,
-        Option(help="Train none; drive with a policy file, a shipped one or a baseline."),
+        str | None, Option(help="Train none; drive by a policy file, a shipped one or a baseline.")
     ] = None,
     train_steps: Annotated[int | None, Option(min=1, help="Environment steps to train.")] = None,
 ) -> None:

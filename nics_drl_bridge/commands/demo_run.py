@@ -40,8 +40,7 @@ NEEDED = ("torch", "stable_baselines3", "tensorboard", "onnx", "onnxruntime")
 BASELINE = "dynamic_window"
 LINES = 10  # number of progress reports of a training
 START_S, ARRIVE_S = 60.0, 40.0  # time that a node may take to start, and the robot to arrive
-FULL_COMMAND_S, FULL_RATE_S = 0.3, 0.05
-"""Limits of the demo's gate: time from zero to the maximum command, and to its maximum rate."""
+FULL_COMMAND_S, FULL_RATE_S = 0.3, 0.05  # of the demo's gate, from zero to greatest command, rate
 PANELS = 9  # maximum number of episodes that are drawn
 R = TypeVar("R")
 
@@ -74,12 +73,7 @@ class Learned:
 
 
 def run(plan: DemoPlan, say: Say) -> str:
-    """Generates a simulator, trains a policy in it, drives it over DDS, and writes the report.
-
-    Every process that this starts has ended when it returns or raises. Returns the last line of the
-    demo: successes in process and over DDS, and the path of the report. Raises BridgeError for a
-    bad recording or name, or a node that does not start.
-    """
+    """Runs all parts, whose processes have then ended; returns the last line. BridgeError."""
     if find_spec("rclpy") is None:
         raise ConfigError(f"the demo {MISSING_ROS.format(module='rclpy')}")
     took: dict[str, float] = {}
@@ -167,10 +161,8 @@ def _trained(plan: DemoPlan, say: Say) -> Learned:
         before = curve[-1].steps if curve else 0
         curve.append(pictures.Point(progress.steps, progress.success, progress.collision))
         if progress.steps * LINES // settings.steps > before * LINES // settings.steps:
-            say(
-                f"  {progress.steps:,} steps: success {100 * progress.success:.1f} %, "
-                f"{progress.steps_per_s:,.0f} steps/s"
-            )
+            speed = f"{progress.steps_per_s:,.0f} steps/s"
+            say(f"  {progress.steps:,} steps: success {100 * progress.success:.1f} %, {speed}")
 
     trained = train(settings, TRAINING_SEED, plan.out / "training", tell)
     result, file = SeedResult(TRAINING_SEED, trained, {}), plan.out / "policy.onnx"
@@ -202,21 +194,15 @@ def _drive(plan: DemoPlan, place: str, policy: str, say: Say) -> list[Episode]:
 
 
 def _deploy(plan: DemoPlan, model: SimulatorModel, policy: str, seed: int, say: Say) -> Episode:
-    """Runs a robot's nodes in real time in the scene of a seed; BackendError if one ends."""
     scene = sample_scene(load_world(plan.world), model.robot.footprint_radius, seed)
     goal = [float(value) for value in scene.goals[0]]
-    folder = str(plan.model)
+    given, limits = {"model": str(plan.model)}, _write_limits(model.robot, plan.out / "limits.yaml")
+    boxes, gate = str(plan.out / "black_box"), {"use_sim_time": True, "e_stop_required": False}
     nodes: dict[str, dict[str, Any]] = {
-        "simulator_node": {"model": folder, "world": plan.world, "episode_seed": seed},
-        "middleware_node": {"model": folder},
-        "command_gate": {
-            "model": folder,
-            "use_sim_time": True,
-            "e_stop_required": False,
-            "limits": str(_write_limits(model.robot, plan.out / "limits.yaml")),
-            "black_box": str(plan.out / "black_box"),
-        },
-        "policy_node": {"model": folder, "policy": policy, "goal": goal},
+        "simulator_node": {**given, "world": plan.world, "episode_seed": seed},
+        "middleware_node": given,
+        "command_gate": {**given, **gate, "limits": str(limits), "black_box": boxes},
+        "policy_node": {**given, "policy": policy, "goal": goal},
     }
     say(f"deploying {', '.join(nodes)} in real time")
     # The policy stops where it believes the goal is; its odometry drifts.
@@ -230,7 +216,6 @@ def _deploy(plan: DemoPlan, model: SimulatorModel, policy: str, seed: int, say: 
 def _watched(
     nodes: dict[str, dict[str, Any]], logs: Path, goal: list[float], near: float, say: Say
 ) -> tuple[bool, Any]:
-    """Starts the nodes, arms the gate, waits; returns arrival and the robot's path (T, 3)."""
     from nics_drl_bridge.nodes.processes import NodeProcess, Witness, free_domain_id
 
     domain_id = free_domain_id()
@@ -241,8 +226,8 @@ def _watched(
             processes.append(stack.enter_context(NodeProcess(node, logs, parameters, domain_id)))
             if node == "simulator_node" and not witness.sees(START_S):
                 processes[0].check()
-                reason = f"publishes nothing after {START_S:g} s; look at its log"
-                raise BackendError(f"{node} {reason}, {processes[0].log}.")
+                fix = f"look at its log, {processes[0].log}."
+                raise BackendError(f"{node} publishes nothing after {START_S:g} s; {fix}")
         refused = witness.arms("command_gate", START_S)
         for process in processes:
             process.check()
@@ -256,7 +241,6 @@ def _watched(
 
 
 def _write_limits(robot: RobotSpec, path: Path) -> Path:
-    """Writes limits that allow a simulated robot all its commands, with limited rate and jerk."""
     commands = {}
     for variable in robot.command:
         low, high = min(variable.min, 0.0), max(variable.max, 0.0)
@@ -283,10 +267,9 @@ def _policy(plan: DemoPlan, learned: Learned, summary: Summary) -> list[str]:
     if learned.curve:
         caption = "Success and collisions while it explores; all episodes are new ones."
         blocks.append(pictures.picture(pictures.training_curve(learned.curve), caption))
-    rows = [
-        (name, *(f"{100 * value:.1f} %" for value in astuple(share)))
-        for name, share in summary.shares.items()
-    ]
+    rows = []
+    for name, share in summary.shares.items():
+        rows.append((name, *(f"{100 * value:.1f} %" for value in astuple(share))))
     for name, amount in (("path [m]", summary.length), ("time [s]", summary.time)):
         rows.append((name, *(f"{value:.2f}" for value in astuple(amount))))
     text = (
@@ -333,7 +316,5 @@ def _deployed(
         "processes of their own; nobody stepped them. The robot "
         f"{'reached' if live.result == 'success' else 'did not reach'} its goal."
     )
-    return [
-        pictures.paragraph(text),
-        pictures.picture(drawn, "The true path of the deployed robot beside the lock-step one."),
-    ]
+    caption = "The true path of the deployed robot beside the lock-step one."
+    return [pictures.paragraph(text), pictures.picture(drawn, caption)]

@@ -21,10 +21,7 @@ def doctor(
     bag: Annotated[Path | None, Argument(help="A bag to look at; else the live robot.")] = None,
     model: Annotated[
         str | None,
-        Option(
-            help="What the robot must fit: folder of a model, or a shipped robot; ackermann if "
-            "neither it nor a policy is given."
-        ),
+        Option(help="What it must fit: a model's folder, or a shipped robot (ackermann)."),
     ] = None,
     policy: Annotated[str | None, Option(help="What it must fit instead: a policy file.")] = None,
     namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",

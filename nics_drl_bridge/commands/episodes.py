@@ -1,8 +1,4 @@
-"""The same episodes in process, over DDS, in MuJoCo over DDS, and on the vehicle.
-
-Compares the worlds as Fig. 7 of the paper does, with a table. The vehicle is driven in real time,
-through the command gate.
-"""
+"""The same episodes in process, over DDS, in MuJoCo, and on the vehicle, compared as in Fig. 7."""
 
 from __future__ import annotations
 
@@ -54,12 +50,7 @@ def drive_in(
     place: str, policy: str, name: str, world: str, seeds: Sequence[int], logs: Path,
     on_episode: Callable[[Episode], None], say: Say = lambda _: None,
 ) -> list[Episode]:  # fmt: skip
-    """Drives episodes with the model of a name in one of `PLACES`; `on_episode` hears of each.
-
-    The node that a place needs runs in its own process, in lock-step, with its log in a folder, and
-    has ended when this returns or raises. Raises BridgeError for a bad name or file, or a node that
-    does not start.
-    """
+    """Drives episodes in one of `PLACES`, whose node, if any, has then ended. BridgeError."""
     check_place(place)
     model = open_model(name)
     if place == FAST:
@@ -91,10 +82,8 @@ def env_of(
     """Makes the env of a policy's task with a backend, and opens the policy."""
     register_envs()
     opened, task = open_policy(policy, model)
-    env = gymnasium.make(
-        NAVIGATION, backend=backend, model=model, world=world, task=task, **arguments
-    )
-    return env, opened
+    given = {"backend": backend, "model": model, "world": world, "task": task, **arguments}
+    return gymnasium.make(NAVIGATION, **given), opened
 
 
 def check_place(place: str) -> None:
@@ -146,12 +135,7 @@ class Evaluated:
 
 
 def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
-    """Drives every policy through the same episodes in every place.
-
-    `tell` is called with what is being driven, the number of episodes done, and the total. Returns
-    the results of each policy; `evaluation.json` and a picture per policy are in `order.out`.
-    Raises BridgeError for a bad name or file, or a node that does not start.
-    """
+    """Drives all policies through the same episodes everywhere; writes results, pictures."""
     name, seeds, logs = _model_name(order), order.seeds, order.out / "logs"
     model, world = open_model(name), load_world(order.world)
     for place in order.places:
@@ -185,7 +169,6 @@ def judged(
 
 
 def _model_name(order: EvaluationOrder) -> str:
-    """The model that the episodes are driven with. Raises ConfigError for unknown policies."""
     if order.model is not None:
         for policy in order.policies:
             is_policy_file(policy)
@@ -246,13 +229,11 @@ def drive_vehicle(
 ) -> Evaluated:  # fmt: skip
     """Checks that the vehicle fits its model, drives the first policy, and compares.
 
-    Commands go to `cmd_vel_raw`, so that only an armed `command_gate` lets them pass; `arm` arms it
-    before each episode, otherwise the user does. A goal in `map` [m] takes the place of the
-    world's. Afterwards the fast simulator drives the same episodes from the vehicle's actual
-    starting poses. `ask` is called before each episode with where to place the vehicle, and returns
-    when it may begin; the options are those of `RealtimeBackend`. Returns the episodes of both;
-    `evaluation.json` and a picture are in `order.out`. Raises BackendError if the vehicle does not
-    fit its model, or does not answer, another BridgeError for a bad name or file.
+    Commands go to `cmd_vel_raw`, so that only an armed `command_gate` lets them pass. Afterwards
+    the fast simulator drives the same episodes from the vehicle's actual starting poses. `ask` is
+    called before each episode with where to place the vehicle, and returns when it may begin; the
+    options are those of `RealtimeBackend`. Raises BackendError if the vehicle does not fit its
+    model, or does not answer, another BridgeError for a bad name or file.
     """
     policy = order.policies[0]
     name, namespace = order.model or robot_of(policy), options.get("namespace", "")
@@ -282,17 +263,14 @@ def drive_vehicle(
             say(f"  {driven.result}, {driven.steps} steps, {episodes[-1].length:.2f} m")
     env, driver = env_of(policy, model, order.world, "sim", estimator=True)
     with closing(env):
-        again = [
-            drive(env, driver, one.seed, {"start": one.path[0], "goal": one.goal})
-            for one in episodes
-        ]
+        starts = [(one.seed, {"start": one.path[0], "goal": one.goal}) for one in episodes]
+        again = [drive(env, driver, *each) for each in starts]
     made = judged(policy, {VEHICLE: episodes, FAST: again}, model, world, order.out)
     write_evaluation(order.out, name, model, order.world, order.seed, [made])
     return made
 
 
 def _placed(scene: Scene, goal: tuple[float, float] | None, present: bool, armed: bool) -> str:
-    """Instruction before an episode: where to place the vehicle, and where it will drive."""
     x, y = scene.goals[0] if goal is None else goal
     where = f"it will drive to ({x:.2f} m, {y:.2f} m)"
     order = "" if armed else f"; arm {GATE}"

@@ -15,51 +15,29 @@ from nics_drl_bridge.errors import ConfigError
 
 
 def evaluate(
-    policies: Annotated[
-        list[str],
-        Argument(
-            metavar="POLICY...",
-            help="Policy files, shipped policies (differential), or baselines (dynamic_window, "
-            "straight, random).",
-        ),
-    ],
-    model: Annotated[
-        str | None,
-        Option(
-            "--model", "--robot",
-            help="Folder of a model, or a shipped robot; the policy's own by default.",
-        ),
+    policies: Annotated[list[str], Argument(
+        metavar="POLICY...", help="Policy files, shipped policies (differential), or baselines "
+        "(dynamic_window, straight, random).")],
+    model: Annotated[str | None, Option(
+        "--model", "--robot", help="A model's folder, or a shipped robot; else the policy's own.")
     ] = None,
-    world: Annotated[
-        str, Option("--world", "--scene", help="A shipped world (circles) or a YAML file.")
-    ] = "circles",
-    places: Annotated[
-        list[str] | None,
-        Option("--in", help="fast, dds or mujoco_dds; several times; all by default."),
-    ] = None,
+    world: Annotated[str, Option(
+        "--world", "--scene", help="A shipped world (circles) or a YAML file.")] = "circles",
+    places: Annotated[list[str] | None, Option(
+        "--in", help="fast, dds or mujoco_dds; several times; all by default.")] = None,
     episodes: Annotated[int | None, Option(min=1, help="How many; 20, or 1 on a vehicle.")] = None,
     seed: Annotated[int, Option(min=0, help="Of the first episode.")] = 1_000_000,
-    out: Annotated[Path, Option(help="Folder for everything that is written.")] = Path(
-        "runs/evaluate"
-    ),
-    shadow: Annotated[
-        Path | None, Option(help="A bag: compare the policy with what was driven in it.")
-    ] = None,
-    topic: Annotated[
-        list[str] | None,
-        Option(metavar="ROLE=TOPIC", help="For --shadow: as scan=/front/scan."),
-    ] = None,
-    ahead: Annotated[
-        float,
-        Option(help="For --shadow without --goal: the goal is where it was so much later."),
-    ] = 4.0,
+    out: Annotated[Path, Option(help="Folder for all that is written.")] = Path("runs/evaluate"),
+    shadow: Annotated[Path | None, Option(help="A bag: compare policies with its drive.")] = None,
+    topic: Annotated[list[str] | None, Option(
+        metavar="ROLE=TOPIC", help="For --shadow: as scan=/front/scan.")] = None,
+    ahead: Annotated[float, Option(
+        help="For --shadow without --goal: the goal is where it was so much later.")] = 4.0,
     backend: Annotated[str | None, Option(help="dds, with --hardware.", metavar="dds")] = None,
-    hardware: Annotated[
-        bool, Option("--hardware", help="Drive the vehicle, through command_gate.")
-    ] = False,
-    start: Annotated[
-        str, Option(help="For --hardware: wait until it stands there, or take the present.")
-    ] = "wait",
+    hardware: Annotated[bool, Option(
+        "--hardware", help="Drive the vehicle, through command_gate.")] = False,
+    start: Annotated[str, Option(
+        help="For --hardware: wait until it stands there, or take the present.")] = "wait",
     goal: Annotated[str | None, Option(metavar="X,Y", help="In map [m]; else the world's.")] = None,
     namespace: Annotated[str, Option(help="For --hardware: of the vehicle's topics.")] = "",
     pose_type: Annotated[str, Option(help="For --hardware: type of `pose`, in map.")] = "none",
@@ -89,9 +67,8 @@ def evaluate(
         if hardware:
             options = {"start": start, "namespace": namespace, "pose_type": pose_type}
             with needs_ros("nics evaluate --hardware"):
-                evaluated = [
-                    driving.drive_vehicle(order, place, arm, tell, partial(_ask, yes), **options)
-                ]
+                ask = partial(_ask, yes)
+                evaluated = [driving.drive_vehicle(order, place, arm, tell, ask, **options)]
         else:
             with progress_bar() as advance:
                 evaluated = driving.evaluate(order, tell, advance)
@@ -123,7 +100,6 @@ def _shadow(
     bag: Path, policies: list[str], model: str | None, topics: list[str],
     goal: tuple[float, float] | None, ahead: float, out: Path,
 ) -> None:  # fmt: skip
-    """Compares policies with a recorded drive; writes `shadow_POLICY.png` and `.json`."""
     from nics_drl_bridge.commands.episodes import robot_of
     from nics_drl_bridge.files import write_bytes, write_text
     from nics_drl_bridge.generator import open_model

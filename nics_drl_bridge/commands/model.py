@@ -11,13 +11,7 @@ import typer
 from typer import Argument, Option
 
 from nics_drl_bridge.commands import console
-from nics_drl_bridge.commands.console import (
-    RobotOption,
-    WorldOption,
-    intact,
-    needs_ros,
-    one_sentence,
-)
+from nics_drl_bridge.commands.console import RobotOption, intact, needs_ros, one_sentence
 from nics_drl_bridge.errors import BackendError, ConfigError
 
 
@@ -30,13 +24,9 @@ def record(
     seed: Annotated[int, Option(help="Of the pattern.")] = 0,
     namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
     remap: Annotated[list[str] | None, Option(help="A topic's other name: odom:=/wheels.")] = None,
-    topics: Annotated[
-        Path | None, Option(help="YAML file that names the joints of state and wheels.")
-    ] = None,
+    topics: Annotated[Path | None, Option(help="YAML file of the state's, wheels' joints.")] = None,
     stamped: Annotated[bool, Option(help="Send cmd_vel as TwistStamped.")] = False,
-    use_sim_time: Annotated[
-        bool, Option("--use-sim-time", help="Take the time from /clock.")
-    ] = False,
+    use_sim_time: Annotated[bool, Option("--use-sim-time", help="Take time from /clock.")] = False,
     preview: Annotated[bool, Option("--preview", help="Show the drive's plan, and stop.")] = False,
     yes: Annotated[bool, Option("--yes", help="Do not ask before the robot moves.")] = False,
 ) -> None:
@@ -114,37 +104,25 @@ def drive_summary(recording: Any, given: dict[str, Any]) -> tuple[str, ...]:
 
 
 def generate(
-    recording: Annotated[
-        Path, Argument(help="A rosbag2, an .npz recording, or a folder of CSV files.")
-    ],
+    recording: Annotated[Path, Argument(help="A rosbag2, .npz recording or folder of CSV files.")],
     out: Annotated[Path, Option(help="Folder of the model to write.")],
     robot: RobotOption = "ackermann",
     topics: console.TopicsOption = None,
     topic: console.TopicOption = None,
-    world: WorldOption = "arena",
+    world: console.WorldOption = "arena",
     lidar: Annotated[str, Option(help="A shipped lidar (paper) or a YAML file.")] = "paper",
     sensor: Annotated[
-        list[Path] | None,
-        Option(help="YAML file of a further sensor, docs/sensors.md; repeatable."),
+        list[Path] | None, Option(help="YAML of a further sensor, docs/sensors.md; repeatable.")
     ] = None,
     order: Annotated[int, Option(min=1, max=4, help="Order of the Taylor model.")] = 2,
-    alpha: Annotated[
-        str, Option(help="Pruning threshold of Eq. 2, 0 to 1, or auto for the knee.")
-    ] = "auto",
+    alpha: Annotated[str, Option(help="Pruning of Eq. 2, 0 to 1, or auto for the knee.")] = "auto",
     assume_textbook: Annotated[
         bool, Option(help="Fill in from the textbook what the drive did not show.")
     ] = False,
-    strict: Annotated[
-        bool, Option(help="Refuse a drive that did not move every input on its own.")
-    ] = False,
-    salvage: Annotated[
-        bool, Option("--salvage", help="Take what is intact of a damaged bag; tell the rest.")
-    ] = False,
+    strict: Annotated[bool, Option(help="Refuse if an input was not moved on its own.")] = False,
+    salvage: console.SalvageOption = False,
     anyway: Annotated[
-        bool,
-        Option(
-            "--anyway", help="Write the model even if its predictions of unseen data are of no use."
-        ),
+        bool, Option("--anyway", help="Write it even if predictions of unseen data are of no use.")
     ] = False,
     pictures: Annotated[bool, Option(help="Draw the fit into the model's pictures/.")] = False,
 ) -> None:
@@ -191,7 +169,6 @@ def urdf(
 
         opened = open_model(model)
         file = out or Path(f"{opened.robot.name}.urdf")
-        lidar = opened.lidar
-        further = {each.frame: each.mount for each in opened.sensors}
+        lidar, further = opened.lidar, {each.frame: each.mount for each in opened.sensors}
         write_text(file, urdf_of(opened.robot, lidar.mount, lidar.frame, further=further))
         typer.echo(f"{file}: the URDF of {opened.robot.name}")

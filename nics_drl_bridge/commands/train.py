@@ -32,8 +32,7 @@ def train(
         str | None, Option(help="Shipped settings (navigation_differential), or a YAML file.")
     ] = None,
     world: Annotated[
-        list[str] | None,
-        Option(help="Train in this world only; given several times, in all of them."),
+        list[str] | None, Option(help="Train in this world only; several times: in all of them.")
     ] = None,
     algorithm: Annotated[str | None, Option(help="ppo or sac.")] = None,
     seeds: Annotated[list[int] | None, Option(help="One or more, as --seeds 0 1 2.")] = None,
@@ -45,15 +44,10 @@ def train(
         str, Option(help="sb3 (Stable-Baselines3, this process) or ray (RLlib, a cluster).")
     ] = "sb3",
     address: Annotated[
-        str | None,
-        Option(
-            help="Of the Ray cluster: auto (the one this machine is part of) or HOST:PORT; by "
-            "default one is started here."
-        ),
+        str | None, Option(help="Ray cluster: auto (this machine's), HOST:PORT; else started here.")
     ] = None,
     env_runners: Annotated[
-        int | None,
-        Option(min=1, help="Processes on Ray that share the worlds; by default one per CPU."),
+        int | None, Option(min=1, help="Ray processes that share the worlds; default: one per CPU.")
     ] = None,
 ) -> None:
     """Trains policies in the fast simulator, and evaluates them."""
@@ -86,7 +80,6 @@ def train(
 def _learner(
     engine: str, address: str | None, env_runners: int | None, worlds: int
 ) -> Iterator[Any]:
-    """Yields the function that trains one policy; on Ray while connected to its cluster."""
     engines = (SB3, *extensions.known("engines"))
     if engine not in engines:
         raise ConfigError(f"unknown engine {engine!r}; {nearest(engine, engines)}")
@@ -141,9 +134,8 @@ def info(
 
 def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
     lidar, scan, seen = facts["lidar"], facts["scan"], facts["observation"]
-    commands = [
-        f"{c['name']} {c['min']:g} to {c['max']:g} {c['unit']}" for c in facts["robot"]["command"]
-    ]
+    limits = "{name} {min:g} to {max:g} {unit}"
+    commands = [limits.format(**command) for command in facts["robot"]["command"]]
     observed = "the beams of this lidar"
     if scan is not None:
         observed = (

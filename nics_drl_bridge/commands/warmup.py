@@ -37,7 +37,6 @@ def warmup(
 
 
 def _compiled_by(part: Callable[..., Any], *given: Any) -> tuple[int, float, Any]:
-    """Runs a part; returns how many kernels that compiled, its CPU time [s], and its result."""
     from nics_drl_bridge.kernels import COMPILING
 
     COMPILING.quiet = True
@@ -47,14 +46,12 @@ def _compiled_by(part: Callable[..., Any], *given: Any) -> tuple[int, float, Any
 
 
 def _model() -> Any:
-    """Fits the kinematics of a drive and bakes a lidar table."""
     from nics_drl_bridge.generator import builtin_model
 
     return builtin_model(ROBOT)
 
 
 def _simulate(model: Any) -> None:
-    """Begins episodes and steps, alone and in many worlds at once."""
     from nics_drl_bridge.env.bridge_env import BridgeEnv
     from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 

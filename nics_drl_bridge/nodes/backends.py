@@ -43,13 +43,8 @@ class _Mail(NamedTuple):
 
 
 class _Mailbox:
-    """The newest message of each topic, serialised, from the executor's thread to the caller's.
-
-    The caller is woken once, when all topics that it waits for are there: each wake-up costs a good
-    part of a step. Odometry that it waits for is given to `work`, with stamp and arrival [ns], by
-    the executor's thread, while the scan is still in transit.
-    """
-
+    # The caller is woken once, when all its topics are there: each wake-up costs a good part of a
+    # step. The executor's thread gives awaited odometry to `work` while the scan is in transit.
     def __init__(self, topics: tuple[str, ...], work: Callable[[int, int, bytes], None]) -> None:
         self._mail, self._work = dict.fromkeys(topics, _Mail()), work
         self._lock, self._complete = threading.Lock(), threading.Event()
@@ -57,7 +52,6 @@ class _Mailbox:
         self._failure: Exception | None = None
 
     def put(self, topic: str, message: bytes) -> object:
-        """Takes a message; returns `HANDED_OVER` if the caller now continues."""
         with self._lock:
             try:
                 stamp_ns = _read(topic, wire.stamp_of, message)
@@ -76,14 +70,12 @@ class _Mailbox:
             self._work(*self._mail[ODOM])
 
     def _late(self, stamp_ns: int) -> str | None:
-        """Returns the first topic whose newest message is older than a stamp; None if none is."""
         return next((topic for topic, mail in self._mail.items() if mail.stamp_ns < stamp_ns), None)
 
     def stamp_ns(self, topic: str) -> int:
         return self._mail[topic].stamp_ns
 
     def wait(self, stamp_ns: int, timeout_s: float) -> dict[str, _Mail]:
-        """Waits until each topic is at least as new as a stamp; StaleDataError if one is not."""
         with self._lock:
             self._awaited_ns, self._failure = stamp_ns, None
             self._complete.clear()
@@ -109,14 +101,11 @@ def _take_odometry(middleware: Middleware, stamp_ns: int, arrival_ns: int, messa
 class DdsBackend:
     """One robot behind `cmd_vel`, `scan` and `odom`, in lock-step with a simulator node.
 
-    Each step publishes one command and returns exactly the data that are stamped one control
-    period later. Its own node in its own context listens in one executor thread. `close`, an error
-    and garbage collection leave a zero command behind, see `Link`.
-
-    `truth` waits for `ground_truth` too, and puts the true pose into `info`; `timeout_s` bounds
-    each wait for a peer or an answer. Raises BackendError if no simulator is there, it refuses,
-    does not answer or is not in lock-step, or another node moved it; ModelError if it runs another
-    model or world; StaleDataError if its data do not arrive.
+    Each step publishes one command and returns exactly the data stamped one control period later.
+    `close`, an error and garbage collection leave a zero command behind, see `Link`. `truth` adds
+    the true pose to `info`; `timeout_s` bounds each wait. Raises BackendError if no simulator is
+    there, it refuses, does not answer or is not in lock-step, or another node moved it; ModelError
+    if it runs another model or world; StaleDataError if its data do not arrive.
     """
 
     def __init__(
@@ -139,8 +128,8 @@ class DdsBackend:
             kind = LaserScan if topic == SCAN else Odometry
             if topic in self._sensors:
                 kind = sensor_type(self._sensors[topic])
-            take_up = partial(_put, self._mail, topic)
-            self._link.node.create_subscription(kind, topic, take_up, qos.SENSOR, raw=True)
+            put = partial(_put, self._mail, topic)
+            self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
         self._episodes = EpisodeServices(self._link, simulator, model, world)
         self._link.begin()
         try:
@@ -186,8 +175,7 @@ class DdsBackend:
 
     def _check_stamps(self) -> None:
         for topic in self._topics:
-            off_ns = self._mail.stamp_ns(topic) - self._now_ns
-            if off_ns:
+            if off_ns := self._mail.stamp_ns(topic) - self._now_ns:
                 self._link.check_alone()
                 raise BackendError(
                     f"topic {topic!r}: stamped {off_ns / NS_PER_S:+.3f} s off the step; start "
@@ -212,7 +200,6 @@ class DdsBackend:
         return self._middleware.view(now), facts
 
     def _await(self, stamp_ns: int) -> dict[str, _Mail]:
-        """Returns the mailbox's data for a stamp; what does not arrive is requested again."""
         deadline = time.monotonic() + self.timeout_s
         while True:
             try:
@@ -237,13 +224,11 @@ class DdsBackend:
 
 
 def _read(topic: str, read: Callable[[bytes], T], message: bytes) -> T:
-    """Returns the content of a message. Raises BackendError if it is not of that type."""
     try:
         return read(message)
     except wire.UNREADABLE as error:
-        raise BackendError(
-            f"topic {topic!r}: a message can't be read ({error}); look at who publishes it."
-        ) from None
+        reason = f"a message can't be read ({error}); look at who publishes it."
+        raise BackendError(f"topic {topic!r}: {reason}") from None
 
 
 def _put(mail: _Mailbox, topic: str, message: bytes) -> object:
@@ -253,9 +238,8 @@ def _put(mail: _Mailbox, topic: str, message: bytes) -> object:
 class FleetBackend:
     """M robots in lock-step with one simulator node, which moves when all have their commands.
 
-    Views and commands have a leading (M,). Each robot has a `DdsBackend`, which takes the options,
-    in a namespace, in the order of the simulator's parameter `robots`; the simulator is named in
-    full. Raises BackendError if no simulator is there, or a robot is missing.
+    Views and commands have a leading (M,). Each robot has a `DdsBackend` with the options, in the
+    order of the simulator's parameter `robots`. Raises BackendError if one of them is missing.
     """
 
     def __init__(
@@ -263,10 +247,8 @@ class FleetBackend:
         simulator: str = "/simulator_node", **options: Any,
     ) -> None:  # fmt: skip
         if len(set(namespaces)) < max(2, len(namespaces)):
-            raise ConfigError(
-                f"backend_options: namespaces {list(namespaces)!r} must be those of at least two "
-                "different robots."
-            )
+            given = f"namespaces {list(namespaces)!r}"
+            raise ConfigError(f"backend_options: {given} must be of at least two different robots.")
         self._robots: list[DdsBackend] = []
         try:
             for namespace in namespaces:
@@ -309,11 +291,10 @@ class FleetBackend:
 
 def together(facts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Merges the facts of M robots: equal values stay as they are, others become (M, ...)."""
+    values = {name: [each[name] for each in facts] for name in facts[0]}
     return {
-        name: value
-        if all(np.array_equal(value, each[name]) for each in facts)
-        else np.stack([each[name] for each in facts])
-        for name, value in facts[0].items()
+        name: every[0] if all(np.array_equal(every[0], one) for one in every) else np.stack(every)
+        for name, every in values.items()
     }
 
 
@@ -324,27 +305,22 @@ def dds_backend(
     model: SimulatorModel, world: World, mode: str = "lockstep", robots: int = 1,
     estimator: bool = True, randomisation: None = None, **options: Any,
 ) -> interface.Backend:  # fmt: skip
-    """Returns the backend of a robot behind ROS 2 topics, or of a team in lock-step.
+    """Returns a `DdsBackend`, `RealtimeBackend`, or for a team in lock-step a `FleetBackend`.
 
-    In mode `lockstep` it is a `DdsBackend`, or for a team a `FleetBackend` with the option
-    `namespaces` (robot1, robot2, ... by default); in mode `realtime` a `RealtimeBackend`, with a
-    simulator or a vehicle. Raises ConfigError for an unknown mode, one that a team does not have,
-    `estimator=False` and a randomisation; BackendError if no peer is there.
+    A team's `namespaces` are robot1, robot2, ... by default. Raises ConfigError for options that do
+    not go together; BackendError if no peer is there.
     """
     if not estimator or randomisation is not None:
-        raise ConfigError(
-            "backend 'dds' always estimates and is never randomised; leave out `estimator` and "
-            "`randomisation`."
-        )
+        refused = "is never randomised; leave out `estimator` and `randomisation`."
+        raise ConfigError(f"backend 'dds' always estimates and {refused}")
     if mode not in MODES:
         raise ConfigError(f"backend_options: there is no mode {mode!r}; {nearest(mode, MODES)}")
     if robots > 1:
         names = options.pop("namespaces", default_namespaces(robots))
         if mode != "lockstep" or len(names) != robots:
-            raise ConfigError(
-                f"backend_options: a team of {robots} robots is driven in mode 'lockstep' alone, "
-                f"with {robots} namespaces, not in {mode!r} with {list(names)!r}."
-            )
+            needed = f"in mode 'lockstep' alone, with {robots} namespaces"
+            given = f"a team of {robots} robots is driven {needed}, not in {mode!r} with"
+            raise ConfigError(f"backend_options: {given} {list(names)!r}.")
         return FleetBackend(model, world, names, **options)
     made: interface.Backend = MODES[mode](model, world, **options)
     return made

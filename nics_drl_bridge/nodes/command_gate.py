@@ -38,11 +38,9 @@ from nics_drl_bridge.nodes.conversions import is_rotation, sensor_from_ros, sens
 from nics_drl_bridge.nodes.gate_log import GateLog
 
 STALE_S = 0.05  # a motion that was decided on longer ago than this is decided on again [s]
-SCAN_PERIODS = 1.75
-"""For a slow lidar, the default age limit of a command's scan, in periods of the lidar."""
+SCAN_PERIODS = 1.75  # for a slow lidar, default age limit of a command's scan, in its periods
 ROTATION = slice(3, 7)  # position of an odometry's quaternion among its numbers
-VARIANCES = [wire.POSE_COVARIANCE, wire.POSE_COVARIANCE + 7, wire.POSE_COVARIANCE + 35]
-"""Positions of the variances of x, y and heading."""
+VARIANCES = [wire.POSE_COVARIANCE + k for k in (0, 7, 35)]  # positions: of x, y and heading
 HIGHEST = 99
 REFUSED = (
     "parameter 'priority': the system does not allow a real-time priority of {priority} ({error}); "
@@ -72,7 +70,6 @@ def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
 
 
 def _declare_rules(node: Node, model: SimulatorModel) -> dict[str, Any]:
-    """Declares the parameters of the rules; returns their values by the field of the config."""
     scan_age = max(GateConfig.scan_age_s, SCAN_PERIODS / model.lidar.rate)
     heard = "Whether e_stop must have been heard before arming; false in simulations alone."
     default, seconds = GateConfig, (0.01, 10.0)
@@ -107,7 +104,6 @@ def declare_black_box(node: Node) -> Path:
 def _declare_shield(
     node: Node, model: SimulatorModel, limits: Limits | None, file: str
 ) -> ShieldConfig | None:
-    """Returns the shield, None if it is off, and logs a sentence about it."""
     on = runner.declare(node, "shield", True, "Whether to stop before obstacles.", read_only=True)
     values = {}
     for name, about in (
@@ -167,11 +163,7 @@ def e_stop(content: bytes) -> inputs.EStop:
 
 
 def take_priority(priority: int) -> str:
-    """Gives all threads of this process priority over every ordinary one (SCHED_FIFO), if not 0.
-
-    Those of the middleware, too, for which the gate waits. Threads created later have the priority
-    of their creator. Returns a sentence with the reason and the fix if it fails, otherwise "".
-    """
+    """Gives all present threads SCHED_FIFO, if not 0; returns reason and fix if refused, or ""."""
     if priority == 0:
         return ""
     try:
@@ -188,8 +180,7 @@ class CommandGate(qos.QosWatch):
     """Stands between `cmd_vel_raw` and `cmd_vel`, in its own process.
 
     It starts disarmed. `~/arm` lets commands pass if all checks succeed, `~/e_stop` presses the
-    emergency stop, `~/reset` clears a latched stop and leaves the gate disarmed. All decisions are
-    made by `gate.gate.decide`, on the steady clock.
+    emergency stop, `~/reset` clears a latched stop. `gate.gate.decide` decides, on a steady clock.
     """
 
     def __init__(self, context: Context) -> None:
@@ -200,10 +191,8 @@ class CommandGate(qos.QosWatch):
         self._state = begin(self._config)
         self._log = GateLog(self._config, declare_black_box(self), model.robot.name, logger)
         if not self._config.e_stop_required:
-            logger.warning(
-                "e_stop_required is false: an e_stop that was never heard does not stop the robot. "
-                "That is for simulations; set it on a vehicle."
-            )
+            risk = "an e_stop that was never heard does not stop the robot. That is for simulations"
+            logger.warning(f"e_stop_required is false: {risk}; set it on a vehicle.")
         if self._config.shield is not None:
             shield.rehearse()
         self._out = self.create_publisher(Twist, "cmd_vel", qos.COMMAND)
@@ -266,11 +255,8 @@ class CommandGate(qos.QosWatch):
         return decision
 
     def _say(self, decision: Decision, now: float) -> inputs.Input | None:
-        """Publishes a decision, the only path to the robot except `stop`, or returns another input.
-
-        What is not finite is sent as zero and presses the e-stop. A motion that was decided on too
-        long ago, in a process frozen since, is not sent; so the clock is read immediately before.
-        """
+        # The only path to the robot except `stop`. A motion that was decided on too long ago, in a
+        # process frozen since, is not sent; so the clock is read immediately before.
         content = wire.twist_to_bytes(decision.twist)
         if not np.isfinite(decision.twist).all():
             self._out.publish(self._zero)
@@ -282,7 +268,6 @@ class CommandGate(qos.QosWatch):
         return None
 
     def _look(self) -> runner.Condition:
-        """Returns the finding for `/diagnostics`; other publishers are reported, not prevented."""
         found = self._log.finding(self._state)
         others = self.count_publishers(self._out.topic_name) - 1
         if others < 1:

@@ -35,11 +35,9 @@ from nics_drl_bridge.recording import messages
 from nics_drl_bridge.robot.spec import RobotSpec
 
 QUATERNION_TOLERANCE = 0.1  # tolerance of the squared length of a quaternion about 1
-PLANAR = np.ix_([0, 1, 5], [0, 1, 5])
-"""Indices of x, y and heading in the 6 x 6 covariance of a message."""
+PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # x, y and heading in the 6 x 6 covariance of a message
 UNUSED_VARIANCE = 1e6  # variance of z, roll and pitch, which a planar robot does not measure
-FIELD = re.compile(r"^\s*([A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z0-9_/]+)?)")
-"""The type at the start of a line of a `.msg` file."""
+FIELD = re.compile(r"^\s*([A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z0-9_/]+)?)")  # type, in a `.msg` file
 
 
 def stamp_to_ros(time_ns: int) -> Time:
@@ -106,12 +104,9 @@ def reader_from_ros(message: LaserScan, like: LidarSpec, upside_down: bool = Fal
 
 def odometry_to_ros(
     pose: ArrayLike, twist: ArrayLike, time_ns: int, frames: Sequence[str],
-    variance: tuple[float, float, float, float],
+    variance: tuple[float, float, float, float],  # of position, heading, linear, angular [SI]
 ) -> Odometry:  # fmt: skip
-    """Returns pose (3,) and body twist (3,), in a fixed and a body frame, as an Odometry message.
-
-    The variances are of position [m^2], heading [rad^2], linear [m^2/s^2], angular [rad^2/s^2].
-    """
+    """Returns pose (3,) and body twist (3,), in a fixed and a body frame, as an Odometry."""
     x, y, heading = np.asarray(pose, np.float64).tolist()
     message = Odometry(child_frame_id=frames[1])
     message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frames[0]
@@ -175,10 +170,8 @@ def sensor_type(sensor: Sensor) -> Any:
     """Returns the class of a further sensor's message. Raises ConfigError if it is missing."""
     kind = message_type(sensor.message)
     if kind is None:
-        raise ConfigError(
-            f"sensor {sensor.name!r}: the message {sensor.message} is not installed; install its "
-            "package with your ROS 2 distribution."
-        )
+        missing = f"the message {sensor.message} is not installed; install its package"
+        raise ConfigError(f"sensor {sensor.name!r}: {missing} with your ROS 2 distribution.")
     return kind
 
 

@@ -153,10 +153,8 @@ def namespaces(node: Node) -> tuple[str, ...]:
     names = tuple(value) if isinstance(value, Sequence) and not isinstance(value, str) else ()
     valid = all(isinstance(name, str) and NAMESPACE.fullmatch(name) for name in names)
     if not names or not valid or len(set(names)) < len(names) or len(names) > GREATEST_FLEET:
-        raise ConfigError(
-            f"parameter 'robots' is {value!r}; give a count from 1 to {GREATEST_FLEET}, or a list "
-            "of different namespaces, as in [robot1, robot2]."
-        )
+        fix = f"give a count from 1 to {GREATEST_FLEET}, or a list of different namespaces"
+        raise ConfigError(f"parameter 'robots' is {value!r}; {fix}, as in [robot1, robot2].")
     return names
 
 

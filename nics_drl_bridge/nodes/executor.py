@@ -22,27 +22,21 @@ from rclpy.waitable import NumberOfEntities
 
 from nics_drl_bridge.interface import NS_PER_S
 
-PARTS_MISSING = (AttributeError, TypeError)
-"""Raised by Python if rclpy differs from what is known here."""
+PARTS_MISSING = (AttributeError, TypeError)  # raised if rclpy differs from what is known here
 Received = tuple[Callable[..., Any], tuple[Any, ...]]  # a callback and its arguments
 HANDED_OVER, REST_S = object(), 1e-4
 """Returned by a callback that has woken another thread of this process. The executor then rests,
 for less than an exchange of messages takes, to keep out of that thread's way."""
-MOST_AT_ONCE = 32
-"""A timer without a period is always ready, and the spinning thread has other work, too."""
+MOST_AT_ONCE = 32  # a timer without a period is always ready, and the thread has other work, too
 
 
 class StandingExecutor(SingleThreadedExecutor):
     """Waits for all entities of its nodes; handles subscriptions and timers, and leaves the rest.
 
-    rclpy's executors gather the entities of all nodes, open their handles and build a new wait set
-    each time they wait, and they wait three times for one message. Here that is done only when an
-    entity is added or removed. Services, clients, events and tasks are left to rclpy's executor.
-
-    Callbacks are called in the spinning thread, one after the other: those of subscriptions with
-    the message, or the message and its info, and may return `HANDED_OVER`; those of timers without
-    arguments, others are left to rclpy, too. This needs parts of rclpy that are not public. If one
-    is missing, it logs that once, and is rclpy's own executor from then on.
+    rclpy's executors build a new wait set each time they wait, three times for one message; this
+    one only when an entity is added or removed. Callbacks are called one after the other in the
+    spinning thread; those of subscriptions may return `HANDED_OVER`. This needs parts of rclpy that
+    are not public. If one is missing, it logs that once, and is rclpy's own executor from then on.
     """
 
     def __init__(self, context: Context) -> None:
@@ -77,7 +71,6 @@ class StandingExecutor(SingleThreadedExecutor):
             self._handle_others()
 
     def _wait(self, timeout_sec: float | None) -> list[Received]:
-        """Waits; returns what subscriptions received."""
         try:
             entities = self._gathered()
             entities.wait(-1 if timeout_sec is None else int(timeout_sec * NS_PER_S))
@@ -89,7 +82,6 @@ class StandingExecutor(SingleThreadedExecutor):
         return entities.taken()
 
     def _tick(self, timer: Any) -> None:
-        """Calls a timer back, unless an earlier callback has ended the context or the timer."""
         if not self.context.ok() or not any(timer in node.timers for node in self.get_nodes()):
             return
         ready = False
@@ -102,7 +94,6 @@ class StandingExecutor(SingleThreadedExecutor):
 
     @contextlib.contextmanager
     def _falling_back(self) -> Iterator[None]:
-        """Continues as rclpy's own executor if a part of rclpy is missing."""
         try:
             yield
         except PARTS_MISSING as error:
@@ -120,7 +111,6 @@ class StandingExecutor(SingleThreadedExecutor):
                 task.result()  # re-raises the callback's exception
 
     def _gathered(self) -> _Entities:
-        """Returns the entities, in a new wait set if they have changed."""
         nodes, now = self.get_nodes() if self._changed else [], self._entities
         if now is None or (self._changed and now.all != _entities_of(nodes)):
             self._release()
@@ -141,8 +131,6 @@ class StandingExecutor(SingleThreadedExecutor):
 
 
 class _Entities:
-    """The entities of nodes, their handles kept open, and a wait set for all of them."""
-
     def __init__(self, nodes: Sequence[Node], guards: Sequence[Any], context: Context) -> None:
         self.all = _entities_of(nodes)
         subscriptions, others, timers, clients, services, self._waitables = self.all
@@ -190,12 +178,10 @@ class _Entities:
         return _take(self._subscriptions)
 
     def due(self) -> list[Any]:
-        """Returns the timers with plain callbacks that are ready."""
         is_ready = self._wait_set.is_ready
         return [timer for i, timer in self._timers if is_ready("timer", i)]
 
     def others_ready(self, own: Any) -> tuple[bool, bool]:
-        """Returns whether the executor's guard condition is ready, and whether rclpy has work."""
         ready = self._wait_set.get_ready_entities
         triggered = list(ready("guard_condition"))
         for guard in self.all[1]:
@@ -210,7 +196,6 @@ class _Entities:
 
 
 def _take(subscriptions: Iterable[tuple[Any, int]]) -> list[Received]:
-    """Takes one message of each subscription that has one, with its callback's arguments."""
     received = []
     for subscription, arguments in subscriptions:
         taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
@@ -220,7 +205,6 @@ def _take(subscriptions: Iterable[tuple[Any, int]]) -> list[Received]:
 
 
 def _call(received: Iterable[Received]) -> None:
-    """Calls back, and rests if another thread continues."""
     handed_over = False
     for callback, arguments in received:
         handed_over |= callback(*arguments) is HANDED_OVER
@@ -237,6 +221,5 @@ def _takes(callback: Any, *arguments: Any) -> bool:
 
 
 def _entities_of(nodes: Sequence[Node]) -> tuple[tuple[Any, ...], ...]:
-    """Returns subscriptions, guard conditions, timers, clients, services and waitables of nodes."""
     kinds = ("subscriptions", "guards", "timers", "clients", "services", "waitables")
     return tuple(tuple(one for node in nodes for one in getattr(node, kind)) for kind in kinds)

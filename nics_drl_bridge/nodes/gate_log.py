@@ -35,11 +35,7 @@ ENDING = (signal.SIGTERM, signal.SIGALRM)
 
 
 class GateLog:
-    """Counts everything, logs without flooding, and writes one file for each new stop.
-
-    Stops in quick succession are a burst. The first stop of each rule in a burst is written, as it
-    was at that moment; the others are counted.
-    """
+    """Counts all, logs without flooding, writes the first stop of each rule in a burst of stops."""
 
     def __init__(self, config: GateConfig, folder: Path, robot: str, logger: RcutilsLogger) -> None:
         self.counters: Counter[str] = Counter()
@@ -85,8 +81,8 @@ class GateLog:
     def no_number(self, twist: Sequence[float]) -> None:
         """Counts and logs a decision that is not finite, which must never happen."""
         if (more := self._counted("not finite, sent as zero")) is not None:
-            nonsense = f"decided on {list(twist)}, which is not finite"
-            self._logger.error(f"{nonsense}: zero is sent, and the e-stop is pressed{more}")
+            then = f"zero is sent, and the e-stop is pressed{more}"
+            self._logger.error(f"decided on {list(twist)}, which is not finite: {then}")
 
     def _counted(self, kind: str) -> str | None:
         self.counters[kind] += 1
@@ -157,10 +153,9 @@ def prune(folder: Path, own: Sequence[str]) -> None:
 class BoxWriter:
     """Writes files, each in its own process, which starts as a copy of this one.
 
-    The copy (`fork`, which shares memory until it is modified) is the snapshot: it takes some
-    milliseconds, and later changes are not in it. A disk that hangs blocks the copy and nothing
-    else, not even the end of this process, as a waiting thread would. The copy has no other thread,
-    closes all sockets, and runs at ordinary priority.
+    The copy (`fork`) is the snapshot: it takes some milliseconds, and later changes are not in it.
+    A disk that hangs blocks the copy and nothing else, not even the end of this process, as a
+    waiting thread would. The copy closes all sockets, and runs at ordinary priority.
     """
 
     def __init__(self) -> None:
@@ -168,11 +163,7 @@ class BoxWriter:
         self._failed: list[str] = []
 
     def begin(self, write: Callable[[], object]) -> bool:
-        """Starts a copy of this process that writes; returns False if too many are at work.
-
-        If an exception ends `write`, it has to clean up after itself. Raises OSError if the system
-        can't make another process.
-        """
+        """Starts a copy of this process that writes; False if too many are at work; OSError."""
         self._failed = self.failures()
         if len(self._writers) >= MOST_AT_WORK:
             return False
@@ -229,7 +220,6 @@ class BoxWriter:
 
 
 def _live(write: Callable[[], object], told: mmap) -> NoReturn:
-    """Runs in the copy; never returns to the code that it was copied from."""
     code = 1
     try:
         gc.disable()  # which would touch, and so copy, all memory
@@ -244,7 +234,6 @@ def _live(write: Callable[[], object], told: mmap) -> NoReturn:
 
 
 def _let_go() -> None:
-    """Releases sockets, files, priority and signals that belong to the original."""
     for name in os.listdir("/proc/self/fd"):
         with contextlib.suppress(OSError):
             os.close(int(name))

@@ -23,11 +23,9 @@ SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FA
 class ManagedNode(QosWatch, LifecycleNode):
     """A node that `ros2 lifecycle` and Nav2's lifecycle manager can manage.
 
-    With the parameter `autostart`, which is the default, it configures and activates itself. A
-    subclass declares its parameters in its constructor, so that they can be set while it is
-    unconfigured, and implements the transitions: `configure` reads the parameters, makes what they
-    request, subscribes, and puts the clean-up of each on the stack `undo`; `deactivate` leaves the
-    robot at rest. `state` is the last primary state: `unconfigured`, `inactive` or `active`.
+    A subclass declares its parameters in its constructor, so that they can be set while it is
+    unconfigured. `configure` reads them, makes what they request, and puts the clean-up of each on
+    the stack `undo`. `state` is the last primary state: `unconfigured`, `inactive` or `active`.
     """
 
     def __init__(self, name: str, context: Context) -> None:

@@ -42,10 +42,8 @@ LOST_S = 1.0  # a request to repeat data that stays unanswered for longer was it
 class Link:
     """A node in its own context, one executor thread, and the command topic.
 
-    `close`, garbage collection and the end of the process, SIGTERM included, leave a zero command
-    behind. SIGKILL can't be handled: `command_gate` and the base's own timeout are for that.
-    Commands are TwistStamped if `stamped`; one without a successor within the timeout [s] is
-    followed by a zero.
+    `close`, garbage collection, SIGTERM, and silence of the sender for longer than the timeout [s]
+    leave a zero command behind. SIGKILL can't be handled: `command_gate` is for that.
     """
 
     def __init__(
@@ -53,7 +51,10 @@ class Link:
         stamped: bool = False, parameters: Mapping[str, Any] | None = None,
         command_timeout_s: float = math.inf,
     ) -> None:  # fmt: skip
-        _end_orderly_on_sigterm()
+        # SIGTERM ends Python like an exception, unless the program handles it itself.
+        in_main = threading.current_thread() is threading.main_thread()
+        if in_main and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+            signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
         self._context = open_context(domain_id=domain_id)
         overrides = [Parameter(name, value=value) for name, value in (parameters or {}).items()]
         self.node = qos.QosWatch(
@@ -76,10 +77,8 @@ class Link:
         """Publishes linear.x, linear.y, angular.z (3,); BackendError and a zero for NaN or inf."""
         if not all(map(math.isfinite, twist)):
             self.halt()
-            raise BackendError(
-                f"command {twist} for {self.commands.topic_name}: must be finite, a zero was sent "
-                "instead; look at what the task's `command` returns."
-            )
+            fix = "finite, a zero was sent instead; look at what the task's `command` returns."
+            raise BackendError(f"command {twist} for {self.commands.topic_name}: must be {fix}")
         self._timeout.begin(moving=True)
         if self._kind is Twist:
             self.commands.publish(twist_to_bytes(twist))
@@ -105,10 +104,8 @@ class Link:
         future = client.call_async(request)
         if not holds(future.done, deadline - time.monotonic(), POLL_S):
             client.remove_pending_request(future)
-            raise BackendError(
-                f"service {client.srv_name}: no answer within {timeout_s:g} s; look at the "
-                "simulator node's log."
-            )
+            reason = f"no answer within {timeout_s:g} s; look at the simulator node's log."
+            raise BackendError(f"service {client.srv_name}: {reason}")
         return future.result()
 
     def others_command(self) -> bool:
@@ -131,9 +128,8 @@ class Link:
     ) -> None:
         """Waits until all peers are matched. Raises BackendError with what is missing."""
         node, commands = self.node, self.commands
-        needed: dict[str, Callable[[], Any]] = {
-            f"subscriber of {commands.topic_name}": commands.get_subscription_count
-        }
+        needed = dict[str, Callable[[], Any]]()
+        needed[f"subscriber of {commands.topic_name}"] = commands.get_subscription_count
         for name in map(node.resolve_topic_name, topics):
             needed[f"publisher of {name}"] = partial(node.count_publishers, name)
         for client in clients:
@@ -171,7 +167,6 @@ def _spin(context: Context, node: Node, timeout: CommandTimeout) -> None:
 
 
 def _shut_down(context: Context, timeout: CommandTimeout, thread: threading.Thread) -> None:
-    """Leaves a zero command behind and ends the thread; holds no reference to the link."""
     with uninterrupted():  # else Python may exit with a thread inside the middleware's library
         if context.ok():
             timeout.end()
@@ -181,20 +176,10 @@ def _shut_down(context: Context, timeout: CommandTimeout, thread: threading.Thre
             thread.join(timeout=2.0)
 
 
-def _end_orderly_on_sigterm() -> None:
-    """Makes SIGTERM end Python like an exception, unless the program handles it itself."""
-    in_main = threading.current_thread() is threading.main_thread()
-    if in_main and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
-        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
-
-
 class CommandTimeout:
-    """Ends a command whose sender has been silent for longer than a limit [s].
+    """Ends a command whose sender, which may have raised or hang, is silent beyond a limit [s]."""
 
-    The caller of `step` may have failed where the env does not see it: a policy that raised, a
-    wrapper, a loop that hangs. No reference to the link is kept, because it may be garbage.
-    """
-
+    # No reference to the link is kept, because it may be garbage.
     def __init__(self, publisher: Publisher, kind: Any, limit_s: float) -> None:
         self._publisher, self._kind, self._limit_s = publisher, kind, limit_s
         self._due_s = self._answered_s = math.inf
@@ -246,13 +231,10 @@ class EpisodeServices:
 
     def begin(self, start: Start, timeout_s: float) -> int:
         """Begins an episode; returns the stamp of its first data [ns]. Raises BridgeError."""
-        chosen = {
-            "episode_seed": int(start.seed), "episode_start": start.pose.ravel().tolist(),
-            "episode_start_given": True,
-        }  # fmt: skip
-        request = SetParametersAtomically.Request(
-            parameters=[Parameter(name, value=it).to_parameter_msg() for name, it in chosen.items()]
-        )
+        seed, pose = int(start.seed), start.pose.ravel().tolist()
+        chosen = {"episode_seed": seed, "episode_start": pose, "episode_start_given": True}
+        given = [Parameter(name, value=it).to_parameter_msg() for name, it in chosen.items()]
+        request = SetParametersAtomically.Request(parameters=given)
         result = self._link.call(self._parameters, request, timeout_s).result
         if not result.successful:
             raise BackendError(f"the simulator refused the episode: {result.reason}")
@@ -262,8 +244,6 @@ class EpisodeServices:
         answer: dict[str, Any] = json.loads(response.message)
         for key, mine in self._identity.items():
             if answer.get(key) != mine:
-                raise ModelError(
-                    f"the simulator runs the {key} {answer.get(key)!r}, this env {mine!r}; start "
-                    f"both with the same {key}."
-                )
+                runs = f"the simulator runs the {key} {answer.get(key)!r}, this env {mine!r}"
+                raise ModelError(f"{runs}; start both with the same {key}.")
         return int(answer["stamp_ns"])

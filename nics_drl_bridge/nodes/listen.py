@@ -47,16 +47,12 @@ def listen(seconds: float, namespace: str = "", domain_id: int | None = None) ->
 
 
 def _look(node: Node, facts: Facts, subscribed: set[str]) -> None:
-    """Notes the publishers and subscribers; subscribes to topics of types that can be judged."""
     for topic, kinds in node.get_topic_names_and_types():
         offers = node.get_publishers_info_by_topic(topic)
         asks = [i for i in node.get_subscriptions_info_by_topic(topic) if i.node_name != NAME]
         told = {info.topic_type for info in offers} or set(kinds)
-        facts.topics[topic] = Endpoints(
-            tuple(sorted(told)),
-            tuple(offer_of(info.qos_profile) for info in offers),
-            tuple(offer_of(info.qos_profile) for info in asks),
-        )
+        both = (tuple(offer_of(info.qos_profile) for info in some) for some in (offers, asks))
+        facts.topics[topic] = Endpoints(tuple(sorted(told)), *both)
     for role, topic in facts.names.items():
         there = facts.topics.get(topic, Endpoints(()))
         wanted = [kind for kind in there.types if kind in KINDS[role]]

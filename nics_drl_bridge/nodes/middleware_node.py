@@ -22,9 +22,8 @@ SILENCE_S = 5.0  # diagnostics warn of a topic that has been silent for this lon
 class MiddlewareNode(ManagedNode):
     """Listens to a robot's topics; publishes `odometry/filtered` and `/diagnostics`.
 
-    `RobotTopics` describes these topics, `docs/middleware.md` their use. `~/reset` clears all
-    state, so that the next odometry fixes `map` anew. It listens when configured and publishes the
-    estimate when active; diagnostics are published in every state.
+    See `RobotTopics` and `docs/middleware.md`. `~/reset` clears all state, so that the next
+    odometry fixes `map` anew. It listens when configured and publishes the estimate when active.
     """
 
     def __init__(self, context: Context) -> None:

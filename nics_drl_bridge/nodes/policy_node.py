@@ -31,11 +31,10 @@ LONGEST_REASON = 300  # greatest length of a policy's error text, in characters
 class PolicyNode(ManagedNode):
     """Answers scans with `cmd_vel_raw`, with the stamp of the scan, until the goal is reached.
 
-    It observes through the same task as the Gymnasium env, at a fixed rate of the steady clock: it
-    acts at most once per control period and per scan. An inference that exceeds the deadline is
-    dropped; after several in a row it commands zero. The goal, in `map`, is a parameter at the
-    start and the topic `goal_pose` afterwards. It listens when configured and commands when active;
-    its last command before deactivation is zero.
+    It observes through the same task as the Gymnasium env, and acts at most once per control period
+    and per scan. An inference that exceeds the deadline is dropped; after several in a row it
+    commands zero. The goal, in `map`, is a parameter at the start and the topic `goal_pose`
+    afterwards. It listens when configured and commands when active; its last command is zero.
     """
 
     def __init__(self, context: Context) -> None:
@@ -71,9 +70,7 @@ class PolicyNode(ManagedNode):
         self._raw = self.create_lifecycle_publisher(TwistStamped, "cmd_vel_raw", qos.COMMAND)
         goals = self.create_subscription(PoseStamped, "goal_pose", self._on_goal, qos.COMMAND)
         self.undo.callback(self.destroy_subscription, goals)
-        self._topics = RobotTopics(
-            self, model, on_odometry=self._act, on_scan=self._act, on_lidar=self._on_lidar
-        )
+        self._topics = RobotTopics(self, model, self._act, self._act, self._on_lidar)
         self.undo.callback(self._topics.close)
         timer = runner.steadily(self, POLLS * model.control_period, self._act)
         self.undo.callback(self.destroy_timer, timer)
@@ -83,41 +80,34 @@ class PolicyNode(ManagedNode):
         runner.last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
 
     def _declared_pace(self, control_period: float) -> tuple[ActionPace, Deadline]:
-        rate, limit, patience = (
-            self.get_parameter(name).value for name in ("rate", "deadline", "late_limit")
-        )
+        names = ("rate", "deadline", "late_limit")
+        rate, limit, patience = (self.get_parameter(name).value for name in names)
         if rate < 0.0 or limit <= 0.0 or patience < 1:
-            raise ConfigError(
-                f"parameters rate {rate}, deadline {limit}, late_limit {patience}: must be at "
-                "least 0, more than 0, and at least 1."
-            )
+            given = f"parameters rate {rate}, deadline {limit}, late_limit {patience}"
+            raise ConfigError(f"{given}: must be at least 0, more than 0, and at least 1.")
         period = control_period if np.isnan(rate) else 1.0 / rate if rate > 0.0 else 0.0
         limit = 0.5 * control_period if np.isnan(limit) else limit
         return ActionPace(period), Deadline(limit, patience)
 
     def _open_policy(self, model: SimulatorModel) -> None:
-        """Opens the policy for a model, and runs it once, so that it compiles now."""
         name = str(self.get_parameter("policy").value)
         self._policy, self._task = open_policy(name, model)
-        view = rehearse(model)
+        view = rehearse(model)  # so that all compiles now
         self._task.judge(view, {"goal": np.zeros(2)})
         self._asked(view, np.zeros(2))
 
     def _on_lidar(self, lidar: LidarSpec) -> None:
-        """Switches to another lidar. Raises ConfigError if that is not possible."""
         self._open_policy(replace(self._model, lidar=lidar))
         begin, end = np.degrees([lidar.angles[0], lidar.angles[-1]])
         done = "used" if self._task.scan is None else "resampled"
-        self.get_logger().info(
-            f"scans of {lidar.beams} beams from {begin:.4g} to {end:.4g} deg are {done}"
-        )
+        span = f"from {begin:.4g} to {end:.4g} deg"
+        self.get_logger().info(f"scans of {lidar.beams} beams {span} are {done}")
 
     def _on_goal(self, message: PoseStamped) -> None:
         self._goal = np.array([message.pose.position.x, message.pose.position.y])
         self.get_logger().info(f"new goal ({self._goal[0]:.2f}, {self._goal[1]:.2f}) m")
 
     def _act(self, _: int = 0) -> None:
-        """Acts when due, once per scan, with an odometry at least as new."""
         if self.state != ACTIVE:
             return
         newest, begin_s = self._topics.middleware.cache.newest, time.monotonic()
@@ -133,10 +123,8 @@ class PolicyNode(ManagedNode):
         twist = self._twist()
         answer = self._deadline.judge(time.monotonic() - begin_s)
         if answer is not Answer.SEND:
-            self.get_logger().warning(
-                f"inference was late ({self._deadline.late} so far), its command is dropped",
-                throttle_duration_sec=5.0,
-            )
+            told = f"inference was late ({self._deadline.late} so far), its command is dropped"
+            self.get_logger().warning(told, throttle_duration_sec=5.0)
         if answer is not Answer.DROP:
             sent = twist if answer is Answer.SEND and np.isfinite(twist).all() else np.zeros(3)
             self._raw.publish(self._message(sent, scan_ns))
@@ -149,7 +137,6 @@ class PolicyNode(ManagedNode):
         return runner.Condition(f"{self.state}; {done.late} late inferences", done.late > 0, facts)
 
     def _twist(self) -> Array:
-        """Returns the command (3,); zero without a pose or goal, at the goal, or on contact."""
         if not (self._topics.located and np.isfinite(self._goal).all()):
             return np.zeros(3)
         view = self._topics.view()
@@ -162,7 +149,6 @@ class PolicyNode(ManagedNode):
         return self._asked(view, self._goal)
 
     def _asked(self, view: RobotView, goal: Array) -> Array:
-        """Returns the policy's command (3,). Its errors become BridgeError, which ends the node."""
         try:
             action = self._policy.act(self._task.observation(view, {"goal": goal}))
             return self._task.robot.to_cmd_vel(self._task.command(action))
@@ -172,10 +158,12 @@ class PolicyNode(ManagedNode):
             self.get_logger().debug(traceback.format_exc())
             place = traceback.extract_tb(error.__traceback__)[-1]
             words = shortened(f"{type(error).__name__}: {error}", LONGEST_REASON)
-            raise BridgeError(
-                f"policy {self.get_parameter('policy').value!r} raised {words} ({place.filename}, "
-                f"line {place.lineno}); the robot is stopped, mend the policy."
-            ) from error
+            name, where = (
+                self.get_parameter("policy").value,
+                f"{place.filename}, line {place.lineno}",
+            )
+            fix = "the robot is stopped, mend the policy."
+            raise BridgeError(f"policy {name!r} raised {words} ({where}); {fix}") from error
 
     def _message(self, twist: Array, stamp_ns: int) -> TwistStamped:
         frame = str(self.get_parameter("base_frame").value)

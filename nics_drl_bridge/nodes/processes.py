@@ -41,15 +41,12 @@ def free_domain_id() -> int:
         every = range(1, LAST_DOMAIN_ID + 1)
         return random.SystemRandom().choice(sorted(set(every) - domains_in_use()) or every)
     if not given.isdecimal() or int(given) > GREATEST_DOMAIN_ID:
-        raise ConfigError(
-            f"the environment variable ROS_DOMAIN_ID is {given!r}; it must be a number from 0 to "
-            f"{GREATEST_DOMAIN_ID}, or unset."
-        )
+        fix = f"it must be a number from 0 to {GREATEST_DOMAIN_ID}, or unset."
+        raise ConfigError(f"the environment variable ROS_DOMAIN_ID is {given!r}; {fix}")
     return int(given)
 
 
 def _dies_with_parent() -> Callable[[], None] | None:
-    """Returns what a child does first, on Linux: request SIGTERM for any death of its parent."""
     if sys.platform != "linux":
         return None
     prctl, parent = ctypes.CDLL(None).prctl, os.getpid()
@@ -63,10 +60,9 @@ def _dies_with_parent() -> Callable[[], None] | None:
 
 
 class NodeProcess(AbstractContextManager["NodeProcess", None]):
-    """One node in its own process; a context manager that ends it.
+    """One node in its own process, with log and parameters in a folder, which `close` ends.
 
-    The folder gets its log and its parameter file; `remap` maps names; `discovery` is LOCALHOST or
-    SUBNET. On Linux the node also ends when the thread that started it does.
+    `discovery` is LOCALHOST or SUBNET. On Linux the node also ends when its parent thread does.
     """
 
     def __init__(
@@ -97,9 +93,8 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
         if code is not None:
             lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
             last = " | ".join(lines[-LOG_LINES:]) or "no output"
-            raise BackendError(
-                f"{self.node} ended with code {code}: {last} (its log is {self.log})."
-            )
+            reason = f"ended with code {code}: {last} (its log is {self.log})."
+            raise BackendError(f"{self.node} {reason}")
 
     def close(self) -> int:
         """Ends the node: SIGINT, then SIGKILL if it does not react. Returns its exit code."""
@@ -123,9 +118,8 @@ class Witness(AbstractContextManager["Witness", None]):
         self._context = open_context(domain_id=domain_id)
         self._node = Node("witness", context=self._context, start_parameter_services=False)
         self._node.create_subscription(Odometry, topic, self._take, qos.SENSOR_RELIABLE)
-        self._thread = threading.Thread(
-            target=spin, args=(self._node, threading.Event()), daemon=True, name="witness"
-        )
+        given = self._node, threading.Event()
+        self._thread = threading.Thread(target=spin, args=given, daemon=True, name="witness")
         self._thread.start()
 
     def _take(self, message: Odometry) -> None:

@@ -8,6 +8,7 @@ for late joiners (volatile): a robot's old data mislead.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 from rclpy import qos as rclpy_qos
@@ -50,24 +51,16 @@ SENSOR = profile_of(Offer(5, reliable=False))
 link a reliable scan arrives half a second late and looks fresh. It matches every publisher. Also in
 lock-step: acknowledging each datum takes a tenth of a step, and lost data are requested again."""
 
-SENSOR_RELIABLE = profile_of(Offer(10))
-"""Publishers of the same, so that subscribers of both kinds match."""
+SENSOR_RELIABLE = profile_of(Offer(10))  # publishers of the same: subscribers of both kinds match
 
 EVERY_COMMAND = profile_of(Offer(10))
 """Commands in lock-step: each moves the world, and a second publisher must not replace the
 first one's unnoticed. Also `e_stop`, of which no press may be overwritten."""
 
 COMMAND = profile_of(Offer(1))  # commands and goals: only the newest counts, and it has to arrive
-
-TRANSFORMS = profile_of(Offer(100))
-"""`/tf`: like tf2's own broadcasters, whose listeners request reliable."""
-
-FIXED_TRANSFORMS = profile_of(Offer(1, transient_local=True))
-"""`/tf_static`: published once, and delivered to late joiners too."""
-
-DIAGNOSTICS = profile_of(Offer(10))
-"""`/diagnostics`: rare and small, and each message may concern something else; as the diagnostic
-aggregator expects it."""
+TRANSFORMS = profile_of(Offer(100))  # `/tf`: like tf2's own, whose listeners request reliable
+FIXED_TRANSFORMS = profile_of(Offer(1, transient_local=True))  # `/tf_static`: for late joiners too
+DIAGNOSTICS = profile_of(Offer(10))  # as the diagnostic aggregator expects `/diagnostics`
 
 MOMENT_S, UNKNOWN = 0.5, "_UNKNOWN_"
 
@@ -82,18 +75,15 @@ class QosWatch(Node):
 
     def publisher_events(self, topic: str, qos: Any) -> PublisherEventCallbacks:
         """Returns the callbacks for a publisher that rclpy makes without `create_publisher`."""
-        return PublisherEventCallbacks(
-            incompatible_qos=lambda event: self._warn(event, topic, qos, publishing=True)
-        )
+        warn = partial(self._warn, topic=topic, qos=qos, publishing=True)
+        return PublisherEventCallbacks(incompatible_qos=warn)
 
     def create_subscription(
         self, kind: Any, topic: str, callback: Any, qos: Any, **options: Any
     ) -> Subscription:
         """Creates a subscription; see rclpy."""
-        watched = SubscriptionEventCallbacks(
-            incompatible_qos=lambda event: self._warn(event, topic, qos, publishing=False)
-        )
-        options = {"event_callbacks": watched} | options
+        warn = partial(self._warn, topic=topic, qos=qos, publishing=False)
+        options = {"event_callbacks": SubscriptionEventCallbacks(incompatible_qos=warn)} | options
         return super().create_subscription(kind, topic, callback, qos, **options)
 
     def _warn(self, event: Any, topic: str, qos: Any, publishing: bool) -> None:
@@ -106,21 +96,17 @@ class QosWatch(Node):
             ours = qos if isinstance(qos, QoSProfile) else QoSProfile(depth=qos)
             name, theirs = self._misfit(resolved, ours, publishing)
             own, other = (_value(profile, policy) for profile in (ours, theirs))
-            offered, asked, cure = (
-                (own, other, f"{name} ask for {own}")
-                if publishing
-                else (other, own, f"{name} offer {own}, or put a relay between")
-            )
+            offered, asked = (own, other) if publishing else (other, own)
+            cure = f"ask for {own}" if publishing else f"offer {own}, or put a relay between"
             self.get_logger().warning(
                 f"{resolved}: no message passes between this node and {name}: the {policy.lower()} "
                 f"that the publisher offers ({offered}) is less than what the subscription asks "
-                f"for ({asked}); let {cure}."
+                f"for ({asked}); let {name} {cure}."
             )
 
         timer = self.create_timer(MOMENT_S, say, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
     def _misfit(self, topic: str, ours: QoSProfile, publishing: bool) -> tuple[str, Any]:
-        """Returns name and profile of the last peer that does not fit, as far as known."""
         kind = "subscriptions" if publishing else "publishers"
         for peer in reversed(getattr(self, f"get_{kind}_info_by_topic")(topic)):
             pair = (ours, peer.qos_profile) if publishing else (peer.qos_profile, ours)

@@ -25,8 +25,7 @@ from nics_drl_bridge.sim.world import World
 RAW = "cmd_vel_raw"
 POLL_S, SAY_EVERY_S = 0.01, 2.0
 SERVICES_S = 0.5  # a peer that shows no services this long after its topics is a vehicle [s]
-COMMAND_S, PERIODS = 0.5, 2
-"""A command lasts this long, and at least this many periods; then a zero follows by itself."""
+COMMAND_S, PERIODS = 0.5, 2  # least time and periods that a command lasts; then a zero follows
 STILL = (0.02, 0.05)  # a slower robot is at rest [m/s, rad/s]
 ADVICE = (
     "start the robot, or `simulator_node` with mode:=realtime, in the same ROS_DOMAIN_ID and "
@@ -66,13 +65,10 @@ class RealtimeBackend:
     """One robot behind its topics, stepped at a fixed period of the steady clock.
 
     A step publishes its command at once, waits for the end of the period, and returns the newest
-    view. A late caller misses deadlines, which are counted and not made up for: the next step again
-    ends on the grid of periods. Data feed the middleware as they arrive, in one executor thread;
-    late and unordered ones are put in their place there.
-
-    Raises ConfigError if an option can't be used; BackendError if no peer is there, a simulator
-    refuses, or a vehicle does not come to rest at its start; ModelError if a simulator runs another
-    model or world; StaleDataError if a topic's newest datum is older than `stale_after_s`.
+    view. Deadlines that a late caller misses are counted and not made up for. Raises ConfigError
+    if an option can't be used; BackendError if no peer is there, a simulator refuses, or a vehicle
+    does not come to rest at its start; ModelError if a simulator runs another model or world;
+    StaleDataError if a topic's newest datum is older than `stale_after_s`.
     """
 
     def __init__(self, model: SimulatorModel, world: World, **options: Any) -> None:
@@ -125,30 +121,26 @@ class RealtimeBackend:
         return self._fresh_view()[0]
 
     def _is_vehicle(self) -> bool:
-        """True for a vehicle: by the options, or if it has never shown services of a simulator."""
         if self._options.vehicle is not None:
             return self._options.vehicle
         self._simulated = self._simulated or self._episodes.there
         return not self._simulated
 
     def _await_start(self, start: Start) -> None:
-        """Waits until a vehicle stands at its start, telling what is missing, or is a simulator."""
         say = self._options.say or self._link.node.get_logger().info
         began, said = time.monotonic(), -math.inf
         while self._is_vehicle() and (missing := self._missing(start)):
             now = time.monotonic()
             if now - began > self._options.start_timeout_s:
-                raise BackendError(
-                    f"after {self._options.start_timeout_s:g} s the robot is not ready: {missing}; "
-                    "place it there, or choose start='present'."
-                )
+                late = f"after {self._options.start_timeout_s:g} s the robot is not ready"
+                fix = "place it there, or choose start='present'."
+                raise BackendError(f"{late}: {missing}; {fix}")
             if now - said >= SAY_EVERY_S:
                 say(f"waiting for the robot: {missing}")
                 said = now
             time.sleep(POLL_S)
 
     def _missing(self, start: Start) -> str:
-        """Returns what is missing before an episode may begin, as a clause; empty if nothing is."""
         topic, silence_s = self._oldest()
         if math.isinf(silence_s):
             return f"no {topic} yet"
@@ -171,7 +163,6 @@ class RealtimeBackend:
         )
 
     def _oldest(self) -> tuple[str, float]:
-        """Returns the topic with the oldest datum, and its age or lag [s]; inf without one."""
         with self._topics.lock:
             newest, now = dict(self._topics.middleware.cache.newest), time.monotonic_ns()
         latest = max((datum.stamp_ns for datum in newest.values()), default=0)
@@ -204,7 +195,6 @@ class RealtimeBackend:
         return self._fresh_view()
 
     def _fresh_view(self) -> tuple[RobotView, dict[str, Any]]:
-        """Returns the newest view, with facts. Raises StaleDataError if it is too old."""
         topic, age_s = self._oldest()
         if age_s > self._options.stale_after_s:
             raise StaleDataError(topic, age_s, self._options.stale_after_s)

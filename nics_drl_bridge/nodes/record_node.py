@@ -41,8 +41,7 @@ HALT_S = 0.5  # zero is repeated for this long [s]: a best-effort subscriber may
 PERIOD_NS = round(PERIOD_S * NS_PER_S)
 PLACE = "recording"
 FEWEST = 2
-SAME_PACE = (0.8, 1.25)
-"""Limits of the stamps' rate relative to receipt; beyond them it is another kind of time."""
+SAME_PACE = (0.8, 1.25)  # of stamps relative to receipt; beyond it, it is another kind of time
 
 
 @dataclass(frozen=True)
@@ -112,29 +111,21 @@ class DriveLog:
         if self._joints:
             joint_streams("joint_states", self._joints, self._spec, self._roles, PLACE)
         elif measured or self._roles.state:
-            raise BackendError(
-                f"topic 'joint_states': nothing has arrived, but {(measured or ['the state'])[0]} "
-                f"of robot {self._spec.name!r} has to be measured; start the joints' publisher, "
-                "or remap the topic."
-            )
+            what = f"{(measured or ['the state'])[0]} of robot {self._spec.name!r}"
+            fix = "has to be measured; start the joints' publisher, or remap the topic."
+            raise BackendError(f"topic 'joint_states': nothing has arrived, but {what} {fix}")
         receive, header = np.array([row[:2] for row in self.rows["odom"]]).T
         heard, rate = (receive[-1] - receive[0]) / NS_PER_S, pace(receive, header)
         if not SAME_PACE[0] <= rate <= SAME_PACE[1]:
-            raise BackendError(
-                f"topic 'odom': its stamps went on by {rate * heard:.2f} s within {heard:.2f} s; "
-                "where a simulator is the robot, take its time: --use-sim-time, or "
-                "-p use_sim_time:=true."
-            )
+            off = f"its stamps went on by {rate * heard:.2f} s within {heard:.2f} s"
+            fix = "take the time of a simulator by --use-sim-time, or -p use_sim_time:=true."
+            raise BackendError(f"topic 'odom': {off}; {fix}")
 
     def recording(self) -> Recording:
-        """Returns all streams on their clocks; the pose is that of `pose` if that topic was heard.
-
-        In addition to such a pose, the twist of the odometry is kept, to determine its noise.
-        Raises RecordingError if too little was received.
-        """
+        """Returns all streams on their clocks. Raises RecordingError if too little was received."""
         topics = {"command": "cmd_vel", "pose": "odom", "imu": "imu"}
         if len(self.rows["pose"]) >= FEWEST:
-            topics |= {"pose": "pose", "odometry": "odom twist"}
+            topics |= {"pose": "pose", "odometry": "odom twist"}  # which determines its noise
         data: dict[str, TopicData] = {}
         for name, topic in topics.items():
             if len(self.rows[topic]) >= FEWEST:
@@ -175,11 +166,10 @@ class DriveResult:
 class RecordNode(qos.QosWatch):
     """Sends `cmd_vel` at 20 Hz; writes `odom`, `joint_states`, `imu` and `pose` to a recording.
 
-    The centre of the circle is the robot's place at the start; each segment of the drive is chosen
-    from the robot's position by odometry. The drive ends with zero commands, also on a signal, on
-    an error, when odometry is silent, and when the robot leaves the circle; what was recorded
-    until then is saved. If this process is killed, only the robot's own timeout on `cmd_vel` stops
-    it. Given parameters override those of the command line.
+    Each segment of the drive is chosen from the robot's position by odometry. It ends with zero
+    commands, also on a signal, on an error, when odometry is silent, and when the robot leaves the
+    circle around its start; what was recorded until then is saved. If this process is killed, only
+    the robot's own timeout on `cmd_vel` stops it.
     """
 
     def __init__(self, context: Context, given: Mapping[str, Any] | None = None) -> None:
@@ -206,7 +196,6 @@ class RecordNode(qos.QosWatch):
         steadily(self, POLL_S, self._on_time)
 
     def _now_ns(self) -> int:
-        """Returns simulated time, or the system time at the start plus steady time [ns]."""
         if self._sim_time:
             # Odometry may arrive before its tick of /clock.
             return max(int(self.get_clock().now().nanoseconds), self._stamp_ns)
@@ -238,24 +227,20 @@ class RecordNode(qos.QosWatch):
                 self._end(None, complete=True)
 
     def _ready(self) -> bool:
-        """True if the robot listens and reports its pose; raises BackendError after 10 s."""
         listeners = self._topic.get_subscription_count()
         if self._pose is not None and listeners > 0 and self._now_ns() > 0:
             others = self.count_publishers(self._topic.topic_name) - 1
             if others > 0:
-                raise BackendError(
-                    f"topic {self._topic.topic_name!r}: {others} other publisher(s) would drive "
-                    "the robot too; end them, or remap the topic."
-                )
+                reason = f"{others} other publisher(s) would drive the robot too; end them, or"
+                raise BackendError(f"topic {self._topic.topic_name!r}: {reason} remap the topic.")
             self._start, self._origin_ns = self._pose, self._now_ns()
             return True
         if time.monotonic() - self._began > PATIENCE_S:
             odom, command = ("odom", "nothing arrived"), ("cmd_vel", "nobody listened")
             name, missing = odom if self._pose is None else command
-            raise BackendError(
-                f"topic {self._place(name)}: {missing} within {PATIENCE_S:g} s; start the robot, "
-                "or correct namespace, ROS_DOMAIN_ID or remapping."
-            )
+            fix = "start the robot, or correct namespace, ROS_DOMAIN_ID or remapping."
+            reason = f"{missing} within {PATIENCE_S:g} s"
+            raise BackendError(f"topic {self._place(name)}: {reason}; {fix}")
         return False
 
     def _place(self, topic: str) -> str:
@@ -277,18 +262,15 @@ class RecordNode(qos.QosWatch):
     def _guard(self) -> None:
         age, limit = time.monotonic() - self._heard, self._order.odom_timeout
         if age > limit:
-            raise BackendError(
-                f"topic {self._place('odom')}: nothing new for {age:.2f} s, which may be "
-                f"{limit:g} s; find out why odometry stopped."
-            )
+            reason = f"nothing new for {age:.2f} s, which may be {limit:g} s"
+            place = self._place("odom")
+            raise BackendError(f"topic {place}: {reason}; find out why odometry stopped.")
         bound, radius = self._order.plan.bound, self._order.plan.robot.footprint_radius
         x, y, _ = geometry.between(self._start, self._start if self._pose is None else self._pose)
         if np.hypot(x, y) + radius > bound:
-            raise BackendError(
-                f"the robot left its circle of {bound:g} m, at x {x:.2f}, y {y:.2f} m "
-                f"from the start with a radius of {radius:g} m; give it a larger bound, less "
-                "speed, or the parameters that it really has."
-            )
+            where = f"at x {x:.2f}, y {y:.2f} m from the start with a radius of {radius:g} m"
+            fix = "give it a larger bound, less speed, or the parameters that it really has."
+            raise BackendError(f"the robot left its circle of {bound:g} m, {where}; {fix}")
 
     def _send(self, command: Array) -> None:
         self._topic.publish(self._message(self._order.plan.robot.to_cmd_vel(command)))

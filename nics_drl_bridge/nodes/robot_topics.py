@@ -45,17 +45,13 @@ def declare_sensors(node: Node) -> None:
 class RobotTopics:
     """Subscribes to a robot's topics and keeps the middleware up to date.
 
-    These are `scan`, `odom`, `cmd_vel` and those of the model's further sensors, and `pose` and
-    `imu` as requested by the parameters that `declare_sensors` has declared. A reader in another
-    thread than the spinning one holds `lock`.
     Data are used at their own stamps; a command, which has none, at the stamp of the newest datum
-    before it. The first odometry fixes `map`, unless there is a pose sensor: then the first pose.
-
-    `on_odometry` and `on_scan` are called with the stamp [ns] after each odometry that is the
-    newest, and each scan that was used; `on_lidar` with the lidar of scans with a header other than
-    the model's, which are rejected if it raises ConfigError. Without it only scans with another
-    number of beams are rejected. `now_ns` is the clock of arrivals, the node's by default. Raises
-    ConfigError if `pose_type` is unknown.
+    before it. The first odometry fixes `map`, unless there is a pose sensor: then the first pose. A
+    reader in another thread than the spinning one holds `lock`. `on_odometry` and `on_scan` are
+    called with the stamp [ns] after each odometry that is the newest, and each scan that was used;
+    `on_lidar` with the lidar of scans with another header than the model's, which are rejected if
+    it raises ConfigError; without it, if their number of beams differs. `now_ns` is the clock of
+    arrivals, the node's by default. Raises ConfigError if the parameter `pose_type` is unknown.
     """
 
     def __init__(
@@ -84,10 +80,8 @@ class RobotTopics:
         self._posed = pose_type != NO_POSE
         if self._posed:
             if pose_type not in POSE_TYPES:
-                raise ConfigError(
-                    f"parameter 'pose_type': there is no {pose_type!r}; "
-                    f"{nearest(pose_type, (NO_POSE, *POSE_TYPES))}"
-                )
+                fix = nearest(pose_type, (NO_POSE, *POSE_TYPES))
+                raise ConfigError(f"parameter 'pose_type': there is no {pose_type!r}; {fix}")
             sensors[POSE] = (POSE_TYPES[pose_type], self._take_pose)
         if node.get_parameter("use_imu").value:
             sensors[IMU] = (Imu, self._take_imu)
@@ -149,7 +143,6 @@ class RobotTopics:
             self._on_scan(stamp)
 
     def _reader_for(self, message: LaserScan) -> Reader | None:
-        """Returns the reader of a scan; None if it can't be used, logged once for each header."""
         fields = [message.angle_min, message.angle_increment, message.range_min, message.range_max]
         header = np.array([*fields, len(message.ranges)], np.float32).tobytes()
         if header == self._header or self._on_lidar is None:

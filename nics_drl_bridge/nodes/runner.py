@@ -36,23 +36,19 @@ SPIN_S = 0.1
 DELIVERY_S = 0.5
 EXIT_BAD_INPUT = 2
 SETTLE_S, POLL_S = 0.3, 0.02  # time until the graph shows all nodes [s]
-ANSWER_S = 1.5
-"""A node that does not answer within this time is dead; the graph shows it for some 20 s more."""
+ANSWER_S = 1.5  # a node that does not answer within it is dead; the graph shows it for 20 s more
 DIAGNOSTICS_S = 1.0
 RANGES = {int: (IntegerRange, "integer_range"), float: (FloatingPointRange, "floating_point_range")}
+# Parameters that rclpy reads itself; and one that a file sets for nodes that have no model, too.
 QOS, SHARED = "qos_overrides.", "model"
-"""Names of parameters that rclpy reads itself, if a publisher or subscription requests it; and one
-that a file sets for all nodes at once, including those that have no model."""
 
 
 def open_context(args: Sequence[str] | None = None, domain_id: int | None = None) -> Context:
     """Returns a new context; discovery stays on this machine unless the environment sets a range.
 
-    A robot that others should see sets `ROS_AUTOMATIC_DISCOVERY_RANGE` (on Humble
-    `ROS_LOCALHOST_ONLY=0`); by default a simulator in a lab can't move another robot. Fast DDS
-    sends by UDP, unless the environment chooses otherwise (`transport`). Raises BackendError if the
-    arguments are wrong, no ROS 2 middleware is there, or discovery should reach further than that
-    of an earlier context of this process.
+    By default a simulator in a lab can't move another robot; see `transport`. Raises BackendError
+    if the arguments are wrong, no ROS 2 middleware is there, or discovery should reach further than
+    that of an earlier context of this process.
     """
 
     def make() -> Context:
@@ -77,9 +73,8 @@ def run_node(
 ) -> Any:
     """Runs a node until SIGINT or SIGTERM, then destroys it in order, and returns it.
 
-    A node's `start()`, if any, is called before it spins, and its `stop()` while it can still
-    publish, to leave its robot at rest. A user's error becomes one sentence on standard error and
-    exit code 2. With a `sole_name` only a single instance runs in a namespace.
+    A node's `start()`, if any, is called before it spins, its `stop()` while it can still publish.
+    A user's error becomes one sentence and exit code 2. `sole_name`: see `sole`.
     """
     stopping, started = threading.Event(), threading.Event()
 
@@ -146,10 +141,9 @@ def spin(node: Node, stopping: threading.Event) -> None:
 def sole(context: Context, name: str) -> Iterator[None]:
     """Ensures a single instance while a node runs: if its name is taken, it does not start.
 
-    Two that start at the same moment on one machine (and network namespace) are told apart by the
-    name of a socket, which only one of them gets, and which ends with its process. Others, and
-    nodes of other packages, are found in the graph and asked whether they are alive. The arguments
-    of the context may set another name or a namespace. Raises BackendError if another is running.
+    Two that start at the same moment on one machine are told apart by the name of a socket, which
+    only one of them gets; others are found in the graph and asked whether they are alive. Raises
+    BackendError if another is running.
     """
     # The probe resolves its name as the node will.
     probe = Node(name, context=context, start_parameter_services=False, enable_rosout=False)
@@ -164,17 +158,14 @@ def sole(context: Context, name: str) -> Iterator[None]:
             except OSError:
                 taken = True
             if taken or (_seen(probe, whole) and _lives(probe, whole)):
-                raise BackendError(
-                    f"a node {whole!r} runs already in ROS domain {domain}; end it, or give this "
-                    "one another namespace: `--ros-args -r __ns:=/robot_2`."
-                )
+                fix = "end it, or give this one a namespace: `--ros-args -r __ns:=/robot_2`."
+                raise BackendError(f"a node {whole!r} runs already in ROS domain {domain}; {fix}")
         finally:
             probe.destroy_node()
         yield
 
 
 def _seen(probe: Node, whole: str) -> bool:
-    """True if the graph shows another node of the probe's name within `SETTLE_S`."""
 
     def shows() -> bool:
         nodes = probe.get_node_names_and_namespaces()
@@ -227,12 +218,8 @@ def declare(
     node: Node, name: str, default: Any, description: str, span: tuple[float, float] | None = None,
     read_only: bool = False,
 ) -> Any:  # fmt: skip
-    """Declares a parameter of the default's type, and returns its value, which lies in a span.
-
-    In a managed node `read_only` applies from configure to cleanup. `rate:=2` may be given for a
-    floating-point parameter: rclpy itself refuses an integer.
-    """
-    if read_only and hasattr(node, "fixed"):  # a managed node reads it at each configure
+    """Declares a parameter of the default's type, and returns its value, which lies in a span."""
+    if read_only and hasattr(node, "fixed"):  # a managed node: from configure to cleanup
         node.fixed.add(name)
         read_only = False
     descriptor = ParameterDescriptor(description=description, read_only=read_only)
@@ -240,6 +227,7 @@ def declare(
         kind, field = RANGES[type(default)]
         setattr(descriptor, field, [kind(from_value=span[0], to_value=span[1])])
     given, many = _given_values(node), isinstance(default, list)
+    # rclpy itself refuses an integer, as in `rate:=2`, for a floating-point parameter.
     if name in given and isinstance(default[0] if many else default, float):
         types, value = Parameter.Type, given[name].value
         if given[name].type_ == (types.INTEGER_ARRAY if many else types.INTEGER):
@@ -282,9 +270,8 @@ def diagnose(node: Node, part: str, look: Callable[[], Condition]) -> None:
         found = look()
         level = DiagnosticStatus.WARN if found.warns else DiagnosticStatus.OK
         values = [KeyValue(key=key, value=str(value)) for key, value in found.facts.items()]
-        status = DiagnosticStatus(
-            level=level, name=name, message=found.message, hardware_id=found.hardware, values=values
-        )
+        status = DiagnosticStatus(level=level, name=name, message=found.message, values=values)
+        status.hardware_id = found.hardware
         message = DiagnosticArray(status=[status])
         message.header.stamp = node.get_clock().now().to_msg()
         topic.publish(message)

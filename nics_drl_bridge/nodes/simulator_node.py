@@ -7,7 +7,7 @@ import itertools
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, cast
 
@@ -87,10 +87,7 @@ class Outbox:
 
 
 class RobotPort:
-    """Publishes `scan`, `odom`, further sensors, `joint_states`, `ground_truth` of one robot.
-
-    The last two cost nothing without subscribers. The namespace is empty or ends with a slash.
-    """
+    """Publishes `scan`, `odom`, further sensors, `joint_states`, `ground_truth` of one robot."""
 
     def __init__(
         self, node: Node, namespace: str, model: SimulatorModel, frames: device_parameters.Frames,
@@ -162,9 +159,8 @@ class RobotPort:
 class CommandInlet:
     """Listens to `cmd_vel`, and to `ackermann_cmd` if the robot steers and the message exists.
 
-    The node's parameter `enable_stamped_cmd_vel` selects the type. A stamped command is treated as
-    by ros2_control's drive controllers: a stamp of zero counts as now, and one older than the
-    command timeout is ignored. `take` gets each command (C,) whose stamp [ns] is not `too_old`.
+    A stamped command is treated as by ros2_control's drive controllers: a stamp of zero counts as
+    now. `take` gets each command (C,) whose stamp [ns] is not `too_old`.
     """
 
     def __init__(
@@ -190,7 +186,7 @@ class CommandInlet:
         except wire.UNREADABLE as error:
             self._complain(f"a message that can't be read ({error}) is ignored")
 
-    def _obey(self, twist: tuple[float, float, float]) -> None:
+    def _obey(self, twist: Sequence[float]) -> None:
         if all(map(math.isfinite, twist)):
             self._take(self._robot.from_cmd_vel(twist))
         else:
@@ -198,8 +194,7 @@ class CommandInlet:
 
     def _on_stamped(self, message: TwistStamped) -> None:
         if self._is_fresh(message.header.stamp):
-            twist = message.twist
-            self._obey((twist.linear.x, twist.linear.y, twist.angular.z))
+            self._obey(conversions.twist_from_ros(message).tolist())
 
     def _on_ackermann(self, message: Any) -> None:
         if self._is_fresh(message.header.stamp):
@@ -209,10 +204,8 @@ class CommandInlet:
         stamp_ns = conversions.stamp_from_ros(stamp)
         if not stamp_ns or not self._too_old(stamp_ns):
             return True
-        self._complain(
-            "a command is ignored, because its stamp is older than command_timeout; do both ends "
-            "take their time from the same clock (use_sim_time)?"
-        )
+        why = "its stamp is older than command_timeout; do both ends use one clock (use_sim_time)?"
+        self._complain(f"a command is ignored, because {why}")
         return False
 
     def _complain(self, what: str) -> None:
@@ -246,11 +239,10 @@ class DeviceNode(qos.QosWatch):
     """Takes `cmd_vel`; publishes `scan`, `odom`, `joint_states`, `ground_truth`, `/clock`, `/tf`.
 
     With the parameter `robots` it is a fleet in one world, each robot in a namespace below the
-    node's own. Stamps are simulated time, as on `/clock`: it begins at the system's time and never
-    runs backwards, not even at a reset. `~/reset` begins the episode of the parameters
-    `episode_seed` and `episode_start`; its answer is JSON with the stamp of the first data. In
-    lock-step the world moves when each robot has a command, and `~/repeat` publishes its present
-    data again. `~/touched` reports which robots have truly touched something in this episode.
+    node's own. Stamps are simulated time: it begins at the system's time and never runs backwards.
+    `~/reset` begins an episode; its answer is JSON with the stamp of the first data. In lock-step
+    the world moves when each robot has a command, and `~/repeat` publishes the present data again.
+    `~/touched` reports which robots have truly touched something in this episode.
     """
 
     def __init__(self, name: str, context: Context, make: MakeSimulator) -> None:
@@ -292,13 +284,12 @@ class DeviceNode(qos.QosWatch):
         runner.diagnose(self, "simulator", self._look)
 
     def _open_transforms(self) -> None:
-        """Publishes what never changes; if tf2_msgs is not installed, it logs that instead."""
         self._transforms: Any = conversions.message_type("tf2_msgs/msg/TFMessage")
         if self._transforms is None:
-            self.get_logger().warning(
-                "the message package tf2_msgs is not installed, so that neither /tf nor /tf_static "
-                "is published; install it with your ROS 2 distribution."
-            )
+            silent = "so that neither /tf nor /tf_static is published"
+            fix = "install it with your ROS 2 distribution."
+            told = f"the message package tf2_msgs is not installed, {silent}; {fix}"
+            self.get_logger().warning(told)
             return
         self._moving = self.create_publisher(self._transforms, "/tf", qos.TRANSFORMS)
         fixed = self.create_publisher(self._transforms, "/tf_static", qos.FIXED_TRANSFORMS)
@@ -309,10 +300,8 @@ class DeviceNode(qos.QosWatch):
         # Steady: with use_sim_time the node's clock would wait for this very node.
         runner.steadily(self, WATCH_S, self._watch)
         step_ns = self._time.step_ns
-        self._odom_pace, self._scan_pace = (
-            device_parameters.TopicPace(period_ns, step_ns)
-            for period_ns in (self._time.odom_ns, self._time.scan_ns)
-        )
+        self._odom_pace = device_parameters.TopicPace(self._time.odom_ns, step_ns)
+        self._scan_pace = device_parameters.TopicPace(self._time.scan_ns, step_ns)
         self._real_time = device_parameters.RealTime(step_ns, self._time.rate)
         self._timer = None
         self._soon = self.create_guard_condition(self._on_time)
@@ -326,7 +315,6 @@ class DeviceNode(qos.QosWatch):
             runner.steadily(self, 0.0, self._on_free_time)
 
     def _watch(self) -> None:
-        """Warns once of commands of another type, and of other nodes that publish the time."""
         for inlet in self._inlets:
             inlet.watch()
         ends = self.get_publishers_info_by_topic(CLOCK)
@@ -366,11 +354,9 @@ class DeviceNode(qos.QosWatch):
         steady_ns = time.monotonic_ns()
         if self._real_time.lost(steady_ns, self._now_ns):
             self._lags += 1
-            self.get_logger().warning(
-                "this machine does not keep up with real time; ask for a smaller rate, scan_rate "
-                "or odom_rate, or fewer robots",
-                throttle_duration_sec=5.0,
-            )
+            fix = "ask for a smaller rate, scan_rate or odom_rate, or fewer robots"
+            told = f"this machine does not keep up with real time; {fix}"
+            self.get_logger().warning(told, throttle_duration_sec=5.0)
             self._real_time.begin(steady_ns, self._now_ns + self._time.step_ns)
         behind = self._real_time.behind(steady_ns, self._now_ns)
         if behind:
@@ -393,7 +379,6 @@ class DeviceNode(qos.QosWatch):
         self._publish()
 
     def _begin(self) -> None:
-        """Begins an episode. Raises BridgeError if the parameters do not fit the world."""
         given = bool(self.get_parameter("episode_start_given").value)
         start = np.array(self.get_parameter("episode_start").value, dtype=np.float64)
         seed = int(device_parameters.number(self, "episode_seed"))
@@ -407,7 +392,6 @@ class DeviceNode(qos.QosWatch):
         self._publish()
 
     def _go_on(self) -> None:
-        """Restarts real time at the present."""
         self._real_time.begin(time.monotonic_ns(), self._now_ns)
         if self._timer is not None:
             self._timer.reset()
@@ -427,7 +411,6 @@ class DeviceNode(qos.QosWatch):
         return response
 
     def _repeat(self) -> tuple[bool, str]:
-        """Publishes the present data again, if some were lost; in real time new ones follow."""
         if not self._time.lockstep:
             return False, "data are repeated in lock-step alone"
         self._publish_data(odom_due=True, scan_due=True)

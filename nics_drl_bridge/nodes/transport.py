@@ -81,11 +81,9 @@ class Transport:
             stay_on_this_machine(os.environ)
             here = stays_here(os.environ)
             if self._in_force and not here:
-                raise BackendError(
-                    f"{RANGE} is {os.environ[RANGE]}, but an earlier node in this process keeps "
-                    "its discovery on this machine; set it before the first, or use another "
-                    "process."
-                )
+                earlier = "an earlier node in this process keeps its discovery on this machine"
+                fix = "set it before the first, or use another process."
+                raise BackendError(f"{RANGE} is {os.environ[RANGE]}, but {earlier}; {fix}")
             fast_dds = str(get_rmw_implementation_identifier()).startswith("rmw_fast")
             if sys.platform != "linux" or not fast_dds or chosen(os.environ):
                 return make()
@@ -120,7 +118,7 @@ class Transport:
 
 @contextlib.contextmanager
 def _changed(environment: MutableMapping[str, str], words: Mapping[str, str]) -> Iterator[None]:
-    """Sets variables for a while, without the older discovery variable, which overrides them."""
+    # Without the older discovery variable, which overrides the others.
     kept = {key: environment.pop(key, None) for key in (ONLY_LOCAL, *words)}
     environment.update(words)
     try:
@@ -136,7 +134,6 @@ def _maps() -> bytes:
 
 
 def _is_in_force(context: Context) -> bool:
-    """True if a node in a context has neither shared memory nor the multicast of its domain."""
     try:
         node = Node(
             "transport_probe", context=context, use_global_arguments=False,
@@ -177,7 +174,6 @@ def domains_in_use() -> set[int]:
 
 
 def _sockets() -> list[tuple[str, int]]:
-    """Returns name and port of each UDP socket; none where Linux does not report them."""
     lines = TABLE.read_text(encoding="ascii").splitlines()[1:] if TABLE.is_file() else []
     rows = [line.split() for line in lines]
     return [(f"socket:[{row[9]}]", int(row[1].split(":")[1], 16)) for row in rows]

@@ -23,28 +23,24 @@ from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes.conversions import PLANAR, heading_of
 
 Bytes = bytes | bytearray
-HEAD = 4
-"""Bytes of the header, which do not count for alignment; the second one gives the byte order."""
+HEAD = 4  # bytes of the header, not counted for alignment; the second one gives the byte order
 STAMP, FRAME = 4, 12  # offsets of stamp and frame of a message's header
-UNREADABLE = (ValueError, struct.error)
-"""Raised by all readers for bytes that are not a message of the type."""
+UNREADABLE = (ValueError, struct.error)  # raised by all readers for bytes of another type
 PLAIN = (0, 1)  # big-endian and little-endian plain CDR
 NATIVE = bytes((0, PLAIN[sys.byteorder == "little"], 0, 0))  # header of this machine
+# Numbers of an odometry before each: pose, its covariance, twist, its covariance.
 POSE_COVARIANCE, TWIST, DOUBLES = 7, 7 + 36, 7 + 36 + 6 + 36
-"""Numbers of an odometry before each: pose, its covariance, twist, its covariance."""
 SCAN_FIELDS = 7  # floats of a scan between its header and its ranges
 
 
 def _order(content: Bytes) -> str:
-    """Returns the byte order, for `struct`. Raises ValueError if it is not plain CDR."""
     if len(content) < HEAD or content[0] != 0 or content[1] not in PLAIN:
         raise ValueError(f"the bytes {bytes(content[:HEAD]).hex()} begin no plain CDR")
     return "<" if content[1] else ">"
 
 
 def _after_text(content: Bytes, place: int, order: str) -> int:
-    """Returns the end of the text that begins, with its length, at the next multiple of 4."""
-    place = _aligned(place, 4)
+    place = _aligned(place, 4)  # a text begins there with its length
     (length,) = struct.unpack_from(f"{order}I", content, place)
     return place + 4 + int(length)
 

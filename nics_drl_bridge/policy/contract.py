@@ -56,11 +56,11 @@ class ObservationEntry(Schema):
 
 
 class GoldenEntry(Schema):
-    """Sixteen pairs to reproduce, (16, O), (16, C or 1), (16, C) in SI; float32 in base 64."""
+    """Sixteen pairs that must be reproduced; float32, little endian, in base 64."""
 
-    observations: str
-    actions: str
-    commands: str
+    observations: str  # (16, O)
+    actions: str  # (16, C), or (16, 1) discrete
+    commands: str  # (16, C) SI
 
     def rows(self, name: str) -> Rows:
         """One of the arrays as (16, ...). Raises ValueError if it is damaged."""
@@ -95,13 +95,10 @@ class Contract(Schema):
 
 
 def contract_of(
-    task: Task,
-    model: SimulatorModel,
-    golden: Mapping[str, Rows],
-    graph_sha256: str,
+    task: Task, model: SimulatorModel, golden: Mapping[str, Rows], graph_sha256: str,
     provenance: Mapping[str, Any],
-) -> str:
-    """Writes the contract of a policy as JSON; ConfigError if an entry has a wrong type."""
+) -> str:  # fmt: skip
+    """Writes the contract of a policy as JSON. Raises ConfigError if an entry has a wrong type."""
     entry, observation = task_entry(task), observation_entry(task)
     data: dict[str, Any] = {
         "format": FORMAT,
@@ -159,8 +156,7 @@ def _task_hash(entry: Mapping[str, Any], observation: Mapping[str, Any]) -> str:
 def leaves(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     """Yields every entry of nested mappings and lists with its path, as `robot.command.0.max`."""
     if isinstance(data, dict | list) and data:
-        items = data.items() if isinstance(data, dict) else enumerate(data)
-        for key, value in items:
+        for key, value in data.items() if isinstance(data, dict) else enumerate(data):
             yield from leaves(value, f"{path}.{key}" if path else str(key))
     else:
         yield path, data
@@ -173,7 +169,7 @@ def checksums(data: Mapping[str, Any]) -> dict[str, str]:
 
 
 def read_contract(text: str, source: str) -> Contract:
-    """Reads a contract; PolicyError with the field that is wrong, changed or contradictory."""
+    """Reads and checks the contract of a policy file. Raises PolicyError, which names the field."""
     entries = sum(map(text.count, ",[{"))
     if entries > MOST_ENTRIES:
         reason = f"has {entries} entries, a contract at most {MOST_ENTRIES}; not read."

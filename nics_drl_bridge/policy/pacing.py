@@ -6,10 +6,7 @@ from enum import Enum
 
 
 class ActionPace:
-    """Allows at most one action per period, as soon as there are data to act on; 0 acts on all.
-
-    Due times are a period apart, whatever the jitter of data, or a period after data that are late.
-    """
+    """Allows at most one action per period, as soon as there are data to act on; 0 acts on all."""
 
     def __init__(self, period_s: float) -> None:
         self._period_s, self._due_s = period_s, -float("inf")
@@ -20,6 +17,7 @@ class ActionPace:
 
     def acted(self, now_s: float) -> None:
         """Records the start of an action."""
+        # Due times are a period apart: jitter of the data makes it neither faster nor slower.
         late = now_s - self._due_s > 0.5 * self._period_s
         self._due_s = (now_s if late else self._due_s) + self._period_s
 
@@ -33,10 +31,7 @@ class Answer(Enum):
 
 
 class Deadline:
-    """Judges the duration of each inference; counts those in time, the late, and the longest.
-
-    A late command is dropped; after `patience` in a row the robot stops until one is in time again.
-    """
+    """Judges the duration of each inference; after `patience` late ones in a row it says stop."""
 
     def __init__(self, limit_s: float, patience: int) -> None:
         self._limit_s, self._patience = limit_s, patience

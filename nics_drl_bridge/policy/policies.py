@@ -23,7 +23,7 @@ from nics_drl_bridge.robot.spec import RobotSpec
 Array = NDArray[np.float64]
 
 FULL_TURN_RAD = 0.8  # bearing of the goal from which a robot turns as fast as it can
-CREEP = 0.3  # share of full speed if a robot can't turn on the spot and has its goal behind
+CREEP = 0.3  # share of the speed for a robot that can't turn on the spot and has its goal behind
 
 
 class Policy(Protocol):
@@ -34,7 +34,6 @@ class Policy(Protocol):
 
 
 def _actions(robot: RobotSpec, commands: Array) -> Array:
-    """Commands (..., C), scaled to [-1, 1]."""
     low, high = robot.command_low, robot.command_high
     return np.asarray(2.0 * (commands - low) / (high - low) - 1.0)
 
@@ -77,11 +76,10 @@ class RandomActions:
 class DynamicWindow:
     """The dynamic-window approach (Fox, Burgard, Thrun 1997) on scan, goal and twist.
 
-    Tries the twists that commands allow and the robot can reach in a period, each held for the
-    look-ahead. One with a contact before the robot could stop is inadmissible; the best in
-    distance, aim, clearance and time to contact is chosen. It plans no path: behind a long wall it
-    stays. Raises ConfigError if it is not known where the robot's commands lead, see
-    `steady_twist`.
+    Each twist that the robot can reach in a period is held for the look-ahead. One with a contact
+    before the robot could stop is inadmissible; the best of the others in distance, aim, clearance
+    and time to contact is chosen. It plans no path: behind a long wall it stays. Raises ConfigError
+    if it is not known where the robot's commands lead, see `steady_twist`.
     """
 
     task: Navigation
@@ -107,7 +105,6 @@ class DynamicWindow:
 
     @cached_property
     def _search(self) -> tuple[Array, kernels.ScanRays, kernels.LookAhead, kernels.TwistWeights]:
-        """(K, 3) body twist of each command; what is seen, how far it looks, what it weighs."""
         robot, sight = self.task.robot, self.task.sight
         twists = steady_twist(robot, self._commands)
         directions = np.stack([np.cos(sight.angles), np.sin(sight.angles)], axis=-1)
@@ -122,7 +119,6 @@ class DynamicWindow:
 
     @cached_property
     def _commands(self) -> Array:
-        """(K, C) grid of commands between their limits, including zero."""
         robot = self.task.robot
         counts = {1: (15,), 2: (7, 15), 3: (7, 7, 5)}.get(len(robot.command))
         axes = [
@@ -133,15 +129,12 @@ class DynamicWindow:
 
     @cached_property
     def _scaled(self) -> NDArray[np.float32]:
-        """(K, C) action of each command."""
         return _actions(self.task.robot, self._commands).astype(np.float32)
 
 
 POLICIES: dict[str, Callable[[Navigation], Policy]] = {
-    "dynamic_window": DynamicWindow,
-    "random": RandomActions,
-    "straight": StraightToGoal,
-}
+    "dynamic_window": DynamicWindow, "random": RandomActions, "straight": StraightToGoal,
+}  # fmt: skip
 
 
 def shipped_policies() -> list[str]:
@@ -158,10 +151,7 @@ def is_policy_file(name: str) -> bool:
 
 
 def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None) -> Policy:
-    """Makes a policy by a key of `POLICIES`, the name of a shipped policy file, or a path.
-
-    A file is checked against task and model. ConfigError: unknown name; PolicyError: wrong field.
-    """
+    """Makes a policy by name, or the path of a file. Raises ConfigError, PolicyError."""
     if not is_policy_file(name):
         return POLICIES[name](task)
     from nics_drl_bridge.policy.policy_file import load_policy  # the others need no onnxruntime
@@ -172,7 +162,7 @@ def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None
 
 
 def open_policy(name: str, model: SimulatorModel) -> tuple[Policy, Navigation]:
-    """Opens a policy as `make_policy`, with its task; PolicyError if that is no navigation."""
+    """Opens a policy and its navigation task; PolicyError if it was trained for another task."""
     if not is_policy_file(name):
         task = Navigation(model.robot, model.lidar)
         return POLICIES[name](task), task

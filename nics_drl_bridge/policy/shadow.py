@@ -42,7 +42,7 @@ class Shadow:
     skipped: Mapping[str, int]  # reason -> number of times that were not compared
 
     def differences(self) -> dict[str, dict[str, float]]:
-        """Differences (policy minus drive) by command, in its unit, and share of opposite signs."""
+        """Mean of policy minus drive by command; its magnitude; the share of opposite signs."""
         found = {}
         for c, name in enumerate(self.names):
             one, other, band = self.policy[:, c], self.driven[:, c], DEAD_BAND * self.scale[c]
@@ -68,21 +68,16 @@ class _Moment:
 
 
 def shadow(
-    path: str | Path,
-    model: SimulatorModel,
-    policy: str,
-    topics: Mapping[str, str],
-    goal: ArrayLike | None = None,
-    ahead_s: float = 4.0,
-) -> Shadow:
+    path: str | Path, model: SimulatorModel, policy: str, topics: Mapping[str, str],
+    goal: ArrayLike | None = None, ahead_s: float = 4.0,
+) -> Shadow:  # fmt: skip
     """Runs a policy on a recorded drive, in process and deterministically.
 
-    The policy acts when `policy_node` would: once per scan, with odometry at least as new, at most
-    once per control period of the stamps. Its command is compared with the first one recorded after
-    that, or else with the one that still applied. The goal (2,) [m] is in `map`, where the first
-    odometry is taken at face value; None: the robot's position `ahead_s` later. `topics` are by
-    role, see `playback.chosen`. Raises RecordingError if the bag can't be used, or lacks scans or
-    commands, another BridgeError if the policy can't be used, or does not fit.
+    The policy acts when `policy_node` would; its command is compared with the first one recorded
+    after that, or else with the one that still applied. The goal (2,) [m] is in `map`; None uses
+    the robot's position `ahead_s` later: the driver's intention. `topics`: see `playback.chosen`.
+    Raises RecordingError if the bag can't be used, or lacks scans or commands, another BridgeError
+    if the policy can't be used, or does not fit.
     """
     if goal is None and not ahead_s > 0.0:
         raise ConfigError(f"--ahead {ahead_s:g}: must be more than 0 s.")
@@ -95,13 +90,7 @@ def shadow(
     moments = _moments(playback, messages, model)
     if not moments:
         raise RecordingError(f"{path}: no scan with an odometry could be used; see nics bag info.")
-    if goal is None:
-        times = np.array([moment.stamp_ns for moment in moments]) * S_PER_NS
-        places = np.array([moment.view.pose[:2] for moment in moments])
-        ahead = [np.interp(times + ahead_s, times, place) for place in places.T]
-        goals = np.stack(ahead, axis=-1)
-    else:
-        goals = np.broadcast_to(np.asarray(goal, np.float64), (len(moments), 2))
+    goals = _goals(moments, goal, ahead_s)
     return _answered(moments, goals, policy, replace(model, lidar=playback.lidar))
 
 
@@ -135,10 +124,17 @@ def _moments(
 
 
 def _hold(moments: list[_Moment], held: tuple[int, Array] | None) -> None:
-    """Gives the newest moment the command that still applied, if none came after it."""
     if moments and moments[-1].driven is None and held is not None:
         age_s = (moments[-1].receive_ns - held[0]) * S_PER_NS
         moments[-1].driven = held[1] if age_s <= HELD_S else None
+
+
+def _goals(moments: list[_Moment], goal: ArrayLike | None, ahead_s: float) -> Array:
+    if goal is not None:
+        return np.broadcast_to(np.asarray(goal, np.float64), (len(moments), 2))
+    times = np.array([moment.stamp_ns for moment in moments]) * S_PER_NS
+    places = np.array([moment.view.pose[:2] for moment in moments])
+    return np.stack([np.interp(times + ahead_s, times, place) for place in places.T], axis=-1)
 
 
 def _answered(moments: list[_Moment], goals: Array, name: str, model: SimulatorModel) -> Shadow:
@@ -146,8 +142,7 @@ def _answered(moments: list[_Moment], goals: Array, name: str, model: SimulatorM
     robot, rows = model.robot, list[tuple[Any, ...]]()
     skipped = {"no command was driven": 0, "at the goal": 0, "touching something": 0}
     for moment, goal in zip(moments, goals, strict=True):
-        memory = {"goal": goal}
-        verdict = task.judge(moment.view, memory)
+        verdict = task.judge(moment.view, memory := {"goal": goal})
         if moment.driven is None:
             skipped["no command was driven"] += 1
         elif verdict.touched:

@@ -49,16 +49,14 @@ class Trained:
 
 
 def train(
-    settings: TrainingSettings,
-    seed: int,
-    folder: Path,
-    tell: Tell = lambda _: None,
+    settings: TrainingSettings, seed: int, folder: Path, tell: Tell = lambda _: None,
     resumed: bool = False,
-) -> Trained:
+) -> Trained:  # fmt: skip
     """Trains one policy; checkpoint and TensorBoard logs are in `folder`.
 
     A resumed training gives bit-identical weights to an uninterrupted one. `tell` is called with
-    the progress a few times per second. ConfigError: no such settings, or no checkpoint fits them.
+    the progress, a few times per second. Raises ConfigError if the settings are inconsistent, or no
+    checkpoint fits them.
     """
     begin, path = time.perf_counter(), folder / CHECKPOINT
     content = checkpoints.read_checkpoint(path) if resumed else None
@@ -86,10 +84,9 @@ def train(
 
 
 def make_train_env(
-    settings: TrainingSettings,
-    model: SimulatorModel | None = None,
+    settings: TrainingSettings, model: SimulatorModel | None = None,
     scenes: Mapping[str, World] | None = None,
-) -> TrainVecEnv:
+) -> TrainVecEnv:  # fmt: skip
     """Makes the worlds of the settings in one env; model and worlds may already be open."""
     model = model or open_model(settings.robot)
     envs = (
@@ -106,7 +103,6 @@ def _again(
     content: dict[str, Any], about: dict[str, Any], settings: TrainingSettings, env: TrainVecEnv,
     path: Path,
 ) -> BaseAlgorithm:  # fmt: skip
-    """Restores the algorithm of a checkpoint. Raises ConfigError if it is of another training."""
     check_same(content["about"], about, path)
     size = int(np.prod(env.observation_space.shape))
     algorithm = make_algorithm(settings, env, about["seed"], (np.zeros(size), np.ones(size)))
@@ -131,12 +127,9 @@ def check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:
 
 
 def evaluate(
-    algorithm: BaseAlgorithm | Actor,
-    settings: TrainingSettings,
-    world: str,
-    episodes: int,
+    algorithm: BaseAlgorithm | Actor, settings: TrainingSettings, world: str, episodes: int,
     model: SimulatorModel | None = None,
-) -> Outcomes:
+) -> Outcomes:  # fmt: skip
     """Drives the episodes of the evaluation protocol in a world with an algorithm's policy."""
     env = BridgeVectorEnv(
         episodes, model or open_model(settings.robot), world, settings.task,
@@ -170,15 +163,10 @@ class TrainOrder:
 
 
 def run(
-    order: TrainOrder,
-    tell: Tell = lambda _: None,
-    done: Callable[[SeedResult], None] = lambda _: None,
-    learn: Learn = train,
-) -> list[SeedResult]:
-    """Trains seed after seed and evaluates each in its worlds; `tell` and `done` are told of it.
-
-    Raises ConfigError if the folder already contains a run, or none to resume.
-    """
+    order: TrainOrder, tell: Tell = lambda _: None,
+    done: Callable[[SeedResult], None] = lambda _: None, learn: Learn = train,
+) -> list[SeedResult]:  # fmt: skip
+    """Trains and evaluates seed after seed; ConfigError for a run in the folder, or none there."""
     _check(order.seeds, order.out, order.resumed)
     settings, model = order.settings, open_model(order.settings.robot)
     write_text(order.out / SETTINGS, dump_yaml(settings.model_dump(mode="json")))
@@ -187,11 +175,10 @@ def run(
         folder = order.out / f"seed_{seed}"
         begun = (folder / CHECKPOINT).is_file()
         trained = learn(settings, seed, folder, tell, order.resumed and begun)
-        driven = {
-            world: evaluate(trained.algorithm, settings, world, order.episodes, model)
-            for world in settings.worlds
-        }
-        summaries = {w: summarise(one, model.control_period) for w, one in driven.items()}
+        summaries = {}
+        for world in settings.worlds:
+            driven = evaluate(trained.algorithm, settings, world, order.episodes, model)
+            summaries[world] = summarise(driven, model.control_period)
         result = SeedResult(seed, trained, summaries)
         plain = {world: dataclasses.asdict(one) for world, one in summaries.items()}
         write_text(folder / EVALUATION, json.dumps(plain, indent=2) + "\n")
@@ -216,8 +203,8 @@ def _check(seeds: Sequence[int], out: Path, resumed: bool) -> None:
         raise ConfigError(f"seeds {list(seeds)}: give one or more, none twice.")
     begun = any((out / f"seed_{seed}" / CHECKPOINT).is_file() for seed in seeds)
     if begun and not resumed:
-        reason = "holds checkpoints of these seeds; add --resume, or choose another --out."
-        raise ConfigError(f"{out}: {reason}")
+        fix = "add --resume, or choose another --out."
+        raise ConfigError(f"{out}: holds checkpoints of these seeds; {fix}")
     if resumed and not begun:
         raise ConfigError(f"{out}: holds no checkpoint of these seeds; leave out --resume.")
 

@@ -32,7 +32,7 @@ ACTION_GAIN = 0.01  # initial gain of an actor's last layer: all its actions are
 def make_algorithm(
     settings: TrainingSettings, env: TrainVecEnv, seed: int, normaliser: tuple[Array, Array]
 ) -> BaseAlgorithm:
-    """Makes an untrained algorithm; ConfigError if it does not suit the task; see `Normaliser`."""
+    """Makes an untrained algorithm; `normaliser` is mean and deviation (O,). See `check_serves`."""
     check_serves(settings, env)
     torch.set_num_threads(settings.threads)
     shared: dict[str, Any] = {"seed": seed, "device": "cpu", "stats_window_size": RECENT}
@@ -87,7 +87,7 @@ def act_of(algorithm: BaseAlgorithm | Actor) -> Act:
 
 
 class Normaliser(BaseFeaturesExtractor):
-    """First layer: (observation - mean) / std, (O,) each of `observed`, cut at +-5; not trained."""
+    """First layer of actor and critic: (observation - mean) / std (O,), cut at +-5; not trained."""
 
     mean: torch.Tensor
     std: torch.Tensor
@@ -103,13 +103,10 @@ class Normaliser(BaseFeaturesExtractor):
 
 
 def observed(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Mean and standard deviation (O,), at least 0.05, of observations under random actions.
-
-    Each world holds its action for several steps: a robot with inertia would else stay in place.
-    """
+    """Mean and standard deviation (O,), at least 0.05, of observations under random actions."""
     seen = [np.array(env.reset())]
     for k in range(OBSERVED_STEPS):
-        if k % 8 == 0:
+        if k % 8 == 0:  # else a robot with inertia would stay in place
             space: Any = env.action_space
             if isinstance(space, gymnasium.spaces.Discrete):
                 actions: NDArray[Any] = rng.integers(space.n, size=env.num_envs)
@@ -124,12 +121,10 @@ class Actor(torch.nn.Module):
     """Maps observations (n, O) to raw actions (n, C), or to logits (n, A) of discrete ones."""
 
     def __init__(
-        self,
-        observations: gymnasium.spaces.Box,
-        actions: gymnasium.spaces.Box | gymnasium.spaces.Discrete,
-        hidden: Sequence[int],
+        self, observations: gymnasium.spaces.Box,
+        actions: gymnasium.spaces.Box | gymnasium.spaces.Discrete, hidden: Sequence[int],
         normaliser: tuple[Array, Array],
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__()
         self.discrete, size = isinstance(actions, gymnasium.spaces.Discrete), actions.shape or ()
         count = int(actions.n if isinstance(actions, gymnasium.spaces.Discrete) else np.prod(size))
@@ -148,7 +143,7 @@ class Actor(torch.nn.Module):
 
 
 def layers_of(widths: Sequence[int], gain: float) -> torch.nn.Sequential:
-    """Linear layers with tanh between, orthogonal as Stable-Baselines3's; gain of the last one."""
+    """Linear layers with tanh in between, initialised as in Stable-Baselines3, the last by gain."""
     layers: list[torch.nn.Module] = []
     for ins, outs in itertools.pairwise(widths):
         layers += [torch.nn.Linear(ins, outs), torch.nn.Tanh()]

@@ -25,11 +25,11 @@ Rows = NDArray[np.float32]
 Normaliser = tuple[ArrayLike, ArrayLike, float]
 OPSET = 17
 GOLDEN_SEED = 0
-GOLDEN_SPREAD = 3.0  # golden observations lie this near to zero if their limits are wider
+GOLDEN_SPREAD = 3.0  # distance from zero of golden observations, if their limits are wider
 
 
 class Deployed(torch.nn.Module):  # type: ignore[misc]
-    """Graph of a policy file with clipping, unscaling and normaliser, around `actor_of`'s actor."""
+    """The graph of a policy file; Stable-Baselines3's recipe omits clipping, scale, normaliser."""
 
     def __init__(self, actor: torch.nn.Module, task: Task, normaliser: Normaliser | None) -> None:
         super().__init__()
@@ -59,7 +59,7 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
 
 
 def actor_of(model: Any) -> torch.nn.Module:
-    """Returns the acting part of a PPO, A2C or SAC, or of any torch module; else ConfigError."""
+    """Returns the acting part of a PPO, A2C or SAC, or module like `Actor`, else ConfigError."""
     policy = getattr(model, "policy", model)
     if hasattr(policy, "action_net") and hasattr(policy, "mlp_extractor"):
         latent = policy.mlp_extractor.policy_net
@@ -75,18 +75,14 @@ def actor_of(model: Any) -> torch.nn.Module:
 
 
 def export_policy(
-    model: Any,
-    task: Task,
-    simulator_model: SimulatorModel,
-    path: str | Path,
-    normaliser: Normaliser | None = None,
-    provenance: Mapping[str, Any] | None = None,
-) -> PolicyFile:
+    model: Any, task: Task, simulator_model: SimulatorModel, path: str | Path,
+    normaliser: Normaliser | None = None, provenance: Mapping[str, Any] | None = None,
+) -> PolicyFile:  # fmt: skip
     """Writes a trained model (see `actor_of`) as a policy file, and loads it as a robot would.
 
-    Task and simulator model are those of its training; the normaliser is mean (O,), deviation (O,)
-    and limit, None if the model has its own; the provenance holds strings and numbers. ConfigError:
-    it can't be exported; PolicyError: the file does not reproduce its outputs.
+    The normaliser is mean (O,), standard deviation (O,) and limit of the normalised observations;
+    None if the model has its own. Raises ConfigError if the model can't be exported, PolicyError if
+    the file does not reproduce its outputs.
     """
     file = Path(path)
     if file.suffix != SUFFIX:
@@ -104,7 +100,6 @@ def export_policy(
 
 
 def _golden(deployed: Deployed, graph: Any, task: Task, source: str) -> dict[str, Rows]:
-    """The golden pairs. Raises PolicyError unless the graph reproduces the module's outputs."""
     space = task.observation_space
     low = np.maximum(space.low, -GOLDEN_SPREAD)
     high = np.minimum(space.high, GOLDEN_SPREAD)

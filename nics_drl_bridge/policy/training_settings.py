@@ -13,50 +13,38 @@ Share = Annotated[float, Field(gt=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=1, le=10**12)]
 MOST_WORLDS = 65_536  # maximum number of copies of all worlds together
 MOST_LAYERS, MOST_WIDE = 16, 8_192
-MOST_KEPT = 2**26  # of stored transitions: of a roll-out in all worlds, or of SAC's buffer
+MOST_KEPT = 2**26  # stored transitions: of a roll-out in all worlds, or of SAC's buffer
 Width = Annotated[int, Field(ge=1, le=MOST_WIDE)]
 
 
 class PpoSettings(Schema):
-    """Proximal policy optimisation (Schulman and others 2017), as in Stable-Baselines3.
+    """Proximal policy optimisation (Schulman and others 2017), as in Stable-Baselines3."""
 
-    The learning rate falls linearly to a fiftieth. `rollout`: steps of a world between updates;
-    `batch`: transitions of a gradient step; `epochs`: passes of an update; `log_std`: at the start.
-    """
-
-    learning_rate: float = Field(default=1e-3, gt=0.0)
-    rollout: Count = 32
-    batch: Count = 2048
-    epochs: Count = 5
+    learning_rate: float = Field(default=1e-3, gt=0.0)  # at the start; falls linearly to a fiftieth
+    rollout: Count = 32  # steps in each world between two updates
+    batch: Count = 2048  # transitions of one gradient step
+    epochs: Count = 5  # passes of an update through the roll-outs
     discount: Share = 0.98
     gae_lambda: Share = 0.95
     clip: float = Field(default=0.2, gt=0.0)
     entropy: float = Field(default=0.0, ge=0.0)
-    log_std: float = -0.5
+    log_std: float = -0.5  # of the actions at the start
 
 
 class SacSettings(Schema):
-    """Soft actor-critic (Haarnoja and others 2018), as in Stable-Baselines3.
-
-    `buffer`: transitions kept, `batch`: those of a gradient step, `begin_after`: random ones before
-    the first update; `updates` follow each step of the worlds, targets move by `soft_update`.
-    """
+    """Soft actor-critic (Haarnoja and others 2018), as in Stable-Baselines3."""
 
     learning_rate: float = Field(default=1e-3, gt=0.0)
-    buffer: Count = 300_000
-    batch: Count = 512
-    updates: Count = 8
-    begin_after: Count = 5_000
+    buffer: Count = 300_000  # transitions that are stored of all worlds together
+    batch: Count = 512  # transitions of one gradient step
+    updates: Count = 8  # gradient steps after each step of the worlds
+    begin_after: Count = 5_000  # transitions of random actions before the first update
     discount: Share = 0.98
-    soft_update: Share = 0.01
+    soft_update: Share = 0.01  # by which each gradient step moves the target critics
 
 
 class TrainingSettings(Schema):
-    """A training, as in `config/training/*.yaml`.
-
-    `worlds` maps names or YAML files to numbers of copies; actor and critic have `hidden` layers
-    each.
-    """
+    """A training, as in `config/training/*.yaml`; `worlds` maps names or files to their copies."""
 
     task: str = "navigation"  # a name, or `path/to/file.py:ClassName`
     task_options: dict[str, Any] = Field(default_factory=dict)  # of the task's class
@@ -67,7 +55,7 @@ class TrainingSettings(Schema):
     max_episode_steps: Count = 300  # an episode ends as a time-out after this many steps
     algorithm: Literal["ppo", "sac"] = "ppo"
     hidden: tuple[Width, ...] = Field(default=(64, 64), min_length=1, max_length=MOST_LAYERS)
-    threads: Annotated[int, Field(ge=1, le=1024)] = 1  # sums over several round differently
+    threads: Annotated[int, Field(ge=1, le=1024)] = 1
     checkpoint_every: Count = 200_000  # environment steps between two checkpoints
     ppo: PpoSettings = PpoSettings()
     sac: SacSettings = SacSettings()
@@ -102,15 +90,14 @@ class TrainingSettings(Schema):
 
 
 def load_training(name: str | Path) -> TrainingSettings:
-    """Loads settings by the name of a shipped file, or by path; ConfigError if it is wrong."""
+    """Loads settings by the name of a shipped file, or by path. Raises ConfigError."""
     return load_yaml(find_config(name, "training"), TrainingSettings)
 
 
 def chosen_settings(task: str, name: str | None, changes: dict[str, Any]) -> TrainingSettings:
-    """Settings of a shipped name or YAML file; by default those of task and robot if shipped.
+    """Settings by name or file, else those shipped for task and robot, with changes by the user.
 
-    `changes` are keys of `TrainingSettings`, or `world`: names that share the number of worlds.
-    Raises ConfigError for an unknown name or a wrong value.
+    `changes` are keys of `TrainingSettings`, and `world`: names that share the number of worlds.
     """
     robot = str(changes.get("robot", "differential"))
     shipped = {path.stem for path in (share_folder() / "config" / "training").glob("*.yaml")}

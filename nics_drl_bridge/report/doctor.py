@@ -1,7 +1,4 @@
-"""Checks of the data received from a robot against the expectations of a model.
-
-Each check is a function of the facts; it yields a finding for each fault, on a role's topic.
-"""
+"""Checks of data received from a robot against a model; each yields a finding for each fault."""
 
 from __future__ import annotations
 
@@ -49,9 +46,7 @@ odometry_warning = partial(warning, "odometry", ODOM)
 def examine(facts: Facts, expected: Expected) -> list[Mismatch]:
     """Runs all checks and returns their findings, errors first."""
     expected = doctor_facts.seen(facts, expected)
-    checks = (
-        presence, quality, speakers, frames, rates, latency, clock, layout, ranges, motion,
-    )  # fmt: skip
+    checks = presence, quality, speakers, frames, rates, latency, clock, layout, ranges, motion
     found = [finding for check in checks for finding in check(facts, expected)]
     named = [replace(finding, where=facts.names[finding.where]) for finding in found]
     return sorted(named, key=lambda finding: finding.severity)
@@ -88,9 +83,8 @@ def quality(facts: Facts, _: Expected) -> Findings:
         weak = any(not offer.reliable for offer in there.offers)
         if role != CLOCK and weak and any(ask.reliable for ask in there.asks):
             what = "is sent best effort, and a subscriber asks for reliable: they never match"
-            yield no_match(
-                role, what, "let the publisher be reliable, or the subscriber best effort"
-            )
+            fix = "let the publisher be reliable, or the subscriber best effort"
+            yield no_match(role, what, fix)
         passing = any(not offer.transient_local for offer in there.offers)
         if passing and any(ask.transient_local for ask in there.asks):
             what = "is sent volatile, and a subscriber asks for transient local: they never match"
@@ -142,12 +136,11 @@ def rates(facts: Facts, expected: Expected) -> Findings:
 
 
 def _rate(facts: Facts, role: str) -> float | None:
-    """Rate by the stamps if there is a `/clock`: a simulation may run at another speed."""
     if (heard := facts.heard.get(role)) is None or len(heard.arrivals_ns) <= 2:
         return None
     stamps, times = heard.stamps_ns, heard.arrivals_ns
     if facts.clock_ns and len(stamps) > 2 and stamps[-1] > stamps[0]:
-        times = stamps
+        times = stamps  # a simulation may run at another speed
     span = times[-1] - times[0]
     return (len(times) - 1) / (span * S_PER_NS) if span else None
 
@@ -177,7 +170,6 @@ def latency(facts: Facts, _: Expected) -> Findings:
 
 
 def _here(facts: Facts, arrivals: Sequence[int]) -> NDArray[np.int64]:
-    """Arrivals (T,) on the clock that the stamps should use [ns]."""
     times = np.array(arrivals, dtype=np.int64)
     if not facts.clock_ns:
         return times
@@ -300,7 +292,6 @@ def _slope(x: Array, y: Array) -> float:
 
 
 def _scale(facts: Facts) -> float | None:
-    """Slope of the turns per odometry step over the commanded turn rates; None if undetermined."""
     heard, odometry = facts.heard.get(CMD_VEL), facts.heard.get(ODOM)
     if heard is None or odometry is None or len(facts.poses) < LEAST_STEPS:
         return None

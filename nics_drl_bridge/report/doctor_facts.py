@@ -24,13 +24,12 @@ from nics_drl_bridge.robot.spec import RobotSpec
 
 SCAN, ODOM, CMD_VEL, CLOCK = "scan", "odom", "cmd_vel", "/clock"
 TWIST_STAMPED_TYPE = "geometry_msgs/msg/TwistStamped"
-KINDS: dict[str, Sequence[str]] = {
+KINDS: dict[str, Sequence[str]] = {  # message types of each role; others are not read
     SCAN: ("sensor_msgs/msg/LaserScan",),
     ODOM: ("nav_msgs/msg/Odometry",),
     CMD_VEL: ("geometry_msgs/msg/Twist", TWIST_STAMPED_TYPE),
     CLOCK: ("rosgraph_msgs/msg/Clock",),
 }
-"""Message types of each role; messages of other types are not read."""
 MOST_SCANS = 200  # maximum number of scans whose ranges are kept; of the others only the times are
 MOST_RAD = 7.0
 
@@ -151,15 +150,12 @@ class Mismatch:
 
 @dataclass(frozen=True)
 class Expected:
-    """Expectations of a robot: its spec, its lidar and the time between commands.
-
-    `scan` are the sectors that any lidar may fill; None: the beams of exactly this one.
-    """
+    """Expectations of a robot."""
 
     robot: RobotSpec
     lidar: LidarSpec
-    period_s: float
-    scan: ScanLayout | None = None
+    period_s: float  # between commands
+    scan: ScanLayout | None = None  # that any lidar may fill; None: the beams of exactly this one
 
 
 def expected_of(source: SimulatorModel | Contract, scan: ScanLayout | None = None) -> Expected:

@@ -60,11 +60,7 @@ def write_pictures(spec: RobotSpec, identified: Identified, folder: str | Path) 
 
 
 def fit_pictures(spec: RobotSpec, identified: Identified) -> dict[str, bytes]:
-    """The pictures of a fit by name, each a PNG.
-
-    `accuracy` is always included; `paths` and `residuals` if data was held out from the fit,
-    `alignment` if a command changed.
-    """
+    """The pictures of a fit by name, as far as the recording shows them, each a PNG."""
     pictures = {"accuracy": accuracy(identified)}
     if identified.held_out is not None:
         pictures["paths"] = held_out_paths(identified)
@@ -100,9 +96,8 @@ def held_out_paths(identified: Identified) -> bytes:
     """Draws open-loop predictions on unseen data and the measured paths, from the same start."""
     drive, calibration, pose = identified.drive, identified.calibration, identified.recording.pose
     free = max(drive.duration_s - identified.train_until_s - HORIZON_S, 0.0)
-    chosen = windows(
-        drive, calibration, identified.train_until_s, drive.duration_s, HORIZON_S, free / PATHS
-    )
+    span = identified.train_until_s, drive.duration_s
+    chosen = windows(drive, calibration, *span, HORIZON_S, free / PATHS)
     predicted = _predicted(identified, chosen)
     count = min(len(predicted), PATHS)
     rows, columns = -(-count // 3), min(count, 3)
@@ -167,7 +162,6 @@ def alignment(spec: RobotSpec, identified: Identified) -> bytes:
 def _response(
     axes: Axes, samples: Samples, shown: NDArray[np.bool_], variable: int, identified: Identified
 ) -> None:
-    """Draws the component of the body twist that correlates most with a variable of X."""
     twist, wanted = samples.dq[:, :3], samples.x[:, variable]
     with np.errstate(all="ignore"):
         alike = np.abs([np.corrcoef(twist[:, d], wanted)[0, 1] for d in range(3)])
@@ -190,11 +184,7 @@ def _predicted(identified: Identified, chosen: Windows) -> Array:
 
 
 def calibration_pictures(spec: RobotSpec, identified: Identified) -> dict[str, bytes]:
-    """The pictures of a calibration by name, each a PNG.
-
-    `timing`, `bursts`, `mounting`, `wheels` and `noise`, each if the recording showed it; the
-    report in text says why the others are missing.
-    """
+    """The pictures of a calibration by name, as far as the recording shows them, each a PNG."""
     found = estimates(identified)
     drawn = {each.__name__: each(identified, found) for each in (timing, bursts, mounting, wheels)}
     drawn["noise"] = noise(identified)
@@ -242,9 +232,8 @@ def bursts(identified: Identified, found: dict[str, CalibratedValue]) -> bytes |
 
 def mounting(identified: Identified, found: dict[str, CalibratedValue]) -> bytes | None:
     """Draws velocities of the tracked body and of `base_link`: rotation and lever arm as slopes."""
-    rotation, lever_x, lever_y = (
-        found[name] for name in ("rotation_rad", "lever_arm_x_m", "lever_arm_y_m")
-    )
+    rotation, lever_x = found["rotation_rad"], found["lever_arm_x_m"]
+    lever_y = found["lever_arm_y_m"]
     if rotation.value is None:
         return None
     tracked = identified.drive.twists.twist
@@ -326,12 +315,9 @@ def noise(identified: Identified) -> bytes | None:
         _histogram(axes, *histogram)
     if drifts and grown is not None:
         horizon, position, heading = grown
-        rows_ = (
-            ("position", levels.position_drift, position, "m"),
-            ("heading", levels.heading_drift, heading, "rad"),
-        )
-        for axes, row in zip(grid[len(histograms) :], rows_, strict=False):
-            _growth(axes, horizon, *row)
+        after = grid[len(histograms) :]
+        _growth(after[0], horizon, "position", levels.position_drift, position, "m")
+        _growth(after[1], horizon, "heading", levels.heading_drift, heading, "rad")
     return png(figure)
 
 
@@ -358,9 +344,9 @@ def _value(level: Level) -> str:
 
 
 class ShiftCurve(NamedTuple):
-    """Residual against an estimated time, which is named as in `Calibration`."""
+    """Residual against an estimated time."""
 
-    name: str
+    name: str  # as in `Calibration`
     value: Array  # (n,) trial values of the time [s]
     unexplained: Array  # (n,) root mean square, as a share of the signal's spread
 

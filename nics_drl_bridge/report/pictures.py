@@ -103,10 +103,7 @@ def png(figure: Figure, legend: Axes | None = None) -> bytes:
 
 
 def trajectories(runs: Mapping[str, Sequence[Episode]], world: World, footprint: float) -> bytes:
-    """Draws one panel per episode with the paths of all runs (the paper's Fig. 7).
-
-    The runs are by name, with the same seeds in each; the footprint is the robot's radius [m].
-    """
+    """Draws a panel per episode with its path in each run, of equal seeds (the paper's Fig. 7)."""
     count = max(len(episodes) for episodes in runs.values())
     columns, rows = min(count, 3), -(-count // 3)
     size = max(4.2 * columns, LEAST_WIDTH), 4.2 * rows + 0.5
@@ -120,9 +117,8 @@ def _panel(axes: Axes, episodes: Mapping[str, Episode], world: World, footprint:
     first = next(iter(episodes.values()))
     draw_world(axes, world, first.bodies)
     axes.add_patch(Circle(tuple(first.goal), 0.3, color="#f2c14e", alpha=0.7, label="goal"))
-    axes.add_patch(
-        Circle(tuple(first.path[0, :2]), footprint, fill=False, color=DARK, label="start")
-    )
+    start = Circle(tuple(first.path[0, :2]), footprint, fill=False, color=DARK, label="start")
+    axes.add_patch(start)
     for line, (name, episode) in zip(LINES, episodes.items(), strict=False):
         axes.plot(episode.path[:, 0], episode.path[:, 1], label=name, **line)
     results = ", ".join(dict.fromkeys(episode.result for episode in episodes.values()))
@@ -137,9 +133,8 @@ def drive_picture(pattern: Pattern, spec: RobotSpec) -> bytes:
     grid = figure.add_gridspec(rows, 2, width_ratios=(1.0, 1.2))
     path = figure.add_subplot(grid[:, 0])
     robot = {"color": GREEN, "alpha": 0.5, "label": "robot at the start"}
-    path.add_patch(
-        Circle((0.0, 0.0), pattern.bound, fill=False, color=MODEL, linestyle="--", label="bound")
-    )
+    bound = {"fill": False, "color": MODEL, "linestyle": "--", "label": "bound"}
+    path.add_patch(Circle((0.0, 0.0), pattern.bound, **bound))
     path.add_patch(Circle((0.0, 0.0), pattern.footprint, **robot))
     path.plot(pattern.pose[:, 0], pattern.pose[:, 1], color=MEASURED, linewidth=1.0, label="path")
     path.set(aspect="equal", xlabel="x, ahead of the robot [m]", ylabel="y, to its left [m]")

@@ -9,47 +9,39 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from typer import Argument, Option
 
-from nics_drl_bridge.commands.console import intact, needs_ros, one_sentence, roles_of, table
+from nics_drl_bridge.commands import console
+from nics_drl_bridge.commands.console import SalvageOption, intact, needs_ros, one_sentence
 
 bag = typer.Typer(help="Records, describes, replays and saves bags.", no_args_is_help=True)
 
 STORAGES = ("mcap", "sqlite3")
-BagArgument = Annotated[Path, typer.Argument(help="Folder or file of a rosbag2.")]
-SalvageOption = Annotated[
-    bool, typer.Option("--salvage", help="Take what is intact of a damaged bag, and tell the rest.")
-]
-StorageOption = Annotated[
-    str, typer.Option(help="mcap, which carries checksums, or sqlite3.", metavar="mcap|sqlite3")
-]
-NamespaceOption = Annotated[str, typer.Option(help="Namespace of the robot's topics.")]
+BagArgument = Annotated[Path, Argument(help="Folder or file of a rosbag2.")]
+StorageOption = Annotated[str, Option(help="mcap (checksums) or sqlite3.", metavar="mcap|sqlite3")]
+NamespaceOption = Annotated[str, Option(help="Namespace of the robot's topics.")]
 
 
 @bag.command()
 def record(
-    out: Annotated[Path, typer.Argument(help="Folder of the bag to write.")],
-    topics: Annotated[
-        list[str] | None, typer.Option(help="A topic to record; may be given several times.")
-    ] = None,
-    everything: Annotated[bool, typer.Option("--all", help="Record every topic.")] = False,
+    out: Annotated[Path, Argument(help="Folder of the bag to write.")],
+    topics: Annotated[list[str] | None, Option(help="A topic to record; repeatable.")] = None,
+    everything: Annotated[bool, Option("--all", help="Record every topic.")] = False,
     namespace: NamespaceOption = "",
     duration: Annotated[
-        float | None, typer.Option(min=0.0, help="Stop after so long [s]; else at Ctrl-C.")
+        float | None, Option(min=0.0, help="Stop after so long [s]; else at Ctrl-C.")
     ] = None,
     storage: StorageOption = "mcap",
-    use_sim_time: Annotated[
-        bool, typer.Option("--use-sim-time", help="Take times of receipt from /clock.")
-    ] = False,
+    use_sim_time: Annotated[bool, Option("--use-sim-time", help="Receipts by /clock.")] = False,
 ) -> None:
     """Records the topics of a robot as they are, without driving it."""
     with one_sentence():
         kind = _storage(storage)
         with needs_ros("nics bag record"):
             from nics_drl_bridge.extras.bags.live import BagOrder, record_bag
-        order = BagOrder(
-            out, tuple(topics or ()), everything, namespace, duration, kind, use_sim_time
-        )
-        counts = record_bag(order, lambda line: typer.echo(line, err=True))
+        names, say = tuple(topics or ()), partial(typer.echo, err=True)
+        order = BagOrder(out, names, everything, namespace, duration, kind, use_sim_time)
+        counts = record_bag(order, say)
         for topic, count in sorted(counts.items()):
             typer.echo(f"{topic}: {count} messages")
         typer.echo(f"bag written to {out}")
@@ -58,7 +50,7 @@ def record(
 @bag.command()
 def info(
     path: BagArgument,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: Annotated[bool, Option("--json", help="Print one JSON object.")] = False,
     salvage: SalvageOption = False,
 ) -> None:
     """Tells what is in a bag: topics, rates, gaps, and whose clock stamped them."""
@@ -73,39 +65,34 @@ def info(
         span, size = f"{told.duration_s:.3f} s", f"{told.size_bytes / 1e6:.2f} MB"
         typer.echo(f"{path}: {told.messages} messages in {span}, {size}")
         heads = ("topic", "type", "count", "Hz", "from, to [s]", "gaps", "clock", "delay [ms]")
-        typer.echo(table(heads, [_row(each) for each in told.topics]))
+        typer.echo(console.table(heads, [_row(each) for each in told.topics]))
 
 
 @bag.command()
 def replay(
     path: BagArgument,
-    rate: Annotated[float, typer.Option(min=0.001, help="Seconds of the bag per second.")] = 1.0,
-    loop: Annotated[bool, typer.Option("--loop", help="Begin anew at the end.")] = False,
-    clock: Annotated[bool, typer.Option(help="Publish the bag's time on /clock.")] = True,
-    topics: Annotated[
-        list[str] | None, typer.Option(help="Play this topic only; may be given several times.")
-    ] = None,
-    namespace: Annotated[str, typer.Option(help="Put in front of the topics' names.")] = "",
+    rate: Annotated[float, Option(min=0.001, help="Seconds of the bag per second.")] = 1.0,
+    loop: Annotated[bool, Option("--loop", help="Begin anew at the end.")] = False,
+    clock: Annotated[bool, Option(help="Publish the bag's time on /clock.")] = True,
+    topics: Annotated[list[str] | None, Option(help="Play this topic only; repeatable.")] = None,
+    namespace: Annotated[str, Option(help="Put in front of the topics' names.")] = "",
     lockstep: Annotated[
-        str | None,
-        typer.Option(metavar="NODE", help="Wait after each message until this node has taken it."),
+        str | None, Option(metavar="NODE", help="Wait after each message till this node has it.")
     ] = None,
     estimate: Annotated[
-        bool, typer.Option("--estimate", help="Run the middleware on it in process instead.")
+        bool, Option("--estimate", help="Run the middleware on it in process instead.")
     ] = False,
     model: Annotated[
-        str, typer.Option(help="For --estimate: folder of a model, or a shipped robot.")
+        str, Option(help="For --estimate: folder of a model, or a shipped robot.")
     ] = "ackermann",
     topic: Annotated[
         list[str] | None,
-        typer.Option(
+        Option(
             metavar="ROLE=TOPIC",
             help="For --estimate: as odom=/wheel_odom. Roles: scan, odom, cmd_vel, pose, imu.",
         ),
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option(help="For --estimate: .npz or .csv file to write.")
-    ] = None,
+    out: Annotated[Path | None, Option(help="For --estimate: .npz or .csv to write.")] = None,
     salvage: SalvageOption = False,
 ) -> None:
     """Plays a bag over ROS 2, or gives the estimate that the middleware makes of it."""
@@ -114,7 +101,7 @@ def replay(
             from nics_drl_bridge.generator import open_model
             from nics_drl_bridge.middleware import playback
 
-            made = playback.estimate(whole, open_model(model), roles_of(topic or []))
+            made = playback.estimate(whole, open_model(model), console.roles_of(topic or []))
             if out is not None:
                 playback.write_estimate(made, out)
             for reason, count in sorted(made.rejected.items()):
@@ -133,7 +120,7 @@ def replay(
 @bag.command()
 def salvage(
     path: BagArgument,
-    out: Annotated[Path, typer.Argument(help="Folder of the bag to write.")],
+    out: Annotated[Path, Argument(help="Folder of the bag to write.")],
     storage: StorageOption = "mcap",
 ) -> None:
     """Writes what is intact of a damaged bag as a new one, and says how much is lost."""

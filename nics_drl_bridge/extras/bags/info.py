@@ -53,17 +53,13 @@ def bag_info(path: str | Path) -> BagInfo:
         received = {topic: _received(bag, topic) for topic in sorted(bag.types)}
         times = np.concatenate([ns for ns, _ in received.values()])
         start, end = int(times.min()), int(times.max())
-        topics = tuple(
-            _topic(topic, bag.types[topic], ns - start, stamps)
-            for topic, (ns, stamps) in received.items()
-        )
+        topics = tuple(_topic(t, bag.types[t], ns - start, s) for t, (ns, s) in received.items())
     files = [path] if path.is_file() else [file for file in path.iterdir() if file.is_file()]
     size = sum(file.stat().st_size for file in files)
     return BagInfo(str(path), size, start, (end - start) * S_PER_NS, len(times), topics)
 
 
 def _received(bag: BagFile, topic: str) -> tuple[Nanoseconds, Nanoseconds | str]:
-    """Returns times of receipt [ns], and receipt minus stamp [ns] or why there are no stamps."""
     if not bag.knows(topic):
         return np.array([ns for ns, _ in bag.serialized(topic)], dtype=np.int64), UNKNOWN
     receive, stamps = times_of(bag.messages(topic))
@@ -73,7 +69,6 @@ def _received(bag: BagFile, topic: str) -> tuple[Nanoseconds, Nanoseconds | str]
 
 
 def _topic(topic: str, kind: str, since: Nanoseconds, delays: Nanoseconds | str) -> BagTopic:
-    """Describes a topic from receipts since the bag's start (T,) and delays (T,), both [ns]."""
     clock, delay, jitter, backwards = delays if isinstance(delays, str) else "", None, None, 0
     if not isinstance(delays, str):
         low, middle, high = np.percentile(delays * S_PER_NS, (5.0, 50.0, 95.0))

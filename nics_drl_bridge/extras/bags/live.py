@@ -29,11 +29,10 @@ from nics_drl_bridge.recording.bag_file import BagFile, opened
 from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.recording.write import BagSink, Storage, bag_sink
 
-ROBOT = (
+ROBOT = (  # topics of a robot, in its namespace
     "scan", "odom", "cmd_vel", "cmd_vel_raw", "joint_states", "imu", "pose", "ground_truth",
     "odometry/filtered", "e_stop",
 )  # fmt: skip
-"""Topics of a robot, in its namespace."""
 SHARED = ("/tf", "/tf_static", "/clock", "/diagnostics")
 LOOK_S = 0.25  # period of the search for new topics [s]
 FLUSH_S = 1.0  # greatest span that is lost if the process is killed [s]
@@ -72,8 +71,7 @@ class BagRecorder(QosWatch):
     """Writes the messages of all wanted topics into a bag, serialised as received.
 
     A subscription requests the best quality of service that all publishers of its topic offer, so
-    that none of them is left out; their offers are stored in the bag. `say` is called with a
-    sentence when a topic begins or can't be recorded.
+    that none of them is left out. `say` hears of each topic that begins or can't be recorded.
     """
 
     def __init__(
@@ -104,14 +102,12 @@ class BagRecorder(QosWatch):
                 self._listen(topic, kinds)
 
     def _listen(self, topic: str, kinds: Sequence[str]) -> None:
-        """Subscribes to a topic, or again if a new publisher offers less."""
         publishers = self.get_publishers_info_by_topic(topic)
         if not publishers or topic in self.skipped:
             return
         offers = [offer_of(info.qos_profile) for info in publishers]
-        wanted = Offer(
-            QUEUE, all(o.reliable for o in offers), all(o.transient_local for o in offers)
-        )
+        lasting = all(each.transient_local for each in offers)
+        wanted = Offer(QUEUE, all(each.reliable for each in offers), lasting)
         known = self._heard.get(topic)
         if known is not None and known[0] in (wanted, Offer(QUEUE, False)):
             return
@@ -140,19 +136,15 @@ class BagRecorder(QosWatch):
 
 
 def record_bag(order: BagOrder, say: Callable[[str], None]) -> dict[str, int]:
-    """Records until the duration is over, SIGINT or SIGTERM; returns the messages by topic.
-
-    `say` is called with a sentence when a topic begins or can't be recorded. Raises BackendError if
-    nothing was received, RecordingError if the bag can't be written.
-    """
+    """Records until the duration or a signal; counts by topic. BackendError, RecordingError."""
     with bag_sink(order.out, order.storage) as sink:
         node = run_node(lambda context: BagRecorder(context, order, sink, say), ["nics"])
         if not sum(sink.counts.values()):
             skipped = " ".join(node.skipped.values())
-            left_out = f" Not recorded: {skipped}" if skipped else ""
+            fix = "start the robot, or correct --topics, --namespace or ROS_DOMAIN_ID."
+            fix += f" Not recorded: {skipped}" if skipped else ""
             raise BackendError(
-                "nothing was heard on any of the topics, so no bag is written; start the robot, "
-                f"or correct --topics, --namespace or ROS_DOMAIN_ID.{left_out}"
+                f"nothing was heard on any of the topics, so no bag is written; {fix}"
             )
     return sink.counts
 
@@ -177,7 +169,6 @@ class _Player:
             self._barrier = node.create_client(GetParameters, service)
 
     def offer(self, topic: str, kind: str, offers: tuple[Offer, ...]) -> bool:
-        """Opens a topic; returns False if its type is not installed."""
         found = message_type(kind)
         if found is None:
             return False
@@ -192,7 +183,6 @@ class _Player:
         return True
 
     def ready(self) -> None:
-        """Waits for the node in lock-step, or a while for subscribers."""
         publishers, known = self.publishers.values(), self._node.count_subscribers
         self._stopping.wait(DISCOVERY_S)
         self._wait(lambda: any(each.get_subscription_count() for each in publishers), ALONE_S)
@@ -201,16 +191,13 @@ class _Player:
             PATIENCE_S,
         )
         if self._barrier is not None and not self._wait(self._barrier.service_is_ready, PATIENCE_S):
-            raise BackendError(
-                f"node {self._lockstep!r}: not found within {PATIENCE_S:g} s; start it, or "
-                "correct its name, namespace or ROS_DOMAIN_ID."
-            )
+            fix = "start it, or correct its name, namespace or ROS_DOMAIN_ID."
+            raise BackendError(f"node {self._lockstep!r}: not found within {PATIENCE_S:g} s; {fix}")
 
     def _wait(self, condition: Callable[[], bool], patience_s: float) -> bool:
         return holds(lambda: condition() or self._stopping.is_set(), patience_s, NAP_S)
 
     def play(self, messages: list[Timed]) -> int:
-        """Publishes all messages; returns their number, fewer if it is stopped."""
         now = first = messages[0][0]
         began, rate = time.monotonic_ns(), self._rate
         for sent, (due, topic, data) in enumerate(messages):
@@ -238,10 +225,8 @@ class _Player:
         future = self._barrier.call_async(GetParameters.Request(names=["use_sim_time"]))
         self._executor.spin_until_future_complete(future, timeout_sec=PATIENCE_S)
         if not future.done():
-            raise BackendError(
-                f"node {self._lockstep!r}: has not answered for {PATIENCE_S:g} s; it hangs "
-                "or has ended: start it anew."
-            )
+            fix = f"{PATIENCE_S:g} s; it hangs or has ended: start it anew."
+            raise BackendError(f"node {self._lockstep!r}: has not answered for {fix}")
 
 
 def play_bag(
@@ -250,13 +235,11 @@ def play_bag(
 ) -> int:  # fmt: skip
     """Publishes a bag until its end, SIGINT or SIGTERM; returns the number of published messages.
 
-    They are published as recorded, with the quality of service that their publishers offered: the
-    given topics or all, at a rate [seconds of the bag per second], in a namespace save `/clock`,
-    `/tf` and `/tf_static`, and in lock-step only when a node has taken the message before. A loop
-    begins anew at the end. `clock` publishes the times of receipt on `/clock`, as `ros2 bag play
-    --clock` does, instead of the bag's own. `say` is called with a sentence about each topic that
-    is left out. Raises RecordingError if the bag is damaged, lacks a topic, or none of its types is
-    installed, BackendError if the peer does not answer.
+    They are published with the quality of service that their publishers offered, at a rate [seconds
+    of the bag per second], in a namespace save `/clock`, `/tf` and `/tf_static`, in lock-step only
+    when a node has taken the message before. `clock` publishes the times of receipt on `/clock`
+    instead of the bag's own. Raises RecordingError if the bag is damaged, lacks a topic, or none of
+    its types is installed, BackendError if the peer does not answer.
     """
     stopping = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -294,8 +277,5 @@ def _wanted(bag: BagFile, topics: Sequence[str], clock: bool) -> list[str]:
     for name in names:
         if name not in bag.types:
             raise RecordingError(f"{bag.place}: has no topic {name!r}; {nearest(name, bag.types)}")
-    return [
-        topic
-        for topic in sorted(names or bag.types)
-        if topic not in bag.empty and not (clock and topic == CLOCK)
-    ]
+    left_out = {*bag.empty, *([CLOCK] if clock else [])}
+    return [topic for topic in sorted(names or bag.types) if topic not in left_out]

@@ -55,12 +55,9 @@ class Salvage:
             share = 100.0 * self.lost / max(total, 1)
             lost = f" and {self.lost} of {total} are lost ({share:.1f} %)"
         head = f"{sum(self.kept.values())} messages are kept{lost}; they span {self.span_s:.3f} s"
-        topics = (
-            f"  {topic}: {self.kept.get(topic, 0)}"
-            + (f" of {promised[topic]}" if topic in promised else "")
-            for topic in sorted({*self.kept, *promised})
-        )
-        return head, *topics
+        of = {topic: f" of {count}" for topic, count in promised.items()}
+        names = sorted({*self.kept, *promised})
+        return head, *(f"  {name}: {self.kept.get(name, 0)}{of.get(name, '')}" for name in names)
 
 
 @dataclass
@@ -77,8 +74,7 @@ def salvage(path: str | Path, out: str | Path, storage: Storage = "mcap") -> Sal
 
     From an MCAP file these are all chunks with a correct checksum, or, in chunks without one, all
     messages before the damage; from an SQLite file all readable rows. Messages that can't be
-    decoded are dropped. The hidden folder that a killed recorder leaves is accepted too.
-    Raises RecordingError: nothing is intact, or `out` exists already.
+    decoded are dropped. Raises RecordingError: nothing is intact, or `out` exists already.
     """
     path, found = Path(path), _Found()
     for file in _files(path):
@@ -110,7 +106,7 @@ def salvaged(path: Path) -> Iterator[tuple[Path, tuple[str, ...]]]:
 
 
 def _files(path: Path) -> list[Path]:
-    """Returns the files of a bag; in the folder of a killed recorder they are one level deeper."""
+    # In the hidden folder that a killed recorder leaves, the files are one level deeper.
     if not path.exists():
         raise RecordingError(f"{path}: no such bag; check the path.")
     files = [path] if path.is_file() else sorted(path.rglob("*"), key=_number)
@@ -124,8 +120,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _number(file: Path) -> tuple[int, str]:
-    """Sorts `drive_10` after `drive_9`."""
-    digits = file.stem.rpartition("_")[2]
+    digits = file.stem.rpartition("_")[2]  # `drive_10` comes after `drive_9`
     return int(digits) if digits.isdecimal() else -1, str(file)
 
 
@@ -145,7 +140,6 @@ def _decodable(found: _Found) -> Iterator[tuple[str, int, bytes]]:
 
 
 def _promised(path: Path) -> dict[str, int] | None:
-    """Returns the messages per topic by the bag's metadata; None if it can't be read."""
     try:
         about = metadata_of(path if path.is_dir() else path.parent)
         topics = about["topics_with_message_count"]
@@ -155,7 +149,6 @@ def _promised(path: Path) -> dict[str, int] | None:
 
 
 def _read_mcap(file: Path, found: _Found) -> None:
-    """Reads all intact messages of an MCAP file; after damage it is searched for the next chunk."""
     told, waiting, promised = mcap.McapSummary(), list[mcap.Record](), dict[int, int]()
     data = mcap.mapped(file) if file.stat().st_size else memoryview(b"")
     place = len(mcap.MAGIC)
@@ -196,7 +189,6 @@ def _read_mcap(file: Path, found: _Found) -> None:
 
 
 def _cut_chunk(data: memoryview, place: int) -> list[mcap.Record]:
-    """Returns the records of a plain chunk that is cut off or whose length is wrong."""
     start = place + mcap.PREFIX + 40
     if data[place] != Opcode.CHUNK or start >= len(data):
         return []
@@ -208,7 +200,6 @@ def _cut_chunk(data: memoryview, place: int) -> list[mcap.Record]:
 
 
 def _until_damage(data: memoryview, span_ns: tuple[int, int]) -> Iterator[mcap.Record]:
-    """Yields records up to the first wrong length; messages only within the chunk's time span."""
     place: int | None = 0
     while place is not None:
         try:
@@ -224,7 +215,6 @@ def _until_damage(data: memoryview, span_ns: tuple[int, int]) -> Iterator[mcap.R
 
 
 def _next_chunk(data: memoryview, start: int, end: int) -> int:
-    """Returns the offset of the next record with the consistent lengths of a chunk, or the end."""
     file, place = data.obj, start - 1
     while isinstance(file, mmap) and (place := file.find(CHUNK_OP, place + 1, end)) >= 0:
         if _looks_like_chunk(data, place):
@@ -269,8 +259,7 @@ def _read_database(file: Path, found: _Found) -> None:
 
 
 def _drop_cut_page(copy: Path) -> None:
-    """Removes a truncated last page, which SQLite would silently fill with zeros."""
-    with copy.open("r+b") as file:
+    with copy.open("r+b") as file:  # SQLite would silently fill a cut page with zeros
         size = int.from_bytes(file.read(18)[16:], "big")
         size = 65536 if size == 1 else size
         if size >= SMALLEST_PAGE and size & (size - 1) == 0:
@@ -278,7 +267,6 @@ def _drop_cut_page(copy: Path) -> None:
 
 
 def _rows(base: sqlite3.Connection, bound: int) -> list[tuple[Any, ...]]:
-    """Reads messages: topic, time, data. Ranges that can't be read are halved."""
     ask = "SELECT topic_id, timestamp, data FROM messages WHERE id BETWEEN ? AND ?"
     rows, waiting = list[tuple[Any, ...]](), [(1, bound)]
     with suppress(sqlite3.Error):

@@ -58,14 +58,10 @@ class Machine:
 def _motor(
     transmission: str, inertia: float, lag: float, radius: float, step: float, physics: Physics
 ) -> str:
-    """MJCF of a motor at a `joint="NAME"` or a `tendon="NAME"`, under a velocity servo.
-
-    Torque = gain x (wanted - actual speed), up to a limit. The wanted speed follows the command
-    with a first-order lag [s], like the set point of a motor controller, so that the servo is stiff
-    and keeps its speed under load. Spinning or locked wheels do not steer, so the lag is longer if
-    the maximum step [m/s] of the command would accelerate the robot too much. The inertia is that
-    at the motor's shaft, including the share of the moving robot [kg m^2].
-    """
+    # Torque = gain x (wanted - actual speed), up to a limit. The wanted speed follows the command
+    # with a first-order lag [s], so that the servo is stiff and keeps its speed under load.
+    # Spinning or locked wheels do not steer, so the lag is longer if the maximum step [m/s] would
+    # accelerate the robot too much. The inertia [kg m^2] is at the shaft, with the robot's share.
     lag = max(lag, step / physics.acceleration) - SERVO_LAG_S
     gain = inertia / SERVO_LAG_S
     torque = inertia * TORQUE_RESERVE * physics.acceleration / radius
@@ -106,7 +102,6 @@ def _chassis(mass: float, centre: tuple[float, float, float], size: tuple[float,
 
 
 def _wheel(name: str, radius: float, width: float, physics: Physics, damping: float = 0.0) -> str:
-    """MJCF inside a wheel's body: a hinge about y, a hub with the mass, a round tread."""
     return f"""
         <joint name="{name}" axis="0 1 0" damping="{damping}"/>
         <geom type="cylinder" mass="{physics.wheel_mass}" size="{radius:.6g} {0.5 * width:.6g}"
@@ -120,9 +115,8 @@ def load_mujoco() -> Any:
     try:
         import mujoco
     except ImportError:
-        raise ConfigError(
-            "MuJoCo is not installed; run pip install 'nics_drl_bridge[mujoco]'."
-        ) from None
+        fix = "run pip install 'nics_drl_bridge[mujoco]'."
+        raise ConfigError(f"MuJoCo is not installed; {fix}") from None
     return mujoco
 
 
@@ -130,26 +124,19 @@ def build_machine(spec: RobotSpec, physics: Physics | None = None) -> Machine:
     """Builds the machine of a robot; ConfigError without one of its kind, or a parameter."""
     kind = require_textbook(spec)
     if kind not in _BUILDERS:
-        raise ConfigError(
-            f"robot {spec.name!r}: MuJoCo has no machine of the kind {kind!r}; take one of "
-            f"{', '.join(_BUILDERS)}, or the fast simulator."
-        )
+        fix = f"take one of {', '.join(_BUILDERS)}, or the fast simulator."
+        raise ConfigError(f"robot {spec.name!r}: MuJoCo has no machine of the kind {kind!r}; {fix}")
     try:
         step = max(c.max - c.min for c in spec.command if not c.turns)
         return _BUILDERS[kind](spec.parameters, step, physics or Physics())
     except KeyError as error:
-        raise ConfigError(
-            f"robot {spec.name!r}: the {kind} machine needs the parameter {error}; add it under "
-            "`parameters:`."
-        ) from None
+        reason = f"the {kind} machine needs the parameter {error}; add it under `parameters:`."
+        raise ConfigError(f"robot {spec.name!r}: {reason}") from None
 
 
 def _ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
-    """Builds a car: rear axle with an open differential, front wheels steered by two servos.
-
-    `base_link` is the centre of the rear axle. One motor turns both rear wheels through a
-    tendon that averages their speeds, which shares its torque as a differential does.
-    """
+    # One motor turns both rear wheels through a tendon that averages their speeds, which shares its
+    # torque as a differential does.
     wheelbase = p["wheelbase"]
     track, radius = track_and_radius(p)
     total = physics.mass + 4 * physics.wheel_mass
@@ -212,7 +199,6 @@ def _car_actuators(engine: str) -> str:
 
 
 def _differential(p: Parameters, step: float, physics: Physics) -> Machine:
-    """Builds a robot of two driven wheels and a ball caster; `base_link` is the axle's centre."""
     radius, track = p["wheel_radius"], p["track"]
     behind, ball = -0.5 * track, 0.4 * radius
     total = physics.mass + 2 * physics.wheel_mass
@@ -238,11 +224,8 @@ def _differential(p: Parameters, step: float, physics: Physics) -> Machine:
 
 
 def _mecanum(p: Parameters, step: float, physics: Physics) -> Machine:
-    """Builds a robot of four wheels with real rollers, which carry it in turn.
-
-    MuJoCo can't align a friction that differs by direction with the roller at the bottom of a
-    turning wheel; free rollers are robust, and reproduce the slight vibration of real ones.
-    """
+    # MuJoCo can't align a friction that differs by direction with the roller at the bottom of a
+    # turning wheel; free rollers are robust, and reproduce the slight vibration of real ones.
     radius = p["wheel_radius"]
     total = physics.mass + 4 * physics.wheel_mass
     inertia = (0.25 * total + 0.5 * physics.wheel_mass) * radius**2
@@ -287,10 +270,7 @@ def roller_size(radius: float, rollers: int) -> tuple[float, float]:
 def _roller_wheel(
     name: str, place: tuple[float, float], lean: int, radius: float, physics: Physics
 ) -> str:
-    """MJCF of a wheel at x, y [m]: a driven hub, and free rollers at 45 degrees to its axle.
-
-    It leans by +1 if the axle of the roller on the floor points forward and left, else by -1.
-    """
+    # It leans by +1 if the axle of the roller on the floor points forward and left, else by -1.
     a, b = roller_size(radius, physics.rollers)
     hub = physics.wheel_mass - physics.rollers * ROLLER_MASS
     rows = ""

@@ -38,10 +38,7 @@ def compile_scene(
     mujoco: Any, machine: Machine, physics: Physics, footprint: Shape, robots: int, world: World,
     sampler: SceneSampler, bodies: Array,
 ) -> Any:  # fmt: skip
-    """Compiles the model of robots of one kind, with a circle or polygon as footprint, in a world.
-
-    Obstacles (K, 7), as in `lidar.shapes.BODY`, that move have prescribed poses (mocap).
-    """
+    """Compiles robots of one kind in a world; bodies (K, 7) that move have prescribed poses."""
     spec = mujoco.MjSpec.from_string(machine.xml)
     maker = _Maker(mujoco, spec, physics)
     maker.bumper(spec.body("base_link"), footprint)
@@ -70,14 +67,12 @@ def bumpers(model: Any, robots: int) -> NDArray[np.int64]:
 
 
 class _Maker:
-    """Adds geoms to an MjSpec."""
-
     def __init__(self, mujoco: Any, spec: Any, physics: Physics) -> None:
         self._kinds, self._spec = mujoco.mjtGeom, spec
         self._solref = [physics.softness, 1.0]
 
     def bumper(self, base: Any, footprint: Shape) -> None:
-        """Adds the footprint of a robot, without mass, which belongs to the chassis."""
+        # Without mass, which belongs to the chassis.
         half, own = 0.5 * float(base.pos[2]), {"contype": BUMPER, "mass": 0.0}
         if isinstance(footprint, Circle):
             # Its round edge touches a wall in one point, at the height of the axles.
@@ -121,9 +116,8 @@ class _Maker:
 
     def _prism(self, body: Any, corners: Array, z: tuple[float, float], **others: Any) -> None:
         mesh = self._spec.add_mesh(name=f"prism_{len(self._spec.meshes)}")
-        mesh.uservert = np.concatenate(
-            [np.column_stack([corners, np.full(len(corners), height)]) for height in z]
-        ).ravel()
+        layers = [np.column_stack([corners, np.full(len(corners), height)]) for height in z]
+        mesh.uservert = np.concatenate(layers).ravel()
         self._add(body, type=self._kinds.mjGEOM_MESH, meshname=mesh.name, **others)
 
     def _add(self, body: Any, **values: Any) -> None:
@@ -151,12 +145,10 @@ def convex_parts(outline: Array) -> list[Array]:
 
 
 def _area(a: Array, b: Array, c: Array) -> float:
-    """Twice the signed area of a triangle; positive counter-clockwise."""
     return float((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]))
 
 
 def _is_ear(outline: Array, rest: list[int], i: int) -> bool:
-    """True if corner i of `rest` can be cut off: convex, with no other corner within."""
     before, here, after = rest[i - 1], rest[i], rest[(i + 1) % len(rest)]
     a, b, c = outline[before], outline[here], outline[after]
     if _area(a, b, c) <= 0.0:
@@ -168,11 +160,7 @@ def _is_ear(outline: Array, rest: list[int], i: int) -> bool:
 
 
 def rectangles(blocked: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Rectangles (R, 4) that together cover exactly the blocked cells (rows, columns) of a map.
-
-    Each is first row, first column, and those after the last. They are runs along the rows; equal
-    runs in consecutive rows are merged.
-    """
+    """Rectangles (R, 4) of blocked cells: first row, first column, and those after the last."""
     done: list[tuple[int, int, int, int]] = []
     open_runs: dict[tuple[int, int], int] = {}
     framed = np.pad(blocked, ((0, 1), (1, 1)))

@@ -93,10 +93,9 @@ class Rig:
         """Raises BackendError if the robot has fallen over."""
         x, y = data.qpos[self._place + 4 : self._place + 6]
         if not 1.0 - 2.0 * (x * x + y * y) > np.cos(LARGEST_TILT_RAD):
-            raise BackendError(
-                f"robot {self.spec.name!r} has fallen over at {data.time:.2f} s; lower the "
-                "acceleration of its Physics, or its command limits."
-            )
+            fix = "lower the acceleration of its Physics, or its command limits."
+            when = f"at {data.time:.2f} s"
+            raise BackendError(f"robot {self.spec.name!r} has fallen over {when}; {fix}")
 
 
 class MujocoRobot:
@@ -122,10 +121,7 @@ class MujocoRobot:
         return self.read()
 
     def step(self, command: ArrayLike, duration: float) -> Reading:
-        """Drives with a command (C,), clipped to its limits, for a whole number of time steps [s].
-
-        Raises BackendError if the robot has fallen over, or the command contains NaN.
-        """
+        """Drives with a command (C,), clipped, for so many whole time steps [s]; BackendError."""
         self._rig.command(self._data, command)
         self._advance(duration)
         self._rig.require_upright(self._data)
@@ -144,13 +140,12 @@ class MujocoSimulator(DrivenSimulator):
     """One world of robots in MuJoCo, with motors, wheels and contact.
 
     Scenes, moving obstacles, lidar and odometry noise are those of the FastSimulator for the same
-    seed; only the robots move differently. Whatever their footprint touches blocks them. Odometry
-    integrates the turns of the wheels, so it drifts if they slip. A command acts at once, on motors
-    with their own lag: the model's latency is not added. The textbook kinematics of the robot
-    select the machine; the fitted ones are not used. The time step of `physics` is shortened so
-    that a control period is a whole number of steps. Raises ConfigError if MuJoCo is not installed,
-    the robot names no textbook kinematics or lacks a parameter of its machine, or the world has no
-    free space left.
+    seed. Whatever the robots' footprints touch blocks them. Odometry integrates the turns of the
+    wheels, so it drifts if they slip. A command acts on motors with their own lag: the model's
+    latency is not added. The textbook kinematics of the robot select the machine. The time step of
+    `physics` is shortened to divide a control period. Raises ConfigError if MuJoCo is not
+    installed, the robot names no textbook kinematics or lacks a parameter of its machine, or the
+    world has no free space left.
     """
 
     def __init__(
@@ -189,11 +184,7 @@ class MujocoSimulator(DrivenSimulator):
         return scenes
 
     def step(self, commands: ArrayLike) -> None:
-        """Moves the world by one control period; commands (1, M, C) are clipped to their limits.
-
-        Raises ConfigError for a wrong shape; BackendError for NaN, for a robot that fell over
-        without a collision, or if the motion diverges.
-        """
+        """Moves one control period by commands (1, M, C), clipped. ConfigError, BackendError."""
         commands = np.asarray(commands, dtype=np.float64)
         shape = (1, len(self._rigs), len(self.model.robot.command))
         if commands.shape != shape:
@@ -206,10 +197,9 @@ class MujocoSimulator(DrivenSimulator):
             if not collided:
                 rig.require_upright(self._data)
         if any(warning.number for warning in self._data.warning):
-            raise BackendError(
-                f"MuJoCo warns at {self._data.time:.2f} s that the motion of robot "
-                f"{self.model.robot.name!r} diverges; shorten the timestep of its Physics."
-            )
+            what = f"the motion of robot {self.model.robot.name!r} diverges"
+            fix = "shorten the timestep of its Physics."
+            raise BackendError(f"MuJoCo warns at {self._data.time:.2f} s that {what}; {fix}")
 
     def _move(self) -> None:
         rigs, data, part_s = self._rigs, self._data, self.model.control_period / self._subperiods
@@ -222,10 +212,8 @@ class MujocoSimulator(DrivenSimulator):
             bumped = self._bumper_of[data.contact.geom.ravel()]
             touched[bumped[bumped >= 0]] = True
             before, turned = turned, [rig.encoders(data) for rig in rigs]
-            means = [
-                self._machine.state(0.5 * (first + last), (last - first) / part_s)
-                for first, last in zip(before, turned, strict=True)
-            ]
+            both, mean = zip(before, turned, strict=True), self._machine.state
+            means = [mean(0.5 * (first + last), (last - first) / part_s) for first, last in both]
             counted = self._twist(np.array(means))
             wheels = geometry.compose(wheels, geometry.exp(counted * part_s))
         readings = [rig.read(data) for rig in rigs]
@@ -250,11 +238,9 @@ def record(
     robot: MujocoRobot, rng: np.random.Generator, duration: float = 60.0, dt: float = 0.01,
     hold: float = 0.5,
 ) -> Recording:  # fmt: skip
-    """Drives at random from the origin and records, as `textbook.record` does.
+    """Drives at random, with a new command each `hold` [s], and records; see `textbook.record`.
 
-    New commands are drawn, uniform within their limits, every `hold` seconds; the sample period
-    `dt` [s] is a whole number of the robot's time steps. Raises BackendError if the robot fell
-    over.
+    The sample period `dt` [s] is a whole number of the robot's time steps. Raises BackendError.
     """
     spec = robot.spec
     per_hold, holds = round(hold / dt), int(np.ceil(duration / hold))

@@ -99,11 +99,7 @@ class Rollout:
 
 
 class WorldsRunner(SingleAgentEnvRunner):
-    """Steps its share of the worlds of a training.
-
-    `env_config` contains `make` (a reference to a function of runner and number of runners that
-    makes a TrainVecEnv), `rollout` (T), `seed` (two numbers) and `threads`.
-    """
+    """Steps its share of the worlds of a training; `env_config` is made by `_algorithm`."""
 
     def make_env(self) -> None:
         """Makes the worlds of this runner; each runner draws different episodes."""
@@ -138,7 +134,6 @@ class WorldsRunner(SingleAgentEnvRunner):
         return list(Rollout(whole, actions, logits, logp, rewards, final).episodes())
 
     def _step(self, t: int) -> tuple[Any, ...]:
-        """Steps every world once; returns a row of `Rollout`."""
         seen = self._seen
         out = self.module.forward_exploration({Columns.OBS: torch.as_tensor(seen)})
         logits = out[Columns.ACTION_DIST_INPUTS]
@@ -166,12 +161,10 @@ class ActorCritic(TorchRLModule, InferenceOnlyAPI, ValueFunctionAPI):
 
     def setup(self) -> None:
         """Builds the layers."""
-        chosen, size = self.model_config, int(self.observation_space.shape[0])
+        chosen, seen = self.model_config, self.observation_space
         hidden, normaliser = list(chosen["hidden"]), chosen["normaliser"]
-        self.actor = train_algorithms.Actor(
-            self.observation_space, self.action_space, hidden, normaliser
-        )
-        self.critic = train_algorithms.layers_of([size, *hidden, 1], 1.0)
+        self.actor = train_algorithms.Actor(seen, self.action_space, hidden, normaliser)
+        self.critic = train_algorithms.layers_of([int(seen.shape[0]), *hidden, 1], 1.0)
         if not self.actor.discrete:
             spread = torch.full(self.action_space.shape, float(chosen["log_std"]))
             self.log_std = torch.nn.Parameter(spread)
@@ -206,8 +199,7 @@ def connected(address: str | None, runners: int | None, worlds: int) -> Iterator
     """Connects with a cluster, and yields the number of env runners, by default its CPUs.
 
     The address is `auto` (the cluster that this machine is part of) or `HOST:PORT`; None starts one
-    on this machine, which ends with the training. Raises ConfigError if no cluster answers there,
-    or it is too small.
+    here, for the training. Raises ConfigError if none answers there, or it is too small.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     # A lost worker is no error here, and Ray's messages about it would disturb the progress bar.
@@ -221,10 +213,9 @@ def connected(address: str | None, runners: int | None, worlds: int) -> Iterator
         ray.init(address or "local", log_to_driver=False, logging_level="ERROR", **local)
     except (OSError, OverflowError, ValueError, RuntimeError) as error:
         first = str(error).strip().partition("\n")[0].rstrip(".")
-        raise ConfigError(
-            f"--address {address}: no Ray cluster answers ({first}); start one on the first "
-            "machine with 'ray start --head', and name the HOST:PORT that it prints."
-        ) from None
+        fix = "start one on the first machine with 'ray start --head', and name its HOST:PORT."
+        reason = f"no Ray cluster answers ({first}); {fix}"
+        raise ConfigError(f"--address {address}: {reason}") from None
     try:
         yield _runners(runners, int(ray.cluster_resources().get("CPU", 0)), worlds)
     finally:
@@ -235,15 +226,11 @@ def _runners(runners: int | None, cpus: int, worlds: int) -> int:
     if runners is None:
         return max(1, min(cpus, worlds))
     if runners > cpus:
-        raise ConfigError(
-            f"--env-runners {runners}: the cluster has {cpus} CPUs, and each env runner takes one; "
-            "add machines with 'ray start', or ask for fewer."
-        )
+        fix = "each env runner takes one; add machines with 'ray start', or ask for fewer."
+        raise ConfigError(f"--env-runners {runners}: the cluster has {cpus} CPUs, and {fix}")
     if runners > worlds:
-        raise ConfigError(
-            f"--env-runners {runners}: the settings have {worlds} worlds to share; give them more, "
-            "or ask for fewer."
-        )
+        fix = "give them more, or ask for fewer."
+        raise ConfigError(f"--env-runners {runners}: the settings have {worlds} worlds; {fix}")
     return runners
 
 
@@ -253,11 +240,9 @@ def train_on_ray(
 ) -> train.Trained:  # fmt: skip
     """Trains one policy on the cluster that this process is connected to.
 
-    An env runner whose process or machine is lost is restarted, if necessary on another machine;
-    the others continue meanwhile. The steps that are learned from then depend on the time of the
-    loss: two runs with one seed agree only as long as no runner is lost. The arguments are those of
-    `policy.train.train`; `tell` is called after each roll-out. Raises ConfigError if the settings
-    are inconsistent, no checkpoint fits them, or no env runner answers.
+    A lost env runner is restarted, if necessary on another machine; two runs with one seed agree
+    only as long as none is lost. The arguments are those of `policy.train.train`. Raises
+    ConfigError if the settings are inconsistent, no checkpoint fits them, or no runner answers.
     """
     if settings.algorithm != "ppo":
         given = settings.algorithm
@@ -296,9 +281,8 @@ class Learning:
     @property
     def learner(self) -> Any:
         """RLlib's learner, which runs in this process."""
-        return (
-            self.algorithm.learner_group.foreach_learner(lambda one: one).result_or_errors[0].get()
-        )
+        found = self.algorithm.learner_group.foreach_learner(lambda one: one)
+        return found.result_or_errors[0].get()
 
     @property
     def module(self) -> ActorCritic:
@@ -342,10 +326,8 @@ class Learning:
     def _check_silence(self, silent_s: float, about: dict[str, Any]) -> None:
         if silent_s > SILENCE_S:
             self.save(about)
-            raise ConfigError(
-                f"no env runner has answered for {silent_s:.0f} s; look at the machines with "
-                f"'ray status', and go on from {self.path} with --resume."
-            )
+            fix = f"look at 'ray status', and go on from {self.path} with --resume."
+            raise ConfigError(f"no env runner has answered for {silent_s:.0f} s; {fix}")
 
     def _progress(self, first: int, taken: float) -> Progress:
         ended, *counts = np.sum(list(self.recent), axis=0)
@@ -371,7 +353,6 @@ class Learning:
 
 
 def _algorithm(settings: TrainingSettings, seed: int, done: int, runners: int) -> PPO:
-    """RLlib's PPO, after `done` steps of the training."""
     torch.set_num_threads(settings.threads)
     model = open_model(settings.robot)
     scenes = {name: load_world(name) for name in settings.worlds}
@@ -383,10 +364,8 @@ def _algorithm(settings: TrainingSettings, seed: int, done: int, runners: int) -
     spaces = env.observation_space, env.action_space
     env.close()
     make = ray.put(functools.partial(share_of_worlds, settings, model, scenes))
-    env_config = {
-        "make": make, "rollout": settings.ppo.rollout, "seed": (seed, done),
-        "threads": settings.threads,
-    }  # fmt: skip
+    env_config = {"make": make, "seed": (seed, done), "threads": settings.threads}
+    env_config["rollout"] = settings.ppo.rollout
     config = _config(settings, seed, done, normaliser, spaces).env_runners(
         env_runner_cls=WorldsRunner, num_env_runners=runners, rollout_fragment_length="auto",
         sample_timeout_s=SILENCE_S,
