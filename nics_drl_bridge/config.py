@@ -5,8 +5,6 @@ key that stands twice an error, aliases and merge keys are counted while reading
 grow to gigabytes, and tags, which build objects, are refused.
 """
 
-from __future__ import annotations
-
 import re
 import reprlib
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Extensions by name, in groups of entry points `nics_drl_bridge.GROUP`: `docs/extensions.md`."""
 
-from __future__ import annotations
-
 import hashlib
 import sys
 from functools import cache

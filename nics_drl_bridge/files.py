@@ -1,7 +1,5 @@
 """Atomic writes and checksums: a reader finds the old file or the new, and notices any damage."""
 
-from __future__ import annotations
-
 import ctypes
 import errno
 import hashlib

@@ -1,7 +1,5 @@
 """The generator: from a recording to a SimulatorModel, one readable folder on disk."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property, lru_cache

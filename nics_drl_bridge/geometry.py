@@ -1,7 +1,5 @@
 """Plane geometry: angles and poses. REP-103 axes, radians; heading is in [-pi, pi)."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

@@ -1,7 +1,5 @@
 """Interfaces of what learns: RobotView, and Backend for whatever moves the robot."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, TypedDict, runtime_checkable

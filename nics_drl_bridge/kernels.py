@@ -5,8 +5,6 @@ module that its own module imports, directly or not, has changed its content: of
 the folders in which a kernel of your own lies.
 """
 
-from __future__ import annotations
-
 import gc
 import hashlib
 import os

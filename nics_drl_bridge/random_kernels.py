@@ -4,8 +4,6 @@ No state is kept, so a world draws the same numbers in any batch and thread. Spl
 Lea, Flood 2014) mixes the counters; Box-Muller makes normals. Each purpose has a stream of its own.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Checks of seeds: non-negative integers that fit into signed 64 bits."""
 
-from __future__ import annotations
-
 import reprlib
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Threads: a pool for the parts of one job, and a single BLAS thread for small problems."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait

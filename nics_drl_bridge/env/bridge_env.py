@@ -1,7 +1,5 @@
 """BridgeEnv: one task over one backend, as a Gymnasium environment."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import reduce
 from operator import add

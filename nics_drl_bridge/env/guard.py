@@ -1,7 +1,5 @@
 """Guard around an env's methods: any exception stops the robot; checks of what a caller gives."""
 
-from __future__ import annotations
-
 import contextlib
 import signal
 import threading

@@ -5,8 +5,6 @@ round the remainder of a batch differently from its body. Shapes: R robots of an
 commands, P parts of a scan in an observation.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """The paper's task: navigation to a goal by lidar, without touching anything (Sec. VI-B)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar

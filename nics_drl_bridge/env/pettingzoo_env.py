@@ -1,7 +1,5 @@
 """BridgeParallelEnv: a task of several robots, each an agent, as a PettingZoo environment."""
 
-from __future__ import annotations
-
 from copy import deepcopy
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Tasks by name or by the path of a user's file; the environments, for `gymnasium.make`."""
 
-from __future__ import annotations
-
 from importlib import import_module
 from inspect import Parameter, signature
 from typing import Any

@@ -1,7 +1,5 @@
 """Pictures of a world from above, for `render_mode` `rgb_array` and `human`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

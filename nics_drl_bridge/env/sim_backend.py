@@ -1,7 +1,5 @@
 """Backends of an env: the fast simulator in this process, those by name, and user-defined ones."""
 
-from __future__ import annotations
-
 from inspect import signature
 from typing import Any
 

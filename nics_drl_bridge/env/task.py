@@ -1,7 +1,5 @@
 """Task: the job of a robot, written once for one robot over ROS 2 and thousands in arrays."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property

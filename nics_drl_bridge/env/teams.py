@@ -1,7 +1,5 @@
 """Tasks of several robots: reach goals together, and pursuit and evasion."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar

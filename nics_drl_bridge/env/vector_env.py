@@ -1,7 +1,5 @@
 """The vector environment: many worlds of the fast simulator in one set of arrays."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Baking: scans of every shape on the lidar's main axis, stored in a table (Sec. IV-B)."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable, Sequence

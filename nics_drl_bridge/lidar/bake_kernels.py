@@ -1,7 +1,5 @@
 """Compiled inner loops of baking: scans of a shape on the lidar's main axis."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

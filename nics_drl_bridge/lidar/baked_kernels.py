@@ -5,8 +5,6 @@ points around a beam; and the beams that hit follow from the true silhouette, as
 side of a beam is by far the largest error of a plain look-up.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -4,8 +4,6 @@ Each function lowers the beams that hit its object in a scan `out` (B,), float32
 other they are the minimum of Eq. 4. Positions are in the frame of the lidar.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -5,8 +5,6 @@ scanner), then too close, noise, quantisation and dropouts, by `distort`. The fa
 are a row (P,) of numbers; one whose numbers are 0 takes no time and draws nothing.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

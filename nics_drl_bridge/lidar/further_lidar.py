@@ -1,7 +1,5 @@
 """A further lidar, as a `Sensor`: the second one of a robot, or the third."""
 
-from __future__ import annotations
-
 import array
 from typing import Any, Literal
 from zlib import crc32

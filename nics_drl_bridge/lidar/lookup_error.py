@@ -1,7 +1,5 @@
 """Distances at which a shape may be looked up, measured for the renderer `auto`."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

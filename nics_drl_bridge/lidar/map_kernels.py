@@ -8,8 +8,6 @@ to a cell. `jump` works in float32 relative to the lidar's cell: the relative er
 most 3e-7, and a beam within 1e-6 cells of a corner may pass on its other side.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -6,8 +6,6 @@ LLVM vectorises. Steps hand on their results in lanes: one array per type of num
 places for each quantity from a constant on, which LLVM can prove not to overlap.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Scanner: a batch of scans in one call, exact or baked."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -3,8 +3,6 @@
 Ranges follow REP-117: `inf` no return, `-inf` too close, NaN unknown. Shapes: B beams, S sectors.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ The simulator renders its readings, the nodes publish and read its messages, the
 them by name, views hold them in `sensed`, tasks observe `shares`, the gate keeps clear of `points`.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

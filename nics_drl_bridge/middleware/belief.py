@@ -1,7 +1,5 @@
 """State of the filter at a time, and bounds on motion that none of a robot's data showed."""
 
-from __future__ import annotations
-
 from itertools import product
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """The state estimator: filterpy's extended Kalman filter around the fitted model."""
 
-from __future__ import annotations
-
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import ArrayLike, NDArray

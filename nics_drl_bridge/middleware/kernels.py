@@ -4,8 +4,6 @@ Shared arguments: `mean` (3 + S,) and `transition` (3 + S, 3 + S), the Jacobian 
 `begin`, `end` and `now` are times [ns]; `motion` is `MotionModel`, `log` is `Log`.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

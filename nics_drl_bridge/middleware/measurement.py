@@ -1,7 +1,5 @@
 """Measurements of a robot's sensors, the estimator's verdicts on them, and health of the topics."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The middleware: topics in, RobotView out (Sec. VI, Fig. 5)."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter, deque
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Runs a recorded drive, in the order of receipt, through the middleware, to identical bits."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Order of a robot's data in time: replay of late ones, and time stamps that can't be right."""
 
-from __future__ import annotations
-
 from bisect import bisect_left, bisect_right
 from collections import Counter, deque
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Commanded are the rear axle's speed [m/s] and the steering angle [rad] of a virtual middle wheel.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -3,8 +3,6 @@
 Its commands are the base's forward speed [m/s] and turn rate [rad/s].
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from nics_drl_bridge.robot.drivetrain import wheeled

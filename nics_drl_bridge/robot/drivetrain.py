@@ -6,8 +6,6 @@ rate-limited (`wheel_rate`, `speed_rate`, `steering_rate` [its unit/s]). Siegwar
 Scaramuzza: Introduction to Autonomous Mobile Robots, ch. 3; the paper's reference for Table I.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

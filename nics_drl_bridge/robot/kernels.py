@@ -6,8 +6,6 @@ Shared arguments: `terms` are `Terms`; `x` contains state, command and a last en
 the rates; `series` is `SERIES` in the type of the other arrays.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Kinds of robots: textbook kinematics and a drawing for each; `spec` finds them by name."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar

@@ -4,8 +4,6 @@ Its commands are the body twist: speeds forward and to the left [m/s], and the t
 `base_link` is the centre of the wheels; `half_length` and `half_width` lead from it to each wheel.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from nics_drl_bridge.robot.drivetrain import wheeled

@@ -3,8 +3,6 @@
 Its commands are the front wheel's speed along its own direction [m/s] and steering angle [rad].
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

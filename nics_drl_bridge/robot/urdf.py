@@ -1,7 +1,5 @@
 """URDF of a robot, for RViz and robot_state_publisher (REP-103)."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from xml.etree import ElementTree

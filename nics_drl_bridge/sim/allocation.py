@@ -1,7 +1,5 @@
 """Allocation of worlds, as the kernels take them: state, surroundings, and scratch memory."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass

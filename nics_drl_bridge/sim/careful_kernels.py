@@ -5,8 +5,6 @@ a robot until the end of the substep, an obstacle until the end of the period. T
 contact is sought. Shared arguments: m is a robot, until and time are in the substep [s].
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -7,8 +7,6 @@ and the midpoints of the pieces of edges within. Shared arguments: a body (7,) h
 4, is scratch for the corners of the first body.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

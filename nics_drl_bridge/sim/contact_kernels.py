@@ -5,8 +5,6 @@ lists the bodies that each substep tests. In a crowded world the bodies are sort
 each period, and a robot tests only those around it; bodies larger than a cell are always tested.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

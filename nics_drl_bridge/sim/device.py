@@ -1,7 +1,5 @@
 """One world of a simulator: as its devices see it, and with robots that other physics moves."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

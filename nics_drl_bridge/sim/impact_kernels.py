@@ -10,8 +10,6 @@ Features touch when they are within `SLACK` and approach each other; bodies that
 left to `careful_kernels`. Times are in the substep [s]; body -1 is the map.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

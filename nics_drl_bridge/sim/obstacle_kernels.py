@@ -8,8 +8,6 @@ Distances are between surfaces. The anticipated step is that of the relative mot
 Helbing, Shukla 2007): by the other's alone, a walker pushes against a robot in its way.
 """
 
-from __future__ import annotations
-
 import math
 
 from nics_drl_bridge import random_kernels as random

@@ -6,8 +6,6 @@ in pairs; if that fails, with fresh numbers. Shared arguments: `seed` and `count
 next draw, `plan` is the ScenePlan, `scratch` the SceneScratch, `disc` a body without corners.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Scenes drawn from worlds: obstacles, starts and goals of each seed, in connected free space."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Observations may be delayed: `past` (N, M, R, 12) is a ring buffer of the last R
 i in row i % R: true pose, true twist, pose by odometry, measured twist, interpolated linearly.
 """
 
-from __future__ import annotations
-
 import math
 
 from nics_drl_bridge import random_kernels as random

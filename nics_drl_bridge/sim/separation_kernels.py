@@ -6,8 +6,6 @@ that neither needs to know the other's step (buffered Voronoi cells; Zhou, Wang,
 Schwager 2017). A displacement within all half planes is free of contacts throughout the period.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """FastSimulator: N worlds x M robots of one SimulatorModel in one set of arrays."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from functools import cached_property

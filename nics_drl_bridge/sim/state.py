@@ -4,8 +4,6 @@ N worlds, n of them in one part, M robots, S state, C command, T kinematic terms
 command history, K obstacles, W walls, B beams, L lanes, R periods of the past.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

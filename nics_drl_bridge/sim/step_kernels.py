@@ -4,8 +4,6 @@ A world is bit-identical in any batch, part or thread: nothing is summed over wo
 drawn at random is drawn by the world's own seed and counter.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
