@@ -101,11 +101,9 @@ def _take_odometry(middleware: Middleware, stamp_ns: int, arrival_ns: int, messa
 class DdsBackend:
     """One robot behind `cmd_vel`, `scan` and `odom`, in lock-step with a simulator node.
 
-    Each step publishes one command and returns exactly the data stamped one control period later.
-    `close`, an error and garbage collection leave a zero command behind, see `Link`. `truth` adds
-    the true pose to `info`; `timeout_s` bounds each wait. Raises BackendError if no simulator is
-    there, it refuses, does not answer or is not in lock-step, or another node moved it; ModelError
-    if it runs another model or world; StaleDataError if its data do not arrive.
+    `truth` adds the true pose to `info`; `timeout_s` bounds each wait. Raises BackendError if no
+    simulator is there, it refuses, is not in lock-step, or another node moved it; ModelError if it
+    runs another model or world; StaleDataError if its data do not arrive.
     """
 
     def __init__(
@@ -236,11 +234,7 @@ def _put(mail: _Mailbox, topic: str, message: bytes) -> object:
 
 
 class FleetBackend:
-    """M robots in lock-step with one simulator node, which moves when all have their commands.
-
-    Views and commands have a leading (M,). Each robot has a `DdsBackend` with the options, in the
-    order of the simulator's parameter `robots`. Raises BackendError if one of them is missing.
-    """
+    """M robots (M, ...) in lock-step with one simulator node; BackendError if one is missing."""
 
     def __init__(
         self, model: SimulatorModel, world: World, namespaces: Sequence[str],
@@ -305,11 +299,7 @@ def dds_backend(
     model: SimulatorModel, world: World, mode: str = "lockstep", robots: int = 1,
     estimator: bool = True, randomisation: None = None, **options: Any,
 ) -> interface.Backend:  # fmt: skip
-    """Returns a `DdsBackend`, `RealtimeBackend`, or for a team in lock-step a `FleetBackend`.
-
-    A team's `namespaces` are robot1, robot2, ... by default. Raises ConfigError for options that do
-    not go together; BackendError if no peer is there.
-    """
+    """Returns the backend for the options; ConfigError if they do not go together, BackendError."""
     if not estimator or randomisation is not None:
         refused = "is never randomised; leave out `estimator` and `randomisation`."
         raise ConfigError(f"backend 'dds' always estimates and {refused}")

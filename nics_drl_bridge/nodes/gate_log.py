@@ -151,12 +151,7 @@ def prune(folder: Path, own: Sequence[str]) -> None:
 
 
 class BoxWriter:
-    """Writes files, each in its own process, which starts as a copy of this one.
-
-    The copy (`fork`) is the snapshot: it takes some milliseconds, and later changes are not in it.
-    A disk that hangs blocks the copy and nothing else, not even the end of this process, as a
-    waiting thread would. The copy closes all sockets, and runs at ordinary priority.
-    """
+    """Writes files, each in a forked copy of this process: a hanging disk blocks only the copy."""
 
     def __init__(self) -> None:
         self._writers: dict[int, tuple[mmap, float]] = {}  # pid: what failed, begin [s]

@@ -31,10 +31,7 @@ LONGEST_REASON = 300  # greatest length of a policy's error text, in characters
 class PolicyNode(ManagedNode):
     """Answers scans with `cmd_vel_raw`, with the stamp of the scan, until the goal is reached.
 
-    It observes through the same task as the Gymnasium env, and acts at most once per control period
-    and per scan. An inference that exceeds the deadline is dropped; after several in a row it
-    commands zero. The goal, in `map`, is a parameter at the start and the topic `goal_pose`
-    afterwards. It listens when configured and commands when active; its last command is zero.
+    An inference that exceeds the deadline is dropped; after several in a row it commands zero.
     """
 
     def __init__(self, context: Context) -> None:

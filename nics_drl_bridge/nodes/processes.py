@@ -60,10 +60,7 @@ def _dies_with_parent() -> Callable[[], None] | None:
 
 
 class NodeProcess(AbstractContextManager["NodeProcess", None]):
-    """One node in its own process, with log and parameters in a folder, which `close` ends.
-
-    `discovery` is LOCALHOST or SUBNET. On Linux the node also ends when its parent thread does.
-    """
+    """One node in its own process, which ends with `close`, and on Linux with its parent thread."""
 
     def __init__(
         self, node: str, folder: Path, parameters: Mapping[str, Any], domain_id: int,

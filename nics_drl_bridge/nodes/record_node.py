@@ -166,10 +166,8 @@ class DriveResult:
 class RecordNode(qos.QosWatch):
     """Sends `cmd_vel` at 20 Hz; writes `odom`, `joint_states`, `imu` and `pose` to a recording.
 
-    Each segment of the drive is chosen from the robot's position by odometry. It ends with zero
-    commands, also on a signal, on an error, when odometry is silent, and when the robot leaves the
-    circle around its start; what was recorded until then is saved. If this process is killed, only
-    the robot's own timeout on `cmd_vel` stops it.
+    It ends with zero commands, also on a signal, an error, silent odometry, and outside the circle
+    around its start. If this process is killed, only the robot's timeout on `cmd_vel` stops it.
     """
 
     def __init__(self, context: Context, given: Mapping[str, Any] | None = None) -> None:

@@ -157,11 +157,7 @@ class RobotPort:
 
 
 class CommandInlet:
-    """Listens to `cmd_vel`, and to `ackermann_cmd` if the robot steers and the message exists.
-
-    A stamped command is treated as by ros2_control's drive controllers: a stamp of zero counts as
-    now. `take` gets each command (C,) whose stamp [ns] is not `too_old`.
-    """
+    """Listens to `cmd_vel`, stamped or not, and to `ackermann_cmd` if the robot steers."""
 
     def __init__(
         self, node: Node, namespace: str, robot: RobotSpec, quality: QoSProfile,
@@ -238,11 +234,9 @@ def transform_to_ros(parent: str, child: str, pose: ArrayLike, stamp: Time) -> T
 class DeviceNode(qos.QosWatch):
     """Takes `cmd_vel`; publishes `scan`, `odom`, `joint_states`, `ground_truth`, `/clock`, `/tf`.
 
-    With the parameter `robots` it is a fleet in one world, each robot in a namespace below the
-    node's own. Stamps are simulated time: it begins at the system's time and never runs backwards.
-    `~/reset` begins an episode; its answer is JSON with the stamp of the first data. In lock-step
-    the world moves when each robot has a command, and `~/repeat` publishes the present data again.
-    `~/touched` reports which robots have truly touched something in this episode.
+    With the parameter `robots` it is a fleet, each in a namespace below its own. Simulated time
+    begins at the system's and never runs backwards. `~/reset` begins an episode; in lock-step the
+    world moves when each robot has a command, and `~/repeat` publishes the present data again.
     """
 
     def __init__(self, name: str, context: Context, make: MakeSimulator) -> None:

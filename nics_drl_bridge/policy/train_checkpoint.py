@@ -1,7 +1,4 @@
-"""Checkpoints of a training: all that it needs to continue bit-identically.
-
-A checkpoint is never deployed. PyTorch's `weights_only` reader builds no objects: no code runs.
-"""
+"""Checkpoints of a training, all that it needs to continue bit-identically; none is deployed."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""A scene in MuJoCo: robots with their bumpers, walls, map and obstacles.
-
-A bumper is the footprint of the RobotSpec, at the height of the axles; it collides with walls,
-obstacles and the bumpers of other robots. Wheels touch only the floor. MuJoCo's bodies are convex,
-so outlines are cut into convex parts and maps into rectangles.
-"""
+"""A scene in MuJoCo: robots with bumpers, walls, map and obstacles, cut into convex parts."""
 
 from __future__ import annotations
 
