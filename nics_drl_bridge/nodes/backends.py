@@ -126,7 +126,7 @@ class DdsBackend:
             kind = LaserScan if topic == SCAN else Odometry
             if topic in self._sensors:
                 kind = sensor_type(self._sensors[topic])
-            put = partial(_put, self._mail, topic)
+            put = partial(self._mail.put, topic)
             self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
         self._episodes = EpisodeServices(self._link, simulator, model, world)
         self._link.begin()
@@ -175,10 +175,9 @@ class DdsBackend:
         for topic in self._topics:
             if off_ns := self._mail.stamp_ns(topic) - self._now_ns:
                 self._link.check_alone()
-                raise BackendError(
-                    f"topic {topic!r}: stamped {off_ns / NS_PER_S:+.3f} s off the step; start "
-                    "the simulator with mode:=lockstep, and move it from here alone."
-                )
+                off = f"stamped {off_ns / NS_PER_S:+.3f} s off the step"
+                fix = "start the simulator with mode:=lockstep, and move it from here alone."
+                raise BackendError(f"topic {topic!r}: {off}; {fix}")
 
     @halts_on_error
     def receive(self) -> tuple[RobotView, dict[str, Any]]:
@@ -227,10 +226,6 @@ def _read(topic: str, read: Callable[[bytes], T], message: bytes) -> T:
     except wire.UNREADABLE as error:
         reason = f"a message can't be read ({error}); look at who publishes it."
         raise BackendError(f"topic {topic!r}: {reason}") from None
-
-
-def _put(mail: _Mailbox, topic: str, message: bytes) -> object:
-    return mail.put(topic, message)
 
 
 class FleetBackend:

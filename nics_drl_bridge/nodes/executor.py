@@ -28,11 +28,7 @@ MOST_AT_ONCE = 32  # a timer without a period is always ready, and the thread ha
 
 
 class StandingExecutor(SingleThreadedExecutor):
-    """Waits for all entities of its nodes; handles subscriptions and timers, and leaves the rest.
-
-    Callbacks of subscriptions may return `HANDED_OVER`. This needs parts of rclpy that are not
-    public; if one is missing, it logs that once, and is rclpy's own executor from then on.
-    """
+    """Handles subscriptions, whose callbacks may return `HANDED_OVER`, and timers; leaves the rest."""
 
     def __init__(self, context: Context) -> None:
         super().__init__(context=context)

@@ -74,8 +74,7 @@ class GateLog:
 
     def refuse(self, reason: str) -> None:
         """Counts an unused input, by the part of the reason before the colon, and logs it."""
-        kind = f"refused, {reason.partition(':')[0]}"
-        if (more := self._counted(kind)) is not None:
+        if (more := self._counted(f"refused, {reason.partition(':')[0]}")) is not None:
             self._logger.warning(f"refused: {reason}{more}")
 
     def no_number(self, twist: Sequence[float]) -> None:

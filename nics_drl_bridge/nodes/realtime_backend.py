@@ -131,8 +131,7 @@ class RealtimeBackend:
             now = time.monotonic()
             if now - began > self._options.start_timeout_s:
                 late = f"after {self._options.start_timeout_s:g} s the robot is not ready"
-                fix = "place it there, or choose start='present'."
-                raise BackendError(f"{late}: {missing}; {fix}")
+                raise BackendError(f"{late}: {missing}; place it there, or choose start='present'.")
             if now - said >= SAY_EVERY_S:
                 say(f"waiting for the robot: {missing}")
                 said = now

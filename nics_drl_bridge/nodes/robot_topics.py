@@ -135,8 +135,7 @@ class RobotTopics:
             return
         ordered = reader.ordered(np.asarray(message.ranges, np.float32))
         ranges = from_device(np.ascontiguousarray(ordered), reader.lidar)
-        used = self.middleware.scan(stamp, self.now_ns(), ranges)
-        if used and self._on_scan is not None:
+        if self.middleware.scan(stamp, self.now_ns(), ranges) and self._on_scan is not None:
             self._on_scan(stamp)
 
     def _reader_for(self, message: LaserScan) -> Reader | None:
@@ -191,8 +190,7 @@ class RobotTopics:
             self.middleware.sense(sensor.name, stamp, self.now_ns(), reading)
 
     def _take_command(self, message: Twist | TwistStamped) -> None:
-        twist = conversions.twist_from_ros(message)
-        self.middleware.command(None, self._robot.from_cmd_vel(twist))
+        self.middleware.command(None, self._robot.from_cmd_vel(conversions.twist_from_ros(message)))
 
 
 def data_facts(middleware: Middleware, now_ns: int) -> dict[str, Any]:

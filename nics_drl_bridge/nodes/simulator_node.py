@@ -59,11 +59,9 @@ class Outbox:
         self._latest: dict[Publisher, int] = {}
         self._numbers = itertools.count()
 
-    def send(
-        self, publisher: Publisher, message: Any, now_ns: int, late_ns: tuple[int, int]
-    ) -> None:
+    def send(self, publisher: Publisher, message: Any, now_ns: int, late: tuple[int, int]) -> None:
         """Publishes a message or its bytes, after a delay and a drawn part of a jitter [ns]."""
-        delay, jitter = late_ns
+        delay, jitter = late
         if jitter:
             delay += int(self._random.integers(jitter + 1))
         if not delay:
@@ -94,8 +92,8 @@ class RobotPort:
         time: device_parameters.DeviceTiming, outbox: Outbox,
     ) -> None:  # fmt: skip
         self._model, self.frames = model, frames
-        self._send = partial(outbox.send, late_ns=time.odom_late_ns)
-        self._send_scan = partial(outbox.send, late_ns=time.scan_late_ns)
+        self._send = partial(outbox.send, late=time.odom_late_ns)
+        self._send_scan = partial(outbox.send, late=time.scan_late_ns)
 
         def publisher(kind: Any, topic: str) -> Publisher:
             return node.create_publisher(kind, f"{namespace}{topic}", qos.SENSOR_RELIABLE)
@@ -173,8 +171,7 @@ class CommandInlet:
         self._warned: set[str] = set()
         kind = conversions.message_type("ackermann_msgs/msg/AckermannDriveStamped")
         if robot.steers and kind is not None:  # its package is optional
-            topic = f"{namespace}ackermann_cmd"
-            node.create_subscription(kind, topic, self._on_ackermann, quality)
+            node.create_subscription(kind, f"{namespace}ackermann_cmd", self._on_ackermann, quality)
 
     def _on_bytes(self, content: bytes) -> None:
         try:

@@ -1,8 +1,4 @@
-"""Scans, odometry and twists in serialised form, without a Python object for each number.
-
-The data of each step are in the Common Data Representation of DDS: numbers aligned to their size,
-counted from behind a header of four bytes (OMG DDS-XTypes 7.4.3, "plain CDR").
-"""
+"""Scans, odometry and twists from and to their bytes: "plain CDR" of OMG DDS-XTypes 7.4.3."""
 
 from __future__ import annotations
 

@@ -104,6 +104,5 @@ def chosen_settings(task: str, name: str | None, changes: dict[str, Any]) -> Tra
         base = load_training(name or f"{task}_{robot}")
     changed = base.model_dump(mode="json") | changes
     if worlds := changed.pop("world", None):
-        each = max(1, base.num_envs // len(worlds))
-        changed["worlds"] = dict.fromkeys(worlds, each)
+        changed["worlds"] = dict.fromkeys(worlds, max(1, base.num_envs // len(worlds)))
     return validate(changed, TrainingSettings, "training settings")

@@ -139,9 +139,7 @@ def record_bag(order: BagOrder, say: Callable[[str], None]) -> dict[str, int]:
             skipped = " ".join(node.skipped.values())
             fix = "start the robot, or correct --topics, --namespace or ROS_DOMAIN_ID."
             fix += f" Not recorded: {skipped}" if skipped else ""
-            raise BackendError(
-                f"nothing was heard on any of the topics, so no bag is written; {fix}"
-            )
+            raise BackendError(f"nothing was heard on any topic, so no bag is written; {fix}")
     return sink.counts
 
 

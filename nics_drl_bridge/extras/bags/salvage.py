@@ -136,8 +136,7 @@ def _decodable(found: _Found) -> Iterator[tuple[str, int, bytes]]:
 
 def _promised(path: Path) -> dict[str, int] | None:
     try:
-        about = metadata_of(path if path.is_dir() else path.parent)
-        topics = about["topics_with_message_count"]
+        topics = metadata_of(path if path.is_dir() else path.parent)["topics_with_message_count"]
         return {t["topic_metadata"]["name"]: int(t["message_count"]) for t in topics}
     except (OSError, ValueError, TypeError, KeyError):
         return None

@@ -149,17 +149,14 @@ def _is_ear(outline: Array, rest: list[int], i: int) -> bool:
     if _area(a, b, c) <= 0.0:
         return False
     others = (outline[k] for k in rest if k not in (before, here, after))
-    return not any(
-        _area(a, b, p) >= 0.0 and _area(b, c, p) >= 0.0 and _area(c, a, p) >= 0.0 for p in others
-    )
+    return not any(min(_area(a, b, p), _area(b, c, p), _area(c, a, p)) >= 0.0 for p in others)
 
 
 def rectangles(blocked: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Rectangles (R, 4) of blocked cells: first row, first column, and those after the last."""
     done: list[tuple[int, int, int, int]] = []
     open_runs: dict[tuple[int, int], int] = {}
-    framed = np.pad(blocked, ((0, 1), (1, 1)))
-    for row, cells in enumerate(framed):
+    for row, cells in enumerate(np.pad(blocked, ((0, 1), (1, 1)))):
         edges = np.flatnonzero(cells[1:] != cells[:-1]).reshape(-1, 2)
         runs = {(int(first), int(after)) for first, after in edges}
         for run in open_runs.keys() - runs:

@@ -132,8 +132,7 @@ class MujocoRobot:
         return self._rig.read(self._data)
 
     def _advance(self, duration: float) -> None:
-        steps = round(duration / self.timestep)
-        self._mujoco.mj_step(self._model, self._data, nstep=steps)
+        self._mujoco.mj_step(self._model, self._data, nstep=round(duration / self.timestep))
 
 
 class MujocoSimulator(DrivenSimulator):

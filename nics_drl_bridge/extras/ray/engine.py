@@ -116,8 +116,7 @@ class WorldsRunner(SingleAgentEnvRunner):
     def _sample(self, **kwargs: Any) -> list[SingleAgentEpisode]:
         """Runs one roll-out; its length is fixed, whatever RLlib requests."""
         steps, busy = int(self.config.env_config["rollout"]), self.env.stepping_s
-        parts = [self._step(t) for t in range(steps)]
-        *arrays, finals = zip(*parts, strict=True)
+        *arrays, finals = zip(*(self._step(t) for t in range(steps)), strict=True)
         seen, actions, logits, logp, rewards = (np.stack(one) for one in arrays)
         final = {place: end for one in finals for place, end in one.items()}
         whole = np.concatenate([seen, self._seen[None]])
@@ -191,7 +190,7 @@ def learner(
 
 @contextmanager
 def connected(address: str | None, runners: int | None, worlds: int) -> Iterator[int]:
-    """Connects with `auto`, `HOST:PORT`, or None: an own cluster; yields its runners; ConfigError."""
+    """Connects with `auto`, `HOST:PORT` or an own cluster, and yields its runners. ConfigError."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     # A lost worker is no error here, and Ray's messages about it would disturb the progress bar.
     os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")
