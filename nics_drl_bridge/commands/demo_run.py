@@ -97,7 +97,7 @@ def run(plan: DemoPlan, say: Say) -> str:
         ("The model", _model(plan, model, identified)),
         ("The policy", _policy(plan, learned, summary)),
         ("The same episodes, in process and over DDS", _episodes(plan, model, here, there)),
-        ("Deployed", _deployed(plan, model, here, live)),
+        ("Deployed", _deployed(plan, model.robot, here, live)),
         ("Time", [pictures.table(("part", "wall time [s]"), times)]),
     ]
     name, file = model.robot.name, plan.out / "report.html"
@@ -305,12 +305,10 @@ def _episodes(
     ]
 
 
-def _deployed(
-    plan: DemoPlan, model: SimulatorModel, here: Sequence[Episode], live: Episode
-) -> list[str]:
+def _deployed(plan: DemoPlan, robot: RobotSpec, here: list[Episode], live: Episode) -> list[str]:
     beside = [episode for episode in here if episode.seed == live.seed]
     runs = {LABELS[FAST]: beside, "deployed": [live]}
-    drawn = pictures.trajectories(runs, load_world(plan.world), model.robot.footprint_radius)
+    drawn = pictures.trajectories(runs, load_world(plan.world), robot.footprint_radius)
     text = (
         "simulator_node in real time, middleware_node, policy_node and command_gate ran as "
         "processes of their own; nobody stepped them. The robot "

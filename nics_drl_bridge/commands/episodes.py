@@ -227,13 +227,10 @@ def drive_vehicle(
     order: EvaluationOrder, goal: tuple[float, float] | None, arm: bool, say: Say, ask: Say,
     **options: Any,
 ) -> Evaluated:  # fmt: skip
-    """Checks that the vehicle fits its model, drives the first policy, and compares.
+    """Drives episodes on the vehicle by `cmd_vel_raw`, so through an armed gate, and compares.
 
-    Commands go to `cmd_vel_raw`, so that only an armed `command_gate` lets them pass. Afterwards
-    the fast simulator drives the same episodes from the vehicle's actual starting poses. `ask` is
-    called before each episode with where to place the vehicle, and returns when it may begin; the
-    options are those of `RealtimeBackend`. Raises BackendError if the vehicle does not fit its
-    model, or does not answer, another BridgeError for a bad name or file.
+    Then the fast simulator drives them from the actual starting poses. `ask` gets each start, and
+    returns when it may begin. Raises BackendError if the vehicle does not fit its model or answer.
     """
     policy = order.policies[0]
     name, namespace = order.model or robot_of(policy), options.get("namespace", "")

@@ -77,21 +77,19 @@ def train(
 
 
 @contextmanager
-def _learner(
-    engine: str, address: str | None, env_runners: int | None, worlds: int
-) -> Iterator[Any]:
+def _learner(engine: str, address: str | None, runners: int | None, worlds: int) -> Iterator[Any]:
     engines = (SB3, *extensions.known("engines"))
     if engine not in engines:
         raise ConfigError(f"unknown engine {engine!r}; {nearest(engine, engines)}")
     if engine == SB3:
         from nics_drl_bridge.policy.train import train as learn
 
-        for name, value in (("address", address), ("env-runners", env_runners)):
+        for name, value in (("address", address), ("env-runners", runners)):
             if value is not None:
                 raise ConfigError(f"--{name}: belongs to --engine ray; add that, or leave it out.")
         yield learn
     else:
-        with extensions.load("engines", engine)(address, env_runners, worlds) as learn:
+        with extensions.load("engines", engine)(address, runners, worlds) as learn:
             yield learn
 
 

@@ -101,11 +101,9 @@ def _take_odometry(middleware: Middleware, stamp_ns: int, arrival_ns: int, messa
 class DdsBackend:
     """One robot behind `cmd_vel`, `scan` and `odom`, in lock-step with a simulator node.
 
-    Each step publishes one command and returns exactly the data stamped one control period later.
-    `close`, an error and garbage collection leave a zero command behind, see `Link`. `truth` adds
-    the true pose to `info`; `timeout_s` bounds each wait. Raises BackendError if no simulator is
-    there, it refuses, does not answer or is not in lock-step, or another node moved it; ModelError
-    if it runs another model or world; StaleDataError if its data do not arrive.
+    `truth` adds the true pose to `info`; `timeout_s` bounds each wait. Raises BackendError if no
+    simulator is there, it refuses, is not in lock-step, or another node moved it; ModelError if it
+    runs another model or world; StaleDataError if its data do not arrive.
     """
 
     def __init__(
@@ -128,7 +126,7 @@ class DdsBackend:
             kind = LaserScan if topic == SCAN else Odometry
             if topic in self._sensors:
                 kind = sensor_type(self._sensors[topic])
-            put = partial(_put, self._mail, topic)
+            put = partial(self._mail.put, topic)
             self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
         self._episodes = EpisodeServices(self._link, simulator, model, world)
         self._link.begin()
@@ -177,10 +175,9 @@ class DdsBackend:
         for topic in self._topics:
             if off_ns := self._mail.stamp_ns(topic) - self._now_ns:
                 self._link.check_alone()
-                raise BackendError(
-                    f"topic {topic!r}: stamped {off_ns / NS_PER_S:+.3f} s off the step; start "
-                    "the simulator with mode:=lockstep, and move it from here alone."
-                )
+                off = f"stamped {off_ns / NS_PER_S:+.3f} s off the step"
+                fix = "start the simulator with mode:=lockstep, and move it from here alone."
+                raise BackendError(f"topic {topic!r}: {off}; {fix}")
 
     @halts_on_error
     def receive(self) -> tuple[RobotView, dict[str, Any]]:
@@ -231,16 +228,8 @@ def _read(topic: str, read: Callable[[bytes], T], message: bytes) -> T:
         raise BackendError(f"topic {topic!r}: {reason}") from None
 
 
-def _put(mail: _Mailbox, topic: str, message: bytes) -> object:
-    return mail.put(topic, message)
-
-
 class FleetBackend:
-    """M robots in lock-step with one simulator node, which moves when all have their commands.
-
-    Views and commands have a leading (M,). Each robot has a `DdsBackend` with the options, in the
-    order of the simulator's parameter `robots`. Raises BackendError if one of them is missing.
-    """
+    """M robots (M, ...) in lock-step with one simulator node; BackendError if one is missing."""
 
     def __init__(
         self, model: SimulatorModel, world: World, namespaces: Sequence[str],
@@ -305,11 +294,7 @@ def dds_backend(
     model: SimulatorModel, world: World, mode: str = "lockstep", robots: int = 1,
     estimator: bool = True, randomisation: None = None, **options: Any,
 ) -> interface.Backend:  # fmt: skip
-    """Returns a `DdsBackend`, `RealtimeBackend`, or for a team in lock-step a `FleetBackend`.
-
-    A team's `namespaces` are robot1, robot2, ... by default. Raises ConfigError for options that do
-    not go together; BackendError if no peer is there.
-    """
+    """Returns the backend for the options; ConfigError if they do not go together, BackendError."""
     if not estimator or randomisation is not None:
         refused = "is never randomised; leave out `estimator` and `randomisation`."
         raise ConfigError(f"backend 'dds' always estimates and {refused}")

@@ -1,8 +1,4 @@
-"""command_gate: passes the policy's commands on while they can be trusted.
-
-Messages are read from their bytes (`wire`): rclpy would first make a Python object of each field,
-which at 50 Hz costs the gate more than deciding.
-"""
+"""command_gate: passes the policy's commands on while they can be trusted."""
 
 from __future__ import annotations
 
@@ -177,11 +173,7 @@ def take_priority(priority: int) -> str:
 
 
 class CommandGate(qos.QosWatch):
-    """Stands between `cmd_vel_raw` and `cmd_vel`, in its own process.
-
-    It starts disarmed. `~/arm` lets commands pass if all checks succeed, `~/e_stop` presses the
-    emergency stop, `~/reset` clears a latched stop. `gate.gate.decide` decides, on a steady clock.
-    """
+    """Stands between `cmd_vel_raw` and `cmd_vel`, in its own process, and starts disarmed."""
 
     def __init__(self, context: Context) -> None:
         super().__init__("command_gate", context=context)

@@ -84,12 +84,10 @@ def twist_from_ros(message: Twist | TwistStamped) -> Array:
     return np.array(messages.command_row(message))
 
 
-def scan_to_ros(
-    spec: LidarSpec, ranges: NDArray[np.float32], time_ns: int, frame: str
-) -> LaserScan:
+def scan_to_ros(spec: LidarSpec, ranges: NDArray[np.float32], now_ns: int, frame: str) -> LaserScan:
     """Returns ranges (B,) as the device's LaserScan; every header field follows from the spec."""
     message = LaserScan()
-    message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
+    message.header.stamp, message.header.frame_id = stamp_to_ros(now_ns), frame
     for field, value in spec.header._asdict().items():
         setattr(message, field, value)
     message.ranges = array.array("f", to_device(ranges, spec).tobytes())

@@ -229,5 +229,4 @@ class RealTime:
 
     def lost(self, steady_ns: int, now_ns: int) -> bool:
         """True if the world is too far behind to catch up with real time."""
-        late_ns = self.time_at(steady_ns) - now_ns - self._step_ns
-        return late_ns > PATIENCE_NS * self._rate
+        return self.time_at(steady_ns) - now_ns - self._step_ns > PATIENCE_NS * self._rate

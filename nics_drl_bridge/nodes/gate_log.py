@@ -74,8 +74,7 @@ class GateLog:
 
     def refuse(self, reason: str) -> None:
         """Counts an unused input, by the part of the reason before the colon, and logs it."""
-        kind = f"refused, {reason.partition(':')[0]}"
-        if (more := self._counted(kind)) is not None:
+        if (more := self._counted(f"refused, {reason.partition(':')[0]}")) is not None:
             self._logger.warning(f"refused: {reason}{more}")
 
     def no_number(self, twist: Sequence[float]) -> None:
@@ -151,12 +150,7 @@ def prune(folder: Path, own: Sequence[str]) -> None:
 
 
 class BoxWriter:
-    """Writes files, each in its own process, which starts as a copy of this one.
-
-    The copy (`fork`) is the snapshot: it takes some milliseconds, and later changes are not in it.
-    A disk that hangs blocks the copy and nothing else, not even the end of this process, as a
-    waiting thread would. The copy closes all sockets, and runs at ordinary priority.
-    """
+    """Writes files, each in a forked copy of this process: a hanging disk blocks only the copy."""
 
     def __init__(self) -> None:
         self._writers: dict[int, tuple[mmap, float]] = {}  # pid: what failed, begin [s]

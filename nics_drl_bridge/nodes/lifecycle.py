@@ -21,12 +21,7 @@ SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FA
 
 
 class ManagedNode(QosWatch, LifecycleNode):
-    """A node that `ros2 lifecycle` and Nav2's lifecycle manager can manage.
-
-    A subclass declares its parameters in its constructor, so that they can be set while it is
-    unconfigured. `configure` reads them, makes what they request, and puts the clean-up of each on
-    the stack `undo`. `state` is the last primary state: `unconfigured`, `inactive` or `active`.
-    """
+    """A lifecycle node; `configure` makes what it needs, with the clean-up on the stack `undo`."""
 
     def __init__(self, name: str, context: Context) -> None:
         super().__init__(name, context=context)

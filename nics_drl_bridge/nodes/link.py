@@ -40,11 +40,7 @@ LOST_S = 1.0  # a request to repeat data that stays unanswered for longer was it
 
 
 class Link:
-    """A node in its own context, one executor thread, and the command topic.
-
-    `close`, garbage collection, SIGTERM, and silence of the sender for longer than the timeout [s]
-    leave a zero command behind. SIGKILL can't be handled: `command_gate` is for that.
-    """
+    """A node in its own context and thread, whose end or silence leaves a zero command behind."""
 
     def __init__(
         self, namespace: str = "", domain_id: int | None = None, command_topic: str = "cmd_vel",

@@ -20,11 +20,7 @@ SILENCE_S = 5.0  # diagnostics warn of a topic that has been silent for this lon
 
 
 class MiddlewareNode(ManagedNode):
-    """Listens to a robot's topics; publishes `odometry/filtered` and `/diagnostics`.
-
-    See `RobotTopics` and `docs/middleware.md`. `~/reset` clears all state, so that the next
-    odometry fixes `map` anew. It listens when configured and publishes the estimate when active.
-    """
+    """Listens to a robot's topics; publishes `odometry/filtered` and `/diagnostics`."""
 
     def __init__(self, context: Context) -> None:
         super().__init__("middleware_node", context)

@@ -29,13 +29,7 @@ LONGEST_REASON = 300  # greatest length of a policy's error text, in characters
 
 
 class PolicyNode(ManagedNode):
-    """Answers scans with `cmd_vel_raw`, with the stamp of the scan, until the goal is reached.
-
-    It observes through the same task as the Gymnasium env, and acts at most once per control period
-    and per scan. An inference that exceeds the deadline is dropped; after several in a row it
-    commands zero. The goal, in `map`, is a parameter at the start and the topic `goal_pose`
-    afterwards. It listens when configured and commands when active; its last command is zero.
-    """
+    """Answers scans with `cmd_vel_raw`, with the stamp of the scan, until the goal is reached."""
 
     def __init__(self, context: Context) -> None:
         super().__init__("policy_node", context)
@@ -90,8 +84,7 @@ class PolicyNode(ManagedNode):
         return ActionPace(period), Deadline(limit, patience)
 
     def _open_policy(self, model: SimulatorModel) -> None:
-        name = str(self.get_parameter("policy").value)
-        self._policy, self._task = open_policy(name, model)
+        self._policy, self._task = open_policy(str(self.get_parameter("policy").value), model)
         view = rehearse(model)  # so that all compiles now
         self._task.judge(view, {"goal": np.zeros(2)})
         self._asked(view, np.zeros(2))
@@ -140,8 +133,7 @@ class PolicyNode(ManagedNode):
         if not (self._topics.located and np.isfinite(self._goal).all()):
             return np.zeros(3)
         view = self._topics.view()
-        memory = {"goal": self._goal}
-        verdict = self._task.judge(view, memory)
+        verdict = self._task.judge(view, {"goal": self._goal})
         if verdict.reached or verdict.touched:
             why = "touching something, stopped" if verdict.touched else "goal reached"
             self.get_logger().info(why, throttle_duration_sec=5.0)
@@ -158,12 +150,11 @@ class PolicyNode(ManagedNode):
             self.get_logger().debug(traceback.format_exc())
             place = traceback.extract_tb(error.__traceback__)[-1]
             words = shortened(f"{type(error).__name__}: {error}", LONGEST_REASON)
-            name, where = (
-                self.get_parameter("policy").value,
-                f"{place.filename}, line {place.lineno}",
+            name = self.get_parameter("policy").value
+            where = (
+                f"{place.filename}, line {place.lineno}); the robot is stopped, mend the policy."
             )
-            fix = "the robot is stopped, mend the policy."
-            raise BridgeError(f"policy {name!r} raised {words} ({where}); {fix}") from error
+            raise BridgeError(f"policy {name!r} raised {words} ({where}") from error
 
     def _message(self, twist: Array, stamp_ns: int) -> TwistStamped:
         frame = str(self.get_parameter("base_frame").value)

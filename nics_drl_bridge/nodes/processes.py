@@ -60,10 +60,7 @@ def _dies_with_parent() -> Callable[[], None] | None:
 
 
 class NodeProcess(AbstractContextManager["NodeProcess", None]):
-    """One node in its own process, with log and parameters in a folder, which `close` ends.
-
-    `discovery` is LOCALHOST or SUBNET. On Linux the node also ends when its parent thread does.
-    """
+    """One node in its own process, which ends with `close`, and on Linux with its parent thread."""
 
     def __init__(
         self, node: str, folder: Path, parameters: Mapping[str, Any], domain_id: int,
@@ -93,8 +90,9 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
         if code is not None:
             lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
             last = " | ".join(lines[-LOG_LINES:]) or "no output"
-            reason = f"ended with code {code}: {last} (its log is {self.log})."
-            raise BackendError(f"{self.node} {reason}")
+            raise BackendError(
+                f"{self.node} ended with code {code}: {last} (its log is {self.log})."
+            )
 
     def close(self) -> int:
         """Ends the node: SIGINT, then SIGKILL if it does not react. Returns its exit code."""

@@ -1,9 +1,7 @@
 """Quality of service for each kind of topic, with the reason.
 
-A reliable publisher matches subscribers of both kinds, a best-effort one only best-effort ones:
-this package publishes reliably, and subscribes best effort wherever a lost message does no harm.
-So RViz, `ros2 topic echo`, Nav2 and drivers of every kind match it without changes. Nothing is kept
-for late joiners (volatile): a robot's old data mislead.
+Reliable publishers match all subscribers, so this package publishes reliably, and subscribes best
+effort wherever a lost message does no harm. Nothing is kept for late joiners: old data mislead.
 """
 
 from __future__ import annotations

@@ -64,11 +64,9 @@ class RealtimeOptions(Schema):
 class RealtimeBackend:
     """One robot behind its topics, stepped at a fixed period of the steady clock.
 
-    A step publishes its command at once, waits for the end of the period, and returns the newest
-    view. Deadlines that a late caller misses are counted and not made up for. Raises ConfigError
-    if an option can't be used; BackendError if no peer is there, a simulator refuses, or a vehicle
-    does not come to rest at its start; ModelError if a simulator runs another model or world;
-    StaleDataError if a topic's newest datum is older than `stale_after_s`.
+    Deadlines that a late caller misses are counted and not made up for. Raises ConfigError if an
+    option can't be used; BackendError if no peer is there, refuses, or does not come to rest;
+    ModelError for another model or world; StaleDataError for data older than `stale_after_s`.
     """
 
     def __init__(self, model: SimulatorModel, world: World, **options: Any) -> None:
@@ -133,8 +131,7 @@ class RealtimeBackend:
             now = time.monotonic()
             if now - began > self._options.start_timeout_s:
                 late = f"after {self._options.start_timeout_s:g} s the robot is not ready"
-                fix = "place it there, or choose start='present'."
-                raise BackendError(f"{late}: {missing}; {fix}")
+                raise BackendError(f"{late}: {missing}; place it there, or choose start='present'.")
             if now - said >= SAY_EVERY_S:
                 say(f"waiting for the robot: {missing}")
                 said = now

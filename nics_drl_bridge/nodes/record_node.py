@@ -166,10 +166,8 @@ class DriveResult:
 class RecordNode(qos.QosWatch):
     """Sends `cmd_vel` at 20 Hz; writes `odom`, `joint_states`, `imu` and `pose` to a recording.
 
-    Each segment of the drive is chosen from the robot's position by odometry. It ends with zero
-    commands, also on a signal, on an error, when odometry is silent, and when the robot leaves the
-    circle around its start; what was recorded until then is saved. If this process is killed, only
-    the robot's own timeout on `cmd_vel` stops it.
+    It ends with zero commands, also on a signal, an error, silent odometry, and outside the circle
+    around its start. If this process is killed, only the robot's timeout on `cmd_vel` stops it.
     """
 
     def __init__(self, context: Context, given: Mapping[str, Any] | None = None) -> None:
@@ -186,8 +184,7 @@ class RecordNode(qos.QosWatch):
         self.create_subscription(Odometry, "odom", self._on_odometry, qos.SENSOR)
         self.create_subscription(JointState, "joint_states", self._log.joints, qos.SENSOR)
         for each, topic, row in ((PoseStamped, "pose", pose_row), (Imu, "imu", imu_row)):
-            take = partial(self._take, topic, row)
-            self.create_subscription(each, topic, take, qos.SENSOR)
+            self.create_subscription(each, topic, partial(self._take, topic, row), qos.SENSOR)
         self._began, self._heard = time.monotonic(), -np.inf
         self._ticks = self._origin_ns = self._stamp_ns = 0
         self._pose: Array | None = None
@@ -314,9 +311,7 @@ class RecordNode(qos.QosWatch):
         return recording, f"{self._log.seconds:.1f} s are recorded in {self._order.out}"
 
 
-def record(
-    given: Mapping[str, Any] | None = None, args: Sequence[str] | None = None
-) -> DriveResult:
+def record(given: dict[str, Any] | None = None, args: Sequence[str] | None = None) -> DriveResult:
     """Drives and records until the end, an error or a signal, with parameters beside `args`."""
     node: RecordNode = run_node(partial(RecordNode, given=given), args, "record_node")
     return node.outcome or DriveResult(False, None, None, "interrupted: nothing was saved")

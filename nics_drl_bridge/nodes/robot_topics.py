@@ -45,13 +45,10 @@ def declare_sensors(node: Node) -> None:
 class RobotTopics:
     """Subscribes to a robot's topics and keeps the middleware up to date.
 
-    Data are used at their own stamps; a command, which has none, at the stamp of the newest datum
-    before it. The first odometry fixes `map`, unless there is a pose sensor: then the first pose. A
-    reader in another thread than the spinning one holds `lock`. `on_odometry` and `on_scan` are
-    called with the stamp [ns] after each odometry that is the newest, and each scan that was used;
-    `on_lidar` with the lidar of scans with another header than the model's, which are rejected if
-    it raises ConfigError; without it, if their number of beams differs. `now_ns` is the clock of
-    arrivals, the node's by default. Raises ConfigError if the parameter `pose_type` is unknown.
+    The first odometry fixes `map`, or with a pose sensor the first pose. A reader in another thread
+    holds `lock`. `on_odometry` and `on_scan` get the stamp [ns] of what was used; `on_lidar` the
+    lidar of a header unlike the model's, whose scans are rejected if it raises ConfigError. Raises
+    ConfigError if `pose_type` is unknown.
     """
 
     def __init__(
@@ -138,8 +135,7 @@ class RobotTopics:
             return
         ordered = reader.ordered(np.asarray(message.ranges, np.float32))
         ranges = from_device(np.ascontiguousarray(ordered), reader.lidar)
-        used = self.middleware.scan(stamp, self.now_ns(), ranges)
-        if used and self._on_scan is not None:
+        if self.middleware.scan(stamp, self.now_ns(), ranges) and self._on_scan is not None:
             self._on_scan(stamp)
 
     def _reader_for(self, message: LaserScan) -> Reader | None:
@@ -194,8 +190,7 @@ class RobotTopics:
             self.middleware.sense(sensor.name, stamp, self.now_ns(), reading)
 
     def _take_command(self, message: Twist | TwistStamped) -> None:
-        twist = conversions.twist_from_ros(message)
-        self.middleware.command(None, self._robot.from_cmd_vel(twist))
+        self.middleware.command(None, self._robot.from_cmd_vel(conversions.twist_from_ros(message)))
 
 
 def data_facts(middleware: Middleware, now_ns: int) -> dict[str, Any]:

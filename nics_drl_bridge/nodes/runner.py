@@ -44,12 +44,7 @@ QOS, SHARED = "qos_overrides.", "model"
 
 
 def open_context(args: Sequence[str] | None = None, domain_id: int | None = None) -> Context:
-    """Returns a new context; discovery stays on this machine unless the environment sets a range.
-
-    By default a simulator in a lab can't move another robot; see `transport`. Raises BackendError
-    if the arguments are wrong, no ROS 2 middleware is there, or discovery should reach further than
-    that of an earlier context of this process.
-    """
+    """Returns a new context, local unless the environment sets a range. Raises BackendError."""
 
     def make() -> Context:
         context = Context()
@@ -71,11 +66,7 @@ def last_word(publisher: Publisher, message: Any) -> None:
 def run_node(
     make: Callable[[Context], Node], args: Sequence[str] | None = None, sole_name: str = ""
 ) -> Any:
-    """Runs a node until SIGINT or SIGTERM, then destroys it in order, and returns it.
-
-    A node's `start()`, if any, is called before it spins, its `stop()` while it can still publish.
-    A user's error becomes one sentence and exit code 2. `sole_name`: see `sole`.
-    """
+    """Runs a node until SIGINT or SIGTERM, then stops and destroys it in order, and returns it."""
     stopping, started = threading.Event(), threading.Event()
 
     def end(*_: Any) -> None:
@@ -139,12 +130,7 @@ def spin(node: Node, stopping: threading.Event) -> None:
 
 @contextlib.contextmanager
 def sole(context: Context, name: str) -> Iterator[None]:
-    """Ensures a single instance while a node runs: if its name is taken, it does not start.
-
-    Two that start at the same moment on one machine are told apart by the name of a socket, which
-    only one of them gets; others are found in the graph and asked whether they are alive. Raises
-    BackendError if another is running.
-    """
+    """Ensures a single instance while a node runs; BackendError if another is running."""
     # The probe resolves its name as the node will.
     probe = Node(name, context=context, start_parameter_services=False, enable_rosout=False)
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as claim:

@@ -59,11 +59,9 @@ class Outbox:
         self._latest: dict[Publisher, int] = {}
         self._numbers = itertools.count()
 
-    def send(
-        self, publisher: Publisher, message: Any, now_ns: int, late_ns: tuple[int, int]
-    ) -> None:
+    def send(self, publisher: Publisher, message: Any, now_ns: int, late: tuple[int, int]) -> None:
         """Publishes a message or its bytes, after a delay and a drawn part of a jitter [ns]."""
-        delay, jitter = late_ns
+        delay, jitter = late
         if jitter:
             delay += int(self._random.integers(jitter + 1))
         if not delay:
@@ -94,8 +92,8 @@ class RobotPort:
         time: device_parameters.DeviceTiming, outbox: Outbox,
     ) -> None:  # fmt: skip
         self._model, self.frames = model, frames
-        self._send = partial(outbox.send, late_ns=time.odom_late_ns)
-        self._send_scan = partial(outbox.send, late_ns=time.scan_late_ns)
+        self._send = partial(outbox.send, late=time.odom_late_ns)
+        self._send_scan = partial(outbox.send, late=time.scan_late_ns)
 
         def publisher(kind: Any, topic: str) -> Publisher:
             return node.create_publisher(kind, f"{namespace}{topic}", qos.SENSOR_RELIABLE)
@@ -157,11 +155,7 @@ class RobotPort:
 
 
 class CommandInlet:
-    """Listens to `cmd_vel`, and to `ackermann_cmd` if the robot steers and the message exists.
-
-    A stamped command is treated as by ros2_control's drive controllers: a stamp of zero counts as
-    now. `take` gets each command (C,) whose stamp [ns] is not `too_old`.
-    """
+    """Listens to `cmd_vel`, stamped or not, and to `ackermann_cmd` if the robot steers."""
 
     def __init__(
         self, node: Node, namespace: str, robot: RobotSpec, quality: QoSProfile,
@@ -177,8 +171,7 @@ class CommandInlet:
         self._warned: set[str] = set()
         kind = conversions.message_type("ackermann_msgs/msg/AckermannDriveStamped")
         if robot.steers and kind is not None:  # its package is optional
-            topic = f"{namespace}ackermann_cmd"
-            node.create_subscription(kind, topic, self._on_ackermann, quality)
+            node.create_subscription(kind, f"{namespace}ackermann_cmd", self._on_ackermann, quality)
 
     def _on_bytes(self, content: bytes) -> None:
         try:
@@ -238,11 +231,9 @@ def transform_to_ros(parent: str, child: str, pose: ArrayLike, stamp: Time) -> T
 class DeviceNode(qos.QosWatch):
     """Takes `cmd_vel`; publishes `scan`, `odom`, `joint_states`, `ground_truth`, `/clock`, `/tf`.
 
-    With the parameter `robots` it is a fleet in one world, each robot in a namespace below the
-    node's own. Stamps are simulated time: it begins at the system's time and never runs backwards.
-    `~/reset` begins an episode; its answer is JSON with the stamp of the first data. In lock-step
-    the world moves when each robot has a command, and `~/repeat` publishes the present data again.
-    `~/touched` reports which robots have truly touched something in this episode.
+    With the parameter `robots` it is a fleet, each in a namespace below its own. Simulated time
+    begins at the system's and never runs backwards. `~/reset` begins an episode; in lock-step the
+    world moves when each robot has a command, and `~/repeat` publishes the present data again.
     """
 
     def __init__(self, name: str, context: Context, make: MakeSimulator) -> None:

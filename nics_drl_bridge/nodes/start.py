@@ -1,7 +1,4 @@
-"""Entry points of the nodes: one sentence, not a traceback, where ROS 2 is missing.
-
-Nodes of this folder, and those that extensions register in the group `nodes`, are started alike.
-"""
+"""Entry points of the nodes: one sentence, not a traceback, where ROS 2 is missing."""
 
 from __future__ import annotations
 

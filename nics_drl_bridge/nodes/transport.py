@@ -1,17 +1,11 @@
 """Transport of messages: UDP, so that a stalled listener can't block a publisher.
 
-Fast DDS's shared memory has a lock for each listening process. A process that is frozen or killed
-while it has the lock blocks everyone who sends to it, for as long as it is stalled: a gate that
-stops the base, a base that sends its odometry to a policy. UDP has no such lock, and makes a step
-in lock-step a twentieth longer. These nodes have no shared memory, neither for sending nor for
-receiving, so that they can't block drivers that have it either.
+Fast DDS's shared memory has a lock for each listening process: one that is frozen or killed while
+it has it blocks everyone who sends to it. UDP has none; a lock-step step takes a twentieth longer.
 
-If discovery stays on this machine, rmw_fastrtps chooses the transports itself. A profile does the
-same without the shared memory. Fast DDS reads it once in a process, with its first node, so the
-result is checked; the environment is restored. A node that other code creates in the process
-afterwards does not listen to multicast, and may have shared memory.
-
-If discovery goes further, an environment variable is enough. It is read with each node and stays.
+If discovery stays on this machine, rmw_fastrtps chooses the transports itself, so a profile does
+it, which Fast DDS reads once in a process: the result is checked. A node that other code creates
+there afterwards may have shared memory. Otherwise an environment variable is enough, and stays.
 """
 
 from __future__ import annotations

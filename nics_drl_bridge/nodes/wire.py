@@ -1,11 +1,4 @@
-"""Scans, odometry and twists in serialised form, without a Python object for each number.
-
-rclpy makes a Python object of each field of a message, and back, and checks it: for an odometry
-that takes longer than to simulate its step. So the data of each step are written into, and read
-from, their serialised form. That is the Common Data Representation of DDS, with numbers aligned to
-their size, counted from behind a header of four bytes that gives the byte order (OMG DDS-XTypes
-7.4.3, "plain CDR"). `test/nodes/test_wire.py` compares it with rclpy's own serialisation.
-"""
+"""Scans, odometry and twists from and to their bytes: "plain CDR" of OMG DDS-XTypes 7.4.3."""
 
 from __future__ import annotations
 

@@ -31,11 +31,7 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class Episode:
-    """Record of one episode.
-
-    The result is `success`, `collision`, `time-out`, or `elsewhere` for a wrongly believed success,
-    by the truth if the backend knows it; `believed` is then the robot's own, else None.
-    """
+    """Record of an episode: `success`, `collision`, `time-out`, or `elsewhere`, by the truth."""
 
     seed: int
     result: str
@@ -88,10 +84,7 @@ def drive(
     on_start: Callable[[], None] = lambda: None,
     touched: Callable[[], bool] | None = None,
 ) -> Episode:
-    """Drives one episode to its end; halts the robot if the policy or a callback raises.
-
-    `on_start` is called at its start; `touched` tells at its end of contacts that `info` does not.
-    """
+    """Drives one episode to its end; halts the robot if the policy or a callback raises."""
     try:
         observation, info = env.reset(seed=seed, options=options)
         on_start()
@@ -172,10 +165,7 @@ class Outcomes:
 
 
 def drive_worlds(env: BridgeVectorEnv, act: Act, seeds: Sequence[int]) -> Outcomes:
-    """Drives one episode per seed, as many at once as the env has worlds (`NextStep`).
-
-    They are bit-identical to those of `BridgeEnv.reset(seed=...)` without estimator.
-    """
+    """Drives an episode per seed, to the bit as `BridgeEnv.reset(seed=...)` without estimator."""
     width, given = env.num_envs, checked_seeds(seeds)
     # The last batch is padded with seeds that are driven but not counted.
     batches = (np.resize(given[k : k + width], width) for k in range(0, len(given), width))
@@ -279,10 +269,7 @@ def summarise(outcomes: Outcomes, control_period: float) -> Summary:
 
 @dataclass(frozen=True)
 class Tally(Summary):
-    """Figures of the episodes of one world, by the truth if it is known.
-
-    `deviation` is the mean of the maximum distance [m] from the path in the first world per step.
-    """
+    """Figures of the episodes of one world; `deviation` [m] is the mean distance from the first."""
 
     same: float  # share of the episodes that ended as in the first world
     deviation: ConfidenceInterval

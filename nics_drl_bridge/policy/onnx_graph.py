@@ -1,9 +1,4 @@
-"""Checks of the graph of a policy file, before anything of it runs: form, operators, size.
-
-Two bytes of a file can become a message of some hundred bytes in memory, and one byte a number of
-eight. So the parts are counted in the raw bytes, and only a file with few of them is parsed. Memory
-and work of a graph come from onnx's strict shape inference on a copy without weights.
-"""
+"""Checks of a policy file's graph before anything of it runs: raw size, form, operators, work."""
 
 from __future__ import annotations
 

@@ -74,13 +74,7 @@ class RandomActions:
 
 @dataclass(frozen=True)
 class DynamicWindow:
-    """The dynamic-window approach (Fox, Burgard, Thrun 1997) on scan, goal and twist.
-
-    Each twist that the robot can reach in a period is held for the look-ahead. One with a contact
-    before the robot could stop is inadmissible; the best of the others in distance, aim, clearance
-    and time to contact is chosen. It plans no path: behind a long wall it stays. Raises ConfigError
-    if it is not known where the robot's commands lead, see `steady_twist`.
-    """
+    """The dynamic-window approach (Fox, Burgard, Thrun 1997); ConfigError: see `steady_twist`."""
 
     task: Navigation
     margin: float = 0.05  # clearance to keep around the footprint [m]

@@ -1,8 +1,4 @@
-"""Policy files: one `.onnx` with network, normaliser, commands and contract.
-
-Loading needs onnxruntime and onnx, but no training library. Everything is checked before the
-first inference; nothing is ever unpickled.
-"""
+"""Policy files: one `.onnx` with network, normaliser, commands and contract; never unpickled."""
 
 from __future__ import annotations
 
@@ -81,10 +77,7 @@ class PolicyFile:
         return options
 
     def make_task(self, model: SimulatorModel, kind: str | type[Task] | None = None) -> Task:
-        """Makes the policy's task for a robot; PolicyError names a field that does not fit.
-
-        Of a task that is not shipped, `kind` is its class or `path/to/file.py:ClassName`.
-        """
+        """Makes the policy's task for a robot; PolicyError names a field that does not fit."""
         name = self.contract.task.name
         if kind is None and name not in TASKS:
             reason = f"{name!r} is no shipped task; give path/to/file.py:{name}."
@@ -95,11 +88,7 @@ class PolicyFile:
         return task
 
     def check_fits(self, model: SimulatorModel | None, task: Task | None = None) -> None:
-        """Raises PolicyError, with the field, unless the policy fits a robot and a task.
-
-        Another SimulatorModel of the same robot fits, and so does any lidar that fills the
-        policy's sectors; a policy without sectors needs the beams that it was trained with.
-        """
+        """Raises PolicyError, with the field, unless the policy fits a robot and a task."""
         if model is not None:
             self._check_robot(model.robot, model.lidar)
             known = {sensor.name: sensor.model_dump(mode="json") for sensor in model.sensors}

@@ -73,11 +73,8 @@ def shadow(
 ) -> Shadow:  # fmt: skip
     """Runs a policy on a recorded drive, in process and deterministically.
 
-    The policy acts when `policy_node` would; its command is compared with the first one recorded
-    after that, or else with the one that still applied. The goal (2,) [m] is in `map`; None uses
-    the robot's position `ahead_s` later: the driver's intention. `topics`: see `playback.chosen`.
-    Raises RecordingError if the bag can't be used, or lacks scans or commands, another BridgeError
-    if the policy can't be used, or does not fit.
+    The goal (2,) [m] is in `map`; None uses the robot's position `ahead_s` later. Raises
+    RecordingError if the bag can't be used, BridgeError if the policy can't, or does not fit.
     """
     if goal is None and not ahead_s > 0.0:
         raise ConfigError(f"--ahead {ahead_s:g}: must be more than 0 s.")

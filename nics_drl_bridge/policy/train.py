@@ -52,12 +52,7 @@ def train(
     settings: TrainingSettings, seed: int, folder: Path, tell: Tell = lambda _: None,
     resumed: bool = False,
 ) -> Trained:  # fmt: skip
-    """Trains one policy; checkpoint and TensorBoard logs are in `folder`.
-
-    A resumed training gives bit-identical weights to an uninterrupted one. `tell` is called with
-    the progress, a few times per second. Raises ConfigError if the settings are inconsistent, or no
-    checkpoint fits them.
-    """
+    """Trains a policy, resumed bit-identically from `folder`. Raises ConfigError if it can't."""
     begin, path = time.perf_counter(), folder / CHECKPOINT
     content = checkpoints.read_checkpoint(path) if resumed else None
     about: dict[str, Any] = {"seed": seed, "settings": settings.model_dump(mode="json")}

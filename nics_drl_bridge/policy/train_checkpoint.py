@@ -1,7 +1,4 @@
-"""Checkpoints of a training: all that it needs to continue bit-identically.
-
-A checkpoint is never deployed. PyTorch's `weights_only` reader builds no objects: no code runs.
-"""
+"""Checkpoints of a training, all that it needs to continue bit-identically; none is deployed."""
 
 from __future__ import annotations
 
@@ -135,7 +132,6 @@ def _tensors(arrays: dict[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
 
 
 def _random_state(algorithm: BaseAlgorithm) -> dict[str, Any]:
-    """State of all random generators: PyTorch's, numpy's global one, the action space's."""
     shared = np.random.get_state(legacy=False)  # noqa: NPY002 - Stable-Baselines3 draws from it
     spaces = algorithm.action_space.np_random.bit_generator.state
     return {
@@ -191,7 +187,6 @@ class Companion(BaseCallback):
         self._first = self._saved = self.num_timesteps
 
     def _on_rollout_start(self) -> None:
-        """Saves a checkpoint if due: between two roll-outs nothing is half done."""
         if self.model.num_timesteps // self._every > self._saved // self._every:
             self._save()
             self._saved = self.model.num_timesteps
@@ -207,10 +202,8 @@ class Companion(BaseCallback):
             return
         self._told = now
         taken = max(now - self._begin, 1e-9)
-        successes = self.model.ep_success_buffer
-        success, collision = (
-            float(np.mean(r)) if r else np.nan for r in (successes, self._collisions)
-        )
+        recent = self.model.ep_success_buffer, self._collisions
+        success, collision = (float(np.mean(r)) if r else np.nan for r in recent)
         progress = Progress(
             self._seed, self.num_timesteps, self._total, success, collision,
             (self.num_timesteps - self._first) / taken,

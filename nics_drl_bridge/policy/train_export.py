@@ -78,11 +78,10 @@ def export_policy(
     model: Any, task: Task, simulator_model: SimulatorModel, path: str | Path,
     normaliser: Normaliser | None = None, provenance: Mapping[str, Any] | None = None,
 ) -> PolicyFile:  # fmt: skip
-    """Writes a trained model (see `actor_of`) as a policy file, and loads it as a robot would.
+    """Writes a trained model as a policy file, and loads it as a robot would.
 
-    The normaliser is mean (O,), standard deviation (O,) and limit of the normalised observations;
-    None if the model has its own. Raises ConfigError if the model can't be exported, PolicyError if
-    the file does not reproduce its outputs.
+    The normaliser is mean (O,), deviation (O,) and limit, or None. Raises ConfigError if the model
+    can't be exported, PolicyError if the file does not reproduce its outputs.
     """
     file = Path(path)
     if file.suffix != SUFFIX:

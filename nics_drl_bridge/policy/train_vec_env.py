@@ -20,12 +20,7 @@ Observation = NDArray[np.float32]
 
 
 class TrainVecEnv(VecEnv):
-    """Feeds Stable-Baselines3 from a `BridgeVectorEnv`, or from several with equal spaces.
-
-    Observations are not copied; only worlds that ended get `infos`: `terminal_observation`,
-    `TimeLimit.truncated`, `is_success`, `collision`. `stepping_s` is the wall time in the envs [s].
-    ConfigError unless they fit, with `autoreset_mode='SameStep'` and `copy=True`.
-    """
+    """Feeds SB3 from `BridgeVectorEnv`s (`SameStep`, `copy=True`); else ConfigError."""
 
     def __init__(self, *envs: BridgeVectorEnv) -> None:
         for env in envs:

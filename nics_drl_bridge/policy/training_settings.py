@@ -95,10 +95,7 @@ def load_training(name: str | Path) -> TrainingSettings:
 
 
 def chosen_settings(task: str, name: str | None, changes: dict[str, Any]) -> TrainingSettings:
-    """Settings by name or file, else those shipped for task and robot, with changes by the user.
-
-    `changes` are keys of `TrainingSettings`, and `world`: names that share the number of worlds.
-    """
+    """Settings by name or file, else those shipped for task and robot, with changes by the user."""
     robot = str(changes.get("robot", "differential"))
     shipped = {path.stem for path in (share_folder() / "config" / "training").glob("*.yaml")}
     if name is None and f"{task}_{robot}" not in shipped:
@@ -107,6 +104,5 @@ def chosen_settings(task: str, name: str | None, changes: dict[str, Any]) -> Tra
         base = load_training(name or f"{task}_{robot}")
     changed = base.model_dump(mode="json") | changes
     if worlds := changed.pop("world", None):
-        each = max(1, base.num_envs // len(worlds))
-        changed["worlds"] = dict.fromkeys(worlds, each)
+        changed["worlds"] = dict.fromkeys(worlds, max(1, base.num_envs // len(worlds)))
     return validate(changed, TrainingSettings, "training settings")

@@ -41,8 +41,7 @@ def record(
             from nics_drl_bridge.extras.bags.live import BagOrder, record_bag
         names, say = tuple(topics or ()), partial(typer.echo, err=True)
         order = BagOrder(out, names, everything, namespace, duration, kind, use_sim_time)
-        counts = record_bag(order, say)
-        for topic, count in sorted(counts.items()):
+        for topic, count in sorted(record_bag(order, say).items()):
             typer.echo(f"{topic}: {count} messages")
         typer.echo(f"bag written to {out}")
 
@@ -130,8 +129,7 @@ def salvage(
         check_libraries(path, "reading")
         from nics_drl_bridge.extras.bags.salvage import salvage as salvage_bag
 
-        kept = salvage_bag(path, out, _storage(storage))
-        for line in kept.lines():
+        for line in salvage_bag(path, out, _storage(storage)).lines():
             typer.echo(line)
         typer.echo(f"bag written to {out}")
 

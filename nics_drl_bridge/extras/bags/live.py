@@ -68,11 +68,7 @@ class BagOrder:
 
 
 class BagRecorder(QosWatch):
-    """Writes the messages of all wanted topics into a bag, serialised as received.
-
-    A subscription requests the best quality of service that all publishers of its topic offer, so
-    that none of them is left out. `say` hears of each topic that begins or can't be recorded.
-    """
+    """Writes wanted topics into a bag as received; `say` hears of each that begins or can't be."""
 
     def __init__(
         self, context: Context, order: BagOrder, sink: BagSink, say: Callable[[str], None]
@@ -143,9 +139,7 @@ def record_bag(order: BagOrder, say: Callable[[str], None]) -> dict[str, int]:
             skipped = " ".join(node.skipped.values())
             fix = "start the robot, or correct --topics, --namespace or ROS_DOMAIN_ID."
             fix += f" Not recorded: {skipped}" if skipped else ""
-            raise BackendError(
-                f"nothing was heard on any of the topics, so no bag is written; {fix}"
-            )
+            raise BackendError(f"nothing was heard on any topic, so no bag is written; {fix}")
     return sink.counts
 
 
@@ -235,9 +229,7 @@ def play_bag(
 ) -> int:  # fmt: skip
     """Publishes a bag until its end, SIGINT or SIGTERM; returns the number of published messages.
 
-    They are published with the quality of service that their publishers offered, at a rate [seconds
-    of the bag per second], in a namespace save `/clock`, `/tf` and `/tf_static`, in lock-step only
-    when a node has taken the message before. `clock` publishes the times of receipt on `/clock`
+    The rate is in seconds of the bag per second; `clock` publishes the times of receipt on `/clock`
     instead of the bag's own. Raises RecordingError if the bag is damaged, lacks a topic, or none of
     its types is installed, BackendError if the peer does not answer.
     """

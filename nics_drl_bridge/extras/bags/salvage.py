@@ -70,12 +70,7 @@ class _Found:
 
 
 def salvage(path: str | Path, out: str | Path, storage: Storage = "mcap") -> Salvage:
-    """Writes the intact messages of a bag to a new bag in a folder to create.
-
-    From an MCAP file these are all chunks with a correct checksum, or, in chunks without one, all
-    messages before the damage; from an SQLite file all readable rows. Messages that can't be
-    decoded are dropped. Raises RecordingError: nothing is intact, or `out` exists already.
-    """
+    """Writes a bag's intact messages to a new bag; RecordingError if none is, or `out` exists."""
     path, found = Path(path), _Found()
     for file in _files(path):
         read = _read_database if file.suffix == DATABASE else _read_mcap
@@ -141,8 +136,7 @@ def _decodable(found: _Found) -> Iterator[tuple[str, int, bytes]]:
 
 def _promised(path: Path) -> dict[str, int] | None:
     try:
-        about = metadata_of(path if path.is_dir() else path.parent)
-        topics = about["topics_with_message_count"]
+        topics = metadata_of(path if path.is_dir() else path.parent)["topics_with_message_count"]
         return {t["topic_metadata"]["name"]: int(t["message_count"]) for t in topics}
     except (OSError, ValueError, TypeError, KeyError):
         return None

@@ -1,10 +1,7 @@
 """The machines of the three robots in MuJoCo: mass, friction, motors, and their MJCF.
 
-MuJoCo solves the contact of each wheel with the floor; nothing ties the robot to its textbook
-kinematics. Tyres are ellipsoids: a round tread touches a plane in one point, which neither jumps
-from edge to edge, as a cylinder's contact does, nor scrubs when the robot turns. Contacts have no
-torsional friction, and nothing is dragged over the floor: with MuJoCo's elliptic cones a contact
-that slides for long pushes itself off the floor and chatters.
+Tyres are ellipsoids: a round tread touches a plane in one point, and neither jumps from edge to
+edge, as a cylinder's contact does, nor scrubs when the robot turns.
 """
 
 from __future__ import annotations
@@ -255,12 +252,7 @@ _BUILDERS: dict[str, Callable[[Parameters, float, Physics], Machine]] = {
 
 
 def roller_size(radius: float, rollers: int) -> tuple[float, float]:
-    """Semi-axes [m], thickness and length, of ellipsoidal rollers that best outline a circle.
-
-    Seen from the side, an ellipsoid at angle q from the bottom reaches
-    `(R - a) cos q + sqrt(a^2 + (b^2 - a^2) sin^2 q / 2)` below the axle. Its length b makes this R
-    at q = 0 and where the next roller takes over, at half the angle between two.
-    """
+    """Semi-axes [m], thickness and length, of ellipsoidal rollers that best outline a circle."""
     a, q = THICKNESS * radius, np.pi / rollers
     reach = radius - (radius - a) * np.cos(q)
     b = np.sqrt(a**2 + 2.0 * (reach**2 - a**2) / np.sin(q) ** 2)

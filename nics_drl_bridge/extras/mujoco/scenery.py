@@ -1,9 +1,4 @@
-"""A scene in MuJoCo: robots with their bumpers, walls, map and obstacles.
-
-A bumper is the footprint of the RobotSpec, at the height of the axles; it collides with walls,
-obstacles and the bumpers of other robots. Wheels touch only the floor. MuJoCo's bodies are convex,
-so outlines are cut into convex parts and maps into rectangles.
-"""
+"""A scene in MuJoCo: robots with bumpers, walls, map and obstacles, cut into convex parts."""
 
 from __future__ import annotations
 
@@ -154,17 +149,14 @@ def _is_ear(outline: Array, rest: list[int], i: int) -> bool:
     if _area(a, b, c) <= 0.0:
         return False
     others = (outline[k] for k in rest if k not in (before, here, after))
-    return not any(
-        _area(a, b, p) >= 0.0 and _area(b, c, p) >= 0.0 and _area(c, a, p) >= 0.0 for p in others
-    )
+    return not any(min(_area(a, b, p), _area(b, c, p), _area(c, a, p)) >= 0.0 for p in others)
 
 
 def rectangles(blocked: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Rectangles (R, 4) of blocked cells: first row, first column, and those after the last."""
     done: list[tuple[int, int, int, int]] = []
     open_runs: dict[tuple[int, int], int] = {}
-    framed = np.pad(blocked, ((0, 1), (1, 1)))
-    for row, cells in enumerate(framed):
+    for row, cells in enumerate(np.pad(blocked, ((0, 1), (1, 1)))):
         edges = np.flatnonzero(cells[1:] != cells[:-1]).reshape(-1, 2)
         runs = {(int(first), int(after)) for first, after in edges}
         for run in open_runs.keys() - runs:

@@ -132,20 +132,14 @@ class MujocoRobot:
         return self._rig.read(self._data)
 
     def _advance(self, duration: float) -> None:
-        steps = round(duration / self.timestep)
-        self._mujoco.mj_step(self._model, self._data, nstep=steps)
+        self._mujoco.mj_step(self._model, self._data, nstep=round(duration / self.timestep))
 
 
 class MujocoSimulator(DrivenSimulator):
-    """One world of robots in MuJoCo, with motors, wheels and contact.
+    """One world of robots in MuJoCo, with motors, wheels and contact, as seeded for FastSimulator.
 
-    Scenes, moving obstacles, lidar and odometry noise are those of the FastSimulator for the same
-    seed. Whatever the robots' footprints touch blocks them. Odometry integrates the turns of the
-    wheels, so it drifts if they slip. A command acts on motors with their own lag: the model's
-    latency is not added. The textbook kinematics of the robot select the machine. The time step of
-    `physics` is shortened to divide a control period. Raises ConfigError if MuJoCo is not
-    installed, the robot names no textbook kinematics or lacks a parameter of its machine, or the
-    world has no free space left.
+    A command acts on motors with their own lag: the model's latency is not added. ConfigError if
+    MuJoCo, textbook kinematics, a parameter of the machine or free space in the world is missing.
     """
 
     def __init__(
@@ -238,10 +232,7 @@ def record(
     robot: MujocoRobot, rng: np.random.Generator, duration: float = 60.0, dt: float = 0.01,
     hold: float = 0.5,
 ) -> Recording:  # fmt: skip
-    """Drives at random, with a new command each `hold` [s], and records; see `textbook.record`.
-
-    The sample period `dt` [s] is a whole number of the robot's time steps. Raises BackendError.
-    """
+    """Drives at random, a new command each `hold` [s], and records each `dt` [s]; BackendError."""
     spec = robot.spec
     per_hold, holds = round(hold / dt), int(np.ceil(duration / hold))
     held = rng.uniform(spec.command_low, spec.command_high, (holds, len(spec.command)))

@@ -1,9 +1,4 @@
-"""Training on a Ray cluster, or on one of this machine: RLlib's PPO, with the worlds spread out.
-
-Settings, normaliser, network, evaluation and policy file are those of training on one machine.
-RLlib's own env runner iterates over its worlds in Python in every step, which takes many times
-longer than the simulator. This one keeps arrays, and cuts them into episodes at the end.
-"""
+"""Training on a Ray cluster, or on one of this machine: RLlib's PPO, with the worlds spread out."""
 
 from __future__ import annotations
 
@@ -121,8 +116,7 @@ class WorldsRunner(SingleAgentEnvRunner):
     def _sample(self, **kwargs: Any) -> list[SingleAgentEpisode]:
         """Runs one roll-out; its length is fixed, whatever RLlib requests."""
         steps, busy = int(self.config.env_config["rollout"]), self.env.stepping_s
-        parts = [self._step(t) for t in range(steps)]
-        *arrays, finals = zip(*parts, strict=True)
+        *arrays, finals = zip(*(self._step(t) for t in range(steps)), strict=True)
         seen, actions, logits, logp, rewards = (np.stack(one) for one in arrays)
         final = {place: end for one in finals for place, end in one.items()}
         whole = np.concatenate([seen, self._seen[None]])
@@ -196,11 +190,7 @@ def learner(
 
 @contextmanager
 def connected(address: str | None, runners: int | None, worlds: int) -> Iterator[int]:
-    """Connects with a cluster, and yields the number of env runners, by default its CPUs.
-
-    The address is `auto` (the cluster that this machine is part of) or `HOST:PORT`; None starts one
-    here, for the training. Raises ConfigError if none answers there, or it is too small.
-    """
+    """Connects with `auto`, `HOST:PORT` or an own cluster, and yields its runners. ConfigError."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     # A lost worker is no error here, and Ray's messages about it would disturb the progress bar.
     os.environ.setdefault("RAY_BACKEND_LOG_LEVEL", "fatal")
@@ -238,12 +228,7 @@ def train_on_ray(
     settings: TrainingSettings, seed: int, folder: Path, tell: train.Tell = lambda _: None,
     resumed: bool = False, runners: int = 1,
 ) -> train.Trained:  # fmt: skip
-    """Trains one policy on the cluster that this process is connected to.
-
-    A lost env runner is restarted, if necessary on another machine; two runs with one seed agree
-    only as long as none is lost. The arguments are those of `policy.train.train`. Raises
-    ConfigError if the settings are inconsistent, no checkpoint fits them, or no runner answers.
-    """
+    """`policy.train.train` on the connected cluster; ConfigError also if no runner answers."""
     if settings.algorithm != "ppo":
         given = settings.algorithm
         raise ConfigError(f"--engine ray learns with ppo, not {given!r}; leave it out.")
