@@ -1,8 +1,4 @@
-"""Clocks: offset, latency and lags of a drive; responses of states that were not measured.
-
-Each time is the shift that makes a signal a function of the commands, by separable least squares:
-the best combination of the paper's features (Eq. 1) for a given delay has a closed form.
-"""
+"""Clocks: a drive's offset, latency and lags, each the shift that best explains it by commands."""
 
 from __future__ import annotations
 

@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from identify.drives import drive, with_wheels, without
+from identify.drives import calibrate, drive, with_wheels, without
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify.calibration import Calibration, align
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.identify import calibrate
 from nics_drl_bridge.recording.recording import samples_on_one_clock
 from nics_drl_bridge.robot.spec import load_robot
 
