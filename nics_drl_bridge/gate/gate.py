@@ -295,7 +295,6 @@ def _fresh(topic: str, arrivals: Arrivals, limit_s: float, config: GateConfig, n
 
 
 def _sensors(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
-    """All further sensors are fresh."""
     both = zip(config.sensors, state.sensors, strict=True)
     wrong = (_fresh(name, each.arrivals, config.scan_age_s, config, now) for name, each in both)
     return next(filter(None, wrong), "")

@@ -179,7 +179,6 @@ def _follow_one(
     dt: float, value: float, slope: float, target: float, least_value: float, most_value: float,
     rate: float, jerk: float,
 ) -> tuple[float, float]:  # fmt: skip
-    """Moves one command; see `follow`."""
     # A slope a can be brought back to zero within a change of a^2 / (2 jerk) whatever the coming
     # intervals, as the sum over them lies below the integral: a value that far within the bounds
     # stays so. In shares of the greatest value and steps of this interval, nothing overflows.

@@ -65,8 +65,7 @@ class _Completion:
                 self.assumed.append((dof, product))
                 self.notes.append(
                     f"Assumed, not learnt: {dof} = {coefficient:.4g}*{product} ({source}), since "
-                    f"{name} never moved; drive with {name} changing over its whole range to learn "
-                    "it."
+                    f"{name} never moved; to learn it, drive with {name} over its whole range."
                 )
 
     def _slope(self, d: int, product: str) -> float:

@@ -158,9 +158,7 @@ def timing_of(drive: Drive) -> TimingEstimate:
     command, state, place = recording.command, recording.state, recording.source
     missing = [v.name for v in spec.state if v.follows is None]
     if state is None and missing:
-        fault = (
-            f"has no measured state, and {missing[0]!r} of robot {spec.name!r} follows no command"
-        )
+        fault = f"no measured state, and {missing[0]!r} of robot {spec.name!r} follows no command"
         advice = "record the state too, or add `follows:` to the robot's YAML file"
         raise RecordingError(f"{place}: {fault}; {advice}.")
     if len(twists.start) < MIN_STAMPS:

@@ -267,7 +267,7 @@ def identify(
     strict: bool = False,
 ) -> Identified:
     """Learns a motion up to `train_until` [s], and tests it on the rest; see `Settings`."""
-    # RecordingError: it can't be used for this robot. FitError: it shows too little.
+    # Default: two thirds. RecordingError: unusable for this robot. FitError: it shows too little.
     drive = Drive(check(recording, spec), spec)
     until = TRAIN_SHARE * drive.duration_s if train_until is None else train_until
     found = run(STAGES, replace(drive, settings=Settings(order, alpha, until, assume, strict)))

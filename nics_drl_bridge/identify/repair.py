@@ -183,9 +183,7 @@ def check_axes(drive: Drive) -> None:
     else:
         return
     if as_given < INCONSISTENT and mirrored > CONSISTENT:
-        fault = (
-            "the heading turns one way and the path the other; one of x, y and heading is reversed"
-        )
+        fault = "heading and path turn opposite ways; one of x, y and heading is reversed"
         advice = "they must be x forward, y left, heading counter-clockwise (REP-103)"
         raise RecordingError(f"{recording.source}: pose: {fault}: {advice}.")
 

@@ -15,6 +15,7 @@ INTEGRATION_STEP_S = 1e-3
 
 def _arc(book: Textbook, state: Array, goal: Array, since: Array | float, h: float) -> Array:
     """Returns body twist x duration (..., 3) of a substep that begins `since` [s] after `state`."""
+    # By the Magnus expansion of fourth order (Iserles, Norsett 1999).
     early, late = (
         book.twist(book.respond(state, goal, since + (0.5 + sign * np.sqrt(3.0) / 6.0) * h))
         for sign in (-1.0, 1.0)
@@ -44,7 +45,12 @@ def record(
         states.append(book.respond(now, goal, since))
         arcs.append(_arc(book, now, goal, since, h))
         now = book.respond(now, goal, per_hold * inner * h)
-    state, pose = np.concatenate(states), _chain(geometry.exp(np.concatenate(arcs)))
+    # Relative poses (T, 3) are chained to the poses (T, 3) at their starts, from the origin on.
+    state, relative = np.concatenate(states), geometry.exp(np.concatenate(arcs))
+    heading = np.concatenate([[0.0], np.cumsum(relative[:-1, 2])])
+    moved = geometry.rotate(relative[:, :2], heading)
+    position = np.concatenate([np.zeros((1, 2)), np.cumsum(moved[:-1], axis=0)])
+    pose = np.concatenate([position, geometry.wrap_angle(heading)[:, None]], axis=1)
     t = np.asarray(np.arange(holds * per_hold) * dt, dtype=np.float64)
     return Recording(
         Stream(t, np.repeat(held, per_hold, axis=0)),
@@ -53,11 +59,3 @@ def record(
         source=f"textbook {spec.name}",
         variables=spec.variable_names,
     )
-
-
-def _chain(relative: Array) -> Array:
-    """Chains relative poses (T, 3) to the poses (T, 3) at their starts, from the origin on."""
-    heading = np.concatenate([[0.0], np.cumsum(relative[:-1, 2])])
-    moved = geometry.rotate(relative[:, :2], heading)
-    position = np.concatenate([np.zeros((1, 2)), np.cumsum(moved[:-1], axis=0)])
-    return np.concatenate([position, geometry.wrap_angle(heading)[:, None]], axis=1)

@@ -37,7 +37,7 @@ CHUNK_BYTES = 1 << 16  # damage costs a whole chunk, since each checksum covers 
 
 
 def check_out(path: str | Path) -> Path:
-    """ConfigError: the output exists, or has another suffix; RecordingError: no library."""
+    """Checks an output; ConfigError: it exists, or wrong suffix; RecordingError: no library."""
     path = Path(path)
     if path.exists():
         raise ConfigError(f"{path}: is there already; give another name, or remove it.")

@@ -145,7 +145,7 @@ def test_wheels_tell_latency_from_clock_offset_and_whether_they_are_swapped(car,
 
 def test_a_robot_whose_state_follows_nothing_must_have_it_measured(differential):
     recording = drive(differential, measured_state=False)
-    with pytest.raises(RecordingError, match="has no measured state, and 'left_wheel'"):
+    with pytest.raises(RecordingError, match="no measured state, and 'left_wheel'"):
         calibrate(recording, differential)
 
 
