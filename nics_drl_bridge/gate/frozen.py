@@ -1,8 +1,6 @@
-"""Data that arrive but are dead: repeated scans, jumps of odometry, no motion when commanded.
-
-A lidar without noise may show the same between two long walls. So an old scan is moved by the
-motion from odometry, and only beams count whose length must have changed by now.
-"""
+"""Data that arrive but are dead: repeated scans, jumps of odometry, no motion when commanded."""
+# A lidar without noise may show the same between two long walls: an old scan is moved by odometry,
+# and only beams count whose length must have changed by now.
 
 from __future__ import annotations
 
@@ -30,11 +28,8 @@ NOISE = 3.0  # noise of odometry that is allowed for, in standard deviations
 def look(
     config: GateConfig, seen: tuple[Sameness, ...], ranges: Ranges, pose: Array | None
 ) -> tuple[tuple[Sameness, ...], str]:
-    """Compares a scan (B,) with the last pictures, bit for bit; one without returns is ignored.
-
-    Returns the pictures, newest last, and the reason why the scan is an old one, which is empty if
-    it may be new. The pose (3,) is the present one by odometry, None before the first.
-    """
+    """Returns the pictures with a scan (B,), newest last, and why it is an old one, or ""."""
+    # Bit for bit; one without returns is ignored. The pose (3,) is None before the first odometry.
     if not np.isfinite(ranges).any():
         return seen, ""
     known = next((one for one in reversed(seen) if same(one.ranges, ranges)), None)

@@ -1,9 +1,4 @@
-"""The gate: one pure function from (time, state, input) to (state, decision).
-
-It reads no clock, draws no numbers and has no side effects: a recording of its inputs replays to
-bit-identical decisions. All that it does is in the tables of rules: `REFUSALS` of malformed data,
-which feed no watchdog; `CHECKS` before it is armed; `STOPS`; and `SHAPERS` of a motion.
-"""
+"""The gate: a pure function from (time, state, input) to (state, decision), replayed to the bit."""
 
 from __future__ import annotations
 
@@ -42,11 +37,9 @@ Check = Callable[[GateConfig, GateState, inputs.Arm, float], str]  # what is wro
 def decide(
     config: GateConfig, state: GateState, given: inputs.Input, now: float
 ) -> tuple[GateState, Decision]:
-    """Decides on an input at a steady time [s]; returns the state after it, and the decision.
-
-    Only a tick publishes a motion; a stop is published at the input that causes it, and at every
-    tick while it lasts. A stop is an immediate zero: limits of rate and jerk apply to motion.
-    """
+    """Decides on an input at a steady time [s]; returns the state after it, and the decision."""
+    # Only a tick publishes a motion; a stop is published at the input that causes it, and at every
+    # tick while it lasts. A stop is an immediate zero: limits of rate and jerk apply to motion.
     state = stops.take_time(config, state, given, now)
     if state.clock_fault:
         now = state.now_s  # the last plausible time
@@ -302,7 +295,6 @@ def _fresh(topic: str, arrivals: Arrivals, limit_s: float, config: GateConfig, n
 
 
 def _sensors(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
-    """All further sensors are fresh."""
     both = zip(config.sensors, state.sensors, strict=True)
     wrong = (_fresh(name, each.arrivals, config.scan_age_s, config, now) for name, each in both)
     return next(filter(None, wrong), "")

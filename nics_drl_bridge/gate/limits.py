@@ -72,10 +72,7 @@ class Limits:
 
 
 def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
-    """Reads the limits of a robot from a shipped file in `config/limits`, or a YAML file.
-
-    ConfigError names the key: missing, unknown, of another robot, beyond it, or too low to move.
-    """
+    """Reads limits, shipped or of a YAML file; ConfigError names the key that can't be used."""
     path = find_config(name, "limits")
     file = load_yaml(path, LimitsFile)
     if file.robot != robot.name:
@@ -157,10 +154,8 @@ def saturate(command: Array, limits: Limits) -> Array:
 def follow(
     value: Array, slope: Array, target: Array, dt: float, limits: Limits
 ) -> tuple[Array, Array]:
-    """Moves a command (C,) towards its target as fast as rate and jerk allow; with its slope.
-
-    The turn waits for the speed, so that an accelerating robot is on its path from the start.
-    """
+    """Moves a command (C,) and its slope towards its target as fast as rate and jerk allow."""
+    # The turn waits for the speed, so that an accelerating robot is on its path from the start.
     wanted, after, change = target.copy(), value.copy(), slope.copy()
     given = (value, slope, wanted, limits.low, limits.high, limits.rate, limits.jerk)
     for turning in (False, True):
@@ -184,12 +179,9 @@ def _follow_one(
     dt: float, value: float, slope: float, target: float, least_value: float, most_value: float,
     rate: float, jerk: float,
 ) -> tuple[float, float]:  # fmt: skip
-    """Moves one command; see `follow`.
-
-    A slope a can be brought back to zero within a change of a^2 / (2 jerk) whatever the coming
-    intervals, as the sum over them lies below the integral: a value that far within the bounds
-    stays so. In shares of the greatest value and steps of this interval, nothing overflows.
-    """
+    # A slope a can be brought back to zero within a change of a^2 / (2 jerk) whatever the coming
+    # intervals, as the sum over them lies below the integral: a value that far within the bounds
+    # stays so. In shares of the greatest value and steps of this interval, nothing overflows.
     scale = max(-least_value, most_value)
     low, high = least_value / scale, most_value / scale
     here, there = value / scale, target / scale

@@ -1,12 +1,8 @@
-"""The shield: passes only commands from which the robot can stop before the nearest obstacle.
-
-The robot may do anything between its recent commands, its motion by odometry and the present
-command, for as long as the scan is old, the next decision takes and it needs to react, and then
-brakes; a new command must also leave room to brake calmly. The footprint is swept along the arcs of
-that family; a command is scaled down, on its path, until no obstacle lies in the swept area (for
-one arc: the dynamic window of Fox, Burgard, Thrun 1997). An obstacle may approach if it is where
-the robot saw free space a moment ago, in older scans moved by odometry.
-"""
+"""The shield: passes only commands from which the robot can stop before the nearest obstacle."""
+# The footprint is swept along all arcs between recent commands, odometry and the present command,
+# while the scan is old, the next decision takes and the robot reacts, then brakes; a command is
+# scaled down, on its path, until no obstacle is swept (dynamic window of Fox, Burgard, Thrun 1997).
+# An obstacle may approach if it is where the robot saw free space a moment ago.
 
 from __future__ import annotations
 
@@ -109,10 +105,7 @@ def _ends(config: GateConfig, angles: Array, ranges: Array, speeds: Array | floa
 
 
 def obstacles(config: GateConfig, ranges: Ranges, views: tuple[View, ...]) -> Array | None:
-    """Returns all obstacles (P, 3) in a scan (B,): x, y in `base_link` [m], greatest speed [m/s].
-
-    The views are that of the scan and earlier ones, empty before odometry. None without shield.
-    """
+    """Returns obstacles (P, 3) in a scan (B,): x, y [m], greatest speed [m/s]; None if off."""
     given = config.shield
     if given is None:
         return None

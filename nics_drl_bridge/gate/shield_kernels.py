@@ -25,13 +25,9 @@ def place(twist, time):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def free(points, twists, blind, deceleration, room, step):  # type: ignore[no-untyped-def]
-    """True if no point comes within `room` of any of the arcs before the robot rests on it.
-
-    A point that is already that near must not come nearer. A moving point may be nearer by all that
-    it can have moved. Points (P, 3) are x, y [m] and greatest speed [m/s], twists (K, 3) those of
-    the arcs; the robot keeps its twist for `blind` [s], then brakes with a deceleration [m/s^2].
-    Places are checked at each `step` of the path [m].
-    """
+    """True if no point (P, 3) comes within `room` [m] of twists (K, 3) until the robot rests."""
+    # One that is already that near must not come nearer. Points are x, y [m] and greatest speed
+    # [m/s]; the robot keeps its twist for `blind` [s], then brakes; places are a `step` [m] apart.
     longest, rest = 0.0, 0.0
     for k in range(twists.shape[0]):
         speed = math.hypot(twists[k, 0], twists[k, 1])
@@ -84,11 +80,9 @@ class MountedBeams(NamedTuple):
 
 @kernel(allocates=True)
 def entered(out, ranges, old, lidar, moved, far, tolerance):  # type: ignore[no-untyped-def]
-    """Marks, in `out` (B,), the beams of a scan (B,) that end where an old one (B,) saw free space.
-
-    The robot's own motion, `moved` (3,), is compensated; hidden or unknown places, and other flags,
-    stay. `far` is the greatest range [m]; the tolerance is in metres and as a share of the range.
-    """
+    """Marks in `out` (B,) the beams of a scan (B,) that end where an old one saw free space."""
+    # The robot's own motion, `moved` (3,), is compensated; hidden or unknown places, and other
+    # flags, stay. `far` is the greatest range [m]; the tolerance is in metres and of the range.
     beams, circle = len(ranges), 2.0 * math.pi / abs(lidar.step)
     whole, wide = round(circle), math.ceil(WIDTH / abs(lidar.step))
     cosine, sine = math.cos(moved[2]), math.sin(moved[2])

@@ -28,12 +28,8 @@ def shield_config(
     file: str | Path = "",
     given: Mapping[str, float] | None = None,
 ) -> tuple[ShieldConfig, str]:
-    """Returns a robot's shield configuration, and a sentence with its values and their source.
-
-    It is the `shield` of a file of limits, else, with caution, model and limits; given values
-    override it. ConfigError: a value can't be used, or the shield does not know the robot's
-    commands.
-    """
+    """Returns a robot's shield, and a sentence on its values; ConfigError: can't be used."""
+    # It is the `shield` of a file of limits, else of model and limits; given values override it.
     path = find_config(file, "limits") if file else None
     measured = load_yaml(path, LimitsFile).shield if path else None
     if (stopping := measured) is None:  # one command per period; brakes no harder than its limits

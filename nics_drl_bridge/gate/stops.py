@@ -1,10 +1,7 @@
-"""Rules that stop the robot by the age of data, the gate's own clock, commands and e-stop.
-
-The age of a datum is the time since its arrival on the steady clock, plus its delay. The lead of
-its stamp over that clock is the offset of the two clocks minus the delay; the greatest lead, the
-envelope, is that of the fastest data. It is found before the gate is armed and then follows at most
-the drift of real clocks: stamps that creep ahead or fall behind do not become the new normal.
-"""
+"""Rules that stop the robot by the age of data, the gate's own clock, commands and e-stop."""
+# Age is the time since arrival on the steady clock, plus delay. The greatest lead of stamps over
+# that clock, the envelope, is that of the fastest data. Found before the gate is armed, it follows
+# at most the drift of real clocks: stamps that creep ahead or behind do not become the new normal.
 
 from __future__ import annotations
 
@@ -26,10 +23,8 @@ FROZEN_INPUTS = 20  # a running clock does not give this many inputs in a row th
 def arrived(
     config: GateConfig, arrivals: Arrivals, stamp_ns: int, now: float, gap_s: float, armed: bool
 ) -> tuple[Arrivals, str]:
-    """Accounts for a datum; if the gate is armed, the envelope is fixed.
-
-    Returns the arrivals, after a jump of the new datum only, and `repeated`, `jumped` or "".
-    """
+    """Accounts for a datum; returns arrivals, and `repeated`, `jumped` or ""."""
+    # If the gate is armed, the envelope is fixed; after a jump only the new datum is kept.
     fresh = Arrivals(
         (stamp_ns,), (now,), (0.0,), (stamp_ns, now), 1, 0.0, now, ((now, stamp_ns, 1, 0.0),)
     )

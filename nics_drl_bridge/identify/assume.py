@@ -17,12 +17,9 @@ DIFFERENCE = 1e-4
 def assume_textbook(
     model: TaylorModel, spec: RobotSpec, unmoved: tuple[str, ...]
 ) -> tuple[TaylorModel, tuple[str, ...]]:
-    """Adds terms for inputs that never moved, from the structure of the textbook kinematics.
-
-    A fit at a constant input is a section through the whole model: `wz = c speed`, measured at the
-    steering angle s0, becomes `wz = (c/s0) speed*steering`. At s0 = 0 the coefficient comes from
-    the spec's parameters. Each change gets a sentence. ConfigError: the spec names no textbook.
-    """
+    """Adds textbook terms for inputs that never moved; ConfigError: the spec names no textbook."""
+    # A fit at a constant input is a section through the whole model: `wz = c speed`, measured at
+    # the steering angle s0, becomes `wz = (c/s0) speed*steering`; at s0 = 0 by the parameters.
     named = model.named
     rows = {dof: dict(terms) for dof, terms in named.terms.items()}
     point = dict(zip(model.variables, (model.low + model.high) / 2.0, strict=True))
@@ -68,8 +65,7 @@ class _Completion:
                 self.assumed.append((dof, product))
                 self.notes.append(
                     f"Assumed, not learnt: {dof} = {coefficient:.4g}*{product} ({source}), since "
-                    f"{name} never moved; drive with {name} changing over its whole range to learn "
-                    "it."
+                    f"{name} never moved; to learn it, drive with {name} over its whole range."
                 )
 
     def _slope(self, d: int, product: str) -> float:

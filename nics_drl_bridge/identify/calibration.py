@@ -84,11 +84,8 @@ class Calibration:
 
 
 def align(drive: Drive, calibration: Calibration) -> Samples:
-    """Puts a drive on one time axis, at `base_link` and on the clock of the commands.
-
-    A recording that needs no correction is used bit for bit; else noisy poses are smoothed by local
-    parabolas, and rows in gaps dropped. RecordingError: the streams do not overlap in time.
-    """
+    """Puts a drive on one time axis, at `base_link`; RecordingError: no overlap in time."""
+    # Without corrections it is used bit for bit; else noisy poses are smoothed by local parabolas.
     recording = drive.recording
     if calibration.is_identity and (shared := _shared_stamps(recording)) is not None:
         return samples_on_one_clock(*shared)

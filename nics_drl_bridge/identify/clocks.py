@@ -1,8 +1,4 @@
-"""Clocks: offset, latency and lags of a drive; responses of states that were not measured.
-
-Each time is the shift that makes a signal a function of the commands, by separable least squares:
-the best combination of the paper's features (Eq. 1) for a given delay has a closed form.
-"""
+"""Clocks: a drive's offset, latency and lags, each the shift that best explains it by commands."""
 
 from __future__ import annotations
 
@@ -162,9 +158,7 @@ def timing_of(drive: Drive) -> TimingEstimate:
     command, state, place = recording.command, recording.state, recording.source
     missing = [v.name for v in spec.state if v.follows is None]
     if state is None and missing:
-        fault = (
-            f"has no measured state, and {missing[0]!r} of robot {spec.name!r} follows no command"
-        )
+        fault = f"no measured state, and {missing[0]!r} of robot {spec.name!r} follows no command"
         advice = "record the state too, or add `follows:` to the robot's YAML file"
         raise RecordingError(f"{place}: {fault}; {advice}.")
     if len(twists.start) < MIN_STAMPS:

@@ -137,11 +137,9 @@ def spread(t: Array, bursts: Bursts | None) -> Array:
 
 
 def pose_noise(pose: Stream, bursts: Bursts | None) -> tuple[float, float] | None:
-    """Returns standard deviations of position [m] and heading [rad] of poses.
-
-    They come from sixth differences, in which smooth motion vanishes; in bursts, whose sample
-    times are not known well enough, from stretches at rest. None if there are none.
-    """
+    """Returns standard deviations of position [m] and heading [rad] of poses, if known."""
+    # By sixth differences, in which smooth motion vanishes; in bursts, whose sample times are not
+    # known well enough, by stretches at rest.
     if bursts is not None:
         sigma = _spread_at_rest(unwrapped(pose.values))
     else:

@@ -1,8 +1,4 @@
-"""Excitation: what a drive moved, and moved independently, and so what a fit can learn from it.
-
-Outliers are the rows that it can't learn from: far from the bulk that least trimmed squares finds
-(Rousseeuw, Van Driessen: Computing LTS regression for large data sets).
-"""
+"""Excitation: what a drive moved, and moved independently, and so what a fit can learn from it."""
 
 from __future__ import annotations
 
@@ -133,10 +129,7 @@ def states_are_noisy(samples: Samples, spec: RobotSpec) -> bool:
 
 
 def inliers(chi: Array, target: Array, usual: float) -> NDArray[np.bool_]:
-    """Selects the rows of a target (T,) on features (T, K) that are no outliers.
-
-    They are searched for if a residual exceeds the usual range, more than any misfit of a model.
-    """
+    """Selects the rows of a target (T,) on features (T, K) that are no outliers."""
     everything = np.ones(len(target), dtype=np.bool_)
     plain = _left(chi, target)
     if not (plain > max(FAR / 2.0 * float(np.median(plain)) / GAUSSIAN_MAD, usual)).any():

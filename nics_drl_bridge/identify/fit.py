@@ -1,8 +1,4 @@
-"""Eq. 1 and 2 on one page (Sec. IV-A): features, least squares, pruning, least squares again.
-
-`dQ/dt = A chi`, `chi = vec([1, X] (x) [1, X])`: `robot.taylor` makes the features, `regress` finds
-the coefficients of all, and `pruned` keeps those of Eq. 2 and estimates them anew.
-"""
+"""Eq. 1 and 2 on one page (Sec. IV-A): features, least squares, pruning, least squares again."""
 
 from __future__ import annotations
 
@@ -90,13 +86,10 @@ def fit(
 def regress(
     samples: Samples, spec: RobotSpec, order: int = ORDER, noisy: bool = False
 ) -> Regression:
-    """Finds the coefficients of all features by least squares (Eq. 1); outliers are dropped.
-
-    The order is 1 to 4; the paper's is 2. `noisy` is any recording but an exact one: insignificant
-    terms are dropped before Eq. 2, and the body twist is a function of the state alone, if any, and
-    zero at zero speed, if it moved: within a step a command acts through the state, and in noise
-    the two can't be told apart. Raises FitError: too few samples, or nothing moved.
-    """
+    """Fits all features of order 1 to 4 (Eq. 1); FitError: too few samples, or nothing moved."""
+    # `noisy` is any recording but an exact one: insignificant terms are dropped before Eq. 2, and
+    # the body twist is a function of the state alone, if any, and zero at zero speed, if it moved:
+    # within a step a command acts through the state, and in noise the two can't be told apart.
     believed = excitation.plausible(samples.x, spec)
     samples = samples.rows(believed)
     excited, names = excitation.Excitation.of(samples, spec), spec.variable_names
@@ -142,11 +135,8 @@ def by_weight(beta: Array, noise_floor: float = 0.0) -> NDArray[np.intp]:
 
 
 def prune(beta: Array, alpha: float, noise_floor: float = 0.0) -> NDArray[np.bool_]:
-    """Selects the standardised coefficients (K,) to keep (Eq. 2).
-
-    In order of size, coefficients are kept while their sum stays below the share `alpha` of the
-    total, and also the one that crosses it. Those up to `noise_floor` are rounding errors.
-    """
+    """Selects the standardised coefficients (K,) to keep: the largest, up to the share `alpha`."""
+    # With the one that crosses it (Eq. 2); those up to `noise_floor` are rounding errors.
     order = by_weight(beta, noise_floor)
     size = np.abs(beta[order])
     kept = order[np.cumsum(size) - size < alpha * size.sum()]
@@ -154,12 +144,9 @@ def prune(beta: Array, alpha: float, noise_floor: float = 0.0) -> NDArray[np.boo
 
 
 def pruned(regression: Regression, spec: RobotSpec, alpha: Alpha = ALPHA) -> Fit:
-    """Prunes a regression (Eq. 2) and estimates the coefficients of the kept terms anew.
-
-    `alpha` is the share of the summed standardised coefficients that is kept per degree of freedom,
-    with the term that crosses it: else a differential robot would lose a wheel. `auto` keeps as
-    many terms, in the same order, as improve the cross-validated error (`statistics.knee`).
-    """
+    """Keeps the share `alpha` of a regression (Eq. 2), or `auto`; estimates the kept terms anew."""
+    # The term that crosses the share is kept: else a differential robot would lose a wheel. `auto`
+    # keeps as many terms, in the same order, as improve the cross-validated error.
     samples, shape = regression.samples, regression.beta.shape
     coefficients, errors, conditions = np.zeros(shape), np.zeros(shape), np.ones(shape[0])
     curves, noisy_state = [], excitation.states_are_noisy(samples, spec)
@@ -210,11 +197,9 @@ def _kept(
 def _reestimate(
     coefficients: Array, errors: Array, d: int, regression: Regression, states: int
 ) -> None:
-    """Replaces a state's coefficients (K,) and errors by instruments, unless these are too weak.
-
-    The noise of a state is both in X and in its rate, so that least squares would mistake it for a
-    fast decay; that of the state one step earlier is independent: it is an instrument for X.
-    """
+    """Replaces a state's coefficients (K,) and errors by instruments, unless these are too weak."""
+    # The noise of a state is both in X and in its rate, so that least squares would mistake it for
+    # a fast decay; that of the state one step earlier is independent: it is an instrument for X.
     samples, inside, kept = regression.samples, regression.inliers[d], np.flatnonzero(coefficients)
     follows = np.abs(np.diff(samples.t) - samples.dt) < SAME_STEP * samples.dt + ROUNDING_S
     now = np.flatnonzero(follows & inside[1:] & inside[:-1]) + 1

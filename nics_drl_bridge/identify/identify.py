@@ -1,8 +1,4 @@
-"""Identification of a model from a recording: a row of stages over one prepared drive.
-
-Each stage takes the drive, as it was recorded, and the findings so far, and returns the findings
-with its own added. `STAGES` is the whole road from a recording to a model.
-"""
+"""Identification of a model from a recording: the row of stages `STAGES` over a prepared drive."""
 
 from __future__ import annotations
 
@@ -212,7 +208,6 @@ STAGES: tuple[Stage, ...] = (
     repair, clocks, mounting, responses, noise, fit, prune, refine, complete, judge,
 )  # fmt: skip
 """In order; each builds on what the stages before it found."""
-CALIBRATION: tuple[Stage, ...] = (clocks, mounting, responses, noise)
 
 
 def begun(drive: Drive) -> Findings:
@@ -271,11 +266,8 @@ def identify(
     assume: bool = False,
     strict: bool = False,
 ) -> Identified:
-    """Learns a robot's motion from the first part of a recording and tests it on the rest.
-
-    That ends at `train_until` after the first pose [s], or after two thirds; for the other options
-    see `Settings`. RecordingError: it can't be used for this robot. FitError: it shows too little.
-    """
+    """Learns a motion up to `train_until` [s], and tests it on the rest; see `Settings`."""
+    # Default: two thirds. RecordingError: unusable for this robot. FitError: it shows too little.
     drive = Drive(check(recording, spec), spec)
     until = TRAIN_SHARE * drive.duration_s if train_until is None else train_until
     found = run(STAGES, replace(drive, settings=Settings(order, alpha, until, assume, strict)))
@@ -285,13 +277,6 @@ def identify(
         known(found.samples, "the training part", "fit"), found.unseen, found.held_out,
         found.noise, found, found.notes,
     )  # fmt: skip
-
-
-@one_blas_thread
-def calibrate(recording: Recording, spec: RobotSpec) -> Calibration:
-    """Estimates a recording's corrections before a fit; RecordingError if it can't be used."""
-    found = run(CALIBRATION, Drive(check(recording, spec), spec))
-    return replace(found.calibration, notes=_sentences(found))
 
 
 def cut(recording: Recording, until: float) -> Recording:

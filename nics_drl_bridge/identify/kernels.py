@@ -52,14 +52,10 @@ def _follow_derivatives(now, values, dof, free, dx, dy, turn, along_x, along_y, 
 
 @kernel(allocates=True)
 def follow(ends, moved, x, steps, share, terms, free, dt):  # type: ignore[no-untyped-def]
-    """Integrates body twists along courses of X that do not depend on the coefficients.
-
-    Each step is the exact arc of its twist, as in the simulator. Written are `ends` (W, 3), the end
-    poses relative to the starts, headings unwrapped, and `moved` (W, 3, P), their derivatives by
-    the `free` (P,) of the `terms` of the twist (`robot.kernels.Terms`); P = 0 skips them. `x` (W,
-    T, V + 1) is X during each step, and a last entry of 1; `steps`, `share` (W,) are the whole
-    steps to the end and the remaining fraction of one more; `dt` is the length of a step [s].
-    """
+    """Writes end poses (W, 3), and derivatives (W, 3, P) by the `free` (P,) of `terms`."""
+    # Of body twists along courses of X (W, T, V + 1), with a last entry of 1, integrated as in
+    # the simulator: whole `steps` (W,) of `dt` [s] and a `share` (W,) of one more; headings are
+    # unwrapped.
     dof, coefficient = terms.dof, terms.coefficient
     factors, count = terms.factors, terms.degree
     params = moved.shape[2]

@@ -1,8 +1,4 @@
-"""Mounting: position and rotation of the tracked body on the robot.
-
-Uncertainty is that of the delete-one-block jackknife (Efron, Tibshirani: An Introduction to the
-Bootstrap, ch. 11), with correlated wheel slip, on an omnidirectional robot.
-"""
+"""Mounting: position and rotation of the tracked body on the robot."""
 
 from __future__ import annotations
 
@@ -46,10 +42,7 @@ class Mounting:
 def mounting_of(
     drive: Drive, timing: clocks.TimingEstimate, speed: Array | None
 ) -> Mounting | None:
-    """Estimates the mounting as far as the drive shows it; None if it does not.
-
-    The speed (n,) along the direction of travel is that expected over the twists, up to a factor.
-    """
+    """Estimates the mounting by speeds (n,) up to a factor; None if the drive does not show it."""
     spec, twists = drive.spec, drive.twists
     if spec.moves_sideways:
         return jackknifed(drive, twists, timing.offset, partial(_by_commands, timing))
@@ -77,13 +70,10 @@ def mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
 
 
 def mounting_without_lateral_motion(motion: TwistIntervals, forward: Array) -> Mounting | None:
-    """Estimates the mounting on a robot whose `base_link` never moves sideways.
-
-    The lateral speed of the tracked point is then yaw rate x lever arm: `cos(rotation) uy -
-    sin(rotation) ux - lever_x wz = 0`, the direction in which the twists have no extent. On a
-    single curvature the lever arm is set to zero; along y it remains unknown. None if nothing
-    moved, or sideways as freely as ahead. Of the forward speed (n,) only the sign matters.
-    """
+    """Estimates the mounting of a robot that never moves sideways; None if it is not shown."""
+    # The lateral speed of the tracked point is then yaw rate x lever arm: `cos(rotation) uy -
+    # sin(rotation) ux - lever_x wz = 0`, the direction in which the twists have no extent. On a
+    # single curvature the lever arm is set to zero. Of the speed (n,) only the sign matters.
     rows = motion.twist * np.array([1.0, 1.0, TURN_SCALE_M])
     size, axes = np.linalg.svd(rows, full_matrices=False)[1:]
     size = size / np.sqrt(len(rows))
@@ -111,10 +101,8 @@ def mounting_without_lateral_motion(motion: TwistIntervals, forward: Array) -> M
 
 
 def lateral_lever(motion: TwistIntervals, rotation: float, speed: Array) -> tuple[float, float]:
-    """Estimates the lever arm along y and its uncertainty [m] from a speed (n,).
-
-    `ux = gain speed - lever_y wz`, faster outside of curves; NaN if all curves were alike.
-    """
+    """Estimates the lever arm along y and its uncertainty [m] from a speed (n,); maybe NaN."""
+    # `ux = gain speed - lever_y wz`, faster outside of curves.
     along = rotate(motion.twist[:, :2], -rotation)[:, 0]
     chi = np.stack([speed, motion.twist[:, 2]], axis=1)
     size = np.linalg.svd(chi * np.array([1.0, TURN_SCALE_M]), compute_uv=False)

@@ -1,8 +1,4 @@
-"""Noise of the sensors, and the motion that a model leaves unexplained.
-
-The drift is measured over a second, since systematic errors of a model grow faster than noise. The
-noise of the odometry is the deviation of reported velocities from the motion.
-"""
+"""Noise of the sensors, and the motion, over a second, that a model leaves unexplained."""
 
 from __future__ import annotations
 

@@ -115,11 +115,7 @@ def _by_one_rollout(
 def _from_measured_states(
     model: TaylorModel, calibration: Calibration, drive: Drive, chosen: Windows
 ) -> tuple[Array, Array, Array, NDArray[np.intp], Array]:
-    """Returns roll-outs of windows, each from its own measured state.
-
-    Poses (W, T + 1, 3) from the origin, states (W, T + 1, S), commands (W, T, C), whole steps (W,)
-    to the end and the remaining fraction (W,) of one more.
-    """
+    """Returns poses (W, T + 1, 3), states, commands, whole steps (W,), share (W,) of a last one."""
     start, end = (t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t))
     steps = int(np.ceil(float((end - start).max()) / model.dt - 1e-6)) + 1
     begin = start[:, None] + model.dt * np.arange(steps) - calibration.command_latency_s

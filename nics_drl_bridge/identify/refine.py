@@ -1,8 +1,4 @@
-"""Refinement of a model by its open-loop errors over seconds (the output-error method).
-
-A simulator must predict the next seconds, not the next instant (Ljung, System Identification, ch.
-7). Kept terms change their values; those that hardly improve the prediction are removed.
-"""
+"""Refinement of a model by its errors over seconds (Ljung, System Identification, ch. 7)."""
 
 from __future__ import annotations
 
@@ -178,11 +174,9 @@ class _Free:
 
     @classmethod
     def of(cls, model: TaylorModel, calibration: Calibration, spec: RobotSpec) -> _Free:
-        """Frees what neither definition nor measurement fixes.
-
-        The rotation is defined by the direction without motion, of which an omnidirectional robot
-        has none; a time from a measured state is fixed.
-        """
+        """Frees what neither definition nor measurement fixes."""
+        # The rotation is defined by the direction without motion, of which an omnidirectional robot
+        # has none; a time from a measured state is fixed.
         known, time = calibration.uncertainty, None
         if calibration.responses and "clock_offset_s" in known:
             time = "clock_offset_s"
@@ -206,10 +200,8 @@ class _Free:
 
 
 def free_coefficients(model: TaylorModel, calibration: Calibration) -> Mask:
-    """Selects the free coefficients (D, K): kept, and not fixed by the definition of a state.
-
-    An inferred speed is that along the direction of travel: vx = 1 speed; measured lags are fixed.
-    """
+    """Selects the free coefficients (D, K): kept, and not fixed by the definition of a state."""
+    # An inferred speed is that along the direction of travel, vx = 1 speed; known lags are fixed.
     free = model.coefficients != 0.0
     if not calibration.responses:
         free[3:] = False  # the rates of a measured state were fitted to that state itself

@@ -1,8 +1,4 @@
-"""Repair of a drive: repeated rows, jumps of single samples, commands beyond the limits.
-
-Dropped rows leave gaps. A drive without such faults is returned unchanged. Other units and reversed
-axes, which nothing can repair, are refused.
-"""
+"""Repair of a drive: drops repeated rows and jumps, clips commands; refuses units and axes."""
 
 from __future__ import annotations
 
@@ -170,11 +166,8 @@ def check_units(drive: Drive) -> None:
 
 
 def check_axes(drive: Drive) -> None:
-    """Refuses poses, with a RecordingError, whose heading turns against the direction of travel.
-
-    In its own frame a robot travels in the same direction, or in that of its state. If only
-    mirrored headings make this true, then x, y or heading is reversed.
-    """
+    """Refuses poses whose heading turns against the direction of travel (RecordingError)."""
+    # If only mirrored headings make the direction constant, then x, y or heading is reversed.
     recording = drive.recording
     path = np.append(0.0, np.cumsum(np.hypot(*np.diff(drive.dated.values[:, :2], axis=0).T)))
     apart = max(TRAVEL_SHARE * drive.spec.footprint_radius, 1e-3)
@@ -190,9 +183,7 @@ def check_axes(drive: Drive) -> None:
     else:
         return
     if as_given < INCONSISTENT and mirrored > CONSISTENT:
-        fault = (
-            "the heading turns one way and the path the other; one of x, y and heading is reversed"
-        )
+        fault = "heading and path turn opposite ways; one of x, y and heading is reversed"
         advice = "they must be x forward, y left, heading counter-clockwise (REP-103)"
         raise RecordingError(f"{recording.source}: pose: {fault}: {advice}.")
 

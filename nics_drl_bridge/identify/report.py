@@ -1,7 +1,4 @@
-"""Fit report: the model's equations, the quality of its fit, and what could not be learnt.
-
-Every estimate of a calibration is listed: value and uncertainty, or why there is none.
-"""
+"""Fit report: the model's equations, the quality of its fit, and what could not be learnt."""
 
 from __future__ import annotations
 
@@ -189,11 +186,8 @@ def estimates(identified: Identified) -> dict[str, CalibratedValue]:
 
 
 def is_useless(error: float, standing: float, path: float, radius: float) -> bool:
-    """True if predictions are hardly better than assuming that the robot stands still.
-
-    Given are the median errors (NaN or inf if they diverge) of both, the mean path and the robot's
-    radius [m], which set the scale for circles. Persistence is a usual baseline (Murphy 1988).
-    """
+    """True if median errors [m] (maybe NaN, inf) are hardly below those of a robot that stands."""
+    # The mean path and the robot's radius [m] set the scale for circles.
     return not error <= max(MOST_LEFT * standing, FAR_OFF * path, radius)
 
 

@@ -23,11 +23,8 @@ def held(
     command: Stream, spec: RobotSpec, start: Array, end: Array,
     powers: NDArray[np.int64] | None = None,
 ) -> Array:  # fmt: skip
-    """Returns the mean (..., C) of held commands over intervals (...) on the commands' clock [s].
-
-    Given powers (K, C), the mean (..., K) of these features. Before its first command a robot
-    stands still: commands that ever change are zero then, others as always.
-    """
+    """Returns means (..., C), or of powers (K, C), of held commands over intervals (...) [s]."""
+    # Before its first command a robot stands still: commands that ever change are zero then.
     still = np.clip(0.0, spec.command_low, spec.command_high)
     before = np.where(moved_commands(command), still, command.values[0])
     values = np.concatenate([before[None], command.values])

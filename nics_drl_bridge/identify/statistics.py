@@ -41,10 +41,7 @@ def minimise(
     bounds: tuple[Array, Array] | None = None,
     jacobian: Callable[[Array], Array] | None = None,
 ) -> tuple[Array, Array, Array]:
-    """Minimises a residual of parameters (P,), which change by about `scale`, within bounds (P,).
-
-    Returns them with Jacobian (n, P), by finite differences if not given, and residual (n,) there.
-    """
+    """Minimises a residual (n,) within bounds (P,); returns minimum, Jacobian (n, P), residual."""
     low, high = bounds or (np.full(len(start), -np.inf), np.full(len(start), np.inf))
     slope: Any = "2-point"
     if jacobian is not None:
@@ -165,11 +162,8 @@ def significant(chi: Array, target: Array) -> NDArray[np.bool_]:
 
 
 def instrumental(chi: Array, instruments: Array, target: Array) -> tuple[Array, Array] | None:
-    """Returns coefficients (K,) by instrumental variables, and their standard errors (K,).
-
-    The instruments (T, K) are features with independent noise; None if they are too weak. Two-stage
-    least squares (Soederstroem, Stoica 1983).
-    """
+    """Returns coefficients (K,) and errors by instruments (T, K); None if these are too weak."""
+    # Two-stage least squares (Soederstroem, Stoica 1983).
     scale, size = np.linalg.norm(chi, axis=0), np.linalg.norm(instruments, axis=0)
     chi, instruments = chi / scale, instruments / size
     bread = instruments.T @ chi

@@ -36,9 +36,7 @@ MIRRORED = -0.5  # correlation of yaw rate and steering below which the robot tu
 def about_stamps(drive: Drive) -> Iterator[str]:
     """Tells of the stamps and the noise of the poses."""
     if (bursts := drive.bursts) is not None:
-        finding = (
-            f"The poses arrive in bursts of about {bursts.size:.0f} every {bursts.period_s:.3f} s"
-        )
+        finding = f"Poses arrive in bursts of about {bursts.size:.0f} every {bursts.period_s:.3f} s"
         spread = "the samples of a burst were spread over the time since the one before"
         yield f"{finding}: their stamps are arrival times; {spread}."
     if drive.pose_noise is None:

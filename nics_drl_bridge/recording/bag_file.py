@@ -1,8 +1,4 @@
-"""Opens a rosbag2 recording and verifies that it is complete.
-
-Bag readers return what they still find in a damaged bag, often silently: here its files are checked
-whole, and its topics against its summary. A flipped bit without checksum is not found.
-"""
+"""Opens a rosbag2 recording, and verifies that it is complete: readers are silent about damage."""
 
 from __future__ import annotations
 
@@ -58,10 +54,7 @@ def is_storage(path: Path) -> bool:
 
 @contextmanager
 def opened(path: str | Path) -> Iterator[BagFile]:
-    """Opens a bag, given its folder or its only file.
-
-    RecordingError: it is missing, damaged, empty or not closed, or a library is not installed.
-    """
+    """Opens a bag (folder or only file); RecordingError: missing, damaged, empty, no library."""
     path = Path(path)
     check_libraries(path, "reading")
     from rosbags.rosbag2 import Reader

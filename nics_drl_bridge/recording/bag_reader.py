@@ -1,7 +1,4 @@
-"""Reads a drive from a rosbag2 recording, SQLite or MCAP, without ROS.
-
-State and wheel speeds come from joint messages; latency is the delay from stamp to receipt.
-"""
+"""Reads a drive from a rosbag2 recording, SQLite or MCAP, without ROS."""
 
 from __future__ import annotations
 
@@ -33,11 +30,7 @@ SPANNED = 0.9  # share of a uniform distribution between the first and last of t
 
 
 def load_bag(path: str | Path, spec: RobotSpec | None, mapping: TopicRoles) -> Recording:
-    """Reads a drive of a robot from a bag: its folder or its only file.
-
-    Missing roles of topics are guessed; for the clocks see `stamping.streams`. RecordingError, with
-    place and fix: the bag is damaged, a topic missing or ambiguous, or of another robot.
-    """
+    """Reads a robot's drive from a bag, guessing missing roles of topics; RecordingError if bad."""
     if spec is None:
         raise RecordingError(f"{path}: is a bag; say of which robot, with a RobotSpec.")
     with opened(path) as bag:
@@ -158,10 +151,7 @@ def gather(topic: str, messages: Sequence[Message]) -> Joints:
 
 
 def state_of(joints: Joints, spec: RobotSpec, mapping: TopicRoles, place: str) -> TopicData | None:
-    """Returns the measured state (T, S); None without all its joints if each follows a command.
-
-    RecordingError if a named joint does not exist, or a required state was not measured.
-    """
+    """Returns the measured state (T, S), or None without joints; RecordingError if it is needed."""
     known = [v.name for v in spec.state]
     for name in sorted(mapping.state.keys() - set(known)):
         fault = f"robot {spec.name!r} has no state {name!r}"

@@ -29,11 +29,8 @@ LONGEST_ROW = 1000  # in characters
 
 
 def load_csv_folder(path: str | Path) -> Recording:
-    """Reads a drive of a car, recorded as up to five CSV files without header lines.
-
-    `cmd.csv` (linear.x, angular.z) and `vrpn.csv` are required, wheels are read in pairs. Pose and
-    robot have clocks of their own. RecordingError names the file, the row and the fix.
-    """
+    """Reads a car's drive from CSV files; RecordingError names the file, the row and the fix."""
+    # `cmd.csv` (linear.x, angular.z) and `vrpn.csv` are required, wheels are read in pairs.
     path = Path(path)
     if not path.is_dir():
         raise RecordingError(f"{path}: no such folder; check the path.")

@@ -1,11 +1,6 @@
-"""Excitation of a robot: a drive whose commands show its whole motion within a circle.
-
-A drive is a sequence of segments, each drawn at random: new levels for one or more commands,
-reached smoothly and held for a random time (amplitude-modulated pseudo-random steps; Nelles:
-Nonlinear System Identification, ch. 21). A segment is accepted only if the expected path stays
-within the circle and the robot can still turn back from its end. Rarely used levels and end points
-from which a path leads close to the centre are preferred.
-"""
+"""Excitation: random drives within a circle that show a robot's whole motion."""
+# Segments reach new levels smoothly and hold them for a random time (Nelles: Nonlinear System
+# Identification, ch. 21). Accepted is one that stays in the circle, and can turn back from its end.
 
 from __future__ import annotations
 
@@ -49,10 +44,7 @@ ATTEMPTS = 8
 
 
 class Exploration:
-    """Generator of a robot's commands, one per period, that tracks the robot's pose.
-
-    It keeps the whole robot in the circle of its plan, and stands still for 1 s at both ends.
-    """
+    """Commands, one per period, that keep a robot in its plan's circle; it rests at both ends."""
 
     def __init__(self, plan: DrivePlan, rng: np.random.Generator) -> None:
         spec, self._plan = plan.robot, plan
@@ -100,10 +92,7 @@ class Exploration:
         return command
 
     def expected(self) -> Pattern | None:
-        """Drives to the end; None if it finds no way back into its circle, or shows too little.
-
-        Every command must cover its range, and no two may be correlated.
-        """
+        """Drives to the end; None if it finds no way back, or shows too little of a command."""
         poses, commands = [self.pose], []
         while not self.done:
             commands.append(self.next())
@@ -197,10 +186,7 @@ class Exploration:
         return np.repeat(ways, round(needed / WAY_STEP_S), axis=1)
 
     def _way_to_centre(self, pose: Array, state: Array, limit: float) -> Array:
-        """Returns the least distance from the centre, over the radius, of ways back from (K, 3).
-
-        Infinite if none stays within `limit` and turns the robot by half a turn or brings it back.
-        """
+        """Returns the least distance from the centre, over the radius, of ways back; maybe inf."""
         many = len(self._ways)
         start = np.repeat(pose, many, 0), np.repeat(state, many, 0)
         poses, _ = self._motion.roll(*start, np.tile(self._ways, (len(pose), 1, 1)), WAY_STEP_S)
@@ -298,10 +284,7 @@ class ExpectedMotion:
 
 
 def expected_motion(spec: RobotSpec) -> ExpectedMotion:
-    """Returns the motion of a robot's textbook kinematics, else its `cmd_vel` as body twist.
-
-    Raises ConfigError: the spec names no textbook, and a command is not part of a twist.
-    """
+    """Returns the motion of the robot's textbook, else of `cmd_vel`; ConfigError: has neither."""
     if spec.textbook is not None:
         book = textbook(spec)
         return ExpectedMotion(

@@ -1,8 +1,4 @@
-"""MCAP files: records parsed by the library `mcap`, and the checks that its readers leave out.
-
-They skip records of unknown kinds, accept fields that are cut off or overlap the next record, and
-follow the index at the end of the file: messages that a damaged index omits are lost silently.
-"""
+"""MCAP files: records parsed by the library `mcap`, and the checks that its readers leave out."""
 
 from __future__ import annotations
 
@@ -169,10 +165,7 @@ class _Walk:
 
 
 def check_mcap(path: Path) -> None:
-    """Checks a file (https://mcap.dev/spec) from its first byte to its last.
-
-    DamageError: it is truncated, a checksum is wrong, or counts, times and index disagree.
-    """
+    """Checks a file (https://mcap.dev/spec) from its first byte to its last (DamageError)."""
     if path.stat().st_size < len(MAGIC):
         raise DamageError(0, "the file is empty or ends at once")
     data, walk = mapped(path), _Walk()
@@ -286,10 +279,7 @@ def _zstd() -> Any:
 
 
 def unpack(data: bytes, compression: str, most: int = MOST_UNPACKED) -> bytes:
-    """Decompresses the content of a chunk by `lz4` or `zstd`: a few bytes can unpack to terabytes.
-
-    ValueError: cut off, or larger than `most` bytes; the libraries' own exceptions are passed on.
-    """
+    """Unpacks `lz4` or `zstd`; ValueError: cut off, or above `most` bytes (may be terabytes)."""
     if compression == "zstd":
         unpacker = _zstd().ZstdDecompressor()
     else:

@@ -37,10 +37,7 @@ FORMATS = (
 def read_recording(
     path: str | Path, spec: RobotSpec | None = None, topics: TopicRoles | None = None
 ) -> Recording:
-    """Reads a recording of any of `FORMATS`; RecordingError if there is none, or it can't be read.
-
-    A bag needs the robot, for its `cmd_vel` and joints; its topics' roles are guessed by default.
-    """
+    """Reads any of `FORMATS`, a bag with its robot; RecordingError: missing, or unreadable."""
     path, topics = Path(path), topics or TopicRoles()
     found = next((each for each in FORMATS if each.recognises(path)), None)
     if topics != TopicRoles() and not (found and found.has_topics):

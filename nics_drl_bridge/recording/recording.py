@@ -1,8 +1,4 @@
-"""Recording: the recorded data of a drive; Samples: the input of a fit.
-
-A `Recording` contains separately stamped streams, as a robot delivers them. Calibration turns it
-into `Samples`, the paper's data `D_t = (t, Q_t, X_t, dQ_t)` (Sec. IV-A) on one time axis.
-"""
+"""Recording: separately stamped streams of a drive; Samples: these on one time axis (Sec. IV-A)."""
 
 from __future__ import annotations
 
@@ -105,11 +101,7 @@ def samples_on_one_clock(t: Array, pose: Array, state: Array, command: Array) ->
 
 
 def check(recording: Recording, spec: RobotSpec) -> Recording:
-    """Returns a recording that can be used for a robot.
-
-    RecordingError names the place: it is of another robot, a stream is empty, contains NaN, runs
-    backwards or has the wrong width, or the pose has wrong units.
-    """
+    """Returns a recording that a robot can use; else RecordingError names place and fault."""
     if recording.variables and recording.variables != spec.variable_names:
         problem = f"{recording.source}: is a drive of a robot with {', '.join(recording.variables)}"
         advice = f"the robot {spec.name!r} has {', '.join(spec.variable_names)}"

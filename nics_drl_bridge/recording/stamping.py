@@ -1,8 +1,4 @@
-"""Stamps: time axis and clock of each stream of a bag.
-
-A message has two times: its receipt by the bag, and the sender's stamp in its header, if any. That
-one is better, without transport jitter, but the sender's clock may differ.
-"""
+"""Stamps: each stream's time axis and clock, by the headers' stamps or by receipt."""
 
 from __future__ import annotations
 
@@ -46,15 +42,11 @@ class TopicData:
 
 
 def streams(data: Mapping[str, TopicData], stamps: Stamps, place: str) -> dict[str, Stream]:
-    """Assigns a time axis, which begins near 0, to each stream with messages.
-
-    With `auto`, a stream is stamped by its headers if it has any. Headers less than 50 ms before
-    their receipt are of the recorder's clock (`receive`), as streams without header. Others are of
-    a foreign clock (`header`): shifted by the median delay, they leave a small offset for
-    calibration. Command, state, wheels and IMU share one clock, by receipt if need be. Late
-    messages are sorted; those before a simulation's first time are dropped. RecordingError if
-    headers are missing, of several clocks, or run backwards.
-    """
+    """Stamps each stream, from near 0 on; RecordingError: headers are missing or unusable."""
+    # With `auto`, by headers if there are any. Those less than 50 ms before their receipt are of
+    # the recorder's clock, others of a foreign one: shifted by the median delay, they leave a small
+    # offset for calibration. Command, state, wheels and IMU share one clock, by receipt if need be.
+    # Late messages are sorted; those before a simulation's first time are dropped.
     if stamps != "receive":
         data = {name: _in_order(part, place) for name, part in data.items()}
     origin = min(int(part.receive_ns.min()) for part in data.values())

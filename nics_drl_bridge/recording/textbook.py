@@ -13,24 +13,9 @@ from nics_drl_bridge.robot.spec import RobotSpec
 INTEGRATION_STEP_S = 1e-3
 
 
-def integrate(
-    book: Textbook, pose: Array, state: Array, command: Array, dt: float
-) -> tuple[Array, Array]:
-    """Moves robots with poses (..., 3) and states (..., S) under constant commands (..., C).
-
-    For `dt` [s]; returns pose and state. The state is exact. The pose follows arcs of at most 1 ms
-    by the Magnus expansion of fourth order (Iserles, Norsett 1999): its error is below 1e-11 m even
-    over seconds.
-    """
-    steps = max(1, int(np.ceil(dt / INTEGRATION_STEP_S - 1e-9)))
-    h, goal = dt / steps, book.target(command)
-    for k in range(steps):
-        pose = geometry.compose(pose, geometry.exp(_arc(book, state, goal, k * h, h)))
-    return pose, book.respond(state, goal, dt)
-
-
 def _arc(book: Textbook, state: Array, goal: Array, since: Array | float, h: float) -> Array:
     """Returns body twist x duration (..., 3) of a substep that begins `since` [s] after `state`."""
+    # By the Magnus expansion of fourth order (Iserles, Norsett 1999).
     early, late = (
         book.twist(book.respond(state, goal, since + (0.5 + sign * np.sqrt(3.0) / 6.0) * h))
         for sign in (-1.0, 1.0)
@@ -60,7 +45,12 @@ def record(
         states.append(book.respond(now, goal, since))
         arcs.append(_arc(book, now, goal, since, h))
         now = book.respond(now, goal, per_hold * inner * h)
-    state, pose = np.concatenate(states), _chain(geometry.exp(np.concatenate(arcs)))
+    # Relative poses (T, 3) are chained to the poses (T, 3) at their starts, from the origin on.
+    state, relative = np.concatenate(states), geometry.exp(np.concatenate(arcs))
+    heading = np.concatenate([[0.0], np.cumsum(relative[:-1, 2])])
+    moved = geometry.rotate(relative[:, :2], heading)
+    position = np.concatenate([np.zeros((1, 2)), np.cumsum(moved[:-1], axis=0)])
+    pose = np.concatenate([position, geometry.wrap_angle(heading)[:, None]], axis=1)
     t = np.asarray(np.arange(holds * per_hold) * dt, dtype=np.float64)
     return Recording(
         Stream(t, np.repeat(held, per_hold, axis=0)),
@@ -69,11 +59,3 @@ def record(
         source=f"textbook {spec.name}",
         variables=spec.variable_names,
     )
-
-
-def _chain(relative: Array) -> Array:
-    """Chains relative poses (T, 3) to the poses (T, 3) at their starts, from the origin on."""
-    heading = np.concatenate([[0.0], np.cumsum(relative[:-1, 2])])
-    moved = geometry.rotate(relative[:, :2], heading)
-    position = np.concatenate([np.zeros((1, 2)), np.cumsum(moved[:-1], axis=0)])
-    return np.concatenate([position, geometry.wrap_angle(heading)[:, None]], axis=1)

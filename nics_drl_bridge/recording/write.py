@@ -1,7 +1,4 @@
-"""Output of a drive: an `.npz` file, or the folder of a rosbag2, written without ROS.
-
-A bag is written message by message: complete at the end, salvageable before.
-"""
+"""Output of a drive: an `.npz` file, or the folder of a rosbag2, written without ROS."""
 
 from __future__ import annotations
 
@@ -40,10 +37,7 @@ CHUNK_BYTES = 1 << 16  # damage costs a whole chunk, since each checksum covers 
 
 
 def check_out(path: str | Path) -> Path:
-    """Checks an output path of a recording: an `.npz` file or the folder of a rosbag2.
-
-    ConfigError: it exists, or has another suffix. RecordingError: a library is missing.
-    """
+    """Checks an output; ConfigError: it exists, or wrong suffix; RecordingError: no library."""
     path = Path(path)
     if path.exists():
         raise ConfigError(f"{path}: is there already; give another name, or remove it.")
@@ -66,11 +60,9 @@ def write_drive(recording: Recording, path: str | Path, spec: RobotSpec) -> None
 def write_bag(
     recording: Recording, path: str | Path, spec: RobotSpec, storage: Storage = "mcap"
 ) -> None:
-    """Writes a recording as a bag, in a folder to create, that `load_bag` reads back.
-
-    Commands become `/cmd_vel`, state or wheels `/joint_states`, the IMU `/imu`, the pose `/odom`;
-    or `/pose` on its own clock or beside odometry. For errors see `bag_sink`.
-    """
+    """Writes a recording as a bag that `load_bag` reads back; for errors see `bag_sink`."""
+    # Commands become `/cmd_vel`, state or wheels `/joint_states`, the IMU `/imu`, the pose `/odom`;
+    # or `/pose` on its own clock or beside odometry.
     with bag_sink(path, storage) as sink:
         messages, command = _Messages(store := sink.store), recording.command
         for topic, kind, stream, make in _topics(recording, spec, messages):
@@ -178,10 +170,7 @@ class BagSink:
         texts: Mapping[str, str] | None = None,
         definition: str | None = None,
     ) -> None:
-        """Adds a topic with messages of a type such as `nav_msgs/msg/Odometry`.
-
-        A type unknown to rosbags needs `.msg` texts of it and its parts, or its whole definition.
-        """
+        """Adds a topic of a type such as `nav_msgs/msg/Odometry`; unknown ones need definitions."""
         from rosbags.typesys import get_types_from_msg
 
         fields = self.store.fielddefs
@@ -216,12 +205,9 @@ class BagSink:
 
 @contextmanager
 def bag_sink(path: str | Path, storage: Storage = "mcap") -> Iterator[BagSink]:
-    """Yields a bag to write to, a folder made at `path` when the block ends without error.
-
-    Until then it is in a hidden folder `.NAME.*` beside it, of which an error leaves nothing; after
-    a kill or on a full disk `salvage` recovers flushed messages. MCAP has checksums, SQLite has
-    none. RecordingError: the folder exists or can't be written, or a library is missing.
-    """
+    """Yields a bag, a folder at the end; RecordingError: it exists, can't be made, no library."""
+    # Until then it is in a hidden folder `.NAME.*` beside it, of which an error leaves nothing;
+    # after a kill or on a full disk `salvage` recovers flushed messages (MCAP alone has checksums).
     path = Path(path)
     msgs.check_libraries(path, "writing")
     from rosbags.rosbag2 import StoragePlugin, Writer

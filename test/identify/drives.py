@@ -7,7 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.recording.recording import Recording, Stream
+from nics_drl_bridge.identify import identify as stages
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.recording.recording import Recording, Stream, check
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -78,3 +81,10 @@ def without(recording: Recording, start: float, end: float) -> Recording:
     pose = recording.pose
     keep = (pose.t < start) | (pose.t > end)
     return replace(recording, pose=replace(pose, t=pose.t[keep], values=pose.values[keep]))
+
+
+def calibrate(recording: Recording, spec: RobotSpec) -> Calibration:
+    """A recording's corrections, and the sentences on them, by the stages before a fit."""
+    row = (stages.clocks, stages.mounting, stages.responses, stages.noise)
+    found = stages.run(row, Drive(check(recording, spec), spec))
+    return replace(found.calibration, notes=stages._sentences(found))

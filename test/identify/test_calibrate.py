@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from pydantic import TypeAdapter
 
-from identify.drives import drive, with_wheels, without
+from identify.drives import calibrate, drive, with_wheels, without
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify.calibration import Calibration, align
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.identify import calibrate
 from nics_drl_bridge.recording.recording import samples_on_one_clock
 from nics_drl_bridge.robot.spec import load_robot
 
@@ -146,7 +145,7 @@ def test_wheels_tell_latency_from_clock_offset_and_whether_they_are_swapped(car,
 
 def test_a_robot_whose_state_follows_nothing_must_have_it_measured(differential):
     recording = drive(differential, measured_state=False)
-    with pytest.raises(RecordingError, match="has no measured state, and 'left_wheel'"):
+    with pytest.raises(RecordingError, match="no measured state, and 'left_wheel'"):
         calibrate(recording, differential)
 
 

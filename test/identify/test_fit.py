@@ -2,12 +2,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from steps import integrate
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.identify.fit import fit, prune
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
-from nics_drl_bridge.recording.textbook import integrate, record
+from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot

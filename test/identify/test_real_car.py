@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from identify.drives import without
+from identify.drives import calibrate, without
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.identify import calibrate, identify
+from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.open_loop import open_loop_error
 from nics_drl_bridge.recording.readers import read_recording
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from robots import DIRECT
+from steps import integrate
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
@@ -16,7 +17,6 @@ from nics_drl_bridge.recording.excite import (
     expected_motion,
 )
 from nics_drl_bridge.recording.recording import samples_on_one_clock
-from nics_drl_bridge.recording.textbook import integrate
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import load_robot
 

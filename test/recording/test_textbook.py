@@ -3,10 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from steps import integrate
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.recording.textbook import integrate, record
+from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import load_robot
 

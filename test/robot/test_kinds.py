@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from robots import lidar
+from steps import integrate
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.config import validate
@@ -18,7 +19,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.generator import generate
 from nics_drl_bridge.policy.policies import make_policy
-from nics_drl_bridge.recording.textbook import integrate, record
+from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.kinds import find_kind, kind_names, steady_twist, textbook
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.robot.urdf import urdf_of
