@@ -228,7 +228,8 @@ def _odometry(facts: Facts, robot: RobotSpec) -> Findings:
 
 
 def _moves(facts: Facts, poses: Array, twists: Array, fastest: float) -> Findings:
-    dt = np.diff(np.array(facts.heard[ODOM].stamps_ns, dtype=np.int64)) * S_PER_NS
+    stamps = np.array(facts.heard[ODOM].stamps_ns, dtype=np.int64)
+    dt = np.diff(stamps) * S_PER_NS
     going = dt > 0.0
     if going.sum() < LEAST_STEPS:
         return
