@@ -1,8 +1,4 @@
-"""The machines of the three robots in MuJoCo: mass, friction, motors, and their MJCF.
-
-Tyres are ellipsoids: a round tread touches a plane in one point, and neither jumps from edge to
-edge, as a cylinder's contact does, nor scrubs when the robot turns.
-"""
+"""The three robots in MuJoCo as MJCF; tyres are ellipsoids, which neither jump nor scrub."""
 
 from __future__ import annotations
 
