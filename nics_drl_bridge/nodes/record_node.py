@@ -164,7 +164,7 @@ class DriveResult:
 
 
 class RecordNode(qos.QosWatch):
-    """Sends `cmd_vel` at 20 Hz, zeros at the end or on a fault; writes what it hears to a recording."""
+    """Sends `cmd_vel` at 20 Hz, zeros at the end or on a fault; records what it hears."""
 
     def __init__(self, context: Context, given: Mapping[str, Any] | None = None) -> None:
         overrides = [Parameter(name, value=value) for name, value in (given or {}).items()]
