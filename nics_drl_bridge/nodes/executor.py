@@ -28,7 +28,7 @@ MOST_AT_ONCE = 32  # a timer without a period is always ready, and the thread ha
 
 
 class StandingExecutor(SingleThreadedExecutor):
-    """Handles subscriptions, whose callbacks may return `HANDED_OVER`, and timers; no more."""
+    """Handles subscriptions, whose callbacks may return `HANDED_OVER`, and timers, not the rest."""
 
     def __init__(self, context: Context) -> None:
         super().__init__(context=context)

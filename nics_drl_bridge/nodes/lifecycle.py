@@ -29,7 +29,7 @@ class ManagedNode(QosWatch, LifecycleNode):
         self.undo = ExitStack()
         about = "Whether it configures and activates itself, without a lifecycle manager."
         self._autostart = bool(declare(self, "autostart", True, about, read_only=True))
-        self.state, self._starting = UNCONFIGURED, False
+        self.state, self._starting = UNCONFIGURED, False  # `state`: the last primary one
         self._failure: Exception | None = None
         self.add_on_set_parameters_callback(self._check_fixed)
 
@@ -66,12 +66,10 @@ class ManagedNode(QosWatch, LifecycleNode):
         late = sorted(self.fixed & {parameter.name for parameter in parameters})
         if not late or self.state == UNCONFIGURED:
             return SetParametersResult(successful=True)
-        return SetParametersResult(
-            successful=False,
-            reason=f"parameter {late[0]!r} is read when the node is configured; lead it to "
-            f"unconfigured first: `ros2 lifecycle set {self.get_fully_qualified_name()} "
-            "deactivate`, then `cleanup`.",
-        )
+        name = self.get_fully_qualified_name()
+        fix = f"lead it to unconfigured by `ros2 lifecycle set {name} deactivate`, then `cleanup`."
+        reason = f"parameter {late[0]!r} is read when the node is configured; {fix}"
+        return SetParametersResult(successful=False, reason=reason)
 
     def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Configures; a failure leaves it unconfigured."""

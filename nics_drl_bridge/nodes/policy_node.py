@@ -151,10 +151,9 @@ class PolicyNode(ManagedNode):
             place = traceback.extract_tb(error.__traceback__)[-1]
             words = shortened(f"{type(error).__name__}: {error}", LONGEST_REASON)
             name = self.get_parameter("policy").value
-            where = (
-                f"{place.filename}, line {place.lineno}); the robot is stopped, mend the policy."
-            )
-            raise BridgeError(f"policy {name!r} raised {words} ({where}") from error
+            where = f"{place.filename}, line {place.lineno}"
+            fix = "the robot is stopped, mend the policy."
+            raise BridgeError(f"policy {name!r} raised {words} ({where}); {fix}") from error
 
     def _message(self, twist: Array, stamp_ns: int) -> TwistStamped:
         frame = str(self.get_parameter("base_frame").value)

@@ -90,9 +90,8 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
         if code is not None:
             lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
             last = " | ".join(lines[-LOG_LINES:]) or "no output"
-            raise BackendError(
-                f"{self.node} ended with code {code}: {last} (its log is {self.log})."
-            )
+            reason = f"ended with code {code}: {last} (its log is {self.log})."
+            raise BackendError(f"{self.node} {reason}")
 
     def close(self) -> int:
         """Ends the node: SIGINT, then SIGKILL if it does not react. Returns its exit code."""

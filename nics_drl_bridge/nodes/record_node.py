@@ -164,11 +164,7 @@ class DriveResult:
 
 
 class RecordNode(qos.QosWatch):
-    """Sends `cmd_vel` at 20 Hz; writes `odom`, `joint_states`, `imu` and `pose` to a recording.
-
-    It ends with zero commands, also on a signal, an error, silent odometry, and outside the circle
-    around its start. If this process is killed, only the robot's timeout on `cmd_vel` stops it.
-    """
+    """Sends `cmd_vel` at 20 Hz, zeros at the end or on a fault; records what it hears."""
 
     def __init__(self, context: Context, given: Mapping[str, Any] | None = None) -> None:
         overrides = [Parameter(name, value=value) for name, value in (given or {}).items()]

@@ -279,8 +279,7 @@ class DeviceNode(qos.QosWatch):
         if self._transforms is None:
             silent = "so that neither /tf nor /tf_static is published"
             fix = "install it with your ROS 2 distribution."
-            told = f"the message package tf2_msgs is not installed, {silent}; {fix}"
-            self.get_logger().warning(told)
+            self.get_logger().warning(f"the package tf2_msgs is not installed, {silent}; {fix}")
             return
         self._moving = self.create_publisher(self._transforms, "/tf", qos.TRANSFORMS)
         fixed = self.create_publisher(self._transforms, "/tf_static", qos.FIXED_TRANSFORMS)

@@ -40,7 +40,7 @@ class Episode:
     goal: Array  # (2,) [m]
     bodies: Array  # (K, 7) obstacles at the start, see `sim.scenes.Scene`
     reward: float  # sum over the episode
-    believed: str | None = None
+    believed: str | None = None  # by the robot itself, where `result` is by the truth
 
     @property
     def believed_success(self) -> bool:

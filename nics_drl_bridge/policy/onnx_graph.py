@@ -151,7 +151,6 @@ def check_wire(data: bytes) -> None:
 
 
 def _size_of(view: memoryview, start: int, end: int, wire: int) -> tuple[int, int]:
-    """Size of a field's content, and its start."""
     if wire == _BYTES:
         return _varint(view, start, end)
     if wire == _VARINT:
@@ -233,7 +232,6 @@ def _attributes(graph: Any) -> Iterator[Any]:
 
 
 def _tensors(graph: Any) -> Iterator[Any]:
-    """Yields every tensor of a graph: its weights, and constants in its nodes."""
     yield from graph.initializer
     for attribute in _attributes(graph):
         if attribute.HasField("t"):
@@ -315,7 +313,6 @@ def _integer_faults(model: Any, source: str) -> Iterator[Fault]:
 
 
 def _costs(model: Any, rows: int, source: str) -> tuple[int, int]:
-    """Output and work of all nodes for `rows` observations."""
     _, shapes = _sizes(model, rows, source, values=True)
     numbers = work = 0
     for node in model.graph.node:

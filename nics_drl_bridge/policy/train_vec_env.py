@@ -41,7 +41,7 @@ class TrainVecEnv(VecEnv):
         self._infos: list[dict[str, Any]] = [{} for _ in range(count)]
         self._ended: list[int] = []
         self._actions: NDArray[Any] = np.zeros(0)
-        self.stepping_s = 0.0
+        self.stepping_s = 0.0  # wall time in the envs [s]
 
     def reset(self) -> Observation:
         """Begins an episode in every world, with the seeds given to `seed`."""

@@ -1,8 +1,4 @@
-"""The machines of the three robots in MuJoCo: mass, friction, motors, and their MJCF.
-
-Tyres are ellipsoids: a round tread touches a plane in one point, and neither jumps from edge to
-edge, as a cylinder's contact does, nor scrubs when the robot turns.
-"""
+"""The three robots in MuJoCo as MJCF; tyres are ellipsoids, which neither jump nor scrub."""
 
 from __future__ import annotations
 
@@ -154,8 +150,7 @@ def _ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
     def measured(position: Array, speed: Array) -> Array:
         each = np.tan(position[2:])
         middle = each / (1.0 + half_ratio * np.array([1.0, -1.0]) * each)
-        steering = np.arctan(np.mean(middle))
-        return np.array([0.5 * radius * (speed[0] + speed[1]), steering])
+        return np.array([0.5 * radius * (speed[0] + speed[1]), np.arctan(np.mean(middle))])
 
     joints = ("rear_left", "rear_right", "steer_left", "steer_right")
     return Machine(xml, joints, controls, measured)

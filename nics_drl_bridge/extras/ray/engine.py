@@ -71,8 +71,7 @@ class Rollout:
         for t, n in sorted(self.final):
             cuts[n].append(t + 1)
         for n, ends in enumerate(cuts):
-            begins = [0, *ends]
-            for begin, end in zip(begins, [*ends, steps], strict=True):
+            for begin, end in zip([0, *ends], [*ends, steps], strict=True):
                 if begin < end:
                     yield self._piece(n, begin, end)
 
@@ -204,8 +203,7 @@ def connected(address: str | None, runners: int | None, worlds: int) -> Iterator
     except (OSError, OverflowError, ValueError, RuntimeError) as error:
         first = str(error).strip().partition("\n")[0].rstrip(".")
         fix = "start one on the first machine with 'ray start --head', and name its HOST:PORT."
-        reason = f"no Ray cluster answers ({first}); {fix}"
-        raise ConfigError(f"--address {address}: {reason}") from None
+        raise ConfigError(f"--address {address}: no Ray cluster answers ({first}); {fix}") from None
     try:
         yield _runners(runners, int(ray.cluster_resources().get("CPU", 0)), worlds)
     finally:
