@@ -1,7 +1,5 @@
 """Shared parts of the commands: options, one-sentence errors, a table, a progress bar."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The parts of the demo in sequence, and its report: one page with all results."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress

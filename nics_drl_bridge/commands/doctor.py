@@ -1,7 +1,5 @@
 """`nics doctor` and `nics replay`: what is wrong with a robot, and why its gate stopped it."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from pathlib import Path

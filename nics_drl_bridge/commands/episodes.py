@@ -1,7 +1,5 @@
 """The same episodes in process, over DDS, in MuJoCo, and on the vehicle, compared as in Fig. 7."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing

@@ -1,7 +1,5 @@
 """`nics evaluate`: in simulators, on a vehicle, or against what was driven in a bag."""
 
-from __future__ import annotations
-
 import json
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`nics record`, `nics generate` and `nics urdf`: from a robot to its model."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

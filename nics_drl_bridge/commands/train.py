@@ -1,7 +1,5 @@
 """`nics train` and `nics policy`."""
 
-from __future__ import annotations
-
 import json
 import math
 import shlex

@@ -1,7 +1,5 @@
 """`nics warmup`: compiles the kernels ahead, on two cores."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Callable

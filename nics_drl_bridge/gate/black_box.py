@@ -1,7 +1,5 @@
 """The black box: the last half minute of the gate, written at each stop, for replay."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

@@ -2,8 +2,6 @@
 # A lidar without noise may show the same between two long walls: an old scan is moved by odometry,
 # and only beams count whose length must have changed by now.
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

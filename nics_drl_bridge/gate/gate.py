@@ -1,7 +1,5 @@
 """The gate: a pure function from (time, state, input) to (state, decision), replayed to the bit."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from itertools import pairwise

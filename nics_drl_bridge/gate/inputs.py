@@ -1,7 +1,5 @@
 """Inputs of the gate: one frozen record for each message, call and tick of its clock."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

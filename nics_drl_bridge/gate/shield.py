@@ -4,8 +4,6 @@
 # scaled down, on its path, until no obstacle is swept (dynamic window of Fox, Burgard, Thrun 1997).
 # An obstacle may approach if it is where the robot saw free space a moment ago.
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Compiled: sweep of a round footprint along arcs, and obstacles where the view was free before."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

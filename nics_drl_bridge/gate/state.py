@@ -1,7 +1,5 @@
 """Configuration, state and decisions of the gate: frozen records, and `replace` for copies."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 

@@ -1,7 +1,5 @@
 """Stopping behaviour of a robot, and a check for settings with which it could never move."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 # that clock, the envelope, is that of the fastest data. Found before the gate is armed, it follows
 # at most the drift of real clocks: stamps that creep ahead or behind do not become the new normal.
 
-from __future__ import annotations
-
 import math
 
 from nics_drl_bridge.gate.inputs import Input, Tick

@@ -1,7 +1,5 @@
 """Textbook terms for inputs that a drive did not move. Opt-in only."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

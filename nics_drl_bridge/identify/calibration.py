@@ -1,7 +1,5 @@
 """Calibration: the relations of a drive's streams in time and space, and its alignment by them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Clocks: a drive's offset, latency and lags, each the shift that best explains it by commands."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any

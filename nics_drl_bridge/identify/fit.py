@@ -1,7 +1,5 @@
 """Eq. 1 and 2 on one page (Sec. IV-A): features, least squares, pruning, least squares again."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Literal

@@ -1,7 +1,5 @@
 """Identification of a model from a recording: the row of stages `STAGES` over a prepared drive."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar

@@ -1,7 +1,5 @@
 """Compiled sensitivities: end poses of known courses of X, and their derivatives."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

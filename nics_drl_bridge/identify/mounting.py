@@ -1,7 +1,5 @@
 """Mounting: position and rotation of the tracked body on the robot."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial

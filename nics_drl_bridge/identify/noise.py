@@ -1,7 +1,5 @@
 """Noise of the sensors, and the motion, over a second, that a model leaves unexplained."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Open-loop prediction: windows of a drive, and the poses that a model predicts at their ends."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

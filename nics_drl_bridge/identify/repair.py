@@ -1,7 +1,5 @@
 """Repair of a drive: drops repeated rows and jumps, clips commands; refuses units and axes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

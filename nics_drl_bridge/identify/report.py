@@ -1,7 +1,5 @@
 """Fit report: the model's equations, the quality of its fit, and what could not be learnt."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from textwrap import fill

@@ -1,7 +1,5 @@
 """Signals in time: held commands, the states that follow them, means, resampled poses, noise."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline

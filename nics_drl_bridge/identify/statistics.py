@@ -1,7 +1,5 @@
 """Statistics of least squares: minima, standard errors, significance, accuracy of more terms."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Verdict on a drive and its model: sentences on all that was found, quality, or a refusal."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from math import isfinite

@@ -1,7 +1,5 @@
 """Backends over ROS 2: one robot or several in lock-step with a simulator behind topics."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time

@@ -1,7 +1,5 @@
 """command_gate: passes the policy's commands on while they can be trusted."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import os

@@ -1,7 +1,5 @@
 """Conversion of messages to data and back, in pairs: `x_to_ros`, `x_from_ros`; types by name."""
 
-from __future__ import annotations
-
 import array
 import contextlib
 import math

@@ -1,7 +1,5 @@
 """Parameters of a device node: devices, frames, episodes, and the pace of world and topics."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Reports of `command_gate`: log lines, counters, and the black box. It never waits for a disk."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import os

@@ -1,7 +1,5 @@
 """Base of the managed nodes: configure, activate, deactivate, cleanup, shutdown."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Any

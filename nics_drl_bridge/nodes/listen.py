@@ -1,7 +1,5 @@
 """Collection of facts about a live robot, by listening, for `report.doctor`."""
 
-from __future__ import annotations
-
 import time
 from functools import partial
 from typing import Any

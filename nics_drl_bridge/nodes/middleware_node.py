@@ -1,7 +1,5 @@
 """middleware_node: caches a robot's topics and publishes the estimate of its state."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import partial

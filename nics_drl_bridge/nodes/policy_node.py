@@ -1,7 +1,5 @@
 """policy_node: runs a policy on a robot's topics."""
 
-from __future__ import annotations
-
 import math
 import time
 import traceback

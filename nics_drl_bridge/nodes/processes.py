@@ -1,7 +1,5 @@
 """Processes for the package's nodes, with a reliable end, and a witness of what they do."""
 
-from __future__ import annotations
-
 import ctypes
 import json
 import os

@@ -4,8 +4,6 @@ Reliable publishers match all subscribers, so this package publishes reliably, a
 effort wherever a lost message does no harm. Nothing is kept for late joiners: old data mislead.
 """
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

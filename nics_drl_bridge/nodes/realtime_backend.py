@@ -1,7 +1,5 @@
 """RealtimeBackend: a vehicle, or a simulator on the wall clock, as the same synchronous backend."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

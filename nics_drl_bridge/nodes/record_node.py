@@ -1,7 +1,5 @@
 """record_node: drives a robot so that it shows its whole motion, and records it."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections import defaultdict

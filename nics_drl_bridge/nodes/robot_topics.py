@@ -1,7 +1,5 @@
 """A robot's topics, fed into the middleware; shared by all listening nodes."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from functools import partial

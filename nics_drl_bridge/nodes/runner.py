@@ -1,7 +1,5 @@
 """All that every node needs: parameters, start, end, a single instance, and diagnostics."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import signal

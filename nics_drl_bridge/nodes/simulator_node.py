@@ -1,7 +1,5 @@
 """simulator_node: a simulator, the fast one or another, behind the topics of the hardware."""
 
-from __future__ import annotations
-
 import heapq
 import itertools
 import json

@@ -1,7 +1,5 @@
 """Entry points of the nodes: one sentence, not a traceback, where ROS 2 is missing."""
 
-from __future__ import annotations
-
 import signal
 import sys
 from functools import partial

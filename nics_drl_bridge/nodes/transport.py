@@ -8,8 +8,6 @@ it, which Fast DDS reads once in a process: the result is checked. A node that o
 there afterwards may have shared memory. Otherwise an environment variable is enough, and stays.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import sys

@@ -1,7 +1,5 @@
 """Scans, odometry and twists from and to their bytes: "plain CDR" of OMG DDS-XTypes 7.4.3."""
 
-from __future__ import annotations
-
 import math
 import struct
 import sys

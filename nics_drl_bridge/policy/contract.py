@@ -1,7 +1,5 @@
 """The contract of a policy file: its training, and the robot that it needs."""
 
-from __future__ import annotations
-
 import base64
 import dataclasses
 import json

@@ -1,7 +1,5 @@
 """Compiled search of the dynamic-window planner. Shapes: N robots, P parts of a scan, K twists."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

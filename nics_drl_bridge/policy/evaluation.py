@@ -1,7 +1,5 @@
 """Evaluation: drives episodes, judges them by the truth, and tallies the results."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Checks of a policy file's graph before anything of it runs: raw size, form, operators, work."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator

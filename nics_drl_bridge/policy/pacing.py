@@ -1,7 +1,5 @@
 """Pacing of a policy's actions, and inferences that take too long; times on a steady clock [s]."""
 
-from __future__ import annotations
-
 from enum import Enum
 
 

@@ -1,7 +1,5 @@
 """Policies by name: baselines that any trained policy must beat, a planner, and policy files."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable

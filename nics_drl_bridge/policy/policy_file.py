@@ -1,7 +1,5 @@
 """Policy files: one `.onnx` with network, normaliser, commands and contract; never unpickled."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Shadow mode: compares the commands of a policy with those of a recorded drive."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

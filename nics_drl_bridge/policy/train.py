@@ -1,7 +1,5 @@
 """Trains policies with Stable-Baselines3 on the vector env, seed after seed, and evaluates them."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import time

@@ -1,7 +1,5 @@
 """Checkpoints of a training, all that it needs to continue bit-identically; none is deployed."""
 
-from __future__ import annotations
-
 import io
 import json
 import time

@@ -1,7 +1,5 @@
 """From a trained network to a policy file: normaliser, network and commands in one graph."""
 
-from __future__ import annotations
-
 import io
 import warnings
 from collections.abc import Mapping

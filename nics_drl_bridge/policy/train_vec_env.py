@@ -1,7 +1,5 @@
 """The vector env as Stable-Baselines3's VecEnv, without a copy for each world."""
 
-from __future__ import annotations
-
 import itertools
 import time
 from collections.abc import Sequence

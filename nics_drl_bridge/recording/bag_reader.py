@@ -1,7 +1,5 @@
 """Reads a drive from a rosbag2 recording, SQLite or MCAP, without ROS."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Reader of a folder of CSV files: a car's drive under a motion-capture system."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

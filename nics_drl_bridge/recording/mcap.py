@@ -1,7 +1,5 @@
 """MCAP files: records parsed by the library `mcap`, and the checks that its readers leave out."""
 
-from __future__ import annotations
-
 import struct
 from collections import Counter
 from collections.abc import Iterator

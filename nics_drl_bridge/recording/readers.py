@@ -1,7 +1,5 @@
 """Readers of recordings: `FORMATS` recognises a recording and names the function that reads it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple

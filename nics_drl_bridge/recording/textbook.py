@@ -1,7 +1,5 @@
 """Drives of textbook robots, the source of synthetic recordings; see `robot.kinds`."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from nics_drl_bridge import geometry

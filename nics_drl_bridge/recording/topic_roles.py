@@ -1,7 +1,5 @@
 """TopicRoles: assignment of a robot's topics to command, pose, state and IMU."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass

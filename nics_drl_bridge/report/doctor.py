@@ -1,7 +1,5 @@
 """Checks of data received from a robot against a model; each yields a finding for each fault."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Facts about a robot, live or from a bag; expectations of the doctor, and its findings."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

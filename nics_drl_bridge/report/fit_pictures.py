@@ -1,7 +1,5 @@
 """Pictures of a fit (its data, predictions and terms) and of its calibration, each a PNG."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

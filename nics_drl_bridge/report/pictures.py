@@ -1,7 +1,5 @@
 """The HTML report in one file, and its pictures of trajectories, drives, trainings and policies."""
 
-from __future__ import annotations
-
 import base64
 import io
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """`nics bag record|info|replay|salvage`."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from functools import partial

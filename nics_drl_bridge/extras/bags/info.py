@@ -1,7 +1,5 @@
 """Contents of a bag: its topics with their message counts, rates and clocks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Bags over ROS 2: what a robot publishes is recorded as sent, and played back as recorded."""
 
-from __future__ import annotations
-
 import signal
 import threading
 import time

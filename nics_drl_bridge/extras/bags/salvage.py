@@ -1,7 +1,5 @@
 """Recovery of the intact messages of a damaged bag, with a count of the lost ones."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 import struct

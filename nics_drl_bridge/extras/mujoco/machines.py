@@ -1,7 +1,5 @@
 """The three robots in MuJoCo as MJCF; tyres are ellipsoids, which neither jump nor scrub."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """mujoco_node: robots in MuJoCo behind the topics of the hardware."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

@@ -1,7 +1,5 @@
 """A scene in MuJoCo: robots with bumpers, walls, map and obstacles, cut into convex parts."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Robots in MuJoCo: one on an infinite floor, or several in a world as in FastSimulator."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Training on a Ray cluster, or on one of this machine: RLlib's PPO, with the worlds spread out."""
 
-from __future__ import annotations
-
 import copy
 import functools
 import json
