@@ -7,6 +7,7 @@ the folders in which a kernel of your own lies.
 
 import gc
 import hashlib
+import math
 import os
 import re
 import sys
@@ -21,19 +22,23 @@ from llvmlite import binding as llvm
 from numba.core import event
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler, compile_result
+from numba.core.compiler import Compiler, Flags, compile_result
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 from numba.core.sigutils import normalize_signature
 
 PACKAGE = Path(__file__).parent
 PATIENCE_S = 2.0  # Compiling that takes longer is announced, on standard error
+REPEATED_S = 20.0  # it is announced again, as long as it takes
 SECONDS_EACH = 0.5  # typical for a kernel with what only it calls [s]
 KERNELS: list[Any] = []  # every kernel that was imported so far, as numba's dispatchers
 _IMPORT = re.compile(
     r"^[ \t]*(?:from[ \t]+([.\w]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)|import[ \t]+([^\n]*))",
     re.MULTILINE,
 )
+_DEFAULTS = {name: option.default for name, option in Flags.options.items()}
+# numba compares them half a million times, a twentieth of the time of compiling: the same in C.
+Flags.values = lambda flags: _DEFAULTS | flags._values
 _ALIAS = re.compile(r"\bas\s+\w+")
 
 
@@ -196,7 +201,8 @@ def imports_of(file: Path) -> tuple[Path, ...]:
     own = file.is_relative_to(PACKAGE)
     top = next(folder for folder in file.parents if not (folder / "__init__.py").is_file())
     found = list[Path]()
-    for origin, names, plain in _IMPORT.findall(_read(file)):
+    text = re.sub(r"#[^\n]*|\\\n", " ", _read(file))
+    for origin, names, plain in _IMPORT.findall(text):
         for module in re.findall(r"[.\w]+", _ALIAS.sub("", origin or plain)):
             name = module.lstrip(".")
             root = file.parents[len(module) - len(name) - 1] if name != module else top
@@ -217,7 +223,8 @@ class _Compiling(event.Listener):  # type: ignore[misc]
     def __init__(self) -> None:
         self.count = 0  # specialisations of kernels, and of what they call
         self.cpu_s = 0.0  # CPU time that compiling took
-        self.quiet = False  # True: nothing is to be said, or it has been
+        self.quiet = False  # True: nothing is to be said
+        self._told = -math.inf
         self._lock, self._depth, self._collects = threading.Lock(), 0, True
         self._begun = self._begun_cpu = self._spent = 0.0
 
@@ -229,8 +236,9 @@ class _Compiling(event.Listener):  # type: ignore[misc]
                 gc.disable()  # a tenth of the time, for next to no garbage
             self._depth += 1
             spent = self._spent + time.monotonic() - self._begun
-            if spent > PATIENCE_S and not self.quiet:
-                self.quiet = True
+            silent = time.monotonic() - self._told
+            if spent > PATIENCE_S and silent > REPEATED_S and not self.quiet:
+                self._told = time.monotonic()
                 left = sum(not each.is_warm for each in KERNELS)
                 seconds = left * SECONDS_EACH
                 sys.stderr.write(

@@ -20,7 +20,7 @@ def warmup(
     """Compiles what generating, training and driving need, on two cores, once on a machine."""
     with one_sentence():
         begin = time.monotonic()
-        typer.echo("compiling the kernels, once on this machine: about a minute", err=True)
+        typer.echo("compiling the kernels: about a minute, once on this machine", err=True)
         # Fresh processes: what a fork shares with its parent's threads may be locked for ever.
         with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
             *first, model = pool.submit(_compiled_by, _model).result()

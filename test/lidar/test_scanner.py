@@ -6,6 +6,7 @@ from lidar_scenes import POLYGONS, Scene, by_plane_geometry, random_scene, rando
 from robots import lidar
 
 from nics_drl_bridge.errors import ConfigError, ModelError
+from nics_drl_bridge.lidar import baked_kernels
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.scan_kernels import LANES
@@ -241,6 +242,21 @@ def test_a_world_of_more_bodies_than_lanes_is_the_minimum_of_its_parts_to_the_bi
     for part in (1, 7, LANES - 1, LANES, LANES + 1):
         pieces = [scanner.scan(robots, bodies[:, k : k + part]) for k in range(0, count, part)]
         assert np.array_equal(scanner.scan(robots, bodies), np.minimum.reduce(pieces))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("beams", [72, 720])
+def test_many_looked_up_at_once_are_each_looked_up_alone_to_the_bit(beams):
+    scanner = make_scanner(lidar(beams=beams), random_shapes(5), "baked")
+    rng, shapes = np.random.default_rng(beams), scanner.table.shapes
+    poses = rng.uniform(-1.0, 1.0, (20, 9, 3)) * [4.0, 4.0, np.pi]
+    bodies = scanner.place([shapes[k % len(shapes)] for k in range(9)], poses)
+    robots = rng.uniform(-1.0, 1.0, (20, 3))
+    walls, alone = np.array([[-3.0, -2.0, 3.0, -2.5]]), np.empty(beams, np.float32)
+    together = scanner.scan(robots, bodies, walls)
+    for robot, around, scan in zip(robots, bodies, together, strict=True):
+        baked_kernels.scan_robot(alone, robot, around, -1, walls, scanner.arguments)
+        assert alone.tobytes() == scan.tobytes()
 
 
 @pytest.mark.parametrize("renderer", RENDERERS)
