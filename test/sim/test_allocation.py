@@ -12,7 +12,7 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import load_world
 
-STEPS, STRETCHES, WARM_UP = 100, 3, 20
+STEPS, STRETCHES, WARM_UP = 100, 4, 20
 BOOKKEEPING = 20_000
 """Python's own objects that a step makes and drops, whatever the number of worlds [bytes]."""
 GROWTH = 2500
