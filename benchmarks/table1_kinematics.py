@@ -112,7 +112,8 @@ def batch(model: TaylorModel, dtype: type, robots: int, robot: Subject) -> tuple
     x[:-1] = rng.uniform(low[:, None], high[:, None], (len(low), robots))
     pose = np.zeros((6, robots), dtype)
     pose[2] = 1.0
-    terms = terms._replace(coefficient=terms.coefficient.astype(dtype))
+    each = np.repeat(terms.coefficient[:, None], robots, axis=1).astype(dtype)
+    terms = terms._replace(coefficient=each)
     dq = np.zeros((len(model.dofs), robots), dtype)
     return pose, x, dq, terms, kernels.SERIES.astype(dtype), dtype(model.dt)
 
