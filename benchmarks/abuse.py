@@ -15,6 +15,8 @@ from importlib import import_module
 from measuring.abuse import BARS, Score
 from measuring.verdict import answer, parser_of
 
+from nics_drl_bridge.kernels import COMPILING
+
 CONTROLS = {
     "credulous": "the checks of policies and of YAML",
     "no_guard": "what stops the robot when an exception leaves the env",
@@ -52,6 +54,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=100, help="of each campaign's sources")
     parser.add_argument("--only", choices=list(CAMPAIGNS), help="one campaign; by default both")
     given = parser.parse_args()
+    COMPILING.quiet = True  # that kernels are compiled is no part of a sentence
     chosen = given.only or OF_CONTROL.get(given.control or "")
     names = [chosen] if chosen else list(CAMPAIGNS)
     scores = {name: run(name, given.seed, given.rounds, given.control) for name in names}
