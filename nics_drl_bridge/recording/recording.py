@@ -38,10 +38,12 @@ class Stream:
     t: Array  # (T,) stamps [s], never decreasing
     values: Array  # (T, D)
     clock: str = "robot"
+    sigma: Array | None = None  # (T, D) standard deviations of the values, where they are known
 
     def rows(self, keep: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Stream:
         """Returns the rows selected by a mask (T,), indices or a slice."""
-        return replace(self, t=self.t[keep], values=self.values[keep])
+        sigma = None if self.sigma is None else self.sigma[keep]
+        return replace(self, t=self.t[keep], values=self.values[keep], sigma=sigma)
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,7 @@ class Recording:
     source: str = "recording"  # its origin, for reports and errors
     variables: tuple[str, ...] = ()  # names of X = [state, command] of the recorded robot, if known
     latency: Latency = field(default_factory=Latency)  # of scan and odometry, if it shows
+    repairs: tuple[str, ...] = ()  # a sentence on each thing that reading mended, as of its clocks
 
     @property
     def streams(self) -> dict[str, Stream]:

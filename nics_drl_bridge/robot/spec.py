@@ -25,7 +25,8 @@ from nics_drl_bridge.errors import ConfigError
 
 CmdVelField = Literal["linear.x", "linear.y", "angular.z"]
 CMD_VEL_FIELDS: tuple[CmdVelField, ...] = ("linear.x", "linear.y", "angular.z")
-POSE_RATES = ("vx", "vy", "wz")
+PoseRate = Literal["vx", "vy", "wz"]
+POSE_RATES: tuple[PoseRate, ...] = ("vx", "vy", "wz")
 POSE_UNITS = ("m/s", "m/s", "rad/s")
 TWIST_UNITS = dict(zip(CMD_VEL_FIELDS, POSE_UNITS, strict=True))
 # SI units of a state or a command; 1 for a ratio or a count.
@@ -71,9 +72,11 @@ class Variable(Schema):
 
 
 class StateVariable(Variable):
-    """A component of the state, and the command that it follows with a lag, if any."""
+    """A component of the state: measured, or `follows` a command with a lag, or of the `twist`."""
 
     follows: str | None = None
+    # the component of the body twist that it is: taken from the pose where nothing measures it
+    twist: PoseRate | None = None
 
 
 class CommandVariable(Variable):
