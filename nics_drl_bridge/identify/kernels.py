@@ -1,9 +1,12 @@
-"""Compiled sensitivities: end poses of known courses of X, and their derivatives."""
+"""Compiled sensitivities: poses at the ends of windows, and their derivatives by coefficients."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 
 SMALL_TURN = 0.3  # below this angle the series of sin(a)/a is exact to the last digits [rad]
@@ -17,7 +20,7 @@ def _product(row, factors, count):  # type: ignore[no-untyped-def]
     return value
 
 
-@kernel(allocates=True)
+@kernel
 def _sinc(half):  # type: ignore[no-untyped-def]
     if abs(half) > SMALL_TURN:
         return math.sin(half) / half
@@ -92,3 +95,135 @@ def follow(ends, moved, x, steps, share, terms, free, dt):  # type: ignore[no-un
         else:
             ends[w, 0], ends[w, 1], ends[w, 2] = px, py, heading
             moved[w] = now
+
+
+class Shot(NamedTuple):
+    """Windows to predict from their first states: inputs of `shoot`, and what it writes."""
+
+    state: Array  # (W, S) at the start
+    command: Array  # (W, T, C) during each step
+    limit: Array  # (S,) greatest absolute value of each state: beyond, a prediction diverges
+    end: Array  # (W, 3) pose at the end from that at the start; headings unwrapped
+    slope: Array  # (W, 3, P) its derivatives by the free coefficients
+
+
+class Tangent(NamedTuple):
+    """Scratch memory of a window: values now, and their derivatives by the free coefficients."""
+
+    x: Array  # (S + C + 1,) X and a last entry of 1
+    value: Array  # (K,) of each term without its coefficient
+    rate: Array  # (3 + S,)
+    jacobian: Array  # (3 + S, S) of the rates by the state
+    state: Array  # (S, P)
+    before: Array  # (S, P) a step earlier
+    twist: Array  # (3, P)
+    pose: Array  # (3, P)
+
+
+def tangent(states: int, commands: int, terms: int, free: int) -> Tangent:
+    """Returns scratch memory for `shoot`."""
+    shapes = ((states + commands + 1,), (terms,), (3 + states,), (3 + states, states),
+              (states, free), (states, free), (3, free), (3, free))  # fmt: skip
+    return Tangent(*map(np.zeros, shapes))
+
+
+@kernel
+def shoot(shot, terms, free, dt, scratch):  # type: ignore[no-untyped-def]
+    """Predicts windows of T steps of dt [s], and the derivatives by the `free` (P,) of `terms`."""
+    for w in range(shot.state.shape[0]):
+        _begin(shot.state[w], scratch)
+        x, y, heading = 0.0, 0.0, 0.0
+        for n in range(shot.command.shape[1]):
+            for c in range(shot.command.shape[2]):
+                scratch.x[shot.state.shape[1] + c] = shot.command[w, n, c]
+            _linearise(terms, scratch)
+            _follow_twist(terms, free, scratch)
+            turn = scratch.rate[2] * dt
+            along = dt * _sinc(turn / 2.0)
+            c, s = math.cos(heading + turn / 2.0), math.sin(heading + turn / 2.0)
+            dx = along * (c * scratch.rate[0] - s * scratch.rate[1])
+            dy = along * (s * scratch.rate[0] + c * scratch.rate[1])
+            _follow_pose(scratch, dx, dy, along * c, along * s, dt)
+            x, y, heading = x + dx, y + dy, heading + turn
+            _follow_state(terms, free, scratch, shot.limit, dt)
+        shot.end[w, 0], shot.end[w, 1], shot.end[w, 2] = x, y, heading
+        for d in range(3):
+            for p in range(free.shape[0]):
+                shot.slope[w, d, p] = scratch.pose[d, p]
+
+
+@kernel
+def _begin(state, scratch):  # type: ignore[no-untyped-def]
+    scratch.x[-1] = 1.0
+    for i in range(state.shape[0]):
+        scratch.x[i] = state[i]
+    scratch.state[:] = 0.0
+    scratch.pose[:] = 0.0
+
+
+@kernel
+def _linearise(terms, scratch):  # type: ignore[no-untyped-def]
+    """Computes the terms, the rates, and their derivatives by the state."""
+    states = scratch.state.shape[0]
+    scratch.rate[:] = 0.0
+    scratch.jacobian[:] = 0.0
+    for k in range(terms.dof.shape[0]):
+        d, coefficient, value = terms.dof[k], terms.coefficient[k], 1.0
+        for f in range(terms.degree[k]):
+            value *= scratch.x[terms.factors[k, f]]
+            if terms.factors[k, f] < states:
+                rest = coefficient
+                for other in range(terms.degree[k]):
+                    if other != f:
+                        rest *= scratch.x[terms.factors[k, other]]
+                scratch.jacobian[d, terms.factors[k, f]] += rest
+        scratch.value[k] = value
+        scratch.rate[d] += coefficient * value
+
+
+@kernel
+def _follow_twist(terms, free, scratch):  # type: ignore[no-untyped-def]
+    for d in range(3):
+        for p in range(free.shape[0]):
+            scratch.twist[d, p] = 0.0
+        for j in range(scratch.state.shape[0]):
+            slope = scratch.jacobian[d, j]
+            if slope != 0.0:
+                for p in range(free.shape[0]):
+                    scratch.twist[d, p] += slope * scratch.state[j, p]
+    for p in range(free.shape[0]):
+        if terms.dof[free[p]] < 3:
+            scratch.twist[terms.dof[free[p]], p] += scratch.value[free[p]]
+
+
+@kernel
+def _follow_pose(scratch, dx, dy, along_x, along_y, dt):  # type: ignore[no-untyped-def]
+    pose, twist = scratch.pose, scratch.twist
+    for p in range(pose.shape[1]):
+        lean = pose[2, p] + 0.5 * dt * twist[2, p]
+        pose[0, p] += along_x * twist[0, p] - along_y * twist[1, p] - lean * dy
+        pose[1, p] += along_y * twist[0, p] + along_x * twist[1, p] + lean * dx
+        pose[2, p] += dt * twist[2, p]
+
+
+@kernel
+def _follow_state(terms, free, scratch, limit, dt):  # type: ignore[no-untyped-def]
+    states, count, before = scratch.state.shape[0], scratch.state.shape[1], scratch.before
+    for i in range(states):
+        for p in range(count):
+            before[i, p] = scratch.state[i, p]
+    for i in range(states):
+        for j in range(states):
+            slope = dt * scratch.jacobian[3 + i, j]
+            if slope != 0.0:
+                for p in range(count):
+                    scratch.state[i, p] += slope * before[j, p]
+    for p in range(count):
+        if terms.dof[free[p]] >= 3:
+            scratch.state[terms.dof[free[p]] - 3, p] += dt * scratch.value[free[p]]
+    for i in range(states):
+        value = scratch.x[i] + dt * scratch.rate[3 + i]
+        if not abs(value) <= limit[i]:
+            value = limit[i] if value > 0.0 else -limit[i]
+            scratch.state[i] = 0.0
+        scratch.x[i] = value
