@@ -240,6 +240,11 @@ class RobotSpec(Schema):
         fields = [CMD_VEL_FIELDS.index(c.cmd_vel) for c in self.command if c.cmd_vel is not None]
         return np.array(fields, dtype=np.intp)
 
+    @property
+    def cmd_vel_places(self) -> tuple[int, ...]:
+        """Places (C,) of the commands in linear.x, linear.y, angular.z; ConfigError without."""
+        return tuple(self._cmd_vel_index.tolist())
+
     @cached_property
     def bicycle(self) -> Bicycle:
         """Geometry of a robot that steers. Raises ConfigError if its wheelbase is unknown."""
@@ -270,6 +275,10 @@ class RobotSpec(Schema):
         command = self.of_fields(np.stack([speed, twist[..., 1], angle], axis=-1))
         limits = np.array([(c.min, c.max) if c.steers else (-np.inf, np.inf) for c in self.command])
         return np.asarray(np.clip(command, *limits.T))
+
+    def require_cmd_vel(self) -> None:
+        """Raises ConfigError if a node can't drive it, since `to_cmd_vel` fails."""
+        self.to_cmd_vel(self.command_low)
 
     def of_fields(self, values: ArrayLike) -> NDArray[np.float64]:
         """Returns of values (..., 3), by field of `cmd_vel`, those of the commands (..., C)."""
