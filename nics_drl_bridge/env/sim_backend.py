@@ -50,7 +50,7 @@ class SimBackend:
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
         """Moves the robots by one control period; see `interface.Backend`."""
         data = self.simulator.data
-        if self._middlewares:
+        if self._middlewares and self._robot.takes_cmd_vel:
             # Via cmd_vel, as over ROS 2, so that both round alike.
             command = self._robot.from_cmd_vel(self._robot.to_cmd_vel(command))
         commands = command.reshape(data.pose.shape[1], -1)
