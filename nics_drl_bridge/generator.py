@@ -184,6 +184,8 @@ def load_model(folder: str | Path) -> SimulatorModel:
         reason = f"key 'format' is {data.get('format')!r}, not {FORMAT!r}"
         raise ModelError(f"{path}: {reason}; generate the model anew.")
     files.check_sums(folder, MODEL_FILES, editable=MODEL_FILE)
+    if isinstance(data.get("robot"), dict):  # files without the key are older than its default
+        data["robot"].setdefault("angular_is", "steering")
     file = validate(data, _File, str(path))
     for key in fields(Calibration):  # its defaults are those of a robot that needs none
         if key.name not in data["calibration"]:

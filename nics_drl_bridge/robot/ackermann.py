@@ -3,25 +3,19 @@
 Commanded are the rear axle's speed [m/s] and the steering angle [rad] of a virtual middle wheel.
 """
 
-import numpy as np
-from numpy.typing import NDArray
-
 from nics_drl_bridge.robot.drivetrain import steered, steering_angle
 from nics_drl_bridge.robot.kinds import Drawing, Pivot, RobotKind, Textbook, Wheel
 from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.steering import Bicycle
+from nics_drl_bridge.robot.template import STEERED, STEERED_LAGS, STEERED_STATE, Template, names_of
 
-Array = NDArray[np.float64]
+LENGTHS = {"wheelbase": 1.3}
+TEMPLATE = Template((STEERED,), (), STEERED_STATE, STEERED_LAGS, LENGTHS)
 
 
 def kinematics(spec: RobotSpec) -> Textbook:
     """Curvature tan(angle) / wheelbase."""
-    wheelbase = spec.parameters["wheelbase"]
-
-    def twist(speed: Array, angle: Array) -> Array:
-        turn = speed * np.tan(angle) / wheelbase
-        return np.stack([speed, np.zeros_like(speed), turn], axis=-1)
-
-    return steered(spec, twist)
+    return steered(spec, Bicycle(spec.parameters["wheelbase"]), names_of(STEERED))
 
 
 def track_and_radius(parameters: dict[str, float]) -> tuple[float, float]:
@@ -36,10 +30,10 @@ def drawing(spec: RobotSpec) -> Drawing:
     track, radius = track_and_radius(spec.parameters)
     wheels = []
     for side, y, suffix in (("left", 0.5 * track, ""), ("right", -0.5 * track, "_right")):
-        pivot = Pivot(f"{side}_knuckle", angle.name + suffix, angle)
+        pivot = Pivot(f"{side}_knuckle", angle.name + suffix, angle) if angle else None
         wheels.append(Wheel(f"rear_{side}_wheel", (0.0, y), radius))
         wheels.append(Wheel(f"front_{side}_wheel", (wheelbase, y), radius, pivot=pivot))
     return Drawing((1.3 * wheelbase, 0.7 * track), (0.45 * wheelbase, radius), tuple(wheels))
 
 
-KIND = RobotKind(kinematics, drawing)
+KIND = RobotKind(kinematics, drawing, TEMPLATE)

@@ -6,8 +6,11 @@ Its commands are the base's forward speed [m/s] and turn rate [rad/s].
 import numpy as np
 
 from nics_drl_bridge.robot.drivetrain import wheeled
-from nics_drl_bridge.robot.kinds import Drawing, RobotKind, Textbook, Wheel
+from nics_drl_bridge.robot.kinds import Drawing, RobotKind, Textbook, wheels_at
 from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.template import LAGS, TWIST, WHEELS, Template, names_of
+
+MOVES, LENGTHS = ("vx", "wz"), {"track": 1.4, "wheel_radius": 0.3}
 
 
 def kinematics(spec: RobotSpec) -> Textbook:
@@ -16,17 +19,15 @@ def kinematics(spec: RobotSpec) -> Textbook:
     inverse = np.array([[1, -p["track"] / 2], [1, p["track"] / 2]]) / p["wheel_radius"]
     forward = np.zeros((3, 2))
     forward[[0, 2]] = np.linalg.inv(inverse)
-    return wheeled(spec, inverse, forward, ("linear.x", "angular.z"), ("vx", "wz"))
+    return wheeled(spec, inverse, forward, ("vx", "wz"), names_of(WHEELS))
 
 
 def drawing(spec: RobotSpec) -> Drawing:
     """A disc between two wheels."""
     track, radius = spec.parameters["track"], spec.parameters["wheel_radius"]
-    wheels = tuple(
-        Wheel(variable.name, (0.0, y), radius, turns=True)
-        for variable, y in zip(spec.state, (0.5 * track, -0.5 * track), strict=True)
-    )
+    places = ((0.0, 0.5 * track), (0.0, -0.5 * track))
+    wheels = wheels_at(spec, places, radius, names_of(WHEELS))
     return Drawing(0.4 * track, (0.0, radius), wheels)
 
 
-KIND = RobotKind(kinematics, drawing)
+KIND = RobotKind(kinematics, drawing, Template((TWIST,), MOVES, (), LAGS, LENGTHS))

@@ -1,69 +1,103 @@
 """Drive trains of which textbook kinematics are made: wheels on a base, and a steered axle.
 
-Commands are identified by their field of `cmd_vel`, speed and steering angle in the state by their
-units. An actuator is of first order (parameters `wheel_lag`, `speed_lag`, `steering_lag` [s]) or
-rate-limited (`wheel_rate`, `speed_rate`, `steering_rate` [its unit/s]). Siegwart, Nourbakhsh,
-Scaramuzza: Introduction to Autonomous Mobile Robots, ch. 3; the paper's reference for Table I.
+Commands are identified by their field of `cmd_vel`, without any by their name, else by their place;
+speed and steering angle in the state by their units. An actuator is of first order (parameters
+`wheel_lag`, `speed_lag`, `steering_lag` [s]) or rate-limited (`wheel_rate`, `speed_rate`,
+`steering_rate` [its unit/s]). Siegwart, Nourbakhsh, Scaramuzza: Introduction to Autonomous Mobile
+Robots, ch. 3; the paper's reference for Table I.
 """
-
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot.kinds import Textbook
-from nics_drl_bridge.robot.spec import POSE_RATES, CmdVelField, RobotSpec, StateVariable
+from nics_drl_bridge.robot.spec import (
+    CMD_VEL_FIELDS,
+    POSE_RATES,
+    CmdVelField,
+    RobotSpec,
+    StateVariable,
+)
+from nics_drl_bridge.robot.steering import Bicycle
 
 Array = NDArray[np.float64]
 
 
-def steered(spec: RobotSpec, twist: Callable[[Array, Array], Array]) -> Textbook:
+def steered(
+    spec: RobotSpec, geometry: Bicycle, names: tuple[str, ...], gain: tuple[float, float] = (1, 1)
+) -> Textbook:
     """Builds the kinematics of a robot that is driven by a speed and a steering angle.
 
-    Both are its state and its commands, in any order; its turn rate is, to second order, a multiple
-    of their product. `twist` is (..., 3) for speeds [m/s] and angles [rad] (...).
+    Both are its actuators, and the `gain` times its commands, in any order; its turn rate is, to
+    second order, a multiple of their product. `names` are usual ones of the commands.
     """
     v, phi = _states(spec)
-    command, order = _commands(spec, ("linear.x", "angular.z")), np.argsort([v, phi])
-    names = [spec.state[i].name for i in (v, phi)]
+    command = _commands(spec, ("linear.x", "angular.z"), names)
+    order = np.argsort([v, phi])
+    speed, angle = (spec.state[i].name if _own_state(spec) else names[i] for i in (v, phi))
     lag, rate = _actuators(spec.parameters, ("speed", "steering"))
     return Textbook(
-        twist=lambda state: twist(state[..., v], state[..., phi]),
-        target=lambda given: given[..., command][..., order], lag=lag[order], rate=rate[order],
-        structure={"vx": (names[0],), "vy": (), "wz": ("*".join(names),)},
+        twist=lambda state: geometry.twist(state[..., v], state[..., phi]),
+        target=lambda given: (given[..., command] * gain)[..., order],
+        lag=lag[order], rate=rate[order],
+        structure={"vx": (speed,), "vy": (), "wz": (f"{speed}*{angle}",)},
+        command=lambda twist: _placed(
+            spec, command, np.stack(geometry.command(twist), axis=-1) / gain
+        ),
     )  # fmt: skip
 
 
-def steering_angle(spec: RobotSpec) -> StateVariable:
-    """Returns the state variable of the steering angle of a robot that is `steered`."""
-    return spec.state[_states(spec)[1]]
+def steering_angle(spec: RobotSpec) -> StateVariable | None:
+    """Returns the state variable of the steering angle of a robot that is `steered`, if any."""
+    return spec.state[_states(spec)[1]] if _own_state(spec) else None
 
 
 def wheeled(
-    spec: RobotSpec, inverse: Array, forward: Array, fields: tuple[CmdVelField, ...],
-    moves: tuple[str, ...],
+    spec: RobotSpec, inverse: Array, forward: Array, moves: tuple[str, ...],
+    wheels: tuple[str, ...], slip: float = 1.0,
 ) -> Textbook:  # fmt: skip
-    """Builds the kinematics of a robot whose twist is linear in its wheel speeds, its state.
+    """Builds the kinematics of a robot whose twist is linear in its wheel speeds, its actuators.
 
-    `inverse` (S, C) gives wheel speeds per command, in the order of `fields`; `forward` (3, S) the
-    body twist per wheel speed. The wheels can move the degrees of freedom `moves`.
+    `inverse` (W, M) gives wheel speeds per component of the twist that the wheels can move, by name
+    in `moves`; `forward` (3, W) the body twist per wheel speed, whose turn rate slips by a factor.
+    It is commanded by its twist, else by its wheel speeds, with the usual names `wheels`.
     """
-    if len(spec.state) != len(inverse):
+    if _own_state(spec) and len(spec.state) != len(inverse):
         needed = f"have {len(inverse)} wheels as state, not {len(spec.state)} variables"
         raise _unfit(spec, f"{needed}; correct `state:`.")
-    command = _commands(spec, fields)
-    names = tuple(v.name for v in spec.state)
+    dofs = [POSE_RATES.index(dof) for dof in moves]
+    fields = tuple(CMD_VEL_FIELDS[dof] for dof in dofs)
+    by_wheels = all(c.unit == "rad/s" and not c.is_twist for c in spec.command)
+    command = _commands(spec, () if by_wheels else fields, wheels if by_wheels else ())
+    into = np.eye(len(inverse)) if by_wheels else inverse
+    if len(command) != into.shape[1]:
+        raise _unfit(spec, f"need {into.shape[1]} commands, not {len(command)}; correct them.")
+    undone = inverse if by_wheels else np.eye(len(dofs))
+    slipping = np.array([1.0, 1.0, slip])
+    out = forward * slipping[:, None]
+    names = tuple(v.name for v in spec.state) if _own_state(spec) else wheels
     lag, rate = _actuators(spec.parameters, ("wheel",) * len(inverse))
     return Textbook(
-        twist=lambda state: state @ forward.T, target=lambda given: given[..., command] @ inverse.T,
+        twist=lambda state: state @ out.T, target=lambda given: given[..., command] @ into.T,
         lag=lag, rate=rate, structure={dof: names if dof in moves else () for dof in POSE_RATES},
+        command=lambda twist: _placed(spec, command, (twist / slipping)[..., dofs] @ undone.T),
     )  # fmt: skip
 
 
-def _commands(spec: RobotSpec, fields: tuple[CmdVelField, ...]) -> list[int]:
+def _own_state(spec: RobotSpec) -> bool:
+    """True if the state consists of actuators."""
+    return any(v.twist is None for v in spec.state)
+
+
+def _commands(
+    spec: RobotSpec, fields: tuple[CmdVelField, ...], names: tuple[str, ...]
+) -> list[int]:
     have = [c.cmd_vel for c in spec.command]
     if not any(have):
+        called = [c.name for c in spec.command]
+        if names and set(names) == set(called):
+            return [called.index(name) for name in names]
         return list(range(len(have)))
     for field in fields:
         if field not in have:
@@ -71,11 +105,20 @@ def _commands(spec: RobotSpec, fields: tuple[CmdVelField, ...]) -> list[int]:
     return [have.index(field) for field in fields]
 
 
+def _placed(spec: RobotSpec, places: list[int], values: Array) -> Array:
+    """Returns commands (..., C) with values at places, else 0."""
+    command = np.zeros((*values.shape[:-1], len(spec.command)))
+    command[..., places] = values
+    return command
+
+
 def _unfit(spec: RobotSpec, reason: str) -> ConfigError:
     return ConfigError(f"robot {spec.name!r}: the {spec.textbook} kinematics {reason}")
 
 
 def _states(spec: RobotSpec) -> tuple[int, int]:
+    if not _own_state(spec):
+        return 0, 1
     have = [v.unit for v in spec.state]
     if sorted(have) != ["m/s", "rad"]:
         given = ", ".join(have) or "nothing"

@@ -1,14 +1,15 @@
 """Kinds of robots: textbook kinematics and a drawing for each; `spec` finds them by name."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.robot.spec import RobotSpec, StateVariable, find_kind, kind_names
+from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec, StateVariable, find_kind, kind_names
+from nics_drl_bridge.robot.template import Template
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
@@ -23,6 +24,12 @@ class Textbook:
     lag: Array  # (S,) time constants of first-order actuators [s]
     rate: Array  # (S,) of rate-limited actuators [its unit/s]; inf for first-order ones
     structure: dict[str, tuple[str, ...]]  # possible products of states, by component of the twist
+    # gives the command (..., C), maybe out of range, that leads to a twist (..., 3), if known
+    command: Callable[[Array], Array] | None = None
+
+    def steady(self, command: Array) -> Array:
+        """Returns the body twist (..., 3) to which commands (..., C) lead when they are held."""
+        return self.twist(self.target(command))
 
     def respond(self, state: Array, goal: Array, t: Array | float) -> Array:
         """Returns the exact state (..., S) at time t [s] on its way from `state` to `goal`."""
@@ -65,17 +72,66 @@ class Drawing:
     wheels: tuple[Wheel, ...]
 
 
+def wheels_at(
+    spec: RobotSpec, places: Sequence[tuple[float, float]], radius: float, names: tuple[str, ...]
+) -> tuple[Wheel, ...]:
+    """Returns wheels at places; those of a state of as many wheels turn by its variables."""
+    if turns := bool(spec.state) and all(v.unit == "rad/s" and v.twist is None for v in spec.state):
+        names = tuple(v.name for v in spec.state)
+    both = zip(names, places, strict=True)
+    return tuple(Wheel(name, place, radius, turns=turns) for name, place in both)
+
+
 @dataclass(frozen=True)
 class RobotKind:
     """A kind of robot. Both functions raise KeyError for a parameter that the spec lacks."""
 
-    kinematics: Callable[[RobotSpec], Textbook]
+    kinematics: Callable[[RobotSpec], Textbook]  # of its actuators, whatever the state is
     drawing: Callable[[RobotSpec], Drawing]
+    template: Template = field(default_factory=Template)
+    sideways: bool = False  # True if it is driven sideways by commands other than a twist's
+    slips: bool = False  # True if it moves otherwise than the twist that is commanded
+    front_drive: bool = False  # True if the speed is that of the steered wheel
 
 
 def textbook(spec: RobotSpec) -> Textbook:
     """Returns a robot's textbook kinematics; ConfigError if its spec names none or does not fit."""
+    book = actuated(spec)
+    if spec.state and all(v.twist is not None for v in spec.state):
+        return _through_lags(spec, book)
+    if len(spec.state) != len(book.lag):
+        have = ", ".join(v.name for v in spec.state) or "none"
+        needed = f"the {spec.textbook} kinematics need a state of {len(book.lag)} actuators"
+        fix = "correct `state:`, or leave it to the kind"
+        raise ConfigError(f"robot {spec.name!r}: {needed}, not {have}; {fix}.")
+    return book
+
+
+def actuated(spec: RobotSpec) -> Textbook:
+    """Returns the textbook kinematics of a robot's actuators; ConfigError as `textbook`."""
     return _made(spec, lambda kind: kind.kinematics(spec))
+
+
+def _through_lags(spec: RobotSpec, book: Textbook) -> Textbook:
+    """Returns the kinematics of a robot whose state is its twist, behind lags of its actuators."""
+    # Speeds take the lag of the first actuator, the turn rate that of the last, as of a steering.
+    dofs = [POSE_RATES.index(v.twist) for v in spec.state if v.twist is not None]
+    if book.limited.any():
+        fault = "a rate limit of an actuator needs the actuators as state"
+        raise ConfigError(f"robot {spec.name!r}: {fault}; give lags, or correct `state:`.")
+    usual = [float(book.lag[-1 if dof == 2 else 0]) for dof in dofs]
+    named = zip(spec.state, usual, strict=True)
+    lag = np.array([spec.parameters.get(f"{v.name}_lag", one) for v, one in named])
+
+    def twist(state: Array) -> Array:
+        whole = np.zeros((*state.shape[:-1], 3))
+        whole[..., dofs] = state
+        return whole
+
+    names: dict[str, tuple[str, ...]] = dict.fromkeys(POSE_RATES, ())
+    names |= {str(v.twist): (v.name,) for v in spec.state}
+    target = lambda command: book.steady(command)[..., dofs]  # noqa: E731
+    return Textbook(twist, target, lag, np.full(len(lag), np.inf), names, book.command)
 
 
 def drawing(spec: RobotSpec) -> Drawing:
@@ -106,12 +162,41 @@ def require_textbook(spec: RobotSpec) -> str:
 def steady_twist(spec: RobotSpec, command: ArrayLike) -> Array:
     """Returns the body twist (..., 3) to which commands (..., C) lead when they are held.
 
-    Raises ConfigError if it steers, and neither its kinematics nor its wheelbase is known.
+    Raises ConfigError if neither kinematics nor wheelbase of a robot are known that needs them.
     """
-    if spec.steers and spec.textbook is not None:
-        book = textbook(spec)
-        return book.twist(book.target(np.asarray(command, dtype=np.float64)))
-    twist = spec.to_cmd_vel(command)
-    if spec.steers:
-        twist[..., 2] = twist[..., 0] * np.tan(twist[..., 2]) / spec.wheelbase
-    return twist
+    if commands_twist(spec):
+        return spec.to_cmd_vel(command)
+    if spec.textbook is None and spec.steers:
+        return _by_turn_rate(spec).to_cmd_vel(command)
+    return actuated(spec).steady(np.asarray(command, dtype=np.float64))
+
+
+def command_for(spec: RobotSpec, twist: ArrayLike) -> Array:
+    """Returns the command (..., C) within its limits that leads to a body twist (..., 3), if any.
+
+    A car that is to turn on the spot stands. Raises ConfigError as `steady_twist`.
+    """
+    twist = np.asarray(twist, dtype=np.float64)
+    if commands_twist(spec):
+        command = spec.from_cmd_vel(twist)
+    elif spec.textbook is None and spec.steers:
+        command = _by_turn_rate(spec).from_cmd_vel(twist)
+    else:
+        book = actuated(spec)
+        if book.command is None:
+            fault = f"which command leads to a twist is not known of a {spec.textbook}"
+            raise ConfigError(f"robot {spec.name!r}: {fault}; use continuous actions, no planner.")
+        command = book.command(twist)
+    return np.clip(command, spec.command_low, spec.command_high)
+
+
+def _by_turn_rate(spec: RobotSpec) -> RobotSpec:
+    return spec.model_copy(update={"angular_is": "turn_rate"})
+
+
+def commands_twist(spec: RobotSpec) -> bool:
+    """True if a robot's commands are the components of its body twist, but for their lags."""
+    if not all(command.is_twist for command in spec.command):
+        return False
+    kind = None if spec.textbook is None else find_kind(spec.textbook)
+    return not getattr(kind, "slips", False)

@@ -7,8 +7,15 @@ Its commands are the body twist: speeds forward and to the left [m/s], and the t
 import numpy as np
 
 from nics_drl_bridge.robot.drivetrain import wheeled
-from nics_drl_bridge.robot.kinds import Drawing, RobotKind, Textbook, Wheel
-from nics_drl_bridge.robot.spec import CMD_VEL_FIELDS, POSE_RATES, RobotSpec
+from nics_drl_bridge.robot.kinds import Drawing, RobotKind, Textbook, wheels_at
+from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
+from nics_drl_bridge.robot.template import FOUR_WHEELS, LAGS, SIDEWAYS, TWIST, Template, names_of
+
+TEMPLATE = Template(
+    commands=((TWIST[0], SIDEWAYS, TWIST[1]), FOUR_WHEELS), moves=POSE_RATES,
+    lengths={"half_length": 0.6, "half_width": 0.6, "wheel_radius": 0.3},
+    parameters=LAGS,
+)  # fmt: skip
 
 
 def kinematics(spec: RobotSpec) -> Textbook:
@@ -17,7 +24,7 @@ def kinematics(spec: RobotSpec) -> Textbook:
     arm = p["half_length"] + p["half_width"]
     inverse = np.array([[1, -1, -arm], [1, 1, arm], [1, 1, -arm], [1, -1, arm]]) / p["wheel_radius"]
     forward = np.asarray(np.linalg.pinv(inverse), dtype=np.float64)
-    return wheeled(spec, inverse, forward, CMD_VEL_FIELDS, POSE_RATES)
+    return wheeled(spec, inverse, forward, POSE_RATES, names_of(FOUR_WHEELS))
 
 
 def drawing(spec: RobotSpec) -> Drawing:
@@ -25,11 +32,8 @@ def drawing(spec: RobotSpec) -> Drawing:
     p = spec.parameters
     length, width, radius = p["half_length"], p["half_width"], p["wheel_radius"]
     places = ((length, width), (length, -width), (-length, width), (-length, -width))
-    wheels = tuple(
-        Wheel(variable.name, place, radius, turns=True)
-        for variable, place in zip(spec.state, places, strict=True)
-    )
+    wheels = wheels_at(spec, places, radius, names_of(FOUR_WHEELS))
     return Drawing((2.0 * length + radius, 1.4 * width), (0.0, radius), wheels)
 
 
-KIND = RobotKind(kinematics, drawing)
+KIND = RobotKind(kinematics, drawing, TEMPLATE, sideways=True)

@@ -7,6 +7,7 @@ YAML files. Other packages add kinds by entry points of the group `nics_drl_brid
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from contextlib import suppress
 from functools import cached_property
 from importlib import import_module
@@ -20,14 +21,17 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, field_validator, model_validator
 
 from nics_drl_bridge import extensions
-from nics_drl_bridge.config import Schema, find_config, load_yaml
-from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.config import Schema, find_config, parse_yaml, read_text, validate
+from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.robot.steering import Bicycle
+from nics_drl_bridge.robot.template import Ranges
 
 CmdVelField = Literal["linear.x", "linear.y", "angular.z"]
 CMD_VEL_FIELDS: tuple[CmdVelField, ...] = ("linear.x", "linear.y", "angular.z")
 PoseRate = Literal["vx", "vy", "wz"]
 POSE_RATES: tuple[PoseRate, ...] = ("vx", "vy", "wz")
 POSE_UNITS = ("m/s", "m/s", "rad/s")
+DOF_UNITS = dict(zip(POSE_RATES, POSE_UNITS, strict=True))
 TWIST_UNITS = dict(zip(CMD_VEL_FIELDS, POSE_UNITS, strict=True))
 # SI units of a state or a command; 1 for a ratio or a count.
 Unit = Literal["m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N*m", "V", "A", "1"]
@@ -108,6 +112,10 @@ class RobotSpec(Schema):
     # its kind: textbook kinematics, to make recordings, or to assume what a drive did not show
     textbook: str | None = None
     parameters: dict[str, float] = Field(default_factory=dict)  # [m, s], see the module of its kind
+    assumed: tuple[str, ...] = ()  # parameters that its kind guessed from the size of the footprint
+    # meaning of `angular.z` for a robot that steers: a turn rate [rad/s], as in any Twist, or the
+    # steering angle [rad] itself
+    angular_is: Literal["turn_rate", "steering"] = "turn_rate"
     # of a circle around `base_link` [m]; optional with a `footprint`, which it then circumscribes
     footprint_radius: float = Field(ge=1e-3, le=1e3)
     # corners of a polygon instead, in `base_link` [m], in either direction
@@ -127,14 +135,8 @@ class RobotSpec(Schema):
 
     @model_validator(mode="before")
     @classmethod
-    def _circumscribed(cls, data: Any) -> Any:
-        outline = data.get("footprint") if isinstance(data, dict) else None
-        if outline is None or "footprint_radius" in data:
-            return data
-        with suppress(OverflowError, TypeError, ValueError):  # the field's own check reports it
-            if len(outline) <= MOST_CORNERS:
-                data = data | {"footprint_radius": _reach(outline)}
-        return data
+    def _with_radius(cls, data: Any) -> Any:
+        return _circumscribed(data) if isinstance(data, dict) else data
 
     @model_validator(mode="after")
     def _consistent(self) -> RobotSpec:
@@ -156,6 +158,14 @@ class RobotSpec(Schema):
         fields = [c.cmd_vel for c in self.command if c.cmd_vel is not None]
         if len(set(fields)) != len(fields):
             raise ValueError("two commands share one field of cmd_vel")
+        twists = [v.twist for v in self.state if v.twist is not None]
+        if len(set(twists)) != len(twists):
+            raise ValueError("two states are the same component of the twist")
+        for v in self.state:
+            if v.twist is not None and v.unit != (unit := DOF_UNITS[v.twist]):
+                raise ValueError(
+                    f"state {v.name!r} is {v.twist} of the twist, so its unit is {unit}"
+                )
         return self
 
     @property
@@ -185,14 +195,27 @@ class RobotSpec(Schema):
 
     @property
     def moves_sideways(self) -> bool:
-        """True if a sideways speed is commanded."""
-        return any(command.cmd_vel == "linear.y" for command in self.command)
+        """True if it can be driven sideways."""
+        fields = [command.cmd_vel for command in self.command]
+        if any(fields) or self.textbook is None:
+            return "linear.y" in fields
+        return bool(getattr(find_kind(self.textbook), "sideways", False))
+
+    @property
+    def takes_cmd_vel(self) -> bool:
+        """True if every command is a field of `cmd_vel`, which nodes need."""
+        return all(command.cmd_vel is not None for command in self.command)
+
+    @property
+    def takes_turn_rate(self) -> bool:
+        """True if `angular.z` is a turn rate for a robot that is commanded a steering angle."""
+        return self.steers and self.angular_is == "turn_rate"
 
     @property
     def wheelbase(self) -> float:
         """Distance between the axles of a robot that steers [m]. Raises ConfigError if unknown."""
         wheelbase = self.parameters.get("wheelbase", 0.0)
-        if not wheelbase > 0.0:
+        if not wheelbase > 0.0 or "wheelbase" in self.assumed:
             fix = "add `wheelbase:` [m] to the `parameters:` of its YAML file."
             raise ConfigError(f"robot {self.name!r} steers, and its wheelbase is not known; {fix}")
         return wheelbase
@@ -209,22 +232,58 @@ class RobotSpec(Schema):
 
     @cached_property
     def _cmd_vel_index(self) -> NDArray[np.intp]:
-        fields = [c.cmd_vel for c in self.command if c.cmd_vel is not None]
-        if len(fields) < len(self.command):
-            reason = "a command names no field of cmd_vel; add `cmd_vel:` to it."
-            raise ConfigError(f"robot {self.name!r}: {reason}")
-        return np.array([CMD_VEL_FIELDS.index(field) for field in fields], dtype=np.intp)
+        for command in self.command:
+            if command.cmd_vel is None:
+                reason = f"the command {command.name!r} names no field of cmd_vel"
+                fix = "add `cmd_vel:` to it, or drive it in process, without ROS 2"
+                raise ConfigError(f"robot {self.name!r}: {reason}; {fix}.")
+        fields = [CMD_VEL_FIELDS.index(c.cmd_vel) for c in self.command if c.cmd_vel is not None]
+        return np.array(fields, dtype=np.intp)
+
+    @cached_property
+    def bicycle(self) -> Bicycle:
+        """Geometry of a robot that steers. Raises ConfigError if its wheelbase is unknown."""
+        kind = None if self.textbook is None else find_kind(self.textbook)
+        return Bicycle(self.wheelbase, getattr(kind, "front_drive", False))
 
     def to_cmd_vel(self, command: ArrayLike) -> NDArray[np.float64]:
-        """Converts a command (..., C) to `cmd_vel` (..., 3): linear.x, linear.y, angular.z."""
+        """Converts a command (..., C) to `cmd_vel` (..., 3): linear.x, linear.y, angular.z.
+
+        Raises ConfigError if a command has no field, or a robot steers with an unknown wheelbase.
+        """
         command = np.asarray(command, dtype=np.float64)
         twist = np.zeros((*command.shape[:-1], 3))
         twist[..., self._cmd_vel_index] = command
+        if self.takes_turn_rate:
+            return self.bicycle.twist(twist[..., 0], twist[..., 2])
         return twist
 
     def from_cmd_vel(self, twist: ArrayLike) -> NDArray[np.float64]:
-        """Converts `cmd_vel` (..., 3) to a command (..., C); unused fields are dropped."""
-        return np.asarray(twist, dtype=np.float64)[..., self._cmd_vel_index]
+        """Converts `cmd_vel` (..., 3) to a command (..., C); unused fields are dropped.
+
+        A steering angle follows from speed and turn rate, within its limits; at rest it is 0.
+        """
+        twist = np.asarray(twist, dtype=np.float64)
+        if not self.takes_turn_rate:
+            return self.of_fields(twist)
+        speed, angle = self.bicycle.command(twist)
+        command = self.of_fields(np.stack([speed, twist[..., 1], angle], axis=-1))
+        limits = np.array([(c.min, c.max) if c.steers else (-np.inf, np.inf) for c in self.command])
+        return np.asarray(np.clip(command, *limits.T))
+
+    def of_fields(self, values: ArrayLike) -> NDArray[np.float64]:
+        """Returns of values (..., 3), by field of `cmd_vel`, those of the commands (..., C)."""
+        return np.asarray(values, dtype=np.float64)[..., self._cmd_vel_index]
+
+
+def _circumscribed(data: dict[str, Any]) -> dict[str, Any]:
+    outline = data.get("footprint")
+    if outline is None or "footprint_radius" in data:
+        return data
+    with suppress(OverflowError, TypeError, ValueError):  # the field's own check reports it
+        if len(outline) <= MOST_CORNERS:
+            data = data | {"footprint_radius": _reach(outline)}
+    return data
 
 
 def _reach(outline: ArrayLike) -> float:
@@ -255,4 +314,32 @@ def _edges_cross(corners: NDArray[np.float64]) -> bool:
 
 def load_robot(name: str | Path) -> RobotSpec:
     """Loads a shipped robot by name (`ackermann`), or any robot by the path of its YAML file."""
-    return load_yaml(find_config(name, "robots"), RobotSpec)
+    return robot_from(name)
+
+
+def robot_from(given: str | Path | Mapping[str, Any], ranges: Ranges | None = None) -> RobotSpec:
+    """Makes a robot of a shipped one's name, the path of a YAML file, or the content of such a one.
+
+    With a `kind` instead of `textbook`, all that the kind knows may be left out: names, units and
+    ranges of commands, state and parameters. `ranges` (least, greatest) of recorded commands, by
+    name, are theirs unless given. Raises ConfigError.
+    """
+    if isinstance(given, Mapping):
+        source, data = "robot", dict(given)
+    else:
+        path = find_config(given, "robots")
+        source, data = str(path), parse_yaml(read_text(path), str(path))
+    if "kind" in data:
+        data = _of_kind(data, ranges or {}, source)
+    return validate(data, RobotSpec, source)
+
+
+def _of_kind(data: dict[str, Any], ranges: Ranges, source: str) -> dict[str, Any]:
+    kind = find_kind(str(data["kind"]))
+    if kind is None:
+        hint = nearest(str(data["kind"]), kind_names())
+        raise ConfigError(f"{source}: key 'kind': there is no {data['kind']!r}; {hint}")
+    if "textbook" in data:
+        raise ConfigError(f"{source}: has a `kind` and a `textbook`; remove one of them.")
+    filled: dict[str, Any] = kind.template.filled(_circumscribed(data), ranges)
+    return filled

@@ -3,32 +3,28 @@
 Its commands are the front wheel's speed along its own direction [m/s] and steering angle [rad].
 """
 
-import numpy as np
-from numpy.typing import NDArray
-
 from nics_drl_bridge.robot.drivetrain import steered, steering_angle
 from nics_drl_bridge.robot.kinds import Drawing, Pivot, RobotKind, Textbook, Wheel
 from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.steering import Bicycle
+from nics_drl_bridge.robot.template import STEERED, STEERED_LAGS, STEERED_STATE, Template, names_of
 
-Array = NDArray[np.float64]
+TEMPLATE = Template(
+    commands=(STEERED,), state=STEERED_STATE, parameters=STEERED_LAGS,
+    lengths={"wheelbase": 1.0, "track": 0.8, "wheel_radius": 0.2},
+)  # fmt: skip
 
 
 def kinematics(spec: RobotSpec) -> Textbook:
     """The front wheel pulls forward by its cosine, and turns the base by its sine."""
-    wheelbase = spec.parameters["wheelbase"]
-
-    def twist(speed: Array, angle: Array) -> Array:
-        forward, turn = speed * np.cos(angle), speed * np.sin(angle) / wheelbase
-        return np.stack([forward, np.zeros_like(speed), turn], axis=-1)
-
-    return steered(spec, twist)
+    return steered(spec, Bicycle(spec.parameters["wheelbase"], front_drive=True), names_of(STEERED))
 
 
 def drawing(spec: RobotSpec) -> Drawing:
     """A box on three wheels of one size."""
     p, angle = spec.parameters, steering_angle(spec)
     wheelbase, track, radius = p["wheelbase"], p["track"], p["wheel_radius"]
-    fork = Pivot("fork", angle.name, angle)
+    fork = Pivot("fork", angle.name, angle) if angle else None
     wheels = (
         Wheel("rear_left_wheel", (0.0, 0.5 * track), radius),
         Wheel("rear_right_wheel", (0.0, -0.5 * track), radius),
@@ -37,4 +33,4 @@ def drawing(spec: RobotSpec) -> Drawing:
     return Drawing((wheelbase, 0.7 * track), (0.4 * wheelbase, 1.5 * radius), wheels)
 
 
-KIND = RobotKind(kinematics, drawing)
+KIND = RobotKind(kinematics, drawing, TEMPLATE, front_drive=True)

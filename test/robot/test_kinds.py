@@ -27,10 +27,12 @@ from nics_drl_bridge.robot.urdf import urdf_of
 PACKAGE = Path(__file__).resolve().parents[2] / "nics_drl_bridge"
 NEW = "tricycle"
 SHIPPED = ("ackermann", "differential", "mecanum", NEW)
+MADE = ("ackermann_throttle", "differential_wheels", "free", "omnidirectional", "skid_steer")
+KINDS = sorted((*SHIPPED, *MADE))
 
 
 def test_the_kinds_are_the_modules_that_define_one():
-    assert kind_names() == sorted(SHIPPED)
+    assert kind_names() == KINDS
     assert find_kind("spec") is find_kind("a tank") is find_kind("..") is None
 
 
@@ -155,7 +157,7 @@ def test_an_unknown_kind_is_refused_with_all_that_there_are():
     data = load_robot(NEW).model_dump() | {"textbook": "tank"}
     with pytest.raises(ConfigError) as caught:
         validate(data, RobotSpec, "tank.yaml")
-    known = ", ".join(sorted(SHIPPED))
+    known = ", ".join(KINDS)
     assert str(caught.value) == f"tank.yaml: key 'textbook': must be one of {known}, not 'tank'."
 
 

@@ -1,0 +1,40 @@
+"""A robot whose wheels or tracks on either side turn alike, so that it skids when it turns.
+
+Its commands are its body twist, or the speeds of both sides [rad/s]. It turns by the distance
+`effective_track` between the centres about which its sides turn, greater than its `track` [m], by
+which its drive makes wheel speeds of a turn rate (Mandow et al. 2007).
+"""
+
+import numpy as np
+
+from nics_drl_bridge.robot.drivetrain import wheeled
+from nics_drl_bridge.robot.kinds import Drawing, RobotKind, Textbook, Wheel
+from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
+from nics_drl_bridge.robot.template import LAGS, TWIST, WHEELS, Template, names_of
+
+TEMPLATE = Template(
+    commands=(TWIST, WHEELS), moves=POSE_RATES, parameters=LAGS,
+    lengths={"track": 1.3, "effective_track": 2.0, "wheel_radius": 0.3},
+)  # fmt: skip
+
+
+def kinematics(spec: RobotSpec) -> Textbook:
+    """A differential robot's kinematics, of which the effective track takes a share."""
+    p = spec.parameters
+    inverse = np.array([[1, -p["track"] / 2], [1, p["track"] / 2]]) / p["wheel_radius"]
+    forward = np.zeros((3, 2))
+    forward[[0, 2]] = np.linalg.inv(inverse)
+    slip = p["track"] / p["effective_track"]
+    return wheeled(spec, inverse, forward, ("vx", "wz"), names_of(WHEELS), slip)
+
+
+def drawing(spec: RobotSpec) -> Drawing:
+    """A box on four wheels, which stand still."""
+    y, radius = spec.parameters["track"] / 2.0, spec.parameters["wheel_radius"]
+    places = {(end, side): (x, s * y) for end, x in (("front", y), ("rear", -y))
+              for side, s in (("left", 1.0), ("right", -1.0))}  # fmt: skip
+    wheels = (Wheel(f"{end}_{side}_wheel", at, radius) for (end, side), at in places.items())
+    return Drawing((2.0 * (y + radius), 1.6 * y), (0.0, 1.2 * radius), tuple(wheels))
+
+
+KIND = RobotKind(kinematics, drawing, TEMPLATE, slips=True)
