@@ -106,7 +106,7 @@ def _annotations_of(model: Any) -> dict[Any, Any]:
     if is_dataclass(model):
         return dict(get_type_hints(model))
     fields: dict[str, Any] = getattr(model, "model_fields", {})
-    return {name: field.annotation for name, field in fields.items()}
+    return {field.alias or name: field.annotation for name, field in fields.items()}
 
 
 def _inner_models(annotation: Any) -> list[type]:

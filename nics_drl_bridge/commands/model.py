@@ -1,9 +1,9 @@
-"""`nics record`, `nics generate` and `nics urdf`: from a robot to its model."""
+"""`nics record`, `nics import`, `nics generate` and `nics urdf`: from a robot to its model."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer import Argument, Option
@@ -11,6 +11,9 @@ from typer import Argument, Option
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands.console import RobotOption, intact, needs_ros, one_sentence
 from nics_drl_bridge.errors import BackendError, ConfigError
+
+if TYPE_CHECKING:
+    from nics_drl_bridge.recording.recording import Recording
 
 
 def record(
@@ -101,10 +104,49 @@ def drive_summary(recording: Any, given: dict[str, Any]) -> tuple[str, ...]:
     )
 
 
+def import_(
+    source: Annotated[Path, Argument(help="A bag, a table, or a folder of tables.")],
+    mapping: Annotated[Path, Option("--map", help="YAML: what is what, docs/recordings.md.")],
+    out: Annotated[Path, Option(help="The .npz file to write.")],
+) -> None:
+    """Keeps a recording of any form as an .npz, after the repairs that its mapping needs."""
+    with one_sentence():
+        from nics_drl_bridge.recording.readers import read_recording
+        from nics_drl_bridge.recording.recording import save_recording
+        from nics_drl_bridge.recording.write import check_out
+
+        if check_out(out).suffix != ".npz":
+            raise ConfigError(f"--out {out}: must end in .npz.")
+        drive = read_recording(source, mapping=mapping)
+        save_recording(drive, out)
+        for line in stream_lines(drive):
+            typer.echo(line)
+        typer.echo(f"recording written to {out}")
+
+
+def stream_lines(drive: "Recording") -> list[str]:
+    """Returns a line for each stream of a recording, and for each thing that was mended."""
+    rows = [
+        (
+            name, f"{len(s.t)}", f"{(len(s.t) - 1) / max(s.t[-1] - s.t[0], 1e-9):.1f} Hz",
+            f"{s.t[0]:.2f} to {s.t[-1]:.2f} s", s.clock,
+        )
+        for name, s in drive.streams.items()
+    ]  # fmt: skip
+    heads = ("stream", "rows", "rate", "time", "clock")
+    return [console.table(heads, rows), *drive.repairs]
+
+
 def generate(
-    recording: Annotated[Path, Argument(help="A rosbag2, .npz recording or folder of CSV files.")],
+    recording: Annotated[Path, Argument(help="A bag, an .npz recording, or tables with a --map.")],
     out: Annotated[Path, Option(help="Folder of the model to write.")],
-    robot: RobotOption = "ackermann",
+    robot: Annotated[
+        str | None, Option(help="A shipped robot or a YAML file; else the map's, else ackermann.")
+    ] = None,
+    mapping: Annotated[
+        Path | None,
+        Option("--map", help="YAML: what is what in the recording, docs/recordings.md."),
+    ] = None,
     topics: console.TopicsOption = None,
     topic: console.TopicOption = None,
     world: console.WorldOption = "arena",
@@ -131,17 +173,17 @@ def generate(
         from nics_drl_bridge.identify.fit import parse_alpha
         from nics_drl_bridge.lidar.sensor import load_sensor
         from nics_drl_bridge.lidar.spec import load_lidar
-        from nics_drl_bridge.recording.readers import read_recording
+        from nics_drl_bridge.recording.readers import robot_and_drive
         from nics_drl_bridge.recording.topic_roles import topic_roles
-        from nics_drl_bridge.robot.spec import load_robot
         from nics_drl_bridge.sim.world import load_world
 
         check_place(out)
-        spec, first, threshold = load_robot(robot), load_lidar(lidar), parse_alpha(alpha)
+        first, threshold = load_lidar(lidar), parse_alpha(alpha)
         further = tuple(load_sensor(file) for file in sensor or ())
         shapes = load_world(world).shapes
         with intact(recording, salvage) as whole:
-            drive = read_recording(whole, spec, topic_roles(topics, topic or ()))
+            roles = topic_roles(topics, topic or ())
+            spec, drive = robot_and_drive(whole, robot, roles, mapping)
         drive = replace(drive, source=str(recording))
         model, identified = generate_model(
             drive, spec, first, shapes, order, threshold, assume_textbook, strict, anyway, further

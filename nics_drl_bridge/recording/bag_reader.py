@@ -44,7 +44,7 @@ def load_bag(path: str | Path, spec: RobotSpec | None, mapping: TopicRoles) -> R
         if "imu" in topics:
             data["imu"] = _table(bag, topics["imu"], msgs.imu_row)
         latency = latency_of(bag, topics.get("odom"))
-    made = streams(data, mapping.stamps, str(path))
+    made: Any = streams(data, mapping.stamps, str(path))
     recording = Recording(**made, source=str(path), variables=spec.variable_names, latency=latency)
     return check(recording, spec)
 

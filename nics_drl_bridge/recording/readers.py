@@ -1,18 +1,32 @@
 """Readers of recordings: `FORMATS` recognises a recording and names the function that reads it."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from nics_drl_bridge.errors import RecordingError
+import numpy as np
+
+from nics_drl_bridge.config import validate
+from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.recording.bag_file import is_bag
 from nics_drl_bridge.recording.bag_reader import load_bag
 from nics_drl_bridge.recording.csv_folder import load_csv_folder
-from nics_drl_bridge.recording.recording import Recording, load_recording
+from nics_drl_bridge.recording.mapped import read_mapped
+from nics_drl_bridge.recording.mapping import Mapping, load_mapping
+from nics_drl_bridge.recording.recording import (
+    Recording,
+    Stream,
+    check,
+    is_recording,
+    load_recording,
+)
+from nics_drl_bridge.recording.sources import open_source
 from nics_drl_bridge.recording.topic_roles import TopicRoles
-from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot import spec as robots
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
-ROS_1 = ".bag"
+DEFAULT_ROBOT = "ackermann"
 
 
 class Format(NamedTuple):
@@ -33,10 +47,18 @@ FORMATS = (
 
 
 def read_recording(
-    path: str | Path, spec: RobotSpec | None = None, topics: TopicRoles | None = None
+    path: str | Path,
+    spec: RobotSpec | None = None,
+    topics: TopicRoles | None = None,
+    mapping: Mapping | str | Path | None = None,
 ) -> Recording:
-    """Reads any of `FORMATS`, a bag with its robot; RecordingError: missing, or unreadable."""
+    """Reads any recording by a mapping or its file, else one of `FORMATS`, a bag with its robot.
+
+    RecordingError, ConfigError: it is missing or unreadable, or does not fit robot or mapping.
+    """
     path, topics = Path(path), topics or TopicRoles()
+    if mapping is not None and not is_recording(path):
+        return _by_mapping(path, spec, topics, mapping)
     found = next((each for each in FORMATS if each.recognises(path)), None)
     if topics != TopicRoles() and not (found and found.has_topics):
         advice = "leave out --topics and --topic, which are for bags only"
@@ -45,8 +67,69 @@ def read_recording(
         return found.read(path, spec, topics)
     if not path.exists():
         raise RecordingError(f"{path}: no such file or folder; check the path.")
-    if path.suffix == ROS_1:
-        command = f"rosbags-convert --src {path.name} --dst {path.stem}"
-        raise RecordingError(f"{path}: is a bag of ROS 1; make a rosbag2 of it with `{command}`.")
     names = " nor ".join(each.name for each in FORMATS)
-    raise RecordingError(f"{path}: is neither {names}; give one of these.")
+    advice = (
+        f"say what is what in it with --map; `nics inspect {path.name} --map my.yaml` begins one"
+    )
+    raise RecordingError(f"{path}: is neither {names}; {advice}.")
+
+
+def _by_mapping(
+    path: Path, spec: RobotSpec | None, topics: TopicRoles, mapping: Mapping | str | Path
+) -> Recording:
+    if topics != TopicRoles():
+        raise ConfigError("--topics and --topic do not go with --map; name the topics in the map.")
+    given = mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
+    recording = read_mapped(open_source(path), given)
+    return recording if spec is None else arranged(recording, spec)
+
+
+def robot_and_drive(
+    path: Path, robot: str | None, topics: TopicRoles, mapping: str | Path | None
+) -> tuple[RobotSpec, Recording]:
+    """Reads a drive with its robot: the one that is named, or the mapping's, or a shipped car."""
+    if robot is None and mapping is not None:
+        given = load_mapping(mapping)
+        drive = read_recording(path, None, topics, given)
+        spec = robot_of(given, drive)
+        return spec, arranged(drive, spec)
+    spec = load_robot(robot or DEFAULT_ROBOT)
+    return spec, read_recording(path, spec, topics, mapping)
+
+
+def robot_of(mapping: Mapping | str | Path, recording: Recording) -> RobotSpec:
+    """Returns the robot of a mapping, whose commands reach as far as in its recording."""
+    given = mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
+    if given.robot is None:
+        raise ConfigError("the mapping names no robot; add `robot:` to it, or give --robot.")
+    names = recording.variables[-recording.command.values.shape[1] :]
+    low, high = (f(recording.command.values, axis=0) for f in (np.min, np.max))
+    ranges = {name: (float(a), float(b)) for name, a, b in zip(names, low, high, strict=True)}
+    robot_from: Callable[..., RobotSpec] | None = getattr(robots, "robot_from", None)
+    if robot_from is not None:
+        return robot_from(given.robot, ranges)
+    if isinstance(given.robot, str):
+        return load_robot(given.robot)
+    return validate(given.robot, RobotSpec, "robot")
+
+
+def arranged(recording: Recording, spec: RobotSpec) -> Recording:
+    """Returns a recording in the order of a robot's variables; ConfigError if they differ."""
+    count = recording.command.values.shape[1]
+    made: dict[str, Any] = {}
+    known = {"command": recording.variables[-count:], "state": recording.variables[:-count]}
+    wanted = {
+        "command": tuple(v.name for v in spec.command),
+        "state": tuple(v.name for v in spec.state),
+    }
+    for part, names in wanted.items():
+        stream: Stream | None = getattr(recording, part)
+        if stream is None:
+            continue
+        if set(known[part]) != set(names):
+            fault = f"{recording.source}: the {part} is {', '.join(known[part])}"
+            other = f"that of the robot {spec.name!r} {', '.join(names)}"
+            raise ConfigError(f"{fault}, {other}; use the robot's names in the mapping.")
+        order = [known[part].index(name) for name in names]
+        made[part] = replace(stream, values=stream.values[:, order])
+    return check(replace(recording, **made, variables=spec.variable_names), spec)

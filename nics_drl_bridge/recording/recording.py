@@ -16,17 +16,15 @@ from nics_drl_bridge import files, geometry
 from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.recording.plausible import implausible_pose
 from nics_drl_bridge.robot.noise import Latency
 from nics_drl_bridge.robot.spec import RobotSpec
 
-FORMAT = "nics_drl_bridge/recording/3"
+FORMAT = "nics_drl_bridge/recording/4"
+PLAIN_FORMAT = "nics_drl_bridge/recording/3"  # without deviations and repairs
 COMMENT_FORMAT = "nics_drl_bridge/recording/2"  # checksum in the comment of the archive
-UNSEALED_FORMAT = "nics_drl_bridge/recording/1"  # without checksum; both can still be read
+UNSEALED_FORMAT = "nics_drl_bridge/recording/1"  # without checksum; all three can still be read
 STREAMS = ("command", "pose", "state", "wheels", "imu", "odometry")
-LARGEST_TURN = 1.5  # a larger turn between neighbouring samples [rad] is implausible,
-TOO_FAST = 20.0  # and so is a speed of more than this many times the greatest command
-SPEED_OVER_S = 0.5
-SLOWEST_SAMPLING_S = 2.0
 IRREGULAR = 0.5  # share of the median by which a step differs if it is a gap or a repetition
 JITTER, ROUNDING_S = 1e-4, 1e-6  # steps that differ by less are equally long, but for rounding
 
@@ -105,38 +103,28 @@ def samples_on_one_clock(t: Array, pose: Array, state: Array, command: Array) ->
 
 def check(recording: Recording, spec: RobotSpec) -> Recording:
     """Returns a recording that a robot can use; else RecordingError names place and fault."""
-    if recording.variables and recording.variables != spec.variable_names:
+    names, known = spec.variable_names, recording.variables
+    if recording.state is None:  # then only the order of the commands matters
+        count = len(spec.command)
+        names, known = names[-count:], known[-count:]
+    if known and known != names:
         problem = f"{recording.source}: is a drive of a robot with {', '.join(recording.variables)}"
         advice = f"the robot {spec.name!r} has {', '.join(spec.variable_names)}"
         raise RecordingError(f"{problem}; {advice}: choose the robot that drove.")
     width = {"command": len(spec.command), "state": len(spec.state), "wheels": 2}
-    for name, stream in recording.streams.items():
-        if fault := _fault(stream, width.get(name, 3)):
-            raise RecordingError(f"{recording.source}: {name}: {fault}.")
-    if fault := _wrong_unit(recording.pose, spec):
-        raise RecordingError(f"{recording.source}: pose: {fault}.")
+    check_streams(recording, width)
+    speeds = [v for v in spec.command if v.unit == "m/s"]
+    fastest = max((max(abs(v.min), abs(v.max)) for v in speeds), default=np.inf)
+    if fault := implausible_pose(recording.pose.t, recording.pose.values, fastest):
+        raise RecordingError(f"{recording.source}: pose: {fault.reason}; {fault.cause}.")
     return recording
 
 
-def _wrong_unit(pose: Stream, spec: RobotSpec) -> str:
-    """Tells of a pose that only degrees, millimetres or milliseconds can explain."""
-    turn = np.percentile(np.abs(geometry.wrap_angle(np.diff(pose.values[:, 2]))), 95)
-    if turn > LARGEST_TURN:
-        reason = f"the heading jumps by {turn:.1f} rad between neighbouring samples"
-        return f"{reason}; it must be in radians (degrees look like this)"
-    speeds = [v for v in spec.command if v.unit == "m/s"]
-    fastest = max((max(abs(v.min), abs(v.max)) for v in speeds), default=np.inf)
-    every = np.unique(np.searchsorted(pose.t, np.arange(pose.t[0], pose.t[-1], SPEED_OVER_S)))
-    step, took = np.diff(pose.values[every, :2], axis=0), np.diff(pose.t[every])
-    speed = np.percentile(np.hypot(*step.T) / np.maximum(took, 1e-9), 90) if len(took) else 0.0
-    if speed > TOO_FAST * fastest:
-        reason = f"moves at {speed:.3g} m/s, a robot whose commands end at {fastest:g} m/s"
-        return f"{reason}; positions must be in metres and stamps in seconds"
-    span = np.median(np.diff(pose.t))
-    if span > SLOWEST_SAMPLING_S:
-        reason = f"there are {span:.3g} s between samples"
-        return f"{reason}; stamps must be in seconds (milliseconds look like this)"
-    return ""
+def check_streams(recording: Recording, width: dict[str, int]) -> None:
+    """Refuses streams of other than `width` columns (3 by default), with NaN, or out of order."""
+    for name, stream in recording.streams.items():
+        if fault := _fault(stream, width.get(name, 3)):
+            raise RecordingError(f"{recording.source}: {name}: {fault}.")
 
 
 def _fault(stream: Stream, width: int) -> str:
@@ -155,16 +143,19 @@ def _fault(stream: Stream, width: int) -> str:
 
 
 def save_recording(recording: Recording, path: str | Path) -> None:
-    """Writes `.npz`: `NAME_t`, `NAME` per stream, JSON `meta`; a checksum follows the archive."""
+    """Writes `.npz`: `NAME_t`, `NAME`, `NAME_sigma` per stream, JSON `meta`; then a checksum."""
     streams = recording.streams
     arrays: dict[str, NDArray[Any]] = {}
     for name, stream in streams.items():
         arrays[f"{name}_t"], arrays[name] = stream.t, stream.values
+        if stream.sigma is not None:
+            arrays[f"{name}_sigma"] = stream.sigma
     meta = {
         "format": FORMAT,
         "source": recording.source,
         "clocks": {name: stream.clock for name, stream in streams.items()},
         "variables": recording.variables,
+        "repairs": recording.repairs,
     }
     if recording.latency.measured:
         meta["latency"] = recording.latency.model_dump(mode="json")
@@ -180,20 +171,19 @@ def load_recording(path: str | Path) -> Recording:
         arrays = _arrays(data)
         meta = json.loads(str(arrays["meta"]))
         version = meta["format"]
-        if version == FORMAT:
+        if version in (FORMAT, PLAIN_FORMAT):
             files.check_sealed(io.BytesIO(data))
         elif version == COMMENT_FORMAT and data[-64:] != files.sha256(data[:-64]).encode():
             raise ValueError("its checksum is missing or does not fit the rest")
-        if version not in (FORMAT, COMMENT_FORMAT, UNSEALED_FORMAT):
+        if version not in (FORMAT, PLAIN_FORMAT, COMMENT_FORMAT, UNSEALED_FORMAT):
             advice = "record it anew or use the version of the package that wrote it"
             raise RecordingError(f"{path}: format {version!r} is not {FORMAT!r}; {advice}.")
-        streams = {
-            name: Stream(arrays[f"{name}_t"].astype(float), arrays[name].astype(float), clock)
-            for name, clock in meta["clocks"].items()
-        }
+        streams = {name: _stream(arrays, name, clock) for name, clock in meta["clocks"].items()}
         latency = Latency.model_validate(meta.get("latency", {}))
-        variables = tuple(meta["variables"])
-        return Recording(**streams, source=str(path), variables=variables, latency=latency)
+        variables, repairs = tuple(meta["variables"]), tuple(meta.get("repairs", ()))
+        return Recording(
+            **streams, source=str(path), variables=variables, latency=latency, repairs=repairs
+        )
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file; check the path.") from None
     except (AttributeError, KeyError, RecursionError, TypeError) as error:
@@ -203,6 +193,21 @@ def load_recording(path: str | Path) -> Recording:
     except (ValueError, OSError) as error:
         why = f"can't be read as .npz ({error}); it may be damaged"
         raise RecordingError(f"{path}: {why}.") from None
+
+
+def is_recording(path: Path) -> bool:
+    """True for a file that `save_recording` wrote."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return "meta" in arrays.files and "pose_t" in arrays.files
+    except Exception:  # noqa: BLE001 - any other file breaks numpy in any way
+        return False
+
+
+def _stream(arrays: dict[str, NDArray[Any]], name: str, clock: str) -> Stream:
+    sigma = arrays.get(f"{name}_sigma")
+    t, values = arrays[f"{name}_t"].astype(float), arrays[name].astype(float)
+    return Stream(t, values, clock, None if sigma is None else sigma.astype(float))
 
 
 def _arrays(data: bytes) -> dict[str, NDArray[Any]]:

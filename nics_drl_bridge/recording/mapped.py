@@ -1,0 +1,206 @@
+"""Reads the streams of a recording of any form as its mapping says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping as Names
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from nics_drl_bridge.errors import ConfigError, RecordingError
+from nics_drl_bridge.geometry import Array, wrap_angle
+from nics_drl_bridge.recording import stamps
+from nics_drl_bridge.recording.mapping import (
+    COVARIANCES,
+    SI,
+    Mapping,
+    Measured,
+    PoseSource,
+    Reference,
+    Value,
+)
+from nics_drl_bridge.recording.plausible import implausible_pose
+from nics_drl_bridge.recording.recording import Recording, Stream, check_streams
+from nics_drl_bridge.recording.table import Source
+from nics_drl_bridge.recording.units import UNITS
+from nics_drl_bridge.recording.values import MappedReader, Series, together, unit_of
+
+QUATERNION_TOLERANCE = 0.05
+MOST_UNTRACKED = 0.05  # share of poses whose quaternion is zero: the tracker had lost the body
+NO_LENGTH = 1e-9
+
+
+def read_mapped(source: Source, mapping: Mapping) -> Recording:
+    """Reads the streams of a mapping; ConfigError, RecordingError: what is missing or wrong."""
+    reader = MappedReader(source, mapping)
+    found: dict[str, Stream] = {"pose": read_pose(reader, mapping.pose)}
+    groups: Names[str, Names[str, Value]] = {"command": mapping.command, "state": mapping.state}
+    for name, values in groups.items():
+        if values:
+            held = name == "command"
+            parts = [reader.series(f"{name}.{k}", v, None, held) for k, v in values.items()]
+            found[name] = together(name, parts, held)
+    for name in ("wheels", "imu", "odometry"):
+        if (stream := getattr(mapping, name)) is not None:
+            found[name] = _measured(reader, name, stream)
+    for name, stream in found.items():
+        keep, note = stamps.not_repeated(stream.t, stream.values, name)
+        reader.say(note)
+        found[name] = stream.rows(keep)
+    found = _from_zero(found, mapping.clock, reader)
+    names = (*mapping.state, *mapping.command)
+    streams: Any = found
+    made = Recording(**streams, source=source.place, variables=names, repairs=tuple(reader.notes))
+    check_streams(made, {"command": len(mapping.command), "state": len(mapping.state), "wheels": 2})
+    if fault := implausible_pose(made.pose.t, made.pose.values, np.inf):
+        line = fault.line.replace("...", str(mapping.time and mapping.time.from_))
+        said = f"{source.place}: pose: {fault.reason}; {fault.cause}"
+        raise RecordingError(f"{said}: write `{line}` into the mapping, below `pose:`.")
+    return made
+
+
+def _measured(reader: MappedReader, name: str, stream: Measured) -> Stream:
+    """Reads a stream of measurements; values that it lacks are zero."""
+    parts: list[Series | None] = []
+    for key, kinds in SI[name].items():
+        value: Value | None = getattr(stream, key)
+        if value is not None and value.unit is not None and unit_of(value).si not in kinds:
+            fault = f"{name}.{key}: is in {unit_of(value).si}"
+            raise ConfigError(f"{fault}, where {' or '.join(kinds)} is needed; check its unit.")
+        parts.append(reader.series(f"{name}.{key}", value, stream, False) if value else None)
+    known = [part for part in parts if part is not None]
+    joined = together(name, known, held=False)
+    columns = iter(joined.values.T)
+    full = [np.zeros(len(joined.t)) if part is None else next(columns) for part in parts]
+    return replace(joined, values=np.stack(full, axis=1))
+
+
+def read_pose(reader: MappedReader, pose: PoseSource) -> Stream:
+    """Reads poses, with their deviations where a covariance is mapped."""
+    if pose.x is None:
+        pose = _of_message(reader, pose)
+    lengths, angles = UNITS[pose.unit].factor, UNITS[pose.heading_unit].factor
+    parts, factors = [], []
+    for key, kinds in SI["pose"].items():
+        value: Value | None = getattr(pose, key)
+        if value is None:
+            parts.append(_heading(reader, pose, pose.quaternion or ""))
+            factors.append(1.0)
+            continue
+        unit = value.unit or (pose.heading_unit if key == "heading" else pose.unit)
+        value = value.model_copy(update={"unit": unit})
+        if unit_of(value).si not in kinds:
+            fault = f"pose.{key}: is in {unit_of(value).si}, not in {kinds[0]}"
+            raise ConfigError(f"{fault}; check its unit.")
+        parts.append(reader.series(f"pose.{key}", value, pose, held=False))
+        factors.append(abs(value.scale))
+    heading = parts[2]
+    parts[2] = heading._replace(values=np.unwrap(heading.values))  # as it may be interpolated
+    made = together("pose", parts, held=False)
+    made.values[:, 2] = wrap_angle(made.values[:, 2])
+    if pose.covariance is None:
+        return made
+    si = np.array(factors) * (lengths, lengths, angles)
+    sigma = _deviations(reader, pose, pose.covariance, made.t)
+    return made if sigma is None else replace(made, sigma=sigma * si)
+
+
+def _heading(reader: MappedReader, pose: PoseSource, given: str | Sequence[Reference]) -> Series:
+    """Returns the heading of quaternions; those of length 0 are left out."""
+    each = [f"{given}.{axis}" for axis in "xyzw"] if isinstance(given, str) else given
+    parts = [
+        reader.series("pose.quaternion", Value.model_validate({"from": which}), pose, held=False)
+        for which in each
+    ]
+    made = together("pose.quaternion", parts, held=False)
+    norm = np.linalg.norm(made.values, axis=1)
+    lost = norm < NO_LENGTH
+    if lost.any() and lost.mean() <= MOST_UNTRACKED:
+        reader.say(
+            f"pose: {int(lost.sum())} of {len(lost)} rows without orientation were left out."
+        )
+        made, norm = made.rows(~lost), norm[~lost]
+    for k in np.flatnonzero(np.abs(norm - 1.0) > QUATERNION_TOLERANCE)[:1]:
+        where = f"{reader.source.place}: pose: {made.t[k] - made.t[0]:.3f} s from the start"
+        fault = f"{where} the quaternion has the length {norm[k]:.3f} and not 1"
+        raise RecordingError(f"{fault}; list its columns in the order x, y, z, w.")
+    x, y, z, w = made.values.T
+    heading = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    return Series(made.t, heading, made.clock)
+
+
+POSES = (
+    ("pose.pose.position.{}", "pose.pose.orientation", "pose.covariance"),
+    ("pose.position.{}", "pose.orientation", None),
+    ("transform.translation.{}", "transform.rotation", None),
+    ("position.{}", "orientation", None),
+    ("{}", "theta", None),
+)
+"""Fields of messages that are poses: position, orientation, covariance."""
+
+
+def _of_message(reader: MappedReader, pose: PoseSource) -> PoseSource:
+    """Completes a pose of which only the topic is given."""
+    table, _ = reader.place("", pose.in_)
+    for position, turned, covariance in POSES:
+        x, y = (position.format(axis) for axis in "xy")
+        quaternion = f"{turned}.w" in table.names
+        if x in table.names and (quaternion or turned in table.names):
+            known = {"x": x, "y": y, "quaternion" if quaternion else "heading": turned}
+            given = pose.model_dump(by_alias=True, exclude_none=True)
+            if covariance is not None and "covariance" not in given:
+                known["covariance"] = covariance
+            return PoseSource.model_validate({**given, **known})
+    fault = f"{table.place}: its messages are no poses of a known form"
+    raise RecordingError(f"{fault}; name x, y and heading or quaternion in the mapping.")
+
+
+def _deviations(
+    reader: MappedReader, pose: PoseSource, given: str | Sequence[Reference], t: Array
+) -> Array | None:
+    """Returns standard deviations (T, 3) from variances or a matrix; None if they say nothing."""
+    if isinstance(given, str):
+        table, which = reader.place(given, pose.in_)
+        count = sum(name.startswith(f"{which}[") for name in table.names)
+        if count not in COVARIANCES:
+            fault = f"{table.place}: {which!r} has {count} numbers"
+            raise RecordingError(f"{fault}; a covariance has 3, 9 or 36.")
+        given = [f"{given}[{k}]" for k in range(count)]
+    columns = []
+    for k in COVARIANCES[len(given)]:
+        value = Value.model_validate({"from": given[k]})
+        part = reader.series("pose.covariance", value, pose, held=False)
+        columns.append(np.interp(t, part.t, part.values))
+    variance = np.stack(columns, axis=1)
+    if (variance > 0.0).all():
+        return np.asarray(np.sqrt(variance))
+    if variance.any():
+        reader.say("pose: its covariance is not positive throughout, and was not used.")
+    return None
+
+
+def _from_zero(found: dict[str, Stream], main: str, reader: MappedReader) -> dict[str, Stream]:
+    """Shifts stamps to begin near 0: by one origin, but for clocks whose spans do not overlap."""
+    spans: dict[str, list[float]] = {}
+    for name, stream in found.items():
+        first, last = float(stream.t[0]), float(stream.t[-1])
+        span = spans.setdefault(stream.clock, [first, last])
+        if first > span[1] or last < span[0]:
+            fault = f"{reader.source.place}: {name} lasts from {first:.3f} to {last:.3f} s"
+            other = f"the streams before it from {span[0]:.3f} to {span[1]:.3f} s, on one clock"
+            advice = "check their `time:`, or give one of them a `clock:` of its own"
+            raise RecordingError(f"{fault}, {other}; {advice}.")
+        span[:] = min(first, span[0]), max(last, span[1])
+    base = spans.get(main) or next(iter(spans.values()))
+    origin = {}
+    together = [span for span in spans.values() if span[0] <= base[1] and span[1] >= base[0]]
+    first = min(span[0] for span in together)
+    for clock, span in spans.items():
+        origin[clock] = first if span in together else span[0]
+        if span not in together:
+            reader.say(f"The clock {clock!r} was set to 0 at its first stamp, {span[0]:.3f} s.")
+    return {
+        name: replace(stream, t=stream.t - origin[stream.clock]) for name, stream in found.items()
+    }

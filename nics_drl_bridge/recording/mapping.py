@@ -1,0 +1,188 @@
+"""Mapping: which column or message field of a recording is which stream, and in what unit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, Field, field_validator, model_validator
+
+from nics_drl_bridge.config import Schema, load_yaml
+from nics_drl_bridge.recording.units import SHARES, UNITS, known_unit
+
+ARRIVAL, HEADER = "arrival", "header"
+ROBOT_CLOCK = "robot"
+# Where the variances of x, y and heading stand: alone, and in a 3 x 3 or 6 x 6 matrix by rows.
+COVARIANCES = {3: (0, 1, 2), 9: (0, 4, 8), 36: (0, 7, 35)}
+
+# A column by name or by number from 0; FILE:COLUMN in a folder, /topic:message.field in a bag.
+Reference = str | int
+Condition = float | str | bool | list[float | str]
+
+
+def _short(key: str) -> Any:
+    """Lets a plain reference, or a list of them, stand for the model with only that key."""
+
+    def expand(given: Any) -> Any:
+        plain = isinstance(given, (str, int, list)) and not isinstance(given, bool)
+        return {key: given} if plain else given
+
+    return BeforeValidator(expand)
+
+
+def _of_kind(kinds: tuple[str, ...]) -> Any:
+    """Refuses units of another kind than `kinds`, which are in SI."""
+
+    def check(unit: str | None) -> str | None:
+        if unit is not None and UNITS[known_unit(unit)].si not in kinds:
+            fitting = (name for name, each in UNITS.items() if each.si in kinds)
+            raise ValueError(f"must be one of {', '.join(fitting)}")
+        return unit
+
+    return BeforeValidator(check)
+
+
+class Time(Schema):
+    """Stamps of rows: of a column, of two that hold seconds and nanoseconds, or at a rate."""
+
+    # also `header` or `arrival` of the messages of a bag
+    from_: Reference | tuple[Reference, Reference] | None = Field(default=None, alias="from")
+    unit: Annotated[str | None, _of_kind(("s",))] = None
+    rate: float | None = Field(default=None, gt=0.0)  # of rows without stamps [Hz]
+
+    @model_validator(mode="after")
+    def _one(self) -> Time:
+        if (self.from_ is None) == (self.rate is None):
+            raise ValueError("time needs either `from`, a column, or `rate` [Hz]")
+        return self
+
+    @property
+    def columns(self) -> tuple[Reference, ...]:
+        """One column, or two: seconds and nanoseconds."""
+        return self.from_ if isinstance(self.from_, tuple) else (self.from_ or 0,)
+
+
+class Value(Schema):
+    """A number in each row: SI value = unit x scale x what stands there + offset."""
+
+    from_: Reference = Field(alias="from")
+    unit: str | None = None  # by default that of the stream, or SI
+    maximum: float | None = None  # value in SI of a full share
+    scale: float = 1.0  # -1 turns the sign
+    offset: float = 0.0  # in SI
+    ticks_per_turn: float | None = Field(default=None, gt=0.0)
+    differentiate: bool | None = None  # by default true for `ticks`, which are counters
+    wrap: float | None = Field(default=None, gt=0.0)  # where a counter overflows; found if left out
+    # other columns, flags, and the values at which this one counts; `otherwise` stands in its place
+    when: dict[str, Condition] = Field(default_factory=dict)
+    otherwise: float = 0.0
+    time: Annotated[Time | None, _short("from")] = None
+    clock: str | None = None
+
+    @field_validator("unit")
+    @classmethod
+    def _known(cls, unit: str | None) -> str | None:
+        return None if unit is None else known_unit(unit)
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Value:
+        if self.maximum is not None and (self.unit or "share") not in SHARES:
+            raise ValueError("maximum belongs to the units share and %")
+        return self
+
+    @property
+    def counts(self) -> bool:
+        """True for a counter, whose rate is the value."""
+        ticks = self.unit == "ticks" or (self.unit is None and self.ticks_per_turn is not None)
+        return ticks if self.differentiate is None else self.differentiate
+
+
+AValue = Annotated[Value, _short("from")]
+
+
+class Measured(Schema):
+    """Keys of all streams: table of their columns, stamps, clock."""
+
+    in_: str | None = Field(default=None, alias="in")  # a file or a topic, for columns without
+    time: Annotated[Time | None, _short("from")] = None
+    clock: str | None = None  # between two clocks there is an unknown offset
+
+
+class PoseSource(Measured):
+    """Pose of the tracked body in a fixed frame."""
+
+    x: AValue | None = None  # both by default in the message of the topic `in`
+    y: AValue | None = None
+    heading: AValue | None = None
+    # instead of the heading: x, y, z, w, or the field of a message
+    quaternion: str | tuple[Reference, Reference, Reference, Reference] | None = None
+    unit: Annotated[str, _of_kind(("m",))] = "m"  # of x and y, and in the covariance
+    heading_unit: Annotated[str, _of_kind(("rad",))] = "rad"
+    # variances of x, y, heading; or all of a 3 x 3 or 6 x 6 matrix, by rows; or a message's field
+    covariance: str | list[Reference] | None = None
+    frame: str | None = None  # parent and child of the transforms to use, of a topic like /tf
+    child_frame: str | None = None
+
+    @model_validator(mode="after")
+    def _whole(self) -> PoseSource:
+        if (self.x is None) != (self.y is None):
+            raise ValueError("pose needs both x and y")
+        if self.x is None and self.in_ is None:
+            raise ValueError("pose needs x and y, or `in`: a topic whose messages are poses")
+        if self.x is not None and (self.heading is None) == (self.quaternion is None):
+            raise ValueError("pose needs either heading or quaternion")
+        if isinstance(self.covariance, list) and len(self.covariance) not in COVARIANCES:
+            raise ValueError("covariance needs 3, 9 or 36 columns")
+        return self
+
+
+class WheelSource(Measured):
+    """Wheel speeds, in the encoder's units or rad/s."""
+
+    left: AValue
+    right: AValue
+
+
+class ImuSource(Measured):
+    """Acceleration along x, y and yaw rate."""
+
+    ax: AValue | None = None
+    ay: AValue | None = None
+    yaw_rate: AValue
+
+
+class OdometrySource(Measured):
+    """Body velocity by the robot's own odometry."""
+
+    vx: AValue
+    vy: AValue | None = None
+    wz: AValue
+
+
+class Mapping(Schema):
+    """A recording of any form as the streams of a Recording."""
+
+    robot: str | dict[str, Any] | None = None  # a shipped robot's name, a path, or its definition
+    in_: str | None = Field(default=None, alias="in")  # as in a stream, for all that name none
+    time: Annotated[Time | None, _short("from")] = None
+    clock: str = ROBOT_CLOCK
+    pose: Annotated[PoseSource, BeforeValidator(lambda v: {"in": v} if isinstance(v, str) else v)]
+    command: dict[str, AValue] = Field(min_length=1)  # by the names of the robot's commands
+    state: dict[str, AValue] = Field(default_factory=dict)  # likewise
+    wheels: WheelSource | None = None
+    imu: ImuSource | None = None
+    odometry: OdometrySource | None = None
+
+
+SI: dict[str, dict[str, tuple[str, ...]]] = {
+    "pose": {"x": ("m",), "y": ("m",), "heading": ("rad",)},
+    "wheels": dict.fromkeys(("left", "right"), ("m/s", "rad/s", "ticks/s", "1", "V")),
+    "imu": {"ax": ("m/s^2",), "ay": ("m/s^2",), "yaw_rate": ("rad/s",)},
+    "odometry": {"vx": ("m/s",), "vy": ("m/s",), "wz": ("rad/s",)},
+}
+"""Values of each stream, in order, with the units that they may have in SI."""
+
+
+def load_mapping(path: str | Path) -> Mapping:
+    """Reads a mapping from YAML. Raises ConfigError with file, key and fix."""
+    return load_yaml(path, Mapping)

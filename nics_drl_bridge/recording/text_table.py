@@ -1,0 +1,203 @@
+"""Reads tables of text: any separator, with header or without, and what loggers leave in them."""
+
+from __future__ import annotations
+
+import csv
+from collections import Counter
+from collections.abc import Sequence
+from itertools import zip_longest
+from pathlib import Path
+
+import numpy as np
+
+from nics_drl_bridge.config import no_device
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.recording.table import Column, Columns
+
+SEPARATORS = (",", ";", "\t", "|", None)  # None: any white space
+MOST_BYTES = 256 * 2**20
+MOST_ROWS, LONGEST_ROW = 2_000_000, 20_000  # longest in characters
+TRIED = 400  # lines from which separator and header are found
+MOST_BROKEN = 0.01  # share of rows with another number of fields that are left out
+COMMENTS = ("#", "//")
+TUM = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
+TUM_SUFFIX = ".tum"
+TRUTH = {"true": "1", "false": "0", "": "nan"}
+
+Row = tuple[int, list[str]]
+"""Line of the file, from 1, and fields."""
+
+
+def read_text_table(path: Path) -> Columns:
+    """Reads a table; RecordingError names the file, the line and the fix."""
+    lines, comments = _lines(path)
+    separator = _separator([text for _, text in lines[:TRIED]])
+    rows = [(line, _split(text, separator)) for line, text in lines]
+    first, width = _first_row(path, rows)
+    above = [row for _, row in rows[:first]]
+    rows, notes = _of_one_width(path, rows[first:], above, width)
+    columns = [list(column) for column in zip(*(row for _, row in rows), strict=True)]
+    head = _header(above, width)
+    if head is None and comments and len(last := _split(comments[-1], separator)) == width:
+        head = last
+    if head is None and width == len(TUM) and (separator is None or path.suffix == TUM_SUFFIX):
+        head = list(TUM) if _is_tum(columns) else None
+    if head is None and (named := _labelled(columns)):
+        columns, head = named
+    if separator != ",":
+        columns = [_with_points(column) for column in columns]
+    names = tuple(name for name, _ in zip_longest(head or (), columns, fillvalue=""))[
+        : len(columns)
+    ]
+    at = np.array([line for line, _ in rows], dtype=np.intp)
+    return Columns(str(path), names, tuple(map(_typed, columns)), at, tuple(notes))
+
+
+def _lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
+    """Returns the lines with their numbers, from 1, without empty ones, and those of comments."""
+    no_device(path)
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            fault = f"is larger than {MOST_BYTES // 2**20} MB"
+            raise RecordingError(f"{path}: {fault}; cut it, or keep fewer columns.")
+        data = path.read_bytes()
+    except OSError as error:
+        raise RecordingError(f"{path}: can't be read ({error.strerror}).") from None
+    if b"\0" in data:
+        raise RecordingError(f"{path}: is not text of 8 bits; save it as CSV in UTF-8.")
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = data.decode("latin-1")  # as written by old tools: a degree sign in a header
+    lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip()]
+    if len(lines) > MOST_ROWS:
+        raise RecordingError(f"{path}: has {len(lines)} rows; cut it to at most {MOST_ROWS}.")
+    for k, line in lines:
+        if len(line) > LONGEST_ROW:
+            fault = f"line {k} has {len(line)} characters, which no row has"
+            raise RecordingError(f"{path}: {fault}; remove it.")
+    comments = [line.lstrip("#/ ") for _, line in lines if line.lstrip().startswith(COMMENTS)]
+    return [each for each in lines if not each[1].lstrip().startswith(COMMENTS)], comments
+
+
+def _split(line: str, separator: str | None) -> list[str]:
+    if separator is None:
+        return line.split()
+    fields = line.split(separator)
+    if '"' in line:
+        fields = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    return [field.strip() for field in fields]
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _separator(lines: Sequence[str]) -> str | None:
+    """Returns the separator that leaves most numbers, and fewest fields that are none."""
+
+    def score(separator: str | None) -> int:
+        fields = [field for line in lines for field in _split(line, separator) if field]
+        points = [field.replace(",", ".") if separator != "," else field for field in fields]
+        return sum(1 if _is_number(field) else -1 for field in points)
+
+    return max(SEPARATORS, key=score)
+
+
+def _first_row(path: Path, rows: Sequence[Row]) -> tuple[int, int]:
+    """Returns the first row of numbers, and how many fields the rows from there on have."""
+
+    def numeric(row: Sequence[str]) -> bool:
+        full = [field for field in row if field]
+        return 2 * sum(_is_number(field.replace(",", ".")) for field in full) > len(full)
+
+    widths = Counter(len(row) for _, row in rows if numeric(row))
+    if not widths:
+        advice = "give a table of numbers, a column each, with or without a header"
+        raise RecordingError(f"{path}: holds no row of numbers; {advice}.")
+    width = widths.most_common(1)[0][0]
+    first = next(k for k, (_, row) in enumerate(rows) if numeric(row) and len(row) == width)
+    return first, width
+
+
+def _of_one_width(
+    path: Path, rows: Sequence[Row], above: Sequence[list[str]], width: int
+) -> tuple[list[Row], list[str]]:
+    """Leaves out headers that are repeated, and the few rows that were cut short."""
+    file, notes = path.name, []
+    full = [row for row in rows if row[1] not in above]
+    if again := len(rows) - len(full):
+        notes.append(f"{file}: {again} lines repeat the header, and were left out.")
+    whole = [row for row in full if len(row[1]) == width]
+    broken = [row for row in full if len(row[1]) != width]
+    if len(broken) > max(1.0, MOST_BROKEN * len(full)):
+        line, row = broken[0]
+        fault = f"line {line} has {len(row)} fields where most lines have {width}"
+        raise RecordingError(f"{path}: {fault}; mend or remove it and those like it.")
+    if broken:
+        where = ", ".join(str(line) for line, _ in broken[:5])
+        notes.append(f"{file}: {len(broken)} lines of another length (line {where}) were left out.")
+    while width > 1 and not any(row[width - 1] for _, row in whole):
+        width -= 1  # after a separator at the end of each line
+        whole = [(line, row[:width]) for line, row in whole]
+    return whole, notes
+
+
+def _header(above: Sequence[list[str]], width: int) -> list[str] | None:
+    """Returns the last line above the numbers that looks like names of columns."""
+    for row in reversed(above):
+        if len(row) > 1 or (width == 1 and row):
+            return row
+    return None
+
+
+def _is_tum(columns: Sequence[Sequence[str]]) -> bool:
+    """True for stamps that rise, and unit quaternions at the end."""
+    try:
+        values = np.array(columns, dtype=np.float64)
+    except ValueError:
+        return False
+    norm = np.linalg.norm(values[4:], axis=0)
+    return bool(np.median(np.abs(norm - 1.0)) < 0.01 and np.median(np.diff(values[0])) > 0.0)
+
+
+def _labelled(columns: Sequence[list[str]]) -> tuple[list[list[str]], list[str]] | None:
+    """Names columns by labels that stand in each row, as in `time: 1.2 ticks: 3 4`."""
+    found: dict[str, list[list[str]]] = {}
+    for column in columns:
+        first = column[0]
+        if first.endswith((":", "=")) and set(column) == {first}:
+            found[label := first.rstrip(":=")] = []
+        elif not found:
+            return None
+        else:
+            found[label].append(column)
+    names = [
+        name if len(some) == 1 else f"{name}[{k}]"
+        for name, some in found.items()
+        for k in range(len(some))
+    ]
+    return [column for some in found.values() for column in some], names
+
+
+def _with_points(column: list[str]) -> list[str]:
+    """Writes decimal commas as points."""
+    changed = [field.replace(",", ".") for field in column]
+    commas = any("," in field for field in column)
+    return changed if commas and all(_is_number(field or "0") for field in changed) else column
+
+
+def _typed(column: Sequence[str]) -> Column:
+    """Returns numbers if all fields are, of true and false too, and else text."""
+    try:
+        return np.array(column, dtype=np.float64)
+    except ValueError:
+        pass
+    try:
+        return np.array([TRUTH.get(field.lower(), field) for field in column], dtype=np.float64)
+    except ValueError:
+        return np.array(column, dtype=np.str_)

@@ -1,0 +1,269 @@
+"""Values of a recording in SI, with their stamps, as its mapping says."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.errors import ConfigError, RecordingError, nearest
+from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.recording import mapping as schema
+from nics_drl_bridge.recording import stamps
+from nics_drl_bridge.recording.mapping import Mapping, Measured, Reference, Value
+from nics_drl_bridge.recording.recording import Stream
+from nics_drl_bridge.recording.table import Column, Source, Table, numbers_of
+from nics_drl_bridge.recording.units import RATES, UNITS, UnitOfData, to_si
+
+CLOSE = 1e-9  # a flag equals a number within this
+
+
+class Series(NamedTuple):
+    """A value in SI, where it is known."""
+
+    t: Array  # (T,) [s]
+    values: Array  # (T,)
+    clock: str
+
+
+class Stamped(NamedTuple):
+    """Rows of a table in the order of their stamps."""
+
+    t: Array  # (T,) [s]
+    rows: NDArray[np.intp]  # (T,)
+    clock: str
+
+
+@dataclass
+class MappedReader:
+    """Reads values of a source; collects what was mended in `notes`."""
+
+    source: Source
+    mapping: Mapping
+
+    def __post_init__(self) -> None:
+        self.notes: list[str] = []
+        self._stamped: dict[tuple[str, str], Stamped] = {}
+
+    def say(self, *notes: str) -> None:
+        """Adds sentences, each once."""
+        self.notes += [note for note in notes if note and note not in self.notes]
+
+    def place(self, reference: Reference, within: str | None = None) -> tuple[Table, Reference]:
+        """Returns the table of a reference, and the column there; RecordingError: no such table."""
+        names = self.source.names
+        if isinstance(reference, str):
+            for k in (k for k, sign in enumerate(reference) if sign == ":"):
+                if (name := _table_name(reference[:k], names)) is not None:
+                    return self._table(name), reference[k + 1 :]
+        wanted = within or self.mapping.in_ or (names[0] if len(names) == 1 else None)
+        if wanted is None and isinstance(reference, str) and ":" in reference:
+            wanted = reference.rpartition(":")[0]
+        if wanted is None:
+            advice = f"write it as TABLE:{reference}, or add `in: TABLE`"
+            listed = ", ".join(names[:20])
+            fault = f"{self.source.place}: {reference!r} is of no table"
+            raise ConfigError(f"{fault}; {advice}; its tables are {listed}.")
+        name = _table_name(wanted, names)
+        if name is None:
+            raise RecordingError(
+                f"{self.source.place}: has no {wanted!r}; {nearest(wanted, names)}"
+            )
+        return self._table(name), reference
+
+    def _table(self, name: str) -> Table:
+        table = self.source.table(name)
+        self.say(*table.notes)
+        return table
+
+    def stamped(self, table: Table, time: schema.Time | None, clock: str | None) -> Stamped:
+        """Returns the rows of a table in order, by their stamps."""
+        time = time or self.mapping.time
+        key = f"{table.place}", repr(time)
+        if key not in self._stamped:
+            self._stamped[key] = self._of_stamps(table, time)
+        found = self._stamped[key]
+        return found._replace(clock=clock or found.clock or self.mapping.clock)
+
+    def _of_stamps(self, table: Table, time: schema.Time | None) -> Stamped:
+        which = "" if time is None else str(time.from_)
+        if time is not None and time.rate is not None:
+            count = len(table.column(0))
+            return Stamped(np.arange(count) / time.rate, np.arange(count), "")
+        if time is None or which in (schema.HEADER, schema.ARRIVAL):
+            given = table.stamps(which)
+            if given is None:
+                example = "as in `time: t`, `time: [s, ns]`, or `time: {rate: 50}` if there is none"
+                raise RecordingError(f"{table.place}: which column is the time? Say {example}.")
+            return Stamped(given.t, given.values[:, 0].astype(np.intp), given.clock)
+        t, name = self._raw_stamps(table, time), f"{table.place.rpartition('/')[2]}"
+        known = np.flatnonzero(np.isfinite(t))
+        if len(known) < len(t):
+            self.say(f"{name}: {len(t) - len(known)} rows without a stamp were left out.")
+        t, note = stamps.without_overflow(t[known], name)
+        self.say(note)
+        if (unit := stamps.likely_unit(t)) is not None and time.unit is None:
+            usual = f"{np.median(np.diff(t)):.4g} apart, which can't be seconds"
+            line = f"time: {{from: {time.from_}, unit: {unit}}}"
+            fault = f"{table.place}: the stamps {time.from_!r} are {usual}"
+            raise RecordingError(
+                f"{fault}; write `{line}` into the mapping (`unit: s` if they are)."
+            )
+        t, order, note = stamps.in_order(t * UNITS[time.unit or "s"].factor, name)
+        self.say(note)
+        return Stamped(t, known[order], "")
+
+    def _raw_stamps(self, table: Table, time: schema.Time) -> Array:
+        first, *others = time.columns
+        which = self._same(table, first)
+        if others:
+            nanoseconds = numbers_of(table, self._same(table, others[0]))
+            return stamps.joined(numbers_of(table, which), nanoseconds)
+        column = table.column(which)
+        if column.dtype.kind in "US":
+            dates = _dates(column)
+            return numbers_of(table, which) if dates is None else dates
+        return column.astype(np.float64)
+
+    def _same(self, table: Table, reference: Reference) -> Reference:
+        """Returns the column of a reference that may repeat the table of the values."""
+        if isinstance(reference, str) and ":" in reference and reference not in table.names:
+            return self.place(reference)[1]
+        return reference
+
+    def series(self, name: str, value: Value, stream: Measured | None, held: bool) -> Series:
+        """Returns a value in SI; of a counter its rate, `held` from stamp to stamp or between."""
+        stream = stream or Measured()
+        table, which = self.place(value.from_, stream.in_)
+        clock = value.clock or stream.clock
+        at = self.stamped(table, value.time or stream.time, clock)
+        column = numbers_of(table, which)
+        if len(column) <= (at.rows.max() if len(at.rows) else -1):
+            fault = f"{which!r} has {len(column)} values, its stamps {len(at.rows)}"
+            raise RecordingError(f"{table.place}: {fault}; name the stamps of these values.")
+        raw = column[at.rows]
+        for k in np.flatnonzero(np.isinf(raw))[:1]:
+            where = f"{table.place}: {table.row(int(at.rows[k]))}"
+            raise RecordingError(f"{where}: {which!r} is infinite; mend or remove the row.")
+        known = np.isfinite(raw)
+        if not known.any():
+            raise RecordingError(
+                f"{table.place}: {which!r} holds no number; choose another column."
+            )
+        if not known.all():
+            missing = f"{int((~known).sum())} of {len(raw)} rows have no value"
+            self.say(f"{name}: {missing}, and were left out.")
+        made = Series(at.t[known], raw[known], at.clock)
+        made = self._in_si(name, value, made, held)
+        return self._where(value, made, table) if value.when else made
+
+    def _in_si(self, name: str, value: Value, raw: Series, held: bool) -> Series:
+        factor = unit_of(value).factor * value.scale
+        factor *= 1.0 if value.maximum is None else value.maximum
+        if value.wrap is not None or value.counts:
+            raw = self._continued(name, value, raw)
+        if value.counts:
+            raw = _rate(raw, held)
+        return raw._replace(values=raw.values * factor + value.offset)
+
+    def _continued(self, name: str, value: Value, raw: Series) -> Series:
+        """Continues a counter over its overflows; an absolute angle begins near zero."""
+        size = value.wrap or stamps.overflow(raw.values, (1.0,), stamps.BITS)
+        if size is None:
+            return raw
+        values, count = stamps.unwrapped(raw.values, size)
+        if not value.counts:
+            values = values - size * np.round(values[0] / size)
+        if count:
+            found = "" if value.wrap else " as found"
+            times = "once" if count == 1 else f"{count} times"
+            self.say(f"{name}: the counter overflowed at {size:.10g}{found} {times}: continued.")
+        return raw._replace(values=values)
+
+    def _where(self, value: Value, made: Series, table: Table) -> Series:
+        """Puts `otherwise` where a flag is not as it must be."""
+        on = np.ones(len(made.t), dtype=np.bool_)
+        for reference, wanted in value.when.items():
+            other, which = table, reference
+            if ":" in reference and reference not in table.names:
+                other, found = self.place(reference)
+                which = str(found)
+            at = self.stamped(other, value.time if other is table else None, made.clock)
+            flags = _equals(other.column(which), wanted)[at.rows]
+            row = np.searchsorted(at.t, made.t, side="right") - 1
+            on &= flags[np.clip(row, 0, None)] & (row >= 0)
+        return made._replace(values=np.where(on, made.values, value.otherwise))
+
+
+def unit_of(value: Value) -> UnitOfData:
+    """Returns the unit in SI and the factor of a value, of a counter those of its rate."""
+    unit = value.unit or ("ticks" if value.ticks_per_turn else None)
+    si, factor = to_si(unit, value.ticks_per_turn) if unit else UnitOfData("", 1.0)
+    return UnitOfData(RATES.get(si, si) if value.counts else si, factor)
+
+
+def _table_name(wanted: str, names: Sequence[str]) -> str | None:
+    """Returns a table by its name, by its name without suffix, or by a topic without slash."""
+    alike = (name for name in names if name.rpartition(".")[0] == wanted or name == f"/{wanted}")
+    return wanted if wanted in names else next(alike, None)
+
+
+def _dates(column: Column) -> Array | None:
+    """Returns seconds since 1970 of dates like 2024-05-01 12:00:00.5; None if they are none."""
+    text = [str(each).removesuffix("Z").removesuffix("+00:00").replace("/", "-") for each in column]
+    try:
+        ns = np.array(text, dtype="datetime64[ns]").astype(np.int64)
+    except ValueError:
+        return None
+    return np.asarray(ns * stamps.NS, dtype=np.float64)
+
+
+def _rate(raw: Series, held: bool) -> Series:
+    """Differentiates a counter: exact between two stamps, so that its integral stays."""
+    last = np.append(np.diff(raw.t) > 0.0, True)  # of rows with one stamp
+    t, values = raw.t[last], raw.values[last]
+    rate = np.diff(values) / np.diff(t)
+    at = t[:-1] if held else (t[:-1] + t[1:]) / 2.0
+    return Series(at, rate, raw.clock)
+
+
+def _equals(column: Column, wanted: schema.Condition) -> NDArray[np.bool_]:
+    """Selects rows (T,) in which a flag has one of the wanted values."""
+    on = np.zeros(len(column), dtype=np.bool_)
+    for each in wanted if isinstance(wanted, list) else [wanted]:
+        if column.dtype.kind in "US":
+            on |= np.char.lower(column) == str(each).lower()
+        elif not isinstance(each, str):
+            on |= np.abs(column.astype(np.float64) - float(each)) < CLOSE
+    return on
+
+
+def together(name: str, parts: Sequence[Series], held: bool) -> Stream:
+    """Joins values to a stream: commands hold, others are interpolated at the first's rows."""
+    clocks = sorted({part.clock for part in parts})
+    if len(clocks) > 1:
+        fault = f"{name}: its values are of the clocks {' and '.join(clocks)}"
+        raise ConfigError(f"{fault}; a stream needs one clock.")
+    t = parts[0].t
+    if not all(np.array_equal(t, part.t) for part in parts):
+        start, stop = max(part.t[0] for part in parts), min(part.t[-1] for part in parts)
+        if held:
+            t = np.unique(np.concatenate([part.t for part in parts]))
+            t = t[t >= start]
+        else:
+            t = t[(t >= start) & (t <= stop)]
+        if not len(t):
+            raise RecordingError(f"{name}: its values are of times that do not overlap.")
+    columns = [_at(part, t, held) for part in parts]
+    return Stream(t, np.stack(columns, axis=1), clocks[0])
+
+
+def _at(part: Series, t: Array, held: bool) -> Array:
+    if np.array_equal(t, part.t):
+        return part.values
+    if held:
+        return part.values[np.searchsorted(part.t, t, side="right") - 1]
+    return np.asarray(np.interp(t, part.t, part.values))
