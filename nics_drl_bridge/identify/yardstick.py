@@ -1,0 +1,269 @@
+"""Yardsticks of a model: a robot that keeps its twist, and its fitted textbook kinematics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import ConfigError, RecordingError
+from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.open_loop import Windows, windows
+from nics_drl_bridge.identify.signals import held, unwrapped
+from nics_drl_bridge.identify.yardstick_kernels import STRAIGHT, Bicycle, roll_windows
+from nics_drl_bridge.robot.kinds import steady_twist
+from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.threads import one_blas_thread
+
+HORIZONS_S = (1.0, 2.5, 5.0)  # the fit's predictions end after these times
+STEP_S, SPACING_S, MOST_WINDOWS = 0.02, 0.1, 200
+BEFORE_S, FEWEST = 0.2, 4  # poses that tell the twist at a window's start: time and number
+STEADY_M_S = 0.05  # greatest standard error of a speed at a start that is taken from a parabola
+HEADING_WEIGHT_M = 0.3  # an error of 1 rad counts as so many metres
+LOSS_SCALE = 0.2  # of the soft L1 loss [m/s]
+MOST_EVALUATIONS, TOLERANCE = 60, 1e-4
+GUESS_S = 0.5  # gains and lags are first guessed from motions over this time,
+DELAYS_S = np.arange(-0.1, 0.51, 0.05)  # at each of these delays between streams of one clock
+FAR_DELAYS_S = np.arange(-1.0, 1.01, 0.05)  # and of these between streams of two
+LAG_S, LAG_RANGE_S = 0.15, (0.005, 5.0)
+LIMIT, LIMIT_RANGE = 10.0, (0.05, 1e3)  # of acceleration [m/s^2]
+PROBE = 0.5  # share of the range of a command at which the textbook is asked for its structure
+
+
+@dataclass(frozen=True)
+class TextbookResponse:
+    """Actuators follow gain * command + offset, with lags, after a delay.
+
+    Actuators are the body twist (vx, vy, wz), or speed, 0, steering angle of a bicycle.
+    """
+
+    delay_s: float
+    gain: Array  # (3, C) actuator per command
+    offset: Array  # (3,)
+    lag_s: Array  # (3,)
+    limit: Array  # (2,) greatest acceleration, deceleration of the first actuator [m/s^2]
+    bicycle: Bicycle
+    mounting: Array  # (3,) pose of the tracked body in `base_link`
+
+
+@dataclass(frozen=True)
+class Yardstick:
+    """A fitted textbook robot to compare a model with."""
+
+    response: TextbookResponse
+    clock_offset_s: float  # added to the pose's stamps, gives the commands' clock
+
+    def predict(self, drive: Drive, chosen: Windows, twist: Array | None = None) -> Array:
+        """Predicts poses (W, 3) at windows' ends, from twists (W, 3) at their starts if known."""
+        duration = (chosen.end_t - chosen.start_t)[:, None]
+        course = _course(drive, chosen.start_t + self.clock_offset_s, duration)
+        twist = twists_before(drive, chosen.start_t) if twist is None else twist
+        return geometry.compose(chosen.start, _relative_ends(self.response, course, twist)[:, 0])
+
+
+def kept_twist(drive: Drive, chosen: Windows, twist: Array | None = None) -> Array:
+    """Predicts poses (W, 3) at windows' ends of a robot that keeps the twist of their starts."""
+    twist = twists_before(drive, chosen.start_t) if twist is None else twist
+    moved = twist * (chosen.end_t - chosen.start_t)[:, None]
+    return geometry.compose(chosen.start, geometry.exp(moved))
+
+
+def twists_before(drive: Drive, at: Array) -> Array:
+    """Estimates twists (W, 3) of the tracked body at times (W,) of poses, from those just before.
+
+    By parabolas, whose ends are in time, or by lines where poses are noisy: four times as steady.
+    """
+    t, pose = drive.dated.t, unwrapped(drive.dated.values)
+    last = np.searchsorted(t, at + 1e-9) - 1
+    first = np.minimum(np.searchsorted(t, at - BEFORE_S - 1e-9), last - FEWEST + 1)
+    noise, count = (drive.pose_noise or (0.0, 0.0))[0], float(np.median(last - first + 1))
+    degree = 2 if noise * np.sqrt(192.0 / count) / BEFORE_S < STEADY_M_S else 1
+    twist = np.zeros((len(at), 3))
+    for w, (a, b) in enumerate(zip(np.maximum(first, 0), last + 1, strict=True)):
+        if b - a > degree and t[b - 1] > t[a]:
+            rate, place = np.polyfit(t[a:b] - t[b - 1], pose[a:b] - pose[b - 1], degree)[-2:]
+            heading = pose[b - 1, 2] + place[2] if degree == 2 else pose[a:b, 2].mean()
+            twist[w] = [*geometry.rotate(rate[:2], -heading), rate[2]]
+    return twist
+
+
+class _Course(NamedTuple):
+    start_t: Array  # (W,) of windows, on the commands' clock [s]
+    duration: Array  # (W, H) to the ends of predictions [s]
+    grid_t: Array  # (G,) [s]
+    command: Array  # (G, C) means over steps of the grid
+
+
+def _course(drive: Drive, start_t: Array, duration: Array) -> _Course:
+    command = drive.recording.command
+    grid = np.arange(command.t[0] - 1.0, command.t[-1] + 1.0, STEP_S)
+    return _Course(start_t, duration, grid, held(command, drive.spec, grid, grid + STEP_S))
+
+
+def _relative_ends(response: TextbookResponse, course: _Course, twist: Array) -> Array:
+    """Returns poses (W, H, 3) of the tracked body seen from its start, where it had a twist."""
+    bicycle, mounting = response.bicycle, response.mounting
+    target = course.command @ response.gain.T
+    begin = course.start_t - response.delay_s - course.grid_t[0]
+    arm = np.array([mounting[1], -mounting[0], 0.0]) * twist[:, 2:]
+    actuator = _turned(twist, mounting[2]) + arm
+    if bicycle.used:  # a command of zero is a stop, whatever the offset
+        more = np.maximum(np.abs(target[:, 0]) + response.offset[0], 0.0)
+        target = np.stack([np.sign(target[:, 0]) * more, 0.0 * more, target[:, 2]], axis=1)
+        target[:, 2] += response.offset[2]
+        share = 1.0 - np.exp(-STEP_S / response.lag_s[2])
+        angle = lfilter([0.0, share], [1.0, share - 1.0], target[:, 2], zi=[target[0, 2]])[0]
+        actuator[:, 1], actuator[:, 2] = (
+            0.0,
+            np.interp(begin / STEP_S, np.arange(len(angle)), angle),
+        )
+        if bicycle.front_drive:
+            actuator[:, 0] /= np.maximum(np.cos(actuator[:, 2]), 0.1)
+    else:
+        target = target + response.offset
+    ends = np.empty((*course.duration.shape, 3))
+    roll_windows(
+        ends, actuator, begin / STEP_S, course.duration / STEP_S, target, response.lag_s,
+        response.limit, bicycle, STEP_S,
+    )  # fmt: skip
+    back = geometry.between(mounting, np.zeros(3))
+    return geometry.compose(back, geometry.compose(ends, mounting))
+
+
+def _turned(twist: Array, angle: float) -> Array:
+    return np.concatenate([geometry.rotate(twist[:, :2], angle), twist[:, 2:]], axis=1)
+
+
+@dataclass(frozen=True)
+class _Form:
+    """A first response, and which of its values are free."""
+
+    start: TextbookResponse
+    moves: NDArray[np.bool_]  # (3, C) commands that an actuator follows
+    mounted: NDArray[np.bool_]  # (3,) of the mounting
+
+    def pack(self) -> Array:
+        """Returns the free values of the start (P,); positive ones as logarithms."""
+        r, rows = self.start, self.moves.any(axis=1)
+        return np.concatenate([
+            [r.delay_s], r.gain[self.moves], r.offset[rows], np.log(r.lag_s[rows]),
+            np.log(r.limit), [r.bicycle.understeer] * r.bicycle.used, r.mounting[self.mounted],
+        ])  # fmt: skip
+
+    def unpack(self, theta: Array) -> TextbookResponse:
+        """Returns the response of free values (P,)."""
+        r, rows = self.start, self.moves.any(axis=1)
+        count = [1, int(self.moves.sum()), *[int(rows.sum())] * 2, 2, int(r.bicycle.used)]
+        delay, gains, offsets, lags, limits, understeer, place = np.split(theta, np.cumsum(count))
+        gain, offset, lag, mounting = (a.copy() for a in (r.gain, r.offset, r.lag_s, r.mounting))
+        gain[self.moves], offset[rows], mounting[self.mounted] = gains, offsets, place
+        lag[rows] = np.exp(np.clip(lags, *np.log(LAG_RANGE_S)))
+        limit = np.exp(np.clip(limits, *np.log(LIMIT_RANGE)))
+        bicycle = r.bicycle._replace(understeer=float(understeer.sum()))
+        return TextbookResponse(float(delay[0]), gain, offset, lag, limit, bicycle, mounting)
+
+
+def _structure(spec: RobotSpec) -> tuple[Array, Bicycle] | None:
+    """Asks the textbook what each command moves (3, C), and for a bicycle; None without one."""
+    half = PROBE * np.maximum(spec.command_high, -spec.command_low)
+    try:
+        alone, together = steady_twist(spec, np.diag(half)), steady_twist(spec, half)
+    except ConfigError:
+        return None
+    if len(half) != 2 or alone[:, 2].any() or together[2] == 0.0:
+        return (alone / half[:, None]).T, STRAIGHT
+    speed = int(np.argmax(np.abs(alone[:, 0])))
+    angle, forward = half[1 - speed], alone[speed, 0]
+    front = bool(abs(together[0]) < (1.0 - 1e-6) * abs(forward))
+    length = abs(forward * (np.sin(angle) if front else np.tan(angle)) / together[2])
+    moves = np.zeros((3, 2))
+    moves[0, speed] = moves[2, 1 - speed] = 1.0
+    return moves, Bicycle(True, front, float(length), 0.0)
+
+
+def _first_guess(drive: Drive, until_s: float, clock_offset: float) -> _Form:
+    """Fits gains and lags by least squares to motions over `GUESS_S`, at the best delay."""
+    structure = _structure(drive.spec)
+    book, bicycle = structure or (np.ones((3, len(drive.spec.command))), STRAIGHT)
+    seen = windows(drive, Calibration(), 0.0, until_s, GUESS_S, SPACING_S)
+    span = (seen.end_t - seen.start_t)[:, None]
+    twist = geometry.log(geometry.between(seen.start, seen.end)) / span
+    change = (twists_before(drive, seen.end_t) - twists_before(drive, seen.start_t)) / span
+    command = drive.recording.command
+    tried = []
+    for delay in DELAYS_S if command.clock == drive.recording.pose.clock else FAR_DELAYS_S:
+        shift = clock_offset - delay
+        u = held(command, drive.spec, seen.start_t + shift, seen.end_t + shift)
+        expected, rotation = u @ book.T, 0.0
+        if structure is not None:
+            a, b = ((v[:, 0] + 1j * v[:, 1]) for v in (expected, twist))
+            rotation = float(np.angle((a.conj() * b).sum()))
+        moved = (_turned(twist, -rotation), _turned(change, -rotation))
+        left, gain, offset, lag = _regressed(u, *moved, book != 0.0, bicycle)
+        tried.append((left, TextbookResponse(
+            float(delay), gain, offset, lag, np.full(2, LIMIT), bicycle,
+            np.array([0.0, 0.0, -rotation]),
+        )))  # fmt: skip
+    # Wheels of unequal gain are a lever arm across; without a textbook, any gain is any mounting.
+    mounted = np.array([True, np.count_nonzero(book[0]) < 2, True]) & (structure is not None)
+    return _Form(min(tried, key=lambda pair: pair[0])[1], book != 0.0, mounted)
+
+
+def _regressed(
+    u: Array, twist: Array, change: Array, moves: NDArray[np.bool_], bicycle: Bicycle
+) -> tuple[float, Array, Array, Array]:
+    """Regresses twist + lag * change on commands: what is left, gains, offsets, lags."""
+    left, gain, offset, lag = 0.0, np.zeros(moves.shape), np.zeros(3), np.full(3, LAG_S)
+    for i in np.flatnonzero(moves.any(axis=1)):
+        given = np.column_stack([u[:, moves[i]], np.ones(len(u))])
+        rows = np.column_stack([given, -change[:, i]])
+        if angle := bicycle.used and i == 2:
+            rows = given = given * twist[:, :1] / bicycle.wheelbase
+        beta = np.linalg.lstsq(rows, twist[:, i], rcond=None)[0]
+        if not angle and beta[-1] > LAG_RANGE_S[0]:
+            lag[i] = min(beta[-1], LAG_RANGE_S[1])
+        else:
+            rows, beta = given, np.linalg.lstsq(given, twist[:, i], rcond=None)[0]
+        gain[i, moves[i]], offset[i] = beta[: moves[i].sum()], beta[moves[i].sum()]
+        rest = rows @ beta - twist[:, i]
+        left += float((rest**2).mean() / max((twist[:, i] ** 2).mean(), 1e-12))
+    return left, gain, offset, lag
+
+
+@one_blas_thread
+def fit_yardstick(drive: Drive, until_s: float, clock_offset_s: float = 0.0) -> Yardstick:
+    """Fits the textbook of a drive's robot, as a fair hand-made model of it, up to `until_s` [s].
+
+    To open-loop errors after `HORIZONS_S`. Raises RecordingError if the part is too short for them.
+    """
+    spacing = max(SPACING_S, (until_s - HORIZONS_S[-1]) / MOST_WINDOWS)
+    chosen = windows(drive, Calibration(), 0.0, until_s, HORIZONS_S[-1], spacing)
+    if not len(chosen.start_t):
+        fault = f"the first {until_s:.1f} s hold no window of {HORIZONS_S[-1]:g} s"
+        raise RecordingError(f"{drive.recording.source}: {fault}; record a longer drive.")
+    horizons = np.tile(HORIZONS_S, (len(chosen.start_t), 1))
+    course = _course(drive, chosen.start_t + clock_offset_s, horizons)
+    twist, at = twists_before(drive, chosen.start_t), chosen.start_t[:, None] + horizons
+    pose = unwrapped(drive.dated.values)
+    ends = np.stack([np.interp(at, drive.dated.t, column) for column in pose.T], axis=-1)
+    measured = geometry.between(chosen.start[:, None], ends)
+    form = _first_guess(drive, until_s, clock_offset_s)
+
+    def residuals(theta: Array) -> Array:
+        error = _relative_ends(form.unpack(theta), course, twist) - measured
+        error[..., 2] = HEADING_WEIGHT_M * geometry.wrap_angle(error[..., 2])
+        return np.asarray(np.clip(error / horizons[..., None], -100.0, 100.0).ravel())
+
+    theta = form.pack()
+    found = least_squares(
+        residuals, theta, x_scale=np.maximum(np.abs(theta), 0.05), loss="soft_l1", diff_step=1e-4,
+        f_scale=LOSS_SCALE, max_nfev=MOST_EVALUATIONS, ftol=TOLERANCE, xtol=TOLERANCE,
+    )  # fmt: skip
+    return Yardstick(form.unpack(found.x), clock_offset_s)
