@@ -101,9 +101,9 @@ def align(drive: Drive, calibration: Calibration) -> Samples:
         states_at(drive, calibration, grid),
         held(recording.command, drive.spec, begin, begin + step),
     )
-    known = _outside_gaps(samples.t, t, step)
+    known = outside_gaps(samples.t, t, step)
     if recording.state is not None:
-        known &= _outside_gaps(samples.t, recording.state.t, step, STATE_GAP, 0.0)
+        known &= outside_gaps(samples.t, recording.state.t, step, STATE_GAP, 0.0)
     return samples.rows(known)
 
 
@@ -157,7 +157,7 @@ def _grid(recording: Recording, calibration: Calibration) -> Array:
     return np.asarray(first + step * np.arange(count + 1))
 
 
-def _outside_gaps(
+def outside_gaps(
     t: Array, samples: Array, step: float, usual: float = 3.0, least: float = MAX_GAP_S
 ) -> NDArray[np.bool_]:
     """Selects steps (T,) between samples less than `least` [s] or `usual` median steps apart."""

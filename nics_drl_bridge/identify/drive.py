@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.fit import ALPHA, ORDER, Alpha
+from nics_drl_bridge.identify.fit import ALPHA, ORDER, Alpha, Order
 from nics_drl_bridge.identify.signals import DIFFERENCE, DIFFERENCE_GAIN, GAUSSIAN_MAD, unwrapped
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -32,11 +32,12 @@ MAX_GAP_S = 0.25
 class Settings:
     """Options of an identification."""
 
-    order: int = ORDER  # of the Taylor expansion (Eq. 1)
+    order: Order = ORDER  # of the Taylor expansion (Eq. 1), or `auto`
     alpha: Alpha = ALPHA  # of the pruning (Eq. 2), or `auto`
     train_until_s: float = float("inf")  # end of the part to learn from, from the first pose
     assume: bool = False  # completes the model by the textbook for inputs that never moved
     strict: bool = False  # refuses a drive that did not move every input independently
+    control_period_s: float = 0.1  # of which the model's step is to be a part
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,5 +1,6 @@
 """Eq. 1 and 2 on one page (Sec. IV-A): features, least squares, pruning, least squares again."""
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -17,6 +18,8 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.threads import one_blas_thread
 
 Alpha = float | Literal["auto"]
+Order = int | Literal["auto"]
+Library = Callable[[NDArray[np.int64], RobotSpec], NDArray[np.bool_]]  # terms (D, K) of powers
 
 ALPHA: Alpha = 0.99
 ORDER = 2
@@ -82,9 +85,11 @@ def fit(
 
 
 def regress(
-    samples: Samples, spec: RobotSpec, order: int = ORDER, noisy: bool = False
-) -> Regression:
+    samples: Samples, spec: RobotSpec, order: int = ORDER, noisy: bool = False,
+    allowed: Library | None = None,
+) -> Regression:  # fmt: skip
     """Fits all features of order 1 to 4 (Eq. 1); FitError: too few samples, or nothing moved."""
+    # Of those that a library, if any, allows each degree of freedom.
     # `noisy` is any recording but an exact one: insignificant terms are dropped before Eq. 2, and
     # the body twist is a function of the state alone, if any, and zero at zero speed, if it moved:
     # within a step a command acts through the state, and in noise the two can't be told apart.
@@ -98,15 +103,19 @@ def regress(
     chi, kept = chi[:, independent], powers[independent]
     beta = np.zeros((samples.dq.shape[1], len(kept)))
     used = np.ones(samples.dq.T.shape, dtype=np.bool_)
-    through_state = excitation.terms_through_state(kept, spec, excited.unmoved)
+    if allowed is None:
+        terms = np.ones((beta.shape[0], len(kept)), dtype=np.bool_)
+        if noisy:
+            terms[:3] = excitation.terms_through_state(kept, spec, excited.unmoved)
+    else:
+        terms = allowed(kept, spec)
     usual, moving = excitation.usual_ranges(samples.dq), excitation.moving_dofs(samples.dq)
     for d in moving:
-        allowed = through_state if noisy and d < 3 else np.ones_like(through_state)
-        some, target = chi[:, allowed], samples.dq[:, d]
+        some, target = chi[:, terms[d]], samples.dq[:, d]
         used[d] = excitation.inliers(some / _scale(some), target, float(usual[d]))
         if not used[d].all():
             some, target = some[used[d]], target[used[d]]
-        unit, used_terms = some / _scale(some), np.flatnonzero(allowed)
+        unit, used_terms = some / _scale(some), np.flatnonzero(terms[d])
         if noisy:
             candidates = statistics.significant(unit, target)
             unit, used_terms = unit[:, candidates], used_terms[candidates]

@@ -9,11 +9,14 @@ import numpy as np
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import clocks as timings
-from nics_drl_bridge.identify import verdict
+from nics_drl_bridge.identify import motion as motions
+from nics_drl_bridge.identify import shooting, verdict
 from nics_drl_bridge.identify.assume import assume_textbook
-from nics_drl_bridge.identify.calibration import Calibration, align
+from nics_drl_bridge.identify.calibration import Calibration, Response, align
 from nics_drl_bridge.identify.drive import Drive, Settings
-from nics_drl_bridge.identify.fit import ALPHA, ORDER, Alpha, Fit, Regression, pruned, regress
+from nics_drl_bridge.identify.fit import (
+    ALPHA, ORDER, Alpha, Fit, Order, Regression, pruned, regress,
+)  # fmt: skip
 from nics_drl_bridge.identify.mounting import Mounting, mounted, mounting_of
 from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
 from nics_drl_bridge.identify.open_loop import OpenLoop
@@ -44,7 +47,10 @@ class Findings:
     # Of `clocks`, `mounting`, `responses` and `noise`; then of `refine`.
     calibration: Calibration = field(default_factory=Calibration)
     noise: Noise = field(default_factory=Noise)  # the pose sensor's of `noise`; the rest of `judge`
+    # of `motion`: half-width [s] of the parabolas that gave the state; None if it was not derived
+    width: float | None = None
     samples: Samples | None = None  # of the training part on one time axis, of `fit`
+    trials: tuple[motions.Trial, ...] = ()  # of orders, on parts of the training part, of `fit`
     regression: Regression | None = None  # on all features (Eq. 1), of `fit`
     linear: Fit | None = None  # the pruned fit (Eq. 2), of `prune`
     model: TaylorModel | None = None  # of `prune`; then of `refine` and `complete`
@@ -82,9 +88,19 @@ def repair(drive: Drive, findings: Findings) -> Findings:
 
 def clocks(drive: Drive, findings: Findings) -> Findings:
     """Finds the period of bursts, the offset between clocks, the latency of commands, and lags."""
-    training, found = findings.training, timings.timing_of(findings.training)
+    training, spec = findings.training, drive.spec
+    derived = motions.by_motion(spec, drive.recording)
+    followed = replace(training, spec=motions.surrogate(spec)) if derived else training
+    found = timings.timing_of(followed)
+    names = [c.name for c in spec.command]
+    responses = (
+        Response(v.name, v.follows, float(found.lags[names.index(v.follows)]))
+        for v in spec.state
+        if derived and v.follows and v.twist is None
+    )
     calibration = replace(
         findings.calibration,
+        responses=tuple(responses),
         clock_offset_s=found.offset,
         command_latency_s=found.latency,
         burst_period_s=training.bursts.period_s if training.bursts else 0.0,
@@ -96,7 +112,8 @@ def clocks(drive: Drive, findings: Findings) -> Findings:
 def mounting(drive: Drive, findings: Findings) -> Findings:
     """Finds where and how the tracked body is mounted on the robot."""
     training, speed = findings.training, None
-    if (place := speed_index(drive.spec)) is not None:
+    derived = motions.by_motion(drive.spec, drive.recording)
+    if not derived and (place := speed_index(drive.spec)) is not None:
         speed = timings.expected_states(training, training.twists, findings.timing)[:, place]
     found = mounting_of(training, findings.timing, speed)
     calibration = mounted(findings.calibration, found)
@@ -106,7 +123,9 @@ def mounting(drive: Drive, findings: Findings) -> Findings:
 def responses(drive: Drive, findings: Findings) -> Findings:
     """Finds how states that were not measured follow the commands, and the scale of the wheels."""
     training, calibration = findings.training, findings.calibration
-    found = timings.responses_of(training, calibration, findings.timing, findings.speed)
+    found = calibration.responses
+    if not motions.by_motion(drive.spec, drive.recording):
+        found = timings.responses_of(training, calibration, findings.timing, findings.speed)
     calibration = timings.with_wheels(training, replace(calibration, responses=found))
     return replace(findings, calibration=calibration)
 
@@ -120,14 +139,58 @@ def noise(drive: Drive, findings: Findings) -> Findings:
     return replace(findings, calibration=calibration, noise=sensor_noise(findings.whole))
 
 
+def motion(drive: Drive, findings: Findings) -> Findings:
+    """Takes the state from the poses, if it is a part of the twist that was not measured."""
+    if not motions.by_motion(drive.spec, drive.recording):
+        return findings
+    calibration, width = findings.calibration, motions.half_width(findings.training)
+    parts = []
+    for part in (findings.training, findings.whole):
+        grid = motions.grid_of(part, calibration, drive.settings.control_period_s)
+        parts.append(motions.with_motion(part, calibration, grid, width))
+    return replace(findings, training=parts[0], whole=parts[1], width=width)
+
+
+def aligned(drive: Drive, findings: Findings) -> Samples:
+    """Puts a drive on one time axis by what was found."""
+    if findings.width is None:
+        return align(drive, findings.calibration)
+    return motions.samples_of(drive, findings.calibration, findings.width)
+
+
+def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:
+    """Fits the order that predicts parts of the training part best that its fits did not see."""
+    samples, order = aligned(findings.training, findings), drive.settings.order
+    problem = motions.problem_of(findings.training, findings.calibration, samples)
+    everything = np.ones(len(samples.t), dtype=np.bool_)
+    trials = []
+    for each in motions.ORDERS if order == "auto" else (order,):
+        try:
+            trial = motions.tried(problem, drive.spec, each, everything)
+        except FitError as error:
+            if not trials:
+                raise FitError(f"{drive.recording.source}: {error}") from None
+            break
+        trials += [trial] if trial else []
+    best = motions.chosen(trials).order if trials else min(order, *motions.ORDERS)
+    linear = motions.linear_fit(samples, drive.spec, best)
+    return replace(
+        findings, samples=samples, regression=linear.regression, linear=linear, model=linear.model,
+        trials=tuple(trials),
+    )  # fmt: skip
+
+
 def fit(drive: Drive, findings: Findings) -> Findings:
     """Puts the streams on one time axis, and fits all terms by least squares (Eq. 1)."""
+    if findings.width is not None:
+        return _fit_of_motion(drive, findings)
     calibration, spec, settings = findings.calibration, drive.spec, drive.settings
     if spec.state and drive.recording.state is None:
         known(calibration.responses or None, "the response of each state", "responses")
     samples = align(findings.training, calibration)
     try:
-        regression = regress(samples, spec, settings.order, noisy=not calibration.is_exact)
+        order = ORDER if settings.order == "auto" else settings.order
+        regression = regress(samples, spec, order, noisy=not calibration.is_exact)
     except FitError as error:
         raise FitError(f"{drive.recording.source}: {error}") from None
     if settings.strict:
@@ -138,6 +201,8 @@ def fit(drive: Drive, findings: Findings) -> Findings:
 def prune(drive: Drive, findings: Findings) -> Findings:
     """Keeps the terms of Eq. 2, and fits them anew."""
     regression = known(findings.regression, "the fit of all terms", "fit")
+    if findings.width is not None:  # what a mirror allows is kept: the predictions weigh it
+        return findings
     linear = pruned(regression, drive.spec, drive.settings.alpha)
     return replace(findings, linear=linear, model=linear.model)
 
@@ -145,10 +210,27 @@ def prune(drive: Drive, findings: Findings) -> Findings:
 def refine(drive: Drive, findings: Findings) -> Findings:
     """Adjusts model and calibration to predictions over seconds, unless the drive is exact."""
     linear, _ = _fitted(findings)
+    if findings.width is not None:
+        return _refined_motion(drive, findings)
     if findings.calibration.is_exact:
         return findings
     model, calibration, note = refined(linear.model, findings.calibration, findings.training)
     return replace(findings, model=model, calibration=calibration, refinement=(note,))
+
+
+def _refined_motion(drive: Drive, findings: Findings) -> Findings:
+    linear, _ = _fitted(findings)
+    samples = known(findings.samples, "the training part", "fit")
+    problem = motions.problem_of(findings.training, findings.calibration, samples)
+    found = motions.refined(problem, linear, drive.spec)
+    calibration, late = findings.calibration, float(found.delays[0])
+    calibration = replace(calibration, command_latency_s=calibration.command_latency_s + late)
+    errors = motions.standard_errors(found)
+    return replace(
+        findings, calibration=calibration, model=replace(found.model, std_errors=errors),
+        refinement=(f"Coefficients and latency were refined by the open-loop errors over up to "
+                    f"{max(shooting.HORIZONS_S):g} s.",),
+    )  # fmt: skip
 
 
 def complete(drive: Drive, findings: Findings) -> Findings:
@@ -164,7 +246,7 @@ def judge(drive: Drive, findings: Findings) -> Findings:
     """Tries the model on unseen data, measures what it leaves unexplained, says what to doubt."""
     linear, model = _fitted(findings)
     spec, whole, calibration = drive.spec, findings.whole, findings.calibration
-    samples = align(whole, calibration)
+    samples = aligned(whole, findings)
     begin = whole.recording.pose.t[0] + calibration.clock_offset_s + drive.settings.train_until_s
     rest = samples.rows(samples.t > begin)
     unseen = rest if len(rest.t) >= verdict.MIN_ROWS else None
@@ -203,7 +285,7 @@ def _sentences(found: Findings) -> tuple[str, ...]:
 
 
 STAGES: tuple[Stage, ...] = (
-    repair, clocks, mounting, responses, noise, fit, prune, refine, complete, judge,
+    repair, clocks, mounting, responses, noise, motion, fit, prune, refine, complete, judge,
 )  # fmt: skip
 """In order; each builds on what the stages before it found."""
 
@@ -258,7 +340,7 @@ class Identified:
 def identify(
     recording: Recording,
     spec: RobotSpec,
-    order: int = ORDER,
+    order: Order = ORDER,
     alpha: Alpha = ALPHA,
     train_until: float | None = None,
     assume: bool = False,

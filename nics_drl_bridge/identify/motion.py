@@ -1,20 +1,43 @@
 """Motion as state: the body twist, taken from the pose, of robots whose state is a part of it."""
 
-from dataclasses import replace
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify import shooting
+from nics_drl_bridge.identify.calibration import Calibration, outside_gaps
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.signals import resample, unwrapped
-from nics_drl_bridge.recording.recording import Recording, Stream
-from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
+from nics_drl_bridge.identify.fit import Fit, regress, pruned
+from nics_drl_bridge.identify.signals import held, inferred_states, resample, unwrapped
+from nics_drl_bridge.identify.statistics import clustered_errors
+from nics_drl_bridge.recording.recording import (
+    Recording, Samples, Stream, samples_on_one_clock,
+)  # fmt: skip
+from nics_drl_bridge.robot.kinds import steady_twist
+from nics_drl_bridge.robot.spec import POSE_RATES, CommandVariable, RobotSpec, StateVariable
+from nics_drl_bridge.robot.taylor import TaylorModel
 
-WIDTHS_S = (0.07, 0.1, 0.15, 0.2, 0.3, 0.4)  # half-widths of the parabolas that give the twist
+Mask = NDArray[np.bool_]
+Powers = NDArray[np.int64]
+
+WIDTHS_S = (0.07, 0.1, 0.15, 0.2)  # half-widths of the parabolas that give the twist
 NOISE = 0.02  # share of the usual speed, and turn rate, that the noise of a twist may reach
+SAMPLES = 2.5  # half a width holds at least this many samples
+FINE_S, COARSE_S, COARSE_FROM_S = 0.01, 0.02, 0.015  # steps of models, by that of the poses
+ORDERS = (1, 2, 3)  # of which `auto` chooses
+WORTH = 0.95  # a higher order is worth its terms if it takes the error to this share
+FOLDS = 3
+CV_SPACING_S, CV_EVALUATIONS = 0.5, 12
+HORIZON_S = 5.0
 
 
 def by_motion(spec: RobotSpec, recording: Recording) -> bool:
@@ -33,24 +56,214 @@ def half_width(drive: Drive) -> float:
     for width in WIDTHS_S:
         gain = np.sqrt(12.0 * every / (2.0 * width)) / (2.0 * width)
         if gain * position <= NOISE * speed and gain * heading <= NOISE * max(turn, speed):
-            return max(width, 2.5 * every)
-    return WIDTHS_S[-1]
-
-
-def twists_on(drive: Drive, calibration: Calibration, grid: Array, width: float) -> Array:
-    """Returns body twists (T, 3) of `base_link` at uniform times (T,) on the commands' clock."""
-    t = drive.sample_t + calibration.clock_offset_s
-    tracked = resample(t, unwrapped(drive.recording.pose.values), grid, 0.5 * width)
-    pose = unwrapped(calibration.to_base(tracked))
-    step = float(grid[1] - grid[0])
-    rows = 2 * max(2, round(width / step)) + 1
-    rates = savgol_filter(pose, rows, 2, deriv=1, delta=step, axis=0)
-    return np.concatenate([geometry.rotate(rates[:, :2], -pose[:, 2]), rates[:, 2:]], axis=1)
+            break
+    return float(max(width, SAMPLES * every))
 
 
 def with_motion(drive: Drive, calibration: Calibration, grid: Array, width: float) -> Drive:
-    """Returns a drive whose state is the twist of its poses, at uniform times (T,)."""
-    twist = twists_on(drive, calibration, grid, width)
-    columns = [twist[:, POSE_RATES.index(v.twist)] for v in drive.spec.state if v.twist]
-    state = Stream(grid, np.stack(columns, axis=1), drive.recording.command.clock)
-    return drive.part(replace(drive.recording, state=state))
+    """Returns a drive with the state at uniform times (T,) on the commands' clock.
+
+    Components of the twist of `base_link` are slopes of parabolas over twice the half-width [s];
+    states that follow a command do so with the calibration's lags.
+    """
+    recording, spec, step = drive.recording, drive.spec, float(grid[1] - grid[0])
+    t = drive.sample_t + calibration.clock_offset_s
+    tracked = resample(t, unwrapped(recording.pose.values), grid, 0.5 * width)
+    pose = unwrapped(calibration.to_base(tracked))
+    rows = 2 * max(2, round(width / step)) + 1
+    rates = savgol_filter(pose, rows, 2, deriv=1, delta=step, axis=0)
+    twist = np.concatenate([geometry.rotate(rates[:, :2], -pose[:, 2]), rates[:, 2:]], axis=1)
+    columns = [
+        twist[:, POSE_RATES.index(v.twist)] if v.twist else _following(v, drive, calibration, grid)
+        for v in spec.state
+    ]
+    state = Stream(grid, np.stack(columns, axis=1), recording.command.clock)
+    return drive.part(replace(recording, state=state))
+
+
+def _following(
+    variable: StateVariable, drive: Drive, calibration: Calibration, grid: Array
+) -> Array:
+    alone = drive.spec.model_copy(update={"state": (variable,)})
+    lag = [r.lag_s for r in calibration.responses if r.state == variable.name]
+    latency, command = calibration.command_latency_s, drive.recording.command
+    return inferred_states(command, alone, np.array(lag), latency, grid)[:, 0]
+
+
+def mirrored(spec: RobotSpec) -> tuple[str, ...] | None:
+    """Names the variables that change sign in a mirror; None if the textbook does not tell."""
+    rng = np.random.default_rng(0)
+    some = rng.uniform(0.1, 0.9, (8, len(spec.command))) * np.maximum(
+        spec.command_high, -spec.command_low
+    )
+    try:
+        twist = steady_twist(spec, some) * np.array([1.0, -1.0, -1.0])
+        for signs in product((1.0, -1.0), repeat=len(spec.command)):
+            if np.allclose(steady_twist(spec, some * signs), twist):
+                break
+        else:
+            return None
+    except ConfigError:
+        return None
+    odd = [c.name for c, sign in zip(spec.command, signs, strict=True) if sign < 0.0]
+    aside = [v.name for v in spec.state if v.twist in ("vy", "wz") or v.follows in odd]
+    return (*aside, *odd)
+
+
+def library(powers: Powers, spec: RobotSpec) -> Mask:
+    """Selects the terms (D, K) that each degree of freedom may have.
+
+    A state that is a component of the twist is so by definition. Slip along y acts in proportion.
+    Beyond the first order, what a mirror reverses is made of what it reverses.
+    """
+    names, odd = spec.variable_names, mirrored(spec)
+    order = powers.sum(axis=1)
+    slip = [names.index(v.name) for v in spec.state if v.twist == "vy"]
+    allowed = np.ones((len(spec.dof_names), len(powers)), dtype=np.bool_)
+    allowed[:, (powers[:, slip].sum(axis=1) > 0) & (order > 1)] = False
+    if odd is not None:
+        reversed_ = powers[:, [n in odd for n in names]].sum(axis=1) % 2 == 1
+        for d, name in enumerate(spec.dof_names):
+            aside = name in ("vy", "wz") or name.removeprefix("d_") in odd
+            allowed[d] &= (reversed_ == aside) | (order <= 1)
+    allowed[:3] &= (powers[:, len(spec.state) :] == 0).all(axis=1)
+    for i, variable in enumerate(spec.state):
+        alone = (order == 1) & (powers[:, i] == 1)
+        if variable.twist:
+            allowed[POSE_RATES.index(variable.twist)] = alone
+        else:
+            follows = names.index(str(variable.follows))
+            allowed[3 + i] = alone | ((order == 1) & (powers[:, follows] == 1))
+    return allowed
+
+
+def samples_of(drive: Drive, calibration: Calibration, width: float) -> Samples:
+    """Puts a drive `with_motion` on the time axis of its state, poses smoothed like it."""
+    state, spec = known_state(drive), drive.spec
+    grid = state.t
+    step = float(grid[1] - grid[0])
+    t = drive.sample_t + calibration.clock_offset_s
+    tracked = resample(t, unwrapped(drive.recording.pose.values), grid, 0.5 * width)
+    begin = grid - calibration.command_latency_s
+    command = held(drive.recording.command, spec, begin, begin + step)
+    samples = samples_on_one_clock(grid, calibration.to_base(tracked), state.values, command)
+    return samples.rows(outside_gaps(samples.t, t, step))
+
+
+def known_state(drive: Drive) -> Stream:
+    """Returns the state of a drive `with_motion`."""
+    if drive.recording.state is None:
+        raise RecordingError(f"{drive.recording.source}: its motion was not derived yet.")
+    return drive.recording.state
+
+
+def grid_of(drive: Drive, calibration: Calibration, period: float) -> Array:
+    """Returns uniform times (T,) of poses on the commands' clock; the step divides a period [s]."""
+    pose = drive.recording.pose.t + calibration.clock_offset_s
+    usual = float(np.median(np.diff(drive.dated.t)))
+    step = period / max(1, round(period / (FINE_S if usual < COARSE_FROM_S else COARSE_S)))
+    first = max(pose[0], drive.recording.command.t[0])
+    return np.asarray(first + step * np.arange(int((pose[-1] - first) / step + 1e-6) + 1))
+
+
+def surrogate(spec: RobotSpec) -> RobotSpec:
+    """Returns a robot whose state follows its commands, one by one: for delays and lags."""
+
+    def follows(command: CommandVariable) -> StateVariable:
+        given = command.model_dump(include={"unit", "min", "max"})
+        return StateVariable(name=f"{command.name}_state", follows=command.name, **given)
+
+    return spec.model_copy(update={"state": tuple(map(follows, spec.command))})
+
+
+def problem_of(drive: Drive, calibration: Calibration, samples: Samples) -> shooting.Shooting:
+    """Returns the prediction problem of a drive on one time axis."""
+    command, spec, t, dt = drive.recording.command, drive.spec, samples.t, samples.dt
+
+    def commands(delay: Array) -> Array:
+        begin = t - calibration.command_latency_s - float(delay[0])
+        return held(command, spec, begin, begin + dt)
+
+    return shooting.Shooting(samples, commands)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A trial of one order, on parts of the training part that its fits did not see."""
+
+    order: int
+    error: float  # mean error after `HORIZON_S`, as a share of the path
+    errors: dict[float, Array]  # (W,) distances at the ends of predictions, by horizon [m]
+
+
+def linear_fit(samples: Samples, spec: RobotSpec, order: int) -> Fit:
+    """Fits all terms of the library of an order to the rates (Eq. 1)."""
+    return pruned(regress(samples, spec, order, allowed=library), spec, 1.0)
+
+
+def refined(
+    problem: shooting.Shooting, linear: Fit, spec: RobotSpec, inside: Mask | None = None,
+    evaluations: int = shooting.EVALUATIONS,
+) -> shooting.Predictive:  # fmt: skip
+    """Adjusts a linear fit to predictions over seconds."""
+    model, defined = by_definition(linear.model, spec)
+    free = (model.coefficients != 0.0) & ~defined
+    return shooting.fitted(problem, model, free, np.zeros(1), inside, evaluations)
+
+
+def by_definition(model: TaylorModel, spec: RobotSpec) -> tuple[TaylorModel, Mask]:
+    """Sets the rows of the twist that are states; returns the mask (D, K) of what is defined."""
+    coefficients, order = model.coefficients.copy(), model.powers.sum(axis=1)
+    defined = np.zeros(coefficients.shape, dtype=np.bool_)
+    for i, variable in enumerate(spec.state):
+        if variable.twist:
+            d = POSE_RATES.index(variable.twist)
+            coefficients[d] = ((order == 1) & (model.powers[:, i] == 1)).astype(np.float64)
+            defined[d] = True
+        else:
+            defined[3 + i] = True
+    return replace(model, coefficients=coefficients), defined
+
+
+def tried(problem: shooting.Shooting, spec: RobotSpec, order: int, inside: Mask) -> Trial | None:
+    """Fits to all but one of `FOLDS` parts of the rows `inside` (T,), predicts that; each in turn."""
+    sparse = replace(problem, spacing_s=CV_SPACING_S)
+    blocks = np.array_split(np.flatnonzero(inside), FOLDS)
+    errors: dict[float, list[Array]] = {h: [] for h in BANDS_S}
+    ends, paths = [], []
+    for block in blocks:
+        kept, left = inside.copy(), np.zeros_like(inside)
+        kept[block], left[block] = False, True
+        linear = linear_fit(problem.samples.rows(kept), spec, order)
+        found = refined(sparse, linear, spec, kept, CV_EVALUATIONS)
+        for horizon in BANDS_S:
+            error, path = problem.errors(found.model, found.delays, horizon, left)
+            errors[horizon].append(np.hypot(error[:, 0], error[:, 1]))
+        ends.append(errors[HORIZON_S][-1])
+        paths.append(path)
+    far, path = np.concatenate(ends), np.concatenate(paths)
+    if not len(far):
+        return None
+    share = float(far.mean() / max(float(path.mean()), 1e-9))
+    return Trial(order, share, {h: np.concatenate(each) for h, each in errors.items()})
+
+
+BANDS_S = (0.5, 1.0, 2.0, HORIZON_S)
+
+
+def chosen(trials: list[Trial]) -> Trial:
+    """Returns the trial of the lowest order that a higher one does not clearly improve on."""
+    best = trials[0]
+    for trial in trials[1:]:
+        if trial.error < WORTH * best.error:
+            best = trial
+    return best
+
+
+def standard_errors(found: shooting.Predictive) -> Array:
+    """Returns standard errors (D, K) of the free coefficients; NaN for the others."""
+    span = max(shooting.HORIZONS_S)
+    cluster = np.floor((found.starts - found.starts.min()) / span).astype(np.intp)
+    errors = np.full(found.free.shape, np.nan)
+    errors[found.free] = clustered_errors(found.jacobian, found.residual, cluster)
+    return errors

@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array, rotate, wrap_angle
 from nics_drl_bridge.identify import clocks
 from nics_drl_bridge.identify.calibration import Calibration
@@ -15,6 +16,7 @@ from nics_drl_bridge.identify.drive import Drive, TwistIntervals
 from nics_drl_bridge.identify.signals import followed, held
 from nics_drl_bridge.identify.statistics import standard_errors
 from nics_drl_bridge.recording.recording import Stream
+from nics_drl_bridge.robot.kinds import steady_twist
 from nics_drl_bridge.robot.kinds import has_textbook, steady_twist
 
 TURN_SCALE_M = 0.2  # a yaw rate counts as the speed at this distance
@@ -23,6 +25,7 @@ MIN_SECOND = 0.05  # it must have at least this share of the size of the first
 STILL = 1e-3
 FLAT = 0.02  # less of the direction without extent lies in the plane: it only never turned
 MIN_LENGTH = 1e-4  # m, rad
+MOST_SLIP = 0.15  # a smaller angle between travel and heading may be slip [rad]
 REGULAR = 0.8
 BLOCKS = 8
 
@@ -54,6 +57,13 @@ def mounting_of(
         return found
     found.lever[1], found.lever_sigma[1] = lateral_lever(twists, found.rotation, speed)
     return found
+
+
+def without_slip(found: Mounting) -> Mounting | None:
+    """Believes of a robot that slips only a rotation that no slip explains."""
+    if abs(found.rotation) < MOST_SLIP:
+        return None
+    return replace(found, lever=np.zeros(2), lever_sigma=np.full(2, np.nan))
 
 
 def mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
