@@ -212,13 +212,17 @@ class RobotSpec(Schema):
         return self.steers and self.angular_is == "turn_rate"
 
     @property
+    def knows_wheelbase(self) -> bool:
+        """True if its wheelbase is given, not only assumed."""
+        return self.parameters.get("wheelbase", 0.0) > 0.0 and "wheelbase" not in self.assumed
+
+    @property
     def wheelbase(self) -> float:
         """Distance between the axles of a robot that steers [m]. Raises ConfigError if unknown."""
-        wheelbase = self.parameters.get("wheelbase", 0.0)
-        if not wheelbase > 0.0 or "wheelbase" in self.assumed:
+        if not self.knows_wheelbase:
             fix = "add `wheelbase:` [m] to the `parameters:` of its YAML file."
             raise ConfigError(f"robot {self.name!r} steers, and its wheelbase is not known; {fix}")
-        return wheelbase
+        return self.parameters["wheelbase"]
 
     @cached_property
     def command_low(self) -> NDArray[np.float64]:
