@@ -17,7 +17,7 @@ from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.open_loop import Windows, windows
 from nics_drl_bridge.identify.signals import held, unwrapped
-from nics_drl_bridge.identify.yardstick_kernels import STRAIGHT, Bicycle, roll_windows
+from nics_drl_bridge.identify.yardstick_kernels import STRAIGHT, BicycleGeometry, roll_windows
 from nics_drl_bridge.robot.kinds import steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.threads import one_blas_thread
@@ -49,7 +49,7 @@ class TextbookResponse:
     offset: Array  # (3,)
     lag_s: Array  # (3,)
     limit: Array  # (2,) greatest acceleration, deceleration of the first actuator [m/s^2]
-    bicycle: Bicycle
+    bicycle: BicycleGeometry
     mounting: Array  # (3,) pose of the tracked body in `base_link`
 
 
@@ -170,7 +170,7 @@ class _Form:
         return TextbookResponse(float(delay[0]), gain, offset, lag, limit, bicycle, mounting)
 
 
-def _structure(spec: RobotSpec) -> tuple[Array, Bicycle] | None:
+def _structure(spec: RobotSpec) -> tuple[Array, BicycleGeometry] | None:
     """Asks the textbook what each command moves (3, C), and for a bicycle; None without one."""
     half = PROBE * np.maximum(spec.command_high, -spec.command_low)
     try:
@@ -185,7 +185,7 @@ def _structure(spec: RobotSpec) -> tuple[Array, Bicycle] | None:
     length = abs(forward * (np.sin(angle) if front else np.tan(angle)) / together[2])
     moves = np.zeros((3, 2))
     moves[0, speed] = moves[2, 1 - speed] = 1.0
-    return moves, Bicycle(True, front, float(length), 0.0)
+    return moves, BicycleGeometry(True, front, float(length), 0.0)
 
 
 def _first_guess(drive: Drive, until_s: float, clock_offset: float) -> _Form:
@@ -217,7 +217,7 @@ def _first_guess(drive: Drive, until_s: float, clock_offset: float) -> _Form:
 
 
 def _regressed(
-    u: Array, twist: Array, change: Array, moves: NDArray[np.bool_], bicycle: Bicycle
+    u: Array, twist: Array, change: Array, moves: NDArray[np.bool_], bicycle: BicycleGeometry
 ) -> tuple[float, Array, Array, Array]:
     """Regresses twist + lag * change on commands: what is left, gains, offsets, lags."""
     left, gain, offset, lag = 0.0, np.zeros(moves.shape), np.zeros(3), np.full(3, LAG_S)
