@@ -17,7 +17,7 @@ from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.open_loop import Windows, windows
 from nics_drl_bridge.identify.signals import held, unwrapped
-from nics_drl_bridge.identify.yardstick_kernels import STRAIGHT, Bicycle, roll_windows
+from nics_drl_bridge.identify.yardstick_kernels import STRAIGHT, BicycleGeometry, roll_windows
 from nics_drl_bridge.robot.kinds import steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.threads import one_blas_thread
@@ -49,7 +49,7 @@ class TextbookResponse:
     offset: Array  # (3,)
     lag_s: Array  # (3,)
     limit: Array  # (2,) greatest acceleration, deceleration of the first actuator [m/s^2]
-    bicycle: Bicycle
+    bicycle: BicycleGeometry
     mounting: Array  # (3,) pose of the tracked body in `base_link`
 
 
@@ -170,26 +170,32 @@ class _Form:
         return TextbookResponse(float(delay[0]), gain, offset, lag, limit, bicycle, mounting)
 
 
-def _structure(spec: RobotSpec) -> tuple[Array, Bicycle] | None:
+def _structure(spec: RobotSpec) -> tuple[Array, BicycleGeometry] | None:
     """Asks the textbook what each command moves (3, C), and for a bicycle; None without one."""
     half = PROBE * np.maximum(spec.command_high, -spec.command_low)
     try:
         alone, together = steady_twist(spec, np.diag(half)), steady_twist(spec, half)
+        if len(half) != 2 or alone[:, 2].any() or together[2] == 0.0:
+            return (alone / half[:, None]).T, STRAIGHT
+        speed = int(np.argmax(np.abs(alone[:, 0])))
+        less = np.where(np.arange(2) == speed, half, 0.5 * half)
+        forward, slower = alone[speed, 0], steady_twist(spec, less)
     except ConfigError:
         return None
-    if len(half) != 2 or alone[:, 2].any() or together[2] == 0.0:
-        return (alone / half[:, None]).T, STRAIGHT
-    speed = int(np.argmax(np.abs(alone[:, 0])))
-    angle, forward = half[1 - speed], alone[speed, 0]
-    front = bool(abs(together[0]) < (1.0 - 1e-6) * abs(forward))
+    cosine = float(together[0] / forward)
+    if front := cosine < 1.0 - 1e-6:
+        angle = float(np.arccos(cosine))
+    else:  # the tangent of half an angle, from that of the angle
+        share = 1.0 - 2.0 * float(slower[2] / together[2])
+        angle = 2.0 * float(np.arctan(np.sqrt(max(share, 1e-6))))
     length = abs(forward * (np.sin(angle) if front else np.tan(angle)) / together[2])
     moves = np.zeros((3, 2))
-    moves[0, speed] = moves[2, 1 - speed] = 1.0
-    return moves, Bicycle(True, front, float(length), 0.0)
+    moves[0, speed], moves[2, 1 - speed] = forward / half[speed], angle / half[1 - speed]
+    return moves, BicycleGeometry(True, front, float(length), 0.0)
 
 
-def _first_guess(drive: Drive, until_s: float, clock_offset: float) -> _Form:
-    """Fits gains and lags by least squares to motions over `GUESS_S`, at the best delay."""
+def _first_guess(drive: Drive, until_s: float, clock_offset: float, offsets: bool) -> _Form:
+    """Fits gains, lags and maybe offsets to motions over `GUESS_S` at the best delay, linearly."""
     structure = _structure(drive.spec)
     book, bicycle = structure or (np.ones((3, len(drive.spec.command))), STRAIGHT)
     seen = windows(drive, Calibration(), 0.0, until_s, GUESS_S, SPACING_S)
@@ -206,7 +212,7 @@ def _first_guess(drive: Drive, until_s: float, clock_offset: float) -> _Form:
             a, b = ((v[:, 0] + 1j * v[:, 1]) for v in (expected, twist))
             rotation = float(np.angle((a.conj() * b).sum()))
         moved = (_turned(twist, -rotation), _turned(change, -rotation))
-        left, gain, offset, lag = _regressed(u, *moved, book != 0.0, bicycle)
+        left, gain, offset, lag = _regressed(u, *moved, book != 0.0, bicycle, offsets)
         tried.append((left, TextbookResponse(
             float(delay), gain, offset, lag, np.full(2, LIMIT), bicycle,
             np.array([0.0, 0.0, -rotation]),
@@ -217,12 +223,17 @@ def _first_guess(drive: Drive, until_s: float, clock_offset: float) -> _Form:
 
 
 def _regressed(
-    u: Array, twist: Array, change: Array, moves: NDArray[np.bool_], bicycle: Bicycle
+    u: Array,
+    twist: Array,
+    change: Array,
+    moves: NDArray[np.bool_],
+    bicycle: BicycleGeometry,
+    offsets: bool,
 ) -> tuple[float, Array, Array, Array]:
     """Regresses twist + lag * change on commands: what is left, gains, offsets, lags."""
     left, gain, offset, lag = 0.0, np.zeros(moves.shape), np.zeros(3), np.full(3, LAG_S)
     for i in np.flatnonzero(moves.any(axis=1)):
-        given = np.column_stack([u[:, moves[i]], np.ones(len(u))])
+        given = np.column_stack([u[:, moves[i]], np.full(len(u), float(offsets))])
         rows = np.column_stack([given, -change[:, i]])
         if angle := bicycle.used and i == 2:
             rows = given = given * twist[:, :1] / bicycle.wheelbase
@@ -254,16 +265,21 @@ def fit_yardstick(drive: Drive, until_s: float, clock_offset_s: float = 0.0) -> 
     pose = unwrapped(drive.dated.values)
     ends = np.stack([np.interp(at, drive.dated.t, column) for column in pose.T], axis=-1)
     measured = geometry.between(chosen.start[:, None], ends)
-    form = _first_guess(drive, until_s, clock_offset_s)
 
-    def residuals(theta: Array) -> Array:
-        error = _relative_ends(form.unpack(theta), course, twist) - measured
-        error[..., 2] = HEADING_WEIGHT_M * geometry.wrap_angle(error[..., 2])
-        return np.asarray(np.clip(error / horizons[..., None], -100.0, 100.0).ravel())
+    def fitted(form: _Form) -> tuple[float, TextbookResponse]:
+        def residuals(theta: Array) -> Array:
+            error = _relative_ends(form.unpack(theta), course, twist) - measured
+            error[..., 2] = HEADING_WEIGHT_M * geometry.wrap_angle(error[..., 2])
+            return np.asarray(np.clip(error / horizons[..., None], -100.0, 100.0).ravel())
 
-    theta = form.pack()
-    found = least_squares(
-        residuals, theta, x_scale=np.maximum(np.abs(theta), 0.05), loss="soft_l1", diff_step=1e-4,
-        f_scale=LOSS_SCALE, max_nfev=MOST_EVALUATIONS, ftol=TOLERANCE, xtol=TOLERANCE,
-    )  # fmt: skip
-    return Yardstick(form.unpack(found.x), clock_offset_s)
+        theta = form.pack()
+        found = least_squares(
+            residuals, theta, x_scale=np.maximum(np.abs(theta), 0.05), loss="soft_l1",
+            diff_step=1e-4, f_scale=LOSS_SCALE, max_nfev=MOST_EVALUATIONS, ftol=TOLERANCE,
+            xtol=TOLERANCE,
+        )  # fmt: skip
+        return float(found.cost), form.unpack(found.x)
+
+    guesses = [_first_guess(drive, until_s, clock_offset_s, offsets) for offsets in (True, False)]
+    best = min((fitted(guess) for guess in guesses), key=lambda pair: pair[0])
+    return Yardstick(best[1], clock_offset_s)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 from nics_drl_bridge.kernels import kernel
 
 
-class Bicycle(NamedTuple):
+class BicycleGeometry(NamedTuple):
     """Geometry of a robot that steers."""
 
     used: bool
@@ -15,7 +15,7 @@ class Bicycle(NamedTuple):
     understeer: float  # turn rates are divided by 1 + understeer * speed^2 [s^2/m^2]
 
 
-STRAIGHT = Bicycle(False, False, 1.0, 0.0)
+STRAIGHT = BicycleGeometry(False, False, 1.0, 0.0)
 
 
 @kernel
