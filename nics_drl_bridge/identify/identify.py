@@ -161,12 +161,16 @@ def aligned(drive: Drive, findings: Findings) -> Samples:
 def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:
     """Fits the order that predicts parts of the training part best that its fits did not see."""
     samples, order = aligned(findings.training, findings), drive.settings.order
+    delay = motions.likely_delay(findings.training, findings.calibration, samples)
+    calibration = replace(findings.calibration, command_latency_s=delay)
+    findings = replace(findings, calibration=calibration)
+    samples = aligned(findings.training, findings)
     problem = motions.problem_of(findings.training, findings.calibration, samples)
     everything = np.ones(len(samples.t), dtype=np.bool_)
     trials = []
     for each in motions.ORDERS if order == "auto" else (order,):
         try:
-            trial = motions.tried(problem, drive.spec, each, everything)
+            trial = motions.tried(problem, drive.spec, each, delay, everything)
         except FitError as error:
             if not trials:
                 raise FitError(f"{drive.recording.source}: {error}") from None
@@ -222,9 +226,9 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
     linear, _ = _fitted(findings)
     samples = known(findings.samples, "the training part", "fit")
     problem = motions.problem_of(findings.training, findings.calibration, samples)
-    found = motions.refined(problem, linear, drive.spec)
-    calibration, late = findings.calibration, float(found.delays[0])
-    calibration = replace(calibration, command_latency_s=calibration.command_latency_s + late)
+    calibration = findings.calibration
+    found = motions.refined(problem, linear, drive.spec, calibration.command_latency_s)
+    calibration = replace(calibration, command_latency_s=float(found.delays[0]))
     errors = motions.standard_errors(found)
     return replace(
         findings, calibration=calibration, model=replace(found.model, std_errors=errors),

@@ -36,7 +36,8 @@ FINE_S, COARSE_S, COARSE_FROM_S = 0.01, 0.02, 0.015  # steps of models, by that 
 ORDERS = (1, 2, 3)  # of which `auto` chooses
 WORTH = 0.95  # a higher order is worth its terms if it takes the error to this share
 FOLDS = 3
-CV_SPACING_S, CV_EVALUATIONS = 0.5, 12
+DELAY_ORDER, DELAY_STEP_S, LONGEST_S = 2, 0.02, 0.4  # of the search for a delay
+CV_SPACING_S, CV_EVALUATIONS = 0.5, 25
 HORIZON_S = 5.0
 
 
@@ -141,13 +142,13 @@ def samples_of(drive: Drive, calibration: Calibration, width: float) -> Samples:
     """Puts a drive `with_motion` on the time axis of its state, poses smoothed like it."""
     state, spec = known_state(drive), drive.spec
     grid = state.t
-    step = float(grid[1] - grid[0])
+    step = round(float(grid[-1] - grid[0]) / (len(grid) - 1), 9)
     t = drive.sample_t + calibration.clock_offset_s
     tracked = resample(t, unwrapped(drive.recording.pose.values), grid, 0.5 * width)
     begin = grid - calibration.command_latency_s
     command = held(drive.recording.command, spec, begin, begin + step)
     samples = samples_on_one_clock(grid, calibration.to_base(tracked), state.values, command)
-    return samples.rows(outside_gaps(samples.t, t, step))
+    return replace(samples.rows(outside_gaps(samples.t, t, step)), dt=step)
 
 
 def known_state(drive: Drive) -> Stream:
@@ -181,7 +182,7 @@ def problem_of(drive: Drive, calibration: Calibration, samples: Samples) -> shoo
     command, spec, t, dt = drive.recording.command, drive.spec, samples.t, samples.dt
 
     def commands(delay: Array) -> Array:
-        begin = t - calibration.command_latency_s - float(delay[0])
+        begin = t - float(delay[0])
         return held(command, spec, begin, begin + dt)
 
     return shooting.Shooting(samples, commands)
@@ -196,19 +197,33 @@ class Trial:
     errors: dict[float, Array]  # (W,) distances at the ends of predictions, by horizon [m]
 
 
+def likely_delay(drive: Drive, calibration: Calibration, samples: Samples) -> float:
+    """Returns the delay [s] of the commands by which they best explain the rates of the state."""
+    problem, now = problem_of(drive, calibration, samples), calibration.command_latency_s
+    one_clock = drive.recording.pose.clock == drive.recording.command.clock
+    tries = np.arange(0.0, LONGEST_S, DELAY_STEP_S) - (0.0 if one_clock else LONGEST_S / 2.0)
+    states, left = len(drive.spec.state), []
+    free = [3 + i for i, v in enumerate(drive.spec.state) if v.twist]
+    for delay in tries:
+        x = np.concatenate([samples.x[:, :states], problem.commands(np.array([delay]))], axis=1)
+        found = linear_fit(replace(samples, x=x), drive.spec, DELAY_ORDER)
+        left.append(float((1.0 - found.r2[free]).sum()))
+    return float(tries[int(np.argmin(left))]) if np.isfinite(left).all() else now
+
+
 def linear_fit(samples: Samples, spec: RobotSpec, order: int) -> Fit:
     """Fits all terms of the library of an order to the rates (Eq. 1)."""
     return pruned(regress(samples, spec, order, allowed=library), spec, 1.0)
 
 
 def refined(
-    problem: shooting.Shooting, linear: Fit, spec: RobotSpec, inside: Mask | None = None,
-    evaluations: int = shooting.EVALUATIONS,
+    problem: shooting.Shooting, linear: Fit, spec: RobotSpec, delay: float,
+    inside: Mask | None = None, evaluations: int = shooting.EVALUATIONS,
 ) -> shooting.Predictive:  # fmt: skip
-    """Adjusts a linear fit to predictions over seconds."""
+    """Adjusts a linear fit, and the delay of its commands [s], to predictions over seconds."""
     model, defined = by_definition(linear.model, spec)
     free = (model.coefficients != 0.0) & ~defined
-    return shooting.fitted(problem, model, free, np.zeros(1), inside, evaluations)
+    return shooting.fitted(problem, model, free, np.array([delay]), inside, evaluations)
 
 
 def by_definition(model: TaylorModel, spec: RobotSpec) -> tuple[TaylorModel, Mask]:
@@ -225,7 +240,9 @@ def by_definition(model: TaylorModel, spec: RobotSpec) -> tuple[TaylorModel, Mas
     return replace(model, coefficients=coefficients), defined
 
 
-def tried(problem: shooting.Shooting, spec: RobotSpec, order: int, inside: Mask) -> Trial | None:
+def tried(
+    problem: shooting.Shooting, spec: RobotSpec, order: int, delay: float, inside: Mask
+) -> Trial | None:
     """Fits to all but one of `FOLDS` parts of the rows `inside` (T,), predicts that; each in turn."""
     sparse = replace(problem, spacing_s=CV_SPACING_S)
     blocks = np.array_split(np.flatnonzero(inside), FOLDS)
@@ -235,7 +252,7 @@ def tried(problem: shooting.Shooting, spec: RobotSpec, order: int, inside: Mask)
         kept, left = inside.copy(), np.zeros_like(inside)
         kept[block], left[block] = False, True
         linear = linear_fit(problem.samples.rows(kept), spec, order)
-        found = refined(sparse, linear, spec, kept, CV_EVALUATIONS)
+        found = refined(sparse, linear, spec, delay, kept, CV_EVALUATIONS)
         for horizon in BANDS_S:
             error, path = problem.errors(found.model, found.delays, horizon, left)
             errors[horizon].append(np.hypot(error[:, 0], error[:, 1]))

@@ -157,7 +157,7 @@ def fitted(
         own = np.concatenate([np.zeros((len(unit), count)), pull * np.eye(len(unit))], axis=1)
         return np.concatenate([np.concatenate([late, slope], axis=1), own])
 
-    low = np.concatenate([-delays / DELAY_S - 1e-9, np.full(len(unit), -np.inf)])
+    low = np.concatenate([np.minimum(-delays / DELAY_S, 0.0) - 1e-9, np.full(len(unit), -np.inf)])
     high = np.concatenate([(LONGEST_DELAY_S - delays) / DELAY_S, np.full(len(unit), np.inf)])
     found = least_squares(
         residual, np.zeros(count + len(unit)), jac=jacobian, bounds=(low, high), loss="soft_l1",
