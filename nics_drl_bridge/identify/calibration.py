@@ -13,6 +13,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import MAX_GAP_S, MIN_STAMPS, Drive
 from nics_drl_bridge.identify.signals import held, inferred_states, resample, unwrapped
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
+from nics_drl_bridge.robot.curve import InputCurve
 
 STEP_S = 0.01  # step of the samples where the pose's own step is not usable
 STEP_RANGE_S = (0.002, 0.02)
@@ -42,6 +43,7 @@ class Calibration:
     rotation_rad: float = 0.0  # heading of `base_link` minus the heading of the tracked body
     lever_arm_m: tuple[float, float] = (0.0, 0.0)  # (x, y) of the tracked point in `base_link`
     responses: tuple[Response, ...] = ()  # of the state variables; empty if the state was measured
+    inputs: tuple[InputCurve, ...] = ()  # of the commands that have a dead zone or saturate
     burst_period_s: NonNegativeFloat = 0.0  # between bursts of poses; 0 without bursts
     position_noise_m: NonNegativeFloat = 0.0  # standard deviation of x and y of the pose
     heading_noise_rad: NonNegativeFloat = 0.0
@@ -59,6 +61,7 @@ class Calibration:
             self.clock_offset_s == self.command_latency_s == self.rotation_rad == 0.0
             and self.lever_arm_m == (0.0, 0.0)
             and not self.responses
+            and not self.inputs
             and self.burst_period_s == 0.0
         )
 

@@ -17,6 +17,7 @@ from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.fit import (
     ALPHA, ORDER, Alpha, Fit, Order, Regression, pruned, regress,
 )  # fmt: skip
+from nics_drl_bridge.identify.inputs import curve_of
 from nics_drl_bridge.identify.mounting import Mounting, mounted, mounting_of
 from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
 from nics_drl_bridge.identify.open_loop import OpenLoop
@@ -158,26 +159,54 @@ def aligned(drive: Drive, findings: Findings) -> Samples:
     return motions.samples_of(drive, findings.calibration, findings.width)
 
 
-def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:
-    """Fits the order that predicts parts of the training part best that its fits did not see."""
-    samples, order = aligned(findings.training, findings), drive.settings.order
+def inputs(drive: Drive, findings: Findings) -> Findings:
+    """Finds the latency, and dead zones and saturation of commands, that explain a motion."""
+    if findings.width is None:
+        return findings
+    training, samples = findings.training, aligned(findings.training, findings)
+    findings = _with_delay(findings, samples)
+    curves = (
+        curve_of(aligned(training, findings), drive.spec, c) for c in range(len(drive.spec.command))
+    )
+    calibration = replace(findings.calibration, inputs=tuple(c for c in curves if c is not None))
+    findings = replace(findings, calibration=calibration)
+    return _with_delay(findings, aligned(training, findings))
+
+
+def _with_delay(findings: Findings, samples: Samples) -> Findings:
     delay = motions.likely_delay(findings.training, findings.calibration, samples)
     calibration = replace(findings.calibration, command_latency_s=delay)
-    findings = replace(findings, calibration=calibration)
-    samples = aligned(findings.training, findings)
-    problem = motions.problem_of(findings.training, findings.calibration, samples)
+    return replace(findings, calibration=calibration)
+
+
+def _trials(drive: Drive, findings: Findings) -> list[motions.Trial]:
+    training, order = findings.training, drive.settings.order
+    samples, trials = aligned(training, findings), []
+    problem = motions.problem_of(training, findings.calibration, samples)
+    given = motions.inputs_of(training, findings.calibration)
     everything = np.ones(len(samples.t), dtype=np.bool_)
-    trials = []
     for each in motions.ORDERS if order == "auto" else (order,):
         try:
-            trial = motions.tried(problem, drive.spec, each, delay, everything)
+            trial = motions.tried(problem, drive.spec, each, given, everything)
         except FitError as error:
             if not trials:
                 raise FitError(f"{drive.recording.source}: {error}") from None
             break
         trials += [trial] if trial else []
-    best = motions.chosen(trials).order if trials else min(order, *motions.ORDERS)
-    linear = motions.linear_fit(samples, drive.spec, best)
+    return trials
+
+
+def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:
+    """Fits the order that predicts parts of the training part best that its fits did not see."""
+    trials = _trials(drive, findings)
+    if findings.calibration.inputs:
+        plain = replace(findings, calibration=replace(findings.calibration, inputs=()))
+        without = _trials(drive, plain)
+        if without and motions.chosen(without).error <= motions.chosen(trials).error:
+            findings, trials = plain, without
+    order = motions.chosen(trials).order if trials else 1
+    samples = aligned(findings.training, findings)
+    linear = motions.linear_fit(samples, drive.spec, order)
     return replace(
         findings, samples=samples, regression=linear.regression, linear=linear, model=linear.model,
         trials=tuple(trials),
@@ -227,8 +256,12 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
     samples = known(findings.samples, "the training part", "fit")
     problem = motions.problem_of(findings.training, findings.calibration, samples)
     calibration = findings.calibration
-    found = motions.refined(problem, linear, drive.spec, calibration.command_latency_s)
-    calibration = replace(calibration, command_latency_s=float(found.delays[0]))
+    given = motions.inputs_of(findings.training, calibration)
+    found = motions.refined(problem, linear, drive.spec, given)
+    calibration = replace(
+        calibration, command_latency_s=float(found.values[0]),
+        inputs=motions.curves_at(calibration.inputs, found.values[1:]),
+    )  # fmt: skip
     errors = motions.standard_errors(found)
     return replace(
         findings, calibration=calibration, model=replace(found.model, std_errors=errors),
@@ -289,7 +322,7 @@ def _sentences(found: Findings) -> tuple[str, ...]:
 
 
 STAGES: tuple[Stage, ...] = (
-    repair, clocks, mounting, responses, noise, motion, fit, prune, refine, complete, judge,
+    repair, clocks, mounting, responses, noise, motion, inputs, fit, prune, refine, complete, judge,
 )  # fmt: skip
 """In order; each builds on what the stages before it found."""
 

@@ -102,7 +102,8 @@ class Shot(NamedTuple):
 
     state: Array  # (W, S) at the start
     command: Array  # (W, T, C) during each step
-    limit: Array  # (S,) greatest absolute value of each state: beyond, a prediction diverges
+    low: Array  # (S,) least and greatest state, at which it is held
+    high: Array
     end: Array  # (W, 3) pose at the end from that at the start; headings unwrapped
     slope: Array  # (W, 3, P) its derivatives by the free coefficients
 
@@ -145,7 +146,7 @@ def shoot(shot, terms, free, dt, scratch):  # type: ignore[no-untyped-def]
             dy = along * (s * scratch.rate[0] + c * scratch.rate[1])
             _follow_pose(scratch, dx, dy, along * c, along * s, dt)
             x, y, heading = x + dx, y + dy, heading + turn
-            _follow_state(terms, free, scratch, shot.limit, dt)
+            _follow_state(terms, free, scratch, shot.low, shot.high, dt)
         shot.end[w, 0], shot.end[w, 1], shot.end[w, 2] = x, y, heading
         for d in range(3):
             for p in range(free.shape[0]):
@@ -207,7 +208,7 @@ def _follow_pose(scratch, dx, dy, along_x, along_y, dt):  # type: ignore[no-unty
 
 
 @kernel
-def _follow_state(terms, free, scratch, limit, dt):  # type: ignore[no-untyped-def]
+def _follow_state(terms, free, scratch, low, high, dt):  # type: ignore[no-untyped-def]
     states, count, before = scratch.state.shape[0], scratch.state.shape[1], scratch.before
     for i in range(states):
         for p in range(count):
@@ -223,7 +224,7 @@ def _follow_state(terms, free, scratch, limit, dt):  # type: ignore[no-untyped-d
             scratch.state[terms.dof[free[p]] - 3, p] += dt * scratch.value[free[p]]
     for i in range(states):
         value = scratch.x[i] + dt * scratch.rate[3 + i]
-        if not abs(value) <= limit[i]:
-            value = limit[i] if value > 0.0 else -limit[i]
+        if not low[i] <= value <= high[i]:
+            value = high[i] if value > high[i] else low[i]
             scratch.state[i] = 0.0
         scratch.x[i] = value

@@ -22,6 +22,7 @@ from nics_drl_bridge.identify.statistics import clustered_errors
 from nics_drl_bridge.recording.recording import (
     Recording, Samples, Stream, samples_on_one_clock,
 )  # fmt: skip
+from nics_drl_bridge.robot.curve import InputCurve, curved
 from nics_drl_bridge.robot.kinds import steady_twist
 from nics_drl_bridge.robot.spec import POSE_RATES, CommandVariable, RobotSpec, StateVariable
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -37,6 +38,7 @@ ORDERS = (1, 2, 3)  # of which `auto` chooses
 WORTH = 0.95  # a higher order is worth its terms if it takes the error to this share
 FOLDS = 3
 DELAY_ORDER, DELAY_STEP_S, LONGEST_S = 2, 0.02, 0.4  # of the search for a delay
+DELAY_SCALE_S, CURVE_SCALE = 0.05, 0.1  # steps of their refinement
 CV_SPACING_S, CV_EVALUATIONS = 0.5, 25
 HORIZON_S = 5.0
 
@@ -145,8 +147,9 @@ def samples_of(drive: Drive, calibration: Calibration, width: float) -> Samples:
     step = round(float(grid[-1] - grid[0]) / (len(grid) - 1), 9)
     t = drive.sample_t + calibration.clock_offset_s
     tracked = resample(t, unwrapped(drive.recording.pose.values), grid, 0.5 * width)
-    begin = grid - calibration.command_latency_s
-    command = held(drive.recording.command, spec, begin, begin + step)
+    begin, stream = grid - calibration.command_latency_s, drive.recording.command
+    bent = replace(stream, values=curved(stream.values, spec, calibration.inputs))
+    command = held(bent, spec, begin, begin + step)
     samples = samples_on_one_clock(grid, calibration.to_base(tracked), state.values, command)
     return replace(samples.rows(outside_gaps(samples.t, t, step)), dt=step)
 
@@ -178,14 +181,40 @@ def surrogate(spec: RobotSpec) -> RobotSpec:
 
 
 def problem_of(drive: Drive, calibration: Calibration, samples: Samples) -> shooting.Shooting:
-    """Returns the prediction problem of a drive on one time axis."""
+    """Returns the prediction problem of a drive on one time axis; its inputs: `inputs_of`."""
     command, spec, t, dt = drive.recording.command, drive.spec, samples.t, samples.dt
+    curves = calibration.inputs
 
-    def commands(delay: Array) -> Array:
-        begin = t - float(delay[0])
-        return held(command, spec, begin, begin + dt)
+    def commands(values: Array) -> Array:
+        begin = t - float(values[0])
+        bent = replace(command, values=curved(command.values, spec, curves_at(curves, values[1:])))
+        return held(bent, spec, begin, begin + dt)
 
     return shooting.Shooting(samples, commands)
+
+
+def inputs_of(drive: Drive, calibration: Calibration) -> shooting.Inputs:
+    """Returns the values on which commands in effect depend: latency, and each curve's."""
+    one_clock = drive.recording.pose.clock == drive.recording.command.clock
+    latency = calibration.command_latency_s
+    start, scale = [latency], [DELAY_SCALE_S]
+    low, high = [min(latency, 0.0) if one_clock else latency - LONGEST_S], [latency + LONGEST_S]
+    for curve in calibration.inputs:
+        size = max(abs(curve.least), abs(curve.most))
+        start += [curve.dead, curve.least, curve.most]
+        scale += [CURVE_SCALE * size] * 3
+        low += [0.0, 1.5 * curve.least, 0.5 * curve.most]
+        high += [0.5 * size if curve.dead else 0.0, 0.5 * curve.least, 1.5 * curve.most]
+    return shooting.Inputs(*map(np.array, (start, scale, low, high)))
+
+
+def curves_at(curves: tuple[InputCurve, ...], values: Array) -> tuple[InputCurve, ...]:
+    """Returns curves with other values (3 * n,)."""
+    rows = zip(curves, values.reshape(-1, 3).tolist(), strict=True)
+    return tuple(
+        InputCurve(command=c.command, dead=max(dead, 0.0), least=least, most=most)
+        for c, (dead, least, most) in rows
+    )
 
 
 @dataclass(frozen=True)
@@ -200,12 +229,14 @@ class Trial:
 def likely_delay(drive: Drive, calibration: Calibration, samples: Samples) -> float:
     """Returns the delay [s] of the commands by which they best explain the rates of the state."""
     problem, now = problem_of(drive, calibration, samples), calibration.command_latency_s
+    inputs = inputs_of(drive, calibration)
     one_clock = drive.recording.pose.clock == drive.recording.command.clock
     tries = np.arange(0.0, LONGEST_S, DELAY_STEP_S) - (0.0 if one_clock else LONGEST_S / 2.0)
     states, left = len(drive.spec.state), []
     free = [3 + i for i, v in enumerate(drive.spec.state) if v.twist]
     for delay in tries:
-        x = np.concatenate([samples.x[:, :states], problem.commands(np.array([delay]))], axis=1)
+        command = problem.commands(np.append(delay, inputs.start[1:]))
+        x = np.concatenate([samples.x[:, :states], command], axis=1)
         found = linear_fit(replace(samples, x=x), drive.spec, DELAY_ORDER)
         left.append(float((1.0 - found.r2[free]).sum()))
     return float(tries[int(np.argmin(left))]) if np.isfinite(left).all() else now
@@ -217,13 +248,13 @@ def linear_fit(samples: Samples, spec: RobotSpec, order: int) -> Fit:
 
 
 def refined(
-    problem: shooting.Shooting, linear: Fit, spec: RobotSpec, delay: float,
+    problem: shooting.Shooting, linear: Fit, spec: RobotSpec, inputs: shooting.Inputs,
     inside: Mask | None = None, evaluations: int = shooting.EVALUATIONS,
 ) -> shooting.Predictive:  # fmt: skip
-    """Adjusts a linear fit, and the delay of its commands [s], to predictions over seconds."""
+    """Adjusts a linear fit, and the values of its inputs, to predictions over seconds."""
     model, defined = by_definition(linear.model, spec)
     free = (model.coefficients != 0.0) & ~defined
-    return shooting.fitted(problem, model, free, np.array([delay]), inside, evaluations)
+    return shooting.fitted(problem, model, free, inputs, inside, evaluations)
 
 
 def by_definition(model: TaylorModel, spec: RobotSpec) -> tuple[TaylorModel, Mask]:
@@ -241,7 +272,7 @@ def by_definition(model: TaylorModel, spec: RobotSpec) -> tuple[TaylorModel, Mas
 
 
 def tried(
-    problem: shooting.Shooting, spec: RobotSpec, order: int, delay: float, inside: Mask
+    problem: shooting.Shooting, spec: RobotSpec, order: int, inputs: shooting.Inputs, inside: Mask
 ) -> Trial | None:
     """Fits to all but one of `FOLDS` parts of the rows `inside` (T,), predicts that; each in turn."""
     sparse = replace(problem, spacing_s=CV_SPACING_S)
@@ -252,9 +283,9 @@ def tried(
         kept, left = inside.copy(), np.zeros_like(inside)
         kept[block], left[block] = False, True
         linear = linear_fit(problem.samples.rows(kept), spec, order)
-        found = refined(sparse, linear, spec, delay, kept, CV_EVALUATIONS)
+        found = refined(sparse, linear, spec, inputs, kept, CV_EVALUATIONS)
         for horizon in BANDS_S:
-            error, path = problem.errors(found.model, found.delays, horizon, left)
+            error, path = problem.errors(found.model, found.values, horizon, left)
             errors[horizon].append(np.hypot(error[:, 0], error[:, 1]))
         ends.append(errors[HORIZON_S][-1])
         paths.append(path)

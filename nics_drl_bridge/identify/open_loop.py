@@ -12,6 +12,7 @@ from nics_drl_bridge.identify.calibration import Calibration, states_at
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.kernels import follow
 from nics_drl_bridge.identify.signals import followed, held
+from nics_drl_bridge.robot.curve import curved
 from nics_drl_bridge.robot.kernels import SERIES, rollout, term_arrays
 from nics_drl_bridge.robot.taylor import TaylorModel
 
@@ -117,7 +118,9 @@ def _from_measured_states(
     start, end = (t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t))
     steps = int(np.ceil(float((end - start).max()) / model.dt - 1e-6)) + 1
     begin = start[:, None] + model.dt * np.arange(steps) - calibration.command_latency_s
-    command = held(drive.recording.command, drive.spec, begin, begin + model.dt)
+    stream = drive.recording.command
+    bent = replace(stream, values=curved(stream.values, drive.spec, calibration.inputs))
+    command = held(bent, drive.spec, begin, begin + model.dt)
     poses, states = _roll(model, states_at(drive, calibration, start), command)
     exact = (end - start) / model.dt
     step = np.floor(exact + 1e-6).astype(np.intp)

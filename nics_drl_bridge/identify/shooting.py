@@ -22,22 +22,32 @@ from nics_drl_bridge.robot.kernels import term_arrays
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 Mask = NDArray[np.bool_]
-Commands = Callable[[Array], Array]  # those in effect (T, C) during each step, by delays (C,) [s]
+Commands = Callable[[Array], Array]  # those in effect (T, C) during each step, by values (I,)
 
 HORIZONS_S = (1.0, 2.5, 5.0)
 SPACING_S = 0.25
 HEADING_ARM_M = 0.3  # a heading error counts as a position error at this distance
-REACH = 3.0  # a prediction whose state exceeds this many times what was measured has diverged
+BEYOND = 0.25  # a state is held at its measured range, widened on both ends by this share of it
 FARTHEST_M = 50.0  # errors are cut at this distance per second of the horizon
 PRIOR = 0.01  # weight of the linear fit against the predictions
-DELAY_S, DELAY_STEP, LONGEST_DELAY_S = 0.05, 0.02, 0.5
+DIFFERENCE = 0.02  # step of finite differences by the values of inputs, in their scale
 EVALUATIONS = 30
 SAME_STEP = 0.01  # share of a step by which two steps may differ
 
 
 @dataclass(frozen=True)
+class Inputs:
+    """Values on which the commands in effect depend, as a delay [s], and their bounds."""
+
+    start: Array  # (I,)
+    scale: Array  # (I,)
+    low: Array  # (I,)
+    high: Array  # (I,)
+
+
+@dataclass(frozen=True)
 class Shooting:
-    """What predictions of a drive on one time axis need."""
+    """A prediction problem: a drive on one time axis, and its commands."""
 
     samples: Samples
     commands: Commands
@@ -68,7 +78,7 @@ class Shooting:
         return np.asarray(length[first + steps] - length[first])
 
     def predict(
-        self, model: TaylorModel, delays: Array, first: NDArray[np.intp], steps: int,
+        self, model: TaylorModel, values: Array, first: NDArray[np.intp], steps: int,
         free: Mask | None = None,
     ) -> tuple[Array, Array]:  # fmt: skip
         """Returns ends (W, 3) of windows, and derivatives (W, 3, P) by `free` (D, K) coefficients."""
@@ -78,12 +88,12 @@ class Shooting:
         terms = term_arrays(replace(model, coefficients=used.astype(np.float64)))
         terms = terms._replace(coefficient=model.coefficients[dofs, places])
         moving = np.flatnonzero(free[dofs, places]).astype(np.int64)
-        command, state = self.commands(delays), self.samples.q[:, 3:]
+        command, state = self.commands(values), self.samples.q[:, 3:]
         rows = first[:, None] + np.arange(steps)
         count = len(first)
-        limit = REACH * np.maximum(np.abs(state).max(axis=0), 1e-3)
+        low, high = state_box(model)
         shot = Shot(
-            np.ascontiguousarray(state[first]), np.ascontiguousarray(command[rows]), limit,
+            np.ascontiguousarray(state[first]), np.ascontiguousarray(command[rows]), low, high,
             np.zeros((count, 3)), np.zeros((count, 3, len(moving))),
         )  # fmt: skip
         scratch = tangent(state.shape[1], command.shape[1], len(dofs), len(moving))
@@ -91,11 +101,11 @@ class Shooting:
         return shot.end, shot.slope
 
     def errors(
-        self, model: TaylorModel, delays: Array, horizon: float, inside: Mask | None = None
+        self, model: TaylorModel, values: Array, horizon: float, inside: Mask | None = None
     ) -> tuple[Array, Array]:
         """Returns errors (W, 3) of predictions over a horizon [s], and the paths' lengths (W,)."""
         first, steps = self.starts(horizon, inside)
-        error = self.predict(model, delays, first, steps)[0] - self.moved(first, steps)
+        error = self.predict(model, values, first, steps)[0] - self.moved(first, steps)
         error[:, 2] = geometry.wrap_angle(error[:, 2])
         return error, self.paths(first, steps)
 
@@ -105,7 +115,7 @@ class Predictive:
     """A model fitted to predictions."""
 
     model: TaylorModel
-    delays: Array  # (C,) of the commands [s]
+    values: Array  # (I,) of the inputs
     error: float  # root mean square of the scaled errors [m/s]
     jacobian: Array  # (n, P) of the residual by the free coefficients
     residual: Array  # (n,)
@@ -114,20 +124,20 @@ class Predictive:
 
 
 def fitted(
-    problem: Shooting, model: TaylorModel, free: Mask, delays: Array, inside: Mask | None = None,
+    problem: Shooting, model: TaylorModel, free: Mask, inputs: Inputs, inside: Mask | None = None,
     evaluations: int = EVALUATIONS,
 ) -> Predictive:  # fmt: skip
-    """Adjusts free coefficients (D, K) and delays (C,) of a model to the least prediction errors."""
+    """Adjusts free coefficients (D, K) and values of inputs to the least prediction errors."""
     unit = scale_of(problem.samples, model)[free]
     chosen = [(*problem.starts(h, inside), h) for h in problem.horizons]
     chosen = [each for each in chosen if len(each[0])]
     weight = np.array([1.0, 1.0, HEADING_ARM_M])
-    count, first = len(delays), model.coefficients[free]
+    count, first = len(inputs.start), model.coefficients[free]
 
     def at(theta: Array) -> tuple[TaylorModel, Array]:
         coefficients = model.coefficients.copy()
         coefficients[free] = first + theta[count:] * unit
-        return replace(model, coefficients=coefficients), delays + DELAY_S * theta[:count]
+        return replace(model, coefficients=coefficients), inputs.start + inputs.scale * theta[:count]
 
     def shot(theta: Array, sloped: bool) -> tuple[Array, Array]:
         trial, late = at(theta)
@@ -151,14 +161,16 @@ def fitted(
         rest, slope = shot(theta, True)
         late = np.empty((len(rest), count))
         for c in range(count):
-            aside = theta + DELAY_STEP * (np.arange(len(theta)) == c)
-            late[:, c] = (shot(aside, False)[0] - rest) / DELAY_STEP
+            aside = theta + DIFFERENCE * (np.arange(len(theta)) == c)
+            late[:, c] = (shot(aside, False)[0] - rest) / DIFFERENCE
         slope = np.clip(np.nan_to_num(slope * unit), -1e6, 1e6)
         own = np.concatenate([np.zeros((len(unit), count)), pull * np.eye(len(unit))], axis=1)
         return np.concatenate([np.concatenate([late, slope], axis=1), own])
 
-    low = np.concatenate([np.minimum(-delays / DELAY_S, 0.0) - 1e-9, np.full(len(unit), -np.inf)])
-    high = np.concatenate([(LONGEST_DELAY_S - delays) / DELAY_S, np.full(len(unit), np.inf)])
+    low = np.full(count + len(unit), -np.inf)
+    high = -low
+    low[:count] = (inputs.low - inputs.start) / inputs.scale - 1e-9
+    high[:count] = (inputs.high - inputs.start) / inputs.scale + 1e-9
     found = least_squares(
         residual, np.zeros(count + len(unit)), jac=jacobian, bounds=(low, high), loss="soft_l1",
         f_scale=max(float(np.median(np.abs(begun))), 0.02), max_nfev=evaluations,
@@ -175,3 +187,10 @@ def scale_of(samples: Samples, model: TaylorModel) -> Array:
     size = np.sqrt((taylor.evaluate(samples.x, model.powers) ** 2).mean(axis=0))
     spread = np.maximum(samples.dq.std(axis=0), 1e-6)
     return np.asarray(spread[:, None] / np.maximum(size, 1e-9))
+
+
+def state_box(model: TaylorModel) -> tuple[Array, Array]:
+    """Returns the least and greatest state (S,) that predictions may reach."""
+    low, high = (edge[: model.state_size] for edge in (model.low, model.high))
+    margin = BEYOND * np.maximum(high - low, 1e-3)
+    return low - margin, high + margin
