@@ -268,7 +268,7 @@ def by_definition(model: TaylorModel, spec: RobotSpec) -> tuple[TaylorModel, Mas
             defined[d] = True
         else:
             defined[3 + i] = True
-    return replace(model, coefficients=coefficients), defined
+    return replace(model, coefficients=coefficients, bounded=True), defined
 
 
 def tried(

@@ -27,7 +27,6 @@ Commands = Callable[[Array], Array]  # those in effect (T, C) during each step, 
 HORIZONS_S = (1.0, 2.5, 5.0)
 SPACING_S = 0.25
 HEADING_ARM_M = 0.3  # a heading error counts as a position error at this distance
-BEYOND = 0.25  # a state is held at its measured range, widened on both ends by this share of it
 FARTHEST_M = 50.0  # errors are cut at this distance per second of the horizon
 PRIOR = 0.01  # weight of the linear fit against the predictions
 DIFFERENCE = 0.02  # step of finite differences by the values of inputs, in their scale
@@ -91,7 +90,7 @@ class Shooting:
         command, state = self.commands(values), self.samples.q[:, 3:]
         rows = first[:, None] + np.arange(steps)
         count = len(first)
-        low, high = state_box(model)
+        low, high = model.state_box
         shot = Shot(
             np.ascontiguousarray(state[first]), np.ascontiguousarray(command[rows]), low, high,
             np.zeros((count, 3)), np.zeros((count, 3, len(moving))),
@@ -188,9 +187,3 @@ def scale_of(samples: Samples, model: TaylorModel) -> Array:
     spread = np.maximum(samples.dq.std(axis=0), 1e-6)
     return np.asarray(spread[:, None] / np.maximum(size, 1e-9))
 
-
-def state_box(model: TaylorModel) -> tuple[Array, Array]:
-    """Returns the least and greatest state (S,) that predictions may reach."""
-    low, high = (edge[: model.state_size] for edge in (model.low, model.high))
-    margin = BEYOND * np.maximum(high - low, 1e-3)
-    return low - margin, high + margin

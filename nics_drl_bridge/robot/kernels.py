@@ -31,6 +31,8 @@ class Terms(NamedTuple):
     coefficient: Array  # (T,), or (T, n) of n robots
     factors: NDArray[np.int64]  # (T, order) indices into `x`; unused ones of its last entry, 1
     degree: NDArray[np.int64]  # (T,) number of factors
+    low: Array  # (S,) least and greatest state, at which it is held
+    high: Array
 
 
 def term_arrays(model: TaylorModel) -> Terms:
@@ -46,7 +48,8 @@ def term_arrays(model: TaylorModel) -> Terms:
         used = np.repeat(np.arange(one), model.powers[k])
         factors[row, : len(used)] = used
     count = (factors != one).sum(axis=1)
-    return Terms(dofs.astype(np.int64), model.coefficients[dofs, places], factors, count)
+    coefficients = model.coefficients[dofs, places]
+    return Terms(dofs.astype(np.int64), coefficients, factors, count, *model.state_box)
 
 
 def scratch(model: TaylorModel) -> tuple[Array, Array]:
@@ -126,9 +129,9 @@ def run(pose, x, dq, terms, series, dt, steps):  # type: ignore[no-untyped-def]
         _rates_of_all(dq, x, terms)
         _move_all(pose, dq, dt, series)
         for d in range(3, dq.shape[0]):
-            state, rate = x[d - 3], dq[d]
+            state, rate, low, high = x[d - 3], dq[d], terms.low[d - 3], terms.high[d - 3]
             for i in range(state.shape[0]):
-                state[i] += dt * rate[i]
+                state[i] = min(max(state[i] + dt * rate[i], low), high)
 
 
 @kernel
@@ -209,7 +212,7 @@ def rollout(poses, states, commands, terms, series, dt):  # type: ignore[no-unty
             px, py, c, s = move(px, py, c, s, dq[0], dq[1], turn, dt, series)
             heading += turn
             for i in range(size):
-                x[i] += dt * dq[3 + i]
+                x[i] = min(max(x[i] + dt * dq[3 + i], terms.low[i]), terms.high[i])
                 states[w, n + 1, i] = x[i]
             poses[w, n + 1, 0], poses[w, n + 1, 1], poses[w, n + 1, 2] = px, py, heading
 

@@ -16,6 +16,8 @@ from nics_drl_bridge.errors import ModelError
 
 Array = NDArray[np.float64]
 
+BEYOND = 0.25  # share of its range by which a bounded state may leave it, on both ends
+
 
 @dataclass(frozen=True)
 class TaylorModel:
@@ -33,11 +35,19 @@ class TaylorModel:
     # (D, K); NaN for a kept coefficient that was assumed or defined; (0, 0) if none is known
     std_errors: Array = field(default_factory=lambda: np.zeros((0, 0)))
     quality: Quality | None = None
+    bounded: bool = False  # True if the state is held in the box that the recording covered, widened
 
     @property
     def state_size(self) -> int:
         """Number of state variables, S."""
         return len(self.dofs) - 3
+
+    @property
+    def state_box(self) -> tuple[Array, Array]:
+        """Least and greatest state (S,), at which it is held; infinite unless `bounded`."""
+        low, high = (edge[: self.state_size] for edge in (self.low, self.high))
+        margin = BEYOND * np.maximum(high - low, 1e-3) if self.bounded else np.inf
+        return low - margin, high + margin
 
     @property
     def terms_kept(self) -> int:
@@ -53,7 +63,8 @@ class TaylorModel:
         state = np.asarray(state, dtype=np.float64)
         x = np.concatenate([state, np.asarray(command, dtype=np.float64)], axis=-1)
         dq = self.rates(x) * self.dt
-        return geometry.compose(pose, geometry.exp(dq[..., :3])), state + dq[..., 3:]
+        held = np.clip(state + dq[..., 3:], *self.state_box)
+        return geometry.compose(pose, geometry.exp(dq[..., :3])), held
 
     @property
     def term_names(self) -> tuple[str, ...]:
@@ -108,7 +119,7 @@ class TaylorModel:
             dt=self.dt, units=dict(zip(self.dofs, self.dof_units, strict=True)), terms=terms,
             valid=dict(zip(self.variables, box, strict=True)), assumed=self.assumed,
             standard_errors=self.named_errors if self.std_errors.size else None,
-            quality=self.quality,
+            quality=self.quality, bounded=self.bounded,
         )  # fmt: skip
 
 
@@ -193,6 +204,7 @@ class NamedTaylorModel(Schema):
     assumed: tuple[tuple[str, str], ...]
     standard_errors: dict[str, dict[str, float]] | None = None
     quality: Quality | None = None
+    bounded: bool = False
 
     def model(self) -> TaylorModel:
         """Returns the model as arrays. Raises ModelError if the names do not fit each other."""
@@ -212,5 +224,5 @@ class NamedTaylorModel(Schema):
         return TaylorModel(
             variables, dofs, units, powers.reshape(len(names), len(variables)),
             np.array(rows, dtype=np.float64).reshape(len(dofs), len(names)), self.dt, low, high,
-            self.assumed, quality=self.quality,
+            self.assumed, quality=self.quality, bounded=self.bounded,
         ).with_errors(self.standard_errors or {})  # fmt: skip

@@ -32,7 +32,9 @@ def rates_at(n: int, m: int, j: int, state: State, motion: Dynamics, single: Sin
         single.x[s] = state.state[n, m, s]
     for c in range(state.history.shape[3]):
         single.x[size + c] = state.history[n, m, row, c]
-    own = Terms(terms.dof, state.coefficient[n, m], terms.factors, terms.degree)
+    own = Terms(
+        terms.dof, state.coefficient[n, m], terms.factors, terms.degree, terms.low, terms.high
+    )  # fmt: skip
     rates(single.dq, single.x, own)
 
 
@@ -186,7 +188,9 @@ def move_carefully(
                 flight, dq = single.flights[first + m], single.dq
                 flight[VX], flight[VY], flight[TURN], flight[STOP] = dq[0], dq[1], dq[2], dt
                 for s in range(state.state.shape[2]):
-                    state.state[n, m, s] += dt * dq[3 + s]
+                    value = state.state[n, m, s] + dt * dq[3 + s]
+                    value = min(max(value, motion.terms.low[s]), motion.terms.high[s])
+                    state.state[n, m, s] = value
                 if events[m, DEPTH] < 0.0:
                     _leave(m, dt, scene, nearby, single, moving)
         _settle(dt, scene, nearby, events, touched, moving)

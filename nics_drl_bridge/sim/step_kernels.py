@@ -76,7 +76,8 @@ def move_freely(begin: int, end: int, state: State, motion: Dynamics, lanes: Lan
             for t in range(lanes.coefficient.shape[0]):
                 lanes.coefficient[t, i] = state.coefficient[n, m, t]
             late[i] = state.delay[n, m] % substeps  # its command changes once, after this many
-    terms = Terms(motion.terms.dof, lanes.coefficient, motion.terms.factors, motion.terms.degree)
+    own = motion.terms
+    terms = Terms(own.dof, lanes.coefficient, own.factors, own.degree, own.low, own.high)
     at, used = 0, (end - begin) * robots
     while at < substeps:
         until = substeps
