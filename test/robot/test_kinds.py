@@ -206,6 +206,17 @@ def test_robots_without_cmd_vel_reach_goals_by_their_kind(unnamed, name):
         assert info["is_success"]
 
 
+@pytest.mark.slow
+def test_a_car_of_a_guessed_wheelbase_drives_in_an_env_by_its_own_commands():
+    robot = made("ackermann")
+    model = generate(record(robot, np.random.default_rng(0)), robot, lidar(), ())[0]
+    env = BridgeEnv(model=model, world="empty", estimator=True)
+    env.reset(seed=0)
+    for _ in range(5):
+        *_, info = env.step(np.array([1.0, 1.0]))
+    assert info["true_pose"][2] > 0.0
+
+
 def test_their_discrete_actions_drive_ahead_and_turn():
     wheels = discrete_commands(made("differential_wheels"))
     assert wheels[1:4] == pytest.approx(np.array([[10.0, 10.0], [0.0, 10.0], [10.0, 0.0]]))
