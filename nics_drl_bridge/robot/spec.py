@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, field_validator, model_validator
 
-from nics_drl_bridge import extensions
+from nics_drl_bridge import extensions, geometry
 from nics_drl_bridge.config import Schema, find_config, parse_yaml, read_text, validate
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.robot.steering import Bicycle
@@ -141,7 +141,7 @@ class RobotSpec(Schema):
     @model_validator(mode="after")
     def _consistent(self) -> RobotSpec:
         if self.footprint is not None:
-            if _edges_cross(np.array(self.footprint)):
+            if geometry.edges_cross(np.array(self.footprint)):
                 raise ValueError("edges of footprint cross or touch; list its corners in order")
             reach, radius = _reach(self.footprint), self.footprint_radius
             if not math.isclose(reach, radius, rel_tol=1e-6):
@@ -301,28 +301,6 @@ def _circumscribed(data: dict[str, Any]) -> dict[str, Any]:
 
 def _reach(outline: ArrayLike) -> float:
     return float(np.hypot(*np.array(outline, dtype=np.float64).T).max())
-
-
-def _edges_cross(corners: NDArray[np.float64]) -> bool:
-    start, stop = corners, np.roll(corners, -1, axis=0)
-    if (start == stop).all(axis=1).any():
-        return True
-
-    def side(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        along, to = (stop - start)[:, None], points[None] - start[:, None]
-        return np.sign(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])
-
-    low, high = np.minimum(start, stop), np.maximum(start, stop)
-    boxes = ((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(axis=-1)
-    apart = side(start) * side(stop)
-    index = np.arange(len(corners))
-    gap = (index[None] - index[:, None]) % len(corners)
-    distant = (gap > 1) & (gap < len(corners) - 1)
-    # An edge may not run back along its predecessor.
-    folded = side(stop)[index, (index + 1) % len(corners)] == 0.0
-    ahead = ((stop - start) * (np.roll(stop - start, -1, axis=0))).sum(axis=1) > 0.0
-    crossing = boxes & (apart <= 0.0) & (apart.T <= 0.0) & distant
-    return bool(crossing.any() or (folded & ~ahead).any())
 
 
 def load_robot(name: str | Path) -> RobotSpec:

@@ -166,7 +166,9 @@ def test_a_state_that_is_no_state_of_its_kind_is_named():
 
 def test_too_few_commands_for_the_wheels_are_refused():
     robot = made("differential_wheels", command=[{"name": "left_wheel"}])
-    with pytest.raises(ConfigError, match="differential_wheels kinematics need 2 commands, not 1"):
+    with pytest.raises(
+        ConfigError, match="differential_wheels kinematics need 2 commands, not 1; correct"
+    ):
         textbook(robot)
 
 
