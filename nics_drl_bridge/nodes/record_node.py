@@ -266,9 +266,8 @@ class RecordNode(qos.QosWatch):
 
     def _send(self, command: Array) -> None:
         robot = self._order.plan.robot
-        twist = robot.to_cmd_vel(command)
-        self._topic.publish(self._message(twist))
-        self._log.add("cmd_vel", 0, robot.from_cmd_vel(twist))  # as the robot understands it
+        self._topic.publish(self._message(robot.to_cmd_vel(command)))
+        self._log.add("cmd_vel", 0, robot.through_cmd_vel(command))
 
     def _message(self, twist: Array) -> Twist | TwistStamped:
         stamped = conversions.stamped_to_ros(twist, self._now_ns(), "")

@@ -280,6 +280,15 @@ class RobotSpec(Schema):
         limits = np.array([(c.min, c.max) if c.steers else (-np.inf, np.inf) for c in self.command])
         return np.asarray(np.clip(command, *limits.T))
 
+    def through_cmd_vel(self, command: ArrayLike) -> NDArray[np.float64]:
+        """Returns commands (..., C) as a robot that hears `cmd_vel` takes them; else as they are.
+
+        They differ by rounding, and a car that takes turn rates does not steer at rest.
+        """
+        if self.takes_cmd_vel and (self.knows_wheelbase or not self.takes_turn_rate):
+            return self.from_cmd_vel(self.to_cmd_vel(command))
+        return np.asarray(command, dtype=np.float64)
+
     def require_cmd_vel(self) -> None:
         """Raises ConfigError if a node can't drive it, since `to_cmd_vel` fails."""
         self.to_cmd_vel(self.command_low)

@@ -89,6 +89,13 @@ def test_a_car_at_rest_holds_its_wheels_straight_and_one_that_can_turn_no_furthe
     assert robot.from_cmd_vel(given) == pytest.approx(np.array(wanted))
 
 
+def test_what_goes_through_cmd_vel_is_what_the_robot_takes():
+    given = np.array([[0.5, 0.3], [0.0, 0.3]])
+    assert car().through_cmd_vel(given) == pytest.approx(np.array([[0.5, 0.3], [0.0, 0.0]]))
+    assert car(assumed=["wheelbase"]).through_cmd_vel(given).tolist() == given.tolist()
+    assert load_robot("ackermann").through_cmd_vel(given).tolist() == given.tolist()
+
+
 @pytest.mark.parametrize("changes", [{"parameters": {}}, {"assumed": ["wheelbase"]}])
 def test_a_turn_rate_needs_a_wheelbase_that_is_known(changes):
     with pytest.raises(ConfigError, match=r"its wheelbase is not known; add `wheelbase:` \[m\] to"):
