@@ -74,6 +74,11 @@ class Drawing:
     wheels: tuple[Wheel, ...]
 
 
+def disc(spec: RobotSpec) -> Drawing:
+    """The looks of a robot of which no more is known."""
+    return Drawing(spec.footprint_radius, (0.0, 0.02), ())
+
+
 def wheels_at(
     spec: RobotSpec, places: Sequence[tuple[float, float]], radius: float, names: tuple[str, ...]
 ) -> tuple[Wheel, ...]:
