@@ -53,6 +53,13 @@ def test_a_state_that_is_called_as_a_command_gets_another_name():
     ]  # fmt: skip
 
 
+def test_a_state_reaches_twice_as_far_as_its_commands_where_they_tell():
+    wheels = {"left_wheel": (0.0, 90.0), "right_wheel": (0.0, 90.0)}
+    assert [v.max for v in made("differential_wheels", wheels).state] == [10.0, 10.0]
+    fast = made("skid_steer", {"forward": (-1.0, 20.0), "turn": (-0.4, 0.3)})
+    assert [v.max for v in fast.state] == [40.0, 40.0, 0.8]
+
+
 def test_recorded_ranges_hold_where_the_user_gave_none_and_always_include_rest():
     ranges = {"throttle": (0.1, 0.6), "steering": (-0.4, 0.4)}
     robot = made("ackermann_throttle", ranges, command=[{"name": "throttle", "max": 0.9}])
