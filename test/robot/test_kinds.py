@@ -172,6 +172,19 @@ def test_too_few_commands_for_the_wheels_are_refused():
         textbook(robot)
 
 
+def successes(env, policy):
+    """In how many of three episodes the goal is reached."""
+    reached = 0
+    for seed in range(3):
+        observation, info, ended = *env.reset(seed=seed), False
+        for _ in range(200):
+            observation, _, ended, _, info = env.step(policy.act(observation))
+            if ended:
+                break
+        reached += bool(info["is_success"])
+    return reached
+
+
 WITHOUT_CMD_VEL = [{"kind": "ackermann_throttle"}, {"kind": "differential_wheels"}]
 
 
@@ -198,14 +211,22 @@ def test_robots_without_cmd_vel_drive_in_an_env(unnamed, options):
 @pytest.mark.parametrize("name", ["straight", "dynamic_window"])
 def test_robots_without_cmd_vel_reach_goals_by_their_kind(unnamed, name):
     env = BridgeEnv(model=unnamed, world="empty")
-    policy = make_policy(name, env.task)
-    for seed in range(3):
-        observation, info, ended = *env.reset(seed=seed), False
-        for _ in range(200):
-            observation, _, ended, _, info = env.step(policy.act(observation))
-            if ended:
-                break
-        assert info["is_success"]
+    assert successes(env, make_policy(name, env.task)) == 3
+    assert successes(env, make_policy(name, env.task, unnamed)) == 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["straight", "dynamic_window"])
+def test_a_free_robot_reaches_goals_by_its_model_and_not_without(name):
+    car = made("ackermann_throttle")
+    ranges = {c.name: (c.min, c.max) for c in car.command}
+    robot = robot_from({"kind": "free", "footprint_radius": 0.2}, ranges)
+    model = generate(record(car, np.random.default_rng(0)), robot, lidar(), ())[0]
+    env = BridgeEnv(model=model, world="empty")
+    assert successes(env, make_policy(name, env.task, model)) == 3
+    observation, _ = env.reset(seed=0)
+    with pytest.raises(ConfigError, match="no textbook tells where"):
+        make_policy(name, env.task).act(observation)
 
 
 @pytest.mark.slow
@@ -262,14 +283,7 @@ def test_it_drives_in_an_env(model, options):
 
 def test_it_reaches_goals_by_the_planner(model):
     env = BridgeEnv(model=model, world="empty")
-    policy = make_policy("dynamic_window", env.task)
-    for seed in range(3):
-        observation, info, ended = *env.reset(seed=seed), False
-        for _ in range(200):
-            observation, _, ended, _, info = env.step(policy.act(observation))
-            if ended:
-                break
-        assert info["is_success"]
+    assert successes(env, make_policy("dynamic_window", env.task)) == 3
 
 
 def test_it_has_limits_and_is_drawn_on_three_wheels():
