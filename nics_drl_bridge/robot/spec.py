@@ -82,6 +82,11 @@ class StateVariable(Variable):
     # the component of the body twist that it is: taken from the pose where nothing measures it
     twist: PoseRate | None = None
 
+    @property
+    def must_be_measured(self) -> bool:
+        """True if neither a command nor the pose tells it."""
+        return self.follows is None and self.twist is None
+
 
 class CommandVariable(Variable):
     """A component of the command, with its field of `cmd_vel` if that drives the robot."""
