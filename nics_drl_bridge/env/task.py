@@ -140,7 +140,8 @@ class Task(ABC):
         out, rows = np.empty(given.shape), given.reshape(-1, given.shape[-1])
         low, high = self.robot.command_low, self.robot.command_high
         kernels.commands(out.reshape(rows.shape), rows, low, high)
-        return out
+        # What a vehicle can't do is not to be learnt: a car by turn rates does not steer at rest.
+        return self.robot.through_cmd_vel(out) if self.robot.takes_turn_rate else out
 
     def step_into(
         self, out: Observation, before: RobotView, after: RobotView, memory: Memory

@@ -106,7 +106,7 @@ class DriveLog:
 
     def check(self) -> None:
         """Raises BridgeError if a state is not measured, or stamps run at another rate."""
-        measured = [v.name for v in self._spec.state if v.follows is None]
+        measured = [v.name for v in self._spec.state if v.must_be_measured]
         if self._joints:
             joint_streams("joint_states", self._joints, self._spec, self._roles, PLACE)
         elif measured or self._roles.state:
@@ -266,9 +266,8 @@ class RecordNode(qos.QosWatch):
 
     def _send(self, command: Array) -> None:
         robot = self._order.plan.robot
-        twist = robot.to_cmd_vel(command)
-        self._topic.publish(self._message(twist))
-        self._log.add("cmd_vel", 0, robot.from_cmd_vel(twist))  # as the robot understands it
+        self._topic.publish(self._message(robot.to_cmd_vel(command)))
+        self._log.add("cmd_vel", 0, robot.through_cmd_vel(command))
 
     def _message(self, twist: Array) -> Twist | TwistStamped:
         stamped = conversions.stamped_to_ros(twist, self._now_ns(), "")

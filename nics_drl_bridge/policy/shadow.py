@@ -146,7 +146,7 @@ def _answered(moments: list[_Moment], goals: Array, name: str, model: SimulatorM
             skipped["at the goal"] += 1
         else:
             command = task.command(policy.act(task.observation(moment.view, memory)))
-            wanted = robot.from_cmd_vel(robot.to_cmd_vel(command))
+            wanted = robot.through_cmd_vel(command)
             rows.append((moment.stamp_ns, moment.view.pose, goal, wanted, moment.driven))
     if not rows:
         reasons = ", ".join(f"{count} times {why}" for why, count in skipped.items() if count)

@@ -60,10 +60,7 @@ class Exploration:
         self._command, self._state = self.rest, np.zeros(self._motion.size)
         self.pose: Array = np.zeros(3)
         self._before, self._seen = self.pose, False
-        if spec.takes_cmd_vel:
-            fastest = np.hypot(*spec.to_cmd_vel(np.maximum(-self.low, self.high))[:2])
-        else:
-            fastest = plan.speed * np.hypot(*reach(spec)[:2])
+        fastest = np.hypot(*(plan.speed * reach(spec)[:2]))
         self._outermost = plan.bound - spec.footprint_radius
         self.keep_within = self._outermost - MARGIN_M - REACTION_S * float(fastest)
         turning = np.array([c.turns for c in spec.command])

@@ -13,6 +13,7 @@ from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec, StateVariable, fin
 from nics_drl_bridge.robot.template import Template
 
 Array = NDArray[np.float64]
+MOST_VARIED = 6
 T = TypeVar("T")
 
 
@@ -71,6 +72,11 @@ class Drawing:
     body: tuple[float, float] | float
     centre: tuple[float, float]
     wheels: tuple[Wheel, ...]
+
+
+def disc(spec: RobotSpec) -> Drawing:
+    """The looks of a robot of which no more is known."""
+    return Drawing(spec.footprint_radius, (0.0, 0.02), ())
 
 
 def wheels_at(
@@ -207,9 +213,10 @@ def command_for(spec: RobotSpec, twist: ArrayLike) -> Array:
 
 def reach(spec: RobotSpec) -> Array:
     """Returns the greatest steady twist (3,) of a robot's commands; ConfigError: see there."""
-    rest = np.clip(0.0, spec.command_low, spec.command_high)
-    ends = zip(spec.command_low, rest, spec.command_high, strict=True)
-    corners = np.array(list(product(*ends)))
+    ends = np.stack([spec.command_low, np.zeros(len(spec.command)), spec.command_high])
+    ends[1] = np.clip(ends[1], ends[0], ends[2])
+    # No kind uses more; if there are more, they are not varied one by one.
+    corners = np.array(list(product(*ends.T))) if ends.shape[1] <= MOST_VARIED else ends
     return np.asarray(np.abs(steady_twist(spec, corners)).max(axis=0))
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, field_validator, model_validator
 
-from nics_drl_bridge import extensions
+from nics_drl_bridge import extensions, geometry
 from nics_drl_bridge.config import Schema, find_config, parse_yaml, read_text, validate
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.robot.steering import Bicycle
@@ -82,6 +82,11 @@ class StateVariable(Variable):
     # the component of the body twist that it is: taken from the pose where nothing measures it
     twist: PoseRate | None = None
 
+    @property
+    def must_be_measured(self) -> bool:
+        """True if neither a command nor the pose tells it."""
+        return self.follows is None and self.twist is None
+
 
 class CommandVariable(Variable):
     """A component of the command, with its field of `cmd_vel` if that drives the robot."""
@@ -141,7 +146,7 @@ class RobotSpec(Schema):
     @model_validator(mode="after")
     def _consistent(self) -> RobotSpec:
         if self.footprint is not None:
-            if _edges_cross(np.array(self.footprint)):
+            if geometry.edges_cross(np.array(self.footprint)):
                 raise ValueError("edges of footprint cross or touch; list its corners in order")
             reach, radius = _reach(self.footprint), self.footprint_radius
             if not math.isclose(reach, radius, rel_tol=1e-6):
@@ -260,12 +265,10 @@ class RobotSpec(Schema):
 
         Raises ConfigError if a command has no field, or a robot steers with an unknown wheelbase.
         """
-        command = np.asarray(command, dtype=np.float64)
-        twist = np.zeros((*command.shape[:-1], 3))
-        twist[..., self._cmd_vel_index] = command
+        values = self.in_fields(command)
         if self.takes_turn_rate:
-            return self.bicycle.twist(twist[..., 0], twist[..., 2])
-        return twist
+            return self.bicycle.twist(values[..., 0], values[..., 2])
+        return values
 
     def from_cmd_vel(self, twist: ArrayLike) -> NDArray[np.float64]:
         """Converts `cmd_vel` (..., 3) to a command (..., C); unused fields are dropped.
@@ -280,9 +283,25 @@ class RobotSpec(Schema):
         limits = np.array([(c.min, c.max) if c.steers else (-np.inf, np.inf) for c in self.command])
         return np.asarray(np.clip(command, *limits.T))
 
+    def through_cmd_vel(self, command: ArrayLike) -> NDArray[np.float64]:
+        """Returns commands (..., C) as a robot that hears `cmd_vel` takes them; else as they are.
+
+        They differ by rounding, and a car that takes turn rates does not steer at rest.
+        """
+        if self.takes_cmd_vel and (self.knows_wheelbase or not self.takes_turn_rate):
+            return self.from_cmd_vel(self.to_cmd_vel(command))
+        return np.asarray(command, dtype=np.float64)
+
     def require_cmd_vel(self) -> None:
         """Raises ConfigError if a node can't drive it, since `to_cmd_vel` fails."""
         self.to_cmd_vel(self.command_low)
+
+    def in_fields(self, command: ArrayLike) -> NDArray[np.float64]:
+        """Returns commands (..., C) by field of `cmd_vel` (..., 3), a steering angle as it is."""
+        command = np.asarray(command, dtype=np.float64)
+        values = np.zeros((*command.shape[:-1], 3))
+        values[..., self._cmd_vel_index] = command
+        return values
 
     def of_fields(self, values: ArrayLike) -> NDArray[np.float64]:
         """Returns of values (..., 3), by field of `cmd_vel`, those of the commands (..., C)."""
@@ -301,28 +320,6 @@ def _circumscribed(data: dict[str, Any]) -> dict[str, Any]:
 
 def _reach(outline: ArrayLike) -> float:
     return float(np.hypot(*np.array(outline, dtype=np.float64).T).max())
-
-
-def _edges_cross(corners: NDArray[np.float64]) -> bool:
-    start, stop = corners, np.roll(corners, -1, axis=0)
-    if (start == stop).all(axis=1).any():
-        return True
-
-    def side(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        along, to = (stop - start)[:, None], points[None] - start[:, None]
-        return np.sign(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])
-
-    low, high = np.minimum(start, stop), np.maximum(start, stop)
-    boxes = ((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(axis=-1)
-    apart = side(start) * side(stop)
-    index = np.arange(len(corners))
-    gap = (index[None] - index[:, None]) % len(corners)
-    distant = (gap > 1) & (gap < len(corners) - 1)
-    # An edge may not run back along its predecessor.
-    folded = side(stop)[index, (index + 1) % len(corners)] == 0.0
-    ahead = ((stop - start) * (np.roll(stop - start, -1, axis=0))).sum(axis=1) > 0.0
-    crossing = boxes & (apart <= 0.0) & (apart.T <= 0.0) & distant
-    return bool(crossing.any() or (folded & ~ahead).any())
 
 
 def load_robot(name: str | Path) -> RobotSpec:

@@ -145,16 +145,14 @@ def _whole(template: Given, own: Given, ranges: Ranges) -> dict[str, Any]:
 
 
 def _ranged(state: Given, command: Sequence[Given]) -> dict[str, Any]:
-    """Returns a state with unit and range, from the commands that it follows or can be told by."""
+    """Returns a state with its unit and range, by the command that it follows, or by the twist."""
     unit, reach = TWIST_RANGES.get(state.get("twist", ""), (None, None))
     unit = state.get("unit", unit)
-    bounds = [
-        abs(value)
-        for one in command
-        if one.get("unit") == unit and state.get("follows") in (None, one.get("name"))
-        for value in (one.get("min"), one.get("max"))
-        if isinstance(value, int | float)
-    ]
-    reach = BEYOND * max(bounds) if bounds and unit != "1" else reach
+    telling = [one for one in command if one.get("unit") == unit and one.get("cmd_vel")]
+    if follows := state.get("follows"):
+        telling = [one for one in command if one.get("name") == follows]
+    ends = [one.get(end) for one in telling for end in ("min", "max")]
+    bounds = [abs(end) for end in ends if isinstance(end, int | float)]
+    reach = BEYOND * max(bounds) if bounds else reach
     usual = {} if reach is None else {"unit": unit, "min": -reach, "max": reach}
     return {**usual, **state}
