@@ -60,11 +60,17 @@ def read_mapped(source: Source, mapping: Mapping) -> Recording:
         repairs=tuple(reader.notes),
     )
     check_streams(made, {"command": len(mapping.command), "state": len(mapping.state), "wheels": 2})
-    if fault := implausible_pose(made.pose.t, made.pose.values, np.inf):
+    if fault := implausible_pose(made.pose.t, made.pose.values, radius=_radius(mapping)):
         line = fault.line.replace("...", str(mapping.time and mapping.time.from_))
         said = f"{source.place}: pose: {fault.reason}; {fault.cause}"
         raise RecordingError(f"{said}: write `{line}` into the mapping, below `pose:`.")
     return made
+
+
+def _radius(mapping: Mapping) -> float:
+    """Returns the radius of the robot [m], as far as the mapping says it."""
+    given = mapping.robot.get("footprint_radius") if isinstance(mapping.robot, dict) else None
+    return float(given) if isinstance(given, (int, float)) else 0.0
 
 
 def _measured(reader: MappedReader, name: str, stream: Measured) -> Stream:
