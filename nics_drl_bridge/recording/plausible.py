@@ -28,7 +28,7 @@ UNITS_OF_STEP = (
 
 
 class Implausible(NamedTuple):
-    """Why a pose can't be as it is, and what explains it."""
+    """A fault of poses, and what explains it."""
 
     reason: str
     cause: str
