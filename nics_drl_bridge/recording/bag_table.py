@@ -95,10 +95,13 @@ class TopicTable:
         if isinstance(values[0], str):
             return np.array(values, dtype=np.str_)
         try:
-            return np.array(values, dtype=np.float64)
+            column = np.array(values, dtype=np.float64)
         except (TypeError, ValueError):
+            column = np.zeros((0, 0))
+        if column.ndim != 1:
             fault = f"{path!r} is no single number"
-            raise RecordingError(f"{self.place}: {fault}; {self._hint(path)}") from None
+            raise RecordingError(f"{self.place}: {fault}; {self._hint(path)}")
+        return column
 
     def _hint(self, path: str) -> str:
         inner = [name for name in self.names if name.startswith(path)]

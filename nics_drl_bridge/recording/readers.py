@@ -84,11 +84,11 @@ def _by_mapping(
 
 
 def robot_and_drive(
-    path: Path, robot: str | None, topics: TopicRoles, mapping: str | Path | None
+    path: Path, robot: str | None, topics: TopicRoles, mapping: Mapping | str | Path | None
 ) -> tuple[RobotSpec, Recording]:
     """Reads a drive with its robot: the one that is named, or the mapping's, or a shipped car."""
     if robot is None and mapping is not None:
-        given = load_mapping(mapping)
+        given = mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
         drive = read_recording(path, None, topics, given)
         spec = robot_of(given, drive)
         return spec, arranged(drive, spec)

@@ -217,18 +217,19 @@ def guess_command(tables: Sequence[TableSurvey]) -> tuple[str, dict[str, tuple[T
     """Finds columns that drive a robot of a known kind; else any whose names say `command`."""
     scored = [
         (_merit(table, column), table, column) for table in tables for column in table.columns
-        if column.low < column.high
+        if np.isfinite(column.low)
     ]  # fmt: skip
     for kind, names in KINDS:
         found = {}
         for meaning, name in names.items():
             fitting = [e for e in scored if e[0] >= 0 and _means(meaning, e[1], e[2].name)]
             if fitting:
-                _, table, column = max(fitting, key=lambda each: each[0])
+                _, table, column = max(fitting, key=lambda e: (e[0], e[2].low < e[2].high))
                 found[name] = table, column.name
         if len(found) == len(names):
             return kind, found
-    some = [(table, column.name) for merit, table, column in scored if merit > 0]
+    moving = ((m, table, column) for m, table, column in scored if column.low < column.high)
+    some = [(table, column.name) for merit, table, column in moving if merit > 0]
     return "free", {f"command_{k}": each for k, each in enumerate(some)}
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError, RecordingError, nearest
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.recording import mapping as schema
 from nics_drl_bridge.recording import stamps
 from nics_drl_bridge.recording.mapping import Mapping, Measured, Reference, Value
@@ -61,19 +62,21 @@ class MappedReader:
                 if (name := _table_name(reference[:k], names)) is not None:
                     return self._table(name), reference[k + 1 :]
         wanted = within or self.mapping.in_ or (names[0] if len(names) == 1 else None)
-        if wanted is None and isinstance(reference, str) and ":" in reference:
+        name = None if wanted is None else _table_name(wanted, names)
+        if name is not None:
+            table = self._table(name)
+            if not isinstance(reference, str) or ":" not in reference or reference in table.names:
+                return table, reference
             wanted = reference.rpartition(":")[0]
-        if wanted is None:
-            advice = f"write it as TABLE:{reference}, or add `in: TABLE`"
-            listed = ", ".join(names[:20])
-            fault = f"{self.source.place}: {reference!r} is of no table"
-            raise ConfigError(f"{fault}; {advice}; its tables are {listed}.")
-        name = _table_name(wanted, names)
-        if name is None:
-            raise RecordingError(
-                f"{self.source.place}: has no {wanted!r}; {nearest(wanted, names)}"
-            )
-        return self._table(name), reference
+        elif wanted is None and isinstance(reference, str) and ":" in reference:
+            wanted = reference.rpartition(":")[0]
+        if wanted is not None:
+            hint = nearest(wanted, names).rstrip(".")
+            raise RecordingError(f"{self.source.place}: has no {wanted!r}; {hint}.")
+        advice = f"write it as TABLE:{reference}, or add `in: TABLE`"
+        listed = ", ".join(names[:20])
+        fault = f"{self.source.place}: {reference!r} is of no table"
+        raise ConfigError(f"{fault}; {advice}; its tables are {listed}.")
 
     def _table(self, name: str) -> Table:
         table = self.source.table(name)
@@ -221,7 +224,7 @@ def _dates(column: Column) -> Array | None:
         ns = np.array(text, dtype="datetime64[ns]").astype(np.int64)
     except ValueError:
         return None
-    return np.asarray(ns * stamps.NS, dtype=np.float64)
+    return stamps.joined(ns // NS_PER_S, ns % NS_PER_S)  # exact to a quarter of a microsecond
 
 
 def _rate(raw: Series, held: bool) -> Series:
