@@ -75,8 +75,9 @@ def test_ticks_are_wheels_that_turn_the_robot_as_its_calibration_says(shared_rec
     heading = np.diff(np.interp(grid, pose.t, np.unwrap(pose.values[:, 2])))
     left, right = np.linalg.lstsq(wheels.T, heading, rcond=None)[0]
     assert (-left, right) == pytest.approx((0.284, 0.284), rel=0.03)
-    at = np.stack([np.interp(grid, pose.t, each) for each in pose.values[:, :2].T], axis=1)
-    ahead = np.diff(at, axis=0)
-    course = geometry.rotate(ahead, -np.interp(grid, pose.t, np.unwrap(pose.values[:, 2]))[:-1])
-    assert np.corrcoef(course[:, 0], wheels.sum(axis=0))[0, 1] > 0.9  # forward is along the heading
+    columns = [np.interp(grid, pose.t, each) for each in pose.values[:, :2].T]
+    at = np.stack([*columns, np.interp(grid, pose.t, np.unwrap(pose.values[:, 2]))], axis=1)
+    ahead = geometry.log(geometry.between(at[:-1], at[1:]))[:, 0]
+    rolled = np.linalg.lstsq(wheels.T, ahead, rcond=None)[0]
+    assert rolled.sum() == pytest.approx(0.1676, rel=0.08)  # [m]: the mean published radius
     assert 0.005 < np.median(pose.sigma[:, 0]) < 0.05
