@@ -121,7 +121,7 @@ def inspect(
         with open_source(source) as opened:
             tables = survey(opened)
         for table in tables:
-            found = "".join(f"\n  {finding}" for finding in table.findings)
+            found = "".join(f"\n  {finding}" for finding in table.regularity + table.findings)
             typer.echo(f"{table.name}: {table.rows} rows{found}")
             rows = [(c.name, f"{c.low:.6g}", f"{c.high:.6g}") for c in table.columns]
             if rows:

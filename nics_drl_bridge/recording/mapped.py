@@ -30,6 +30,7 @@ from nics_drl_bridge.recording.values import MappedReader, Series, together, uni
 QUATERNION_TOLERANCE = 0.05
 MOST_UNTRACKED = 0.05  # share of poses whose quaternion is zero: the tracker had lost the body
 NO_LENGTH = 1e-9
+MOST_RATIO = 100.0  # of durations of two streams of a drive
 
 
 def read_mapped(source: Source, mapping: Mapping) -> Recording:
@@ -205,6 +206,12 @@ def _from_zero(found: dict[str, Stream], main: str, reader: MappedReader) -> dic
             advice = "check their `time:`, or give one of them a `clock:` of its own"
             raise RecordingError(f"{fault}, {other}; {advice}.")
         span[:] = min(first, span[0]), max(last, span[1])
+    pose = found["pose"]
+    for name, stream in found.items():
+        lasts, usual = np.ptp(stream.t), max(np.ptp(pose.t), 1e-9)
+        if lasts and not 1.0 / MOST_RATIO < lasts / usual < MOST_RATIO:
+            fault = f"{reader.source.place}: {name} lasts {lasts:.4g} s, the pose {usual:.4g} s"
+            raise RecordingError(f"{fault}; give the `unit:` of the `time:` that is wrong.")
     base = spans.get(main) or next(iter(spans.values()))
     origin = {}
     together = [span for span in spans.values() if span[0] <= base[1] and span[1] >= base[0]]

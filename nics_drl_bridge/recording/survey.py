@@ -12,6 +12,7 @@ import numpy as np
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording import stamps
+from nics_drl_bridge.recording.mapped import POSES
 from nics_drl_bridge.recording.plausible import implausible_pose
 from nics_drl_bridge.recording.recording import IRREGULAR
 from nics_drl_bridge.recording.table import Column, Source, Table
@@ -20,6 +21,7 @@ from nics_drl_bridge.recording.units import UNITS
 GUESSED = "# guessed"
 GAP = 5.0  # a gap is longer than this many usual steps
 MOST_COLUMNS = 200  # of a table
+UNIT_LENGTH = 0.01  # by which a quaternion may differ from length 1
 MOST_BACK = 0.05  # share of steps of a column of stamps that may go back
 TIMES = {"time", "times", "stamp", "timestamp", "t", "s", "sec", "secs", "seconds", "elapsed"}
 SPLIT = (("s", "ns"), ("sec", "nanosec"), ("secs", "nsecs"), ("sec", "nsec"), ("sec", "nsecs"))
@@ -67,10 +69,22 @@ class TableSurvey:
     name: str
     rows: int
     columns: list[Survey]
-    time: str | None = None  # for a mapping, as `time: t`; None if the stamps come with the rows
+    stamps: str | None = None  # column of the stamps; None if they come with the rows
+    unit: str | None = None  # of these, other than seconds
     findings: list[str] = field(default_factory=list)
     t: Array | None = None  # (T,) [s]
     data: dict[str, Column] = field(default_factory=dict)
+
+    @property
+    def time(self) -> str | None:
+        """What a mapping says of the stamps, as `t`, `[s, ns]` or `{from: t, unit: ms}`."""
+        return f"{{from: {self.stamps}, unit: {self.unit}}}" if self.unit else self.stamps
+
+    @property
+    def regularity(self) -> list[str]:
+        """Sentences on rate, gaps, stamps that run backwards, and repeated rows."""
+        known = self.t is not None and len(self.t) > 1
+        return list(_regularity(self.t, self.data)) if known and self.t is not None else []
 
     def reference(self, column: str, alone: bool) -> str:
         """Returns how a mapping refers to a column."""
@@ -87,7 +101,20 @@ def survey(source: Source) -> list[TableSurvey]:
             found.append(_surveyed(name, source.table(name)))
         except RecordingError as error:  # one unreadable table leaves the others
             found.append(TableSurvey(name, 0, [], findings=[str(error)]))
+    _units_by_span(found)
     return found
+
+
+def _units_by_span(tables: Sequence[TableSurvey]) -> None:
+    """Chooses units of stamps so that all tables last about as long as those in seconds."""
+    lasting = [float(np.ptp(each.t)) for each in tables if each.t is not None and not each.unit]
+    for table in tables:
+        if table.t is None or not table.unit or not lasting:
+            continue
+        raw = table.t / UNITS[table.unit].factor
+        ratio = {u: np.ptp(raw) * UNITS[u].factor / np.median(lasting) for u in ("ms", "us", "ns")}
+        table.unit = min(ratio, key=lambda unit: abs(np.log(max(ratio[unit], 1e-30))))
+        table.t = raw * UNITS[table.unit].factor
 
 
 def _surveyed(name: str, table: Table) -> TableSurvey:
@@ -102,10 +129,8 @@ def _surveyed(name: str, table: Table) -> TableSurvey:
     if given is not None:
         found.t = given.t
     else:
-        found.time, raw = _time(data)
+        found.stamps, raw = _time(data)
         found.t = None if raw is None else _in_seconds(found, raw)
-    if found.t is not None and len(found.t) > 1:
-        found.findings += list(_regularity(found.t, data))
     return found
 
 
@@ -142,7 +167,7 @@ def _in_seconds(found: TableSurvey, raw: Array) -> Array:
     raw = raw[np.isfinite(raw)]
     if (unit := stamps.likely_unit(raw)) is None:
         return raw
-    found.time = f"{{from: {found.time}, unit: {unit}}}"
+    found.unit = unit
     return raw * UNITS[unit].factor
 
 
@@ -187,7 +212,21 @@ def guess_pose(tables: Sequence[TableSurvey]) -> Guess | None:
                 words = set(words_of(f"{table.name} {name}"))
                 merit = 2 * bool(words & TRACKERS) - 2 * bool(words & MEASURING)
                 found.append((merit + ("quaternion" in keys), Guess(table, keys)))
-    return max(found, key=lambda each: each[0])[1] if found else None
+    if found:
+        return max(found, key=lambda each: each[0])[1]
+    return next((guess for table in tables if (guess := _by_quaternion(table))), None)
+
+
+def _by_quaternion(table: TableSurvey) -> Guess | None:
+    """Finds four columns side by side of length 1, after a position x, y, z, without names."""
+    names = [column.name for column in table.columns if np.isfinite(column.low)]
+    for k in range(3, len(names) - 3):
+        four = [table.data[name].astype(np.float64) for name in names[k : k + 4]]
+        turns = any(np.ptp(each) > 0.0 for each in four)
+        if turns and np.nanmax(np.abs(np.linalg.norm(four, axis=0) - 1.0)) < UNIT_LENGTH:
+            quaternion = f"[{', '.join(names[k : k + 4])}]"
+            return Guess(table, {"x": names[k - 3], "y": names[k - 2], "quaternion": quaternion})
+    return None
 
 
 def _like(name: str, axis: str, names: Sequence[str]) -> str | None:
@@ -228,8 +267,7 @@ def guess_command(tables: Sequence[TableSurvey]) -> tuple[str, dict[str, tuple[T
                 found[name] = table, column.name
         if len(found) == len(names):
             return kind, found
-    moving = ((m, table, column) for m, table, column in scored if column.low < column.high)
-    some = [(table, column.name) for merit, table, column in moving if merit > 0]
+    some = [(table, c.name) for merit, table, c in scored if merit > 0 and (c.low or c.high)]
     return "free", {f"command_{k}": each for k, each in enumerate(some)}
 
 
@@ -277,6 +315,9 @@ def first_mapping(tables: Sequence[TableSurvey]) -> str:
 
 
 def _pose_lines(pose: Guess, alone: bool, common: str | None) -> Iterator[str]:
+    if pose.table.stamps is None and pose.keys["x"] in (form[0].format("x") for form in POSES[:4]):
+        yield f"pose: {pose.table.name}  {GUESSED}"  # a message whose fields are known
+        return
     yield f"pose:  {GUESSED}"
     if not alone:
         yield f"  in: {pose.table.name}"

@@ -65,7 +65,7 @@ def test_gaps_backward_stamps_and_repeated_rows_are_listed(tmp_path):
     t[150:] -= 0.5
     path = write(tmp_path / "log.csv", {k: c[order] for k, c in (columns | {"t": t}).items()})
     (table,), _ = surveyed(path)
-    text = "\n".join(table.findings)
+    text = "\n".join(table.regularity)
     assert "gaps: 1, the longest of 0.82 s after 1.0 s" in text
     assert "stamps that run backwards: 1" in text
     assert "stamps like the one before: 2, in rows that repeat all of it: 2" in text
