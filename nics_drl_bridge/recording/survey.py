@@ -81,6 +81,11 @@ class TableSurvey:
         return f"{{from: {self.stamps}, unit: {self.unit}}}" if self.unit else self.stamps
 
     @property
+    def stamp_columns(self) -> list[str]:
+        """The columns of the stamps."""
+        return (self.stamps or "").strip("[]").split(", ")
+
+    @property
     def regularity(self) -> list[str]:
         """Sentences on rate, gaps, stamps that run backwards, and repeated rows."""
         known = self.t is not None and len(self.t) > 1
@@ -256,7 +261,7 @@ def guess_command(tables: Sequence[TableSurvey]) -> tuple[str, dict[str, tuple[T
     """Finds columns that drive a robot of a known kind; else any whose names say `command`."""
     scored = [
         (_merit(table, column), table, column) for table in tables for column in table.columns
-        if np.isfinite(column.low)
+        if np.isfinite(column.low) and column.name not in table.stamp_columns
     ]  # fmt: skip
     for kind, names in KINDS:
         found = {}
