@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping as Names
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -50,17 +50,11 @@ def read_mapped(source: Source, mapping: Mapping) -> Recording:
         keep, note = stamps.not_repeated(stream.t, stream.values, name)
         reader.say(note)
         found[name] = stream.rows(keep)
-    found = _from_zero(found, mapping.clock, reader)
-    names = (*mapping.state, *mapping.command)
-    streams: Any = found
-    made = Recording(
-        **streams,
-        source=source.place,
-        variables=names,
-        latency=source.latency,
-        repairs=tuple(reader.notes),
-    )
+    names, streams = (*mapping.state, *mapping.command), cast(Any, found)
+    made = Recording(**streams, source=source.place, variables=names, latency=source.latency)
     check_streams(made, {"command": len(mapping.command), "state": len(mapping.state), "wheels": 2})
+    shifted: Any = _from_zero(found, mapping.clock, reader)
+    made = replace(made, **shifted, repairs=tuple(reader.notes))
     if fault := implausible_pose(made.pose.t, made.pose.values, radius=_radius(mapping)):
         line = fault.line.replace("...", str(mapping.time and mapping.time.from_))
         said = f"{source.place}: pose: {fault.reason}; {fault.cause}"

@@ -148,7 +148,7 @@ def _range(column: Column) -> tuple[float, float]:
 def _time(data: dict[str, Column]) -> tuple[str | None, Array | None]:
     """Guesses the column of stamps: by its name, and by how steadily it rises."""
     for seconds, rest in SPLIT:
-        if seconds in data and rest in data:
+        if all(each in data and data[each].dtype.kind not in "US" for each in (seconds, rest)):
             return f"[{seconds}, {rest}]", stamps.joined(data[seconds], data[rest])
 
     def merit(name: str) -> float:
@@ -205,14 +205,10 @@ def guess_pose(tables: Sequence[TableSurvey]) -> Guess | None:
     """Finds x, y and heading, or a quaternion, under names that belong together."""
     found: list[tuple[int, Guess]] = []
     for table in tables:
-        names = [column.name for column in table.columns]
+        names = [column.name for column in table.columns if np.isfinite(column.low)]
         for name in names:
-            if not re.search(r"(^|[^A-Za-z]|t|p)x$", name, re.IGNORECASE):
-                continue
-            if (y := _like(name, "y", names)) is None:
-                continue
-            prefix = name[:-1].rstrip("tpTP ._")
-            keys = {"x": name, "y": y} | _heading(name, prefix, table, names)
+            keys = _position(name, names)
+            keys |= _heading(keys["x"], table, names) if len(keys) == 2 else {}
             if len(keys) > 2:
                 words = set(words_of(f"{table.name} {name}"))
                 merit = 2 * bool(words & TRACKERS) - 2 * bool(words & MEASURING)
@@ -234,12 +230,25 @@ def _by_quaternion(table: TableSurvey) -> Guess | None:
     return None
 
 
+def _position(name: str, names: Sequence[str]) -> dict[str, str]:
+    """Returns x and y if a name is of x, and the heading too if it is the first of three."""
+    if name.endswith("[0]") and (TRACKERS | MEASURING) & set(words_of(name)):
+        three = [name, *(name.replace("[0]", f"[{k}]") for k in (1, 2))]
+        more = name.replace("[0]", "[3]") in names
+        known = all(one in names for one in three) and not more
+        return dict(zip(("x", "y", "heading"), three, strict=True)) if known else {}
+    y = _like(name, "y", names)
+    named = re.search(r"(^|[^A-Za-z]|t|p)x$", name, re.IGNORECASE) is not None
+    return {"x": name, "y": y} if named and y is not None else {}
+
+
 def _like(name: str, axis: str, names: Sequence[str]) -> str | None:
     other = name[:-1] + (axis.upper() if name[-1].isupper() else axis)
     return other if other in names else None
 
 
-def _heading(x: str, prefix: str, table: TableSurvey, names: Sequence[str]) -> dict[str, str]:
+def _heading(x: str, table: TableSurvey, names: Sequence[str]) -> dict[str, str]:
+    prefix = x[:-1].rstrip("tpTP ._")
     start = prefix.removesuffix("position").rstrip("._ ")
     turned = [f"{start}.orientation.x", f"{start}.rotation.x", "q.x", "qx", "q_x", f"{start}.q.x"]
     turned += [f"{start.removesuffix('translation')}rotation.x", "orientation.x"]

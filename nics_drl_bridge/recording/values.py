@@ -184,9 +184,10 @@ class MappedReader:
         if not value.counts:
             values = values - size * np.round(values[0] / size)
         if count:
-            found = "" if value.wrap else " as found"
             times = "once" if count == 1 else f"{count} times"
-            self.say(f"{name}: the counter overflowed at {size:.10g}{found} {times}: continued.")
+            found = "" if value.wrap else ", as it seems"
+            end = f"{times}, at {size:.10g}{found}"
+            self.say(f"{name}: the counter overflowed {end}, and was continued.")
         return raw._replace(values=values)
 
     def _where(self, value: Value, made: Series, table: Table, time: schema.Time | None) -> Series:

@@ -107,7 +107,7 @@ def test_the_rate_of_a_counter_holds_until_the_stamp_that_shows_it(tmp_path, col
     assert np.allclose(found.command.values, speed[:-1, None] * [2.0 * np.pi / 100.0, 1.0])
     assert np.allclose(found.command.t, columns["t"][:-1])
     assert found.repairs == (
-        "command.left: the counter overflowed at 65536 as found once: continued.",
+        "command.left: the counter overflowed once, at 65536, as it seems, and was continued.",
     )
     wheels = read(path, wheels={"left": value, "right": backwards}).wheels
     assert np.allclose(wheels.t, columns["t"][:-1] + 0.01)  # measured between two stamps
