@@ -67,8 +67,7 @@ class MappedReader:
             table = self._table(name)
             if not isinstance(reference, str) or ":" not in reference or reference in table.names:
                 return table, reference
-            wanted = reference.rpartition(":")[0]
-        elif wanted is None and isinstance(reference, str) and ":" in reference:
+        if isinstance(reference, str) and ":" in reference:
             wanted = reference.rpartition(":")[0]
         if wanted is not None:
             hint = nearest(wanted, names).rstrip(".")
