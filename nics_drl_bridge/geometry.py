@@ -59,3 +59,26 @@ def log(relative: ArrayLike) -> Array:
     cot = np.where(small, 1.0 - w * w / 12.0, (safe / 2.0) / np.tan(safe / 2.0))
     x, y = relative[..., 0], relative[..., 1]
     return np.stack([cot * x + half * y, -half * x + cot * y, w], axis=-1)
+
+
+def edges_cross(corners: Array) -> bool:
+    """True if edges of a closed outline (K, 2) cross or touch others than their neighbours."""
+    start, stop = corners, np.roll(corners, -1, axis=0)
+    if (start == stop).all(axis=1).any():
+        return True
+
+    def side(points: Array) -> Array:
+        along, to = (stop - start)[:, None], points[None] - start[:, None]
+        return np.asarray(np.sign(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0]))
+
+    low, high = np.minimum(start, stop), np.maximum(start, stop)
+    boxes = ((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(axis=-1)
+    apart = side(start) * side(stop)
+    index = np.arange(len(corners))
+    gap = (index[None] - index[:, None]) % len(corners)
+    distant = (gap > 1) & (gap < len(corners) - 1)
+    # An edge may not run back along its predecessor.
+    folded = side(stop)[index, (index + 1) % len(corners)] == 0.0
+    ahead = ((stop - start) * (np.roll(stop - start, -1, axis=0))).sum(axis=1) > 0.0
+    crossing = boxes & (apart <= 0.0) & (apart.T <= 0.0) & distant
+    return bool(crossing.any() or (folded & ~ahead).any())

@@ -51,8 +51,7 @@ class SimBackend:
         """Moves the robots by one control period; see `interface.Backend`."""
         data = self.simulator.data
         if self._middlewares:
-            # Via cmd_vel, as over ROS 2, so that both round alike.
-            command = self._robot.from_cmd_vel(self._robot.to_cmd_vel(command))
+            command = self._robot.through_cmd_vel(command)  # as over ROS 2: both round alike
         commands = command.reshape(data.pose.shape[1], -1)
         for middleware, one in zip(self._middlewares, commands, strict=False):
             middleware.command(self._now_ns, one)

@@ -15,12 +15,14 @@ from nics_drl_bridge.errors import ConfigError, PolicyError, nearest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy import dynamic_window_kernels as kernels
 from nics_drl_bridge.policy.contract import SUFFIX, shipped
-from nics_drl_bridge.robot.kinds import steady_twist
+from nics_drl_bridge.robot.kinds import command_for, has_textbook, reach, steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
 
 FULL_TURN_RAD = 0.8  # bearing of the goal from which a robot turns as fast as it can
+SETTLED_S = 5.0  # after which a held command has led to its twist
+LEAST_REACH = 1e-3  # of a component of the twist that no command moves [m/s, rad/s]
 CREEP = 0.3  # share of the speed for a robot that can't turn on the spot and has its goal behind
 
 
@@ -31,6 +33,32 @@ class Policy(Protocol):
         """Returns the action (C,) in [-1, 1] for an observation (O,); or (N, C) for (N, O)."""
 
 
+def _grid(robot: RobotSpec) -> Array:
+    """Returns commands (K, C) over the whole range of each, with rest."""
+    counts = {1: (15,), 2: (7, 15), 3: (7, 7, 5)}.get(len(robot.command))
+    axes = [
+        np.unique(np.append(np.linspace(one.min, one.max, count), np.clip(0, one.min, one.max)))
+        for one, count in zip(robot.command, counts or [3] * len(robot.command), strict=True)
+    ]
+    return np.array(list(itertools.product(*axes)))
+
+
+def _settled(task: Navigation, commands: Array, model: SimulatorModel | None) -> Array:
+    """Returns the body twists (K, 3) to which commands (K, C) lead when they are held.
+
+    By the model of a robot that is not driven by `cmd_vel`: its kind may know them roughly alone.
+    """
+    if model is None or task.robot.takes_cmd_vel:
+        return steady_twist(task.robot, commands)
+    kinematics = model.kinematics
+    state = np.zeros((len(commands), kinematics.state_size))
+    low, high = kinematics.low[: state.shape[1]], kinematics.high[: state.shape[1]]
+    for _ in range(round(SETTLED_S / kinematics.dt)):
+        rates = kinematics.rates(np.concatenate([state, commands], axis=1))
+        state = np.clip(state + kinematics.dt * rates[:, 3:], low, high)
+    return np.asarray(kinematics.rates(np.concatenate([state, commands], axis=1))[:, :3])
+
+
 def _actions(robot: RobotSpec, commands: Array) -> Array:
     low, high = robot.command_low, robot.command_high
     return np.asarray(2.0 * (commands - low) / (high - low) - 1.0)
@@ -38,19 +66,49 @@ def _actions(robot: RobotSpec, commands: Array) -> Array:
 
 @dataclass(frozen=True)
 class StraightToGoal:
-    """Turns to the goal and drives there, ignoring obstacles."""
+    """Turns to the goal and drives there, ignoring obstacles; ConfigError: see `command_for`."""
 
     task: Navigation
+    model: SimulatorModel | None = None  # tells the twists of a robot whose kind does not
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """See `Policy`."""
         robot, first = self.task.robot, self.task.scan_parts + 1
         cosine, sine = np.moveaxis(observation[..., first : first + 2].astype(float), -1, 0)
         turn = np.clip(np.arctan2(sine, cosine) / FULL_TURN_RAD, -1.0, 1.0)
-        ahead = np.maximum(cosine, CREEP if robot.steers else 0.0)
+        ahead = np.maximum(cosine, 0.0 if self._turns_in_place else CREEP)
         shares = np.stack([ahead, np.zeros_like(ahead), turn], axis=-1)
-        wanted = robot.from_cmd_vel(shares) * robot.command_high
+        if robot.takes_cmd_vel:
+            wanted = robot.of_fields(shares) * robot.command_high
+        else:
+            wanted = self._command(shares)
         return np.clip(_actions(robot, wanted), -1.0, 1.0).astype(np.float32)
+
+    def _command(self, shares: Array) -> Array:
+        """Returns commands (..., C) for shares (..., 3) of the greatest twist."""
+        robot = self.task.robot
+        if has_textbook(robot):
+            return command_for(robot, shares * self._reach)
+        commands, twists = self._known
+        apart = twists / self._reach - shares[..., None, :]
+        return np.asarray(commands[(apart**2).sum(axis=-1).argmin(axis=-1)])
+
+    @cached_property
+    def _known(self) -> tuple[Array, Array]:
+        commands = _grid(self.task.robot)
+        return commands, _settled(self.task, commands, self.model)
+
+    @cached_property
+    def _reach(self) -> Array:
+        if has_textbook(self.task.robot):
+            return reach(self.task.robot)
+        return np.asarray(np.maximum(np.abs(self._known[1]).max(axis=0), LEAST_REACH))
+
+    @cached_property
+    def _turns_in_place(self) -> bool:
+        if self.task.robot.takes_cmd_vel:
+            return not self.task.robot.steers
+        return bool(self._command(np.array([0.0, 0.0, 1.0])).any())
 
 
 @dataclass(frozen=True)
@@ -79,6 +137,7 @@ class DynamicWindow:
     period: float = 0.1  # between commands [s]
     steps: int = 10  # of the look-ahead, each a period and a half long
     weights: tuple[float, float, float, float] = (1.0, 0.6, 0.3, 1.5)  # see `TwistWeights`
+    model: SimulatorModel | None = None  # tells the twists of a robot without `cmd_vel`
 
     def __post_init__(self) -> None:
         _ = self._search
@@ -98,7 +157,7 @@ class DynamicWindow:
     @cached_property
     def _search(self) -> tuple[Array, kernels.ScanRays, kernels.LookAhead, kernels.TwistWeights]:
         robot, sight = self.task.robot, self.task.sight
-        twists = steady_twist(robot, self._commands)
+        twists = _settled(self.task, self._commands, self.model)
         directions = np.stack([np.cos(sight.angles), np.sin(sight.angles)], axis=-1)
         rays = kernels.ScanRays(directions, sight.origin, float(sight.range_max))
         lags = [value for name, value in robot.parameters.items() if name.endswith("_lag")]
@@ -111,22 +170,18 @@ class DynamicWindow:
 
     @cached_property
     def _commands(self) -> Array:
-        robot = self.task.robot
-        counts = {1: (15,), 2: (7, 15), 3: (7, 7, 5)}.get(len(robot.command))
-        axes = [
-            np.unique(np.append(np.linspace(one.min, one.max, count), np.clip(0, one.min, one.max)))
-            for one, count in zip(robot.command, counts or [3] * len(robot.command), strict=True)
-        ]
-        return np.array(list(itertools.product(*axes)))
+        return _grid(self.task.robot)
 
     @cached_property
     def _scaled(self) -> NDArray[np.float32]:
         return _actions(self.task.robot, self._commands).astype(np.float32)
 
 
-POLICIES: dict[str, Callable[[Navigation], Policy]] = {
-    "dynamic_window": DynamicWindow, "random": RandomActions, "straight": StraightToGoal,
-}  # fmt: skip
+POLICIES: dict[str, Callable[[Navigation, SimulatorModel | None], Policy]] = {
+    "dynamic_window": lambda task, model: DynamicWindow(task, model=model),
+    "random": lambda task, _: RandomActions(task),
+    "straight": StraightToGoal,
+}
 
 
 def shipped_policies() -> list[str]:
@@ -145,7 +200,7 @@ def is_policy_file(name: str) -> bool:
 def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None) -> Policy:
     """Makes a policy by name, or the path of a file. Raises ConfigError, PolicyError."""
     if not is_policy_file(name):
-        return POLICIES[name](task)
+        return POLICIES[name](task, model)
     from nics_drl_bridge.policy.policy_file import load_policy  # the others need no onnxruntime
 
     policy = load_policy(name)
@@ -157,7 +212,7 @@ def open_policy(name: str, model: SimulatorModel) -> tuple[Policy, Navigation]:
     """Opens a policy and its navigation task; PolicyError if it was trained for another task."""
     if not is_policy_file(name):
         task = Navigation(model.robot, model.lidar)
-        return POLICIES[name](task), task
+        return POLICIES[name](task, model), task
     from nics_drl_bridge.policy.policy_file import load_policy
 
     policy = load_policy(name)

@@ -33,7 +33,7 @@ def steered(
     second order, a multiple of their product. `names` are usual ones of the commands.
     """
     v, phi = _states(spec)
-    command = _commands(spec, ("linear.x", "angular.z"), names)
+    command = _commands(spec, ("linear.x", "angular.z"), names, 2)
     order = np.argsort([v, phi])
     speed, angle = (spec.state[i].name if _own_state(spec) else names[i] for i in (v, phi))
     lag, rate = _actuators(spec.parameters, ("speed", "steering"))
@@ -68,11 +68,9 @@ def wheeled(
         raise _unfit(spec, f"{needed}; correct `state:`.")
     dofs = [POSE_RATES.index(dof) for dof in moves]
     fields = tuple(CMD_VEL_FIELDS[dof] for dof in dofs)
-    by_wheels = all(c.unit == "rad/s" and not c.is_twist for c in spec.command)
-    command = _commands(spec, () if by_wheels else fields, wheels if by_wheels else ())
+    by_wheels = all(c.unit == "rad/s" and c.cmd_vel is None for c in spec.command)
     into = np.eye(len(inverse)) if by_wheels else inverse
-    if len(command) != into.shape[1]:
-        raise _unfit(spec, f"need {into.shape[1]} commands, not {len(command)}; correct them.")
+    command = _commands(spec, fields, wheels if by_wheels else (), into.shape[1])
     undone = inverse if by_wheels else np.eye(len(dofs))
     slipping = np.array([1.0, 1.0, slip])
     out = forward * slipping[:, None]
@@ -91,10 +89,12 @@ def _own_state(spec: RobotSpec) -> bool:
 
 
 def _commands(
-    spec: RobotSpec, fields: tuple[CmdVelField, ...], names: tuple[str, ...]
+    spec: RobotSpec, fields: tuple[CmdVelField, ...], names: tuple[str, ...], count: int
 ) -> list[int]:
     have = [c.cmd_vel for c in spec.command]
     if not any(have):
+        if len(have) != count:
+            raise _unfit(spec, f"need {count} commands, not {len(have)}; correct `command:`.")
         called = [c.name for c in spec.command]
         if names and set(names) == set(called):
             return [called.index(name) for name in names]

@@ -3,8 +3,7 @@
 import numpy as np
 
 from nics_drl_bridge.robot.drivetrain import wheeled
-from nics_drl_bridge.robot.free import drawing
-from nics_drl_bridge.robot.kinds import RobotKind, Textbook
+from nics_drl_bridge.robot.kinds import RobotKind, Textbook, disc
 from nics_drl_bridge.robot.spec import CMD_VEL_FIELDS, POSE_RATES, POSE_UNITS, RobotSpec
 from nics_drl_bridge.robot.template import LAGS, Template, usual
 
@@ -18,5 +17,5 @@ def kinematics(spec: RobotSpec) -> Textbook:
 
 
 KIND = RobotKind(
-    kinematics, drawing, Template((COMMANDS,), POSE_RATES, (), LAGS), sideways=True
+    kinematics, disc, Template((COMMANDS,), POSE_RATES, (), LAGS), sideways=True
 )  # fmt: skip

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, field_validator, model_validator
 
-from nics_drl_bridge import extensions
+from nics_drl_bridge import extensions, geometry
 from nics_drl_bridge.config import Schema, find_config, parse_yaml, read_text, validate
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.robot.steering import Bicycle
@@ -141,7 +141,7 @@ class RobotSpec(Schema):
     @model_validator(mode="after")
     def _consistent(self) -> RobotSpec:
         if self.footprint is not None:
-            if _edges_cross(np.array(self.footprint)):
+            if geometry.edges_cross(np.array(self.footprint)):
                 raise ValueError("edges of footprint cross or touch; list its corners in order")
             reach, radius = _reach(self.footprint), self.footprint_radius
             if not math.isclose(reach, radius, rel_tol=1e-6):
@@ -212,13 +212,17 @@ class RobotSpec(Schema):
         return self.steers and self.angular_is == "turn_rate"
 
     @property
+    def knows_wheelbase(self) -> bool:
+        """True if its wheelbase is given, not only assumed."""
+        return self.parameters.get("wheelbase", 0.0) > 0.0 and "wheelbase" not in self.assumed
+
+    @property
     def wheelbase(self) -> float:
         """Distance between the axles of a robot that steers [m]. Raises ConfigError if unknown."""
-        wheelbase = self.parameters.get("wheelbase", 0.0)
-        if not wheelbase > 0.0 or "wheelbase" in self.assumed:
+        if not self.knows_wheelbase:
             fix = "add `wheelbase:` [m] to the `parameters:` of its YAML file."
             raise ConfigError(f"robot {self.name!r} steers, and its wheelbase is not known; {fix}")
-        return wheelbase
+        return self.parameters["wheelbase"]
 
     @cached_property
     def command_low(self) -> NDArray[np.float64]:
@@ -239,6 +243,11 @@ class RobotSpec(Schema):
                 raise ConfigError(f"robot {self.name!r}: {reason}; {fix}.")
         fields = [CMD_VEL_FIELDS.index(c.cmd_vel) for c in self.command if c.cmd_vel is not None]
         return np.array(fields, dtype=np.intp)
+
+    @property
+    def cmd_vel_places(self) -> tuple[int, ...]:
+        """Places (C,) of the commands in linear.x, linear.y, angular.z; ConfigError without."""
+        return tuple(self._cmd_vel_index.tolist())
 
     @cached_property
     def bicycle(self) -> Bicycle:
@@ -271,6 +280,19 @@ class RobotSpec(Schema):
         limits = np.array([(c.min, c.max) if c.steers else (-np.inf, np.inf) for c in self.command])
         return np.asarray(np.clip(command, *limits.T))
 
+    def through_cmd_vel(self, command: ArrayLike) -> NDArray[np.float64]:
+        """Returns commands (..., C) as a robot that hears `cmd_vel` takes them; else as they are.
+
+        They differ by rounding, and a car that takes turn rates does not steer at rest.
+        """
+        if self.takes_cmd_vel and (self.knows_wheelbase or not self.takes_turn_rate):
+            return self.from_cmd_vel(self.to_cmd_vel(command))
+        return np.asarray(command, dtype=np.float64)
+
+    def require_cmd_vel(self) -> None:
+        """Raises ConfigError if a node can't drive it, since `to_cmd_vel` fails."""
+        self.to_cmd_vel(self.command_low)
+
     def of_fields(self, values: ArrayLike) -> NDArray[np.float64]:
         """Returns of values (..., 3), by field of `cmd_vel`, those of the commands (..., C)."""
         return np.asarray(values, dtype=np.float64)[..., self._cmd_vel_index]
@@ -288,28 +310,6 @@ def _circumscribed(data: dict[str, Any]) -> dict[str, Any]:
 
 def _reach(outline: ArrayLike) -> float:
     return float(np.hypot(*np.array(outline, dtype=np.float64).T).max())
-
-
-def _edges_cross(corners: NDArray[np.float64]) -> bool:
-    start, stop = corners, np.roll(corners, -1, axis=0)
-    if (start == stop).all(axis=1).any():
-        return True
-
-    def side(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        along, to = (stop - start)[:, None], points[None] - start[:, None]
-        return np.sign(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])
-
-    low, high = np.minimum(start, stop), np.maximum(start, stop)
-    boxes = ((low[:, None] <= high[None]) & (low[None] <= high[:, None])).all(axis=-1)
-    apart = side(start) * side(stop)
-    index = np.arange(len(corners))
-    gap = (index[None] - index[:, None]) % len(corners)
-    distant = (gap > 1) & (gap < len(corners) - 1)
-    # An edge may not run back along its predecessor.
-    folded = side(stop)[index, (index + 1) % len(corners)] == 0.0
-    ahead = ((stop - start) * (np.roll(stop - start, -1, axis=0))).sum(axis=1) > 0.0
-    crossing = boxes & (apart <= 0.0) & (apart.T <= 0.0) & distant
-    return bool(crossing.any() or (folded & ~ahead).any())
 
 
 def load_robot(name: str | Path) -> RobotSpec:

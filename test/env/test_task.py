@@ -145,6 +145,16 @@ def test_a_discrete_action_gives_its_command_for_one_robot_and_for_many():
     assert still(DIRECT).tolist() == [0.0, 0.0, 0.0]
 
 
+def test_a_car_by_turn_rates_does_not_learn_to_steer_at_rest():
+    steering = load_robot("ackermann")
+    turning = steering.model_copy(update={"angular_is": "turn_rate"})
+    ahead, at_rest = [[0.0, 0.6], [-1.0, 0.6]]  # actions; the car's least speed is 0
+    for robot, angle in ((steering, 0.3), (turning, 0.0)):
+        task = Navigation(robot, lidar())
+        assert task.command(ahead) == pytest.approx([0.5, 0.3])
+        assert task.command(at_rest) == pytest.approx([0.0, angle])
+
+
 def test_a_robot_without_cmd_vel_gets_each_command_alone():
     wheels = DIRECT.model_validate(
         {

@@ -7,6 +7,7 @@ from gate.rig import TICK_S, Rig, config, driving
 from nics_drl_bridge.gate.inputs import Command, EStop, Odometry, Press, Reset, Scan, Tick
 from nics_drl_bridge.gate.stops import FROZEN_INPUTS
 from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.robot.steering import Bicycle
 
 EVERY_TOPIC = "scan odom estimate e_stop command"
 WITHIN_S = 0.40
@@ -22,6 +23,17 @@ def test_a_gate_that_nobody_armed_lets_nothing_pass():
 def test_an_armed_gate_lets_the_command_pass():
     rig = driving()
     assert rig.decision.twist.tolist() == pytest.approx([0.5, 0.0, 0.1])
+
+
+def test_a_car_that_takes_turn_rates_is_limited_by_its_steering_angle():
+    rig = Rig(config(bicycle=Bicycle(0.2)))
+    rig.wish = np.array([0.5, 0.0, 0.3])
+    rig.drive()
+    assert rig.decision.twist.tolist() == pytest.approx([0.5, 0.0, 0.3])
+    assert rig.state.value.tolist() == pytest.approx([0.5, np.arctan(0.2 * 0.3 / 0.5)])
+    rig.wish = np.array([0.5, 0.0, 30.0])
+    rig.run(2.0)
+    assert rig.decision.twist[2] == pytest.approx(0.5 * np.tan(rig.config.limits.high[1]) / 0.2)
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from sensor_msgs.msg import LaserScan
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.errors import BackendError, ConfigError, ModelError, StaleDataError
-from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.generator import builtin_model, open_model
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.backends import DdsBackend, _Mailbox, dds_backend
@@ -399,6 +399,23 @@ def test_two_backends_in_two_domains_do_not_hear_each_other(
     here, there, expected = (b.step(np.zeros(2))[0] for b in (one, two, alone))
     assert here.pose.tolist() == expected.pose.tolist()
     assert np.abs(there.pose - expected.pose).max() > 0.1
+
+
+@pytest.mark.slow
+def test_a_car_that_takes_turn_rates_moves_over_dds_as_in_process(
+    launch, connect, arena, domain_id, tmp_path
+):
+    file = tmp_path / "kart.yaml"
+    file.write_text("kind: ackermann\nfootprint_radius: 0.2\nparameters: {wheelbase: 0.3}\n")
+    launch("simulator_node", domain_id, mode="lockstep", model=str(file))
+    kart = open_model(file)
+    there, alone = connect(model=kart, domain_id=domain_id), SimBackend(kart, arena, estimator=True)
+    for backend in (there, alone):
+        backend.reset(START)
+    for command in ([0.9, 0.5], [0.9, -0.2], [-0.4, 0.3], [0.0, 0.5], [0.5, 0.1]):
+        poses = [backend.step(np.array(command))[0].pose.tolist() for backend in (there, alone)]
+        assert poses[0] == poses[1]
+    assert poses[0] != START.pose.tolist()
 
 
 TEAM = {"task": "cooperative_reaching", "task_options": {"robots": 2}}

@@ -7,7 +7,13 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 
-from nics_drl_bridge.nodes.runner import declare, open_context, unknown
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.generator import open_model
+from nics_drl_bridge.nodes.backends import DdsBackend
+from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
+from nics_drl_bridge.nodes.record_node import declare_drive
+from nics_drl_bridge.nodes.runner import declare, declare_model, open_context, unknown
+from nics_drl_bridge.sim.world import load_world
 
 pytestmark = pytest.mark.ros
 
@@ -27,6 +33,19 @@ def started(monkeypatch, domain_id):
     for context, node in made:
         node.destroy_node()
         context.try_shutdown()
+
+
+def test_what_speaks_to_topics_refuses_a_robot_without_cmd_vel(started, tmp_path):
+    file = tmp_path / "kart.yaml"
+    file.write_text("kind: ackermann_throttle\nfootprint_radius: 0.2\n")
+    for drive in (
+        lambda: declare_model(started(f"model:={file}")),
+        lambda: declare_drive(started(f"robot:={file}")),
+        lambda: DdsBackend(open_model(file), load_world("empty")),
+        lambda: RealtimeBackend(open_model(file), load_world("empty")),
+    ):
+        with pytest.raises(ConfigError, match="the command 'throttle' names no field of cmd_vel"):
+            drive()
 
 
 def test_a_whole_number_is_taken_for_a_floating_point_parameter(started):

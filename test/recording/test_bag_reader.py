@@ -64,6 +64,14 @@ def test_every_kind_of_command_is_read(tmp_path, kind, storage):
     assert np.allclose(recording.command.t - recording.command.t[0], bags.times(0.1))
 
 
+@pytest.mark.parametrize(("kind", "angle"), [("Twist", np.arctan(0.04)), ("AckermannDrive", 0.1)])
+def test_a_twist_tells_a_turn_rate_where_the_robot_takes_one(tmp_path, kind, angle):
+    command = [(t, COMMANDS[kind](t)) for t in bags.times(0.1)]
+    turning = CAR.model_copy(update={"angular_is": "turn_rate"})
+    recording = read(tmp_path, {"/cmd_vel": command, "/pose": bags.poses()}, turning)
+    assert np.allclose(recording.command.values, [0.5, angle])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 @pytest.mark.parametrize("kind", POSES)

@@ -11,6 +11,9 @@ from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 ROBOTS = ("ackermann", "differential", "mecanum")
 
 
+TWIST = {"name": "a", "unit": "m/s", "min": -1, "max": 1, "twist": "vx"}
+
+
 def data(**changes):
     speed = {"name": "speed", "unit": "m/s", "min": -1.0, "max": 1.0}
     return {
@@ -57,9 +60,62 @@ def test_fields_that_a_robot_has_no_use_for_are_dropped():
     assert np.array_equal(load_robot("ackermann").from_cmd_vel([1.0, 9.0, 0.3]), [1.0, 0.3])
 
 
+def car(kind="ackermann", **changes):
+    given = load_robot(kind).model_dump(exclude={"angular_is"})
+    return RobotSpec.model_validate(given | changes)
+
+
+def test_a_car_takes_a_turn_rate_unless_its_file_says_steering():
+    robot, turn = car(), 0.5 * np.tan(0.3) / 0.2
+    assert robot.to_cmd_vel([0.5, 0.3]) == pytest.approx([0.5, 0.0, turn])
+    assert robot.from_cmd_vel([0.5, 9.0, turn]) == pytest.approx([0.5, 0.3])
+    assert robot.from_cmd_vel([-0.5, 0.0, turn]) == pytest.approx([-0.5, -0.3])
+    as_angle = load_robot("ackermann")
+    assert as_angle.angular_is == "steering"
+    assert as_angle.to_cmd_vel([0.5, 0.3]).tolist() == [0.5, 0.0, 0.3]
+
+
+def test_a_tricycle_turns_by_its_front_wheel():
+    robot = car("tricycle")
+    twist = robot.to_cmd_vel([0.5, 0.4])
+    assert twist == pytest.approx([0.5 * np.cos(0.4), 0.0, 0.5 * np.sin(0.4) / 0.3])
+    assert robot.from_cmd_vel(twist) == pytest.approx([0.5, 0.4])
+
+
+def test_a_car_at_rest_holds_its_wheels_straight_and_one_that_can_turn_no_further_its_limit():
+    robot = car()
+    given = [[0.0, 0.0, 1.0], [0.0, 0.0, -1e300], [0.1, 0.0, 3.0], [-1e-320, 0.0, 1e300]]
+    wanted = [[0.0, 0.0], [0.0, 0.0], [0.1, 0.5], [-1e-320, -0.5]]
+    assert robot.from_cmd_vel(given) == pytest.approx(np.array(wanted))
+
+
+def test_what_goes_through_cmd_vel_is_what_the_robot_takes():
+    given = np.array([[0.5, 0.3], [0.0, 0.3]])
+    assert car().through_cmd_vel(given) == pytest.approx(np.array([[0.5, 0.3], [0.0, 0.0]]))
+    assert car(assumed=["wheelbase"]).through_cmd_vel(given).tolist() == given.tolist()
+    assert load_robot("ackermann").through_cmd_vel(given).tolist() == given.tolist()
+
+
+@pytest.mark.parametrize("changes", [{"parameters": {}}, {"assumed": ["wheelbase"]}])
+def test_a_turn_rate_needs_a_wheelbase_that_is_known(changes):
+    with pytest.raises(ConfigError, match=r"its wheelbase is not known; add `wheelbase:` \[m\] to"):
+        car(**changes).require_cmd_vel()
+    car(angular_is="steering", **changes).require_cmd_vel()
+
+
+def test_a_node_is_told_which_command_is_no_field_of_cmd_vel():
+    given = data()
+    del given["command"][1]["cmd_vel"]
+    with pytest.raises(ConfigError, match="'cart': the command 'turn' names no field of cmd_vel"):
+        RobotSpec.model_validate(given).require_cmd_vel()
+
+
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
+        ({"state": [TWIST, TWIST | {"name": "b"}]}, "two states are the same component of the"),
+        ({"state": [TWIST | {"unit": "rad"}]}, "state 'a' is vx of the twist, so its unit is m/s"),
+        ({"angular_is": "sideways"}, "'turn_rate' or 'steering'"),
         ({"footprint_radius": 0.0}, "greater than or equal to 0.001"),
         ({"command": []}, "at least 1 item"),
         ({"state": data()["command"][:1]}, "unknown key 'state.0.cmd_vel'"),
