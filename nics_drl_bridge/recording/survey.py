@@ -77,7 +77,7 @@ class TableSurvey:
 
     @property
     def time(self) -> str | None:
-        """What a mapping says of the stamps, as `t`, `[s, ns]` or `{from: t, unit: ms}`."""
+        """The stamps for a mapping, as `t`, `[s, ns]` or `{from: t, unit: ms}`."""
         return f"{{from: {self.stamps}, unit: {self.unit}}}" if self.unit else self.stamps
 
     @property
