@@ -12,7 +12,7 @@ from nics_drl_bridge.commands.console import EXIT_BAD_INPUT
 from nics_drl_bridge.commands.demo import demo
 from nics_drl_bridge.commands.doctor import doctor, replay
 from nics_drl_bridge.commands.evaluate import evaluate
-from nics_drl_bridge.commands.model import generate, import_, record, urdf
+from nics_drl_bridge.commands.model import generate, import_, inspect, record, urdf
 from nics_drl_bridge.commands.train import policy, train
 from nics_drl_bridge.commands.warmup import warmup
 from nics_drl_bridge.errors import LONGEST, shortened
@@ -40,7 +40,19 @@ def _options(
     """Options of every command."""
 
 
-for command in (generate, import_, record, replay, doctor, urdf, train, evaluate, demo, warmup):
+for command in (
+    generate,
+    inspect,
+    import_,
+    record,
+    replay,
+    doctor,
+    urdf,
+    train,
+    evaluate,
+    demo,
+    warmup,
+):
     app.command(command.__name__.rstrip("_"))(command)
 app.add_typer(policy, name="policy")
 for name, extension in extensions.known("commands").items():

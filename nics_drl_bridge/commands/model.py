@@ -1,4 +1,4 @@
-"""`nics record`, `nics import`, `nics generate` and `nics urdf`: from a robot to its model."""
+"""`nics record`, `inspect`, `import`, `generate` and `urdf`: from a robot to its model."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -102,6 +102,36 @@ def drive_summary(recording: Any, given: dict[str, Any]) -> tuple[str, ...]:
         *(each.line() for each in coverage(recording, load_robot(given["robot"]))),
         f"next: nics generate {out} --robot {given['robot']} --out {out.stem}_model",
     )
+
+
+def inspect(
+    source: Annotated[Path, Argument(help="A bag, a table, or a folder of tables.")],
+    mapping: Annotated[
+        Path | None, Option("--map", help="YAML file to begin: a first mapping, with guesses.")
+    ] = None,
+) -> None:
+    """Lists what a recording of any form holds, and begins the mapping that says what is what."""
+    with one_sentence():
+        from nics_drl_bridge.files import write_text
+        from nics_drl_bridge.recording.sources import open_source
+        from nics_drl_bridge.recording.survey import first_mapping, survey
+
+        if mapping is not None and mapping.exists():
+            raise ConfigError(f"--map {mapping}: is there already; give another name.")
+        with open_source(source) as opened:
+            tables = survey(opened)
+        for table in tables:
+            found = "".join(f"\n  {finding}" for finding in table.regularity + table.findings)
+            typer.echo(f"{table.name}: {table.rows} rows{found}")
+            rows = [(c.name, f"{c.low:.6g}", f"{c.high:.6g}") for c in table.columns]
+            if rows:
+                typer.echo(console.table(("column", "least", "greatest"), rows))
+        text = first_mapping(tables)
+        if mapping is None:
+            typer.echo(f"A first mapping, to edit; --map FILE writes it:\n\n{text}")
+            return
+        write_text(mapping, text)
+        typer.echo(f"a first mapping is in {mapping}: edit it, then nics import or nics generate")
 
 
 def import_(

@@ -22,6 +22,9 @@ from nics_drl_bridge.recording.table import Column
 from nics_drl_bridge.robot.noise import Latency
 
 LONGEST_ARRAY = 64  # of which each element is listed
+SCENES = re.compile(
+    r"/(Compressed)?Image$|/PointCloud2?$|/LaserScan$"
+)  # types of no single numbers
 PART = re.compile(r"[^.\[\]]+")
 STAMPS: dict[str, roles.Stamps] = {"": "auto", HEADER: "header", ARRIVAL: "receive"}
 NAMES = "name"  # field of JointState with a name for each element of the other arrays
@@ -32,7 +35,7 @@ def fields_of(message: Any, path: str = "") -> Iterator[str]:
     if isinstance(message, (bool, int, float, str, np.generic)) or hasattr(message, "nanosec"):
         yield path
     elif isinstance(message, (list, tuple, np.ndarray)):
-        for k in range(min(len(message), LONGEST_ARRAY)):
+        for k in range(len(message) if len(message) <= LONGEST_ARRAY else 0):
             yield from fields_of(message[k], f"{path}[{k}]")
     else:
         labels = getattr(message, NAMES, None)
@@ -92,10 +95,13 @@ class TopicTable:
         if isinstance(values[0], str):
             return np.array(values, dtype=np.str_)
         try:
-            return np.array(values, dtype=np.float64)
+            column = np.array(values, dtype=np.float64)
         except (TypeError, ValueError):
+            column = np.zeros((0, 0))
+        if column.ndim != 1:
             fault = f"{path!r} is no single number"
-            raise RecordingError(f"{self.place}: {fault}; {self._hint(path)}") from None
+            raise RecordingError(f"{self.place}: {fault}; {self._hint(path)}")
+        return column
 
     def _hint(self, path: str) -> str:
         inner = [name for name in self.names if name.startswith(path)]
@@ -119,7 +125,7 @@ class Bag:
     # topics that are read, and whether they come from the robot's computer, for common stamps
     used: Mapping[str, bool] = field(default_factory=dict)
     _read: dict[str, TopicTable] = field(default_factory=dict)
-    _stamps: dict[str, dict[str, Stream]] = field(default_factory=dict)
+    _stamps: dict[tuple[str, ...], dict[str, Stream]] = field(default_factory=dict)
 
     @property
     def place(self) -> str:
@@ -130,7 +136,8 @@ class Bag:
     def names(self) -> tuple[str, ...]:
         """Topics with messages that can be decoded."""
         known = self.bag.types.keys() - self.bag.empty
-        return tuple(sorted(topic for topic in known if self.bag.knows(topic)))
+        scenes = {topic for topic in known if SCENES.search(self.bag.types[topic])}
+        return tuple(sorted(topic for topic in known - scenes if self.bag.knows(topic)))
 
     @property
     def latency(self) -> Latency:
@@ -150,20 +157,18 @@ class Bag:
         return self._read[name]
 
     def _stamps_of(self, topic: str, which: str) -> Stream:
-        return self._stamped(which)[topic]
-
-    def _stamped(self, which: str) -> dict[str, Stream]:
-        """Stamps all topics that are used together: whose clock is whose shows only so."""
-        if which not in self._stamps:
+        """Stamps a topic with all that are used: only together do they show their clocks."""
+        topics = tuple(self.used) or (topic,)
+        if (key := (which, *topics)) not in self._stamps:
             data = {}
-            for topic in self.used or self.names:
-                messages = self.table(topic).messages
+            for each in topics:
+                messages = self.table(each).messages
                 receive, header = times_of(messages)
                 rows = np.arange(len(messages), dtype=np.float64)[:, None]
-                data[topic] = TopicData(topic, receive, header, rows)
-            robot = [topic for topic, own in self.used.items() if own] or ROBOT_STREAMS
-            self._stamps[which] = streams(data, STAMPS[which], self.place, robot)
-        return self._stamps[which]
+                data[each] = TopicData(each, receive, header, rows)
+            robot = [each for each, own in self.used.items() if own]
+            self._stamps[key] = streams(data, STAMPS[which], self.place, robot)
+        return self._stamps[key][topic]
 
 
 def topics_used(mapping: Mapping[str, Any], topics: Sequence[str]) -> dict[str, bool]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping as Names
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -30,6 +30,7 @@ from nics_drl_bridge.recording.values import MappedReader, Series, together, uni
 QUATERNION_TOLERANCE = 0.05
 MOST_UNTRACKED = 0.05  # share of poses whose quaternion is zero: the tracker had lost the body
 NO_LENGTH = 1e-9
+MOST_RATIO = 100.0  # of durations of two streams of a drive
 
 
 def read_mapped(source: Source, mapping: Mapping) -> Recording:
@@ -49,22 +50,22 @@ def read_mapped(source: Source, mapping: Mapping) -> Recording:
         keep, note = stamps.not_repeated(stream.t, stream.values, name)
         reader.say(note)
         found[name] = stream.rows(keep)
-    found = _from_zero(found, mapping.clock, reader)
-    names = (*mapping.state, *mapping.command)
-    streams: Any = found
-    made = Recording(
-        **streams,
-        source=source.place,
-        variables=names,
-        latency=source.latency,
-        repairs=tuple(reader.notes),
-    )
+    names, streams = (*mapping.state, *mapping.command), cast(Any, found)
+    made = Recording(**streams, source=source.place, variables=names, latency=source.latency)
     check_streams(made, {"command": len(mapping.command), "state": len(mapping.state), "wheels": 2})
-    if fault := implausible_pose(made.pose.t, made.pose.values, np.inf):
+    shifted: Any = _from_zero(found, mapping.clock, reader)
+    made = replace(made, **shifted, repairs=tuple(reader.notes))
+    if fault := implausible_pose(made.pose.t, made.pose.values, radius=_radius(mapping)):
         line = fault.line.replace("...", str(mapping.time and mapping.time.from_))
         said = f"{source.place}: pose: {fault.reason}; {fault.cause}"
         raise RecordingError(f"{said}: write `{line}` into the mapping, below `pose:`.")
     return made
+
+
+def _radius(mapping: Mapping) -> float:
+    """Returns the radius of the robot [m], as far as the mapping says it."""
+    given = mapping.robot.get("footprint_radius") if isinstance(mapping.robot, dict) else None
+    return float(given) if isinstance(given, (int, float)) else 0.0
 
 
 def _measured(reader: MappedReader, name: str, stream: Measured) -> Stream:
@@ -199,6 +200,12 @@ def _from_zero(found: dict[str, Stream], main: str, reader: MappedReader) -> dic
             advice = "check their `time:`, or give one of them a `clock:` of its own"
             raise RecordingError(f"{fault}, {other}; {advice}.")
         span[:] = min(first, span[0]), max(last, span[1])
+    pose = found["pose"]
+    for name, stream in found.items():
+        lasts, usual = np.ptp(stream.t), max(np.ptp(pose.t), 1e-9)
+        if lasts and not 1.0 / MOST_RATIO < lasts / usual < MOST_RATIO:
+            fault = f"{reader.source.place}: {name} lasts {lasts:.4g} s, the pose {usual:.4g} s"
+            raise RecordingError(f"{fault}; give the `unit:` of the `time:` that is wrong.")
     base = spans.get(main) or next(iter(spans.values()))
     origin = {}
     together = [span for span in spans.values() if span[0] <= base[1] and span[1] >= base[0]]

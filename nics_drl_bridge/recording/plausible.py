@@ -14,7 +14,9 @@ LARGEST_TURN = 1.5  # a larger turn between neighbouring samples [rad] is implau
 TOO_FAST = 20.0  # and so is a speed of more than this many times the greatest command
 SPEED_OVER_S = 0.5
 SLOWEST_SAMPLING_S = 2.0
-HARDEST = 50.0  # acceleration that no wheeled robot reaches for long [m/s^2]
+# Acceleration that no wheeled robot reaches for a quarter of the time [m/s^2]: one whose radius is
+# below 1 m; and any, as race cars press themselves to the ground.
+HARDEST, HARDEST_OF_CARS, SMALL_M = 14.0, 60.0, 1.0
 SLOWEST_IN_CM = 300.0  # speed from which on millimetres are likelier than centimetres [m/s]
 FASTEST_TURN = 15.0  # a robot that turns faster for long [rad/s] does so in degrees
 FULL_TURN_DEG = 360.0
@@ -26,19 +28,23 @@ UNITS_OF_STEP = (
 
 
 class Implausible(NamedTuple):
-    """Why a pose can't be as it is, and what explains it."""
+    """A fault of poses, and what explains it."""
 
     reason: str
     cause: str
     line: str  # for the mapping, as `heading_unit: deg`
 
 
-def implausible_pose(t: Array, pose: Array, fastest: float) -> Implausible | None:
+def implausible_pose(
+    t: Array, pose: Array, fastest: float = np.inf, radius: float = 0.0
+) -> Implausible | None:
     """Finds poses (T, 3) at t (T,) [s] that degrees, centimetres or milliseconds explain.
 
-    `fastest` is the greatest speed that is commanded [m/s], inf if it is not known.
+    `fastest` is the greatest speed that is commanded [m/s], inf if it is not known; `radius` [m]
+    that of the robot.
     """
-    return _too_slow(t) or _degrees(t, pose[:, 2]) or _too_fast(t, pose, fastest)
+    hardest = HARDEST if radius < SMALL_M else HARDEST_OF_CARS
+    return _too_slow(t) or _degrees(t, pose[:, 2]) or _too_fast(t, pose, fastest, hardest)
 
 
 def _degrees(t: Array, heading: Array) -> Implausible | None:
@@ -65,7 +71,7 @@ def _spaced(t: Array) -> NDArray[np.intp]:
     return np.asarray(every[np.append(True, np.diff(t[every]) > 0.0)])
 
 
-def _too_fast(t: Array, pose: Array, fastest: float) -> Implausible | None:
+def _too_fast(t: Array, pose: Array, fastest: float, hardest: float) -> Implausible | None:
     every = np.unique(np.searchsorted(t, np.arange(t[0], t[-1], SPEED_OVER_S)))
     step, took = np.diff(pose[every, :2], axis=0), np.diff(t[every])
     if not len(took):
@@ -79,8 +85,8 @@ def _too_fast(t: Array, pose: Array, fastest: float) -> Implausible | None:
         return Implausible(reason, cause, line)
     if np.isfinite(fastest) or len(took) < 3:
         return None
-    hard = np.percentile(np.hypot(*np.diff(velocity, axis=0).T) / np.maximum(took[1:], 1e-9), 90)
-    if hard <= HARDEST:
+    hard = np.percentile(np.hypot(*np.diff(velocity, axis=0).T) / np.maximum(took[1:], 1e-9), 75)
+    if hard <= hardest:
         return None
     reason = f"moves at {speed:.3g} m/s and changes that by {hard:.3g} m/s^2"
     return Implausible(reason, cause, line)

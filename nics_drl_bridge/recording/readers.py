@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nics_drl_bridge.config import validate
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.recording.bag_file import is_bag
 from nics_drl_bridge.recording.bag_reader import load_bag
@@ -23,8 +22,7 @@ from nics_drl_bridge.recording.recording import (
 )
 from nics_drl_bridge.recording.sources import open_source
 from nics_drl_bridge.recording.topic_roles import TopicRoles
-from nics_drl_bridge.robot import spec as robots
-from nics_drl_bridge.robot.spec import RobotSpec, load_robot
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot, robot_from
 
 DEFAULT_ROBOT = "ackermann"
 
@@ -86,11 +84,11 @@ def _by_mapping(
 
 
 def robot_and_drive(
-    path: Path, robot: str | None, topics: TopicRoles, mapping: str | Path | None
+    path: Path, robot: str | None, topics: TopicRoles, mapping: Mapping | str | Path | None
 ) -> tuple[RobotSpec, Recording]:
     """Reads a drive with its robot: the one that is named, or the mapping's, or a shipped car."""
     if robot is None and mapping is not None:
-        given = load_mapping(mapping)
+        given = mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
         drive = read_recording(path, None, topics, given)
         spec = robot_of(given, drive)
         return spec, arranged(drive, spec)
@@ -103,19 +101,16 @@ def robot_of(mapping: Mapping | str | Path, recording: Recording) -> RobotSpec:
     given = mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
     if given.robot is None:
         raise ConfigError("the mapping names no robot; add `robot:` to it, or give --robot.")
-    names = recording.variables[-recording.command.values.shape[1] :]
+    names = recording.variables[-recording.command.values.shape[1] :] or tuple(given.command)
     low, high = (f(recording.command.values, axis=0) for f in (np.min, np.max))
     ranges = {name: (float(a), float(b)) for name, a, b in zip(names, low, high, strict=True)}
-    robot_from: Callable[..., RobotSpec] | None = getattr(robots, "robot_from", None)
-    if robot_from is not None:
-        return robot_from(given.robot, ranges)
-    if isinstance(given.robot, str):
-        return load_robot(given.robot)
-    return validate(given.robot, RobotSpec, "robot")
+    return robot_from(given.robot, ranges)
 
 
 def arranged(recording: Recording, spec: RobotSpec) -> Recording:
     """Returns a recording in the order of a robot's variables; ConfigError if they differ."""
+    if not recording.variables:
+        return check(recording, spec)
     count = recording.command.values.shape[1]
     made: dict[str, Any] = {}
     known = {"command": recording.variables[-count:], "state": recording.variables[:-count]}

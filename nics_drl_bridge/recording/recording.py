@@ -115,7 +115,8 @@ def check(recording: Recording, spec: RobotSpec) -> Recording:
     check_streams(recording, width)
     speeds = [v for v in spec.command if v.unit == "m/s"]
     fastest = max((max(abs(v.min), abs(v.max)) for v in speeds), default=np.inf)
-    if fault := implausible_pose(recording.pose.t, recording.pose.values, fastest):
+    pose, radius = recording.pose, spec.footprint_radius
+    if fault := implausible_pose(pose.t, pose.values, fastest, radius):
         raise RecordingError(f"{recording.source}: pose: {fault.reason}; {fault.cause}.")
     return recording
 

@@ -92,7 +92,8 @@ def _clocks(
                 f"{place}: topic {topic!r}: its header stamps lie {least * S_PER_NS:.3f} to "
                 f"{most * S_PER_NS:.3f} s before their receipt, so they are of several clocks or "
                 "of a simulated time at another rate; write `stamps: receive` into the topics "
-                "file, and record a simulation with `ros2 bag record --use-sim-time`."
+                "file (`time: arrival` into a map), and record a simulation with `ros2 bag record "
+                "--use-sim-time`."
             )
         if not SAME_CLOCK_S[0] <= median * S_PER_NS <= SAME_CLOCK_S[1]:
             alike = (c for c, d in foreign.items() if abs(d - median) * S_PER_NS < SAME_CLOCK_S[1])
@@ -106,11 +107,13 @@ def _header(part: TopicData, stamps: Stamps, place: str) -> Nanoseconds | None:
     if ns is None or not ns.any():
         if stamps == "header":
             fault = "its messages have no header stamps"
-            raise RecordingError(f"{topic}: {fault}; write `stamps: auto` into the topics file.")
+            advice = "write `stamps: auto` into the topics file, or no `time: header` into a map"
+            raise RecordingError(f"{topic}: {fault}; {advice}.")
         return None
     if not ns.all():
         fault = f"{(ns == 0).sum()} of {len(ns)} headers have no stamp"
-        raise RecordingError(f"{topic}: {fault}; write `stamps: receive` into the topics file.")
+        advice = "write `stamps: receive` into the topics file (`time: arrival` into a map)"
+        raise RecordingError(f"{topic}: {fault}; {advice}.")
     return ns
 
 
@@ -128,7 +131,8 @@ def _in_order(part: TopicData, place: str) -> TopicData:
     if np.mean(late > 0) > MAX_LATE or late.max() * S_PER_NS > MAX_WANDER_S:
         k = int(np.argmax(late > 0))
         fault = f"the header stamps run backwards at message {k}, by {late[k] * S_PER_NS:.3f} s"
-        advice = "write `stamps: receive` into the topics file, or cut the bag there"
+        advice = "write `stamps: receive` into the topics file (`time: arrival` into a map)"
+        advice += ", or cut the bag there"
         raise RecordingError(f"{place}: topic {part.topic!r}: {fault}; {advice}.")
     return part.rows(np.argsort(ns, kind="stable"))
 

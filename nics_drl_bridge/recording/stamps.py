@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.recording.units import UNITS
 
-NS = 1e-9
 BITS = (8, 16, 24, 31, 32)  # of registers that overflow
 STAMP_BITS = (16, 24, 31, 32)
 LATE_ROWS, LATE_S = 50, 1.0  # rows that come too late do so by less
@@ -16,9 +18,9 @@ USUAL = 10.0  # an overflow goes on with a step of less than this many usual one
 LONGEST_STEP_S = 2.0  # median step between rows; a longer one is of another unit
 
 
-def joined(seconds: Array, nanoseconds: Array) -> Array:
+def joined(seconds: NDArray[Any], nanoseconds: NDArray[Any]) -> Array:
     """Joins stamps that were split into seconds and nanoseconds [s]."""
-    return np.asarray(seconds + nanoseconds * NS)
+    return np.asarray(seconds + nanoseconds * S_PER_NS, dtype=np.float64)
 
 
 def overflow(values: Array, scale: tuple[float, ...], bits: tuple[int, ...]) -> float | None:

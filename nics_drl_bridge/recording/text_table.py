@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections import Counter
 from collections.abc import Sequence
 from itertools import zip_longest
@@ -22,6 +23,7 @@ MOST_BROKEN = 0.01  # share of rows with another number of fields that are left 
 COMMENTS = ("#", "//")
 TUM = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 TUM_SUFFIX = ".tum"
+DATE = re.compile(r"\d{4}[-/]\d\d[-/]\d\d")
 TRUTH = {"true": "1", "false": "0", "": "nan"}
 
 Row = tuple[int, list[str]]
@@ -97,13 +99,18 @@ def _is_number(text: str) -> bool:
     return True
 
 
+def _is_value(text: str, comma: bool) -> bool:
+    """True for numbers, with decimal commas if `comma`, flags and dates."""
+    number = _is_number(text.replace(",", ".") if comma else text)
+    return number or text.lower() in TRUTH or DATE.match(text) is not None
+
+
 def _separator(lines: Sequence[str]) -> str | None:
     """Returns the separator that leaves most numbers, and fewest fields that are none."""
 
     def score(separator: str | None) -> int:
         fields = [field for line in lines for field in _split(line, separator) if field]
-        points = [field.replace(",", ".") if separator != "," else field for field in fields]
-        return sum(1 if _is_number(field) else -1 for field in points)
+        return sum(1 if _is_value(field, separator != ",") else -1 for field in fields)
 
     return max(SEPARATORS, key=score)
 
@@ -113,7 +120,7 @@ def _first_row(path: Path, rows: Sequence[Row]) -> tuple[int, int]:
 
     def numeric(row: Sequence[str]) -> bool:
         full = [field for field in row if field]
-        return 2 * sum(_is_number(field.replace(",", ".")) for field in full) > len(full)
+        return 2 * sum(_is_value(field, comma=True) for field in full) > len(full)
 
     widths = Counter(len(row) for _, row in rows if numeric(row))
     if not widths:

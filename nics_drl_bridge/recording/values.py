@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError, RecordingError, nearest
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.recording import mapping as schema
 from nics_drl_bridge.recording import stamps
 from nics_drl_bridge.recording.mapping import Mapping, Measured, Reference, Value
@@ -34,7 +35,8 @@ class Stamped(NamedTuple):
 
     t: Array  # (T,) [s]
     rows: NDArray[np.intp]  # (T,)
-    clock: str
+    clock: str  # empty if nothing tells it
+    total: int  # rows of the table, before those without a stamp were left out
 
 
 @dataclass
@@ -60,61 +62,67 @@ class MappedReader:
                 if (name := _table_name(reference[:k], names)) is not None:
                     return self._table(name), reference[k + 1 :]
         wanted = within or self.mapping.in_ or (names[0] if len(names) == 1 else None)
-        if wanted is None and isinstance(reference, str) and ":" in reference:
+        name = None if wanted is None else _table_name(wanted, names)
+        if name is not None:
+            table = self._table(name)
+            if not isinstance(reference, str) or ":" not in reference or reference in table.names:
+                return table, reference
+        if isinstance(reference, str) and ":" in reference:
             wanted = reference.rpartition(":")[0]
-        if wanted is None:
-            advice = f"write it as TABLE:{reference}, or add `in: TABLE`"
-            listed = ", ".join(names[:20])
-            fault = f"{self.source.place}: {reference!r} is of no table"
-            raise ConfigError(f"{fault}; {advice}; its tables are {listed}.")
-        name = _table_name(wanted, names)
-        if name is None:
-            raise RecordingError(
-                f"{self.source.place}: has no {wanted!r}; {nearest(wanted, names)}"
-            )
-        return self._table(name), reference
+        if wanted is not None:
+            hint = nearest(wanted, names).rstrip(".")
+            raise RecordingError(f"{self.source.place}: has no {wanted!r}; {hint}.")
+        advice = f"write it as TABLE:{reference}, or add `in: TABLE`"
+        listed = ", ".join(names[:20])
+        fault = f"{self.source.place}: {reference!r} is of no table"
+        raise ConfigError(f"{fault}; {advice}; its tables are {listed}.")
 
     def _table(self, name: str) -> Table:
         table = self.source.table(name)
         self.say(*table.notes)
         return table
 
-    def stamped(self, table: Table, time: schema.Time | None, clock: str | None) -> Stamped:
-        """Returns the rows of a table in order, by their stamps."""
-        time = time or self.mapping.time
-        key = f"{table.place}", repr(time)
+    def stamped(self, table: Table, column: Column, time: schema.Time | None) -> Stamped:
+        """Returns the rows of a column in order, by their stamps."""
+        time, count = time or self.mapping.time, len(column)
+        if time is not None and time.rate is not None:
+            return Stamped(np.arange(count) / time.rate, np.arange(count), "", count)
+        key = table.place, repr(time)
         if key not in self._stamped:
             self._stamped[key] = self._of_stamps(table, time)
         found = self._stamped[key]
-        return found._replace(clock=clock or found.clock or self.mapping.clock)
+        if found.total != count:
+            fault = f"{found.total} stamps can't be those of {count} values"
+            raise RecordingError(
+                f"{table.place}: {fault}; say which are, by `time:` beside `from:`."
+            )
+        return found
 
     def _of_stamps(self, table: Table, time: schema.Time | None) -> Stamped:
         which = "" if time is None else str(time.from_)
-        if time is not None and time.rate is not None:
-            count = len(table.column(0))
-            return Stamped(np.arange(count) / time.rate, np.arange(count), "")
         if time is None or which in (schema.HEADER, schema.ARRIVAL):
             given = table.stamps(which)
             if given is None:
                 example = "as in `time: t`, `time: [s, ns]`, or `time: {rate: 50}` if there is none"
                 raise RecordingError(f"{table.place}: which column is the time? Say {example}.")
-            return Stamped(given.t, given.values[:, 0].astype(np.intp), given.clock)
-        t, name = self._raw_stamps(table, time), f"{table.place.rpartition('/')[2]}"
-        known = np.flatnonzero(np.isfinite(t))
-        if len(known) < len(t):
-            self.say(f"{name}: {len(t) - len(known)} rows without a stamp were left out.")
-        t, note = stamps.without_overflow(t[known], name)
+            rows = given.values[:, 0].astype(np.intp)
+            return Stamped(given.t, rows, given.clock, len(table.column(0)))
+        raw, name = self._raw_stamps(table, time), table.place.rpartition("/")[2]
+        known = np.flatnonzero(np.isfinite(raw))
+        if len(known) < len(raw):
+            self.say(f"{name}: {len(raw) - len(known)} rows without a stamp were left out.")
+        t, note = stamps.without_overflow(raw[known], name)
         self.say(note)
         if (unit := stamps.likely_unit(t)) is not None and time.unit is None:
             usual = f"{np.median(np.diff(t)):.4g} apart, which can't be seconds"
-            line = f"time: {{from: {time.from_}, unit: {unit}}}"
-            fault = f"{table.place}: the stamps {time.from_!r} are {usual}"
+            line = f"time: {{from: {time.columns[0]}, unit: {unit}}}"
+            fault = f"{table.place}: the stamps {time.columns[0]!r} are {usual}"
             raise RecordingError(
                 f"{fault}; write `{line}` into the mapping (`unit: s` if they are)."
             )
         t, order, note = stamps.in_order(t * UNITS[time.unit or "s"].factor, name)
         self.say(note)
-        return Stamped(t, known[order], "")
+        return Stamped(t, known[order], "", len(raw))
 
     def _raw_stamps(self, table: Table, time: schema.Time) -> Array:
         first, *others = time.columns
@@ -138,12 +146,9 @@ class MappedReader:
         """Returns a value in SI; of a counter its rate, `held` from stamp to stamp or between."""
         stream = stream or Measured()
         table, which = self.place(value.from_, stream.in_)
-        clock = value.clock or stream.clock
-        at = self.stamped(table, value.time or stream.time, clock)
-        column = numbers_of(table, which)
-        if len(column) <= (at.rows.max() if len(at.rows) else -1):
-            fault = f"{which!r} has {len(column)} values, its stamps {len(at.rows)}"
-            raise RecordingError(f"{table.place}: {fault}; name the stamps of these values.")
+        column, time = numbers_of(table, which), value.time or stream.time
+        at = self.stamped(table, column, time)
+        clock = value.clock or stream.clock or at.clock or self.mapping.clock
         raw = column[at.rows]
         for k in np.flatnonzero(np.isinf(raw))[:1]:
             where = f"{table.place}: {table.row(int(at.rows[k]))}"
@@ -156,9 +161,9 @@ class MappedReader:
         if not known.all():
             missing = f"{int((~known).sum())} of {len(raw)} rows have no value"
             self.say(f"{name}: {missing}, and were left out.")
-        made = Series(at.t[known], raw[known], at.clock)
+        made = Series(at.t[known], raw[known], clock)
         made = self._in_si(name, value, made, held)
-        return self._where(value, made, table) if value.when else made
+        return self._where(value, made, table, time) if value.when else made
 
     def _in_si(self, name: str, value: Value, raw: Series, held: bool) -> Series:
         factor = unit_of(value).factor * value.scale
@@ -178,12 +183,13 @@ class MappedReader:
         if not value.counts:
             values = values - size * np.round(values[0] / size)
         if count:
-            found = "" if value.wrap else " as found"
             times = "once" if count == 1 else f"{count} times"
-            self.say(f"{name}: the counter overflowed at {size:.10g}{found} {times}: continued.")
+            found = "" if value.wrap else ", as it seems"
+            end = f"{times}, at {size:.10g}{found}"
+            self.say(f"{name}: the counter overflowed {end}, and was continued.")
         return raw._replace(values=values)
 
-    def _where(self, value: Value, made: Series, table: Table) -> Series:
+    def _where(self, value: Value, made: Series, table: Table, time: schema.Time | None) -> Series:
         """Puts `otherwise` where a flag is not as it must be."""
         on = np.ones(len(made.t), dtype=np.bool_)
         for reference, wanted in value.when.items():
@@ -191,10 +197,10 @@ class MappedReader:
             if ":" in reference and reference not in table.names:
                 other, found = self.place(reference)
                 which = str(found)
-            at = self.stamped(other, value.time if other is table else None, made.clock)
-            flags = _equals(other.column(which), wanted)[at.rows]
+            column = other.column(which)
+            at = self.stamped(other, column, time if other is table else None)
             row = np.searchsorted(at.t, made.t, side="right") - 1
-            on &= flags[np.clip(row, 0, None)] & (row >= 0)
+            on &= _equals(column, wanted)[at.rows][np.clip(row, 0, None)] & (row >= 0)
         return made._replace(values=np.where(on, made.values, value.otherwise))
 
 
@@ -218,7 +224,7 @@ def _dates(column: Column) -> Array | None:
         ns = np.array(text, dtype="datetime64[ns]").astype(np.int64)
     except ValueError:
         return None
-    return np.asarray(ns * stamps.NS, dtype=np.float64)
+    return stamps.joined(ns // NS_PER_S, ns % NS_PER_S)  # exact to a quarter of a microsecond
 
 
 def _rate(raw: Series, held: bool) -> Series:

@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import nics
+
+from nics_drl_bridge.config import parse_yaml
+from nics_drl_bridge.generator import load_model
+from nics_drl_bridge.recording import textbook
+from nics_drl_bridge.recording.mapping import Mapping
+from nics_drl_bridge.recording.recording import load_recording
+from nics_drl_bridge.recording.units import UNITS
+from nics_drl_bridge.robot.spec import load_robot
+
+DOCS = Path(__file__).resolve().parents[2] / "docs" / "recordings.md"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A drive of a car as one table, with the names that users give."""
+    room = tmp_path_factory.mktemp("log")
+    drive = textbook.record(load_robot("ackermann"), np.random.default_rng(0), duration=30.0)
+    row = np.searchsorted(drive.command.t, drive.pose.t + 1e-9, side="right") - 1
+    command = drive.command.values[np.clip(row, 0, None)]
+    table = np.column_stack([drive.pose.t, drive.pose.values, command])
+    head = "time,x,y,yaw,cmd_speed,cmd_steering"
+    np.savetxt(room / "drive.csv", table, delimiter=",", header=head, comments="")
+    return room
+
+
+def test_a_log_becomes_a_mapping_a_recording_and_a_model(folder, tmp_path):
+    done = nics("inspect", folder / "drive.csv", "--map", "my.yaml", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "cmd_steering" in done.stdout
+    assert "# guessed" in (tmp_path / "my.yaml").read_text()
+    again = nics("inspect", folder / "drive.csv", "--map", "my.yaml", cwd=tmp_path)
+    assert "is there already" in again.stderr
+
+    words = ("--map", "my.yaml", "--out", "drive.npz")
+    done = nics("import", folder / "drive.csv", *words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "command" in done.stdout
+    kept = load_recording(tmp_path / "drive.npz")
+    assert kept.variables == ("speed_command", "steering_command")
+
+
+@pytest.mark.slow
+def test_a_log_with_its_mapping_becomes_a_simulator(folder, tmp_path):
+    (tmp_path / "my.yaml").write_text(
+        "robot: ackermann\ntime: time\npose: {x: x, y: y, heading: yaw}\n"
+        "command: {steering_command: cmd_steering, speed_command: cmd_speed}\n"
+    )
+    words = ("--map", "my.yaml", "--out", "model")
+    done = nics("generate", folder / "drive.csv", *words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert load_model(tmp_path / "model").robot.name == "ackermann"
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("import", "drive.csv", "--map", "none.yaml", "--out", "a.npz"), "none.yaml: no such"),
+        (("import", "drive.csv", "--map", "my.yaml", "--out", "a"), "must end in .npz"),
+        (("generate", "drive.csv", "--out", "m"), "with --map; `nics inspect"),
+        (
+            ("generate", "drive.csv", "--map", "my.yaml", "--topic", "pose=/p", "--out", "m"),
+            "name the topics in the map",
+        ),
+        (("inspect", "nothing.csv"), "nothing.csv: no such file or folder"),
+    ],
+)  # fmt: skip
+def test_what_can_not_be_done_is_one_sentence(folder, tmp_path, words, sentence):
+    (tmp_path / "drive.csv").write_bytes((folder / "drive.csv").read_bytes())
+    (tmp_path / "my.yaml").write_text("time: 0\npose: {x: 1, y: 2, heading: 3}\ncommand: {v: 4}\n")
+    done = nics(*words, cwd=tmp_path)
+    assert done.returncode == 2
+    assert sentence in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert {path.name for path in tmp_path.iterdir()} == {"drive.csv", "my.yaml"}
+
+
+def test_the_mapping_and_the_units_of_the_docs_are_those_of_the_code():
+    text = DOCS.read_text()
+    example = re.search(r"```yaml\n(.*?)```", text, re.DOTALL)
+    Mapping.model_validate(parse_yaml(example.group(1), "docs"))
+    row = next(line for line in text.splitlines() if line.startswith("| `unit`"))
+    listed = [unit for some in re.findall("`([^`]+)`", row)[1:] for unit in some.split()]
+    assert set(listed) <= set(UNITS)
+    assert len(set(UNITS) - set(listed)) < 12  # rare ones and synonyms

@@ -1,0 +1,45 @@
+"""Tables for tests: a drive as columns, written as users have them, and read by a mapping."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nics_drl_bridge.recording.mapping import Mapping
+from nics_drl_bridge.recording.readers import read_recording
+from nics_drl_bridge.recording.recording import Recording
+
+MAP: dict[str, Any] = {
+    "time": "t",
+    "pose": {"x": "x", "y": "y", "heading": "yaw"},
+    "command": {"v": "v", "w": "w"},
+}
+
+
+def drive(count: int = 200) -> dict[str, np.ndarray]:
+    """Columns of a drive at 50 Hz: a curve at 0.5 m/s that turns by 0.25 rad/s."""
+    t = np.arange(count) * 0.02
+    yaw = 0.25 * t
+    return {
+        "t": t, "x": 2.0 * np.sin(yaw), "y": 2.0 - 2.0 * np.cos(yaw), "yaw": yaw,
+        "v": np.full(count, 0.5), "w": np.where(t < 2.0, 0.25, 0.3),
+    }  # fmt: skip
+
+
+def write(path: Path, columns: dict[str, Any], separator: str = ",", header: bool = True) -> Path:
+    """Writes columns as text, a row per line."""
+    rows = [separator.join(columns)] if header else []
+    rows += [
+        separator.join(f"{v:.12g}" if isinstance(v, float) else str(v) for v in row)
+        for row in zip(*(np.asarray(c).tolist() for c in columns.values()), strict=True)
+    ]
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def read(path: Path, **changes: Any) -> Recording:
+    """Reads a recording by `MAP` with other keys; None removes one."""
+    given = {key: value for key, value in (MAP | changes).items() if value is not None}
+    return read_recording(path, mapping=Mapping.model_validate(given))

@@ -1,0 +1,83 @@
+"""The example mappings, on the real recordings that they are of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.recording.readers import read_recording, robot_and_drive
+from nics_drl_bridge.recording.topic_roles import TopicRoles
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "recordings"
+SOURCES = {
+    "jetracer_csv": ("jetracer_dart/free_driving_104s.csv",),
+    "jetracer_bag": ("jetracer_dart/random_driving_slow_63s.bag",),
+    "f110_folder": tuple(f"f110_frictionmaps/DS{k}" for k in (1, 3, 4)),
+    "differential_ticks": tuple(f"differential_ticks/Camera_Odo_Data_0{k}.txt" for k in (1, 2)),
+    "xtark_folder": ("xtark_ackermann/random_drive_45s",),
+}
+
+
+def imported(shared_recordings, name, k=0):
+    path = shared_recordings / SOURCES[name][k]
+    return robot_and_drive(path, None, TopicRoles(), EXAMPLES / f"{name}.yaml")
+
+
+def test_each_example_is_of_a_real_recording_and_short():
+    assert {path.stem for path in EXAMPLES.glob("*.yaml")} == set(SOURCES)
+    assert max(len(p.read_text().splitlines()) for p in EXAMPLES.glob("*.yaml")) <= 25
+
+
+@pytest.mark.parametrize(
+    ("name", "k"), [(n, k) for n, some in SOURCES.items() for k in range(len(some))]
+)
+def test_each_example_reads_its_drives(shared_recordings, name, k):
+    if name == "jetracer_bag":
+        pytest.importorskip("rosbags", reason="needs the extra 'bags'")
+    spec, drive = imported(shared_recordings, name, k)
+    assert drive.variables == spec.variable_names
+    assert drive.pose.t[-1] - drive.pose.t[0] > 40.0
+    for c, variable in enumerate(spec.command):
+        assert variable.min <= drive.command.values[:, c].min()
+        assert drive.command.values[:, c].max() <= variable.max
+
+
+def test_the_mapped_folder_is_what_the_reader_of_such_folders_reads(shared_recordings):
+    path = shared_recordings / SOURCES["xtark_folder"][0]
+    one, other = read_recording(path), read_recording(path, mapping=EXAMPLES / "xtark_folder.yaml")
+    for name in ("command", "pose"):
+        assert np.array_equal(one.streams[name].t, other.streams[name].t)
+        assert np.allclose(one.streams[name].values, other.streams[name].values)
+        assert one.streams[name].clock == other.streams[name].clock
+
+
+def test_the_throttle_is_zero_while_the_switch_is_off(shared_recordings):
+    raw = np.genfromtxt(
+        shared_recordings / SOURCES["jetracer_csv"][0], delimiter=",", skip_header=1
+    )
+    _, drive = imported(shared_recordings, "jetracer_csv")
+    safe = raw[:, 7] == 1.0
+    assert np.array_equal(drive.command.values[:, 0], np.where(safe, raw[:, 8], 0.0))
+    assert 0.1 < safe.mean() < 1.0
+
+
+@pytest.mark.parametrize("k", [0, 1])
+def test_ticks_are_wheels_that_turn_the_robot_as_its_calibration_says(shared_recordings, k):
+    """Radius / base is 0.284 by the mean of the published radii and bases."""
+    _, drive = imported(shared_recordings, "differential_ticks", k)
+    t, pose = drive.command.t, drive.pose
+    turned = np.cumsum(drive.command.values[:-1] * np.diff(t)[:, None], axis=0)
+    grid = np.arange(2.0, t[-1] - 1.0)
+    wheels = np.diff([np.interp(grid, t[1:], each) for each in turned.T], axis=1)
+    heading = np.diff(np.interp(grid, pose.t, np.unwrap(pose.values[:, 2])))
+    left, right = np.linalg.lstsq(wheels.T, heading, rcond=None)[0]
+    assert (-left, right) == pytest.approx((0.284, 0.284), rel=0.03)
+    columns = [np.interp(grid, pose.t, each) for each in pose.values[:, :2].T]
+    at = np.stack([*columns, np.interp(grid, pose.t, np.unwrap(pose.values[:, 2]))], axis=1)
+    ahead = geometry.log(geometry.between(at[:-1], at[1:]))[:, 0]
+    rolled = np.linalg.lstsq(wheels.T, ahead, rcond=None)[0]
+    assert rolled.sum() == pytest.approx(0.1676, rel=0.08)  # [m]: the mean published radius
+    assert 0.005 < np.median(pose.sigma[:, 0]) < 0.05

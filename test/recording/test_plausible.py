@@ -1,0 +1,43 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nics_drl_bridge.recording.plausible import implausible_pose
+
+T = np.arange(3000) * 0.02
+
+
+def pose(speed=0.6, turn=0.5):
+    """A drive that speeds up and slows down, and turns both ways."""
+    v, w = speed * (1.0 + 0.5 * np.sin(T)), turn * np.sin(0.3 * T) + 0.2 * turn
+    heading = np.cumsum(w) * 0.02
+    step = v[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1) * 0.02
+    return np.column_stack([np.cumsum(step, axis=0), heading])
+
+
+def wrapped(values):
+    return (values + np.pi) % (2.0 * np.pi) - np.pi
+
+
+def test_a_drive_in_si_is_plausible_and_so_is_a_heading_that_turns_on():
+    assert implausible_pose(T, pose()) is None
+    assert implausible_pose(T, pose(2.0, 3.0)) is None
+    assert implausible_pose(T, pose(60.0, 0.2), radius=2.5) is None  # a race car
+
+
+@pytest.mark.parametrize("unwrapped", [True, False])
+def test_degrees_are_told(unwrapped):
+    values = pose()
+    values[:, 2] = np.degrees(values[:, 2] if unwrapped else wrapped(values[:, 2]))
+    assert implausible_pose(T, values).line == "heading_unit: deg"
+
+
+@pytest.mark.parametrize(("factor", "line"), [(100.0, "unit: cm"), (1000.0, "unit: mm")])
+def test_positions_that_are_no_metres_are_told(factor, line):
+    assert implausible_pose(T, pose() * [factor, factor, 1.0]).line == line
+
+
+def test_milliseconds_are_told():
+    assert "(microseconds look like this)" in implausible_pose(T * 1e6, pose()).cause
+    assert implausible_pose(T * 1e3, pose()).line == "time: {from: ..., unit: ms}"

@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nics_drl_bridge.config import parse_yaml
+from nics_drl_bridge.recording.mapping import Mapping
+from nics_drl_bridge.recording.readers import read_recording
+from nics_drl_bridge.recording.sources import open_source
+from nics_drl_bridge.recording.survey import first_mapping, survey, words_of
+
+from .tables import drive, write
+
+NAMES = {"x": "vicon x", "y": "vicon y", "yaw": "vicon yaw", "v": "throttle", "w": "steering"}
+
+
+def surveyed(path):
+    with open_source(path) as source:
+        tables = survey(source)
+    return tables, parse_yaml(first_mapping(tables), "guess")
+
+
+def test_a_first_mapping_reads_a_table_whose_columns_are_called_as_usual(tmp_path):
+    columns = {NAMES.get(name, name): column for name, column in drive().items()}
+    path = write(tmp_path / "log.csv", columns)
+    _, guess = surveyed(path)
+    assert guess["robot"]["kind"] == "ackermann_throttle"
+    found = read_recording(path, mapping=Mapping.model_validate(guess))
+    assert found.variables == ("throttle", "steering")
+    assert np.allclose(found.pose.values[:, 2], columns["vicon yaw"])
+
+
+def test_guesses_reach_over_files_split_stamps_and_quaternions(tmp_path):
+    columns = drive()
+    ns = np.round((1.7e9 + columns["t"]) * 1e9).astype(np.int64)
+    split = {"": np.arange(200), "s": ns // 10**9, "ns": ns % 10**9}
+    half, zero = columns["yaw"] / 2.0, np.zeros(200)
+    turned = {"q.x": zero, "q.y": zero, "q.z": np.sin(half), "q.w": np.cos(half)}
+    write(tmp_path / "pose.csv", split | {"x": columns["x"], "y": columns["y"]} | turned)
+    write(tmp_path / "odom.csv", split | {"x": columns["x"], "y": columns["y"]} | turned)
+    write(tmp_path / "cmd.csv", split | {"V": columns["v"] + 0.1 * half, "delta": columns["w"]})
+    _, guess = surveyed(tmp_path)
+    assert guess["time"] == ["s", "ns"]
+    assert guess["pose"]["in"] == "pose.csv"
+    found = read_recording(tmp_path, mapping=Mapping.model_validate(guess))
+    assert found.variables == ("speed_command", "steering_command")
+    assert np.allclose(found.pose.values[:, 2], columns["yaw"])
+
+
+def test_units_that_can_only_be_others_are_guessed(tmp_path):
+    columns = drive()
+    wavy = {"pose.x": 3e3 * np.sin(columns["t"] * 3.0), "pose.y": columns["y"] * 1e3}
+    wavy["pose.theta"] = np.degrees(columns["yaw"] * 40.0)
+    ticks = {"Left_Tick": np.arange(200), "Right_Tick": np.arange(200) * 2}
+    _, guess = surveyed(write(tmp_path / "log.csv", {"time": columns["t"] * 1e3} | wavy | ticks))
+    assert guess["time"] == {"from": "time", "unit": "ms"}
+    assert guess["pose"]["heading_unit"] == "deg"
+    assert guess["command"]["left_wheel"] == {"from": "Left_Tick", "unit": "ticks"}
+
+
+def test_gaps_backward_stamps_and_repeated_rows_are_listed(tmp_path):
+    columns = drive()
+    order = np.concatenate([np.arange(50), [49, 49], np.arange(90, 200)])
+    t = columns["t"].copy()
+    t[150:] -= 0.5
+    path = write(tmp_path / "log.csv", {k: c[order] for k, c in (columns | {"t": t}).items()})
+    (table,), _ = surveyed(path)
+    text = "\n".join(table.regularity)
+    assert "gaps: 1, the longest of 0.82 s after 1.0 s" in text
+    assert "stamps that run backwards: 1" in text
+    assert "stamps like the one before: 2, in rows that repeat all of it: 2" in text
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("Left_Tick", ["left", "tick"]),
+        ("cmdVel", ["cmd", "vel"]),
+        ("acc x (IMU)", ["acc", "x", "imu"]),
+    ],
+)
+def test_names_are_split_into_words(name, words):
+    assert words_of(name) == words

@@ -1,0 +1,106 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.recording.table import numbers_of
+from nics_drl_bridge.recording.text_table import read_text_table
+
+NUMBERS = [(0.0, 1.5, -2.0), (0.1, 1.6, -2.5), (0.2, 1.7, -3.0)]
+
+
+def table(tmp_path, text, name="log.csv", encoding="utf-8"):
+    (tmp_path / name).write_text(text, encoding=encoding)
+    return read_text_table(tmp_path / name)
+
+
+@pytest.mark.parametrize(
+    ("separator", "point"),
+    [(",", "."), (";", "."), (";", ","), ("\t", "."), ("\t", ","), (" | ", "."), ("  ", ".")],
+)
+@pytest.mark.parametrize("header", [("t", "x", "y"), None])
+def test_any_separator_is_found_with_header_or_without(tmp_path, separator, point, header):
+    rows = [header] if header else []
+    rows += [[f"{v}".replace(".", point) for v in row] for row in NUMBERS]
+    found = table(tmp_path, "\n".join(separator.join(row) for row in rows))
+    assert np.array_equal(np.stack([numbers_of(found, k) for k in range(3)], axis=1), NUMBERS)
+    assert found.names == (header or ("", "", ""))
+
+
+def test_titles_a_separator_at_the_end_and_repeated_headers_are_no_rows(tmp_path):
+    head = "Camera & ticks\n time | pose.x | cov[1,1]\t|\tLeft\n"
+    rows = "1 | 2.5 | 3 | 4 |\n2 | 2.6 | 3 | 5 |\n"
+    found = table(tmp_path, head + rows + head + rows)
+    assert found.names == ("time", "pose.x", "cov[1,1]", "Left")
+    assert numbers_of(found, "Left").tolist() == [4, 5, 4, 5]
+    assert found.notes == ("log.csv: 2 lines repeat the header, and were left out.",)
+    assert found.row(2) == "line 7"
+
+
+def test_a_header_may_be_a_comment_shorter_than_the_rows_or_lack_a_name(tmp_path):
+    assert table(tmp_path, "# t x\n0 1\n1 2\n").names == ("t", "x")
+    assert table(tmp_path, "a,b\n1,2,3\n4,5,6\n").names == ("a", "b", "")
+    assert table(tmp_path, ",s,ns\n0,1,2\n0,3,4\n").names == ("", "s", "ns")
+
+
+def test_labels_within_the_rows_name_the_columns(tmp_path):
+    row = "time: {t} ticks: {t} 4294859756 tracker_pose: 0.2 1.5 -0.1\n"
+    found = table(tmp_path, "#kinematics: 0.1 0.01\n" + row.format(t=1) + row.format(t=2))
+    poses = tuple(f"tracker_pose[{k}]" for k in range(3))
+    assert found.names == ("time", "ticks[0]", "ticks[1]", *poses)
+    assert numbers_of(found, "ticks[1]").tolist() == [4294859756.0] * 2
+
+
+def test_a_tum_trajectory_needs_no_header(tmp_path):
+    found = table(tmp_path, "10.0 1 2 0 0 0 0.6 0.8\n10.1 1 2 0 0 0 0.6 0.8\n", "drive.txt")
+    assert found.names[:3] == ("timestamp", "tx", "ty")
+
+
+def test_flags_may_be_words_and_cells_empty(tmp_path):
+    found = table(tmp_path, "t,on,mode,x\n0,True,AUTO,1\n1,False,MANUAL,\n2,True,AUTO,3\n")
+    assert numbers_of(found, "on").tolist() == [1.0, 0.0, 1.0]
+    assert found.column("mode").tolist() == ["AUTO", "MANUAL", "AUTO"]
+    assert np.isnan(numbers_of(found, "x")[1])
+
+
+def test_a_header_of_an_old_windows_tool_is_read(tmp_path):
+    found = table(tmp_path, "t;Winkel [°]\n0;1,5\n1;2,5\n", encoding="latin-1")
+    assert numbers_of(found, "Winkel [°]").tolist() == [1.5, 2.5]
+
+
+def test_a_row_that_was_cut_short_is_left_out_and_told(tmp_path):
+    found = table(tmp_path, "t,x\n0,1\n1,2\n2\n")
+    assert len(found.column("t")) == 2
+    assert "1 lines of another length (line 4)" in found.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("t,x\n" + "0,1\n" * 9 + "0\n1,2,3\n", "line 11 has 1 fields where most lines have 2"),
+        ("speed,angle\nfast,left\n", "holds no row of numbers"),
+        ("0,1\n" + "2" * 30_000, "line 2 has 30000 characters"),
+        ("0,1\0\n", "is not text of 8 bits"),
+    ],
+)
+def test_what_is_no_table_is_refused(tmp_path, text, sentence):
+    with pytest.raises(RecordingError) as refused:
+        table(tmp_path, text)
+    assert sentence in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("which", "sentence"),
+    [
+        ("tme", "has no column 'tme'; did you mean 'time'?"),
+        ("x", "2 columns are called 'x'; give the number of the one you mean: 1 or 2."),
+        (7, "has no column 7; its columns are 0 to 3."),
+        ("word", "line 3: 'word' is 'oops', which is no number"),
+    ],
+)
+def test_a_column_that_is_not_there_is_named(tmp_path, which, sentence):
+    found = table(tmp_path, "time,x,x,word\n0,1,2,3\n1,2,3,oops\n")
+    with pytest.raises(RecordingError) as refused:
+        numbers_of(found, which)
+    assert sentence in str(refused.value)
