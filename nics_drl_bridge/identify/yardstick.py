@@ -34,6 +34,7 @@ DELAYS_S = np.arange(-0.1, 0.51, 0.05)  # at each of these delays between stream
 FAR_DELAYS_S = np.arange(-1.0, 1.01, 0.05)  # and of these between streams of two
 LAG_S, LAG_RANGE_S = 0.15, (0.005, 5.0)
 LIMIT, LIMIT_RANGE = 10.0, (0.05, 1e3)  # of acceleration [m/s^2]
+NOTHING = 1e-9
 PROBE = 0.5  # share of the range of a command at which the textbook is asked for its structure
 
 
@@ -149,18 +150,23 @@ class _Form:
     moves: NDArray[np.bool_]  # (3, C) commands that an actuator follows
     mounted: NDArray[np.bool_]  # (3,) of the mounting
 
+    @property
+    def slips(self) -> bool:
+        """True if understeer is free."""
+        return self.start.bicycle.used and not self.start.bicycle.front_drive
+
     def pack(self) -> Array:
         """Returns the free values of the start (P,); positive ones as logarithms."""
         r, rows = self.start, self.moves.any(axis=1)
         return np.concatenate([
             [r.delay_s], r.gain[self.moves], r.offset[rows], np.log(r.lag_s[rows]),
-            np.log(r.limit), [r.bicycle.understeer] * r.bicycle.used, r.mounting[self.mounted],
+            np.log(r.limit), [r.bicycle.understeer] * self.slips, r.mounting[self.mounted],
         ])  # fmt: skip
 
     def unpack(self, theta: Array) -> TextbookResponse:
         """Returns the response of free values (P,)."""
         r, rows = self.start, self.moves.any(axis=1)
-        count = [1, int(self.moves.sum()), *[int(rows.sum())] * 2, 2, int(r.bicycle.used)]
+        count = [1, int(self.moves.sum()), *[int(rows.sum())] * 2, 2, int(self.slips)]
         delay, gains, offsets, lags, limits, understeer, place = np.split(theta, np.cumsum(count))
         gain, offset, lag, mounting = (a.copy() for a in (r.gain, r.offset, r.lag_s, r.mounting))
         gain[self.moves], offset[rows], mounting[self.mounted] = gains, offsets, place
@@ -175,8 +181,8 @@ def _structure(spec: RobotSpec) -> tuple[Array, BicycleGeometry] | None:
     half = PROBE * np.maximum(spec.command_high, -spec.command_low)
     try:
         alone, together = steady_twist(spec, np.diag(half)), steady_twist(spec, half)
-        if len(half) != 2 or alone[:, 2].any() or together[2] == 0.0:
-            return (alone / half[:, None]).T, STRAIGHT
+        if len(half) != 2 or np.abs(alone[:, 2]).max() > NOTHING or abs(together[2]) < NOTHING:
+            return np.where(np.abs(alone) > NOTHING, alone / half[:, None], 0.0).T, STRAIGHT
         speed = int(np.argmax(np.abs(alone[:, 0])))
         less = np.where(np.arange(2) == speed, half, 0.5 * half)
         forward, slower = alone[speed, 0], steady_twist(spec, less)
