@@ -31,7 +31,9 @@ class SimBackend:
         self, model: SimulatorModel, world: World, renderer: Renderer = "baked",
         estimator: bool = False, robots: int = 1, **simulation: Any,
     ) -> None:  # fmt: skip
-        self._robot = model.robot
+        self._robot = robot = model.robot
+        known = robot.knows_wheelbase or not robot.takes_turn_rate
+        self._by_cmd_vel = estimator and robot.takes_cmd_vel and known
         self.simulator = FastSimulator(model, world, robots=robots, renderer=renderer, **simulation)
         self._middlewares = [Middleware(model) for _ in range(robots if estimator else 0)]
         self._period_ns = round(model.control_period * NS_PER_S)
@@ -50,7 +52,7 @@ class SimBackend:
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
         """Moves the robots by one control period; see `interface.Backend`."""
         data = self.simulator.data
-        if self._middlewares:
+        if self._by_cmd_vel:
             # Via cmd_vel, as over ROS 2, so that both round alike.
             command = self._robot.from_cmd_vel(self._robot.to_cmd_vel(command))
         commands = command.reshape(data.pose.shape[1], -1)

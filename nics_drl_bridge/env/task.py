@@ -17,6 +17,7 @@ from nics_drl_bridge.lidar.sector_kernels import SectorPlan
 from nics_drl_bridge.lidar.sectors import NO_PLAN, ScanLayout, plan_of
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.robot.kinds import command_for, has_textbook, reach
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
@@ -216,12 +217,14 @@ class Task(ABC):
 
 def discrete_commands(robot: RobotSpec) -> Array:
     """(A, C) commands of the discrete actions, at limits: `DRIVES`, or each command by itself."""
-    if any(command.cmd_vel is None for command in robot.command):
-        each = np.eye(len(robot.command), dtype=np.int64)
-        signs = np.concatenate([0 * each[:1], each, -each])
+    drives = np.array((*DRIVES, *SIDEWAYS) if robot.moves_sideways else DRIVES)
+    if robot.takes_cmd_vel:
+        signs = robot.of_fields(drives)
+    elif has_textbook(robot):
+        return command_for(robot, drives * reach(robot))
     else:
-        drives = (*DRIVES, *SIDEWAYS) if robot.moves_sideways else DRIVES
-        signs = robot.from_cmd_vel(np.array(drives))
+        each = np.eye(len(robot.command))
+        signs = np.concatenate([0.0 * each[:1], each, -each])
     limits = np.where(signs > 0, robot.command_high, robot.command_low)
     commands: Array = np.where(signs == 0, still(robot), limits)
     return commands

@@ -54,8 +54,8 @@ def decide(
         state = _stopped(config, state, now if publish else state.moved_s, disarm=latches)
     elif isinstance(given, inputs.Tick) and not now - state.moved_s < limits.LEAST_STEP_S:
         publish, still = True, np.zeros(len(config.fields))
-        wish = still if state.command is None else state.command.twist[list(config.fields)]
-        motion = Motion(wish.astype(np.float64), still)
+        wish = still if state.command is None else config.command(state.command.twist)
+        motion = Motion(wish, still)
         for shape in SHAPERS:
             motion = shape(config, state, motion, now)
         if motion.fault:
@@ -65,8 +65,7 @@ def decide(
             value, recent = motion.value, _recent(config, state, motion.value, now)
             state = replace(state, value=value, slope=motion.slope, moved_s=now, recent=recent)
             state, shielded = frozen.watch_motion(config, state, now), motion.shielded
-    twist = np.zeros(3)
-    twist[list(config.fields)] = state.value
+    twist = config.cmd_vel(state.value)
     return state, Decision(twist, publish, cause, refused, answer, granted, shielded)
 
 
@@ -154,7 +153,7 @@ def command_not_finite(config: GateConfig, command: inputs.Command) -> str:
 def command_implausible(config: GateConfig, command: inputs.Command) -> str:
     """The command is so far out of range that the policy must be broken."""
     bounds, twist = config.limits, command.twist
-    if bounds is None or not limits.implausible(twist[list(config.fields)], bounds):
+    if bounds is None or not limits.implausible(config.command(twist), bounds):
         return ""
     return f"cmd_vel_raw: {twist.tolist()} is far out of range"
 

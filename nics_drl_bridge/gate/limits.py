@@ -92,7 +92,8 @@ def load_limits(name: str | Path, robot: RobotSpec) -> Limits:
     )
     units = np.array([variable.unit for variable in robot.command])
     limits = Limits(low, high, rate, jerk, linear=units == SPEED, turn=units == TURN)
-    if greatest(limits, limits.linear | limits.turn) < LEAST_MOTION:
+    speeds = limits.linear | limits.turn
+    if (speeds.any() or robot.takes_cmd_vel) and greatest(limits, speeds) < LEAST_MOTION:
         fault = f"none of its speeds and turn rates may reach {LEAST_MOTION:g}"
         raise ConfigError(f"{path}: the robot could never move: {fault}; raise a `max`.")
     return limits

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge.gate.inputs import Command, Estimate, Odometry, Scan
 from nics_drl_bridge.gate.limits import Limits
 from nics_drl_bridge.interface import Array
+from nics_drl_bridge.robot.steering import Bicycle
 
 Ranges = NDArray[np.float32]
 Record = TypeVar("Record")
@@ -46,7 +47,8 @@ class ShieldConfig:
 class GateConfig:
     """Fixed configuration of a gate."""
 
-    fields: tuple[int, ...]  # (C,) place of each command in linear.x, linear.y, angular.z
+    fields: tuple[int, ...]  # (C,) place of each command in linear.x, linear.y, angular.z; but
+    # of a car that takes turn rates, angular.z is that of a `bicycle` at its steering angle
     limits: Limits | None  # of the commands; None lets nothing pass
     beam_angles: Array  # (B,) of the lidar [rad]
     mount: tuple[float, float, float]  # of the lidar in `base_link`: x [m], y [m], heading [rad]
@@ -75,6 +77,20 @@ class GateConfig:
     odom_std: tuple[float, float] = (0.0, 0.0)  # of odometry's twist [m/s, rad/s]
     shield: ShieldConfig | None = None
     sensors: tuple[str, ...] = ()  # further ones, which must be as fresh as the scan
+    bicycle: Bicycle | None = None
+
+    def command(self, twist: Array) -> Array:
+        """Returns the command (C,) of a `cmd_vel` (3,)."""
+        if self.bicycle is not None:
+            speed, angle = self.bicycle.command(twist)
+            twist = np.array([speed, twist[1], angle])
+        return np.asarray(twist[list(self.fields)], dtype=np.float64)
+
+    def cmd_vel(self, command: Array) -> Array:
+        """Returns the `cmd_vel` (3,) of a command (C,)."""
+        twist = np.zeros(3)
+        twist[list(self.fields)] = command
+        return twist if self.bicycle is None else self.bicycle.twist(twist[0], twist[2])
 
 
 @dataclass(frozen=True)

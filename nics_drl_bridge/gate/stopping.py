@@ -81,7 +81,7 @@ def wheelbase(robot: RobotSpec) -> float:
             raise ConfigError(f"{known}, and {fault}.")
     if not robot.steers:
         return 0.0
-    if not robot.parameters.get("wheelbase", 0.0) > 0.0:
+    if not robot.knows_wheelbase:
         fault = f"robot {robot.name!r}: the shield needs the parameter 'wheelbase' of a car"
         advice = "add it under `parameters:` of the robot"
         raise ConfigError(f"{fault}; {advice}, or drive without a shield by `shield: false`.")

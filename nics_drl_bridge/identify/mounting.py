@@ -15,6 +15,7 @@ from nics_drl_bridge.identify.drive import Drive, TwistIntervals
 from nics_drl_bridge.identify.signals import followed, held
 from nics_drl_bridge.identify.statistics import standard_errors
 from nics_drl_bridge.recording.recording import Stream
+from nics_drl_bridge.robot.kinds import has_textbook, steady_twist
 
 TURN_SCALE_M = 0.2  # a yaw rate counts as the speed at this distance
 DISTINCT = 4.0  # the second direction of motion must exceed the noise by this factor
@@ -42,11 +43,13 @@ def mounting_of(
 ) -> Mounting | None:
     """Estimates the mounting by speeds (n,) up to a factor; None if the drive does not show it."""
     spec, twists = drive.spec, drive.twists
+    if not (has_textbook(spec) or spec.takes_cmd_vel):  # which way it faces is not known
+        return None
     if spec.moves_sideways:
         return jackknifed(drive, twists, timing.offset, partial(_by_commands, timing))
     start, end = twists.on_clock(timing.offset)
     command = held(drive.recording.command, spec, start - timing.latency, end - timing.latency)
-    found = mounting_without_lateral_motion(twists, spec.to_cmd_vel(command)[:, 0])
+    found = mounting_without_lateral_motion(twists, steady_twist(spec, command)[:, 0])
     if found is None or speed is None or np.isnan(found.lever_sigma[0]):
         return found
     found.lever[1], found.lever_sigma[1] = lateral_lever(twists, found.rotation, speed)
@@ -121,7 +124,7 @@ def _by_commands(
     else:
         begin = twists.start + timing.offset - timing.latency
         command = held(recording.command, spec, begin, begin + twists.end - twists.start)
-    response = spec.to_cmd_vel(command)  # of base_link, up to one factor
+    response = steady_twist(spec, command)  # of base_link, up to one factor
     size = np.linalg.svd(response, compute_uv=False)
     if size[2] <= MIN_SECOND * size[0]:
         return None

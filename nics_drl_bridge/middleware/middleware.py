@@ -290,7 +290,7 @@ def rehearse(model: SimulatorModel) -> RobotView:
     middleware.reset(0, np.zeros(3))
     still, free = np.zeros(3), np.full(model.lidar.beams, np.inf, np.float32)
     for stamp_ns in (period_ns, 2 * period_ns):
-        middleware.command(stamp_ns - period_ns, model.robot.from_cmd_vel(still))
+        middleware.command(stamp_ns - period_ns, np.zeros(len(model.robot.command)))
         middleware.odometry(stamp_ns, stamp_ns, still, still)
         middleware.scan(stamp_ns, stamp_ns, free)
     return middleware.view(2 * period_ns)

@@ -20,7 +20,7 @@ from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCA
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.recording import topic_roles
 from nics_drl_bridge.recording.bag_file import BagFile, Message, opened
-from nics_drl_bridge.recording.messages import command_row, pose_row, stamp, twist_row
+from nics_drl_bridge.recording.messages import commanded, pose_row, stamp, twist_row
 
 Array = NDArray[np.float64]
 SCAN_TYPE = "sensor_msgs/msg/LaserScan"
@@ -177,7 +177,7 @@ class Playback:
         return self.middleware.odometry(stamp_ns, arrival_ns, pose, np.array(twist_row(message)))
 
     def _command(self, _: int, message: Any) -> bool:
-        command = self._model.robot.from_cmd_vel(np.array(command_row(message)))
+        command = commanded(message, self._model.robot)
         stamp_ns = stamp(message) if hasattr(message, "header") else 0
         self.middleware.command(stamp_ns or None, command)
         return True

@@ -110,6 +110,7 @@ class DdsBackend:
         domain_id: int | None = None,
     ) -> None:  # fmt: skip
         self._robot, self._lidar = model.robot, model.lidar
+        self._robot.require_cmd_vel()
         self._sensors = {sensor.name: sensor for sensor in model.sensors}
         self._middleware = Middleware(model)
         self._period_ns = round(model.control_period * NS_PER_S)

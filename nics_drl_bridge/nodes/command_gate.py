@@ -50,7 +50,7 @@ def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
     file = str(runner.declare(node, "limits", "", about, read_only=True))
     limits = load_limits(file, robot) if file else None
     config = GateConfig(
-        fields=tuple(np.flatnonzero(robot.to_cmd_vel(np.ones(len(robot.command)))).tolist()),
+        fields=robot.cmd_vel_places, bicycle=robot.bicycle if robot.takes_turn_rate else None,
         limits=limits, beam_angles=lidar.angles, mount=lidar.mount, range_min=lidar.range_min,
         range_max=lidar.range_max, scan_rate=lidar.rate,
         sensors=tuple(sensor.name for sensor in model.sensors), odom_std=model.noise.odometry,

@@ -57,6 +57,7 @@ def declare_drive(node: Node) -> DriveParameters:
     """Declares the parameters of a drive, and reads them. Raises ConfigError."""
     get = partial(declare, node, read_only=True)
     robot = load_robot(get("robot", "ackermann", "A shipped robot, or its YAML file."))
+    robot.require_cmd_vel()
     about = "File *.npz of the recording, or folder of a rosbag2."
     out = check_out(Path(get("out", "drive.npz", about)))
     bound = get("bound", 2.0, "Radius of the circle around the start to keep within [m].")
@@ -264,8 +265,10 @@ class RecordNode(qos.QosWatch):
             raise BackendError(f"the robot left its circle of {bound:g} m, {where}; {fix}")
 
     def _send(self, command: Array) -> None:
-        self._topic.publish(self._message(self._order.plan.robot.to_cmd_vel(command)))
-        self._log.add("cmd_vel", 0, command)
+        robot = self._order.plan.robot
+        twist = robot.to_cmd_vel(command)
+        self._topic.publish(self._message(twist))
+        self._log.add("cmd_vel", 0, robot.from_cmd_vel(twist))  # as the robot understands it
 
     def _message(self, twist: Array) -> Twist | TwistStamped:
         stamped = conversions.stamped_to_ros(twist, self._now_ns(), "")

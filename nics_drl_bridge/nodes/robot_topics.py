@@ -56,6 +56,7 @@ class RobotTopics:
         now_ns: Callable[[], int] | None = None,
     ) -> None:  # fmt: skip
         self._node, self._model, self._robot, self._lidar = node, model, model.robot, model.lidar
+        self._robot.require_cmd_vel()
         self.now_ns = now_ns or (lambda: int(node.get_clock().now().nanoseconds))
         self.lock = threading.RLock()
         self.middleware = Middleware(model)

@@ -188,8 +188,10 @@ def serve(node: Node, name: str, answer: Callable[[], tuple[bool, str]]) -> None
 
 
 def declare_model(node: Node) -> SimulatorModel:
-    """Declares the parameter `model` and opens the model that it names."""
-    return open_model(declare_model_name(node))
+    """Declares the parameter `model`, and opens it; ConfigError if `cmd_vel` can't drive it."""
+    model = open_model(declare_model_name(node))
+    model.robot.require_cmd_vel()
+    return model
 
 
 def declare_model_name(node: Node) -> str:

@@ -177,9 +177,11 @@ class CommandInlet:
         except wire.UNREADABLE as error:
             self._complain(f"a message that can't be read ({error}) is ignored")
 
-    def _obey(self, twist: Sequence[float]) -> None:
+    def _obey(
+        self, twist: Sequence[float], read: Callable[[Sequence[float]], Array] | None = None
+    ) -> None:
         if all(map(math.isfinite, twist)):
-            self._take(self._robot.from_cmd_vel(twist))
+            self._take((read or self._robot.from_cmd_vel)(twist))
         else:
             self._complain("NaN or inf ignored")
 
@@ -189,7 +191,8 @@ class CommandInlet:
 
     def _on_ackermann(self, message: Any) -> None:
         if self._is_fresh(message.header.stamp):
-            self._obey((message.drive.speed, 0.0, message.drive.steering_angle))
+            angle = message.drive.steering_angle
+            self._obey((message.drive.speed, 0.0, angle), self._robot.of_fields)
 
     def _is_fresh(self, stamp: Any) -> bool:
         stamp_ns = conversions.stamp_from_ros(stamp)

@@ -15,7 +15,7 @@ from nics_drl_bridge.errors import ConfigError, PolicyError, nearest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy import dynamic_window_kernels as kernels
 from nics_drl_bridge.policy.contract import SUFFIX, shipped
-from nics_drl_bridge.robot.kinds import steady_twist
+from nics_drl_bridge.robot.kinds import command_for, reach, steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
@@ -38,7 +38,7 @@ def _actions(robot: RobotSpec, commands: Array) -> Array:
 
 @dataclass(frozen=True)
 class StraightToGoal:
-    """Turns to the goal and drives there, ignoring obstacles."""
+    """Turns to the goal and drives there, ignoring obstacles; ConfigError: see `command_for`."""
 
     task: Navigation
 
@@ -47,10 +47,24 @@ class StraightToGoal:
         robot, first = self.task.robot, self.task.scan_parts + 1
         cosine, sine = np.moveaxis(observation[..., first : first + 2].astype(float), -1, 0)
         turn = np.clip(np.arctan2(sine, cosine) / FULL_TURN_RAD, -1.0, 1.0)
-        ahead = np.maximum(cosine, CREEP if robot.steers else 0.0)
+        ahead = np.maximum(cosine, 0.0 if self._turns_in_place else CREEP)
         shares = np.stack([ahead, np.zeros_like(ahead), turn], axis=-1)
-        wanted = robot.from_cmd_vel(shares) * robot.command_high
+        if robot.takes_cmd_vel:
+            wanted = robot.of_fields(shares) * robot.command_high
+        else:
+            wanted = command_for(robot, shares * self._reach)
         return np.clip(_actions(robot, wanted), -1.0, 1.0).astype(np.float32)
+
+    @cached_property
+    def _reach(self) -> Array:
+        return reach(self.task.robot)
+
+    @cached_property
+    def _turns_in_place(self) -> bool:
+        robot = self.task.robot
+        if robot.takes_cmd_vel:
+            return not robot.steers
+        return bool(command_for(robot, self._reach * (0.0, 0.0, 1.0)).any())
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from nics_drl_bridge.middleware.playback import Playback, in_order, played
 from nics_drl_bridge.policy.pacing import ActionPace
 from nics_drl_bridge.policy.policies import open_policy
 from nics_drl_bridge.recording.bag_file import Message
-from nics_drl_bridge.recording.messages import command_row
+from nics_drl_bridge.recording.messages import commanded
 
 Array = NDArray[np.float64]
 JITTER = 0.25  # permitted earliness of a scan, in control periods
@@ -98,7 +98,7 @@ def _moments(
     for role, message in in_order(messages):
         playback.take(role, message)
         if role == CMD_VEL:
-            row = model.robot.from_cmd_vel(np.array(command_row(message.content)))
+            row = commanded(message.content, model.robot)
             held = message.receive_ns, row
             if moments and moments[-1].driven is None:
                 moments[-1].driven = row

@@ -63,15 +63,16 @@ def _table(
 
 
 def _command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
+    steered = bag.types[topic] in (roles.ACKERMANN, roles.ACKERMANN_STAMPED)
     for variable in spec.command:
-        steered = bag.types[topic] in (roles.ACKERMANN, roles.ACKERMANN_STAMPED)
         if steered and variable.turns and not variable.steers:
             fault = f"{bag.place}: topic {topic!r} holds steering angles [rad]"
             other = f"{variable.name!r} of robot {spec.name!r} is in {variable.unit}"
             advice = "choose the robot that drove, or another topic"
             raise RecordingError(f"{fault}, but {other}; {advice}.")
     data = _table(bag, topic, msgs.command_row)
-    return replace(data, values=spec.from_cmd_vel(data.values))
+    commands = spec.of_fields(data.values) if steered else spec.from_cmd_vel(data.values)
+    return replace(data, values=commands)
 
 
 def _pose(bag: BagFile, topic: str, mapping: TopicRoles) -> TopicData:

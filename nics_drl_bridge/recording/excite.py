@@ -16,7 +16,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.messages import POSITION_UNITS
-from nics_drl_bridge.robot.kinds import textbook
+from nics_drl_bridge.robot.kinds import has_textbook, reach, textbook
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.seeds import checked_seeds
 
@@ -60,7 +60,10 @@ class Exploration:
         self._command, self._state = self.rest, np.zeros(self._motion.size)
         self.pose: Array = np.zeros(3)
         self._before, self._seen = self.pose, False
-        fastest = np.hypot(*spec.to_cmd_vel(np.maximum(-self.low, self.high))[:2])
+        if spec.takes_cmd_vel:
+            fastest = np.hypot(*spec.to_cmd_vel(np.maximum(-self.low, self.high))[:2])
+        else:
+            fastest = plan.speed * np.hypot(*reach(spec)[:2])
         self._outermost = plan.bound - spec.footprint_radius
         self.keep_within = self._outermost - MARGIN_M - REACTION_S * float(fastest)
         turning = np.array([c.turns for c in spec.command])
@@ -285,7 +288,7 @@ class ExpectedMotion:
 
 def expected_motion(spec: RobotSpec) -> ExpectedMotion:
     """Returns the motion of the robot's textbook, else of `cmd_vel`; ConfigError: has neither."""
-    if spec.textbook is not None:
+    if has_textbook(spec):
         book = textbook(spec)
         return ExpectedMotion(
             len(spec.state),

@@ -9,9 +9,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.recording import topic_roles
+from nics_drl_bridge.robot.spec import RobotSpec
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Qos
@@ -64,6 +68,13 @@ def command_row(message: Any) -> Row:
         return drive.speed, 0.0, drive.steering_angle
     twist = getattr(message, "twist", message)
     return twist.linear.x, twist.linear.y, twist.angular.z
+
+
+def commanded(message: Any, spec: RobotSpec) -> Array:
+    """Returns the command (C,) of a message for a robot; see `command_row`."""
+    row = np.array(command_row(message))
+    of_angles = hasattr(getattr(message, "drive", message), "steering_angle")
+    return spec.of_fields(row) if of_angles else spec.from_cmd_vel(row)
 
 
 def _place(message: Any) -> tuple[Any, Any]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from typing import TypeVar
 
 import numpy as np
@@ -84,9 +85,9 @@ def wheels_at(
 
 @dataclass(frozen=True)
 class RobotKind:
-    """A kind of robot. Both functions raise KeyError for a parameter that the spec lacks."""
+    """A kind of robot. Its functions raise KeyError for a parameter that the spec lacks."""
 
-    kinematics: Callable[[RobotSpec], Textbook]  # of its actuators, whatever the state is
+    kinematics: Callable[[RobotSpec], Textbook] | None  # of its actuators; None: not known
     drawing: Callable[[RobotSpec], Drawing]
     template: Template = field(default_factory=Template)
     sideways: bool = False  # True if it is driven sideways by commands other than a twist's
@@ -109,7 +110,21 @@ def textbook(spec: RobotSpec) -> Textbook:
 
 def actuated(spec: RobotSpec) -> Textbook:
     """Returns the textbook kinematics of a robot's actuators; ConfigError as `textbook`."""
-    return _made(spec, lambda kind: kind.kinematics(spec))
+
+    def make(kind: RobotKind) -> Textbook:
+        if kind.kinematics is None:
+            fault = f"no textbook tells where the commands of the kind {spec.textbook!r} lead"
+            fix = "do without, by a recording and its model, or choose another kind"
+            raise ConfigError(f"robot {spec.name!r}: {fault}; {fix}.")
+        return kind.kinematics(spec)
+
+    return _made(spec, make)
+
+
+def has_textbook(spec: RobotSpec) -> bool:
+    """True if a robot's textbook kinematics are known, but maybe for a parameter."""
+    kind = None if spec.textbook is None else find_kind(spec.textbook)
+    return getattr(kind, "kinematics", None) is not None
 
 
 def _through_lags(spec: RobotSpec, book: Textbook) -> Textbook:
@@ -188,6 +203,14 @@ def command_for(spec: RobotSpec, twist: ArrayLike) -> Array:
             raise ConfigError(f"robot {spec.name!r}: {fault}; use continuous actions, no planner.")
         command = book.command(twist)
     return np.clip(command, spec.command_low, spec.command_high)
+
+
+def reach(spec: RobotSpec) -> Array:
+    """Returns the greatest steady twist (3,) of a robot's commands; ConfigError: see there."""
+    rest = np.clip(0.0, spec.command_low, spec.command_high)
+    ends = zip(spec.command_low, rest, spec.command_high, strict=True)
+    corners = np.array(list(product(*ends)))
+    return np.asarray(np.abs(steady_twist(spec, corners)).max(axis=0))
 
 
 def _by_turn_rate(spec: RobotSpec) -> RobotSpec:

@@ -212,13 +212,17 @@ class RobotSpec(Schema):
         return self.steers and self.angular_is == "turn_rate"
 
     @property
+    def knows_wheelbase(self) -> bool:
+        """True if its wheelbase is given, not only assumed."""
+        return self.parameters.get("wheelbase", 0.0) > 0.0 and "wheelbase" not in self.assumed
+
+    @property
     def wheelbase(self) -> float:
         """Distance between the axles of a robot that steers [m]. Raises ConfigError if unknown."""
-        wheelbase = self.parameters.get("wheelbase", 0.0)
-        if not wheelbase > 0.0 or "wheelbase" in self.assumed:
+        if not self.knows_wheelbase:
             fix = "add `wheelbase:` [m] to the `parameters:` of its YAML file."
             raise ConfigError(f"robot {self.name!r} steers, and its wheelbase is not known; {fix}")
-        return wheelbase
+        return self.parameters["wheelbase"]
 
     @cached_property
     def command_low(self) -> NDArray[np.float64]:
@@ -239,6 +243,11 @@ class RobotSpec(Schema):
                 raise ConfigError(f"robot {self.name!r}: {reason}; {fix}.")
         fields = [CMD_VEL_FIELDS.index(c.cmd_vel) for c in self.command if c.cmd_vel is not None]
         return np.array(fields, dtype=np.intp)
+
+    @property
+    def cmd_vel_places(self) -> tuple[int, ...]:
+        """Places (C,) of the commands in linear.x, linear.y, angular.z; ConfigError without."""
+        return tuple(self._cmd_vel_index.tolist())
 
     @cached_property
     def bicycle(self) -> Bicycle:
@@ -270,6 +279,10 @@ class RobotSpec(Schema):
         command = self.of_fields(np.stack([speed, twist[..., 1], angle], axis=-1))
         limits = np.array([(c.min, c.max) if c.steers else (-np.inf, np.inf) for c in self.command])
         return np.asarray(np.clip(command, *limits.T))
+
+    def require_cmd_vel(self) -> None:
+        """Raises ConfigError if a node can't drive it, since `to_cmd_vel` fails."""
+        self.to_cmd_vel(self.command_low)
 
     def of_fields(self, values: ArrayLike) -> NDArray[np.float64]:
         """Returns of values (..., 3), by field of `cmd_vel`, those of the commands (..., C)."""

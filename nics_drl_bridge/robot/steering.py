@@ -1,6 +1,6 @@
 """A bicycle: speed and steering angle of a car, to its body twist and back."""
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
-class Bicycle(NamedTuple):
+@dataclass(frozen=True)
+class Bicycle:
     """Geometry of a robot that steers; `base_link` is the middle of the unsteered axle."""
 
     wheelbase: float  # [m]
@@ -23,12 +24,9 @@ class Bicycle(NamedTuple):
         return np.stack([forward, np.zeros_like(forward), turn], axis=-1)
 
     def command(self, twist: Array) -> tuple[Array, Array]:
-        """Returns speeds and steering angles (...) of twists (..., 3): both 0 for a turn at rest.
-
-        As of the curvature alone, an angle is within a right angle; a car at rest holds 0 [rad].
-        """
+        """Returns speeds and steering angles (...) of twists (..., 3), both 0 of a turn at rest."""
         forward, turn = twist[..., 0], twist[..., 2]
-        moving = forward != 0.0
-        bend = np.divide(turn, forward, out=np.zeros(np.shape(forward)), where=moving)
-        angle = np.arctan(self.wheelbase * bend)
-        return (forward / np.cos(angle) if self.front_drive else forward), angle
+        across = self.wheelbase * turn  # speed of the front wheel to the left
+        sign = np.sign(forward)
+        angle = np.arctan2(across * sign, np.abs(forward))
+        return (sign * np.hypot(forward, across) if self.front_drive else forward), angle

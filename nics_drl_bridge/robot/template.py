@@ -8,8 +8,10 @@ from nics_drl_bridge.errors import ConfigError
 
 Given = Mapping[str, Any]  # a part of a robot's file
 Ranges = Mapping[str, tuple[float, float]]
-# Generous range of a component of the body twist in the state, in both directions, and its unit.
-TWIST_RANGES = {"vx": (10.0, "m/s"), "vy": (10.0, "m/s"), "wz": (10.0, "rad/s")}
+# Unit, and range in both directions, of a component of the body twist in the state; a state that a
+# command tells in its own unit may come to a multiple of that.
+TWIST_RANGES = {"vx": ("m/s", 10.0), "vy": ("m/s", 10.0), "wz": ("rad/s", 10.0)}
+BEYOND = 2.0
 SHARES = 1.0  # range of a command without a unit, in both directions
 
 
@@ -28,9 +30,10 @@ STEERED = (
     usual("speed_command", "m/s", 1.0, "linear.x"),
     usual("steering_command", "rad", 0.5, "angular.z"),
 )
+# that follows the command of this field, whatever its name is
 STEERED_STATE = (
-    {"name": "speed", "unit": "m/s", "min": -10.0, "max": 10.0, "follows": "speed_command"},
-    {"name": "steering", "unit": "rad", "min": -1.5, "max": 1.5, "follows": "steering_command"},
+    {"name": "speed", "unit": "m/s", "cmd_vel": "linear.x"},
+    {"name": "steering", "unit": "rad", "cmd_vel": "angular.z"},
 )
 LAGS = {"wheel_lag": 0.1}
 STEERED_LAGS = {"speed_lag": 0.1, "steering_lag": 0.1}
@@ -63,72 +66,71 @@ class Template:
         kind = given["kind"]
         data = {"name": kind, **given, "textbook": kind}
         del data["kind"]
-        command = self._command(given, ranges)
-        data["command"] = command
-        names = [one.get("name") for one in command if isinstance(one, Mapping)]
-        data["state"] = self._state(names) if given.get("state") is None else given["state"]
-        own = given.get("parameters", {})
-        if isinstance(own, Mapping):
-            sizes = self._lengths(given)
+        data["command"] = command = self._command(given, ranges)
+        if _mappings(command):
+            data["state"] = self._state(given.get("state"), command)
+        own, radius = given.get("parameters", {}), given.get("footprint_radius")
+        if isinstance(own, Mapping) and isinstance(radius, int | float):
+            sizes = {name: round(share * radius, 4) for name, share in self.lengths.items()}
             data["parameters"] = {**sizes, **self.parameters, **own}
             data["assumed"] = sorted(set(sizes) - set(own))
         return data
 
-    def _command(self, given: Given, ranges: Ranges) -> list[Any]:
-        own = given.get("command")
+    def _command(self, given: Given, ranges: Ranges) -> Any:
+        own, kind = given.get("command"), given["kind"]
         if own is not None and not _mappings(own):
-            return own  # type: ignore[no-any-return]  # the check of the whole file reports it
+            return own  # the check of the whole file reports it
         names = [one.get("name") for one in own] if own is not None else list(ranges)
         way = max(self.commands, key=lambda way: _alike(way, names, own or ()), default=())
         known = {one["name"]: one for one in way}
-        if own is None and way and ranges and set(names) != set(known):
-            fault = f"commands of the kind {given['kind']!r} are {_list(known)}, not {_list(names)}"
+        known |= {name.removesuffix("_command"): one for name, one in known.items()}
+        if own is None and way and ranges and not _are(way, [known.get(name) for name in names]):
+            fault = f"commands of the kind {kind!r} are {_list(known)}, not {_list(names)}"
             fix = "name them so, or list them in that order under `command:` of the robot"
-            raise ConfigError(f"robot {given.get('name', given['kind'])!r}: {fault}; {fix}.")
+            raise ConfigError(f"robot {given.get('name', kind)!r}: {fault}; {fix}.")
         if own is None:
-            own = [{"name": name} for name in (names or known)]
+            own = [{"name": name} for name in (names or names_of(way))]
         if not own:
             fix = "name them under `command:` of the robot, or give a recording"
-            raise ConfigError(
-                f"the commands of a robot of the kind {given['kind']!r} are not known; {fix}."
-            )
+            raise ConfigError(f"the commands of a robot of the kind {kind!r} are not known; {fix}.")
         places = [known.get(one.get("name")) for one in own]
         if None in places and len(own) == len(way):
             places = list(way)  # names of the user's own, in the usual order
         return [_whole(place or {}, one, ranges) for place, one in zip(places, own, strict=True)]
 
-    def _state(self, taken: list[Any]) -> list[Given]:
-        if not self.moves:
-            own = dict(zip(names_of(self.commands[0]), taken, strict=False))
-            own |= {name: name for name in taken if name in own}
-            return [{**one, "follows": own.get(one["follows"])} for one in self.state]
-        return [
-            {
-                "name": f"body_{dof}" if dof in taken else dof, "unit": TWIST_RANGES[dof][1],
-                "min": -TWIST_RANGES[dof][0], "max": TWIST_RANGES[dof][0], "twist": dof,
-            }
-            for dof in self.moves
-        ]  # fmt: skip
-
-    def _lengths(self, given: Given) -> dict[str, float]:
-        radius = given.get("footprint_radius")
-        if not isinstance(radius, int | float):
-            return {}
-        return {name: round(share * radius, 4) for name, share in self.lengths.items()}
+    def _state(self, own: Any, command: Sequence[Given]) -> Any:
+        """Returns the state: the user's own in so far as it is given, the usual one if None."""
+        taken = [one.get("name") for one in command]
+        usual = [dict(one) for one in self.state]
+        for one in usual:  # it follows a command, by whatever name
+            place = one.pop("cmd_vel")
+            fields = {c.get("cmd_vel"): c.get("name") for c in command}
+            one["follows"] = fields.get(place)
+            one["name"] = f"actual_{one['name']}" if one["name"] in taken else one["name"]
+        usual += [{"name": f"body_{d}" if d in taken else d, "twist": d} for d in self.moves]
+        if own is not None and not _mappings(own):
+            return own
+        known = {one["name"]: one for one in usual}
+        chosen = usual if own is None else [{**known.get(c.get("name"), {}), **c} for c in own]
+        return [_ranged(one, command) for one in chosen]
 
 
 def _mappings(own: Any) -> bool:
     return isinstance(own, list | tuple) and all(isinstance(one, Mapping) for one in own)
 
 
-def _alike(way: tuple[Given, ...], names: list[Any], own: Any) -> int:
+def _alike(way: Sequence[Given], names: Sequence[Any], own: Any) -> int:
     """Counts the commands of a way that are given by name or unit."""
     units = [one.get("unit") for one in own]
     return sum(one["name"] in names or one["unit"] in units for one in way)
 
 
+def _are(way: Sequence[Given], found: Sequence[Given | None]) -> bool:
+    return len(way) == len(found) and all(one in found for one in way)
+
+
 def _list(names: Any) -> str:
-    return ", ".join(repr(str(name)) for name in names)
+    return ", ".join(repr(str(name)) for name in names if not str(name).endswith("_command"))
 
 
 def _whole(template: Given, own: Given, ranges: Ranges) -> dict[str, Any]:
@@ -140,3 +142,19 @@ def _whole(template: Given, own: Given, ranges: Ranges) -> dict[str, Any]:
     if low < high or low:  # at rest, a command is 0
         data |= {"min": own.get("min", min(low, 0.0)), "max": own.get("max", max(high, 0.0))}
     return data
+
+
+def _ranged(state: Given, command: Sequence[Given]) -> dict[str, Any]:
+    """Returns a state with unit and range, from the commands that it follows or can be told by."""
+    unit, reach = TWIST_RANGES.get(state.get("twist", ""), (None, None))
+    unit = state.get("unit", unit)
+    bounds = [
+        abs(value)
+        for one in command
+        if one.get("unit") == unit and state.get("follows") in (None, one.get("name"))
+        for value in (one.get("min"), one.get("max"))
+        if isinstance(value, int | float)
+    ]
+    reach = BEYOND * max(bounds) if bounds and unit != "1" else reach
+    usual = {} if reach is None else {"unit": unit, "min": -reach, "max": reach}
+    return {**usual, **state}

@@ -15,13 +15,22 @@ from steps import integrate
 from nics_drl_bridge import extensions
 from nics_drl_bridge.config import validate
 from nics_drl_bridge.env.bridge_env import BridgeEnv
+from nics_drl_bridge.env.task import discrete_commands
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.generator import generate
 from nics_drl_bridge.policy.policies import make_policy
 from nics_drl_bridge.recording.textbook import record
-from nics_drl_bridge.robot.kinds import find_kind, kind_names, steady_twist, textbook
-from nics_drl_bridge.robot.spec import RobotSpec, load_robot
+from nics_drl_bridge.robot.kinds import (
+    command_for,
+    find_kind,
+    has_textbook,
+    kind_names,
+    reach,
+    steady_twist,
+    textbook,
+)
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot, robot_from
 from nics_drl_bridge.robot.urdf import urdf_of
 
 PACKAGE = Path(__file__).resolve().parents[2] / "nics_drl_bridge"
@@ -80,6 +89,130 @@ def test_a_held_command_leads_to_its_steady_twist(name):
     book, command = textbook(robot), 0.6 * robot.command_high
     _, state = integrate(book, np.zeros(3), np.zeros(len(robot.state)), command, 5.0)
     assert steady_twist(robot, command) == pytest.approx(book.twist(state), abs=1e-9)
+
+
+def made(kind, **given):
+    return robot_from({"kind": kind, "footprint_radius": 0.2, **given})
+
+
+KNOWN = [kind for kind in KINDS if kind != "free"]
+
+
+@pytest.mark.parametrize("kind", KNOWN)
+def test_the_command_for_a_twist_leads_to_it(kind):
+    robot = made(kind)
+    for share in np.random.default_rng(0).uniform(-1.0, 1.0, (20, len(robot.command))):
+        command = share * robot.command_high
+        assert command_for(robot, steady_twist(robot, command)) == pytest.approx(command)
+    far = command_for(robot, np.full((2, 3), 1e3))
+    assert (far <= robot.command_high).all()
+
+
+@pytest.mark.parametrize("kind", KNOWN)
+def test_a_robot_known_by_its_twist_comes_to_that_of_its_actuators(kind):
+    robot = made(kind)
+    command, start = 0.6 * robot.command_high, np.zeros(len(robot.state))
+    _, state = integrate(textbook(robot), np.zeros(3), start, command, 5.0)
+    assert textbook(robot).twist(state) == pytest.approx(steady_twist(robot, command), abs=1e-3)
+
+
+def test_a_skid_steer_robot_turns_less_than_it_is_commanded():
+    sizes = {"track": 0.4, "effective_track": 0.8, "wheel_radius": 0.1}
+    robot = made("skid_steer", parameters=sizes)
+    assert steady_twist(robot, [0.5, 1.0]) == pytest.approx([0.5, 0.0, 0.5])
+    sides = [{"name": "left_wheel"}, {"name": "right_wheel"}]
+    robot = made("skid_steer", parameters=sizes, command=sides)
+    assert steady_twist(robot, [-4.0, 4.0]) == pytest.approx([0.0, 0.0, 1.0])
+
+
+def test_a_throttle_comes_to_a_speed_and_a_share_to_an_angle():
+    sizes = {"wheelbase": 0.2, "speed_gain": 4.0, "greatest_steering": 0.5}
+    twist = steady_twist(made("ackermann_throttle", parameters=sizes), [0.5, -1.0])
+    assert twist == pytest.approx([2.0, 0.0, -2.0 * np.tan(0.5) / 0.2])
+
+
+def test_wheels_turn_a_differential_robot_by_their_difference():
+    robot = made("differential_wheels", parameters={"track": 0.5, "wheel_radius": 0.1})
+    assert steady_twist(robot, [3.0, 5.0]) == pytest.approx([0.4, 0.0, 0.4])
+    assert command_for(robot, [0.4, 0.0, 0.4]) == pytest.approx([3.0, 5.0])
+
+
+def test_a_car_that_is_to_turn_on_the_spot_stands():
+    for kind in ("ackermann", "ackermann_throttle", "tricycle"):
+        assert not command_for(made(kind), [0.0, 0.0, 1.0]).any()
+    assert reach(made("ackermann")) == pytest.approx([1.0, 0.0, np.tan(0.5) / 0.26])
+
+
+def test_where_the_commands_of_a_free_robot_lead_is_not_known():
+    robot = robot_from({"kind": "free", "footprint_radius": 0.2}, {"pump": (0.0, 1.0)})
+    assert not has_textbook(robot)
+    assert robot.moves_sideways
+    for ask in (textbook, reach, lambda robot: command_for(robot, np.zeros(3))):
+        with pytest.raises(ConfigError, match="no textbook tells where the commands of the kind"):
+            ask(robot)
+
+
+def test_rate_limits_need_the_actuators_as_state():
+    robot = made("differential", parameters={"wheel_rate": 3.0})
+    with pytest.raises(ConfigError, match="a rate limit of an actuator needs the actuators"):
+        textbook(robot)
+
+
+def test_a_state_that_is_no_state_of_its_kind_is_named():
+    robot = made("differential", state=[])
+    with pytest.raises(ConfigError, match="need a state of 2 actuators, not none; correct `state"):
+        textbook(robot)
+
+
+def test_too_few_commands_for_the_wheels_are_refused():
+    robot = made("differential_wheels", command=[{"name": "left_wheel"}])
+    with pytest.raises(ConfigError, match="differential_wheels kinematics need 2 commands, not 1"):
+        textbook(robot)
+
+
+WITHOUT_CMD_VEL = [{"kind": "ackermann_throttle"}, {"kind": "differential_wheels"}]
+
+
+@pytest.fixture(scope="module", params=WITHOUT_CMD_VEL, ids=lambda given: given["kind"])
+def unnamed(request):
+    """A robot none of whose commands is a field of cmd_vel, generated from a drive of its own."""
+    robot = made(**request.param)
+    return generate(record(robot, np.random.default_rng(0)), robot, lidar(), ())[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{}, {"actions": "discrete"}])
+def test_robots_without_cmd_vel_drive_in_an_env(unnamed, options):
+    assert not unnamed.robot.takes_cmd_vel
+    env = BridgeEnv(model=unnamed, world="arena", estimator=True, task_options=options)
+    env.reset(seed=0)
+    for _ in range(20):
+        observation, *_, info = env.step(env.action_space.sample())
+    assert env.observation_space.contains(observation)
+    assert np.isfinite(info["true_pose"]).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["straight", "dynamic_window"])
+def test_robots_without_cmd_vel_reach_goals_by_their_kind(unnamed, name):
+    env = BridgeEnv(model=unnamed, world="empty")
+    policy = make_policy(name, env.task)
+    for seed in range(3):
+        observation, info, ended = *env.reset(seed=seed), False
+        for _ in range(200):
+            observation, _, ended, _, info = env.step(policy.act(observation))
+            if ended:
+                break
+        assert info["is_success"]
+
+
+def test_their_discrete_actions_drive_ahead_and_turn():
+    wheels = discrete_commands(made("differential_wheels"))
+    assert wheels[1:4] == pytest.approx(np.array([[10.0, 10.0], [0.0, 10.0], [10.0, 0.0]]))
+    car = discrete_commands(made("ackermann_throttle"))
+    assert car[1:4] == pytest.approx(np.array([[1.0, 0.0], [1.0, 1.0], [1.0, -1.0]]))
+    free = robot_from({"kind": "free", "footprint_radius": 0.2}, {"pump": (0.0, 1.0)})
+    assert discrete_commands(free).tolist() == [[0.0], [1.0], [0.0]]
 
 
 def test_a_front_wheel_across_turns_a_tricycle_about_its_rear_axle():

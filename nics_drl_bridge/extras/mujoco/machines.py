@@ -117,6 +117,9 @@ def build_machine(spec: RobotSpec, physics: Physics | None = None) -> Machine:
     if kind not in _BUILDERS:
         fix = f"take one of {', '.join(_BUILDERS)}, or the fast simulator."
         raise ConfigError(f"robot {spec.name!r}: MuJoCo has no machine of the kind {kind!r}; {fix}")
+    if any(v.twist is not None for v in spec.state):
+        fault = "MuJoCo's machines measure actuators, not a twist"
+        raise ConfigError(f"robot {spec.name!r}: {fault}; correct `state:`.")
     try:
         step = max(c.max - c.min for c in spec.command if not c.turns)
         return _BUILDERS[kind](spec.parameters, step, physics or Physics())

@@ -1,0 +1,145 @@
+"""A robot in a few words: its kind knows the rest, and a recording its ranges."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.robot.kinds import find_kind, kind_names, textbook
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot, robot_from
+
+SLIPPING = ("ackermann_throttle", "free", "mecanum", "omnidirectional", "skid_steer")
+
+
+WIDE = {"kind": "mecanum", "footprint_radius": 0.3}
+
+
+def made(kind, ranges=None, **given):
+    if kind == "free" and ranges is None:
+        ranges = {"valve": (-1.0, 0.5)}
+    return robot_from({"kind": kind, "footprint_radius": 0.3, **given}, ranges)
+
+
+def commands(robot):
+    return [(c.name, c.unit, c.min, c.max) for c in robot.command]
+
+
+@pytest.mark.parametrize("kind", kind_names())
+def test_two_words_are_a_whole_robot_of_every_kind(kind):
+    robot = made(kind)
+    assert robot.name == robot.textbook == kind
+    assert RobotSpec.model_validate(robot.model_dump(mode="json")) == robot
+    if find_kind(kind).kinematics is not None:
+        assert len(textbook(robot).lag) == len(robot.state)
+
+
+@pytest.mark.parametrize("kind", kind_names())
+def test_its_state_is_its_twist_unless_it_follows_speed_and_steering(kind):
+    robot = made(kind)
+    if robot.steers:
+        followed = [v.follows for v in robot.state]
+        assert followed == [c.name for c in robot.command]
+    else:
+        dofs = ("vx", "vy", "wz") if kind in SLIPPING else ("vx", "wz")
+        assert tuple(v.twist for v in robot.state) == dofs
+
+
+def test_a_state_that_is_called_as_a_command_gets_another_name():
+    assert [v.name for v in made("omnidirectional").state] == ["body_vx", "body_vy", "body_wz"]
+    car = made("ackermann", {"speed": (0.0, 3.0), "steering": (-0.4, 0.4)})
+    assert [(v.name, v.follows) for v in car.state] == [
+        ("actual_speed", "speed"), ("actual_steering", "steering")
+    ]  # fmt: skip
+
+
+def test_recorded_ranges_hold_where_the_user_gave_none_and_always_include_rest():
+    ranges = {"throttle": (0.1, 0.6), "steering": (-0.4, 0.4)}
+    robot = made("ackermann_throttle", ranges, command=[{"name": "throttle", "max": 0.9}])
+    assert commands(robot) == [("throttle", "1", 0.0, 0.9)]
+    robot = made("ackermann_throttle", ranges)
+    assert commands(robot) == [("throttle", "1", 0.0, 0.6), ("steering", "1", -0.4, 0.4)]
+    robot = made("ackermann_throttle", {"throttle": (0.0, 0.0), "steering": (0.2, 0.2)})
+    assert commands(robot) == [("throttle", "1", -1.0, 1.0), ("steering", "1", 0.0, 0.2)]
+
+
+def test_commands_stand_in_the_order_of_the_recording():
+    ranges = {"steering": (-1.0, 1.0), "throttle": (0.0, 1.0)}
+    robot = made("ackermann_throttle", ranges, parameters={"wheelbase": 0.2})
+    assert [c.name for c in robot.command] == ["steering", "throttle"]
+    assert textbook(robot).steady(np.array([0.0, 1.0])) == pytest.approx([3.0, 0.0, 0.0])
+
+
+def test_names_of_the_users_own_stand_in_the_usual_order():
+    robot = made("ackermann", {"v": (-1.0, 5.0)}, command=[{"name": "v"}, {"name": "delta"}])
+    assert commands(robot) == [("v", "m/s", -1.0, 5.0), ("delta", "rad", -0.5, 0.5)]
+    assert [c.cmd_vel for c in robot.command] == ["linear.x", "angular.z"]
+    assert [(v.name, v.follows, v.max) for v in robot.state] == [
+        ("speed", "v", 10.0), ("steering", "delta", 1.0)
+    ]  # fmt: skip
+
+
+def test_a_skid_steer_robot_is_driven_by_twist_or_by_sides():
+    by_wheels = {"left_wheel": (-5.0, 5.0), "right_wheel": (-5.0, 5.0)}
+    assert [c.unit for c in made("skid_steer").command] == ["m/s", "rad/s"]
+    assert [c.unit for c in made("skid_steer", by_wheels).command] == ["rad/s", "rad/s"]
+    own = [{"name": "a", "unit": "rad/s"}, {"name": "b", "unit": "rad/s"}]
+    assert [c.cmd_vel for c in made("skid_steer", command=own).command] == [None, None]
+
+
+def test_free_takes_whatever_was_recorded():
+    robot = made("free", {"pump": (0.0, 2.0), "valve": (-1.0, 1.0)}, command=[
+        {"name": "pump", "unit": "V"}, {"name": "valve"},
+    ])  # fmt: skip
+    assert commands(robot) == [("pump", "V", 0.0, 2.0), ("valve", "1", -1.0, 1.0)]
+
+
+def test_parameters_and_a_state_that_are_given_stand():
+    state = [{"name": "vx", "max": 3.0}, {"name": "angle", "unit": "rad", "min": -1, "max": 1}]
+    robot = made("differential", parameters={"track": 0.5}, state=state)
+    assert robot.parameters["track"] == 0.5
+    assert robot.assumed == ("wheel_radius",)
+    assert [(v.name, v.twist, v.max) for v in robot.state] == [
+        ("vx", "vx", 3.0), ("angle", None, 1.0)
+    ]  # fmt: skip
+
+
+def test_sizes_come_from_a_footprint_too():
+    corners = [[0.3, 0.4], [-0.3, 0.4], [-0.3, -0.4], [0.3, -0.4]]
+    robot = robot_from({"kind": "mecanum", "footprint": corners})
+    assert robot.parameters["half_width"] == pytest.approx(0.6 * 0.5)
+
+
+def test_a_file_may_say_it_in_a_few_words_too(tmp_path):
+    file = tmp_path / "husky.yaml"
+    file.write_text("kind: skid_steer\nname: husky\nfootprint_radius: 0.6\n")
+    robot = load_robot(file)
+    assert (robot.name, robot.textbook) == ("husky", "skid_steer")
+    assert robot_from(str(file)) == robot
+    assert robot_from(load_robot("mecanum").model_dump()) == load_robot("mecanum")
+
+
+@pytest.mark.parametrize(
+    ("given", "ranges", "sentence"),
+    [
+        ({"kind": "tank"}, None, "robot: key 'kind': there is no 'tank'; valid are: 'ackermann', "),
+        ({"kind": "free"}, None, "commands of a robot of the kind 'free' are not known; name them"),
+        ({"kind": "mecanum", "footprint_radius": "wide"}, None, "key 'footprint_radius'"),
+        ({"kind": "mecanum"}, None, "the key 'footprint_radius' is missing; add it."),
+        ({"kind": "mecanum", "textbook": "mecanum"}, None, "a `kind` and a `textbook`; remove one"),
+        ({**WIDE, "command": 3}, None, "key 'command'"),
+        ({**WIDE, "state": "none"}, None, "key 'state'"),
+        ({**WIDE, "parameters": [1]}, None, "key 'parameters'"),
+        ({**WIDE, "wheels": 4}, None, "unknown key 'wheels'"),
+        (
+            {"kind": "ackermann_throttle", "name": "kart"}, {"gas": (0, 1), "wheel": (0, 1)},
+            "robot 'kart': commands of the kind 'ackermann_throttle' are 'throttle', 'steering', "
+            "not 'gas', 'wheel'; name them so",
+        ),
+    ],
+)  # fmt: skip
+def test_what_is_no_robot_is_refused_in_one_sentence(given, ranges, sentence):
+    with pytest.raises(ConfigError) as caught:
+        robot_from(given, ranges)
+    assert sentence in str(caught.value)
+    assert "\n" not in str(caught.value)
