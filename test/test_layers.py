@@ -63,6 +63,7 @@ HOMES = {
     "pettingzoo": ("env/pettingzoo_env.py",),
     "ray": ("extras/ray/*",),
     "rosbags": ("recording/*", "extras/bags/*"),
+    "pyarrow": ("recording/*",),
     "mcap": ("recording/*", "extras/bags/*"),
     "threadpoolctl": ("threads.py",),
 }

@@ -1,4 +1,4 @@
-"""Opens a rosbag2 recording, and verifies that it is complete: readers are silent about damage."""
+"""Opens a bag of ROS 2 or 1, and verifies that it is complete: readers are silent about damage."""
 
 from __future__ import annotations
 
@@ -15,16 +15,20 @@ import numpy as np
 
 from nics_drl_bridge.config import no_device, parse_yaml, read_text
 from nics_drl_bridge.errors import BridgeError, RecordingError, shortened
-from nics_drl_bridge.recording.messages import Offer, check_libraries, offers_of, stamp, typestore
+from nics_drl_bridge.recording.messages import Offer, check_libraries, offers_of, stamp, with_types
 from nics_drl_bridge.recording.stamping import Nanoseconds
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
+    from rosbags.rosbag1 import Reader as Ros1Reader
     from rosbags.rosbag2 import Reader
+
+    AnyBag = Reader | Ros1Reader
 
 METADATA, ABOUT = "metadata.yaml", "rosbag2_bagfile_information"
 DATABASE = ".db3"
 SUFFIXES = (".mcap", DATABASE)
+ROS_1 = ".bag"
 COMPRESSED = (".zst", ".zstd")
 URI_SIGNS = "?#%"
 LONGEST_NAME, LONGEST_REASON = 60, 260  # of a topic or type, and of a fault [characters]
@@ -39,7 +43,7 @@ class Message:
 
 
 def is_bag(path: str | Path) -> bool:
-    """True if a path is a rosbag2 recording: its folder, or one of its files."""
+    """True if a path is a bag: the folder or a file of a rosbag2, or the file of a rosbag1."""
     path = Path(path)
     if path.is_dir():
         return (path / METADATA).is_file() or any(is_storage(p) for p in path.iterdir())
@@ -49,7 +53,7 @@ def is_bag(path: str | Path) -> bool:
 def is_storage(path: Path) -> bool:
     """True if a file has the name of a bag file, compressed or not."""
     plain = path.with_suffix("") if path.suffix in COMPRESSED else path
-    return plain.suffix in SUFFIXES
+    return plain.suffix in SUFFIXES or path.suffix == ROS_1
 
 
 @contextmanager
@@ -57,9 +61,13 @@ def opened(path: str | Path) -> Iterator[BagFile]:
     """Opens a bag (folder or only file); RecordingError: missing, damaged, empty, no library."""
     path = Path(path)
     check_libraries(path, "reading")
-    from rosbags.rosbag2 import Reader
-
     try:
+        if path.suffix == ROS_1:
+            with _opened_ros_1(path) as found:
+                yield found
+            return
+        from rosbags.rosbag2 import Reader
+
         place = _place(path)
         files = [place, *(place.iterdir() if place.is_dir() else ())]
         # rosbags opens databases by URI, which these characters cut.
@@ -74,8 +82,6 @@ def opened(path: str | Path) -> Iterator[BagFile]:
                 _check_storage(file)
         with Reader(place) as reader:
             _check_summary(reader)
-            if not reader.message_count:
-                raise RecordingError(f"{path}: holds no messages; record a drive of 20 s or more.")
             yield BagFile(reader, str(path))
     except BridgeError:
         raise
@@ -83,8 +89,20 @@ def opened(path: str | Path) -> Iterator[BagFile]:
         why = " ".join(str(error).split()).rstrip(".") or type(error).__name__
         fault = f"can't be read as a bag ({shortened(why, LONGEST_REASON)})"
         advice = "save the rest with `nics bag salvage`, try `ros2 bag reindex`, or record anew"
+        if path.suffix == ROS_1:
+            advice = "mend it with `rosbag reindex`, or record anew"
         said = f"{path}: {fault}; it is damaged or was not closed: {advice}."
         raise RecordingError(said) from None
+
+
+@contextmanager
+def _opened_ros_1(path: Path) -> Iterator[BagFile]:
+    from rosbags.rosbag1 import Reader
+
+    if not no_device(path).is_file():
+        raise RecordingError(f"{path}: no such bag; check the path.")
+    with Reader(path) as reader:
+        yield BagFile(reader, str(path), is_ros_1=True)
 
 
 def _place(path: Path) -> Path:
@@ -189,8 +207,11 @@ def times_of(messages: Sequence[Message]) -> tuple[Nanoseconds, Nanoseconds | No
 class BagFile:
     """A bag in `opened`; ValueError if a topic's messages are not all there and whole."""
 
-    def __init__(self, reader: Reader, place: str) -> None:
-        self._reader, self._store = reader, typestore()
+    def __init__(self, reader: AnyBag, place: str, is_ros_1: bool = False) -> None:
+        if not reader.message_count:
+            raise RecordingError(f"{place}: holds no messages; record a drive of 20 s or more.")
+        self._reader, self._is_ros_1 = reader, is_ros_1
+        self._store = with_types(reader.connections)
         self.place = place  # its name, for errors
         self._connections: dict[str, list[Connection]] = {}
         for connection in reader.connections:
@@ -207,8 +228,8 @@ class BagFile:
 
     def offers(self, topic: str) -> tuple[Offer, ...]:
         """Returns the offers of a topic's publishers, as far as the bag contains them."""
-        found = (offers_of(c.ext.offered_qos_profiles) for c in self._connections[topic])  # type: ignore[union-attr]
-        return tuple(offer for some in found for offer in some)
+        some = (getattr(c.ext, "offered_qos_profiles", ()) for c in self._connections[topic])
+        return tuple(offer for profiles in some for offer in offers_of(profiles))
 
     def knows(self, topic: str) -> bool:
         """True if messages of the topic can be decoded."""
@@ -217,17 +238,22 @@ class BagFile:
     def messages(self, topic: str) -> list[Message]:
         """Returns all messages of a topic."""
         found = []
+        decode = self._store.deserialize_ros1 if self._is_ros_1 else self._store.deserialize_cdr
         for k, (kind, ns, data) in enumerate(self._raw(topic)):
             try:
-                found.append(Message(ns, self._store.deserialize_cdr(data, kind)))
+                found.append(Message(ns, decode(data, kind)))
             except Exception as error:  # noqa: BLE001 - damaged bytes break the decoder in any way
                 what = f"topic {topic!r}: message {k} can't be decoded as {kind} ({error})"
                 raise ValueError(what) from None
         return found
 
     def serialized(self, topic: str) -> list[tuple[int, bytes]]:
-        """Returns the same messages undecoded: time of receipt [ns] and bytes."""
-        return [(ns, bytes(data)) for _, ns, data in self._raw(topic)]
+        """Returns the same messages undecoded, as ROS 2 sends them: receipt [ns] and bytes."""
+        raw = self._raw(topic)
+        if self._is_ros_1:
+            convert = with_types(self._connections[topic], header=False).ros1_to_cdr
+            return [(ns, bytes(convert(data, kind))) for kind, ns, data in raw]
+        return [(ns, bytes(data)) for _, ns, data in raw]
 
     def _raw(self, topic: str) -> list[tuple[str, int, bytes]]:
         connections = self._connections[topic]

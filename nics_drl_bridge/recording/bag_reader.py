@@ -78,7 +78,7 @@ def _command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:
 def _pose(bag: BagFile, topic: str, mapping: TopicRoles) -> TopicData:
     messages = bag.messages(topic)
     if bag.types[topic] in (roles.TRANSFORM, roles.TRANSFORMS):
-        messages = _of_one_body(bag, topic, messages, mapping)
+        messages = of_one_body(bag, topic, messages, mapping.frame, mapping.child_frame)
     quaternions = np.array([msgs.quaternion(m.content) for m in messages])
     with np.errstate(over="ignore"):
         length = np.linalg.norm(quaternions, axis=1)
@@ -89,16 +89,16 @@ def _pose(bag: BagFile, topic: str, mapping: TopicRoles) -> TopicData:
     return _table(bag, topic, msgs.pose_row, messages)
 
 
-def _of_one_body(
-    bag: BagFile, topic: str, messages: Sequence[Message], mapping: TopicRoles
+def of_one_body(
+    bag: BagFile, topic: str, messages: Sequence[Message], frame: str | None, child: str | None
 ) -> list[Message]:
-    """Returns the transforms between the two frames of the mapping, or the only two frames."""
+    """Returns the transforms between two frames, or the only two frames; else RecordingError."""
     single = [
         (msgs.frames(transform), Message(message.receive_ns, transform))
         for message in messages
         for transform in getattr(message.content, "transforms", (message.content,))
     ]
-    wanted, there = (mapping.frame, mapping.child_frame), {pair for pair, _ in single}
+    wanted, there = (frame, child), {pair for pair, _ in single}
     pairs = {
         pair
         for pair in there
@@ -111,7 +111,7 @@ def _of_one_body(
     listed = ", ".join(sorted(f"{a} -> {b}" for a, b in there)) or "none"
     fault = f"{bag.place}: topic {topic!r} holds {problem}{named}"
     example = "as in `frame: world` and `child_frame: base_link`"
-    advice = f"write those of the robot into the topics file, {example}"
+    advice = f"write those of the robot into the topics file or the map, {example}"
     raise RecordingError(f"{fault}; {advice}; it holds {listed}.")
 
 

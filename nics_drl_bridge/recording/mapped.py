@@ -52,7 +52,13 @@ def read_mapped(source: Source, mapping: Mapping) -> Recording:
     found = _from_zero(found, mapping.clock, reader)
     names = (*mapping.state, *mapping.command)
     streams: Any = found
-    made = Recording(**streams, source=source.place, variables=names, repairs=tuple(reader.notes))
+    made = Recording(
+        **streams,
+        source=source.place,
+        variables=names,
+        latency=source.latency,
+        repairs=tuple(reader.notes),
+    )
     check_streams(made, {"command": len(mapping.command), "state": len(mapping.state), "wheels": 2})
     if fault := implausible_pose(made.pose.t, made.pose.values, np.inf):
         line = fault.line.replace("...", str(mapping.time and mapping.time.from_))

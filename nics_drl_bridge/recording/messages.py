@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -18,7 +20,7 @@ from nics_drl_bridge.recording import topic_roles
 from nics_drl_bridge.robot.spec import RobotSpec
 
 if TYPE_CHECKING:
-    from rosbags.interfaces import Qos
+    from rosbags.interfaces import Connection, Qos
     from rosbags.typesys.store import Typestore
 
 Row = tuple[float, float, float]
@@ -30,6 +32,7 @@ ACKERMANN_DEFINITION = (
 ACKERMANN_STAMPED_DEFINITION = "std_msgs/Header header\nackermann_msgs/AckermannDrive drive\n"
 LIBRARIES = ("rosbags", "mcap")
 POSITION_UNITS = ("rad", "m")  # of states that a JointState reports as positions
+HEADER = "std_msgs/msg/Header"
 WHEELS = ("left_wheel", "right_wheel")
 
 
@@ -47,6 +50,34 @@ def typestore() -> Typestore:
     store = get_typestore(Stores.ROS2_JAZZY)
     store.register(get_types_from_msg(ACKERMANN_DEFINITION, topic_roles.ACKERMANN))
     store.register(get_types_from_msg(ACKERMANN_STAMPED_DEFINITION, topic_roles.ACKERMANN_STAMPED))
+    return store
+
+
+def with_types(connections: Sequence[Connection], header: bool = True) -> Typestore:
+    """Returns the message types of `typestore`, and before these those that a bag defines.
+
+    That of ROS 1 for headers decodes messages, that of ROS 2 (`header` is false) converts them.
+    """
+    from rosbags.interfaces import MessageDefinitionFormat
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+    own: dict[str, Any] = {}
+    store = typestore()
+    for connection in connections:
+        form, text = connection.msgdef
+        with suppress(Exception):  # a definition that can't be parsed leaves its type unknown
+            if form == MessageDefinitionFormat.MSG:
+                own |= get_types_from_msg(text, connection.msgtype)
+            elif form == MessageDefinitionFormat.IDL:
+                for part in re.split(r"^=+\nIDL: .*\n", text, flags=re.MULTILINE):
+                    own |= get_types_from_idl(part) if part.strip() else {}
+    if not header:
+        own.pop(HEADER, None)
+    new = {name: each for name, each in own.items() if store.fielddefs.get(name) != each}
+    if new.keys() & store.fielddefs.keys():  # of another release, or of ROS 1
+        new, store = {**store.fielddefs, **new}, get_typestore(Stores.EMPTY)
+        new = {name: each for name, each in new.items() if name not in store.fielddefs}
+    store.register(new)
     return store
 
 

@@ -39,7 +39,7 @@ class Format(NamedTuple):
 
 
 FORMATS = (
-    Format("a rosbag2", lambda p: p.exists() and is_bag(p), load_bag, has_topics=True),
+    Format("a bag", lambda p: p.exists() and is_bag(p), load_bag, has_topics=True),
     Format("a folder of CSV files", Path.is_dir, lambda path, *_: load_csv_folder(path)),
     Format("an .npz file", lambda p: p.suffix == ".npz", lambda path, *_: load_recording(path)),
 )
@@ -80,7 +80,8 @@ def _by_mapping(
     if topics != TopicRoles():
         raise ConfigError("--topics and --topic do not go with --map; name the topics in the map.")
     given = mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
-    recording = read_mapped(open_source(path), given)
+    with open_source(path, given) as source:
+        recording = read_mapped(source, given)
     return recording if spec is None else arranged(recording, spec)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,7 +41,12 @@ class TopicData:
         return TopicData(self.topic, self.receive_ns[keep], header, self.values[keep])
 
 
-def streams(data: Mapping[str, TopicData], stamps: Stamps, place: str) -> dict[str, Stream]:
+def streams(
+    data: Mapping[str, TopicData],
+    stamps: Stamps,
+    place: str,
+    of_robot: Collection[str] = ROBOT_STREAMS,
+) -> dict[str, Stream]:
     """Stamps each stream, from near 0 on; RecordingError: headers are missing or unusable."""
     # With `auto`, by headers if there are any. Those less than 50 ms before their receipt are of
     # the recorder's clock, others of a foreign one: shifted by the median delay, they leave a small
@@ -58,11 +63,11 @@ def streams(data: Mapping[str, TopicData], stamps: Stamps, place: str) -> dict[s
         clocks = dict.fromkeys(data, (HEADER, origin - first))
     else:
         clocks = _clocks(data, headers, place)
-    robot = {clocks[name][0] for name in ROBOT_STREAMS if name in data}
+    robot = {clocks[name][0] for name in of_robot if name in data}
     made = {}
     for name, part in data.items():
         ns, (clock, shift) = headers[name], clocks[name]
-        if ns is None or (len(robot) > 1 and name in ROBOT_STREAMS):
+        if ns is None or (len(robot) > 1 and name in of_robot):
             made[name] = _by_receipt(part, origin)
         else:
             made[name] = Stream(_seconds(ns + shift - origin), part.values, clock)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge.errors import RecordingError, nearest
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.recording import Stream
+from nics_drl_bridge.robot.noise import Latency
 
 Column = NDArray[Any]  # (T,) numbers, or text
 
@@ -45,7 +46,13 @@ class Table(Protocol):
 class Source(Protocol):
     """A recording of any format, as tables."""
 
-    place: str
+    @property
+    def place(self) -> str:
+        """Path, for errors."""
+
+    @property
+    def latency(self) -> Latency:
+        """Delays of scan and odometry, if they show."""
 
     @property
     def names(self) -> tuple[str, ...]:

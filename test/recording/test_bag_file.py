@@ -227,9 +227,9 @@ def test_a_bag_without_messages_is_refused(tmp_path, storage):
     assert "holds no messages" in refused(bag)
 
 
-def test_a_bag_of_ros_1_comes_with_the_way_to_convert_it(tmp_path):
+def test_a_damaged_bag_of_ros_1_comes_with_the_way_to_mend_it(tmp_path):
     (tmp_path / "drive.bag").write_bytes(b"#ROSBAG V2.0\n")
-    assert "rosbags-convert" in refused(tmp_path / "drive.bag")
+    assert "rosbag reindex" in refused(tmp_path / "drive.bag")
 
 
 def renamed(told, k, name):

@@ -138,7 +138,7 @@ def test_the_reader_is_chosen_by_what_lies_there(folder, tmp_path):
     [
         ("nowhere", "no such file or folder"),
         ("nowhere.npz", "no such file"),
-        ("cmd.csv", "is neither a rosbag2 nor a folder of CSV files nor an .npz file; give one"),
+        ("cmd.csv", "is neither a bag nor a folder of CSV files nor an .npz file; say what is what"),
     ],
 )
 def test_a_path_that_holds_no_recording_is_refused(folder, name, sentence):
