@@ -15,6 +15,7 @@ import numpy as np
 import yaml
 
 from measuring import foreign_physics as physics
+from measuring.truths import Truth
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.recording import Recording, Stream
@@ -43,6 +44,17 @@ class ForeignRobot:
     dead_zone: float | None = None  # greatest throttle at which it stands
     wheels: dict[str, float] = field(default_factory=dict)  # radii and base [m]
     ticks_per_turn: int = 0  # of encoders that are recorded in place of commands
+
+    @property
+    def truth(self) -> Truth:
+        """All that a model may be compared with."""
+        x, y, heading = self.mounting
+        mounting = {"rotation_rad": -heading, "lever_arm_y_m": y}
+        return Truth(
+            None if self.ticks_per_turn else self.latency_s,
+            mounting | ({"lever_arm_x_m": x} if self.arm_known else {}), self.dead_zone,
+            {name: (size, size) for name, size in self.wheels.items()},
+        )  # fmt: skip
 
 
 def throttle_car() -> ForeignRobot:
