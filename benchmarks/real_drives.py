@@ -116,6 +116,8 @@ def figures(source: Path, mapping: Path, truth: Truth, control: str | None) -> d
         told |= judged(found, recording, control)
     except BridgeError as error:
         return told | {"refused": str(error)}
+    except Exception as error:  # noqa: BLE001 - one drive's crash is a bar missed, not the end
+        return told | {"crashed": f"{type(error).__name__}: {error}"}
     seconds = time.perf_counter() - begin
     return told | {
         "truths": compared(found, truth), "equations": found.model.equations(),
@@ -151,8 +153,8 @@ def table(result: dict[str, Any]) -> str:
     """The figures for people."""
     lines = [f"{'drive':<34} {'error':>9} {'of path':>8} {'textbook':>9} {'twist':>7} {'95 %':>6}"]
     for name, told in (result["drives"] | result["own_robots"]).items():
-        if "refused" in told:
-            lines.append(f"{name:<34} {told['refused']}")
+        if sentence := told.get("refused", told.get("crashed")):
+            lines.append(f"{name:<34} {sentence}")
             continue
         lines.append(
             f"{name:<34} {told['error_m']:>7.3f} m {told['share_of_path']:>8.3f} "

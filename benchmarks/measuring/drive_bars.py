@@ -88,6 +88,9 @@ def missed_of(result: Mapping[str, Any]) -> list[str]:
 
 def missed_by(name: str, told: Mapping[str, Any], bars: Bars) -> Iterator[str]:
     """Yields a sentence for each bar that one drive misses."""
+    if "crashed" in told:
+        yield f"{name}: crashed: {told['crashed']}"
+        return
     if "refused" in told:
         if not bars.may_refuse:
             yield f"{name}: was refused: {told['refused']}"

@@ -52,7 +52,7 @@ def _throttle_car(s, u, p, out):  # type: ignore[no-untyped-def]
     v, angle, turn = s[3], s[4], s[5]
     beyond = max(abs(u[0]) - dead, 0.0) / (1.0 - dead)
     push = math.copysign(beyond, u[0]) * pull
-    out[3] = push - pull * beyond * v / top - rolling * math.tanh(v / 0.02) - drag * v * abs(v)
+    out[3] = push - pull * beyond * v / top - rolling * math.tanh(v / 0.002) - drag * v * abs(v)
     out[4] = (greatest * min(max(u[1], -1.0), 1.0) - angle) / servo
     out[5] = (v * math.tan(angle) / (wheelbase + understeer * v * v) - turn) / yaw_lag
     return v, -slip * v * v * turn, turn

@@ -73,7 +73,7 @@ ROBOTS: dict[str, ForeignRobot] = {
         physics.SKID_STEER, (30.0, 2.2, 0.25, 0.18, 0.24, 0.6, 0.15, 0.08),
         {"forward_command": (-1.0, 1.0), "turn_command": (-1.5, 1.5)},
         {"kind": "skid_steer", "footprint_radius": 0.4, "parameters": {"track": 0.48}},
-        mounting=(0.0, 0.0, 0.3), arm_known=False,
+        mounting=(0.15, 0.0, 0.3), arm_known=False,
     ),
     "throttle_car": throttle_car(),
     "tricycle": ForeignRobot(

@@ -68,7 +68,8 @@ def dead_zone_of(found: Identified) -> float:
 def wheels_of(model: TaylorModel) -> dict[str, float]:
     """Returns radii and base [m] by which a model of two wheel speeds moves its robot."""
     left, right = (_per_command(model, wheel) for wheel in range(2))
-    base = -left[0] / left[2] + right[0] / right[2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        base = -left[0] / left[2] + right[0] / right[2]
     return {"left_m": -left[2] * base, "right_m": right[2] * base, "base_m": base}
 
 
