@@ -30,6 +30,7 @@ HEADING_WEIGHT_M = 0.3  # an error of 1 rad counts as so many metres
 LOSS_SCALE = 0.2  # of the soft L1 loss [m/s]
 MOST_EVALUATIONS, TOLERANCE = 60, 1e-4
 GUESS_S = 0.5  # gains and lags are first guessed from motions over this time,
+JUMP = 3.0  # but not from those that are so many times the 90th percentile: the localiser jumped
 DELAYS_S = np.arange(-0.1, 0.51, 0.05)  # at each of these delays between streams of one clock
 FAR_DELAYS_S = np.arange(-1.0, 1.01, 0.05)  # and of these between streams of two
 LAG_S, LAG_RANGE_S = 0.15, (0.005, 5.0)
@@ -205,6 +206,8 @@ def _first_guess(drive: Drive, until_s: float, clock_offset: float, offsets: boo
     structure = _structure(drive.spec)
     book, bicycle = structure or (np.ones((3, len(drive.spec.command))), STRAIGHT)
     seen = windows(drive, Calibration(), 0.0, until_s, GUESS_S, SPACING_S)
+    moved = np.hypot(*(seen.end - seen.start)[:, :2].T)
+    seen = seen.rows(moved <= JUMP * np.percentile(moved, 90))
     span = (seen.end_t - seen.start_t)[:, None]
     twist = geometry.log(geometry.between(seen.start, seen.end)) / span
     change = (twists_before(drive, seen.end_t) - twists_before(drive, seen.start_t)) / span
@@ -276,7 +279,8 @@ def fit_yardstick(drive: Drive, until_s: float, clock_offset_s: float = 0.0) -> 
         def residuals(theta: Array) -> Array:
             error = _relative_ends(form.unpack(theta), course, twist) - measured
             error[..., 2] = HEADING_WEIGHT_M * geometry.wrap_angle(error[..., 2])
-            return np.asarray(np.clip(error / horizons[..., None], -100.0, 100.0).ravel())
+            rates = np.clip(error / horizons[..., None], -100.0, 100.0)
+            return np.asarray(np.nan_to_num(rates)).ravel()
 
         theta = form.pack()
         found = least_squares(
