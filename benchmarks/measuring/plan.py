@@ -52,6 +52,7 @@ RUNS: dict[str, Run] = {
     "packet_loss": row("packet_loss", "", "--seconds 5"),
     "paper_fig7": row("paper_fig7", "", "--episodes 1"),
     "parity": row("parity", "", "--steps 50"),
+    "real_drives": row("real_drives", "", "--only xtark_random_drive_45s", HOUR),
     "ros_fleet": row("ros_fleet", "", "--seconds 2 --robots 2"),
     "ros_lockstep": row("ros_lockstep", "", "--chunks 5 --size 20"),
     "shield": row("shield", "--episodes 3000", "--episodes 30", 2 * HOUR),

@@ -1,6 +1,8 @@
 """Open-loop prediction: windows of a drive, and the poses that a model predicts at their ends."""
 
-from dataclasses import dataclass, replace
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +47,10 @@ class Windows:
     start: Array  # (W, 3) poses of the tracked body
     end: Array  # (W, 3)
     path: Array  # (W,) length of the measured path between them [m]
+
+    def rows(self, keep: NDArray[np.bool_]) -> Windows:
+        """Returns the windows selected by a mask (W,)."""
+        return Windows(*(getattr(self, each.name)[keep] for each in fields(self)))
 
 
 def windows(

@@ -30,10 +30,12 @@ HEADING_WEIGHT_M = 0.3  # an error of 1 rad counts as so many metres
 LOSS_SCALE = 0.2  # of the soft L1 loss [m/s]
 MOST_EVALUATIONS, TOLERANCE = 60, 1e-4
 GUESS_S = 0.5  # gains and lags are first guessed from motions over this time,
+JUMP = 3.0  # but not from those that are so many times the 90th percentile: the localiser jumped
 DELAYS_S = np.arange(-0.1, 0.51, 0.05)  # at each of these delays between streams of one clock
 FAR_DELAYS_S = np.arange(-1.0, 1.01, 0.05)  # and of these between streams of two
 LAG_S, LAG_RANGE_S = 0.15, (0.005, 5.0)
 LIMIT, LIMIT_RANGE = 10.0, (0.05, 1e3)  # of acceleration [m/s^2]
+NOTHING = 1e-9
 PROBE = 0.5  # share of the range of a command at which the textbook is asked for its structure
 
 
@@ -149,18 +151,23 @@ class _Form:
     moves: NDArray[np.bool_]  # (3, C) commands that an actuator follows
     mounted: NDArray[np.bool_]  # (3,) of the mounting
 
+    @property
+    def slips(self) -> bool:
+        """True if understeer is free."""
+        return self.start.bicycle.used and not self.start.bicycle.front_drive
+
     def pack(self) -> Array:
         """Returns the free values of the start (P,); positive ones as logarithms."""
         r, rows = self.start, self.moves.any(axis=1)
         return np.concatenate([
             [r.delay_s], r.gain[self.moves], r.offset[rows], np.log(r.lag_s[rows]),
-            np.log(r.limit), [r.bicycle.understeer] * r.bicycle.used, r.mounting[self.mounted],
+            np.log(r.limit), [r.bicycle.understeer] * self.slips, r.mounting[self.mounted],
         ])  # fmt: skip
 
     def unpack(self, theta: Array) -> TextbookResponse:
         """Returns the response of free values (P,)."""
         r, rows = self.start, self.moves.any(axis=1)
-        count = [1, int(self.moves.sum()), *[int(rows.sum())] * 2, 2, int(r.bicycle.used)]
+        count = [1, int(self.moves.sum()), *[int(rows.sum())] * 2, 2, int(self.slips)]
         delay, gains, offsets, lags, limits, understeer, place = np.split(theta, np.cumsum(count))
         gain, offset, lag, mounting = (a.copy() for a in (r.gain, r.offset, r.lag_s, r.mounting))
         gain[self.moves], offset[rows], mounting[self.mounted] = gains, offsets, place
@@ -175,8 +182,8 @@ def _structure(spec: RobotSpec) -> tuple[Array, BicycleGeometry] | None:
     half = PROBE * np.maximum(spec.command_high, -spec.command_low)
     try:
         alone, together = steady_twist(spec, np.diag(half)), steady_twist(spec, half)
-        if len(half) != 2 or alone[:, 2].any() or together[2] == 0.0:
-            return (alone / half[:, None]).T, STRAIGHT
+        if len(half) != 2 or np.abs(alone[:, 2]).max() > NOTHING or abs(together[2]) < NOTHING:
+            return np.where(np.abs(alone) > NOTHING, alone / half[:, None], 0.0).T, STRAIGHT
         speed = int(np.argmax(np.abs(alone[:, 0])))
         less = np.where(np.arange(2) == speed, half, 0.5 * half)
         forward, slower = alone[speed, 0], steady_twist(spec, less)
@@ -199,6 +206,8 @@ def _first_guess(drive: Drive, until_s: float, clock_offset: float, offsets: boo
     structure = _structure(drive.spec)
     book, bicycle = structure or (np.ones((3, len(drive.spec.command))), STRAIGHT)
     seen = windows(drive, Calibration(), 0.0, until_s, GUESS_S, SPACING_S)
+    moved = np.hypot(*(seen.end - seen.start)[:, :2].T)
+    seen = seen.rows(moved <= JUMP * np.percentile(moved, 90))
     span = (seen.end_t - seen.start_t)[:, None]
     twist = geometry.log(geometry.between(seen.start, seen.end)) / span
     change = (twists_before(drive, seen.end_t) - twists_before(drive, seen.start_t)) / span
@@ -270,7 +279,8 @@ def fit_yardstick(drive: Drive, until_s: float, clock_offset_s: float = 0.0) -> 
         def residuals(theta: Array) -> Array:
             error = _relative_ends(form.unpack(theta), course, twist) - measured
             error[..., 2] = HEADING_WEIGHT_M * geometry.wrap_angle(error[..., 2])
-            return np.asarray(np.clip(error / horizons[..., None], -100.0, 100.0).ravel())
+            rates = np.clip(error / horizons[..., None], -100.0, 100.0)
+            return np.asarray(np.nan_to_num(rates)).ravel()
 
         theta = form.pack()
         found = least_squares(

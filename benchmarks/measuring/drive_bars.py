@@ -1,0 +1,115 @@
+"""The drives of others that are measured, by which mapping they go in, and their bars."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from measuring.truths import Truth
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "recordings"
+RECORDINGS = Path(__file__).resolve().parents[3] / "shared" / "recordings"
+MOST_LINES = 25  # of a mapping, without comments
+COVERAGE = (0.9, 0.99)  # of the 95 % band
+
+
+@dataclass(frozen=True)
+class Bars:
+    """Greatest errors after 5 s; None where there is no bar."""
+
+    share: float | None = None  # of the path
+    of_yardstick: float | None = 1.0  # share of the fitted textbook's error
+    error_m: float | None = None
+    may_refuse: bool = False  # in one sentence
+
+
+@dataclass(frozen=True)
+class RealDrive:
+    """A drive, relative to the folder of the recordings."""
+
+    source: str
+    mapping: str  # in the folder of the examples
+    bars: Bars = field(default_factory=Bars)
+    truth: Truth = field(default_factory=Truth)
+
+
+# The calibrations that were published with the four drives of that robot: from least to greatest.
+WHEELS = {"left_m": (0.1632, 0.1734), "right_m": (0.1624, 0.1732), "base_m": (0.5625, 0.5949)}
+
+
+def camera(number: str) -> RealDrive:
+    """Returns a drive of the robot with ticks."""
+    source = f"differential_ticks/Camera_Odo_Data_{number}.txt"
+    bars = Bars(share=0.05, of_yardstick=None)
+    return RealDrive(source, "differential_ticks.yaml", bars, Truth(wheels=WHEELS))
+
+
+DRIVES = {
+    "xtark_random_drive_45s": RealDrive(
+        "xtark_ackermann/random_drive_45s", "xtark_folder.yaml", Bars(error_m=0.0215)
+    ),
+    "jetracer_free_driving_104s": RealDrive(
+        "jetracer_dart/free_driving_104s.csv", "jetracer_csv.yaml", Bars(0.14, 0.8)
+    ),
+    "jetracer_random_driving_slow_63s": RealDrive(
+        "jetracer_dart/random_driving_slow_63s.bag", "jetracer_bag.yaml", Bars(of_yardstick=0.8)
+    ),
+    "f110_ds1": RealDrive(
+        "f110_frictionmaps/DS1", "f110_folder.yaml", Bars(of_yardstick=None, may_refuse=True)
+    ),
+    "f110_ds3": RealDrive("f110_frictionmaps/DS3", "f110_folder.yaml"),
+    "f110_ds4": RealDrive("f110_frictionmaps/DS4", "f110_folder.yaml"),
+    "ticks_01": camera("01"),
+    "ticks_02": camera("02"),
+}
+SEGMENTED, SEGMENT_S, SEGMENT_ERROR_M = "xtark_random_drive_45s", 11.0, 0.026
+"""Of one drive each segment is left out in turn; bar of the mean error on them."""
+OWN = Bars(share=0.03, of_yardstick=None)
+OWN_BARS = {"tricycle": Bars(share=0.02, of_yardstick=None)}  # by the automatic order
+
+
+def missed_of(result: Mapping[str, Any]) -> list[str]:
+    """A sentence for each bar that is missed."""
+    missed = []
+    for name, told in result["drives"].items():
+        missed += missed_by(name, told, DRIVES[name].bars)
+        if told["lines_of_mapping"] > MOST_LINES:
+            missed.append(f"{name}: a mapping of {told['lines_of_mapping']} lines")
+    for name, told in result["left_out"].items():
+        if not told["error_m"] <= SEGMENT_ERROR_M:
+            error = f"off by {told['error_m']:.4f} m on segments left out"
+            missed.append(f"{name}: {error}, bar {SEGMENT_ERROR_M:g} m")
+    for name, told in result["own_robots"].items():
+        missed += missed_by(name, told, OWN_BARS.get(name, OWN))
+    return missed
+
+
+def missed_by(name: str, told: Mapping[str, Any], bars: Bars) -> Iterator[str]:
+    """Yields a sentence for each bar that one drive misses."""
+    if "crashed" in told:
+        yield f"{name}: crashed: {told['crashed']}"
+        return
+    if "refused" in told:
+        if not bars.may_refuse:
+            yield f"{name}: was refused: {told['refused']}"
+        return
+    share, textbook = told["share_of_path"], told["yardstick_share"]
+    kept = told["constant_twist_share"]
+    if bars.share is not None and not share <= bars.share:
+        yield f"{name}: off by {share:.3f} of the path, bar {bars.share:g}"
+    if bars.error_m is not None and not told["error_m"] <= bars.error_m:
+        yield f"{name}: off by {told['error_m']:.4f} m, bar {bars.error_m:g} m"
+    if bars.of_yardstick is not None and not share <= bars.of_yardstick * textbook:
+        bar = f"bar {bars.of_yardstick:g} of its {textbook:.3f}"
+        yield f"{name}: off by {share:.3f} of the path, the fitted textbook's {bar}"
+    if not share < kept:
+        yield f"{name}: off by {share:.3f} of the path, a robot that keeps its twist by {kept:.3f}"
+    if not COVERAGE[0] <= told["coverage_95"] <= COVERAGE[1]:
+        held = f"{told['coverage_95']:.1%} of the ends, bar {COVERAGE[0]:.0%} to {COVERAGE[1]:.0%}"
+        yield f"{name}: the 95 % band holds {held}"
+    for key, row in told["truths"].items():
+        if not row["near"]:
+            sigma = f" +- {row['sigma']:.4f}" if "sigma" in row else ""
+            yield f"{name}: {key} {row['found']:.4f}{sigma}, true {row['true']}"
