@@ -20,7 +20,7 @@ from nics_drl_bridge.identify.fit import (
 from nics_drl_bridge.identify.inputs import curve_of
 from nics_drl_bridge.identify.mounting import Mounting, mounted, mounting_of
 from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
-from nics_drl_bridge.identify.open_loop import OpenLoop
+from nics_drl_bridge.identify.open_loop import SPACING_S, OpenLoop, predict, windows
 from nics_drl_bridge.identify.refine import refined
 from nics_drl_bridge.identify.repair import check_axes, check_units, repaired
 from nics_drl_bridge.identify.signals import speed_index
@@ -33,6 +33,7 @@ from nics_drl_bridge.threads import one_blas_thread
 T = TypeVar("T")
 
 TRAIN_SHARE = 2.0 / 3.0
+WITHIN = 95.0  # percentage of predictions within the band
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,10 @@ class Findings:
     assumptions: tuple[str, ...] = ()  # sentences of `complete`
     unseen: Samples | None = None  # of the part that the fit did not see, of `judge`
     held_out: OpenLoop | None = None  # open-loop errors on that part, of `judge`
+    # of `judge`: radius of the 95 % band of predicted positions [m], and share of the held-out
+    # ends within it, by horizon [s]; empty if the drive is too short
+    bands: dict[float, float] = field(default_factory=dict)
+    coverage: dict[float, float] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  # all sentences, of `judge`
 
 
@@ -288,6 +293,7 @@ def judge(drive: Drive, findings: Findings) -> Findings:
     rest = samples.rows(samples.t > begin)
     unseen = rest if len(rest.t) >= verdict.MIN_ROWS else None
     held_out, trial = verdict.tried(model, calibration, whole)
+    bands = bands_of(drive, findings)
     calibration = replace(calibration, notes=_sentences(findings))
     judged = verdict.with_quality(model, linear, unseen, held_out, spec)
     return replace(
@@ -298,6 +304,8 @@ def judge(drive: Drive, findings: Findings) -> Findings:
         model=judged,
         unseen=unseen,
         held_out=held_out,
+        bands=bands,
+        coverage=coverage_of(whole, calibration, model, bands),
         notes=(
             *findings.repairs,
             *calibration.notes,
@@ -309,6 +317,50 @@ def judge(drive: Drive, findings: Findings) -> Findings:
             *findings.assumptions,
         ),
     )
+
+
+def bands_of(drive: Drive, findings: Findings) -> dict[float, float]:
+    """Returns the distances within which 95 % of predictions end that a fit did not see [m]."""
+    trials = findings.trials
+    errors = motions.chosen(list(trials)).errors if trials else _left_out(drive, findings)
+    told = ((h, each) for h, each in errors.items() if len(each) >= verdict.MIN_ROWS)
+    return {h: float(np.percentile(each, WITHIN)) for h, each in told}
+
+
+def _left_out(drive: Drive, findings: Findings) -> dict[float, Array]:
+    """Returns errors (W,) by horizon [s] on each part of the training part, by a model of the rest."""
+    training, stages = findings.training, STAGES[: STAGES.index(complete)]
+    pose = training.recording.pose
+    errors: dict[float, list[Array]] = {h: [] for h in motions.BANDS_S}
+    for block in np.array_split(np.arange(len(pose.t)), motions.FOLDS):
+        others = np.ones(len(pose.t), dtype=np.bool_)
+        others[block] = False
+        rest = training.part(replace(training.recording, pose=pose.rows(others)))
+        try:
+            found = run(stages, replace(rest, settings=replace(drive.settings, train_until_s=np.inf)))
+        except (FitError, RecordingError):
+            return {}
+        part = training.part(replace(training.recording, pose=pose.rows(block)))
+        for horizon, errors_at in errors.items():
+            chosen = windows(part, found.calibration, 0.0, part.duration_s, horizon, SPACING_S)
+            if len(chosen.start_t):
+                ends = predict(known(found.model, "the model", "prune"), found.calibration, part, chosen)
+                errors_at.append(np.hypot(*(ends - chosen.end)[:, :2].T))
+    return {h: np.concatenate(each) for h, each in errors.items() if each}
+
+
+def coverage_of(
+    drive: Drive, calibration: Calibration, model: TaylorModel, bands: dict[float, float]
+) -> dict[float, float]:
+    """Returns the share of held-out ends that lie within the bands, by horizon [s]."""
+    found, begin = {}, drive.settings.train_until_s
+    for horizon, radius in bands.items():
+        chosen = windows(drive, calibration, begin, drive.duration_s, horizon, SPACING_S)
+        if len(chosen.start_t):
+            ends = predict(model, calibration, drive, chosen)
+            far = np.hypot(*(ends - chosen.end)[:, :2].T)
+            found[horizon] = float((far <= radius).mean())
+    return found
 
 
 def _sentences(found: Findings) -> tuple[str, ...]:
@@ -367,6 +419,11 @@ class Identified:
         return self.drive.settings.train_until_s
 
     @property
+    def coverage(self) -> dict[float, float]:
+        """Share of the held-out ends within the 95 % band of predictions, by horizon [s]."""
+        return self.findings.coverage
+
+    @property
     def alpha(self) -> Alpha:
         """Threshold of the pruning; `auto` for the knee of the accuracy curve."""
         return self.drive.settings.alpha
@@ -377,7 +434,7 @@ class Identified:
 def identify(
     recording: Recording,
     spec: RobotSpec,
-    order: Order = ORDER,
+    order: Order = "auto",
     alpha: Alpha = ALPHA,
     train_until: float | None = None,
     assume: bool = False,

@@ -16,7 +16,7 @@ from nics_drl_bridge.identify.drive import Drive, TwistIntervals
 from nics_drl_bridge.identify.signals import followed, held
 from nics_drl_bridge.identify.statistics import standard_errors
 from nics_drl_bridge.recording.recording import Stream
-from nics_drl_bridge.robot.kinds import steady_twist
+from nics_drl_bridge.robot.kinds import has_textbook, steady_twist
 from nics_drl_bridge.robot.kinds import has_textbook, steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -50,6 +50,8 @@ def mounting_of(
     if not (has_textbook(spec) or spec.takes_cmd_vel):  # which way it faces is not known
         return None
     if spec.moves_sideways:
+        if not (spec.takes_cmd_vel or has_textbook(spec)):
+            return None
         return jackknifed(drive, twists, timing.offset, partial(_by_commands, timing))
     start, end = twists.on_clock(timing.offset)
     command = held(drive.recording.command, spec, start - timing.latency, end - timing.latency)
@@ -129,7 +131,10 @@ def _by_commands(
 ) -> Mounting | None:
     """Estimates an omnidirectional robot's mounting; None unless it moved along x, y and turned."""
     recording, spec = drive.recording, drive.spec
-    if spec.state:
+    if by_twist := any(v.twist for v in spec.state) and recording.state is None:
+        begin = twists.start + timing.offset - timing.latency
+        command = held(recording.command, spec, begin, begin + twists.end - twists.start)
+    elif spec.state:
         expected = clocks.expected_states(drive, twists, timing)
         command = _as_commands(expected, drive, timing.latency)
     else:

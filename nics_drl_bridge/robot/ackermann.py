@@ -5,12 +5,12 @@ Commanded are the rear axle's speed [m/s] and the steering angle [rad] of a virt
 
 from nics_drl_bridge.robot.drivetrain import steered, steering_angle
 from nics_drl_bridge.robot.kinds import Drawing, Pivot, RobotKind, Textbook, Wheel
-from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
 from nics_drl_bridge.robot.steering import Bicycle
-from nics_drl_bridge.robot.template import STEERED, STEERED_LAGS, STEERED_STATE, Template, names_of
+from nics_drl_bridge.robot.template import STEERED, STEERED_LAGS, Template, names_of
 
 LENGTHS = {"wheelbase": 1.3}
-TEMPLATE = Template((STEERED,), (), STEERED_STATE, STEERED_LAGS, LENGTHS)
+TEMPLATE = Template((STEERED,), POSE_RATES, (), STEERED_LAGS, LENGTHS)
 
 
 def kinematics(spec: RobotSpec) -> Textbook:

@@ -4,4 +4,4 @@ from nics_drl_bridge.robot.differential import LENGTHS, MOVES, drawing, kinemati
 from nics_drl_bridge.robot.kinds import RobotKind
 from nics_drl_bridge.robot.template import LAGS, WHEELS, Template
 
-KIND = RobotKind(kinematics, drawing, Template((WHEELS,), MOVES, (), LAGS, LENGTHS))
+KIND = RobotKind(kinematics, drawing, Template((WHEELS,), (), (), LAGS, LENGTHS))
