@@ -104,16 +104,20 @@ def test_a_wrong_field_or_topic_is_named(tmp_path, command, sentence):
     assert sentence in str(refused.value)
 
 
-def test_joints_are_found_by_name_whatever_their_order(tmp_path):
-    rows = [
-        (t, bags.joints(t, names, [0.0, 0.0], [t if name == "left" else -t for name in names]))
-        for k, t in enumerate(bags.times())
-        for names in [["left", "right"] if k % 2 else ["right", "left"]]
-    ]
+def test_joints_are_found_by_name_whatever_their_order_and_where_one_is_missing(tmp_path):
+    def joints(k, t):
+        names = [["left", "right"], ["right", "left"], ["left"]][k % 3]
+        velocity = [t if name == "left" else -t for name in names]
+        return bags.joints(t, names, [0.0] * len(names), velocity)
+
+    rows = [(t, joints(k, t)) for k, t in enumerate(bags.times())]
     bag = bags.write(tmp_path / "bag", {"/pose": bags.poses(), "/joints": rows})
     wheels = {"left": "/joints:velocity[left]", "right": "/joints:velocity[right]"}
     found = read(bag, command=wheels)
-    assert np.allclose(found.command.values, np.outer(bags.times(), [1.0, -1.0]))
+    t = np.array(bags.times())
+    held = np.where(np.arange(len(t)) % 3 == 2, t - bags.STEP_S, t)
+    assert np.allclose(found.command.values, np.stack([t, -held], axis=1))
+    assert "command.right: 100 of 300 rows have no value, and were left out." in found.repairs
 
 
 def test_transforms_are_poses_between_two_frames(tmp_path):
