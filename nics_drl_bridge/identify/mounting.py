@@ -16,6 +16,7 @@ from nics_drl_bridge.identify.signals import followed, held
 from nics_drl_bridge.identify.statistics import standard_errors
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.robot.kinds import has_textbook, steady_twist
+from nics_drl_bridge.robot.spec import RobotSpec
 
 TURN_SCALE_M = 0.2  # a yaw rate counts as the speed at this distance
 DISTINCT = 4.0  # the second direction of motion must exceed the noise by this factor
@@ -49,7 +50,7 @@ def mounting_of(
         return jackknifed(drive, twists, timing.offset, partial(_by_commands, timing))
     start, end = twists.on_clock(timing.offset)
     command = held(drive.recording.command, spec, start - timing.latency, end - timing.latency)
-    found = mounting_without_lateral_motion(twists, steady_twist(spec, command)[:, 0])
+    found = mounting_without_lateral_motion(twists, _response(spec, command)[:, 0])
     if found is None or speed is None or np.isnan(found.lever_sigma[0]):
         return found
     found.lever[1], found.lever_sigma[1] = lateral_lever(twists, found.rotation, speed)
@@ -124,7 +125,7 @@ def _by_commands(
     else:
         begin = twists.start + timing.offset - timing.latency
         command = held(recording.command, spec, begin, begin + twists.end - twists.start)
-    response = steady_twist(spec, command)  # of base_link, up to one factor
+    response = _response(spec, command)  # of base_link, up to one factor
     size = np.linalg.svd(response, compute_uv=False)
     if size[2] <= MIN_SECOND * size[0]:
         return None
@@ -138,6 +139,11 @@ def _by_commands(
         float(wrap_angle(rotation)), np.array([across[1], -across[0]]), float(spread[0, 1] / scale),
         np.full(2, float(spread[2, 0] / abs(gain[2, 2]))), True,
     )  # fmt: skip
+
+
+def _response(spec: RobotSpec, command: Array) -> Array:
+    """Returns twists (n, 3) up to factors; the third may be a steering angle."""
+    return spec.in_fields(command) if spec.takes_cmd_vel else steady_twist(spec, command)
 
 
 def _as_commands(states: Array, drive: Drive, latency: float) -> Array:

@@ -106,7 +106,7 @@ class DriveLog:
 
     def check(self) -> None:
         """Raises BridgeError if a state is not measured, or stamps run at another rate."""
-        measured = [v.name for v in self._spec.state if v.follows is None]
+        measured = [v.name for v in self._spec.state if v.must_be_measured]
         if self._joints:
             joint_streams("joint_states", self._joints, self._spec, self._roles, PLACE)
         elif measured or self._roles.state:

@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge import geometry
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError, PolicyError, nearest
 from nics_drl_bridge.generator import SimulatorModel
@@ -50,13 +51,13 @@ def _settled(task: Navigation, commands: Array, model: SimulatorModel | None) ->
     """
     if model is None or task.robot.takes_cmd_vel:
         return steady_twist(task.robot, commands)
-    kinematics = model.kinematics
-    state = np.zeros((len(commands), kinematics.state_size))
+    kinematics, start = model.kinematics, np.zeros((len(commands), 3))
+    state, moved = np.zeros((len(commands), kinematics.state_size)), start
     low, high = kinematics.low[: state.shape[1]], kinematics.high[: state.shape[1]]
     for _ in range(round(SETTLED_S / kinematics.dt)):
-        rates = kinematics.rates(np.concatenate([state, commands], axis=1))
-        state = np.clip(state + kinematics.dt * rates[:, 3:], low, high)
-    return np.asarray(kinematics.rates(np.concatenate([state, commands], axis=1))[:, :3])
+        moved, state = kinematics.step(start, state, commands)
+        state = np.clip(state, low, high)
+    return geometry.log(moved) / kinematics.dt
 
 
 def _actions(robot: RobotSpec, commands: Array) -> Array:

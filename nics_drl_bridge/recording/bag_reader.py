@@ -164,7 +164,7 @@ def state_of(joints: Joints, spec: RobotSpec, mapping: TopicRoles, place: str) -
             table = joints.position if (source.field or usual) == "position" else joints.velocity
             columns.append(source.scale * table[:, joints.names.index(source.joint)])
         return _complete(joints, np.stack(columns, axis=1), [s.joint for s in found], place)
-    if mapping.state or any(v.follows is None for v in spec.state):
+    if mapping.state or any(v.must_be_measured for v in spec.state):
         missing = next(name for name, source in sources.items() if source is None)
         fault = f"no joint is known for the state {missing!r}"
         listed = f"the joints of {joints.topic!r} are {', '.join(joints.names) or 'none'}"

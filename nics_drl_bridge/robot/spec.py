@@ -82,6 +82,11 @@ class StateVariable(Variable):
     # the component of the body twist that it is: taken from the pose where nothing measures it
     twist: PoseRate | None = None
 
+    @property
+    def must_be_measured(self) -> bool:
+        """True if neither a command nor the pose tells it."""
+        return self.follows is None and self.twist is None
+
 
 class CommandVariable(Variable):
     """A component of the command, with its field of `cmd_vel` if that drives the robot."""
@@ -260,12 +265,10 @@ class RobotSpec(Schema):
 
         Raises ConfigError if a command has no field, or a robot steers with an unknown wheelbase.
         """
-        command = np.asarray(command, dtype=np.float64)
-        twist = np.zeros((*command.shape[:-1], 3))
-        twist[..., self._cmd_vel_index] = command
+        values = self.in_fields(command)
         if self.takes_turn_rate:
-            return self.bicycle.twist(twist[..., 0], twist[..., 2])
-        return twist
+            return self.bicycle.twist(values[..., 0], values[..., 2])
+        return values
 
     def from_cmd_vel(self, twist: ArrayLike) -> NDArray[np.float64]:
         """Converts `cmd_vel` (..., 3) to a command (..., C); unused fields are dropped.
@@ -292,6 +295,13 @@ class RobotSpec(Schema):
     def require_cmd_vel(self) -> None:
         """Raises ConfigError if a node can't drive it, since `to_cmd_vel` fails."""
         self.to_cmd_vel(self.command_low)
+
+    def in_fields(self, command: ArrayLike) -> NDArray[np.float64]:
+        """Returns commands (..., C) by field of `cmd_vel` (..., 3), a steering angle as it is."""
+        command = np.asarray(command, dtype=np.float64)
+        values = np.zeros((*command.shape[:-1], 3))
+        values[..., self._cmd_vel_index] = command
+        return values
 
     def of_fields(self, values: ArrayLike) -> NDArray[np.float64]:
         """Returns of values (..., 3), by field of `cmd_vel`, those of the commands (..., C)."""

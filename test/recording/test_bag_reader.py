@@ -18,7 +18,7 @@ from nics_drl_bridge.recording.bag_reader import (
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import load_recording, save_recording
 from nics_drl_bridge.recording.topic_roles import TopicRoles
-from nics_drl_bridge.robot.spec import load_robot
+from nics_drl_bridge.robot.spec import load_robot, robot_from
 
 CAR, CART = load_robot("ackermann"), load_robot("differential")
 PLACES = np.array([bags.place_at(t) for t in bags.times()])
@@ -280,6 +280,11 @@ def test_messages_about_other_joints_are_left_out():
 
 def test_a_state_that_follows_its_command_need_not_be_measured():
     assert state_of(table((("elbow",), (0.0,), (1.0,))), CAR, roles(), "drive") is None
+
+
+def test_a_component_of_the_twist_is_told_by_the_pose():
+    husky = robot_from({"kind": "skid_steer", "footprint_radius": 0.6})
+    assert state_of(table((("elbow",), (0.0,), (1.0,))), husky, roles(), "drive") is None
 
 
 def test_a_state_that_must_be_measured_and_is_not_is_named():
