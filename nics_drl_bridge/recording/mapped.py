@@ -56,7 +56,8 @@ def read_mapped(source: Source, mapping: Mapping) -> Recording:
     shifted: Any = _from_zero(found, mapping.clock, reader)
     made = replace(made, **shifted, repairs=tuple(reader.notes))
     if fault := implausible_pose(made.pose.t, made.pose.values, radius=_radius(mapping)):
-        line = fault.line.replace("...", str(mapping.time and mapping.time.from_))
+        time = mapping.pose.time or mapping.time
+        line = fault.line.replace("...", str(time.columns[0] if time else "t"))
         said = f"{source.place}: pose: {fault.reason}; {fault.cause}"
         raise RecordingError(f"{said}: write `{line}` into the mapping, below `pose:`.")
     return made
@@ -88,13 +89,12 @@ def read_pose(reader: MappedReader, pose: PoseSource) -> Stream:
     """Reads poses, with their deviations where a covariance is mapped."""
     if pose.x is None:
         pose = _of_message(reader, pose)
-    lengths, angles = UNITS[pose.unit].factor, UNITS[pose.heading_unit].factor
     parts, factors = [], []
     for key, kinds in SI["pose"].items():
         value: Value | None = getattr(pose, key)
         if value is None:
             parts.append(_heading(reader, pose, pose.quaternion or ""))
-            factors.append(1.0)
+            factors.append(UNITS[pose.heading_unit].factor)
             continue
         unit = value.unit or (pose.heading_unit if key == "heading" else pose.unit)
         value = value.model_copy(update={"unit": unit})
@@ -102,16 +102,15 @@ def read_pose(reader: MappedReader, pose: PoseSource) -> Stream:
             fault = f"pose.{key}: is in {unit_of(value).si}, not in {kinds[0]}"
             raise ConfigError(f"{fault}; check its unit.")
         parts.append(reader.series(f"pose.{key}", value, pose, held=False))
-        factors.append(abs(value.scale))
+        factors.append(abs(unit_of(value).factor * value.scale))
     heading = parts[2]
     parts[2] = heading._replace(values=np.unwrap(heading.values))  # as it may be interpolated
     made = together("pose", parts, held=False)
     made.values[:, 2] = wrap_angle(made.values[:, 2])
     if pose.covariance is None:
         return made
-    si = np.array(factors) * (lengths, lengths, angles)
     sigma = _deviations(reader, pose, pose.covariance, made.t)
-    return made if sigma is None else replace(made, sigma=sigma * si)
+    return made if sigma is None else replace(made, sigma=sigma * np.array(factors))
 
 
 def _heading(reader: MappedReader, pose: PoseSource, given: str | Sequence[Reference]) -> Series:

@@ -11,10 +11,13 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.recording.bag_file import opened
 from nics_drl_bridge.recording.mapping import Mapping
 from nics_drl_bridge.recording.readers import read_recording
+from nics_drl_bridge.recording.sources import open_source
+from nics_drl_bridge.recording.survey import first_mapping, survey
 from nics_drl_bridge.robot.spec import load_robot
 
 FOREIGN = "my_car_msgs/msg/Drive"
@@ -104,16 +107,20 @@ def test_a_wrong_field_or_topic_is_named(tmp_path, command, sentence):
     assert sentence in str(refused.value)
 
 
-def test_joints_are_found_by_name_whatever_their_order(tmp_path):
-    rows = [
-        (t, bags.joints(t, names, [0.0, 0.0], [t if name == "left" else -t for name in names]))
-        for k, t in enumerate(bags.times())
-        for names in [["left", "right"] if k % 2 else ["right", "left"]]
-    ]
+def test_joints_are_found_by_name_whatever_their_order_and_where_one_is_missing(tmp_path):
+    def joints(k, t):
+        names = [["left", "right"], ["right", "left"], ["left"]][k % 3]
+        velocity = [t if name == "left" else -t for name in names]
+        return bags.joints(t, names, [0.0] * len(names), velocity)
+
+    rows = [(t, joints(k, t)) for k, t in enumerate(bags.times())]
     bag = bags.write(tmp_path / "bag", {"/pose": bags.poses(), "/joints": rows})
     wheels = {"left": "/joints:velocity[left]", "right": "/joints:velocity[right]"}
     found = read(bag, command=wheels)
-    assert np.allclose(found.command.values, np.outer(bags.times(), [1.0, -1.0]))
+    t = np.array(bags.times())
+    held = np.where(np.arange(len(t)) % 3 == 2, t - bags.STEP_S, t)
+    assert np.allclose(found.command.values, np.stack([t, -held], axis=1))
+    assert "command.right: 100 of 300 rows have no value, and were left out." in found.repairs
 
 
 def test_transforms_are_poses_between_two_frames(tmp_path):
@@ -150,3 +157,12 @@ def test_the_covariance_of_a_message_gives_deviations(tmp_path):
         message.pose.covariance[[0, 7, 35]] = 0.01, 0.04, 0.09
     found = read(bags.write(tmp_path / "some", topics), command=command)
     assert np.allclose(found.pose.sigma, [0.1, 0.2, 0.3])
+
+
+def test_a_bag_is_surveyed_to_a_first_mapping(tmp_path):
+    with open_source(foreign_bag(tmp_path / "bag")) as source:
+        tables = {table.name: table for table in survey(source)}
+        guess = parse_yaml(first_mapping(list(tables.values())), "guess")
+    assert [column.name for column in tables["/drive"].columns][-2:] == ["armed", "mode"]
+    assert any("50 Hz" in line for line in tables["/pose"].regularity)
+    assert guess["pose"] == "/pose"

@@ -114,7 +114,7 @@ def test_the_rate_of_a_counter_holds_until_the_stamp_that_shows_it(tmp_path, col
 
 
 def test_an_absolute_encoder_is_an_angle_about_zero(tmp_path, columns):
-    angle = 0.3 * np.sin(columns["t"])
+    angle = 0.3 * np.sin(columns["t"] - 0.5)  # begins below zero, near the end of its range
     counts = np.round(angle / (2.0 * np.pi) * 8192) % 8192
     value = {"from": "n", "ticks_per_turn": 8192, "wrap": 8192, "differentiate": False}
     found = read(write(tmp_path / "log.csv", columns | {"n": counts}), command={"steering": value})
