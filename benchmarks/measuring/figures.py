@@ -32,6 +32,12 @@ README = told(
         "{mean_position_error_m|.3f} m over a path of {mean_path_m|.2f} m",
     ),
     (
+        "real_drives",
+        "real drives of others, each by one mapping file, 5 s open-loop on the unseen last third",
+        "off by {min drives.*.share_of_path x100|.0f} to {max drives.*.share_of_path|.0%} of the "
+        "path (`docs/kinematics.md`)",
+    ),
+    (
         "generate_from_mujoco",
         "robots in MuJoCo, real wheels on contact, 5 s open-loop on unseen drives",
         "off by {min robots.*.position_error_over_path x100|.1f} to "
@@ -225,6 +231,29 @@ MUJOCO = Table(
         for robot, title in ROBOTS.items()
     ),
 )  # fmt: skip
+ERRORS = ("{%s.error_m|.3f} m", "{%s.share_of_path|.1%%}", "{%s.yardstick_share|.1%%}",
+          "{%s.constant_twist_share|.1%%}", "{%s.coverage_95|.0%%}")  # fmt: skip
+REAL_DRIVES = Table(
+    ("drive", "error", "of the path", "fitted textbook", "twist kept", "95 % band holds"),
+    tuple(
+        ("real_drives", title, *(each % place for each in ERRORS))
+        for title, place in (
+            ("XTARK car, 45 s", "drives.xtark_random_drive_45s"),
+            ("JetRacer by throttle, up to 5 m/s", "drives.jetracer_free_driving_104s"),
+            ("JetRacer by throttle, slow", "drives.jetracer_random_driving_slow_63s"),
+            ("F1/10, slippery floor, DS1", "drives.f110_ds1"),
+            ("F1/10, slippery floor, DS3", "drives.f110_ds3"),
+            ("F1/10, slippery floor, DS4", "drives.f110_ds4"),
+            ("differential, ticks, 1", "drives.ticks_01"),
+            ("differential, ticks, 2", "drives.ticks_02"),
+            ("simulated skid-steer", "own_robots.skid_steer"),
+            ("simulated car by throttle", "own_robots.throttle_car"),
+            ("simulated tricycle", "own_robots.tricycle"),
+            ("simulated omnidirectional", "own_robots.omni"),
+            ("simulated differential, ticks", "own_robots.ticks"),
+        )
+    ),
+)  # fmt: skip
 PAPER_STEPS = {
     "ackermann": ("3.1e-9", "9.7e-6", "9.9e-5", "", "9.0e4", ""),
     "differential": ("2.6e-7", "5.1e-9", "1.6e-16", "", "5.7e4", ""),
@@ -264,4 +293,5 @@ TABLES: Mapping[str, Table] = {
     "baselines": BASELINES,
     "training": TRAINING,
     "mujoco": MUJOCO,
+    "real_drives": REAL_DRIVES,
 }

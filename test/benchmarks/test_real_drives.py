@@ -61,6 +61,14 @@ def test_a_throttle_car_stands_below_its_dead_zone(foreign, share, moves):
     assert (way > 0.1) == moves
 
 
+def test_a_command_acts_after_its_latency(foreign):
+    robot = replace(foreign.ROBOTS["omni"], latency_s=0.3)
+    drive = foreign.foreign_drive(robot, 1, 5.0)
+    told = drive.command.t[np.abs(drive.command.values).max(axis=1) > 0.2][0]
+    moved = np.hypot(*(drive.pose.values - drive.pose.values[0])[:, :2].T) > 0.005
+    assert 0.3 < drive.pose.t[moved][0] - told < 0.5
+
+
 def test_a_skid_steer_turns_less_than_it_is_told(foreign):
     told = {"forward_command": (0.5, 0.5001), "turn_command": (1.0, 1.0001)}
     drive = foreign.foreign_drive(replace(foreign.ROBOTS["skid_steer"], commands=told), 3, 20.0)
