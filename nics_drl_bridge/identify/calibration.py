@@ -115,7 +115,8 @@ def states_at(drive: Drive, calibration: Calibration, grid: Array) -> Array:
     recording = drive.recording
     if recording.state is not None:
         columns = recording.state.values.T
-        return np.stack([np.interp(grid, recording.state.t, c) for c in columns], axis=1)
+        states = [np.interp(grid, recording.state.t, c) for c in columns]
+        return np.stack(states, axis=-1) if states else np.zeros((*grid.shape, 0))
     lags = np.array([r.lag_s for r in calibration.responses])
     gains = np.array([r.gain for r in calibration.responses])
     step = float(grid[1] - grid[0])

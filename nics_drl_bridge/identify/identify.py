@@ -261,12 +261,14 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
     samples = known(findings.samples, "the training part", "fit")
     problem = motions.problem_of(findings.training, findings.calibration, samples)
     calibration = findings.calibration
-    given = motions.inputs_of(findings.training, calibration)
+    given, given_curves = motions.inputs_of(findings.training, calibration), calibration.inputs
     found = motions.refined(problem, linear, drive.spec, given)
     calibration = replace(
         calibration, command_latency_s=float(found.values[0]),
-        inputs=motions.curves_at(calibration.inputs, found.values[1:]),
+        inputs=motions.curves_at(calibration.inputs, found.values[1:1 + 3 * len(given_curves)]),
     )  # fmt: skip
+    if problem.mounted:
+        calibration = motions.remounted(calibration, found)
     errors = motions.standard_errors(found)
     return replace(
         findings, calibration=calibration, model=replace(found.model, std_errors=errors),

@@ -39,13 +39,16 @@ WORTH = 0.95  # a higher order is worth its terms if it takes the error to this 
 FOLDS = 3
 DELAY_ORDER, DELAY_STEP_S, LONGEST_S = 2, 0.02, 0.4  # of the search for a delay
 DELAY_SCALE_S, CURVE_SCALE = 0.05, 0.1  # steps of their refinement
+LEVER_SCALE_M, TURN_SCALE = 0.05, 0.1
 CV_SPACING_S, CV_EVALUATIONS = 0.5, 25
 HORIZON_S = 5.0
 
 
 def by_motion(spec: RobotSpec, recording: Recording) -> bool:
-    """True if a state that is a part of the body twist was not measured."""
-    return recording.state is None and any(v.twist for v in spec.state)
+    """True if a state that is a part of the body twist was not measured, or wheels are inputs."""
+    if recording.state is not None:
+        return False
+    return any(v.twist for v in spec.state) or not (spec.state or spec.takes_cmd_vel)
 
 
 def half_width(drive: Drive) -> float:
@@ -80,7 +83,8 @@ def with_motion(drive: Drive, calibration: Calibration, grid: Array, width: floa
         twist[:, POSE_RATES.index(v.twist)] if v.twist else _following(v, drive, calibration, grid)
         for v in spec.state
     ]
-    state = Stream(grid, np.stack(columns, axis=1), recording.command.clock)
+    values = np.array(columns).reshape(len(columns), len(grid)).T
+    state = Stream(grid, values, recording.command.clock)
     return drive.part(replace(recording, state=state))
 
 
@@ -129,7 +133,8 @@ def library(powers: Powers, spec: RobotSpec) -> Mask:
         for d, name in enumerate(spec.dof_names):
             aside = name in ("vy", "wz") or name.removeprefix("d_") in odd
             allowed[d] &= (reversed_ == aside) | (order <= 1)
-    allowed[:3] &= (powers[:, len(spec.state) :] == 0).all(axis=1)
+    if spec.state:  # commands act through the state
+        allowed[:3] &= (powers[:, len(spec.state) :] == 0).all(axis=1)
     for i, variable in enumerate(spec.state):
         alone = (order == 1) & (powers[:, i] == 1)
         if variable.twist:
@@ -187,10 +192,11 @@ def problem_of(drive: Drive, calibration: Calibration, samples: Samples) -> shoo
 
     def commands(values: Array) -> Array:
         begin = t - float(values[0])
-        bent = replace(command, values=curved(command.values, spec, curves_at(curves, values[1:])))
+        shapes = values[1 : 1 + 3 * len(curves)]
+        bent = replace(command, values=curved(command.values, spec, curves_at(curves, shapes)))
         return held(bent, spec, begin, begin + dt)
 
-    return shooting.Shooting(samples, commands)
+    return shooting.Shooting(samples, commands, mounted=not spec.state)
 
 
 def inputs_of(drive: Drive, calibration: Calibration) -> shooting.Inputs:
@@ -205,7 +211,18 @@ def inputs_of(drive: Drive, calibration: Calibration) -> shooting.Inputs:
         scale += [CURVE_SCALE * size] * 3
         low += [0.0, 1.5 * curve.least, 0.5 * curve.most]
         high += [0.5 * size if curve.dead else 0.0, 0.5 * curve.least, 1.5 * curve.most]
+    if not drive.spec.state:  # what is left of the mounting
+        start += [0.0, 0.0, 0.0]
+        scale += [LEVER_SCALE_M, LEVER_SCALE_M, TURN_SCALE]
+        reach = 2.0 * drive.spec.footprint_radius
+        low += [-reach, -reach if sided(drive.spec) else 0.0, -np.pi]
+        high += [reach, reach if sided(drive.spec) else 0.0, np.pi]
     return shooting.Inputs(*map(np.array, (start, scale, low, high)))
+
+
+def sided(spec: RobotSpec) -> bool:
+    """True if a lever arm along y can be told from unequal wheels: not if one turns the robot."""
+    return spec.moves_sideways or mirrored(spec) is not None
 
 
 def curves_at(curves: tuple[InputCurve, ...], values: Array) -> tuple[InputCurve, ...]:
@@ -233,7 +250,7 @@ def likely_delay(drive: Drive, calibration: Calibration, samples: Samples) -> fl
     one_clock = drive.recording.pose.clock == drive.recording.command.clock
     tries = np.arange(0.0, LONGEST_S, DELAY_STEP_S) - (0.0 if one_clock else LONGEST_S / 2.0)
     states, left = len(drive.spec.state), []
-    free = [3 + i for i, v in enumerate(drive.spec.state) if v.twist]
+    free = [3 + i for i, v in enumerate(drive.spec.state) if v.twist] or [0, 2]
     for delay in tries:
         command = problem.commands(np.append(delay, inputs.start[1:]))
         x = np.concatenate([samples.x[:, :states], command], axis=1)
@@ -261,6 +278,8 @@ def by_definition(model: TaylorModel, spec: RobotSpec) -> tuple[TaylorModel, Mas
     """Sets the rows of the twist that are states; returns the mask (D, K) of what is defined."""
     coefficients, order = model.coefficients.copy(), model.powers.sum(axis=1)
     defined = np.zeros(coefficients.shape, dtype=np.bool_)
+    if not spec.moves_sideways:  # what is left of lateral motion is noise, unless it is a state
+        coefficients[1] = 0.0
     for i, variable in enumerate(spec.state):
         if variable.twist:
             d = POSE_RATES.index(variable.twist)
@@ -315,3 +334,15 @@ def standard_errors(found: shooting.Predictive) -> Array:
     errors = np.full(found.free.shape, np.nan)
     errors[found.free] = clustered_errors(found.jacobian, found.residual, cluster)
     return errors
+
+
+def remounted(calibration: Calibration, found: shooting.Predictive) -> Calibration:
+    """Adds the mounting that predictions show to what the calibration has."""
+    mounting = geometry.compose(calibration.mounting, found.values[-3:])
+    x, y, heading = map(float, mounting)
+    names = ("lever_arm_x_m", "lever_arm_y_m", "rotation_rad")
+    sigma = dict(zip(names, map(float, found.value_errors[-3:]), strict=True))
+    return replace(
+        calibration, rotation_rad=-heading, lever_arm_m=(x, y),
+        uncertainty={**calibration.uncertainty, **sigma},
+    )  # fmt: skip

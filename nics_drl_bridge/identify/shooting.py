@@ -16,6 +16,7 @@ from scipy.optimize import least_squares
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.kernels import Shot, shoot, tangent
+from nics_drl_bridge.identify.statistics import clustered_errors
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.kernels import term_arrays
@@ -50,6 +51,7 @@ class Shooting:
 
     samples: Samples
     commands: Commands
+    mounted: bool = False  # True if the last three values are the pose of what `q` is, in the base
     horizons: tuple[float, ...] = HORIZONS_S
     spacing_s: float = SPACING_S
 
@@ -97,7 +99,7 @@ class Shooting:
         )  # fmt: skip
         scratch = tangent(state.shape[1], command.shape[1], len(dofs), len(moving))
         shoot(shot, terms, moving, model.dt, scratch)
-        return shot.end, shot.slope
+        return _seen_from(values[-3:], shot) if self.mounted else (shot.end, shot.slope)
 
     def errors(
         self, model: TaylorModel, values: Array, horizon: float, inside: Mask | None = None
@@ -107,6 +109,18 @@ class Shooting:
         error = self.predict(model, values, first, steps)[0] - self.moved(first, steps)
         error[:, 2] = geometry.wrap_angle(error[:, 2])
         return error, self.paths(first, steps)
+
+
+def _seen_from(mounting: Array, shot: Shot) -> tuple[Array, Array]:
+    """Returns ends (W, 3) and their derivatives of a body at a pose (3,) in the base."""
+    end = geometry.between(mounting, geometry.compose(shot.end, mounting))
+    end[:, 2] = shot.end[:, 2]
+    arm = geometry.rotate(np.broadcast_to(mounting[:2], (len(end), 2)), shot.end[:, 2])
+    across = np.stack([-arm[:, 1], arm[:, 0]], axis=1)[:, :, None]
+    moved = shot.slope[:, :2] + across * shot.slope[:, 2:]
+    c, s = np.cos(mounting[2]), np.sin(mounting[2])
+    along, aside = moved[:, 0], moved[:, 1]
+    return end, np.stack([c * along + s * aside, c * aside - s * along, shot.slope[:, 2]], axis=1)
 
 
 @dataclass(frozen=True)
@@ -120,6 +134,7 @@ class Predictive:
     residual: Array  # (n,)
     free: Mask  # (D, K)
     starts: Array  # (n,) start of the window of each residual [s]
+    value_errors: Array  # (I,) standard errors of the values
 
 
 def fitted(
@@ -178,7 +193,12 @@ def fitted(
     rest, slope = shot(found.x, True)
     starts = [np.repeat(problem.samples.t[begin], 3) for begin, *_ in chosen]
     error = float(np.sqrt(np.mean(rest**2)))
-    return Predictive(best, late, error, slope, rest, free, np.concatenate(starts))
+    span = np.floor(np.concatenate(starts) / max(problem.horizons)).astype(np.intp)
+    late_slope = jacobian(found.x)[: len(rest), :count] / inputs.scale
+    value_errors = clustered_errors(late_slope, rest, span)
+    return Predictive(
+        best, late, error, slope, rest, free, np.concatenate(starts), value_errors
+    )  # fmt: skip
 
 
 def scale_of(samples: Samples, model: TaylorModel) -> Array:
