@@ -135,6 +135,8 @@ def library(powers: Powers, spec: RobotSpec) -> Mask:
             allowed[d] &= (reversed_ == aside) | (order <= 1)
     if spec.state:  # commands act through the state
         allowed[:3] &= (powers[:, len(spec.state) :] == 0).all(axis=1)
+    else:  # who stands still stands still
+        allowed &= order > 0
     for i, variable in enumerate(spec.state):
         alone = (order == 1) & (powers[:, i] == 1)
         if variable.twist:
