@@ -30,7 +30,7 @@ HEADING_WEIGHT_M = 0.3  # an error of 1 rad counts as so many metres
 LOSS_SCALE = 0.2  # of the soft L1 loss [m/s]
 MOST_EVALUATIONS, TOLERANCE = 60, 1e-4
 GUESS_S = 0.5  # gains and lags are first guessed from motions over this time,
-JUMP = 3.0  # but not from those that are so many times the 90th percentile: the localiser jumped
+JUMP = 3.0  # speeds beyond so many times the 90th percentile are jumps of the localiser
 DELAYS_S = np.arange(-0.1, 0.51, 0.05)  # at each of these delays between streams of one clock
 FAR_DELAYS_S = np.arange(-1.0, 1.01, 0.05)  # and of these between streams of two
 LAG_S, LAG_RANGE_S = 0.15, (0.005, 5.0)
@@ -94,6 +94,22 @@ def twists_before(drive: Drive, at: Array) -> Array:
             heading = pose[b - 1, 2] + place[2] if degree == 2 else pose[a:b, 2].mean()
             twist[w] = [*geometry.rotate(rate[:2], -heading), rate[2]]
     return twist
+
+
+def _without_jumps(
+    drive: Drive, until_s: float, horizon: float, spacing: float
+) -> tuple[Windows, Array]:
+    """Selects windows in which the localiser did not jump, and twists (W, 3) at their starts."""
+    chosen = windows(drive, Calibration(), 0.0, until_s, horizon, spacing)
+    if not len(chosen.start_t):
+        return chosen, np.zeros((0, 3))
+    brief = windows(drive, Calibration(), 0.0, until_s, GUESS_S, SPACING_S)
+    twist = twists_before(drive, chosen.start_t)
+    fastest = JUMP * np.percentile(brief.path, 90) / GUESS_S
+    moved = np.hypot(*(chosen.end - chosen.start)[:, :2].T) / horizon
+    calm = np.maximum(moved, np.hypot(twist[:, 0], twist[:, 1])) <= fastest
+    calm |= calm.mean() < 0.5
+    return chosen.rows(calm), twist[calm]
 
 
 class _Course(NamedTuple):
@@ -205,12 +221,10 @@ def _first_guess(drive: Drive, until_s: float, clock_offset: float, offsets: boo
     """Fits gains, lags and maybe offsets to motions over `GUESS_S` at the best delay, linearly."""
     structure = _structure(drive.spec)
     book, bicycle = structure or (np.ones((3, len(drive.spec.command))), STRAIGHT)
-    seen = windows(drive, Calibration(), 0.0, until_s, GUESS_S, SPACING_S)
-    moved = np.hypot(*(seen.end - seen.start)[:, :2].T)
-    seen = seen.rows(moved <= JUMP * np.percentile(moved, 90))
+    seen, before = _without_jumps(drive, until_s, GUESS_S, SPACING_S)
     span = (seen.end_t - seen.start_t)[:, None]
     twist = geometry.log(geometry.between(seen.start, seen.end)) / span
-    change = (twists_before(drive, seen.end_t) - twists_before(drive, seen.start_t)) / span
+    change = (twists_before(drive, seen.end_t) - before) / span
     command = drive.recording.command
     tried = []
     for delay in DELAYS_S if command.clock == drive.recording.pose.clock else FAR_DELAYS_S:
@@ -264,13 +278,13 @@ def fit_yardstick(drive: Drive, until_s: float, clock_offset_s: float = 0.0) -> 
     To open-loop errors after `HORIZONS_S`. Raises RecordingError if the part is too short for them.
     """
     spacing = max(SPACING_S, (until_s - HORIZONS_S[-1]) / MOST_WINDOWS)
-    chosen = windows(drive, Calibration(), 0.0, until_s, HORIZONS_S[-1], spacing)
+    chosen, twist = _without_jumps(drive, until_s, HORIZONS_S[-1], spacing)
     if not len(chosen.start_t):
         fault = f"the first {until_s:.1f} s hold no window of {HORIZONS_S[-1]:g} s"
         raise RecordingError(f"{drive.recording.source}: {fault}; record a longer drive.")
     horizons = np.tile(HORIZONS_S, (len(chosen.start_t), 1))
     course = _course(drive, chosen.start_t + clock_offset_s, horizons)
-    twist, at = twists_before(drive, chosen.start_t), chosen.start_t[:, None] + horizons
+    at = chosen.start_t[:, None] + horizons
     pose = unwrapped(drive.dated.values)
     ends = np.stack([np.interp(at, drive.dated.t, column) for column in pose.T], axis=-1)
     measured = geometry.between(chosen.start[:, None], ends)
