@@ -28,7 +28,7 @@ RIGHT_X, RIGHT_Y, RIGHT_X2, RIGHT_Y2, LEFT_X, LEFT_Y, LEFT_X2, LEFT_Y2 = (
     np.uintp(k * LANES) for k in range(11, 19)
 )
 """The two corners of the hull that can be the right silhouette, and the left one."""
-DISTANCE, BEARING, BLEND, SHARE, TOUCHED = (np.uintp(k * LANES) for k in range(5))
+DISTANCE, BEARING, BLEND, SHARE = (np.uintp(k * LANES) for k in range(4))
 """The latter two are those of the farther row and of the next point."""
 KIND, CELL, HULL, CLIMBS, START, PLACE, START2, PLACE2 = (np.uintp(k * LANES) for k in range(8))
 """Shape, cell, first corner of the hull; begin and place of the row and of the farther one."""
@@ -47,7 +47,7 @@ class ScanLanes(NamedTuple):
 def scan_lanes() -> ScanLanes:
     """Allocates the memory that one thread needs to scan."""
     return ScanLanes(
-        np.zeros(19 * LANES), np.zeros(5 * LANES, np.float32), np.zeros(15 * LANES, np.int32)
+        np.zeros(19 * LANES), np.zeros(4 * LANES, np.float32), np.zeros(15 * LANES, np.int32)
     )
 
 
@@ -126,7 +126,6 @@ def look_up(found, ranges, lidar, lanes):  # type: ignore[no-untyped-def]
         if lanes.whole[np.uintp(j) + CLIMBS] < 0:
             climb(np.uintp(j), lidar, lanes)
     aims(padded, count, np.int32(table.shift), lanes)
-    touch(found, table.rows, lanes)
     for j in range(found):
         fuse(flat, np.uintp(j), lidar, lanes)
     for j in range(found):
@@ -232,19 +231,6 @@ def aims(padded, count, shift, lanes):  # type: ignore[no-untyped-def]
     """Finds the beams and the points of each body."""
     for j in range(padded):
         aim(np.uintp(j), 0.0, count, shift, lanes)
-
-
-@kernel
-def touch(found, rows, lanes):  # type: ignore[no-untyped-def]
-    """Loads the begin of both rows of each body into the cache, where nothing waits for it."""
-    zero = np.int32(0)
-    for j in range(found):
-        k = np.uintp(j)
-        one = np.uintp(max(lanes.whole[k + ONE], zero))
-        other = np.uintp(max(lanes.whole[k + OTHER], zero))
-        lanes.single[k + TOUCHED] = (
-            rows[one] + rows[one + np.uintp(BLOCK)] + rows[other] + rows[other + np.uintp(BLOCK)]
-        )
 
 
 @kernel(contracts=True, inline=True)
