@@ -53,7 +53,7 @@ WORLD = {
 DEPTH, PATIENCE_S = 10, 60.0
 CONTROLS = {"slow": "speed: a step rests", "standing": "the commands: the robot does not drive"}
 REST_S, DRIVEN_M = 0.003, 0.1
-RATIOS = {"rclpy": 0.6, "standing": 0.45}
+RATIOS = {"rclpy": 0.7, "standing": 0.5}
 """The least, by the executor of the bare pair."""
 EXECUTORS = {"rclpy": SingleThreadedExecutor, "standing": StandingExecutor}
 Exchange = Callable[[], Callable[[], object] | None]

@@ -12,7 +12,7 @@ import time
 from typing import Any
 
 import numpy as np
-from measuring.rates import interleaved
+from measuring.rates import interleaved, medians
 from measuring.scenes import SCENES, SPEC, Batch, batches, errors, nearest_row, scan
 from measuring.verdict import answer, parser_of
 
@@ -82,7 +82,7 @@ def measure(
     plain = [scan(table, "exact", nearest_row(batch, table)) for batch in drawn]
     plain_rmse, plain_area = errors(plain, exact)
     times = timed(table, drawn, repeats, control)
-    seconds, batch = undisturbed(times), len(drawn[0].lidar)
+    seconds, batch = medians(times), len(drawn[0].lidar)
     figures = {
         "exact_scans_per_s": batch / seconds["exact"],
         "baked_scans_per_s": batch / seconds["baked"],
@@ -91,13 +91,8 @@ def measure(
         "nearest_row_rmse_m": plain_rmse,
         "nearest_row_area_rmse_m2": plain_area,
     }
-    writes = batch / seconds["write"]
+    writes = [batch / each for each in times["write"]]
     return figures, {"bytes": table.memory, "bake_s": bake_s, "writes": writes}
-
-
-def undisturbed(times: dict[str, list[float]]) -> dict[str, float]:
-    """Times of each call while nothing else slowed it down: the tenth percentile [s]."""
-    return {name: float(np.percentile(each, 10.0)) for name, each in times.items()}
 
 
 def judge(scene: dict[str, Any], write_limit: float) -> None:
@@ -135,7 +130,9 @@ def run(scans: int, repeats: int, control: str | None) -> dict[str, Any]:
     """All figures, see the head of this file."""
     bake(SPEC, SCENES["mixture"], Density(distances=3, rotations=1))  # compiled before it is timed
     found = {name: measure(name, scans, repeats, control) for name in SCENES}
-    write_limit = float(np.median([about["writes"] for _, about in found.values()]))
+    write_limit = float(
+        np.median([rate for _, about in found.values() for rate in about["writes"]])
+    )
     scenes: dict[str, dict[str, Any]] = {
         name: dict(figures) for name, (figures, _) in found.items()
     }
@@ -178,7 +175,7 @@ def main() -> None:
     """Prints a table, or one JSON object."""
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--scans", type=int, default=4096, help="scans of each scene")
-    parser.add_argument("--repeats", type=int, default=400, help="timed batches of each scene")
+    parser.add_argument("--repeats", type=int, default=200, help="timed batches of each scene")
     given = parser.parse_args()
     result = run(given.scans, given.repeats, given.control)
     answer(result, missed_of(result), table_of(result), given.json)
