@@ -1,12 +1,10 @@
 """Backends over ROS 2: one robot or several in lock-step with a simulator behind topics."""
 
-import ctypes
 import math
-import os
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from functools import partial
 from typing import Any, NamedTuple, TypeVar, cast
 
@@ -32,7 +30,6 @@ from nics_drl_bridge.sim.world import World
 
 T = TypeVar("T")
 SCAN, ODOM, TRUTH = "scan", "odom", "ground_truth"
-CORE_NOW = getattr(ctypes.PyDLL(None), "sched_getcpu", None)  # None unless on Linux with glibc
 AGAIN_S = 0.05  # data that do not arrive within this time are requested again [s]
 ADVICE = "start `simulator_node` with mode:=lockstep in the same ROS_DOMAIN_ID and namespace."
 
@@ -51,10 +48,8 @@ class _Mailbox:
         self._lock, self._complete = threading.Lock(), threading.Event()
         self._awaited_ns, self._worked_ns = -1, -1
         self._failure: Exception | None = None
-        self._executor, self._pinned = 0, (0, -1)  # its thread; that thread and its core
 
     def put(self, topic: str, message: bytes) -> object:
-        self._executor = threading.get_native_id()
         with self._lock:
             try:
                 stamp_ns = _read(topic, wire.stamp_of, message)
@@ -72,23 +67,6 @@ class _Mailbox:
             self._worked_ns = self._awaited_ns
             self._work(*self._mail[ODOM])
 
-    def _wait_on_one_core(self, timeout_s: float) -> None:
-        # Neither thread is woken on a core that sleeps: 1.07 to 1.15 times as many steps a second.
-        cores = os.sched_getaffinity(0) if CORE_NOW and self._executor else set()
-        if len(cores) < 2 or CORE_NOW is None:
-            self._complete.wait(timeout_s)
-            return
-        try:
-            with suppress(OSError):  # the thread has ended, or the system decides about cores
-                if self._pinned != (place := (self._executor, CORE_NOW())):
-                    os.sched_setaffinity(self._executor, {place[1]})
-                    self._pinned = place
-                os.sched_setaffinity(0, {place[1]})
-            self._complete.wait(timeout_s)
-        finally:
-            with suppress(OSError):
-                os.sched_setaffinity(0, cores)
-
     def _late(self, stamp_ns: int) -> str | None:
         return next((topic for topic, mail in self._mail.items() if mail.stamp_ns < stamp_ns), None)
 
@@ -102,7 +80,7 @@ class _Mailbox:
             self._work_in()
             late = self._late(stamp_ns)
         if late is not None:
-            self._wait_on_one_core(timeout_s)
+            self._complete.wait(timeout_s)
         with self._lock:
             self._awaited_ns = -1
             if self._failure is not None:
