@@ -57,7 +57,7 @@ class _Mailbox:
                 self._work_in()
             except Exception as error:  # noqa: BLE001  (it is raised in the caller's thread)
                 self._failure = error
-            if self._awaited_ns >= 0 and (self._failure or self._late(self._awaited_ns) is None):
+            if self._awaited_ns >= 0 and (self._failure or not self._late(self._awaited_ns)):
                 self._complete.set()
                 return HANDED_OVER
         return None
@@ -68,7 +68,10 @@ class _Mailbox:
             self._work(*self._mail[ODOM])
 
     def _late(self, stamp_ns: int) -> str | None:
-        return next((topic for topic, mail in self._mail.items() if mail.stamp_ns < stamp_ns), None)
+        for topic, mail in self._mail.items():
+            if mail.stamp_ns < stamp_ns:
+                return topic
+        return None
 
     def stamp_ns(self, topic: str) -> int:
         return self._mail[topic].stamp_ns

@@ -6,7 +6,7 @@ import contextlib
 import inspect
 import itertools
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from typing import Any
 
@@ -38,8 +38,10 @@ class StandingExecutor(SingleThreadedExecutor):
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Waits for an event and handles it; raises ExternalShutdownException, see rclpy."""
         received: list[Received] = []
-        with self._falling_back():
+        try:
             received = self._wait(timeout_sec) if self.stands else []
+        except PARTS_MISSING as error:
+            self._fall_back(error)
         if not self.stands:
             super().spin_once(timeout_sec)
             return
@@ -47,12 +49,14 @@ class StandingExecutor(SingleThreadedExecutor):
         _call(received)
         due: list[Any] = []
         left = False
-        with self._falling_back():
+        try:
             if self._entities is not None and self.context.ok():  # a callback may have shut it down
                 woken, others = self._entities.others_ready(self._guard)
                 self._changed |= woken or others  # adding an entity to a node wakes the executor
                 # So does rclpy itself, after each callback; then there is nothing to handle.
                 due, left = self._entities.due(), others or (woken and bool(self._tasks))
+        except PARTS_MISSING as error:
+            self._fall_back(error)
         if received and self._entities is not None and self.context.ok():
             # To take what arrived while callbacks ran costs less than to wait for it.
             _call(self._entities.come())
@@ -75,22 +79,19 @@ class StandingExecutor(SingleThreadedExecutor):
     def _tick(self, timer: Any) -> None:
         if not self.context.ok() or not any(timer in node.timers for node in self.get_nodes()):
             return
-        ready = False
-        with self._falling_back():
-            ready = timer.handle.is_timer_ready()
-            if ready:
-                timer.handle.call_timer()  # it is due again after another period
-        if ready and self.stands:
-            timer.callback()
-
-    @contextlib.contextmanager
-    def _falling_back(self) -> Iterator[None]:
         try:
-            yield
+            if not timer.handle.is_timer_ready():
+                return
+            timer.handle.call_timer()  # it is due again after another period
         except PARTS_MISSING as error:
-            self.stands = False
-            self._release()
-            get_logger("executor").warning(f"this rclpy needs its own, slower executor ({error})")
+            self._fall_back(error)
+            return
+        timer.callback()
+
+    def _fall_back(self, error: Exception) -> None:
+        self.stands = False
+        self._release()
+        get_logger("executor").warning(f"this rclpy needs its own, slower executor ({error})")
 
     def _handle_others(self) -> None:
         with contextlib.suppress(TimeoutException):
