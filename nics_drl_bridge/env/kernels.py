@@ -93,7 +93,7 @@ def bearing(dx, dy, heading):  # type: ignore[no-untyped-def]
 def navigate(out, approach, flags, before, pose, twist, ranges, goals, scale, radius):  # type: ignore[no-untyped-def]
     """Writes the observations (R, P + 6) of `navigation.Navigation`, and its `GoalProgress`.
 
-    The flags (R, 2) are reached and touched.
+    The flags (R, 3) are reached, touched, and succeeded.
     """
     parts = out.shape[1] - 6
     for i in range(out.shape[0]):
@@ -103,6 +103,7 @@ def navigate(out, approach, flags, before, pose, twist, ranges, goals, scale, ra
         dx, dy = goals[i, 0] - before[i, 0], goals[i, 1] - before[i, 1]
         approach[i] = math.sqrt(dx * dx + dy * dy) - distance
         flags[i, 0] = distance < radius
+        flags[i, 2] = flags[i, 0] and not flags[i, 1]
         out[i, parts] = min(distance, LIMIT)
         out[i, parts + 1], out[i, parts + 2] = c, s
         for k in range(3):

@@ -22,6 +22,7 @@ class GoalProgress(NamedTuple):
     approach: Array  # (...,) decrease of the distance to the goal [m]
     reached: Flags  # (...,) True at the goal
     touched: Flags  # (...,) True if the scan shows a contact with the footprint
+    succeeded: Flags  # (...,) True at the goal without a contact
 
 
 @dataclass(frozen=True)
@@ -119,27 +120,27 @@ class Navigation(Task):
         self, out: Observation, before: Array, view: RobotView, memory: Memory
     ) -> GoalProgress:
         lead = view.pose.shape[:-1]
-        approach, flags, own = np.empty(lead), np.empty((*lead, 2), np.bool_), out
+        approach, flags, own = np.empty(lead), np.empty((*lead, 3), np.bool_), out
         if self.sensors:
             own = np.empty((*lead, self.scan_parts + 6), np.float32)
         kernels.navigate(
-            own.reshape(-1, own.shape[-1]), approach.reshape(-1), flags.reshape(-1, 2),
+            own.reshape(-1, own.shape[-1]), approach.reshape(-1), flags.reshape(-1, 3),
             before.reshape(-1, 3), view.pose.reshape(-1, 3), view.twist.reshape(-1, 3),
             view.ranges.reshape(-1, view.ranges.shape[-1]), memory["goal"].reshape(-1, 2),
             self.scale, self.goal_radius,
         )  # fmt: skip
         if self.sensors:
             np.concatenate([own, self.sensor_shares(view)], axis=-1, out=out)
-        return GoalProgress(approach, flags[..., 0], flags[..., 1])
+        return GoalProgress(approach, flags[..., 0], flags[..., 1], flags[..., 2])
 
     def _terms(self, progress: GoalProgress) -> dict[str, Array]:
         return {
             "progress": self.progress_reward * progress.approach,
             "time": np.full(progress.approach.shape, self.time_reward),
-            "success": np.multiply(self.success_reward, progress.reached & ~progress.touched),
+            "success": np.multiply(self.success_reward, progress.succeeded),
             "collision": np.multiply(self.collision_reward, progress.touched),
         }
 
     @staticmethod
     def _facts(progress: GoalProgress) -> dict[str, NDArray[Any]]:
-        return {"is_success": progress.reached & ~progress.touched, "collision": progress.touched}
+        return {"is_success": progress.succeeded, "collision": progress.touched}
