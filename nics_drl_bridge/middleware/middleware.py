@@ -255,18 +255,15 @@ class Middleware:
     def view(self, now_ns: int) -> RobotView:
         """Returns the view of the robot at a time; NaN ranges before the first scan."""
         scan, newest_ns = self.cache.newest.get(SCAN), self.newest_ns
-        sensed, oldest_s = self._sensed(now_ns) if self._sensors else ({}, 0.0)
+        sensed, newest = unread(self._sensors), self.cache.newest
+        sensed |= {name: newest[name].value for name in sensed if name in newest}
+        oldest_s = max((self.cache.age_s(name, now_ns) for name in sensed), default=0.0)
         return RobotView(
             *self.estimator.at(now_ns), sensed=sensed, sensed_age_s=oldest_s,
             ranges=np.full(self._beams, np.nan, np.float32) if scan is None else scan.value,
             stamp_s=(now_ns if newest_ns is None else newest_ns) * S_PER_NS,
             scan_age_s=self.cache.age_s(SCAN, now_ns), odom_age_s=self.cache.age_s(ODOM, now_ns),
         )  # fmt: skip
-
-    def _sensed(self, now_ns: int) -> tuple[dict[str, NDArray[np.float32]], float]:
-        sensed, newest = unread(self._sensors), self.cache.newest
-        sensed |= {name: newest[name].value for name in sensed if name in newest}
-        return sensed, max(self.cache.age_s(name, now_ns) for name in sensed)
 
     def health(self, arrival_ns: int) -> measured.Health:
         """Returns the health of all topics at a time of the receiver's clock [ns]."""
