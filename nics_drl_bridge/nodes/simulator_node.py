@@ -134,12 +134,9 @@ class RobotPort:
         return moving
 
     def publish_odometry(self, sensed: Sensed, now_ns: int) -> None:
-        """Publishes odometry."""
+        """Publishes odometry, and joints and true pose if they have subscribers."""
         odometry = self._odom.write(now_ns, sensed.odom, sensed.twist, sensed.covariance)
         self._send(self._odoms, odometry, now_ns)
-
-    def publish_state(self, sensed: Sensed, now_ns: int) -> None:
-        """Publishes joints and true pose if they have subscribers."""
         if self._joints.get_subscription_count():
             joints = conversions.joints_to_ros(self._model.robot, sensed.state, now_ns)
             self._send(self._joints, joints, now_ns)
@@ -421,12 +418,10 @@ class DeviceNode(qos.QosWatch):
             sensed = self._world.sensed(k)
             if odom_due:
                 port.publish_odometry(sensed, now_ns)
-            if scan_due:
-                port.publish_scan(sensed, now_ns)
-            if odom_due:  # last, because peers may be waiting for the others
-                port.publish_state(sensed, now_ns)
                 if self._transforms is not None:
                     moving += port.moving(conversions.stamp_to_ros(now_ns), sensed)
+            if scan_due:
+                port.publish_scan(sensed, now_ns)
         if moving:  # with the delay of the odometry that it comes from
             message = self._transforms(transforms=moving)
             self._outbox.send(self._moving, message, now_ns, self._time.odom_late_ns)
