@@ -101,10 +101,7 @@ def in_effect(log, time):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def logged(log, effective_ns, command, low, high, needed_ns):  # type: ignore[no-untyped-def]
-    """Fields of a `Log` with a command (C,), clipped to [low, high] (C,); empty for a duplicate.
-
-    Commands that are over before `needed_ns` are dropped.
-    """
+    """Adds a command (C,), clipped; drops those over before `needed_ns`; empty for a duplicate."""
     effective, commands = log.effective, log.commands
     place = count = effective.shape[0]
     while place > 0 and effective[place - 1] >= effective_ns:

@@ -21,9 +21,9 @@ from nics_drl_bridge.interface import NS_PER_S
 
 PARTS_MISSING = (AttributeError, TypeError)  # raised if rclpy differs from what is known here
 Received = tuple[Callable[..., Any], tuple[Any, ...]]  # a callback and its arguments
-HANDED_OVER, REST_S = object(), 1e-4
-"""Returned by a callback that has woken another thread of this process. The executor then rests,
-for less than an exchange of messages takes, to keep out of that thread's way."""
+HANDED_OVER, REST, LONGEST_REST_S = object(), 0.4, 1e-3
+"""Returned by a callback that has woken another thread of this process. The executor then keeps out
+of that thread's way, for a part of the time since it last did so: of an exchange of messages."""
 MOST_AT_ONCE = 32  # a timer without a period is always ready, and the thread has other work, too
 
 
@@ -33,7 +33,7 @@ class StandingExecutor(SingleThreadedExecutor):
     def __init__(self, context: Context) -> None:
         super().__init__(context=context)
         self._entities: _Entities | None = None
-        self._changed, self.stands = True, True
+        self._changed, self.stands, self._handed_over_s = True, True, 0.0
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Waits for an event and handles it; raises ExternalShutdownException, see rclpy."""
@@ -46,7 +46,7 @@ class StandingExecutor(SingleThreadedExecutor):
             super().spin_once(timeout_sec)
             return
         # Before anything else: a peer may be waiting for the answer to a message.
-        _call(received)
+        self._call(received)
         due: list[Any] = []
         left = False
         try:
@@ -59,7 +59,7 @@ class StandingExecutor(SingleThreadedExecutor):
             self._fall_back(error)
         if received and self._entities is not None and self.context.ok():
             # To take what arrived while callbacks ran costs less than to wait for it.
-            _call(self._entities.come())
+            self._call(self._entities.come())
         for timer in due:
             self._tick(timer)
         if left:
@@ -75,6 +75,14 @@ class StandingExecutor(SingleThreadedExecutor):
         if not self.context.ok():
             raise ExternalShutdownException
         return entities.taken()
+
+    def _call(self, received: Iterable[Received]) -> None:
+        handed_over = False
+        for callback, arguments in received:
+            handed_over |= callback(*arguments) is HANDED_OVER
+        if handed_over:
+            before_s, self._handed_over_s = self._handed_over_s, time.monotonic()
+            time.sleep(min(REST * (self._handed_over_s - before_s), LONGEST_REST_S))
 
     def _tick(self, timer: Any) -> None:
         if not self.context.ok() or not any(timer in node.timers for node in self.get_nodes()):
@@ -194,14 +202,6 @@ def _take(subscriptions: Iterable[tuple[Any, int]]) -> list[Received]:
         if taken is not None:
             received.append((subscription.callback, taken[:arguments]))
     return received
-
-
-def _call(received: Iterable[Received]) -> None:
-    handed_over = False
-    for callback, arguments in received:
-        handed_over |= callback(*arguments) is HANDED_OVER
-    if handed_over:
-        time.sleep(REST_S)
 
 
 def _takes(callback: Any, *arguments: Any) -> bool:
