@@ -8,8 +8,10 @@ SHELL := /bin/bash
 PYTHON ?= python3
 RECORDING ?=
 PYTEST_ARGS ?=
-# Tests of one file run one after the other; PARALLEL= runs all of them so.
-PARALLEL ?= -n auto --dist loadfile
+# Tests of one file run one after the other; PARALLEL= runs all of them so. Many wait for processes,
+# so that three of them keep two cores at work.
+WORKERS := $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) * 3 / 2)))
+PARALLEL ?= -n $(WORKERS) --dist loadfile
 BENCHMARKS ?=
 QUICK ?=
 OUT ?=

@@ -113,5 +113,5 @@ def test_the_memory_of_a_vector_env_does_not_grow_with_its_steps(task):
         env.step(actions[count[0] % len(actions)])
         count[0] += 1
 
-    grown, _ = taken(step, stretches=20)
+    grown, _ = taken(step, stretches=10)
     assert grown < GROWTH
