@@ -8,10 +8,10 @@ SHELL := /bin/bash
 PYTHON ?= python3
 RECORDING ?=
 PYTEST_ARGS ?=
-# Tests of one file run one after the other; PARALLEL= runs all of them so. Many wait for processes,
-# so that three of them keep two cores at work.
+# Tests of one file run one after the other; PARALLEL= runs all of them so.
+PARALLEL ?= -n auto --dist loadfile
+# Those of `make test` often wait for processes: three of them keep two cores at work.
 WORKERS := $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) * 3 / 2)))
-PARALLEL ?= -n $(WORKERS) --dist loadfile
 BENCHMARKS ?=
 QUICK ?=
 OUT ?=
@@ -149,7 +149,7 @@ types: setup ## mypy
 	$(BIN)/mypy nics_drl_bridge
 
 pytest: setup
-	$(BIN)/python -m pytest $(PARALLEL) -m "not campaign" $(PYTEST_ARGS)
+	$(BIN)/python -m pytest $(PARALLEL:auto=$(WORKERS)) -m "not campaign" $(PYTEST_ARGS)
 
 # Environments apart, of what clashes with .venv; what they share with it has the same pins.
 # $(1): folder. $(2): command that prints its constraints. $(3): what it holds.
