@@ -11,7 +11,7 @@ PYTEST_ARGS ?=
 # Tests of one file run one after the other; PARALLEL= runs all of them so.
 PARALLEL ?= -n auto --dist loadfile
 # Those of `make test` often wait for processes: three of them keep two cores at work.
-WORKERS := $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) * 3 / 2)))
+WORKERS := $(shell echo $$(($$(nproc 2>/dev/null || getconf _NPROCESSORS_ONLN) * 3 / 2)))
 BENCHMARKS ?=
 QUICK ?=
 OUT ?=

@@ -136,7 +136,7 @@ class Navigation(Task):
     def _terms(self, progress: GoalProgress) -> dict[str, Array]:
         return {
             "progress": self.progress_reward * progress.approach,
-            "time": np.full(progress.approach.shape, self.time_reward),
+            "time": np.full(progress.approach.shape, self.time_reward, np.float64),
             "success": np.multiply(self.success_reward, progress.succeeded),
             "collision": np.multiply(self.collision_reward, progress.touched),
         }

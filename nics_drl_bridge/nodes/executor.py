@@ -23,7 +23,7 @@ PARTS_MISSING = (AttributeError, TypeError)  # raised if rclpy differs from what
 Received = tuple[Callable[..., Any], tuple[Any, ...]]  # a callback and its arguments
 HANDED_OVER, REST, LONGEST_REST_S = object(), 0.4, 1e-3
 """Returned by a callback that has woken another thread of this process. The executor then keeps out
-of that thread's way, for a part of the time since it last did so: of an exchange of messages."""
+of that thread's way for a part of the time since it last did so, at most for LONGEST_REST_S."""
 MOST_AT_ONCE = 32  # a timer without a period is always ready, and the thread has other work, too
 
 

@@ -108,7 +108,8 @@ def propagate(covariance: Array, before: ArrayLike, after: ArrayLike, added: Arr
     to the old one (Thrun et al., Probabilistic Robotics, Sec. 5.4), Q `added`.
     """
     out = np.array(covariance, np.float64)
-    step_kernels.propagate(out, *(np.asarray(pose, np.float64) for pose in (before, after)), added)
+    poses = (np.asarray(each, np.float64).reshape(len(out), 3) for each in (before, after))
+    step_kernels.propagate(out, *poses, added)
     return out
 
 
