@@ -10,6 +10,8 @@ RECORDING ?=
 PYTEST_ARGS ?=
 # Tests of one file run one after the other; PARALLEL= runs all of them so.
 PARALLEL ?= -n auto --dist loadfile
+# Those of `make test` often wait for processes: three of them keep two cores at work.
+WORKERS := $(shell echo $$(($$(nproc 2>/dev/null || getconf _NPROCESSORS_ONLN) * 3 / 2)))
 BENCHMARKS ?=
 QUICK ?=
 OUT ?=
@@ -147,7 +149,7 @@ types: setup ## mypy
 	$(BIN)/mypy nics_drl_bridge
 
 pytest: setup
-	$(BIN)/python -m pytest $(PARALLEL) -m "not campaign" $(PYTEST_ARGS)
+	$(BIN)/python -m pytest $(PARALLEL:auto=$(WORKERS)) -m "not campaign" $(PYTEST_ARGS)
 
 # Environments apart, of what clashes with .venv; what they share with it has the same pins.
 # $(1): folder. $(2): command that prints its constraints. $(3): what it holds.

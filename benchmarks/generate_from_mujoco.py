@@ -97,6 +97,7 @@ def batched_speed(model: TaylorModel, spec: RobotSpec) -> float:
     low, high = spec.command_low[:, None], spec.command_high[:, None]
     commands = rng.uniform(low, high, (HOLDS, len(low), BATCH))
     terms, per_hold = term_arrays(model), round(0.1 / model.dt)
+    terms = terms._replace(coefficient=np.repeat(terms.coefficient[:, None], BATCH, axis=1))
     x, dq = np.ones((len(model.variables) + 1, BATCH)), np.zeros((len(model.dofs), BATCH))
 
     def drive() -> None:

@@ -18,6 +18,7 @@ def draws(function, seeds, streams, counters):
     return out
 
 
+@pytest.mark.slow
 def test_uniform_draws_are_uniform_in_the_half_open_unit_interval():
     sample = draws(random.uniform, np.arange(10), np.arange(4), np.arange(5000)).ravel()
     assert sample.min() >= 0.0

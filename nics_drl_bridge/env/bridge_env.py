@@ -1,6 +1,5 @@
 """BridgeEnv: one task over one backend, as a Gymnasium environment."""
 
-from dataclasses import replace
 from functools import reduce
 from operator import add
 from typing import Any
@@ -228,9 +227,11 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
 
     def _lifted(self, view: RobotView) -> RobotView:
         lead = (1, self.robots, -1)
-        arrays = {name: getattr(view, name).reshape(lead) for name in ("pose", "twist", "ranges")}
         sensed = {name: reading.reshape(lead) for name, reading in view.sensed.items()}
-        return replace(view, **arrays, sensed=sensed)
+        return RobotView(
+            view.pose.reshape(lead), view.twist.reshape(lead), view.ranges.reshape(lead),
+            view.stamp_s, view.scan_age_s, view.odom_age_s, sensed, view.sensed_age_s,
+        )  # fmt: skip
 
     def _row(self, rows: NDArray[Any]) -> NDArray[Any]:
         return rows[0] if self.robots == 1 else rows

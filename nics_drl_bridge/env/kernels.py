@@ -27,14 +27,6 @@ class ScanScale(NamedTuple):
     plan: SectorPlan  # mapping of beams to sectors
 
 
-class GoalProgress(NamedTuple):
-    """Outcome of a step of the navigation task."""
-
-    approach: NDArray[np.float64]  # (R,) decrease of the distance to the goal [m]
-    reached: NDArray[np.bool_]  # (R,) True at the goal
-    touched: NDArray[np.bool_]  # (R,) True if the scan shows a contact with the footprint
-
-
 @kernel(allocates=True)
 def episode_seeds(seeds, numbers, out):  # type: ignore[no-untyped-def]
     """Seeds (n,) of the episodes with these numbers (n,) in envs with these seeds (n,)."""
@@ -98,16 +90,20 @@ def bearing(dx, dy, heading):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def navigate(out, progress, before, pose, twist, ranges, goals, scale, radius):  # type: ignore[no-untyped-def]
-    """Writes the observations (R, P + 6) of `navigation.Navigation`, and a `GoalProgress`."""
+def navigate(out, approach, flags, before, pose, twist, ranges, goals, scale, radius):  # type: ignore[no-untyped-def]
+    """Writes the observations (R, P + 6) of `navigation.Navigation`, and its `GoalProgress`.
+
+    The flags (R, 3) are reached, touched, and succeeded.
+    """
     parts = out.shape[1] - 6
     for i in range(out.shape[0]):
-        progress.touched[i] = look(out[i, :parts], ranges[i], scale)
+        flags[i, 1] = look(out[i, :parts], ranges[i], scale)
         dx, dy = goals[i, 0] - pose[i, 0], goals[i, 1] - pose[i, 1]
         distance, c, s = bearing(dx, dy, pose[i, 2])
         dx, dy = goals[i, 0] - before[i, 0], goals[i, 1] - before[i, 1]
-        progress.approach[i] = math.sqrt(dx * dx + dy * dy) - distance
-        progress.reached[i] = distance < radius
+        approach[i] = math.sqrt(dx * dx + dy * dy) - distance
+        flags[i, 0] = distance < radius
+        flags[i, 2] = flags[i, 0] and not flags[i, 1]
         out[i, parts] = min(distance, LIMIT)
         out[i, parts + 1], out[i, parts + 2] = c, s
         for k in range(3):

@@ -2,18 +2,27 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env import kernels
-from nics_drl_bridge.env.kernels import LIMIT, GoalProgress
+from nics_drl_bridge.env.kernels import LIMIT
 from nics_drl_bridge.env.task import Episodes, Flags, Memory, Observation, Outcome, Task
 from nics_drl_bridge.interface import RobotView
 
 Array = NDArray[np.float64]
+
+
+class GoalProgress(NamedTuple):
+    """Outcome of a step."""
+
+    approach: Array  # (...,) decrease of the distance to the goal [m]
+    reached: Flags  # (...,) True at the goal
+    touched: Flags  # (...,) True if the scan shows a contact with the footprint
+    succeeded: Flags  # (...,) True at the goal without a contact
 
 
 @dataclass(frozen=True)
@@ -111,30 +120,27 @@ class Navigation(Task):
         self, out: Observation, before: Array, view: RobotView, memory: Memory
     ) -> GoalProgress:
         lead = view.pose.shape[:-1]
-        approach: Array = np.empty(lead)
-        reached, touched = np.empty(lead, np.bool_), np.empty(lead, np.bool_)
-        own = out
+        approach, flags, own = np.empty(lead), np.empty((*lead, 3), np.bool_), out
         if self.sensors:
             own = np.empty((*lead, self.scan_parts + 6), np.float32)
         kernels.navigate(
-            own.reshape(-1, own.shape[-1]),
-            GoalProgress(approach.reshape(-1), reached.reshape(-1), touched.reshape(-1)),
+            own.reshape(-1, own.shape[-1]), approach.reshape(-1), flags.reshape(-1, 3),
             before.reshape(-1, 3), view.pose.reshape(-1, 3), view.twist.reshape(-1, 3),
             view.ranges.reshape(-1, view.ranges.shape[-1]), memory["goal"].reshape(-1, 2),
             self.scale, self.goal_radius,
         )  # fmt: skip
         if self.sensors:
             np.concatenate([own, self.sensor_shares(view)], axis=-1, out=out)
-        return GoalProgress(approach, reached, touched)
+        return GoalProgress(approach, flags[..., 0], flags[..., 1], flags[..., 2])
 
     def _terms(self, progress: GoalProgress) -> dict[str, Array]:
         return {
             "progress": self.progress_reward * progress.approach,
-            "time": np.full_like(progress.approach, self.time_reward),
-            "success": np.multiply(self.success_reward, progress.reached & ~progress.touched),
+            "time": np.full(progress.approach.shape, self.time_reward, np.float64),
+            "success": np.multiply(self.success_reward, progress.succeeded),
             "collision": np.multiply(self.collision_reward, progress.touched),
         }
 
     @staticmethod
     def _facts(progress: GoalProgress) -> dict[str, NDArray[Any]]:
-        return {"is_success": progress.reached & ~progress.touched, "collision": progress.touched}
+        return {"is_success": progress.succeeded, "collision": progress.touched}

@@ -19,21 +19,22 @@ from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN
 
 BLOCK = 16  # Beams that are fused at once
 LANES = 9 * BLOCK  # Bodies looked up together: so few that their scans stay in the L1 cache
-DX, DY, TURNED, COSINE, SINE, SIZE, BEARING_0, AT, MIDDLE, LOW, HIGH = (
-    np.uintp(k * LANES) for k in range(11)
+DX, DY, TURNED, COSINE, SINE, SIZE, BEARING_0, SCAN, MIDDLE, LOW, HIGH, AT = (
+    np.uintp(k * LANES) for k in range(12)
 )
 """Of a body: offset from the lidar, heading, cosine, sine, radius; the bearing of beam 0 and the
-index of the scan in memory; bearing and silhouettes [beams]."""
+index of the scan in memory; bearing and silhouettes [beams]; index of the first range to fuse."""
 RIGHT_X, RIGHT_Y, RIGHT_X2, RIGHT_Y2, LEFT_X, LEFT_Y, LEFT_X2, LEFT_Y2 = (
-    np.uintp(k * LANES) for k in range(11, 19)
+    np.uintp(k * LANES) for k in range(12, 20)
 )
 """The two corners of the hull that can be the right silhouette, and the left one."""
-DISTANCE, BEARING, BLEND, SHARE, TOUCHED = (np.uintp(k * LANES) for k in range(5))
+DISTANCE, BEARING, BLEND, SHARE = (np.uintp(k * LANES) for k in range(4))
 """The latter two are those of the farther row and of the next point."""
 KIND, CELL, HULL, CLIMBS, START, PLACE, START2, PLACE2 = (np.uintp(k * LANES) for k in range(8))
 """Shape, cell, first corner of the hull; begin and place of the row and of the farther one."""
-BEGIN, HITS, BACK, ONE, TWO, OTHER, OTHER2 = (np.uintp(k * LANES) for k in range(8, 15))
-"""First beam, beams, beams before the first; points of the row, and of the farther one."""
+BLOCKS, HITS, BACK, ONE, TWO, OTHER, OTHER2 = (np.uintp(k * LANES) for k in range(8, 15))
+"""Blocks, 0 where none fits; beams, and those before the first; points of the row, and of the
+farther one."""
 
 
 class ScanLanes(NamedTuple):
@@ -47,7 +48,7 @@ class ScanLanes(NamedTuple):
 def scan_lanes() -> ScanLanes:
     """Allocates the memory that one thread needs to scan."""
     return ScanLanes(
-        np.zeros(19 * LANES), np.zeros(5 * LANES, np.float32), np.zeros(15 * LANES, np.int32)
+        np.zeros(20 * LANES), np.zeros(4 * LANES, np.float32), np.zeros(15 * LANES, np.int32)
     )
 
 
@@ -101,7 +102,7 @@ def select(found, begin, end, bodies, me, device, lidar, lanes):  # type: ignore
         d2, reach, shape = dx * dx + dy * dy, lidar.range_max + radius, np.int32(bodies[b, SHAPE])
         wide[k + DX], wide[k + DY], wide[k + TURNED] = dx, dy, bodies[b, HEADING]
         wide[k + COSINE], wide[k + SINE], wide[k + SIZE] = bodies[b, COS], bodies[b, SIN], radius
-        wide[k + BEARING_0], wide[k + AT] = device.heading, device.at
+        wide[k + BEARING_0], wide[k + SCAN] = device.heading, device.at
         lanes.whole[k + KIND] = shape
         h = np.uintp(shape)
         seen = (d2 <= reach * reach) & (radius > 0.0) & (j != me)
@@ -115,7 +116,7 @@ def select(found, begin, end, bodies, me, device, lidar, lanes):  # type: ignore
 @kernel
 def look_up(found, ranges, lidar, lanes):  # type: ignore[no-untyped-def]
     """Fuses the bodies in the lanes into their scans (N, M, B)."""
-    wide, table, flat = lanes.wide, lidar.table, ranges.reshape(-1)
+    wide, table, flat = lanes.wide, lidar.table, ranges.reshape(-1).view(np.int32)
     padded, turn = (found + BLOCK - 1) // BLOCK * BLOCK, 2.0 * math.pi / lidar.beams.step
     count = np.int32(ranges.shape[2])
     places(padded, lanes)
@@ -126,7 +127,6 @@ def look_up(found, ranges, lidar, lanes):  # type: ignore[no-untyped-def]
         if lanes.whole[np.uintp(j) + CLIMBS] < 0:
             climb(np.uintp(j), lidar, lanes)
     aims(padded, count, np.int32(table.shift), lanes)
-    touch(found, table.rows, lanes)
     for j in range(found):
         fuse(flat, np.uintp(j), lidar, lanes)
     for j in range(found):
@@ -217,13 +217,16 @@ def aim(k, turn, count, shift, lanes):  # type: ignore[no-untyped-def]
     wide, whole, zero = lanes.wide, lanes.whole, np.int32(0)
     middle, low, high = wide[k + MIDDLE] - turn, wide[k + LOW] - turn, wide[k + HIGH] - turn
     begin, hits, point, share = baked.beams_between(middle, low, high, count, shift)
-    blocks = np.int32(max(np.int32(hits + BLOCK - 1) & np.int32(-BLOCK), np.int32(2 * BLOCK)))
-    back = np.int32(max(np.int32(begin + blocks - count), zero))
-    whole[k + BEGIN], whole[k + HITS], whole[k + BACK] = np.int32(begin - back), hits, back
+    width = np.int32(max(np.int32(hits + BLOCK - 1) & np.int32(-BLOCK), np.int32(2 * BLOCK)))
+    back = np.int32(max(np.int32(begin + width - count), zero))
+    whole[k + HITS], whole[k + BACK], wide[k + AT] = hits, back, wide[k + SCAN] + (begin - back)
     one, two = baked.points_of(whole[k + START], whole[k + PLACE], point, shift, hits)
     other, other2 = baked.points_of(whole[k + START2], whole[k + PLACE2], point, shift, hits)
     whole[k + ONE], whole[k + TWO] = np.int32(one - back), np.int32(two - back)
     whole[k + OTHER], whole[k + OTHER2] = np.int32(other - back), np.int32(other2 - back)
+    first = np.int32(min(min(one, two), min(min(other, other2), begin)) - back)
+    blocks = np.int32(max(np.int32(hits + back + BLOCK - 1) >> np.int32(4), np.int32(2)))
+    whole[k + BLOCKS] = blocks if (first >= 0) & (hits > 0) else zero  # none at a table's begin
     lanes.single[k + SHARE] = share
 
 
@@ -234,48 +237,33 @@ def aims(padded, count, shift, lanes):  # type: ignore[no-untyped-def]
         aim(np.uintp(j), 0.0, count, shift, lanes)
 
 
-@kernel
-def touch(found, rows, lanes):  # type: ignore[no-untyped-def]
-    """Loads the begin of both rows of each body into the cache, where nothing waits for it."""
-    zero = np.int32(0)
-    for j in range(found):
-        k = np.uintp(j)
-        one = np.uintp(max(lanes.whole[k + ONE], zero))
-        other = np.uintp(max(lanes.whole[k + OTHER], zero))
-        lanes.single[k + TOUCHED] = (
-            rows[one] + rows[one + np.uintp(BLOCK)] + rows[other] + rows[other + np.uintp(BLOCK)]
-        )
-
-
 @kernel(contracts=True, inline=True)
 def fuse(flat, k, lidar, lanes):  # type: ignore[no-untyped-def]
     """Lowers the beams of one body in blocks, or beam by beam where no block fits."""
     whole, rows = lanes.whole, lidar.table.rows
-    begin, hits, back = whole[k + BEGIN], whole[k + HITS], whole[k + BACK]
-    one, two, other, other2 = whole[k + ONE], whole[k + TWO], whole[k + OTHER], whole[k + OTHER2]
-    if hits <= 0:
-        return
+    blocks, hits, back = whole[k + BLOCKS], whole[k + HITS], whole[k + BACK]
     share, blend = lanes.single[k + SHARE], lanes.single[k + BLEND]
     least, most = np.float32(lidar.range_min), np.float32(lidar.range_max)
-    fits = min(begin, one, two, min(other, other2)) >= 0
-    first = np.int64(0 if fits else back)  # few beams, or at the begin of the table
-    at, one, two = np.uintp(lanes.wide[k + AT] + begin + first), one + first, two + first
-    one, two, other, other2 = np.uintp(one), np.uintp(two), other + first, other2 + first
-    other, other2 = np.uintp(other), np.uintp(other2)
-    place = np.int32(-back)
-    if fits:
-        for j in range(max((hits + back + BLOCK - 1) // BLOCK, 2) * BLOCK):
+    at, first = np.uintp(lanes.wide[k + AT]), np.int64(0 if blocks > 0 else back)
+    one, two = np.uintp(whole[k + ONE] + first), np.uintp(whole[k + TWO] + first)
+    other, other2 = np.uintp(whole[k + OTHER] + first), np.uintp(whole[k + OTHER2] + first)
+    # Ranges are fused as whole numbers, in the same order: of floats LLVM masks the store.
+    if blocks > 0:
+        place = np.int32(-back)
+        for j in range(blocks * BLOCK):
             i = np.uintp(j)
             value = baked.blended(rows, one + i, two + i, other + i, other2 + i, share, blend)
             value = baked.limited(value, least, most)
             value = value if np.uint32(place) < np.uint32(hits) else np.float32(np.inf)
             place = np.int32(place + np.int32(1))  # of 32 bits, as the ranges
-            flat[at + i] = min(flat[at + i], value)
-    else:
+            flat[at + i] = min(flat[at + i], np.float32(value).view(np.int32))
+    else:  # few beams, or at the begin of the table
+        at = np.uintp(lanes.wide[k + AT] + back)
         for j in range(hits):
             i = np.uintp(j)
             value = baked.blended(rows, one + i, two + i, other + i, other2 + i, share, blend)
-            flat[at + i] = min(flat[at + i], baked.limited(value, least, most))
+            value = baked.limited(value, least, most)
+            flat[at + i] = min(flat[at + i], np.float32(value).view(np.int32))
 
 
 @kernel

@@ -139,7 +139,8 @@ Ranges = NDArray[np.float32]
 def to_device(ranges: ArrayLike, spec: LidarSpec) -> Ranges:
     """Converts ranges (..., B) to the device's convention; only `inf` is replaced."""
     out = np.array(ranges, dtype=np.float32)
-    out[out == np.inf] = _no_return(spec)
+    if spec.no_return != "inf":
+        out[out == np.inf] = _no_return(spec)
     return out
 
 
@@ -148,13 +149,14 @@ def from_device(values: ArrayLike, spec: LidarSpec) -> Ranges:
 
     A finite value below range_min is too close, unless it means no return: that is not free space.
     """
-    out, none = np.array(values, dtype=np.float32), _no_return(spec)
-    lost = np.isnan(out) if np.isnan(none) else out == none
-    out[lost | (out > np.float32(spec.range_max))] = np.inf
+    out = np.array(values, dtype=np.float32)
+    if spec.no_return != "inf":
+        none = _no_return(spec)
+        out[np.isnan(out) if np.isnan(none) else out == none] = np.inf
+    out[out > np.float32(spec.range_max)] = np.inf
     out[out < np.float32(spec.range_min)] = -np.inf
     return out
 
 
 def _no_return(spec: LidarSpec) -> np.float32:
-    values = {"inf": np.inf, "zero": 0.0, "nan": np.nan, "range_max": spec.range_max}
-    return np.float32(values[spec.no_return])
+    return np.float32({"zero": 0.0, "nan": np.nan, "range_max": spec.range_max}[spec.no_return])

@@ -8,7 +8,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.middleware import kernels
 from nics_drl_bridge.middleware.belief import Anchor, Belief, Foreseen, Unseen, parted
-from nics_drl_bridge.middleware.kernels import MotionModel, log_of, logged
+from nics_drl_bridge.middleware.kernels import Log, MotionModel, log_of
 from nics_drl_bridge.middleware.measurement import Acceptance, Judgement, Kind, Measurement
 from nics_drl_bridge.robot.kernels import SERIES, term_arrays, wrap
 
@@ -123,10 +123,10 @@ class Estimator:
         """
         needed_ns = self.time_ns if needed_ns is None else needed_ns
         self._foreseen = None
-        possible = np.minimum(np.maximum(command, self._least), self._most)
-        log = logged(self._log, self.effective_ns(stamp_ns), possible, needed_ns)
-        self._log = log or self._log
-        return log is not None
+        given = np.asarray(command, np.float64), self._least, self._most, needed_ns
+        log = Log(*kernels.logged(self._log, self.effective_ns(stamp_ns), *given))
+        self._log = log if len(log.effective) else self._log
+        return log is self._log
 
     def at(self, time_ns: int) -> tuple[Array, Array]:
         """Predicts pose (3,) and body twist (3,) at a time, without moving the estimate."""
@@ -158,10 +158,12 @@ class Estimator:
 
     def _forecast(self, time_ns: int) -> Foreseen:
         own, motion, log, now = self._filter, self._motion, self._log, self.time_ns
-        mean, covariance = kernels.forecast(own.x, own.P, self._process, now, time_ns, motion, log)
+        mean, covariance, expected = kernels.forecast(
+            own.x, own.P, self._process, now, time_ns, motion, log
+        )
         if time_ns - now > motion.longest_ns:
             covariance = self.unseen.doubted(covariance, (time_ns - now) / NS_PER_S)
-        return Foreseen(time_ns, mean, covariance, kernels.expect(mean, time_ns, motion, log))
+        return Foreseen(time_ns, mean, covariance, expected)
 
     def update(self, kind: Kind, value: ArrayLike, std: ArrayLike | None = None) -> Judgement:
         """Corrects by a measured value (n,), with its standard deviations or the model's."""

@@ -41,19 +41,6 @@ def log_of(command: ArrayLike) -> Log:
     return Log(np.full(1, np.iinfo(np.int64).min), np.array([command], np.float64))
 
 
-def logged(log: Log, effective_ns: int, command: ArrayLike, needed_ns: int) -> Log | None:
-    """Adds a command (C,), and drops those over before `needed_ns`; None for a duplicate."""
-    effective, commands = log
-    place = int(np.searchsorted(effective, effective_ns))
-    if place < len(effective) and effective[place] == effective_ns:
-        return None
-    first = min(place, max(int(np.searchsorted(effective, needed_ns)) - 1, 0))
-    return Log(
-        np.concatenate([effective[first:place], [effective_ns], effective[place:]]),
-        np.concatenate([commands[first:place], [command], commands[place:]]),
-    )
-
-
 @kernel(allocates=True)
 def rates_jacobian(jacobian, x, terms):  # type: ignore[no-untyped-def]
     """Computes the derivative (3 + S, V) of `rates` with respect to X."""
@@ -113,6 +100,28 @@ def in_effect(log, time):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
+def logged(log, effective_ns, command, low, high, needed_ns):  # type: ignore[no-untyped-def]
+    """Adds a command (C,), clipped; drops those over before `needed_ns`; empty for a duplicate."""
+    effective, commands = log.effective, log.commands
+    place = count = effective.shape[0]
+    while place > 0 and effective[place - 1] >= effective_ns:
+        place -= 1
+    first = min(place, in_effect(log, needed_ns))
+    size = count - first + 1
+    if place < count and effective[place] == effective_ns:
+        size = 0
+    times, values = np.empty(size, np.int64), np.empty((size, command.shape[0]))
+    for i in range(size):
+        k = first + i
+        if k == place:
+            times[i], values[i] = effective_ns, np.minimum(np.maximum(command, low), high)
+        else:
+            k -= 1 if k > place else 0
+            times[i], values[i] = effective[k], commands[k]
+    return times, values
+
+
+@kernel(allocates=True)
 def carry(mean, transition, begin, end, motion, log):  # type: ignore[no-untyped-def]
     """Moves a mean between two times, command by command, in place, see `predict`.
 
@@ -139,15 +148,6 @@ def carry(mean, transition, begin, end, motion, log):  # type: ignore[no-untyped
 
 
 @kernel(allocates=True)
-def forecast(mean, covariance, process, begin, end, motion, log):  # type: ignore[no-untyped-def]
-    """Predicts mean and covariance at a later time; `process` (3 + S, 3 + S) is per second."""
-    moved, transition = mean.copy(), np.eye(mean.shape[0])
-    carry(moved, transition, begin, end, motion, log)
-    spread = transition @ covariance @ transition.T + process * ((end - begin) / NS_PER_S)
-    return moved, (spread + spread.T) * 0.5
-
-
-@kernel(allocates=True)
 def expect(mean, now, motion, log):  # type: ignore[no-untyped-def]
     """Expected body twist (3,) at the time of the mean, and its derivative (3, 3 + S)."""
     command = log.commands[in_effect(log, now)]
@@ -159,6 +159,15 @@ def expect(mean, now, motion, log):  # type: ignore[no-untyped-def]
     rates_jacobian(jacobian, x, motion.terms)
     derivative[:, 3:] = jacobian[:3, :size]
     return dq[:3].copy(), derivative
+
+
+@kernel(allocates=True)
+def forecast(mean, covariance, process, begin, end, motion, log):  # type: ignore[no-untyped-def]
+    """Predicts mean, covariance, and what `expect` returns; `process` is added per second."""
+    moved, transition = mean.copy(), np.eye(mean.shape[0])
+    carry(moved, transition, begin, end, motion, log)
+    spread = transition @ covariance @ transition.T + process * ((end - begin) / NS_PER_S)
+    return moved, (spread + spread.T) * 0.5, expect(moved, end, motion, log)
 
 
 @kernel(allocates=True)

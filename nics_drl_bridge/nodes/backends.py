@@ -45,7 +45,7 @@ class _Mailbox:
     # step. The executor's thread gives awaited odometry to `work` while the scan is in transit.
     def __init__(self, topics: tuple[str, ...], work: Callable[[int, int, bytes], None]) -> None:
         self._mail, self._work = dict.fromkeys(topics, _Mail()), work
-        self._lock, self._complete = threading.Lock(), threading.Event()
+        self._lock, self._awaiting = threading.Lock(), threading.Lock()
         self._awaited_ns, self._worked_ns = -1, -1
         self._failure: Exception | None = None
 
@@ -57,8 +57,9 @@ class _Mailbox:
                 self._work_in()
             except Exception as error:  # noqa: BLE001  (it is raised in the caller's thread)
                 self._failure = error
-            if self._awaited_ns >= 0 and (self._failure or self._late(self._awaited_ns) is None):
-                self._complete.set()
+            if self._awaited_ns >= 0 and (self._failure or not self._late(self._awaited_ns)):
+                if self._awaiting.locked():
+                    self._awaiting.release()
                 return HANDED_OVER
         return None
 
@@ -68,7 +69,10 @@ class _Mailbox:
             self._work(*self._mail[ODOM])
 
     def _late(self, stamp_ns: int) -> str | None:
-        return next((topic for topic, mail in self._mail.items() if mail.stamp_ns < stamp_ns), None)
+        for topic, mail in self._mail.items():
+            if mail.stamp_ns < stamp_ns:
+                return topic
+        return None
 
     def stamp_ns(self, topic: str) -> int:
         return self._mail[topic].stamp_ns
@@ -76,11 +80,11 @@ class _Mailbox:
     def wait(self, stamp_ns: int, timeout_s: float) -> dict[str, _Mail]:
         with self._lock:
             self._awaited_ns, self._failure = stamp_ns, None
-            self._complete.clear()
+            self._awaiting.acquire(blocking=False)
             self._work_in()
             late = self._late(stamp_ns)
         if late is not None:
-            self._complete.wait(timeout_s)
+            self._awaiting.acquire(timeout=timeout_s)  # until `put` releases it
         with self._lock:
             self._awaited_ns = -1
             if self._failure is not None:

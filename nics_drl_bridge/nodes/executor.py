@@ -6,7 +6,7 @@ import contextlib
 import inspect
 import itertools
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from typing import Any
 
@@ -21,9 +21,9 @@ from nics_drl_bridge.interface import NS_PER_S
 
 PARTS_MISSING = (AttributeError, TypeError)  # raised if rclpy differs from what is known here
 Received = tuple[Callable[..., Any], tuple[Any, ...]]  # a callback and its arguments
-HANDED_OVER, REST_S = object(), 1e-4
-"""Returned by a callback that has woken another thread of this process. The executor then rests,
-for less than an exchange of messages takes, to keep out of that thread's way."""
+HANDED_OVER, REST, LONGEST_REST_S = object(), 0.4, 1e-3
+"""Returned by a callback that has woken another thread of this process. The executor then keeps out
+of that thread's way for a part of the time since it last did so, at most for LONGEST_REST_S."""
 MOST_AT_ONCE = 32  # a timer without a period is always ready, and the thread has other work, too
 
 
@@ -33,29 +33,33 @@ class StandingExecutor(SingleThreadedExecutor):
     def __init__(self, context: Context) -> None:
         super().__init__(context=context)
         self._entities: _Entities | None = None
-        self._changed, self.stands = True, True
+        self._changed, self.stands, self._handed_over_s = True, True, 0.0
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
         """Waits for an event and handles it; raises ExternalShutdownException, see rclpy."""
         received: list[Received] = []
-        with self._falling_back():
+        try:
             received = self._wait(timeout_sec) if self.stands else []
+        except PARTS_MISSING as error:
+            self._fall_back(error)
         if not self.stands:
             super().spin_once(timeout_sec)
             return
         # Before anything else: a peer may be waiting for the answer to a message.
-        _call(received)
+        self._call(received)
         due: list[Any] = []
         left = False
-        with self._falling_back():
+        try:
             if self._entities is not None and self.context.ok():  # a callback may have shut it down
                 woken, others = self._entities.others_ready(self._guard)
                 self._changed |= woken or others  # adding an entity to a node wakes the executor
                 # So does rclpy itself, after each callback; then there is nothing to handle.
                 due, left = self._entities.due(), others or (woken and bool(self._tasks))
+        except PARTS_MISSING as error:
+            self._fall_back(error)
         if received and self._entities is not None and self.context.ok():
             # To take what arrived while callbacks ran costs less than to wait for it.
-            _call(self._entities.come())
+            self._call(self._entities.come())
         for timer in due:
             self._tick(timer)
         if left:
@@ -72,25 +76,30 @@ class StandingExecutor(SingleThreadedExecutor):
             raise ExternalShutdownException
         return entities.taken()
 
+    def _call(self, received: Iterable[Received]) -> None:
+        handed_over = False
+        for callback, arguments in received:
+            handed_over |= callback(*arguments) is HANDED_OVER
+        if handed_over:
+            before_s, self._handed_over_s = self._handed_over_s, time.monotonic()
+            time.sleep(min(REST * (self._handed_over_s - before_s), LONGEST_REST_S))
+
     def _tick(self, timer: Any) -> None:
         if not self.context.ok() or not any(timer in node.timers for node in self.get_nodes()):
             return
-        ready = False
-        with self._falling_back():
-            ready = timer.handle.is_timer_ready()
-            if ready:
-                timer.handle.call_timer()  # it is due again after another period
-        if ready and self.stands:
-            timer.callback()
-
-    @contextlib.contextmanager
-    def _falling_back(self) -> Iterator[None]:
         try:
-            yield
+            if not timer.handle.is_timer_ready():
+                return
+            timer.handle.call_timer()  # it is due again after another period
         except PARTS_MISSING as error:
-            self.stands = False
-            self._release()
-            get_logger("executor").warning(f"this rclpy needs its own, slower executor ({error})")
+            self._fall_back(error)
+            return
+        timer.callback()
+
+    def _fall_back(self, error: Exception) -> None:
+        self.stands = False
+        self._release()
+        get_logger("executor").warning(f"this rclpy needs its own, slower executor ({error})")
 
     def _handle_others(self) -> None:
         with contextlib.suppress(TimeoutException):
@@ -193,14 +202,6 @@ def _take(subscriptions: Iterable[tuple[Any, int]]) -> list[Received]:
         if taken is not None:
             received.append((subscription.callback, taken[:arguments]))
     return received
-
-
-def _call(received: Iterable[Received]) -> None:
-    handed_over = False
-    for callback, arguments in received:
-        handed_over |= callback(*arguments) is HANDED_OVER
-    if handed_over:
-        time.sleep(REST_S)
 
 
 def _takes(callback: Any, *arguments: Any) -> bool:

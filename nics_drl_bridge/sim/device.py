@@ -107,11 +107,10 @@ def propagate(covariance: Array, before: ArrayLike, after: ArrayLike, added: Arr
     A heading error rotates the motion that follows: P' = F P F^T + Q, F the new pose's derivative
     to the old one (Thrun et al., Probabilistic Robotics, Sec. 5.4), Q `added`.
     """
-    p, (x, y, _) = np.array(covariance, np.float64), np.subtract(before, after).T
-    turned = np.stack([y, -x], axis=1)  # F differs from the identity only in its last column
-    p[:, :2] += turned[:, :, None] * p[:, 2:]
-    p[:, :, :2] += turned[:, None] * p[:, :, 2:]
-    return p + added
+    out = np.array(covariance, np.float64)
+    poses = (np.asarray(each, np.float64).reshape(len(out), 3) for each in (before, after))
+    step_kernels.propagate(out, *poses, added)
+    return out
 
 
 class DrivenSimulator(FastSimulator):

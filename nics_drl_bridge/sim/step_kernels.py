@@ -240,3 +240,21 @@ def end_period(packed: Any, true: Array, before: Array, wheels: Array, counted: 
         waiting = sensing.scan_or_wait(n, waiting, state, scene, part.lidar, motion, scratch)
     sensing.scan_together(waiting, state, scene, part.lidar, scratch)
     sensing.distort(0, state.pose.shape[0], state, part.lidar)
+
+
+@kernel
+def propagate(covariance: Array, before: Array, after: Array, added: Array) -> None:
+    """Propagates covariances in place, see `device.propagate`: P' = F P F^T + Q."""
+    for m in range(covariance.shape[0]):
+        p = covariance[m]
+        # F differs from the identity only in its last column.
+        turned = before[m, 1] - after[m, 1], after[m, 0] - before[m, 0]
+        for i in range(2):
+            for j in range(3):
+                p[i, j] += turned[i] * p[2, j]
+        for j in range(2):
+            for i in range(3):
+                p[i, j] += turned[j] * p[i, 2]
+        for i in range(3):
+            for j in range(3):
+                p[i, j] += added[i, j]

@@ -323,7 +323,9 @@ class Forgetful(Navigation):
 def test_a_task_that_remembers_nothing_can_be_stepped():
     env = vector(2, task=Forgetful)
     env.reset(seed=0)
-    env.step(np.zeros((2, 3), np.float32))
+    observation, reward, *_ = env.step(np.zeros((2, 3), np.float32))
+    assert np.isfinite(observation).all()
+    assert reward.shape == (2,)
 
 
 def test_actions_that_hold_nan_are_refused():

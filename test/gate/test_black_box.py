@@ -76,6 +76,7 @@ def test_it_replays_from_the_middle_once_the_oldest_is_forgotten(tmp_path):
     assert rig.box.copy()[0].now == again.entries[0].now
 
 
+@pytest.mark.slow
 def test_another_decision_than_the_recorded_one_is_found(tmp_path):
     path = tmp_path / "stop.jsonl"
     stopped(path)

@@ -77,6 +77,7 @@ def test_the_lever_arm_along_y_of_a_differential_robot_is_said_to_be_unknown(dif
     assert any("along y could not be learnt" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_a_robot_that_moves_sideways_shows_both_parts_of_the_lever_arm(mecanum):
     recording = drive(
         mecanum, latency=0.05, rotation=-0.5, lever=(0.03, 0.04), noise=(0.001, 0.002)
@@ -97,6 +98,7 @@ def test_bursts_do_not_spoil_offset_and_mounting(differential):
     assert any("bursts" in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_gaps_of_the_pose_do_not_spoil_the_calibration(car):
     recording = drive(car, latency=0.06, rotation=0.4, noise=(5e-4, 1e-3))
     for start in (5.0, 11.3, 20.2):

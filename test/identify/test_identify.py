@@ -149,6 +149,7 @@ def test_at_the_same_steering_the_completed_model_moves_like_the_learnt_one(car)
     assert np.allclose(plain.rates(x), completed.rates(x), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_at_zero_steering_the_parameters_of_the_spec_are_assumed(car):
     spec, recording = constant_steering(car, 0.0)
     found = identify(recording, spec, assume=True)

@@ -24,6 +24,7 @@ FAR, SMALL = (-3600.0, -30.0, 2.0, 3600.0), (-2.0, -1.5, -0.5, -0.3, 0.3, 0.5, 0
 ROBOTS = ("ackermann", "differential", "mecanum")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("robot", "jumps"),
     [

@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.middleware import kernels
-from nics_drl_bridge.middleware.kernels import log_of, logged
+from nics_drl_bridge.middleware.kernels import Log, log_of
+
+
+def logged(log, time, command, needed):
+    limit = np.full(len(command), np.inf)
+    return Log(*kernels.logged(log, time, np.array(command), -limit, limit, needed))
 
 
 def in_effect(log, time):
@@ -37,7 +42,7 @@ def test_of_two_commands_at_once_the_first_stays(time):
     log = log_of([0.0])
     for other in (10, 20, 30):
         log = logged(log, other, [1.0], 0)
-    assert logged(log, time, [2.0], 0) is None
+    assert not len(logged(log, time, [2.0], 0).effective)
 
 
 def test_what_is_no_longer_needed_is_forgotten_and_all_else_kept():

@@ -114,7 +114,19 @@ def test_it_rests_too_when_the_message_that_counts_came_while_another_was_handle
     assert not rests
     publisher.publish(Int32())
     spin_until(executor, lambda: heard, "the message")
-    assert rests == [executor_module.REST_S]
+    assert rests == [executor_module.LONGEST_REST_S]
+
+
+def test_it_rests_for_a_part_of_the_time_since_it_last_did_but_no_longer_than_a_limit(
+    executor, monkeypatch
+):
+    now_s, rests = [0.0], []
+    monkeypatch.setattr(executor_module.time, "sleep", rests.append)
+    monkeypatch.setattr(executor_module.time, "monotonic", lambda: now_s[0])
+    for now_s[0] in (1.0, 1.001, 2.0):
+        executor._call([(lambda: HANDED_OVER, ())])
+    longest = executor_module.LONGEST_REST_S
+    assert rests == pytest.approx([longest, executor_module.REST * 0.001, longest])
 
 
 def test_it_rests_after_a_callback_that_woke_another_thread_and_after_no_other(

@@ -154,6 +154,7 @@ def test_another_rule_is_written_though_a_burst_goes_on(tmp_path, log):
     ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_stop_after_commands_have_passed_for_long_is_written_again(tmp_path, log):
     rig = Recorded(log).drive()
     for _ in range(3):

@@ -159,6 +159,7 @@ def test_a_checkpoint_that_holds_something_else_is_refused(tmp_path, name):
         read_checkpoint(path)
 
 
+@pytest.mark.slow
 def test_a_packed_checkpoint_is_refused_unread(tmp_path):
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_DEFLATED) as archive:

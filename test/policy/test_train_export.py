@@ -26,6 +26,7 @@ def observations(env, count=50):
     return rng.uniform(np.maximum(space.low, -4), np.minimum(space.high, 4), (count, *space.shape))
 
 
+@pytest.mark.slow
 def test_the_file_of_a_ppo_acts_as_it_predicts(env, tmp_path):
     model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu")
     with torch.no_grad():  # actions that have to be cut at the limits

@@ -47,6 +47,7 @@ def test_the_whole_robot_keeps_within_its_circle(robot, seed):
     assert 0.8 < away.max() <= 2.0
 
 
+@pytest.mark.slow
 @robots
 def test_it_begins_and_ends_at_rest(robot):
     pattern = preview(robot)
@@ -91,6 +92,7 @@ def test_a_robot_that_can_reverse_does():
     assert (command.min(axis=0) < -0.5).all()
 
 
+@pytest.mark.slow
 def test_a_seed_tells_a_drive():
     one, other = (preview(ROBOTS[0], 20.0, seed=seed).command for seed in (0, 1))
     same = DrivePlan(ROBOTS[0], 2.0, 20.0).preview().command

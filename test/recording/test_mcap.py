@@ -166,6 +166,7 @@ def test_a_file_without_summary_is_read(tmp_path):
         assert len(bag.serialized("/cmd_vel")) == COUNT
 
 
+@pytest.mark.slow
 def test_a_flipped_bit_of_a_sealed_file_is_found(tmp_path):
     path = written(tmp_path / "drive.mcap", **FORMS["sealed"])
     data = path.read_bytes()

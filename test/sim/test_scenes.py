@@ -239,6 +239,7 @@ def test_start_and_goal_lie_on_one_side_of_a_wall_without_a_door():
     assert set(sides[0]) == {-1.0, 1.0}
 
 
+@pytest.mark.slow
 def test_an_obstacle_never_shuts_the_only_door():
     world = field(
         4.0, obstacles=[circles(3, (0.3,), 0.0)], goal_distance=[1.0, 4.0],
