@@ -75,7 +75,9 @@ class SimulatorModel:
         data = {
             "format": FORMAT, "control_period": self.control_period,
             "robot": self.robot.model_dump(mode="json"),
-            "kinematics": self.kinematics.named.model_dump(exclude_none=True, exclude_defaults=True),
+            "kinematics": self.kinematics.named.model_dump(
+                exclude_none=True, exclude_defaults=True
+            ),
             "calibration": asdict(self.calibration), "lidar": self.lidar.model_dump(mode="json"),
             "noise": self.noise.model_dump(mode="json"),
         }  # fmt: skip

@@ -15,7 +15,14 @@ from nics_drl_bridge.identify.assume import assume_textbook
 from nics_drl_bridge.identify.calibration import Calibration, Response, align
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.fit import (
-    ALPHA, ORDER, Alpha, Fit, Order, Regression, pruned, regress,
+    ALPHA,
+    ORDER,
+    Alpha,
+    Fit,
+    Order,
+    Regression,
+    pruned,
+    regress,
 )  # fmt: skip
 from nics_drl_bridge.identify.inputs import curve_of
 from nics_drl_bridge.identify.mounting import Mounting, mounted, mounting_of
@@ -186,7 +193,8 @@ def _with_delay(findings: Findings, samples: Samples) -> Findings:
 
 def _trials(drive: Drive, findings: Findings) -> list[motions.Trial]:
     training, order = findings.training, drive.settings.order
-    samples, trials = aligned(training, findings), []
+    samples = aligned(training, findings)
+    trials: list[motions.Trial] = []
     problem = motions.problem_of(training, findings.calibration, samples)
     given = motions.inputs_of(training, findings.calibration)
     everything = np.ones(len(samples.t), dtype=np.bool_)
@@ -330,7 +338,7 @@ def bands_of(drive: Drive, findings: Findings) -> dict[float, float]:
 
 
 def _left_out(drive: Drive, findings: Findings) -> dict[float, Array]:
-    """Returns errors (W,) by horizon [s] on each part of the training part, by a model of the rest."""
+    """Returns errors (W,) by horizon [s] on parts of the training part, by models of the rest."""
     training, stages = findings.training, STAGES[: STAGES.index(complete)]
     pose = training.recording.pose
     errors: dict[float, list[Array]] = {h: [] for h in motions.BANDS_S}
@@ -339,14 +347,15 @@ def _left_out(drive: Drive, findings: Findings) -> dict[float, Array]:
         others[block] = False
         rest = training.part(replace(training.recording, pose=pose.rows(others)))
         try:
-            found = run(stages, replace(rest, settings=replace(drive.settings, train_until_s=np.inf)))
+            settings = replace(drive.settings, train_until_s=np.inf)
+            found = run(stages, replace(rest, settings=settings))
         except (FitError, RecordingError):
             return {}
         part = training.part(replace(training.recording, pose=pose.rows(block)))
         for horizon, errors_at in errors.items():
             chosen = windows(part, found.calibration, 0.0, part.duration_s, horizon, SPACING_S)
             if len(chosen.start_t):
-                ends = predict(known(found.model, "the model", "prune"), found.calibration, part, chosen)
+                ends = predict(_fitted(found)[1], found.calibration, part, chosen)
                 errors_at.append(np.hypot(*(ends - chosen.end)[:, :2].T))
     return {h: np.concatenate(each) for h, each in errors.items() if each}
 

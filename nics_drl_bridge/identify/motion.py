@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -16,11 +15,14 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import shooting
 from nics_drl_bridge.identify.calibration import Calibration, outside_gaps
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.fit import Fit, regress, pruned
+from nics_drl_bridge.identify.fit import Fit, pruned, regress
 from nics_drl_bridge.identify.signals import held, inferred_states, resample, unwrapped
 from nics_drl_bridge.identify.statistics import clustered_errors
 from nics_drl_bridge.recording.recording import (
-    Recording, Samples, Stream, samples_on_one_clock,
+    Recording,
+    Samples,
+    Stream,
+    samples_on_one_clock,
 )  # fmt: skip
 from nics_drl_bridge.robot.curve import InputCurve, curved
 from nics_drl_bridge.robot.kinds import steady_twist
@@ -295,7 +297,7 @@ def by_definition(model: TaylorModel, spec: RobotSpec) -> tuple[TaylorModel, Mas
 def tried(
     problem: shooting.Shooting, spec: RobotSpec, order: int, inputs: shooting.Inputs, inside: Mask
 ) -> Trial | None:
-    """Fits to all but one of `FOLDS` parts of the rows `inside` (T,), predicts that; each in turn."""
+    """Fits to all but one of `FOLDS` parts of the rows `inside` (T,), and predicts that."""
     sparse = replace(problem, spacing_s=CV_SPACING_S)
     blocks = np.array_split(np.flatnonzero(inside), FOLDS)
     errors: dict[float, list[Array]] = {h: [] for h in BANDS_S}

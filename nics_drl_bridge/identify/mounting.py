@@ -8,7 +8,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array, rotate, wrap_angle
 from nics_drl_bridge.identify import clocks
 from nics_drl_bridge.identify.calibration import Calibration
@@ -16,7 +15,6 @@ from nics_drl_bridge.identify.drive import Drive, TwistIntervals
 from nics_drl_bridge.identify.signals import followed, held
 from nics_drl_bridge.identify.statistics import standard_errors
 from nics_drl_bridge.recording.recording import Stream
-from nics_drl_bridge.robot.kinds import has_textbook, steady_twist
 from nics_drl_bridge.robot.kinds import has_textbook, steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -131,7 +129,7 @@ def _by_commands(
 ) -> Mounting | None:
     """Estimates an omnidirectional robot's mounting; None unless it moved along x, y and turned."""
     recording, spec = drive.recording, drive.spec
-    if by_twist := any(v.twist for v in spec.state) and recording.state is None:
+    if any(v.twist for v in spec.state) and recording.state is None:
         begin = twists.start + timing.offset - timing.latency
         command = held(recording.command, spec, begin, begin + twists.end - twists.start)
     elif spec.state:

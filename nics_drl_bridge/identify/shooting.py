@@ -56,7 +56,7 @@ class Shooting:
     spacing_s: float = SPACING_S
 
     def starts(self, horizon: float, inside: Mask | None = None) -> tuple[NDArray[np.intp], int]:
-        """Returns first rows (W,) of windows without gaps, of rows `inside` (T,), and their steps."""
+        """Returns first rows (W,) of windows without gaps, of rows `inside` (T,), and steps."""
         t, dt = self.samples.t, self.samples.dt
         steps = max(1, round(horizon / dt))
         first = np.arange(0, max(len(t) - steps, 0), max(1, round(self.spacing_s / dt)))
@@ -82,7 +82,7 @@ class Shooting:
         self, model: TaylorModel, values: Array, first: NDArray[np.intp], steps: int,
         free: Mask | None = None,
     ) -> tuple[Array, Array]:  # fmt: skip
-        """Returns ends (W, 3) of windows, and derivatives (W, 3, P) by `free` (D, K) coefficients."""
+        """Returns ends (W, 3) of windows, derivatives (W, 3, P) by `free` (D, K) coefficients."""
         free = np.zeros(model.coefficients.shape, dtype=np.bool_) if free is None else free
         used = (model.coefficients != 0.0) | free
         dofs, places = np.nonzero(used)
@@ -151,7 +151,8 @@ def fitted(
     def at(theta: Array) -> tuple[TaylorModel, Array]:
         coefficients = model.coefficients.copy()
         coefficients[free] = first + theta[count:] * unit
-        return replace(model, coefficients=coefficients), inputs.start + inputs.scale * theta[:count]
+        late = inputs.start + inputs.scale * theta[:count]
+        return replace(model, coefficients=coefficients), late
 
     def shot(theta: Array, sloped: bool) -> tuple[Array, Array]:
         trial, late = at(theta)

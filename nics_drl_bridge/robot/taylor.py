@@ -35,7 +35,7 @@ class TaylorModel:
     # (D, K); NaN for a kept coefficient that was assumed or defined; (0, 0) if none is known
     std_errors: Array = field(default_factory=lambda: np.zeros((0, 0)))
     quality: Quality | None = None
-    bounded: bool = False  # True if the state is held in the box that the recording covered, widened
+    bounded: bool = False  # True if the state is held in the recording's box, widened
 
     @property
     def state_size(self) -> int:
