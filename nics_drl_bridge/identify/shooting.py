@@ -29,9 +29,11 @@ HORIZONS_S = (1.0, 2.5, 5.0)
 SPACING_S = 0.25
 HEADING_ARM_M = 0.3  # a heading error counts as a position error at this distance
 FARTHEST_M = 50.0  # errors are cut at this distance per second of the horizon
-PRIOR = 0.001  # weight of the linear fit against the predictions
+PULL = 0.001  # usual weight of the first coefficients against the predictions
+REFERENCE_M_S = 0.1  # error that weighs as much, at a pull of 1, as a term as large as the rates
 DIFFERENCE = 0.02  # step of finite differences by the values of inputs, in their scale
 EVALUATIONS = 30
+LEAST_SCALE = 0.02  # of the loss: smaller errors count as their squares [m/s]
 SAME_STEP = 0.01  # share of a step by which two steps may differ
 
 
@@ -52,6 +54,7 @@ class Shooting:
     samples: Samples
     commands: Commands
     mounted: bool = False  # True if the last three values are the pose of what `q` is, in the base
+    fixed: Array | None = None  # values (I,) that are used instead of those given
     horizons: tuple[float, ...] = HORIZONS_S
     spacing_s: float = SPACING_S
 
@@ -89,6 +92,7 @@ class Shooting:
         terms = term_arrays(replace(model, coefficients=used.astype(np.float64)))
         terms = terms._replace(coefficient=model.coefficients[dofs, places])
         moving = np.flatnonzero(free[dofs, places]).astype(np.int64)
+        values = values if self.fixed is None else self.fixed
         command, state = self.commands(values), self.samples.q[:, 3:]
         rows = first[:, None] + np.arange(steps)
         count = len(first)
@@ -137,69 +141,106 @@ class Predictive:
     value_errors: Array  # (I,) standard errors of the values
 
 
+NOTHING_FREE = Inputs(*(np.zeros(0) for _ in range(4)))
+
+
 def fitted(
     problem: Shooting, model: TaylorModel, free: Mask, inputs: Inputs, inside: Mask | None = None,
-    evaluations: int = EVALUATIONS,
+    evaluations: int = EVALUATIONS, pull: float = PULL, first: Array | None = None,
 ) -> Predictive:  # fmt: skip
-    """Adjusts free coefficients (D, K) and values of inputs to the least prediction errors."""
-    unit = scale_of(problem.samples, model)[free]
-    chosen = [(*problem.starts(h, inside), h) for h in problem.horizons]
-    chosen = [each for each in chosen if len(each[0])]
-    weight = np.array([1.0, 1.0, HEADING_ARM_M])
-    count, first = len(inputs.start), model.coefficients[free]
+    """Adjusts free coefficients (D, K) and values of inputs to the least prediction errors.
 
-    def at(theta: Array) -> tuple[TaylorModel, Array]:
-        coefficients = model.coefficients.copy()
-        coefficients[free] = first + theta[count:] * unit
-        late = inputs.start + inputs.scale * theta[:count]
-        return replace(model, coefficients=coefficients), late
+    They are pulled to those of the model. The search starts at the `first` if these are better.
+    """
+    return _Search(problem, model, free, inputs, inside, pull).run(first, evaluations)
 
-    def shot(theta: Array, sloped: bool) -> tuple[Array, Array]:
-        trial, late = at(theta)
+
+class _Search:
+    """Least squares over windows, by scaled values and coefficients (I + P,): zero is the model."""
+
+    def __init__(
+        self, problem: Shooting, model: TaylorModel, free: Mask, inputs: Inputs,
+        inside: Mask | None, pull: float,
+    ) -> None:  # fmt: skip
+        self.problem, self.model, self.free, self.inputs = problem, model, free, inputs
+        self.unit = scale_of(problem.samples, model)[free]
+        chosen = ((*problem.starts(h, inside), h) for h in problem.horizons)
+        self.chosen = [each for each in chosen if len(each[0])]
+        self.weight = np.array([1.0, 1.0, HEADING_ARM_M])
+        self.count = len(inputs.start)
+        rows = 3 * sum(len(begin) for begin, *_ in self.chosen)
+        self.pull = REFERENCE_M_S * np.sqrt(pull * rows)
+
+    def at(self, theta: Array) -> tuple[TaylorModel, Array]:
+        """Returns the model and the values of the inputs."""
+        coefficients = self.model.coefficients.copy()
+        coefficients[self.free] += theta[self.count :] * self.unit
+        late = self.inputs.start + self.inputs.scale * theta[: self.count]
+        return replace(self.model, coefficients=coefficients), late
+
+    def shot(self, theta: Array, sloped: bool) -> tuple[Array, Array]:
+        """Returns scaled errors (n,), and derivatives (n, P) by the coefficients."""
+        trial, late = self.at(theta)
         rest, slopes = [], []
-        for begin, steps, horizon in chosen:
-            end, slope = problem.predict(trial, late, begin, steps, free if sloped else None)
-            error = end - problem.moved(begin, steps)
+        for begin, steps, horizon in self.chosen:
+            free = self.free if sloped else None
+            end, slope = self.problem.predict(trial, late, begin, steps, free)
+            error = end - self.problem.moved(begin, steps)
             error[:, 2] = geometry.wrap_angle(error[:, 2])
-            rest.append((np.clip(error, -FARTHEST_M, FARTHEST_M) * weight / horizon).ravel())
-            slope = slope * weight[:, None] / horizon
+            far = np.clip(error, -FARTHEST_M, FARTHEST_M) * self.weight / horizon
+            rest.append(far.ravel())
+            slope = slope * self.weight[:, None] / horizon
             slopes.append(slope.reshape(3 * len(begin), slope.shape[2]))
         return np.nan_to_num(np.concatenate(rest), nan=FARTHEST_M), np.concatenate(slopes)
 
-    begun, _ = shot(np.zeros(count + len(unit)), False)
-    pull = np.sqrt(PRIOR * len(begun)) * 0.1
+    def residual(self, theta: Array) -> Array:
+        """Returns what is to be small (n + P,)."""
+        return np.append(self.shot(theta, False)[0], self.pull * theta[self.count :])
 
-    def residual(theta: Array) -> Array:
-        return np.append(shot(theta, False)[0], pull * theta[count:])
-
-    def jacobian(theta: Array) -> Array:
-        rest, slope = shot(theta, True)
+    def jacobian(self, theta: Array) -> Array:
+        """Returns its derivatives (n + P, I + P)."""
+        count, unit = self.count, self.unit
+        rest, slope = self.shot(theta, True)
         late = np.empty((len(rest), count))
         for c in range(count):
             aside = theta + DIFFERENCE * (np.arange(len(theta)) == c)
-            late[:, c] = (shot(aside, False)[0] - rest) / DIFFERENCE
+            late[:, c] = (self.shot(aside, False)[0] - rest) / DIFFERENCE
         slope = np.clip(np.nan_to_num(slope * unit), -1e6, 1e6)
-        own = np.concatenate([np.zeros((len(unit), count)), pull * np.eye(len(unit))], axis=1)
+        own = np.concatenate([np.zeros((len(unit), count)), self.pull * np.eye(len(unit))], axis=1)
         return np.concatenate([np.concatenate([late, slope], axis=1), own])
 
-    low = np.full(count + len(unit), -np.inf)
-    high = -low
-    low[:count] = (inputs.low - inputs.start) / inputs.scale - 1e-9
-    high[:count] = (inputs.high - inputs.start) / inputs.scale + 1e-9
-    found = least_squares(
-        residual, np.zeros(count + len(unit)), jac=jacobian, bounds=(low, high), loss="soft_l1",
-        f_scale=max(float(np.median(np.abs(begun))), 0.02), max_nfev=evaluations,
-    )  # fmt: skip
-    best, late = at(found.x)
-    rest, slope = shot(found.x, True)
-    starts = [np.repeat(problem.samples.t[begin], 3) for begin, *_ in chosen]
-    error = float(np.sqrt(np.mean(rest**2)))
-    span = np.floor(np.concatenate(starts) / max(problem.horizons)).astype(np.intp)
-    late_slope = jacobian(found.x)[: len(rest), :count] / inputs.scale
-    value_errors = clustered_errors(late_slope, rest, span)
-    return Predictive(
-        best, late, error, slope, rest, free, np.concatenate(starts), value_errors
-    )  # fmt: skip
+    def run(self, first: Array | None, evaluations: int) -> Predictive:
+        """Searches for the least errors."""
+        count, inputs, start = self.count, self.inputs, np.zeros(self.count + len(self.unit))
+        begun = self.residual(start)
+        if first is not None:
+            other = start.copy()
+            other[count:] = (first[self.free] - self.model.coefficients[self.free]) / self.unit
+            if np.abs(rest := self.residual(other)).sum() < np.abs(begun).sum():
+                start, begun = other, rest
+        low = np.full(len(start), -np.inf)
+        high = -low
+        low[:count] = (inputs.low - inputs.start) / inputs.scale - 1e-9
+        high[:count] = (inputs.high - inputs.start) / inputs.scale + 1e-9
+        found = least_squares(
+            self.residual, start, jac=self.jacobian, bounds=(low, high), loss="soft_l1",
+            f_scale=max(float(np.median(np.abs(begun))), LEAST_SCALE), max_nfev=evaluations,
+        )  # fmt: skip
+        return self.predictive(found.x)
+
+    def predictive(self, theta: Array) -> Predictive:
+        """Returns the model with what tells its uncertainty."""
+        best, late = self.at(theta)
+        rest, slope = self.shot(theta, True)
+        t = self.problem.samples.t
+        starts = np.concatenate([np.repeat(t[begin], 3) for begin, *_ in self.chosen])
+        span = np.floor(starts / max(self.problem.horizons)).astype(np.intp)
+        errors = np.zeros(0)
+        if self.count:
+            late_slope = self.jacobian(theta)[: len(rest), : self.count] / self.inputs.scale
+            errors = clustered_errors(late_slope, rest, span)
+        error = float(np.sqrt(np.mean(rest**2)))
+        return Predictive(best, late, error, slope, rest, self.free, starts, errors)
 
 
 def scale_of(samples: Samples, model: TaylorModel) -> Array:
