@@ -150,7 +150,7 @@ def library(powers: Powers, spec: RobotSpec) -> Mask:
         else:
             follows = names.index(str(variable.follows))
             allowed[3 + i] = alone | ((order == 1) & (powers[:, follows] == 1))
-    return allowed
+    return np.asarray(allowed)
 
 
 def samples_of(drive: Drive, calibration: Calibration, width: float) -> Samples:
@@ -278,7 +278,7 @@ def by_textbook(powers: Powers, spec: RobotSpec) -> Mask:
     names, states, order = spec.variable_names, len(spec.state), powers.sum(axis=1)
     allowed, given = library(powers, spec) & (order <= 1), structure_of(spec)
     if given is None or not states:
-        return allowed
+        return np.asarray(allowed)
     moves, bicycle = given
     first = np.eye(len(names), dtype=np.int64)
     speed = [i for i, v in enumerate(spec.state) if v.twist == "vx"]
@@ -371,13 +371,11 @@ def tried(
     """Fits each hypothesis to all but one of `FOLDS` parts of a drive, and predicts that part."""
     sparse = replace(problem, spacing_s=CV_SPACING_S, fixed=values)
     everything = np.arange(len(problem.samples.t))
-    errors: dict[Hypothesis, dict[float, list[Array]]]
-    errors = {hypothesis: {t: [] for t in BANDS_S} for hypothesis in asked}
-    paths = []
+    errors: dict[Hypothesis, list[Array]] = {hypothesis: [] for hypothesis in asked}
+    paths, judge = [], replace(sparse, horizons=BANDS_S)
     for block in np.array_split(everything, FOLDS):
         left = np.isin(everything, block)
         base = fit_base(sparse, spec, shooting.NOTHING_FREE, ~left)
-        paths.append(problem.paths(*problem.starts(HORIZON_S, left)))
         linear: dict[int, TaylorModel] = {}
         for order, pull in asked:
             model = base.model
@@ -388,14 +386,14 @@ def tried(
                     sparse, base.model, linear[order], spec, shooting.NOTHING_FREE, ~left,
                     CV_EVALUATIONS, pull,
                 ).model  # fmt: skip
-            for horizon in BANDS_S:
-                error, _ = sparse.errors(model, values, horizon, left)
-                errors[order, pull][horizon].append(np.hypot(error[:, 0], error[:, 1]))
-    path = max(float(np.concatenate(paths).mean()), 1e-9)
+            error, path = judge.errors(model, values, left)
+            errors[order, pull].append(np.hypot(error[..., 0], error[..., 1]))
+        paths.append(path)
+    length = max(float(np.nanmean(np.concatenate(paths)[:, -1])), 1e-9)
     return tuple(
-        Trial(order, pull, float(np.concatenate(found[HORIZON_S]).mean()) / path,
-              {h: np.concatenate(each) for h, each in found.items()})
-        for (order, pull), found in errors.items()
+        Trial(order, pull, float(np.nanmean(far[:, -1])) / length,
+              {h: each[~np.isnan(each)] for h, each in zip(BANDS_S, far.T, strict=True)})
+        for (order, pull), blocks in errors.items() for far in [np.concatenate(blocks)]
     )  # fmt: skip
 
 

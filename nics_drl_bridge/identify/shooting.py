@@ -23,6 +23,7 @@ from nics_drl_bridge.robot.kernels import term_arrays
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 Mask = NDArray[np.bool_]
+Rows = NDArray[np.intp]
 Commands = Callable[[Array], Array]  # those in effect (T, C) during each step, by values (I,)
 
 HORIZONS_S = (1.0, 2.5, 5.0)
@@ -58,34 +59,40 @@ class Shooting:
     horizons: tuple[float, ...] = HORIZONS_S
     spacing_s: float = SPACING_S
 
-    def starts(self, horizon: float, inside: Mask | None = None) -> tuple[NDArray[np.intp], int]:
-        """Returns first rows (W,) of windows without gaps, of rows `inside` (T,), and steps."""
+    def starts(self, inside: Mask | None = None) -> tuple[Rows, Rows]:
+        """Returns first rows (W,) of windows, and steps (W, H) to their horizons; 0: not inside.
+
+        Windows have no gaps, and only rows `inside` (T,).
+        """
         t, dt = self.samples.t, self.samples.dt
-        steps = max(1, round(horizon / dt))
-        first = np.arange(0, max(len(t) - steps, 0), max(1, round(self.spacing_s / dt)))
-        last = first + steps
-        whole = np.abs(t[last] - t[first] - steps * dt) < SAME_STEP * dt * steps
+        last = len(t) - 1
+        first = np.arange(0, last, max(1, round(self.spacing_s / dt)))
+        steps = np.tile(np.maximum(1, np.round(np.array(self.horizons) / dt)), (len(first), 1))
+        steps = steps.astype(np.intp)
+        end = np.minimum(first[:, None] + steps, last)
+        apart = t[end] - t[first][:, None] - steps * dt
+        whole = (end - first[:, None] == steps) & (np.abs(apart) < SAME_STEP * dt * steps)
         if inside is not None:
             outside = np.append(0, np.cumsum(~inside))
-            whole &= outside[last] == outside[first]
-        return first[whole], steps
+            whole &= outside[end] == outside[first][:, None]
+        some = whole.any(axis=1)
+        return first[some], np.where(whole, steps, 0)[some]
 
-    def moved(self, first: NDArray[np.intp], steps: int) -> Array:
-        """Returns the measured poses (W, 3) at windows' ends from those at their starts."""
+    def moved(self, first: Rows, steps: Rows) -> Array:
+        """Returns the measured poses (W, H, 3) at windows' horizons from those at their starts."""
         pose = self.samples.q[:, :3]
-        return geometry.between(pose[first], pose[first + steps])
+        return geometry.between(pose[first][:, None], pose[first[:, None] + steps])
 
-    def paths(self, first: NDArray[np.intp], steps: int) -> Array:
-        """Returns the lengths (W,) of the measured paths over windows [m]."""
+    def paths(self, first: Rows, steps: Rows) -> Array:
+        """Returns the lengths (W, H) of the measured paths over windows [m]."""
         step = np.hypot(*np.diff(self.samples.q[:, :2], axis=0).T)
         length = np.append(0.0, np.cumsum(step))
-        return np.asarray(length[first + steps] - length[first])
+        return np.asarray(length[first[:, None] + steps] - length[first][:, None])
 
     def predict(
-        self, model: TaylorModel, values: Array, first: NDArray[np.intp], steps: int,
-        free: Mask | None = None,
-    ) -> tuple[Array, Array]:  # fmt: skip
-        """Returns ends (W, 3) of windows, derivatives (W, 3, P) by `free` (D, K) coefficients."""
+        self, model: TaylorModel, values: Array, first: Rows, steps: Rows, free: Mask | None = None
+    ) -> tuple[Array, Array]:
+        """Returns poses (W, H, 3), derivatives (W, H, 3, P) by `free` (D, K) coefficients."""
         free = np.zeros(model.coefficients.shape, dtype=np.bool_) if free is None else free
         used = (model.coefficients != 0.0) | free
         dofs, places = np.nonzero(used)
@@ -94,37 +101,38 @@ class Shooting:
         moving = np.flatnonzero(free[dofs, places]).astype(np.int64)
         values = values if self.fixed is None else self.fixed
         command, state = self.commands(values), self.samples.q[:, 3:]
-        rows = first[:, None] + np.arange(steps)
-        count = len(first)
         low, high = model.state_box
         shot = Shot(
-            np.ascontiguousarray(state[first]), np.ascontiguousarray(command[rows]), low, high,
-            np.zeros((count, 3)), np.zeros((count, 3, len(moving))),
+            np.ascontiguousarray(state[first]), first, np.ascontiguousarray(command), steps, low,
+            high, np.zeros((*steps.shape, 3)), np.zeros((*steps.shape, 3, len(moving))),
         )  # fmt: skip
         scratch = tangent(state.shape[1], command.shape[1], len(dofs), len(moving))
         shoot(shot, terms, moving, model.dt, scratch)
         return _seen_from(values[-3:], shot) if self.mounted else (shot.end, shot.slope)
 
     def errors(
-        self, model: TaylorModel, values: Array, horizon: float, inside: Mask | None = None
+        self, model: TaylorModel, values: Array, inside: Mask | None = None
     ) -> tuple[Array, Array]:
-        """Returns errors (W, 3) of predictions over a horizon [s], and the paths' lengths (W,)."""
-        first, steps = self.starts(horizon, inside)
+        """Returns errors (W, H, 3) of predictions, and the lengths (W, H) of paths; maybe NaN."""
+        first, steps = self.starts(inside)
         error = self.predict(model, values, first, steps)[0] - self.moved(first, steps)
-        error[:, 2] = geometry.wrap_angle(error[:, 2])
-        return error, self.paths(first, steps)
+        error[..., 2] = geometry.wrap_angle(error[..., 2])
+        error[steps == 0] = np.nan
+        return error, np.where(steps > 0, self.paths(first, steps), np.nan)
 
 
 def _seen_from(mounting: Array, shot: Shot) -> tuple[Array, Array]:
-    """Returns ends (W, 3) and their derivatives of a body at a pose (3,) in the base."""
+    """Returns ends (W, H, 3) and their derivatives of a body at a pose (3,) in the base."""
     end = geometry.between(mounting, geometry.compose(shot.end, mounting))
-    end[:, 2] = shot.end[:, 2]
-    arm = geometry.rotate(np.broadcast_to(mounting[:2], (len(end), 2)), shot.end[:, 2])
-    across = np.stack([-arm[:, 1], arm[:, 0]], axis=1)[:, :, None]
-    moved = shot.slope[:, :2] + across * shot.slope[:, 2:]
+    end[..., 2] = shot.end[..., 2]
+    arm = np.broadcast_to(mounting[:2], (*end.shape[:2], 2))
+    arm = geometry.rotate(arm, shot.end[..., 2])
+    across = np.stack([-arm[..., 1], arm[..., 0]], axis=-1)[..., None]
+    moved = shot.slope[..., :2, :] + across * shot.slope[..., 2:, :]
     c, s = np.cos(mounting[2]), np.sin(mounting[2])
-    along, aside = moved[:, 0], moved[:, 1]
-    return end, np.stack([c * along + s * aside, c * aside - s * along, shot.slope[:, 2]], axis=1)
+    along, aside = moved[..., 0, :], moved[..., 1, :]
+    rows = [c * along + s * aside, c * aside - s * along, shot.slope[..., 2, :]]
+    return end, np.stack(rows, axis=-2)
 
 
 @dataclass(frozen=True)
@@ -164,12 +172,13 @@ class _Search:
     ) -> None:  # fmt: skip
         self.problem, self.model, self.free, self.inputs = problem, model, free, inputs
         self.unit = scale_of(problem.samples, model)[free]
-        chosen = ((*problem.starts(h, inside), h) for h in problem.horizons)
-        self.chosen = [each for each in chosen if len(each[0])]
-        self.weight = np.array([1.0, 1.0, HEADING_ARM_M])
+        self.first, self.steps = problem.starts(inside)
+        self.wanted = self.steps > 0
+        weight = np.array([1.0, 1.0, HEADING_ARM_M])
+        self.weight = (weight / np.array(problem.horizons)[:, None])[None, :, :]
+        self.measured = problem.moved(self.first, self.steps)
         self.count = len(inputs.start)
-        rows = 3 * sum(len(begin) for begin, *_ in self.chosen)
-        self.pull = REFERENCE_M_S * np.sqrt(pull * rows)
+        self.pull = REFERENCE_M_S * np.sqrt(pull * 3 * np.count_nonzero(self.wanted))
 
     def at(self, theta: Array) -> tuple[TaylorModel, Array]:
         """Returns the model and the values of the inputs."""
@@ -181,17 +190,14 @@ class _Search:
     def shot(self, theta: Array, sloped: bool) -> tuple[Array, Array]:
         """Returns scaled errors (n,), and derivatives (n, P) by the coefficients."""
         trial, late = self.at(theta)
-        rest, slopes = [], []
-        for begin, steps, horizon in self.chosen:
-            free = self.free if sloped else None
-            end, slope = self.problem.predict(trial, late, begin, steps, free)
-            error = end - self.problem.moved(begin, steps)
-            error[:, 2] = geometry.wrap_angle(error[:, 2])
-            far = np.clip(error, -FARTHEST_M, FARTHEST_M) * self.weight / horizon
-            rest.append(far.ravel())
-            slope = slope * self.weight[:, None] / horizon
-            slopes.append(slope.reshape(3 * len(begin), slope.shape[2]))
-        return np.nan_to_num(np.concatenate(rest), nan=FARTHEST_M), np.concatenate(slopes)
+        free = self.free if sloped else None
+        end, slope = self.problem.predict(trial, late, self.first, self.steps, free)
+        error = end - self.measured
+        error[..., 2] = geometry.wrap_angle(error[..., 2])
+        rest = np.clip(error, -FARTHEST_M, FARTHEST_M) * self.weight
+        slopes = (slope * self.weight[..., None])[self.wanted]
+        rows = np.nan_to_num(rest[self.wanted].ravel(), nan=FARTHEST_M)
+        return rows, slopes.reshape(len(rows), slope.shape[-1])
 
     def residual(self, theta: Array) -> Array:
         """Returns what is to be small (n + P,)."""
@@ -232,8 +238,7 @@ class _Search:
         """Returns the model with what tells its uncertainty."""
         best, late = self.at(theta)
         rest, slope = self.shot(theta, True)
-        t = self.problem.samples.t
-        starts = np.concatenate([np.repeat(t[begin], 3) for begin, *_ in self.chosen])
+        starts = np.repeat(self.problem.samples.t[self.first], 3 * self.wanted.sum(axis=1))
         span = np.floor(starts / max(self.problem.horizons)).astype(np.intp)
         errors = np.zeros(0)
         if self.count:
