@@ -221,8 +221,8 @@ def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:
     samples = aligned(findings.training, findings)
     linear = motions.linear_fit(samples, drive.spec, order)
     return replace(
-        findings, samples=samples, regression=linear.regression, linear=linear, model=linear.model,
-        trials=tuple(trials),
+        findings, samples=samples, regression=linear.regression, linear=linear,
+        model=replace(linear.model, inputs=findings.calibration.inputs), trials=tuple(trials),
     )  # fmt: skip
 
 
@@ -278,8 +278,9 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
     if problem.mounted:
         calibration = motions.remounted(calibration, found)
     errors = motions.standard_errors(found)
+    model = replace(found.model, std_errors=errors, inputs=calibration.inputs)
     return replace(
-        findings, calibration=calibration, model=replace(found.model, std_errors=errors),
+        findings, calibration=calibration, model=model,
         refinement=(f"Coefficients and latency were refined by the open-loop errors over up to "
                     f"{max(shooting.HORIZONS_S):g} s.",),
     )  # fmt: skip
