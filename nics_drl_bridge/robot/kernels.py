@@ -97,6 +97,14 @@ def bend(command, curve):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def put_command(x, command, terms):  # type: ignore[no-untyped-def]
+    """Writes the effect of a command (C,) to `x`."""
+    first = x.shape[0] - 1 - command.shape[0]
+    for c in range(command.shape[0]):
+        x[first + c] = bend(command[c], terms.curves[c])
+
+
+@kernel
 def bounds_of(terms, i):  # type: ignore[no-untyped-def]
     """Returns the bounds of state variable i."""
     return Bounds(terms.low[i], terms.high[i], terms.fall[i], terms.rise[i], terms.friction[i])

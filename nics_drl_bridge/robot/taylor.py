@@ -76,6 +76,11 @@ class TaylorModel:
         """True if the motors do nothing beside the terms."""
         return not (self.inputs or self.friction.any() or np.isfinite(self.limits).any())
 
+    @property
+    def braking(self) -> Array:
+        """Greatest rate towards zero (S,) of each state, from both sides; infinite if unlimited."""
+        return np.asarray(np.minimum(-self.limits[:, 0], self.limits[:, 1]))
+
     def in_effect(self, command: ArrayLike) -> Array:
         """Returns the commands in effect (..., C) of commands, by the input curves."""
         return bent(command, self.variables[self.state_size :], self.inputs)
@@ -225,8 +230,8 @@ class Quality:
     open_loop_path_m: float = 0.0
 
 
-Fall = Annotated[float, AllowInfNan(), Field(le=0.0)]
-Rise = Annotated[float, AllowInfNan(), Field(ge=0.0)]
+Fall = Annotated[float, AllowInfNan(), Field(lt=0.0)]
+Rise = Annotated[float, AllowInfNan(), Field(gt=0.0)]
 
 
 class NamedTaylorModel(Schema):
