@@ -206,8 +206,9 @@ def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:
     best = motions.chosen(trials).order
     linear = motions.linear_fit(samples, spec, best or motions.BASE_ORDER)
     return replace(
-        findings, samples=samples, regression=linear.regression, linear=linear, model=linear.model,
-        trials=trials, base=base.model,
+        findings, samples=samples, regression=linear.regression, linear=linear,
+        model=replace(linear.model, inputs=findings.calibration.inputs), trials=trials,
+        base=base.model,
     )  # fmt: skip
 
 
@@ -269,8 +270,9 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
     if problem.mounted:
         calibration = motions.remounted(calibration, found)
     errors = motions.standard_errors(found)
+    model = replace(found.model, std_errors=errors, inputs=calibration.inputs)
     return replace(
-        findings, calibration=calibration, model=replace(found.model, std_errors=errors),
+        findings, calibration=calibration, model=model,
         refinement=(f"Coefficients and latency were refined by the open-loop errors over up to "
                     f"{max(shooting.HORIZONS_S):g} s.",),
     )  # fmt: skip

@@ -101,10 +101,9 @@ class Shooting:
         moving = np.flatnonzero(free[dofs, places]).astype(np.int64)
         values = values if self.fixed is None else self.fixed
         command, state = self.commands(values), self.samples.q[:, 3:]
-        low, high = model.state_box
         shot = Shot(
-            np.ascontiguousarray(state[first]), first, np.ascontiguousarray(command), steps, low,
-            high, np.zeros((*steps.shape, 3)), np.zeros((*steps.shape, 3, len(moving))),
+            np.ascontiguousarray(state[first]), first, np.ascontiguousarray(command), steps,
+            np.zeros((*steps.shape, 3)), np.zeros((*steps.shape, 3, len(moving))),
         )  # fmt: skip
         scratch = tangent(state.shape[1], command.shape[1], len(dofs), len(moving))
         shoot(shot, terms, moving, model.dt, scratch)
