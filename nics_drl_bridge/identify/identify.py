@@ -59,7 +59,7 @@ class Findings:
     # of `motion`: half-width [s] of the parabolas that gave the state; None if it was not derived
     width: float | None = None
     samples: Samples | None = None  # of the training part on one time axis, of `fit`
-    base: TaylorModel | None = None  # of the textbook's terms, of `fit`
+    base: motions.Base | None = None  # of the textbook's terms, of `fit`
     trials: tuple[motions.Trial, ...] = ()  # of orders, on parts of the training part, of `fit`
     regression: Regression | None = None  # on all features (Eq. 1), of `fit`
     linear: Fit | None = None  # the pruned fit (Eq. 2), of `prune`
@@ -196,19 +196,21 @@ def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:
     """Fits the order that predicts parts of the training part best that its fits did not see."""
     training, spec, order = findings.training, drive.spec, drive.settings.order
     samples = aligned(training, findings)
-    problem = motions.problem_of(training, findings.calibration, samples)
-    given = motions.inputs_of(training, findings.calibration)
     try:
-        base = motions.fit_base(problem, spec, given)
-        trials = motions.tried(problem, spec, motions.hypotheses(spec, order), base.values)
+        base = motions.base_of(training, findings.calibration, samples)
+        asked = motions.hypotheses(spec, order)
+        trials = motions.tried(base.problem, spec, asked, base.inputs.start)
     except FitError as error:
         raise FitError(f"{drive.recording.source}: {error}") from None
     best = motions.chosen(trials).order
+    curves = motions.curves_at(base.actuators, base.inputs.start)
+    calibration = replace(findings.calibration, inputs=curves)
+    findings = replace(findings, calibration=calibration)
+    samples = aligned(training, findings)
     linear = motions.linear_fit(samples, spec, best or motions.BASE_ORDER)
     return replace(
         findings, samples=samples, regression=linear.regression, linear=linear,
-        model=replace(linear.model, inputs=findings.calibration.inputs), trials=trials,
-        base=base.model,
+        model=replace(linear.model, inputs=curves), trials=trials, base=base,
     )  # fmt: skip
 
 
@@ -252,22 +254,19 @@ def refine(drive: Drive, findings: Findings) -> Findings:
 
 def _refined_motion(drive: Drive, findings: Findings) -> Findings:
     linear, _ = _fitted(findings)
-    samples = known(findings.samples, "the training part", "fit")
-    problem = motions.problem_of(findings.training, findings.calibration, samples)
-    calibration = findings.calibration
-    given, given_curves = motions.inputs_of(findings.training, calibration), calibration.inputs
+    calibration, spec = findings.calibration, drive.spec
     base, best = known(findings.base, "the base", "fit"), motions.chosen(findings.trials)
     if best.order:
         found = motions.refined(
-            problem, base, linear.model, drive.spec, given, pull=best.pull
-        )  # fmt: skip
+            base.problem, base.found.model, linear.model, spec, base.inputs, pull=best.pull
+        )
     else:
-        found = motions.fit_base(problem, drive.spec, given)
+        found = motions.fit_base(base.problem, spec, base.inputs)
     calibration = replace(
         calibration, command_latency_s=float(found.values[0]),
-        inputs=motions.curves_at(calibration.inputs, found.values[1:1 + 3 * len(given_curves)]),
+        inputs=motions.curves_at(base.actuators, found.values),
     )  # fmt: skip
-    if problem.mounted:
+    if base.problem.mounted:
         calibration = motions.remounted(calibration, found)
     errors = motions.standard_errors(found)
     model = replace(found.model, std_errors=errors, inputs=calibration.inputs)

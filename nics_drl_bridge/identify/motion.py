@@ -43,9 +43,11 @@ WORTH = 0.95  # a higher order is worth its terms if it takes the error to this 
 FOLDS = 3
 DELAY_ORDER, DELAY_STEP_S, LONGEST_S = 2, 0.02, 0.4  # of the search for a delay
 DELAY_SCALE_S, CURVE_SCALE = 0.05, 0.1  # steps of their refinement
+STRONG = 95.0  # percentile of the rates at which limits are first sought
 LEVER_SCALE_M, TURN_SCALE = 0.05, 0.1
 CV_SPACING_S, CV_EVALUATIONS = 0.5, 25
-BASE_ORDER, BASE_EVALUATIONS = 2, 40
+BASE_ORDER, BASE_EVALUATIONS, BASE_SPACING_S = 2, 40, 0.5
+SKETCH = ((0, 0.0), (3, 0.01))  # hypotheses by which actuators are judged
 PULLS = (0.1, 0.01, 0.001)  # of which each order chooses
 HORIZON_S = 5.0
 
@@ -193,53 +195,91 @@ def surrogate(spec: RobotSpec) -> RobotSpec:
     return spec.model_copy(update={"state": tuple(map(follows, spec.command))})
 
 
-def problem_of(drive: Drive, calibration: Calibration, samples: Samples) -> shooting.Shooting:
+@dataclass(frozen=True)
+class Actuators:
+    """What is asked of motors besides their gains and lags: input curves, friction, limits."""
+
+    curves: tuple[InputCurve, ...] = ()
+    friction: tuple[str, ...] = ()  # states with dry friction
+    limits: tuple[str, ...] = ()  # states with a greatest fall and rise
+
+
+def problem_of(drive: Drive, samples: Samples, actuators: Actuators) -> shooting.Shooting:
     """Returns the prediction problem of a drive on one time axis; its inputs: `inputs_of`."""
     command, spec, t, dt = drive.recording.command, drive.spec, samples.t, samples.dt
-    curves = calibration.inputs
 
     def commands(values: Array) -> Array:
-        begin = t - float(values[0])
-        shapes = values[1 : 1 + 3 * len(curves)]
-        bent = replace(command, values=curved(command.values, spec, curves_at(curves, shapes)))
+        begin, curves = t - float(values[0]), curves_at(actuators, values)
+        bent = replace(command, values=curved(command.values, spec, curves))
         return held(bent, spec, begin, begin + dt)
 
-    return shooting.Shooting(samples, commands, mounted=not spec.state)
+    def shaped(model: TaylorModel, values: Array) -> TaylorModel:
+        return with_actuators(model, spec, actuators, values)
+
+    return shooting.Shooting(samples, commands, shaped, mounted=not spec.state)
 
 
-def inputs_of(drive: Drive, calibration: Calibration) -> shooting.Inputs:
-    """Returns the values on which commands in effect depend: latency, and each curve's."""
+def curves_at(actuators: Actuators, values: Array) -> tuple[InputCurve, ...]:
+    """Returns the input curves for values (I,)."""
+    rows = values[1 : 1 + 3 * len(actuators.curves)].reshape(-1, 3).tolist()
+    return tuple(
+        InputCurve(
+            command=c.command, dead=max(dead, 0.0), least=min(least, 0.0), most=max(most, 0.0)
+        )
+        for c, (dead, least, most) in zip(actuators.curves, rows, strict=True)
+    )
+
+
+def with_actuators(
+    model: TaylorModel, spec: RobotSpec, actuators: Actuators, values: Array
+) -> TaylorModel:
+    """Returns a model with friction and limits for values (I,)."""
+    names, place = [v.name for v in spec.state], 1 + 3 * len(actuators.curves)
+    friction, limits = np.zeros(len(names)), np.tile([-np.inf, np.inf], (len(names), 1))
+    for name in actuators.friction:
+        friction[names.index(name)] = max(values[place], 0.0)
+        place += 1
+    for name in actuators.limits:
+        limits[names.index(name)] = -abs(values[place]), abs(values[place + 1])
+        place += 2
+    return replace(model, friction=friction, limits=limits)
+
+
+def inputs_of(
+    drive: Drive, latency: float, samples: Samples, actuators: Actuators
+) -> shooting.Inputs:
+    """Returns the values that are sought besides coefficients: latency, and those of actuators."""
     one_clock = drive.recording.pose.clock == drive.recording.command.clock
-    latency = calibration.command_latency_s
-    start, scale = [latency], [DELAY_SCALE_S]
-    low, high = [min(latency, -0.2) if one_clock else latency - LONGEST_S], [latency + LONGEST_S]
-    for curve in calibration.inputs:
+    least = min(latency, 0.0) if one_clock else latency - LONGEST_S
+    rows = [(latency, DELAY_SCALE_S, least, latency + LONGEST_S)]  # start, scale, low, high
+    for curve in actuators.curves:
         size = max(abs(curve.least), abs(curve.most))
-        start += [curve.dead, curve.least, curve.most]
-        scale += [CURVE_SCALE * size] * 3
-        low += [0.0, 1.5 * curve.least, 0.5 * curve.most]
-        high += [0.5 * size if curve.dead else 0.0, 0.5 * curve.least, 1.5 * curve.most]
+        step = CURVE_SCALE * size
+        rows += [
+            (curve.dead, step, 0.0, 0.5 * size if curve.dead else 0.0),
+            (curve.least, step, 1.5 * curve.least, 0.5 * curve.least),
+            (curve.most, step, 0.5 * curve.most, 1.5 * curve.most),
+        ]
+    names = [v.name for v in drive.spec.state]
+    rates = {name: samples.dq[:, 3 + i] for i, name in enumerate(names)}
+    for name in actuators.friction:
+        size = float(np.percentile(np.abs(rates[name]), STRONG))
+        rows.append((0.1 * size, 0.1 * size, 0.0, size))
+    for name in actuators.limits:
+        for rate in (-rates[name], rates[name]):
+            size = max(float(np.percentile(rate, STRONG)), 1e-3)
+            rows.append((size, 0.3 * size, 0.1 * size, 10.0 * size))
     if not drive.spec.state:  # what is left of the mounting
-        start += [0.0, 0.0, 0.0]
-        scale += [LEVER_SCALE_M, LEVER_SCALE_M, TURN_SCALE]
         reach = 2.0 * drive.spec.footprint_radius
-        low += [-reach, -reach if sided(drive.spec) else 0.0, -np.pi]
-        high += [reach, reach if sided(drive.spec) else 0.0, np.pi]
-    return shooting.Inputs(*map(np.array, (start, scale, low, high)))
+        aside = reach if sided(drive.spec) else 0.0
+        rows += [(0.0, LEVER_SCALE_M, -reach, reach), (0.0, LEVER_SCALE_M, -aside, aside),
+                 (0.0, TURN_SCALE, -np.pi, np.pi)]  # fmt: skip
+    return shooting.Inputs(*np.array(rows).T)
 
 
 def sided(spec: RobotSpec) -> bool:
     """True if a lever arm along y can be told from unequal wheels: not if one turns the robot."""
     return spec.moves_sideways or mirrored(spec) is not None
-
-
-def curves_at(curves: tuple[InputCurve, ...], values: Array) -> tuple[InputCurve, ...]:
-    """Returns curves with other values (3 * n,)."""
-    rows = zip(curves, values.reshape(-1, 3).tolist(), strict=True)
-    return tuple(
-        InputCurve(command=c.command, dead=max(dead, 0.0), least=least, most=most)
-        for c, (dead, least, most) in rows
-    )
 
 
 @dataclass(frozen=True)
@@ -254,8 +294,9 @@ class Trial:
 
 def likely_delay(drive: Drive, calibration: Calibration, samples: Samples) -> float:
     """Returns the delay [s] of the commands by which they best explain the rates of the state."""
-    problem, now = problem_of(drive, calibration, samples), calibration.command_latency_s
-    inputs = inputs_of(drive, calibration)
+    actuators, now = Actuators(calibration.inputs), calibration.command_latency_s
+    problem = problem_of(drive, samples, actuators)
+    inputs = inputs_of(drive, now, samples, actuators)
     one_clock = drive.recording.pose.clock == drive.recording.command.clock
     tries = np.arange(0.0, LONGEST_S, DELAY_STEP_S) - (0.0 if one_clock else LONGEST_S / 2.0)
     states, left = len(drive.spec.state), []
@@ -266,6 +307,38 @@ def likely_delay(drive: Drive, calibration: Calibration, samples: Samples) -> fl
         found = linear_fit(replace(samples, x=x), drive.spec, DELAY_ORDER)
         left.append(float((1.0 - found.r2[free]).sum()))
     return float(tries[int(np.argmin(left))]) if np.isfinite(left).all() else now
+
+
+@dataclass(frozen=True)
+class Base:
+    """The textbook's terms with the actuators that predict best: what models depart from."""
+
+    actuators: Actuators
+    problem: shooting.Shooting
+    inputs: shooting.Inputs  # started from the values found
+    found: shooting.Predictive
+
+
+def base_of(drive: Drive, calibration: Calibration, samples: Samples) -> Base:
+    """Fits the textbook with and without input curves, friction and limits; keeps what predicts."""
+
+    def attempt(actuators: Actuators) -> tuple[float, Base]:
+        problem = problem_of(drive, samples, actuators)
+        inputs = inputs_of(drive, calibration.command_latency_s, samples, actuators)
+        sparse = replace(problem, spacing_s=BASE_SPACING_S)
+        found = fit_base(sparse, drive.spec, inputs)
+        error = min(t.error for t in tried(problem, drive.spec, SKETCH, found.values))
+        return error, Base(actuators, problem, replace(inputs, start=found.values), found)
+
+    error, best = attempt(Actuators(calibration.inputs))
+    speeds = tuple(v.name for v in drive.spec.state if v.twist == "vx")
+    plain = [lambda now: replace(now, curves=())] if calibration.inputs else []
+    more = [lambda now: replace(now, friction=speeds), lambda now: replace(now, limits=speeds)]
+    for change in (*plain, *(more if speeds else ())):
+        other, base = attempt(change(best.actuators))
+        if other < (1.0 if change in plain else WORTH) * error:
+            error, best = other, base
+    return best
 
 
 def linear_fit(samples: Samples, spec: RobotSpec, order: int, allowed: Library = library) -> Fit:

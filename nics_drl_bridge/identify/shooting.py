@@ -25,6 +25,7 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 Mask = NDArray[np.bool_]
 Rows = NDArray[np.intp]
 Commands = Callable[[Array], Array]  # those in effect (T, C) during each step, by values (I,)
+Shape = Callable[[TaylorModel, Array], TaylorModel]  # a model with friction and limits by values
 
 HORIZONS_S = (1.0, 2.5, 5.0)
 SPACING_S = 0.25
@@ -33,7 +34,8 @@ FARTHEST_M = 50.0  # errors are cut at this distance per second of the horizon
 PULL = 0.001  # usual weight of the first coefficients against the predictions
 REFERENCE_M_S = 0.1  # error that weighs as much, at a pull of 1, as a term as large as the rates
 DIFFERENCE = 0.02  # step of finite differences by the values of inputs, in their scale
-EVALUATIONS = 30
+EVALUATIONS, TOLERANCE = 40, 1e-4
+INSIDE = 0.05  # share of its range by which a value starts from its bounds
 LEAST_SCALE = 0.02  # of the loss: smaller errors count as their squares [m/s]
 SAME_STEP = 0.01  # share of a step by which two steps may differ
 
@@ -54,6 +56,7 @@ class Shooting:
 
     samples: Samples
     commands: Commands
+    shaped: Shape
     mounted: bool = False  # True if the last three values are the pose of what `q` is, in the base
     fixed: Array | None = None  # values (I,) that are used instead of those given
     horizons: tuple[float, ...] = HORIZONS_S
@@ -93,13 +96,14 @@ class Shooting:
         self, model: TaylorModel, values: Array, first: Rows, steps: Rows, free: Mask | None = None
     ) -> tuple[Array, Array]:
         """Returns poses (W, H, 3), derivatives (W, H, 3, P) by `free` (D, K) coefficients."""
+        values = values if self.fixed is None else self.fixed
+        model = self.shaped(model, values)
         free = np.zeros(model.coefficients.shape, dtype=np.bool_) if free is None else free
         used = (model.coefficients != 0.0) | free
         dofs, places = np.nonzero(used)
         terms = term_arrays(replace(model, coefficients=used.astype(np.float64)))
         terms = terms._replace(coefficient=model.coefficients[dofs, places])
         moving = np.flatnonzero(free[dofs, places]).astype(np.int64)
-        values = values if self.fixed is None else self.fixed
         command, state = self.commands(values), self.samples.q[:, 3:]
         shot = Shot(
             np.ascontiguousarray(state[first]), first, np.ascontiguousarray(command), steps,
@@ -184,7 +188,8 @@ class _Search:
         coefficients = self.model.coefficients.copy()
         coefficients[self.free] += theta[self.count :] * self.unit
         late = self.inputs.start + self.inputs.scale * theta[: self.count]
-        return replace(self.model, coefficients=coefficients), late
+        late = late if self.problem.fixed is None else self.problem.fixed
+        return self.problem.shaped(replace(self.model, coefficients=coefficients), late), late
 
     def shot(self, theta: Array, sloped: bool) -> tuple[Array, Array]:
         """Returns scaled errors (n,), and derivatives (n, P) by the coefficients."""
@@ -227,9 +232,12 @@ class _Search:
         high = -low
         low[:count] = (inputs.low - inputs.start) / inputs.scale - 1e-9
         high[:count] = (inputs.high - inputs.start) / inputs.scale + 1e-9
+        aside = INSIDE * (high - low)[:count]  # at a bound the search would stay there
+        start[:count] = np.clip(0.0, low[:count] + aside, high[:count] - aside)
         found = least_squares(
             self.residual, start, jac=self.jacobian, bounds=(low, high), loss="soft_l1",
             f_scale=max(float(np.median(np.abs(begun))), LEAST_SCALE), max_nfev=evaluations,
+            ftol=TOLERANCE, xtol=TOLERANCE,
         )  # fmt: skip
         return self.predictive(found.x)
 
