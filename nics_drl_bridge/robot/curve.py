@@ -25,6 +25,14 @@ class InputCurve(Schema):
     most: Annotated[float, AllowInfNan()] = Field(default=np.inf, ge=0.0)
     back: float = Field(default=1.0, ge=0.0)  # gain of negative commands; that of positive ones: 1
 
+    @property
+    def equation(self) -> str:
+        """The curve as text: `throttle' = 0 within +-0.12, else throttle -+ 0.12`."""
+        name, dead = self.command, f"{self.dead:.4g}"
+        text = f"0 within +-{dead}, else {name} -+ {dead}" if self.dead else name
+        text += ends(self.least, self.most, name)
+        return f"{name}' = {text}" + (f", backwards times {self.back:.4g}" * (self.back != 1.0))
+
     def of(self, command: ArrayLike) -> Array:
         """Returns the commands in effect (...): beyond the dead zone, in proportion."""
         held = np.clip(np.asarray(command, dtype=np.float64), self.least, self.most)
@@ -38,6 +46,13 @@ class InputCurve(Schema):
         command = effect / gain + np.sign(effect) * self.dead
         command = np.where(effect <= self.of(-np.inf), -np.inf, command)
         return np.where(effect >= self.of(np.inf), np.inf, command)
+
+
+def ends(least: float, most: float, name: str = "") -> str:
+    """Returns those of two ends that are finite, as text: `, throttle at most 0.8`."""
+    both = (("at least", least), ("at most", most))
+    named = f"{name} " if name else ""
+    return "".join(f", {named}{word} {end:.4g}" for word, end in both if np.isfinite(end))
 
 
 def bent(command: ArrayLike, names: Sequence[str], curves: tuple[InputCurve, ...]) -> Array:
