@@ -299,10 +299,13 @@ def inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
         command = np.linspace(sent.min(), sent.max(), CURVE_POINTS)
         axes.plot(command, command, ":", color=OTHER, label="as commanded")
         axes.plot(command, curve.of(command), color=MODEL, label="in effect")
+        sigma = identified.calibration.uncertainty.get(f"{curve.command}.dead", 0.0)
+        for edge in (-curve.dead, curve.dead) if sigma else ():
+            axes.axvspan(edge - 2.0 * sigma, edge + 2.0 * sigma, color=MODEL, alpha=0.25)
         rug: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "alpha": 0.05}
         axes.plot(sent, np.full(len(sent), 0.03), "|", color=MEASURED, markersize=9, **rug)
         axes.set(xlabel=f"{curve.command} [{unit}]", ylabel=f"{curve.command}' [{unit}]")
-        _finish(axes, fill(curve.equation, TITLE))
+        _finish(axes, fill(curve.equation.replace("-+", "∓"), TITLE))
     return png(figure)
 
 

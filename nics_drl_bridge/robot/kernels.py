@@ -41,7 +41,7 @@ class Terms(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """What holds one state variable, as in `Terms`."""
+    """Bounds of one state variable, as in `Terms`."""
 
     low: float
     high: float
