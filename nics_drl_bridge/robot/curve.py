@@ -13,6 +13,7 @@ from nics_drl_bridge.config import Schema
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
+End = Annotated[float, AllowInfNan(), Field(ge=-np.inf)]  # infinite maybe, but not NaN
 
 
 class InputCurve(Schema):
@@ -20,9 +21,9 @@ class InputCurve(Schema):
 
     command: str
     dead: float = Field(default=0.0, ge=0.0)  # a smaller command moves nothing, in its unit
-    # smaller and greater commands do no more than these, in the command's unit
-    least: Annotated[float, AllowInfNan()] = Field(default=-np.inf, le=0.0)
-    most: Annotated[float, AllowInfNan()] = Field(default=np.inf, ge=0.0)
+    # smaller and greater commands do no more than these, in its unit; 0 never does anything
+    least: End = -np.inf
+    most: End = np.inf
     back: float = Field(default=1.0, ge=0.0)  # gain of negative commands; that of positive ones: 1
 
     @property
@@ -35,7 +36,7 @@ class InputCurve(Schema):
 
     def of(self, command: ArrayLike) -> Array:
         """Returns the commands in effect (...): beyond the dead zone, in proportion."""
-        held = np.clip(np.asarray(command, dtype=np.float64), self.least, self.most)
+        held = np.clip(np.asarray(command, np.float64), min(self.least, 0.0), max(self.most, 0.0))
         beyond = np.sign(held) * np.maximum(np.abs(held) - self.dead, 0.0)
         return np.where(beyond < 0.0, self.back * beyond, beyond)
 

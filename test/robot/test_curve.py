@@ -39,7 +39,11 @@ def test_only_the_commands_that_are_named_are_bent():
     assert moved == pytest.approx(np.array([[0.2, 0.05]]))
 
 
-@pytest.mark.parametrize("wrong", [{"dead": -0.1}, {"back": -1.0}, {"least": 0.2}, {"most": -0.2}])
-def test_a_curve_that_falls_or_moves_a_robot_at_rest_is_refused(wrong):
+def test_a_command_of_zero_never_does_anything():
+    assert InputCurve(command="throttle", least=0.2, most=1.0).of([-0.5, 0.0]).tolist() == [0.0] * 2
+
+
+@pytest.mark.parametrize("wrong", [{"dead": -0.1}, {"back": -1.0}, {"most": np.nan}])
+def test_a_curve_that_falls_is_refused(wrong):
     with pytest.raises(ValidationError):
         InputCurve(command="throttle", **wrong)
