@@ -132,20 +132,19 @@ def test_the_simulator_follows_the_model(model, commands, path, worlds):
     assert_same_path(poses, path[0])
 
 
-def test_a_robot_near_a_wall_follows_the_model_too(model):
-    crowded = field(3.0, count=3)
-    simulator = FastSimulator(model, crowded, worlds=8)
-    simulator.reset(np.arange(8))
-    begun, state = simulator.data.pose[:, 0].copy(), np.zeros((8, 2))
-    pose, command, moved = begun, np.array([0.5, 0.4]), 0
-    for _ in range(6):
-        simulator.step(np.tile(command, (8, 1, 1)))
+def test_robots_that_might_touch_follow_the_model_too(model):
+    simulator = FastSimulator(model, field(60.0), robots=2)
+    start = np.array([[0.0, 0.0, 0.0], [0.0, 0.41, 0.0]])
+    simulator.reset([0], starts=start[None])
+    pose, state = start, np.zeros((2, 2))
+    for throttle in (0.7, 0.7, 0.7, 0.2, -0.9, -0.9):
+        command = np.tile([throttle, 0.0], (2, 1))
+        simulator.step(command[None])
         for _ in range(SUBSTEPS):
-            pose, state = model.kinematics.step(pose, state, np.tile(command, (8, 1)))
-    free = simulator.data.collided[:, 0] == 0
-    moved = simulator.data.pose[free, 0] - pose[free]
-    assert free.sum() > 3
-    assert np.abs(moved[:, :2]).max() < 1e-9
+            pose, state = model.kinematics.step(pose, state, command)
+    assert not simulator.data.collided.any()
+    assert np.abs(pose[:, 0]).min() > 0.1
+    assert_same_path(simulator.data.pose[0], pose)
 
 
 def test_the_estimator_predicts_the_path_of_the_model(model, commands, path):
