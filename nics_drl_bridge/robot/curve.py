@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import AllowInfNan, Field
 
 from nics_drl_bridge.config import Schema
-from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
 End = Annotated[float, AllowInfNan(), Field(ge=-np.inf)]  # infinite maybe, but not NaN
@@ -65,6 +64,13 @@ def bent(command: ArrayLike, names: Sequence[str], curves: tuple[InputCurve, ...
     return values
 
 
-def curved(command: ArrayLike, spec: RobotSpec, curves: tuple[InputCurve, ...]) -> Array:
+class Commanded(Protocol):
+    """Anything with commands that have names: a RobotSpec, which kernels must not depend on."""
+
+    @property
+    def command(self) -> Sequence[Any]: ...
+
+
+def curved(command: ArrayLike, spec: Commanded, curves: tuple[InputCurve, ...]) -> Array:
     """Returns the commands in effect (..., C) of a robot's, by its curves."""
     return bent(command, [c.name for c in spec.command], curves)
