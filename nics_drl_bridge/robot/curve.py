@@ -68,7 +68,8 @@ class Commanded(Protocol):
     """Anything with commands that have names: a RobotSpec, which kernels must not depend on."""
 
     @property
-    def command(self) -> Sequence[Any]: ...
+    def command(self) -> Sequence[Any]:
+        """Its commands in order."""
 
 
 def curved(command: ArrayLike, spec: Commanded, curves: tuple[InputCurve, ...]) -> Array:
