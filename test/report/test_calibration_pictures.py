@@ -55,7 +55,8 @@ def listed(found: Found):
 
 def test_every_estimate_of_a_disturbed_drive_has_its_picture(disturbed):
     pictures = calibration_pictures(*disturbed)
-    assert set(pictures) == {"timing", "bursts", "mounting", "wheels", "noise"} == set(CAPTIONS)
+    assert set(pictures) == {"timing", "bursts", "mounting", "wheels", "noise"}
+    assert set(CAPTIONS) == {*pictures, "inputs"}  # its motors have no curves
     assert all(picture.startswith(PNG) for picture in pictures.values())
 
 
