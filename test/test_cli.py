@@ -107,6 +107,19 @@ def test_generate_makes_a_model_of_a_recording_and_replaces_it(drive, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("dt", [0.0100036, 0.0083, 1.0 / 60.0])
+def test_a_recording_of_any_rate_gives_a_model_whose_step_divides_the_period(tmp_path, dt):
+    spec = load_robot("differential")
+    save_recording(textbook.record(spec, np.random.default_rng(0), 40.0, dt), tmp_path / "d.npz")
+    done = nics("generate", "d.npz", "--robot", "differential", "--out", "car", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    model = load_model(tmp_path / "car")
+    steps = model.control_period / model.kinematics.dt
+    assert steps == pytest.approx(round(steps), abs=1e-9)
+    assert model.kinematics.dt == pytest.approx(dt, rel=0.01)
+
+
+@pytest.mark.slow
 def test_a_recording_too_coarse_for_a_useful_model_is_one_sentence(tmp_path):
     spec = load_robot("differential")
     fine = textbook.record(spec, np.random.default_rng(0), duration=60.0, dt=0.01)

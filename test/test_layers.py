@@ -214,8 +214,8 @@ def modules_after(code: str) -> set[str]:
 
 
 LIGHT = {
-    "config.py", "errors.py", "geometry.py", "interface.py", "robot/taylor.py", "sim/state.py",
-    "strict_yaml.py",
+    "config.py", "errors.py", "geometry.py", "interface.py", "robot/curve.py", "robot/taylor.py",
+    "sim/state.py", "strict_yaml.py",
 }  # fmt: skip
 
 

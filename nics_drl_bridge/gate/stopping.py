@@ -32,10 +32,10 @@ def shield_config(
     measured = load_yaml(path, LimitsFile).shield if path else None
     if (stopping := measured) is None:  # one command per period; brakes no harder than its limits
         rates = [] if limits is None else limits.rate[limits.linear].tolist()
-        known = zip(model.robot.state, model.kinematics.braking.tolist(), strict=True)
-        rates += [rate for v, rate in known if v.unit == SPEED and np.isfinite(rate)]
+        brakes = zip(model.robot.state, model.kinematics.braking.tolist(), strict=True)
+        hardest = [rate for v, rate in brakes if v.unit == SPEED]
         delay = model.calibration.command_latency_s + lag(model.kinematics) + model.control_period
-        deceleration = min(rates, default=UNKNOWN_DECELERATION)
+        deceleration = min(min(rates, default=UNKNOWN_DECELERATION), min(hardest, default=np.inf))
         stopping = Stopping(latency=max(0.0, delay), deceleration=deceleration)
     values = stopping.model_copy(update=dict(given or {}))
     for name, value in values.model_dump().items():

@@ -1,6 +1,6 @@
 """Calibration: the relations of a drive's streams in time and space, and its alignment by them."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated
 
 import numpy as np
@@ -20,6 +20,8 @@ STEP_RANGE_S = (0.002, 0.02)
 SMOOTHING_S = 0.1
 SMOOTHING_BURSTS = 1.5
 UNIFORM = 1e-6
+WHOLE = 1e-6  # a period of so nearly a whole number of steps has one
+SAME_STEP = 1e-3  # share of a step by which rounded stamps may change it
 SHARED = 0.5  # minimum share of rows with common stamps; only then are the other rows dropped
 STATE_GAP = 2.5  # rates are unknown between states that are this many median steps apart
 
@@ -87,16 +89,16 @@ class Calibration:
 def align(drive: Drive, calibration: Calibration) -> Samples:
     """Puts a drive on one time axis, at `base_link`; RecordingError: no overlap in time."""
     # Without corrections it is used bit for bit; else noisy poses are smoothed by local parabolas.
-    recording = drive.recording
-    if calibration.is_identity and (shared := _shared_stamps(recording)) is not None:
-        return samples_on_one_clock(*shared)
-    grid = _grid(recording, calibration)
+    recording, period = drive.recording, drive.settings.control_period_s
+    if calibration.is_identity and (shared := _shared_stamps(recording, period)) is not None:
+        samples = samples_on_one_clock(*shared)
+        return replace(samples, dt=part_of(period, samples.dt))
+    grid, step = _grid(recording, calibration, period)
     half_width = SMOOTHING_BURSTS * calibration.burst_period_s
     if not half_width and (calibration.position_noise_m or calibration.heading_noise_rad):
         half_width = SMOOTHING_S
     t = drive.sample_t + calibration.clock_offset_s
     tracked = resample(t, unwrapped(recording.pose.values), grid, half_width)
-    step = float(grid[1] - grid[0])
     begin = grid - calibration.command_latency_s
     samples = samples_on_one_clock(
         grid,
@@ -107,7 +109,14 @@ def align(drive: Drive, calibration: Calibration) -> Samples:
     known = outside_gaps(samples.t, t, step)
     if recording.state is not None:
         known &= outside_gaps(samples.t, recording.state.t, step, STATE_GAP, 0.0)
-    return samples.rows(known)
+    return replace(samples.rows(known), dt=step)
+
+
+def part_of(period: float, step: float) -> float:
+    """Returns the step nearest to a given one of which a period is a whole number, both in [s]."""
+    count = period / step
+    whole = max(1, round(count))
+    return step if abs(count - whole) < WHOLE else period / whole
 
 
 def states_at(drive: Drive, calibration: Calibration, grid: Array) -> Array:
@@ -126,10 +135,13 @@ def states_at(drive: Drive, calibration: Calibration, grid: Array) -> Array:
     return gains * inferred_states(recording.command, drive.spec, lags, latency, longer)[lead:]
 
 
-def _shared_stamps(recording: Recording) -> tuple[Array, Array, Array, Array] | None:
-    """Returns stamps (T,), poses, states, commands of the rows whose stamps share one grid."""
+def _shared_stamps(recording: Recording, period: float) -> tuple[Array, Array, Array, Array] | None:
+    """Returns stamps (T,), poses, states, commands of the rows on one grid, a part of a period."""
     pose, state, command = recording.pose, recording.state, recording.command
-    if state is None or not (step := np.median(np.diff(pose.t))) > 0.0:
+    if state is None or not (usual := float(np.median(np.diff(pose.t)))) > 0.0:
+        return None
+    step = part_of(period, usual)
+    if abs(step - usual) > SAME_STEP * usual:
         return None
     since = [s.t - pose.t[0] for s in (pose, state, command)]
     tick = [np.round(t / step) for t in since]
@@ -144,12 +156,16 @@ def _shared_stamps(recording: Recording) -> tuple[Array, Array, Array, Array] | 
     return pose.t[at], pose.values[at], state.values[at_state[both]], command.values[at_command]
 
 
-def _grid(recording: Recording, calibration: Calibration) -> Array:
-    """Returns uniform times (T,) covered by pose, commands and state, on the commands' clock."""
+def _grid(recording: Recording, calibration: Calibration, period: float) -> tuple[Array, float]:
+    """Returns uniform times (T,) covered by pose, commands and state, on the commands' clock.
+
+    And their step [s], a part of a period [s].
+    """
     pose = recording.pose.t + calibration.clock_offset_s
     step = float(np.median(np.diff(pose)))
     if calibration.burst_period_s > 0.0 or not STEP_RANGE_S[0] <= step <= STEP_RANGE_S[1]:
         step = STEP_S
+    step = part_of(period, step)
     first = max(pose[0], recording.command.t[0] + calibration.command_latency_s)
     last = pose[-1]
     if recording.state is not None:
@@ -158,7 +174,7 @@ def _grid(recording: Recording, calibration: Calibration) -> Array:
     if count < MIN_STAMPS:
         fault = f"commands and poses overlap for {max(last - first, 0.0):.2f} s only"
         raise RecordingError(f"{recording.source}: {fault}; check that they are of one drive.")
-    return np.asarray(first + step * np.arange(count + 1))
+    return np.asarray(first + step * np.arange(count + 1)), step
 
 
 def outside_gaps(

@@ -26,11 +26,13 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
     latency, until = identified.recording.latency.sentences(), identified.train_until_s
     units = dict(zip(spec.variable_names, spec.variable_units, strict=True))
     ranges = zip(model.variables, model.low, model.high, strict=True)
+    around = list(stages(spec, identified))
     notes = identified.notes or ("Nothing had to be corrected.",)
     sections: dict[str, Iterable[str]] = {
         f"Fit report: robot {spec.name!r} from {source}": (),
         f"Kept {model.terms_kept} of {total} terms, step {model.dt:g} s "
         f"(X = {', '.join(model.variables)}), with standard errors:": equations_with_errors(model),
+        **({"What motors do around the terms (standard uncertainties):": around} if around else {}),
         fill(_pruning(identified.alpha), WIDTH): (),
         "Cross-validated error against the number of terms, largest first, * for those kept:": (
             line for curve in identified.fit.curves for line in _curve(curve)
@@ -57,18 +59,51 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
 
 def equations_with_errors(model: TaylorModel) -> list[str]:
     """Returns one line per degree of freedom: `wz = (4.63 +- 0.02)*speed*steering  [rad/s]`."""
-    errors, lines = model.named_errors, []
+    errors, lines = model.named_errors, [curve.equation for curve in model.inputs]
     for dof, unit, row in zip(model.dofs, model.dof_units, model.coefficients, strict=True):
         text = ""
-        for name, value in zip(model.term_names, map(float, row), strict=True):
+        terms = zip(model.term_names, model.shown_terms, map(float, row), strict=True)
+        for name, shown, value in terms:
             if value == 0.0:
                 continue
             sign = ("-" if value < 0 else "") if not text else (" - " if value < 0 else " + ")
             mark = " (assumed)" if (dof, name) in model.assumed else ""
             number = with_error(abs(value), errors.get(dof, {}).get(name))
-            text += f"{sign}{number}" + ("" if name == "1" else f"*{name}") + mark
-        lines.append(f"{dof} = {text or '0'}  [{unit}]")
+            text += f"{sign}{number}" + ("" if name == "1" else f"*{shown}") + mark
+        lines.append(f"{dof} = {text or '0'}{model.restraint(dof)}  [{unit}]")
     return lines
+
+
+def stages(spec: RobotSpec, identified: Identified) -> Iterator[str]:
+    """Yields a line per value of the stages around the terms, with the calibration's uncertainty.
+
+    Of those the names are `throttle.dead`, `.least`, `.most` and `.back` of a command, `vx.fall`,
+    `.rise` and `.friction` of a state.
+    """
+    model, sigma = identified.model, identified.calibration.uncertainty
+    units = dict(zip(spec.variable_names, spec.variable_units, strict=True))
+    values = [
+        (f"{curve.command}.{name}", words, getattr(curve, name), unit, usual)
+        for curve in model.inputs
+        for name, words, unit, usual in (
+            ("dead", "dead zone on both sides of 0", units[curve.command], 0.0),
+            ("least", "does no more below", units[curve.command], -np.inf),
+            ("most", "does no more above", units[curve.command], np.inf),
+            ("back", "gain backwards, of that forwards", "", 1.0),
+        )
+    ]
+    rates = zip(model.variables, model.dof_units[3:], model.limits, model.friction, strict=False)
+    for state, unit, (fall, rise), friction in rates:
+        values += [
+            (f"{state}.fall", "greatest fall", fall, unit, -np.inf),
+            (f"{state}.rise", "greatest rise", rise, unit, np.inf),
+            (f"{state}.friction", "dry friction", friction, unit, 0.0),
+        ]
+    for key, words, value, unit, usual in values:
+        if value != usual:
+            spread = f" +- {sigma[key]:.2g}" if key in sigma else ""
+            name = key.partition(".")[0]
+            yield f"{name:<24} {words}: {value:.4g}{spread} {unit}".rstrip()
 
 
 def with_error(value: float, error: float | None) -> str:

@@ -17,7 +17,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy import dynamic_window_kernels as kernels
 from nics_drl_bridge.policy.contract import SUFFIX, shipped
 from nics_drl_bridge.robot.kinds import command_for, has_textbook, reach, steady_twist
-from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
+from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
 
@@ -165,8 +165,9 @@ class DynamicWindow:
         lags = [value for name, value in robot.parameters.items() if name.endswith("_lag")]
         lag = max(lags, default=0.0)
         brakes = [] if self.model is None else self.model.kinematics.braking.tolist()
-        fastest = dict(zip(POSE_RATES, np.abs(twists).max(axis=0).tolist(), strict=True))
-        slow = (fastest[v.twist] / b for v, b in zip(robot.state, brakes, strict=False) if v.twist)
+        states = zip(robot.state, brakes, strict=False)
+        fastest = float(np.hypot(twists[:, 0], twists[:, 1]).max())
+        slow = (fastest / rate for v, rate in states if v.unit == "m/s")
         share = 1.0 - math.exp(-self.period / lag) if lag > 0.0 else 1.0
         reach = share * (twists.max(axis=0) - twists.min(axis=0)) + 1e-6
         radius = robot.footprint_radius + self.margin

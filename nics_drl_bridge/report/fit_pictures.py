@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from textwrap import fill
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,6 +36,7 @@ LEAST_RATE = 1e-6
 BURSTS_SHOWN = 12
 MOST_POINTS = 3000
 BINS = 60
+CURVE_POINTS, TITLE = 400, 44  # of an input curve; letters in a line above it
 REACH = 5.0  # histograms end at this many standard deviations
 REACH_S, TRIALS = 0.5, 81  # largest shift in time of a curve, and number of its points
 CAPTIONS = {
@@ -43,6 +45,7 @@ CAPTIONS = {
     "mounting": "Velocities before and after correction: base_link of a robot that can't move "
     "sideways has no lateral velocity.",
     "wheels": "Wheel speeds against the motion: the scale, and which wheel is the left one.",
+    "inputs": "What motors make of commands, over the range that the drive sent.",
     "noise": "Noise of the sensors, and how the error of predictions grows beside the drift that "
     "simulator and estimator use.",
 }
@@ -185,7 +188,7 @@ def calibration_pictures(spec: RobotSpec, identified: Identified) -> dict[str, b
     """The pictures of a calibration by name, as far as the recording shows them, each a PNG."""
     found = estimates(identified)
     drawn = {each.__name__: each(identified, found) for each in (timing, bursts, mounting, wheels)}
-    drawn["noise"] = noise(identified)
+    drawn |= {"inputs": inputs(spec, identified), "noise": noise(identified)}
     return {name: picture for name, picture in drawn.items() if picture is not None}
 
 
@@ -280,6 +283,29 @@ def wheels(identified: Identified, found: dict[str, CalibratedValue]) -> bytes |
         axes.set(xlabel=x_label, ylabel=y_label)
         swapped = "" if name == "wheel_scale" else f"\n{found['wheels_swapped'].text}"
         _finish(axes, estimate.text + swapped)
+    return png(figure)
+
+
+def inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
+    """Draws the curve of each command that has one, and where the drive's commands lie."""
+    curves = identified.model.inputs
+    if not curves:
+        return None
+    figure, grid = panels(1, len(curves), (4.2 * len(curves), 3.8))
+    names = [command.name for command in spec.command]
+    for axes, curve in zip(grid, curves, strict=True):
+        place = names.index(curve.command)
+        sent, unit = identified.recording.command.values[:, place], spec.command[place].unit
+        command = np.linspace(sent.min(), sent.max(), CURVE_POINTS)
+        axes.plot(command, command, ":", color=OTHER, label="as commanded")
+        axes.plot(command, curve.of(command), color=MODEL, label="in effect")
+        sigma = identified.calibration.uncertainty.get(f"{curve.command}.dead", 0.0)
+        for edge in (-curve.dead, curve.dead) if sigma else ():
+            axes.axvspan(edge - 2.0 * sigma, edge + 2.0 * sigma, color=MODEL, alpha=0.25)
+        rug: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "alpha": 0.05}
+        axes.plot(sent, np.full(len(sent), 0.03), "|", color=MEASURED, markersize=9, **rug)
+        axes.set(xlabel=f"{curve.command} [{unit}]", ylabel=f"{curve.command}' [{unit}]")
+        _finish(axes, fill(curve.equation.replace("-+", "∓"), TITLE))
     return png(figure)
 
 

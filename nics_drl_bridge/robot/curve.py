@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import AllowInfNan, Field
 
 from nics_drl_bridge.config import Schema
-from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
+End = Annotated[float, AllowInfNan(), Field(ge=-np.inf)]  # infinite maybe, but not NaN
 
 
 class InputCurve(Schema):
@@ -20,14 +20,22 @@ class InputCurve(Schema):
 
     command: str
     dead: float = Field(default=0.0, ge=0.0)  # a smaller command moves nothing, in its unit
-    # smaller and greater commands do no more than these, in the command's unit
-    least: Annotated[float, AllowInfNan()] = Field(default=-np.inf, le=0.0)
-    most: Annotated[float, AllowInfNan()] = Field(default=np.inf, ge=0.0)
+    # smaller and greater commands do no more than these, in its unit; 0 never does anything
+    least: End = -np.inf
+    most: End = np.inf
     back: float = Field(default=1.0, ge=0.0)  # gain of negative commands; that of positive ones: 1
+
+    @property
+    def equation(self) -> str:
+        """The curve as text: `throttle' = 0 within +-0.12, else throttle -+ 0.12`."""
+        name, dead = self.command, f"{self.dead:.4g}"
+        text = f"0 within +-{dead}, else {name} -+ {dead}" if self.dead else name
+        text += ends(self.least, self.most, name)
+        return f"{name}' = {text}" + (f", backwards times {self.back:.4g}" * (self.back != 1.0))
 
     def of(self, command: ArrayLike) -> Array:
         """Returns the commands in effect (...): beyond the dead zone, in proportion."""
-        held = np.clip(np.asarray(command, dtype=np.float64), self.least, self.most)
+        held = np.clip(np.asarray(command, np.float64), min(self.least, 0.0), max(self.most, 0.0))
         beyond = np.sign(held) * np.maximum(np.abs(held) - self.dead, 0.0)
         return np.where(beyond < 0.0, self.back * beyond, beyond)
 
@@ -40,6 +48,13 @@ class InputCurve(Schema):
         return np.where(effect >= self.of(np.inf), np.inf, command)
 
 
+def ends(least: float, most: float, name: str = "") -> str:
+    """Returns those of two ends that are finite, as text: `, throttle at most 0.8`."""
+    both = (("at least", least), ("at most", most))
+    named = f"{name} " if name else ""
+    return "".join(f", {named}{word} {end:.4g}" for word, end in both if np.isfinite(end))
+
+
 def bent(command: ArrayLike, names: Sequence[str], curves: tuple[InputCurve, ...]) -> Array:
     """Returns the commands in effect (..., C) of commands with C names."""
     values = np.array(command, dtype=np.float64)
@@ -49,6 +64,14 @@ def bent(command: ArrayLike, names: Sequence[str], curves: tuple[InputCurve, ...
     return values
 
 
-def curved(command: ArrayLike, spec: RobotSpec, curves: tuple[InputCurve, ...]) -> Array:
+class Commanded(Protocol):
+    """Anything with commands that have names: a RobotSpec, which kernels must not depend on."""
+
+    @property
+    def command(self) -> Sequence[Any]:
+        """Its commands in order."""
+
+
+def curved(command: ArrayLike, spec: Commanded, curves: tuple[InputCurve, ...]) -> Array:
     """Returns the commands in effect (..., C) of a robot's, by its curves."""
     return bent(command, [c.name for c in spec.command], curves)

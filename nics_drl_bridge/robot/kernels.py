@@ -41,7 +41,7 @@ class Terms(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """What holds one state variable, as in `Terms`."""
+    """Bounds of one state variable, as in `Terms`."""
 
     low: float
     high: float
@@ -75,7 +75,7 @@ def _curve_rows(model: TaylorModel) -> Array:
     commands = model.variables[model.state_size :]
     rows = np.tile([0.0, -np.inf, np.inf, 1.0], (len(commands), 1))
     for curve in model.inputs:
-        row = curve.dead, curve.least, curve.most, curve.back
+        row = curve.dead, min(curve.least, 0.0), max(curve.most, 0.0), curve.back
         rows[commands.index(curve.command)] = row
     return rows
 

@@ -14,7 +14,7 @@ from pydantic import AllowInfNan, ConfigDict, Field, NonNegativeFloat
 from nics_drl_bridge import geometry
 from nics_drl_bridge.config import Schema
 from nics_drl_bridge.errors import ModelError
-from nics_drl_bridge.robot.curve import InputCurve, bent
+from nics_drl_bridge.robot.curve import InputCurve, bent, ends
 
 Array = NDArray[np.float64]
 
@@ -86,22 +86,48 @@ class TaylorModel:
         return bent(command, self.variables[self.state_size :], self.inputs)
 
     def rates(self, x: ArrayLike) -> Array:
-        """Returns dQ/dt (..., D) at X (..., V), whose commands are those in effect."""
-        return evaluate(x, self.powers) @ self.coefficients.T
+        """Returns dQ/dt (..., D) in a step from X (..., V), whose commands are those in effect."""
+        x = np.asarray(x, dtype=np.float64)
+        dq = evaluate(x, self.powers) @ self.coefficients.T
+        if self.friction.any() or np.isfinite(self.limits).any():
+            state = x[..., : self.state_size]
+            dq[..., 3:] = (self._moved(state, dq[..., 3:] * self.dt) - state) / self.dt
+        return dq
+
+    def _moved(self, state: Array, change: Array) -> Array:
+        """Returns states (..., S) that change in a step, as their limits and friction let them."""
+        moved = state + np.clip(change, *(self.dt * self.limits.T))
+        stick = self.dt * self.friction
+        return np.asarray(np.maximum(moved - stick, np.minimum(moved + stick, 0.0)))
 
     def step(self, pose: ArrayLike, state: ArrayLike, command: ArrayLike) -> tuple[Array, Array]:
         """Returns pose (..., 3) and state (..., S) after a step of `dt` along the exact arc."""
         state = np.asarray(state, dtype=np.float64)
-        dq = self.rates(np.concatenate([state, self.in_effect(command)], axis=-1)) * self.dt
-        moved = state + np.clip(dq[..., 3:], *(self.dt * self.limits.T))
-        stick = self.dt * self.friction
-        moved = np.maximum(moved - stick, np.minimum(moved + stick, 0.0))
-        return geometry.compose(pose, geometry.exp(dq[..., :3])), np.clip(moved, *self.state_box)
+        x = np.concatenate([state, self.in_effect(command)], axis=-1)
+        dq = evaluate(x, self.powers) @ self.coefficients.T * self.dt
+        moved = np.clip(self._moved(state, dq[..., 3:]), *self.state_box)
+        return geometry.compose(pose, geometry.exp(dq[..., :3])), moved
 
     @property
     def term_names(self) -> tuple[str, ...]:
         """Names of the K terms: `1`, `speed`, `speed*steering`."""
         return tuple(term_name(row, self.variables) for row in self.powers)
+
+    @property
+    def shown_terms(self) -> tuple[str, ...]:
+        """Names of the K terms, those of commands in effect primed: `throttle'`."""
+        curved = [curve.command for curve in self.inputs]
+        names = tuple(f"{name}'" if name in curved else name for name in self.variables)
+        return tuple(term_name(row, names) for row in self.powers)
+
+    def restraint(self, dof: str) -> str:
+        """Returns limits and friction of a degree of freedom as text, beginning with a comma."""
+        d = self.dofs.index(dof) - 3
+        if d < 0:
+            return ""
+        friction = self.friction[d]
+        less = f", less dry friction of {friction:.4g}" if friction else ""
+        return ends(*self.limits[d].tolist()) + less
 
     @property
     def named_errors(self) -> dict[str, dict[str, float]]:
@@ -125,17 +151,17 @@ class TaylorModel:
         return replace(self, std_errors=np.where(self.coefficients != 0.0, known, 0.0))
 
     def equations(self) -> list[str]:
-        """Returns one line per dof, with units: `wz = 4.6*speed*steering  [rad/s]`."""
-        lines, names = [], self.term_names
+        """Returns a line per curve, and per dof with units: `wz = 4.6*speed*steering  [rad/s]`."""
+        lines, names = [curve.equation for curve in self.inputs], self.term_names
         for d, dof in enumerate(self.dofs):
             terms = [
                 f"{self.coefficients[d, k]:.5g}"
-                + ("" if names[k] == "1" else f"*{names[k]}")
+                + ("" if names[k] == "1" else f"*{self.shown_terms[k]}")
                 + (" (assumed)" if (dof, names[k]) in self.assumed else "")
                 for k in np.flatnonzero(self.coefficients[d])
             ]
             text = " + ".join(terms).replace("+ -", "- ")
-            lines.append(f"{dof} = {text or '0'}  [{self.dof_units[d]}]")
+            lines.append(f"{dof} = {text or '0'}{self.restraint(dof)}  [{self.dof_units[d]}]")
         return lines
 
     @property

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from gate.rig import Rig, config
@@ -53,6 +54,14 @@ def test_what_no_file_tells_is_derived_with_care(robot):
     later = shield_config(replace(model, calibration=slow), None)[0]
     assert later.latency_s == pytest.approx(shield.latency_s + 0.3)
     assert later.deceleration < 1.0
+
+
+def test_a_robot_brakes_no_harder_than_its_model_can():
+    model = builtin_model("ackermann")
+    limits = np.array([[-0.3, 0.4], [-0.1, 0.1]])  # of its speed, and of its steering
+    slow = replace(model, kinematics=replace(model.kinematics, limits=limits))
+    assert shield_config(slow, load_limits("ackermann", model.robot))[0].deceleration == 0.3
+    assert shield_config(slow, None)[0].deceleration == 0.3
 
 
 def test_the_lag_of_a_model_that_shows_none_is_guessed():

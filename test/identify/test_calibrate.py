@@ -9,10 +9,40 @@ from pydantic import TypeAdapter
 
 from identify.drives import calibrate, drive, with_wheels, without
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.identify.calibration import Calibration, align
+from nics_drl_bridge.identify.calibration import Calibration, Response, align, part_of
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.recording.recording import samples_on_one_clock
+from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.spec import load_robot
+
+
+@pytest.mark.parametrize(
+    ("step", "part"),
+    [(0.01, 0.01), (0.0100036, 0.01), (0.0083, 0.1 / 12), (0.05, 0.05), (0.07, 0.1), (0.2, 0.1)],
+)
+def test_a_step_becomes_a_part_of_the_control_period(step, part):
+    assert part_of(0.1, step) == part
+
+
+def test_stamps_that_were_rounded_are_taken_as_they_are(car):
+    late = drive(car, duration=10.0)
+    streams = {
+        name: replace(getattr(late, name), t=getattr(late, name).t + 1.7e9)
+        for name in ("pose", "state", "command")
+    }
+    samples = align(Drive(replace(late, **streams), car), Calibration())
+    assert samples.dt == 0.01
+    assert np.array_equal(samples.q[:, :3], late.pose.values[: len(samples.t)])
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_stamps_whose_step_is_no_part_of_the_control_period_are_resampled(car, measured):
+    recording = record(car, np.random.default_rng(0), 20.0, 0.0083)
+    recording = recording if measured else replace(recording, state=None)
+    responses = () if measured else (Response("speed", "speed_command", 0.1),) * 2
+    samples = align(Drive(recording, car), Calibration(responses=responses))
+    assert samples.dt == 0.1 / 12
+    assert np.diff(samples.t) == pytest.approx(samples.dt)
 
 
 @pytest.mark.parametrize("name", ["ackermann", "differential", "mecanum"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from gymnasium.wrappers import TimeLimit
@@ -11,9 +13,11 @@ from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.policy.evaluation import drive_all, drive_worlds, successes
 from nics_drl_bridge.policy.policies import POLICIES, DynamicWindow, make_policy
+from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.kinds import steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
@@ -124,6 +128,22 @@ def test_a_car_turns_by_its_own_wheelbase(changes):
     assert steady_twist(long, long.command_high) == pytest.approx(twist)
     planner = DynamicWindow(Navigation(long, lidar()))
     assert np.abs(planner._search[0]).max(axis=0) == pytest.approx(np.abs(twist))
+
+
+def test_the_planner_asks_a_model_whose_motors_bend_commands_where_they_lead():
+    model = builtin_model("ackermann")
+    curve = InputCurve(command="speed_command", dead=0.2)
+    slow = np.array([[-0.5, 0.5], [-np.inf, np.inf]])
+    bent = replace(model, kinematics=replace(model.kinematics, inputs=(curve,), limits=slow))
+    task = task_of("ackermann")
+    plain, asking = (make_policy("dynamic_window", task, m) for m in (model, bent))
+    assert np.abs(asking._search[0][:, 0]).max() == pytest.approx(0.8, abs=0.02)
+    crawling = np.unique(asking._commands[:, 0])[1]
+    assert crawling < 0.2
+    still = asking._search[0][asking._commands[:, 0] == crawling]
+    assert np.abs(still).max() < 1e-3
+    rests = asking._search[2].rest - plain._search[2].rest
+    assert rests == pytest.approx(1.6, abs=0.1)  # from 0.8 m/s by 0.5 m/s^2
 
 
 def test_a_car_of_unknown_wheelbase_is_refused_and_none_assumed():

@@ -14,6 +14,7 @@ from nics_drl_bridge.report.fit_pictures import (
     calibration_pictures,
     timing_curves,
 )
+from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
 Found = tuple[RobotSpec, Identified]
@@ -54,7 +55,8 @@ def listed(found: Found):
 
 def test_every_estimate_of_a_disturbed_drive_has_its_picture(disturbed):
     pictures = calibration_pictures(*disturbed)
-    assert set(pictures) == {"timing", "bursts", "mounting", "wheels", "noise"} == set(CAPTIONS)
+    assert set(pictures) == {"timing", "bursts", "mounting", "wheels", "noise"}
+    assert set(CAPTIONS) == {*pictures, "inputs"}  # its motors have no curves
     assert all(picture.startswith(PNG) for picture in pictures.values())
 
 
@@ -101,3 +103,37 @@ def test_the_text_has_value_uncertainty_and_unit(disturbed):
     found = listed(disturbed)
     offset = replace(found["clock_offset_s"], value=-3.0012, sigma=0.0104)
     assert offset.text == "clock offset -3.001 +- 0.01 s"
+
+
+def test_motors_are_drawn_and_reported_with_what_is_known_of_them(exact):
+    spec, found = exact
+    assert "inputs" not in calibration_pictures(spec, found)
+    name = spec.command[0].name
+    state = spec.state[0].name
+    size = len(spec.state)
+    curve = InputCurve(command=name, dead=0.12, least=-0.5, most=0.8, back=0.6)
+    friction, limits = np.zeros(size), np.tile([-np.inf, np.inf], (size, 1))
+    friction[0], limits[0] = 0.2, (-3.0, 2.0)
+    model = replace(found.model, inputs=(curve,), friction=friction, limits=limits)
+    sigma = {f"{name}.dead": 0.004}
+    calibration = replace(found.calibration, uncertainty=sigma)
+    motors = replace(found, model=model, calibration=calibration)
+    report = fit_report("drive", spec, motors)
+    assert (
+        f"{name}' = 0 within +-0.12, else {name} -+ 0.12, {name} at least -0.5, {name} at "
+        in report
+    )
+    assert f"*{name}'" in report
+    assert ", at least -3, at most 2, less dry friction of 0.2  [rad/s/s]" in report
+    assert (
+        f"{name:<24} dead zone on both sides of 0: 0.12 +- 0.004 {spec.command[0].unit}" in report
+    )
+    assert f"{state:<24} dry friction: 0.2 rad/s/s" in report
+    assert "does no more" in report
+    assert model.equations()[0] == curve.equation
+    assert calibration_pictures(spec, motors)["inputs"].startswith(PNG)
+
+
+def test_a_robot_whose_motors_do_no_more_than_its_terms_has_no_section_on_them(exact):
+    spec, found = exact
+    assert "What motors do" not in fit_report("drive", spec, found)

@@ -1,0 +1,259 @@
+"""One drive of a car whose motors do more than its terms: every room predicts the same path."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from robots import field, lidar
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import ModelError
+from nics_drl_bridge.generator import SimulatorModel, load_model, save_model
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.kernels import Shot, shoot, tangent
+from nics_drl_bridge.identify.open_loop import predict, windows
+from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.lidar.bake import bake
+from nics_drl_bridge.lidar.shapes import Circle
+from nics_drl_bridge.middleware.ekf import Estimator
+from nics_drl_bridge.recording.recording import Recording, Stream
+from nics_drl_bridge.robot.curve import InputCurve
+from nics_drl_bridge.robot.kernels import SERIES, rollout, run, term_arrays
+from nics_drl_bridge.robot.noise import Noise
+from nics_drl_bridge.robot.spec import robot_from
+from nics_drl_bridge.robot.taylor import NamedTaylorModel, TaylorModel
+from nics_drl_bridge.sim.simulator import CommandBox, FastSimulator
+
+CAR = robot_from(
+    {
+        "kind": "ackermann_throttle", "footprint_radius": 0.2,
+        "parameters": {"wheelbase": 0.26}, "state": [{"name": "vx"}, {"name": "wz"}],
+    },
+    {"throttle": (-1.0, 1.0), "steering": (-1.0, 1.0)},
+)  # fmt: skip
+DEAD, PERIODS, SUBSTEPS = 0.12, 60, 10
+
+
+def motors() -> TaylorModel:
+    """vx' = 5 throttle - 0.8 vx, wz' = 4 vx steering - 5 wz, behind motors that bend all of it."""
+    powers = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 1]])
+    rows = [[1.0, 0, 0, 0], [0.0] * 4, [0, 1.0, 0, 0], [-0.8, 0, 5.0, 0], [0, -5.0, 0, 8.0]]
+    return TaylorModel(
+        CAR.variable_names, CAR.dof_names, CAR.dof_units, powers, np.array(rows), 0.01,
+        np.array([-1.0, -1.0, -0.6, -1.0]), np.array([2.0, 1.0, 0.7, 1.0]),
+        inputs=(
+            InputCurve(command="throttle", dead=DEAD, least=-0.5, most=0.8, back=0.6),
+            InputCurve(command="steering", dead=0.02),
+        ),
+        friction=np.array([0.2, 0.0]), limits=np.array([[-2.5, 1.5], [-np.inf, 6.0]]),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def model() -> SimulatorModel:
+    sensor = lidar()
+    table = bake(sensor, (Circle(radius=0.2),))
+    return SimulatorModel(CAR, motors(), Calibration(), sensor, table, Noise())
+
+
+@pytest.fixture(scope="module")
+def commands() -> np.ndarray:
+    """Commands (T, C) of each period that reach every stage: it stands, slips out, saturates."""
+    rng = np.random.default_rng(4)
+    held = rng.uniform(-1.0, 1.0, (PERIODS // 6, 2))
+    held[::3, 0] *= 0.1
+    return np.repeat(held, 6, axis=0)
+
+
+@pytest.fixture(scope="module")
+def path(commands) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (T + 1, 3) and states (T + 1, S) at the ends of periods, step by step of the model."""
+    car, pose, state = motors(), np.zeros(3), np.zeros(2)
+    poses, states = [pose], [state]
+    for command in commands:
+        for _ in range(SUBSTEPS):
+            pose, state = car.step(pose, state, command)
+        poses.append(pose)
+        states.append(state)
+    return np.array(poses), np.array(states)
+
+
+def test_the_drive_shows_every_stage(commands, path):
+    speed, car = path[1][:, 0], motors()
+    assert (speed == 0.0).sum() > 5
+    assert (np.abs(commands[:, 0]) < DEAD).any()
+    assert (np.abs(commands[:, 0]) > 0.8).any()
+    raw = replace(car, inputs=()), replace(car, friction=np.zeros(2))
+    for other in (*raw, replace(car, limits=np.tile([-np.inf, np.inf], (2, 1)))):
+        ends = rolled(other, commands)[0]
+        assert np.hypot(*(ends[-1] - path[0][-1])[:2]) > 0.02
+
+
+def rolled(car, commands):
+    poses, states = np.zeros((1, PERIODS * SUBSTEPS + 1, 3)), np.zeros((1, 601, 2))
+    every = np.repeat(car.in_effect(commands), SUBSTEPS, axis=0)[None]
+    rollout(poses, states, every, term_arrays(car), SERIES, car.dt)
+    return poses[0, ::SUBSTEPS], states[0, ::SUBSTEPS]
+
+
+def assert_same_path(poses, expected):
+    apart = np.asarray(poses) - expected
+    apart[:, 2] = geometry.wrap_angle(apart[:, 2])
+    assert np.abs(apart).max() < 1e-9
+
+
+def test_the_roll_out_of_an_identification_follows_the_model(commands, path):
+    poses, states = rolled(motors(), commands)
+    assert_same_path(poses, path[0])
+    assert np.allclose(states, path[1], rtol=0.0, atol=1e-12)
+
+
+def test_an_open_loop_prediction_of_a_recorded_drive_follows_the_model(commands, path):
+    t = 0.1 * np.arange(PERIODS + 1)
+    streams = Stream(t[:-1], commands), Stream(t, path[0]), Stream(t, path[1])
+    drive = Drive(Recording(*streams), CAR)
+    chosen = windows(drive, Calibration(), 0.0, t[-1], 2.0, 0.3)
+    ends = predict(motors(), Calibration(), drive, chosen)
+    assert len(ends) > 10
+    assert_same_path(ends, chosen.end)
+
+
+@pytest.mark.parametrize("worlds", [1, 3])
+def test_the_simulator_follows_the_model(model, commands, path, worlds):
+    simulator = FastSimulator(model, field(60.0), worlds=worlds)
+    simulator.reset(np.arange(worlds), starts=np.zeros((worlds, 1, 3)))
+    poses = [simulator.data.pose[-1, 0].copy()]
+    for command in commands:
+        simulator.step(np.tile(command, (worlds, 1, 1)))
+        poses.append(simulator.data.pose[-1, 0].copy())
+    assert_same_path(poses, path[0])
+
+
+def test_robots_that_might_touch_follow_the_model_too(model):
+    simulator = FastSimulator(model, field(60.0), robots=2)
+    start = np.array([[0.0, 0.0, 0.0], [0.0, 0.41, 0.0]])
+    simulator.reset([0], starts=start[None])
+    pose, state = start, np.zeros((2, 2))
+    for throttle in (0.7, 0.7, 0.7, 0.2, -0.9, -0.9):
+        command = np.tile([throttle, 0.0], (2, 1))
+        simulator.step(command[None])
+        for _ in range(SUBSTEPS):
+            pose, state = model.kinematics.step(pose, state, command)
+    assert not simulator.data.collided.any()
+    assert np.abs(pose[:, 0]).min() > 0.1
+    assert_same_path(simulator.data.pose[0], pose)
+
+
+def test_the_estimator_predicts_the_path_of_the_model(model, commands, path):
+    estimator = Estimator(model)
+    estimator.reset(0, np.zeros(3))
+    poses = [estimator.belief.mean[:3]]
+    for k, command in enumerate(commands):
+        estimator.command(k * NS_PER_S // 10, command)
+        estimator.predict((k + 1) * NS_PER_S // 10)
+        poses.append(estimator.belief.mean[:3])
+    assert_same_path(poses, path[0])
+
+
+def test_the_estimator_expects_the_twist_of_a_command_in_effect(model):
+    sent = replace(
+        model, kinematics=replace(motors(), powers=np.eye(4, dtype=np.int64)[[0, 2]],
+        coefficients=np.array([[0.0, 1.0], [0, 0], [0, 0], [0, 0], [0, 0]]))
+    )  # fmt: skip
+    estimator = Estimator(sent)
+    estimator.reset(0, np.zeros(3))
+    estimator.command(0, np.array([0.3, 0.0]))
+    assert estimator.at(1)[1] == pytest.approx([0.3 - DEAD, 0.0, 0.0])
+
+
+def test_a_batch_of_robots_moves_as_each_alone(commands, path):
+    car, count = motors(), 37
+    terms = term_arrays(car)
+    lanes = terms._replace(coefficient=np.tile(terms.coefficient[:, None], count))
+    pose, x, dq = np.zeros((6, count)), np.zeros((5, count)), np.zeros((5, count))
+    pose[2], x[4] = 1.0, 1.0
+    for command in commands:
+        x[2:4] = car.in_effect(command)[:, None]
+        run(pose, x, dq, lanes, SERIES, car.dt, SUBSTEPS)
+    assert np.allclose(pose[:2, -1], path[0][-1, :2], rtol=0.0, atol=1e-9)
+    assert (pose == pose[:, :1]).all()
+
+
+def test_predictions_over_seconds_have_the_derivatives_that_differences_show(commands):
+    car, steps = motors(), 300
+    every = np.repeat(car.in_effect(commands), SUBSTEPS, axis=0)
+    first = np.arange(0, 300, 50)
+    rows = first[:, None] + np.arange(steps)
+    state = rolled_states(car, every)[first]
+    free = np.arange(car.terms_kept)
+
+    def ends(terms):
+        shot = Shot(
+            state, np.ascontiguousarray(every[rows]), *car.state_box,
+            np.zeros((len(first), 3)), np.zeros((len(first), 3, len(free))),
+        )  # fmt: skip
+        shoot(shot, terms, free, car.dt, tangent(2, 2, len(free), len(free)))
+        return shot.end, shot.slope
+
+    terms, slight = term_arrays(car), 1e-7
+    end, slope = ends(terms)
+    for p in free:
+        aside = terms.coefficient + slight * (np.arange(len(free)) == p)
+        expected = (ends(terms._replace(coefficient=aside))[0] - end) / slight
+        assert np.allclose(slope[:, :, p], expected, rtol=1e-3, atol=1e-3), p
+
+
+def rolled_states(car, every):
+    poses, states = np.zeros((1, len(every) + 1, 3)), np.zeros((1, len(every) + 1, 2))
+    rollout(poses, states, every[None], term_arrays(car), SERIES, car.dt)
+    return states[0]
+
+
+def test_a_model_that_is_written_steps_as_it_did(model, tmp_path, commands):
+    save_model(model, tmp_path / "car")
+    read = load_model(tmp_path / "car")
+    assert read.fingerprint == model.fingerprint
+    pose = [np.zeros((PERIODS, 3)), np.full((PERIODS, 2), 0.3), commands]
+    for one, other in zip(model.kinematics.step(*pose), read.kinematics.step(*pose), strict=True):
+        assert np.array_equal(one, other)
+    assert "dead: 0.12" in model.text
+    assert "inputs" not in replace(model, kinematics=replace(motors(), inputs=())).text
+
+
+def test_a_written_car_stands_still_at_a_throttle_in_its_dead_zone(model, tmp_path):
+    save_model(model, tmp_path / "car")
+    simulator = FastSimulator(load_model(tmp_path / "car"), field(20.0))
+    for throttle, moves in ((0.9 * DEAD, False), (-0.9 * DEAD, False), (3.0 * DEAD, True)):
+        simulator.reset([0], starts=np.zeros((1, 1, 3)))
+        for _ in range(30):
+            simulator.step([[[throttle, 0.5]]])
+        assert bool(np.abs(simulator.data.pose[0, 0]).max() > 0.01) == moves
+        assert bool((simulator.data.pose[0, 0] == 0.0).all()) != moves
+
+
+def test_a_warning_is_of_the_command_that_was_sent(model):
+    said: list[str] = []
+    box = CommandBox(motors(), CAR, said.append)
+    box.check(np.array([[0.85, 0.0]]))  # in effect 0.68: more than 0.8 does no more
+    assert not said
+    slow = replace(motors(), high=np.array([2.0, 1.0, 0.3, 1.0]))
+    CommandBox(slow, CAR, said.append).check(np.array([[0.6, 0.0]]))
+    assert "throttle is 0.6, but the model was fitted to -inf to 0.42 only" in said[0]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"inputs": ({"command": "gas"},)}, "key 'inputs' has 'gas', not one of"),
+        ({"inputs": ({"command": "throttle"},) * 2}, "key 'inputs' has a command twice"),
+        ({"friction": {"speed": 0.1}}, "key 'friction' has 'speed'"),
+        ({"limits": {"throttle": (-1.0, 1.0)}}, "key 'limits' has 'throttle'"),
+    ],
+)
+def test_a_stage_of_an_unknown_variable_is_one_sentence(change, says):
+    named = NamedTaylorModel.model_validate(motors().named.model_dump() | change)
+    with pytest.raises(ModelError, match=says):
+        named.model()
