@@ -201,12 +201,12 @@ def apart(drive: Drive, timing: TimingEstimate) -> TimingEstimate:
     command's delay: the latency is the least delay, and the rest counts as lag.
     """
     recording, spec, twists = drive.recording, drive.spec, drive.twists
-    moved = np.flatnonzero(signals.moved_inputs(recording.command, spec)[: len(spec.state)])
-    if recording.state is not None or len(timing.sigma) != 1 or not len(moved):
+    if recording.state is not None or not spec.state or len(timing.sigma) != 1:
         return timing
-    rows, moving = _some(len(twists.start), FEW_ROWS), moving_dofs(twists.twist)
+    moved = np.flatnonzero(signals.moved_inputs(recording.command, spec))
+    rows, moving = _some(len(twists.start), FEW_ROWS), list(moving_dofs(twists.twist))
     begin = twists.start[rows]
-    target = (begin, twists.end[rows], twists.twist[np.ix_(rows, moving)])
+    target = (begin, twists.end[rows], twists.twist[rows][:, moving])
     left_over = response_residual(recording.command, spec, target, GREATEST_ORDER)
     shift = timing.latency - timing.offset
     tau, delays, count = timing.lags.copy(), np.full(len(timing.lags), shift), len(moved)

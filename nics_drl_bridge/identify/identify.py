@@ -426,7 +426,7 @@ def begun(drive: Drive) -> Findings:
 
 
 def run(stages: Sequence[Stage], drive: Drive, findings: Findings | None = None) -> Findings:
-    """Runs a row of stages over a drive and returns their findings, beginning with what is known."""
+    """Runs a row of stages over a drive, from what is known, and returns their findings."""
     findings = findings or begun(drive)
     for stage in stages:
         findings = stage(drive, findings)

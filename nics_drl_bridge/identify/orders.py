@@ -16,7 +16,7 @@ def through_state(powers: Powers, spec: RobotSpec, centred: bool) -> Mask:
     mirror reverses, and beyond the first order the rest is odd. States lag behind their commands.
     """
     names, odd, order = spec.variable_names, mirrored(spec), powers.sum(axis=1)
-    unmoved = [name for name, used in zip(names, powers.any(axis=0), strict=True) if not used]
+    unmoved = [name for name, most in zip(names, powers.max(axis=0), strict=True) if most == 0]
     allowed = np.ones((len(spec.dof_names), len(powers)), dtype=np.bool_)
     allowed[:3] = terms_through_state(powers, spec, tuple(unmoved))
     if odd is not None and centred:
