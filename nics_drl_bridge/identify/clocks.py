@@ -1,6 +1,6 @@
 """Clocks: a drive's offset, latency and lags, each the shift that best explains it by commands."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -195,49 +195,74 @@ def timing_of(drive: Drive) -> TimingEstimate:
 
 
 def apart(drive: Drive, timing: TimingEstimate) -> TimingEstimate:
-    """Estimates delay and lag of each moved command of its own, by terms of the greatest order.
+    """Sharpens a timing by a delay and a lag of each command of its own.
 
     What stands between command and motion beside one lag, as a servo of higher order, adds to a
     command's delay: the latency is the least delay, and the rest counts as lag.
     """
-    recording, spec, twists = drive.recording, drive.spec, drive.twists
-    if recording.state is not None or not spec.state or len(timing.sigma) != 1:
+    if drive.recording.state is not None or not drive.spec.state or len(timing.sigma) != 1:
         return timing
-    moved = np.flatnonzero(signals.moved_inputs(recording.command, spec))
-    rows, moving = _some(len(twists.start), FEW_ROWS), list(moving_dofs(twists.twist))
-    begin = twists.start[rows]
-    target = (begin, twists.end[rows], twists.twist[rows][:, moving])
-    left_over = response_residual(recording.command, spec, target, GREATEST_ORDER)
-    shift = timing.latency - timing.offset
-    tau, delays, count = timing.lags.copy(), np.full(len(timing.lags), shift), len(moved)
-
-    def residual(theta: Array) -> Array:
-        delays[moved], tau[moved] = theta[:count], np.exp(theta[count:])
-        return left_over(tau, delays)
-
-    start = np.append(delays[moved], np.log(tau[moved]))
-    low, high = (np.repeat([shift + BOUNDS[i][0], BOUNDS[i][1]], count) for i in range(2))
-    found, jacobian, rest = minimise(residual, start, np.full(2 * count, 0.1), (low, high))
-    span = np.repeat(((begin - begin[0]) / CLUSTER_S).astype(np.intp), len(moving))
-    by_lag = jacobian[:, count:] / np.exp(found[count:])  # of delays and of their sums with lags
-    by_sum = np.concatenate([jacobian[:, :count] - by_lag, by_lag], axis=1)
-    sigma = np.maximum(clustered_errors(by_sum, rest, span), EXACT).reshape(2, count)
-    delay, sums = found[:count], found[:count] + np.exp(found[count:])
+    moved = np.flatnonzero(signals.moved_inputs(drive.recording.command, drive.spec))
+    delay, sums, sigma = _delays(drive, timing, moved)
+    if not np.isfinite(sigma).all():
+        return timing
     first = int(np.argmin(delay + CERTAIN * sigma[0]))
     alike = np.abs(delay - delay[first]) <= CERTAIN * np.hypot(sigma[0], sigma[0, first])
     least = float(np.average(delay[alike], weights=sigma[0, alike] ** -2.0))
-    if not np.isfinite(sigma).all():
-        return timing
+    sigma = np.hypot(sigma, WITHIN_TICK * STEP_S)
     (name,) = timing.sigma  # of the latency, or of the offset between clocks that contains it
     errors = {name: float(sigma[0, first])}
     if timing.separated:
         least = if_certain(max(least, 0.0), errors[name], MIN_TIME_S)
         if errors[name] > TOLD_S:
-            errors["latency_and_lag_s"] = float(sigma[1, first])
+            names = (_of_sum(drive.spec.state[i].name) for i in moved)
+            errors |= zip(names, map(float, sigma[1]), strict=True)
     lags, lag_sigma = timing.lags.copy(), timing.lag_sigma.copy()
     lags[moved], lag_sigma[moved] = np.maximum(sums - least, 0.0), np.hypot(*sigma)
     latency = least if timing.separated else 0.0
     return TimingEstimate(latency - least, latency, errors, lags, lag_sigma, timing.separated)
+
+
+def _delays(
+    drive: Drive, timing: TimingEstimate, moved: NDArray[np.intp]
+) -> tuple[Array, Array, Array]:
+    """Returns delays (m,) of moved states, their sums (m,) with the lags, errors (2, m) of both."""
+    twists, command = drive.twists, drive.recording.command
+    rows, moving = _some(len(twists.start), FEW_ROWS), list(moving_dofs(twists.twist))
+    begin = twists.start[rows]
+    target = (begin, twists.end[rows], twists.twist[rows][:, moving])
+    left_over = response_residual(command, drive.spec, target, GREATEST_ORDER)
+    shift, count = timing.latency - timing.offset, len(moved)
+    lags, delays = timing.lags.copy(), np.full(len(timing.lags), shift)
+
+    def residual(theta: Array) -> Array:
+        delays[moved], lags[moved] = theta[:count], np.exp(theta[count:])
+        return left_over(lags, delays)
+
+    low, high = (np.repeat([shift + delay, log_lag], count) for delay, log_lag in BOUNDS)
+    start = np.clip(np.append(delays[moved], np.log(lags[moved])), low, high)
+    found, jacobian, rest = minimise(residual, start, np.full(2 * count, 0.1), (low, high))
+    lag = np.exp(found[count:])
+    by_lag = jacobian[:, count:] / lag
+    by_sum = np.concatenate([jacobian[:, :count] - by_lag, by_lag], axis=1)
+    cluster = np.repeat(((begin - begin[0]) / CLUSTER_S).astype(np.intp), len(moving))
+    sigma = np.maximum(clustered_errors(by_sum, rest, cluster), EXACT)
+    return found[:count], found[:count] + lag, sigma.reshape(2, count)
+
+
+def _of_sum(state: str) -> str:
+    """Returns the name of the uncertainty of a latency and a lag together."""
+    return f"command_latency_and_{state}_lag_s"
+
+
+def about_sums(calibration: Calibration) -> Iterator[str]:
+    """Tells of latency and lags that could not be told apart."""
+    for response in calibration.responses:
+        sigma = calibration.uncertainty.get(_of_sum(response.state))
+        if sigma is not None:
+            both = calibration.command_latency_s + response.lag_s
+            finding = f"Latency and the lag of {response.state} can hardly be told apart"
+            yield f"{finding}: trust their sum, {both:.4f} s (+- {sigma:.4f} s)."
 
 
 def nominal_timing(drive: Drive, offset: float = 0.0) -> TimingEstimate:

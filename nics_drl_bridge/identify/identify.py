@@ -408,6 +408,7 @@ def _sentences(found: Findings) -> tuple[str, ...]:
     return (
         *verdict.about_stamps(drive),
         *verdict.about_clocks(drive, calibration, found.timing),
+        *timings.about_sums(calibration),
         *verdict.about_mounting(drive, calibration, found.mounting),
         *verdict.about_responses(drive, calibration, found.timing),
     )
