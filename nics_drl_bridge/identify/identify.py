@@ -29,7 +29,7 @@ from nics_drl_bridge.identify.inputs import curve_of
 from nics_drl_bridge.identify.mounting import Mounting, mounted, mounting_of
 from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
 from nics_drl_bridge.identify.open_loop import SPACING_S, OpenLoop, predict, windows
-from nics_drl_bridge.identify.orders import ORDERS, through_state
+from nics_drl_bridge.identify.orders import ORDERS, about_orders, through_state
 from nics_drl_bridge.identify.refine import refined
 from nics_drl_bridge.identify.repair import check_axes, check_units, repaired
 from nics_drl_bridge.identify.signals import speed_index
@@ -285,7 +285,8 @@ def refine(drive: Drive, findings: Findings) -> Findings:
     if findings.calibration.is_exact:
         return findings
     model, calibration, note = refined(linear.model, findings.calibration, findings.training)
-    return replace(findings, model=model, calibration=calibration, refinement=(note,))
+    sentences = (note, *about_orders(findings.trials))
+    return replace(findings, model=model, calibration=calibration, refinement=sentences)
 
 
 def _refined_motion(drive: Drive, findings: Findings) -> Findings:

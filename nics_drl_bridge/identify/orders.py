@@ -1,9 +1,11 @@
 """Terms of robots whose state follows the commands and was not measured."""
 
+from collections.abc import Iterator, Sequence
+
 import numpy as np
 
 from nics_drl_bridge.identify.excitation import terms_through_state
-from nics_drl_bridge.identify.motion import Mask, Powers, mirrored
+from nics_drl_bridge.identify.motion import HORIZON_S, Mask, Powers, Trial, chosen, mirrored
 from nics_drl_bridge.robot.spec import RobotSpec
 
 ORDERS = (2, 3, 4)  # of which `auto` chooses
@@ -27,3 +29,12 @@ def through_state(powers: Powers, spec: RobotSpec, centred: bool) -> Mask:
         own = [names.index(variable.name), names.index(str(variable.follows))]
         allowed[3 + i] = (order == 1) & powers[:, own].any(axis=1)
     return allowed
+
+
+def about_orders(trials: Sequence[Trial]) -> Iterator[str]:
+    """Tells of a higher order than the usual one."""
+    if trials and (best := chosen(list(trials))) is not trials[0]:
+        errors = ", ".join(f"{trial.error:.1%} by order {trial.order}" for trial in trials)
+        finding = f"The model has terms up to order {best.order}"
+        unseen = f"predictions over {HORIZON_S:g} s of parts that a fit did not see"
+        yield f"{finding}: {unseen} end {errors} of the path away."

@@ -41,6 +41,7 @@ def test_a_tricycle_that_steers_far_gets_its_order_and_mounting_by_itself():
     trials = found.findings.trials
     assert [trial.order for trial in trials] == [2, 3, 4]
     assert trials[0].error > 3.0 * trials[2].error
+    assert any("The model has terms up to order 4" in note for note in found.notes)
     assert found.model.powers.sum(axis=1).max() >= 3
     assert share(found) < 0.02
     assert np.abs(off(found.calibration, (0.25, 0.12, 0.5))).max() < 3.0
