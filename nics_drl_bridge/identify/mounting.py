@@ -86,7 +86,8 @@ def by_instruments(
     power = seen.T @ seen
     noise += RIDGE * np.trace(power + noise) * np.eye(3)
     strength, axes = eigh(power, noise)
-    if not strength[1] * (count - size) / size > STRONG:
+    flat = float(np.hypot(*axes[:2, 0]) / np.linalg.norm(axes[:, 0]))
+    if not strength[1] * (count - size) / size > STRONG or flat < FLAT:
         return None
     normal = axes[:, 0] / np.hypot(*axes[:2, 0])
     if float(motion.twist[:, :2] @ [normal[1], -normal[0]] @ forward) < 0.0:
@@ -94,9 +95,11 @@ def by_instruments(
     travel = float(np.arctan2(-normal[0], normal[1]))
     ahead = rotate(seen[:, :2], -travel)[:, :1]
     sigma = standard_errors(np.hstack([ahead, seen[:, 2:]]), motion.twist @ normal)
-    across, across_sigma = 0.0, np.nan
-    if (odd := mirrored(spec)) is not None:  # motion along x is even in what a mirror reverses
-        aside = powers[:, [v.name in odd for v in spec.state]].sum(axis=1) % 2 == 1
+    if clocks.CERTAIN * sigma[1] > spec.footprint_radius:
+        return None
+    across, across_sigma, odd = 0.0, np.nan, mirrored(spec) or ()
+    aside = powers[:, [v.name in odd for v in spec.state]].sum(axis=1) % 2 == 1
+    if aside.any():  # motion along x is even in what a mirror reverses
         even = np.hstack([orth(chi[:, ~aside], rcond=SAME), seen[:, 2:]])
         along = rotate(motion.twist[:, :2], -travel)[:, 0]
         beta = np.linalg.lstsq(even, along, rcond=None)[0]

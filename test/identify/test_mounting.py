@@ -87,8 +87,10 @@ def test_the_lever_of_a_car_that_turned_little_both_ways_is_found_with_its_error
     assert np.abs(off).mean() > 0.3  # the errors are not too wide either
 
 
-def test_a_path_of_one_curvature_tells_no_lever(car):
-    motion, states = seen_by(car, np.full(900, 0.8), (0.08, 0.0))
+@pytest.mark.parametrize("spread", [0.0, 0.005])
+def test_a_path_of_one_curvature_tells_no_lever(car, spread):
+    bends = 0.8 + spread * np.repeat(np.random.default_rng(0).uniform(-1.0, 1.0, 90), 10)
+    motion, states = seen_by(car, bends, (0.08, 0.0))
     assert by_instruments(motion, states, states[:, 0], car) is None
 
 
