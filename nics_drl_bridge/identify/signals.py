@@ -82,7 +82,9 @@ def inferred_states(
     dt, follows = float(grid[1] - grid[0]), followed(spec)
     late = np.broadcast_to(latency, len(follows)).tolist()
     means = {one: held(command, spec, grid - one, grid + dt - one) for one in set(late)}
-    target = np.stack([means[one][:, c] for one, c in zip(late, follows, strict=True)], axis=1)
+    target = np.empty((len(grid), len(follows)))
+    for i, (one, c) in enumerate(zip(late, follows, strict=True)):
+        target[:, i] = means[one][:, c]
     long_ago = np.array([command.t[0] - 2.0])
     initial = held(command, spec, long_ago, long_ago + 1.0)[0, follows]
     states = np.empty((len(grid), len(follows)))
