@@ -1,19 +1,28 @@
 """Clocks: a drive's offset, latency and lags, each the shift that best explains it by commands."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import signals
 from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.drive import MIN_STAMPS, Drive, TwistIntervals
-from nics_drl_bridge.identify.statistics import minimise, standard_errors, uncertainty, unexplained
+from nics_drl_bridge.identify.excitation import moving_dofs
+from nics_drl_bridge.identify.statistics import (
+    clustered_errors,
+    minimise,
+    standard_errors,
+    uncertainty,
+    unexplained,
+)
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot import taylor
+from nics_drl_bridge.robot.kernels import GREATEST_ORDER
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Target = tuple[Array, Array, Array]  # start (n,), end (n,) of intervals, a signal's means (n, K)
@@ -24,7 +33,7 @@ LEAD_S = 2.0  # for the states to forget their initial values
 STEPS_S = (0.05, 0.005, 0.0005)
 SEARCH_S = 5.0
 BOUNDS = ((-0.5, np.log(0.005)), (0.5, np.log(2.0)))  # of the delay [s], of log(lag / s)
-MAX_ROWS = 2000
+MAX_ROWS, FEW_ROWS = 2000, 1000
 EXACT = 1e-6
 LONG_STEP = 1.5  # a step longer than this many usual steps is a gap
 WHEELS_EXPLAINED = 0.5  # the commands must explain this share of the wheels' variance
@@ -33,6 +42,8 @@ WHEELS_EXPLAINED = 0.5  # the commands must explain this share of the wheels' va
 WITHIN_TICK = 12.0**-0.5
 MIN_TIME_S = 5e-4
 CERTAIN = 3.0  # a correction below this many standard uncertainties is not made
+CLUSTER_S = 2.5  # residuals further apart are independent
+TOLD_S = 0.005  # a latency that is less certain can't be told from a lag
 
 
 @dataclass(frozen=True)
@@ -68,15 +79,15 @@ def delay_of_response(
 
 
 def response_residual(
-    command: Stream, spec: RobotSpec, target: Target
-) -> Callable[[Array, float], Array]:
-    """Returns the residual of a signal explained by commands, given lags (S,) and a delay [s]."""
+    command: Stream, spec: RobotSpec, target: Target, order: int = 2
+) -> Callable[[Array, Array | float], Array]:
+    """Returns the residual of a signal explained by commands, given lags and delays (S,) [s]."""
     (start, end, signal), moved = target, signals.moved_inputs(command, spec)
-    powers = taylor.exponents(len(moved), 2)
+    powers = taylor.exponents(len(moved), order)
     powers = powers[(powers[:, ~moved] == 0).all(axis=1)]
     grid = np.arange(start.min() - LEAD_S, end.max() + STEP_S, STEP_S)
 
-    def residual(lags: Array, delay: float) -> Array:
+    def residual(lags: Array, delay: Array | float) -> Array:
         if not spec.state:
             means = signals.held(command, spec, start - delay, end - delay, powers)
             return unexplained(means, signal)
@@ -90,8 +101,7 @@ def state_residual(command: Stream, state: Stream, spec: RobotSpec) -> Residual:
     """Returns the residual of a measured state's rates, given a delay (1,) of the commands [s]."""
     span = np.diff(state.t)
     keep = np.flatnonzero((span > 0.0) & (span < LONG_STEP * np.median(span)))
-    if len(keep) > MAX_ROWS:  # golden-section sampling: no stride that commands could share
-        keep = keep[np.unique((np.arange(MAX_ROWS) * 0.6180339887 % 1.0 * len(keep)).astype(int))]
+    keep = keep[_some(len(keep), MAX_ROWS)]
     start, end = state.t[keep], state.t[keep + 1]
     rates = (state.values[keep + 1] - state.values[keep]) / (end - start)[:, None]
     middle = (state.values[keep + 1] + state.values[keep]) / 2.0
@@ -101,6 +111,14 @@ def state_residual(command: Stream, state: Stream, spec: RobotSpec) -> Residual:
         return unexplained(np.concatenate([np.ones((len(u), 1)), middle, u], axis=1), rates)
 
     return residual
+
+
+def _some(count: int, most: int) -> NDArray[np.intp]:
+    """Returns at most so many of the indices of `count` rows, in order."""
+    if count <= most:
+        return np.arange(count)
+    # Golden-section sampling: no stride that commands could share.
+    return np.unique((np.arange(most) * 0.6180339887 % 1.0 * count).astype(np.intp))
 
 
 def residual_by_shift(state: Stream, target: Target) -> Residual:
@@ -154,7 +172,7 @@ def timing_of(drive: Drive) -> TimingEstimate:
     """Estimates clock offset, latency and lags as far as the recording allows (RecordingError)."""
     recording, spec, twists = drive.recording, drive.spec, drive.twists
     command, state, place = recording.command, recording.state, recording.source
-    missing = [v.name for v in spec.state if v.follows is None]
+    missing = [v.name for v in spec.state if v.must_be_measured]
     if state is None and missing:
         fault = f"no measured state, and {missing[0]!r} of robot {spec.name!r} follows no command"
         advice = "record the state too, or add `follows:` to the robot's YAML file"
@@ -174,6 +192,77 @@ def timing_of(drive: Drive) -> TimingEstimate:
     latency = if_certain(max(delay.value, 0.0), delay.sigma, MIN_TIME_S)
     sigma = {"command_latency_s": delay.sigma}
     return TimingEstimate(0.0, latency, sigma, delay.lags, delay.lag_sigma, True)
+
+
+def apart(drive: Drive, timing: TimingEstimate) -> TimingEstimate:
+    """Sharpens a timing by a delay and a lag of each command of its own.
+
+    What stands between command and motion beside one lag, as a servo of higher order, adds to a
+    command's delay: the latency is the least delay, and the rest counts as lag.
+    """
+    if drive.recording.state is not None or not drive.spec.state or len(timing.sigma) != 1:
+        return timing
+    moved = np.flatnonzero(signals.moved_inputs(drive.recording.command, drive.spec))
+    delay, sums, sigma = _delays(drive, timing, moved)
+    if not np.isfinite(sigma).all():
+        return timing
+    first = int(np.argmin(delay + CERTAIN * sigma[0]))
+    alike = np.abs(delay - delay[first]) <= CERTAIN * np.hypot(sigma[0], sigma[0, first])
+    least = float(np.average(delay[alike], weights=sigma[0, alike] ** -2.0))
+    sigma = np.hypot(sigma, WITHIN_TICK * STEP_S)
+    (name,) = timing.sigma  # of the latency, or of the offset between clocks that contains it
+    errors = {name: float(sigma[0, first])}
+    if timing.separated:
+        least = if_certain(max(least, 0.0), errors[name], MIN_TIME_S)
+        if errors[name] > TOLD_S:
+            names = (_of_sum(drive.spec.state[i].name) for i in moved)
+            errors |= zip(names, map(float, sigma[1]), strict=True)
+    lags, lag_sigma = timing.lags.copy(), timing.lag_sigma.copy()
+    lags[moved], lag_sigma[moved] = np.maximum(sums - least, 0.0), np.hypot(*sigma)
+    latency = least if timing.separated else 0.0
+    return TimingEstimate(latency - least, latency, errors, lags, lag_sigma, timing.separated)
+
+
+def _delays(
+    drive: Drive, timing: TimingEstimate, moved: NDArray[np.intp]
+) -> tuple[Array, Array, Array]:
+    """Returns delays (m,) of moved states, their sums (m,) with the lags, errors (2, m) of both."""
+    twists, command = drive.twists, drive.recording.command
+    rows, moving = _some(len(twists.start), FEW_ROWS), list(moving_dofs(twists.twist))
+    begin = twists.start[rows]
+    target = (begin, twists.end[rows], twists.twist[rows][:, moving])
+    left_over = response_residual(command, drive.spec, target, GREATEST_ORDER)
+    shift, count = timing.latency - timing.offset, len(moved)
+    lags, delays = timing.lags.copy(), np.full(len(timing.lags), shift)
+
+    def residual(theta: Array) -> Array:
+        delays[moved], lags[moved] = theta[:count], np.exp(theta[count:])
+        return left_over(lags, delays)
+
+    low, high = (np.repeat([shift + delay, log_lag], count) for delay, log_lag in BOUNDS)
+    start = np.clip(np.append(delays[moved], np.log(lags[moved])), low, high)
+    found, jacobian, rest = minimise(residual, start, np.full(2 * count, 0.1), (low, high))
+    lag = np.exp(found[count:])
+    by_lag = jacobian[:, count:] / lag
+    by_sum = np.concatenate([jacobian[:, :count] - by_lag, by_lag], axis=1)
+    cluster = np.repeat(((begin - begin[0]) / CLUSTER_S).astype(np.intp), len(moving))
+    sigma = np.maximum(clustered_errors(by_sum, rest, cluster), EXACT)
+    return found[:count], found[:count] + lag, sigma.reshape(2, count)
+
+
+def _of_sum(state: str) -> str:
+    """Returns the name of the uncertainty of a latency and a lag together."""
+    return f"command_latency_and_{state}_lag_s"
+
+
+def about_sums(calibration: Calibration) -> Iterator[str]:
+    """Tells of latency and lags that could not be told apart."""
+    for response in calibration.responses:
+        sigma = calibration.uncertainty.get(_of_sum(response.state))
+        if sigma is not None:
+            both = calibration.command_latency_s + response.lag_s
+            finding = f"Latency and the lag of {response.state} can hardly be told apart"
+            yield f"{finding}: trust their sum, {both:.4f} s (+- {sigma:.4f} s)."
 
 
 def nominal_timing(drive: Drive, offset: float = 0.0) -> TimingEstimate:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -28,6 +29,7 @@ from nics_drl_bridge.identify.inputs import curve_of
 from nics_drl_bridge.identify.mounting import Mounting, mounted, mounting_of
 from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
 from nics_drl_bridge.identify.open_loop import SPACING_S, OpenLoop, predict, windows
+from nics_drl_bridge.identify.orders import ORDERS, about_orders, through_state
 from nics_drl_bridge.identify.refine import refined
 from nics_drl_bridge.identify.repair import check_axes, check_units, repaired
 from nics_drl_bridge.identify.signals import speed_index
@@ -106,6 +108,8 @@ def clocks(drive: Drive, findings: Findings) -> Findings:
     derived = motions.by_motion(spec, drive.recording)
     followed = replace(training, spec=motions.surrogate(spec)) if derived else training
     found = timings.timing_of(followed)
+    if not derived:
+        found = timings.apart(training, found)
     names = [c.name for c in spec.command]
     responses = (
         Response(v.name, v.follows, float(found.lags[names.index(v.follows)]))
@@ -125,11 +129,11 @@ def clocks(drive: Drive, findings: Findings) -> Findings:
 
 def mounting(drive: Drive, findings: Findings) -> Findings:
     """Finds where and how the tracked body is mounted on the robot."""
-    training, speed = findings.training, None
-    derived = motions.by_motion(drive.spec, drive.recording)
-    if not derived and (place := speed_index(drive.spec)) is not None:
-        speed = timings.expected_states(training, training.twists, findings.timing)[:, place]
-    found = mounting_of(training, findings.timing, speed)
+    training, states, place = findings.training, None, speed_index(drive.spec)
+    if drive.spec.state and not motions.by_motion(drive.spec, drive.recording):
+        states = timings.expected_states(training, training.twists, findings.timing)
+    found = mounting_of(training, findings.timing, states)
+    speed = None if states is None or place is None else states[:, place]
     calibration = mounted(findings.calibration, found)
     return replace(findings, speed=speed, mounting=found, calibration=calibration)
 
@@ -221,15 +225,35 @@ def fit(drive: Drive, findings: Findings) -> Findings:
     calibration, spec, settings = findings.calibration, drive.spec, drive.settings
     if spec.state and drive.recording.state is None:
         known(calibration.responses or None, "the response of each state", "responses")
-    samples = align(findings.training, calibration)
+    samples, trials = align(findings.training, calibration), findings.trials
+    inferred = drive.recording.state is None and not calibration.is_exact
+    if settings.order == "auto" and inferred:
+        trials = _trials_of_orders(drive, findings)
+    order = ORDER if settings.order == "auto" else settings.order
+    order = motions.chosen(list(trials)).order if trials else order
+    centred = "lever_arm_y_m" in calibration.uncertainty
+    library = partial(through_state, centred=centred) if inferred else None
     try:
-        order = ORDER if settings.order == "auto" else settings.order
-        regression = regress(samples, spec, order, noisy=not calibration.is_exact)
+        regression = regress(samples, spec, order, not calibration.is_exact, library)
     except FitError as error:
         raise FitError(f"{drive.recording.source}: {error}") from None
     if settings.strict:
         verdict.refuse_unexcited(regression.excitation, spec)
-    return replace(findings, samples=samples, regression=regression)
+    return replace(findings, samples=samples, regression=regression, trials=trials)
+
+
+def _trials_of_orders(drive: Drive, findings: Findings) -> tuple[motions.Trial, ...]:
+    """Tries each order on parts of the training part that its fits did not see."""
+    training, trials = findings.training, []
+    span = 0.0, training.duration_s, motions.HORIZON_S, SPACING_S
+    path = windows(training, findings.calibration, *span).path
+    for order in ORDERS:
+        errors = _left_out(drive, findings, order)
+        if motions.HORIZON_S not in errors:
+            break
+        share = float(errors[motions.HORIZON_S].mean() / max(float(path.mean()), 1e-9))
+        trials.append(motions.Trial(order, share, errors))
+    return tuple(trials)
 
 
 def prune(drive: Drive, findings: Findings) -> Findings:
@@ -249,7 +273,8 @@ def refine(drive: Drive, findings: Findings) -> Findings:
     if findings.calibration.is_exact:
         return findings
     model, calibration, note = refined(linear.model, findings.calibration, findings.training)
-    return replace(findings, model=model, calibration=calibration, refinement=(note,))
+    sentences = (note, *about_orders(findings.trials))
+    return replace(findings, model=model, calibration=calibration, refinement=sentences)
 
 
 def _refined_motion(drive: Drive, findings: Findings) -> Findings:
@@ -329,18 +354,23 @@ def bands_of(drive: Drive, findings: Findings) -> dict[float, float]:
     return {h: float(np.percentile(each, WITHIN)) for h, each in told}
 
 
-def _left_out(drive: Drive, findings: Findings) -> dict[float, Array]:
-    """Returns errors (W,) by horizon [s] on parts of the training part, by models of the rest."""
+def _left_out(drive: Drive, findings: Findings, order: int | None = None) -> dict[float, Array]:
+    """Returns errors (W,) by horizon [s] on parts of the training part, by models of the rest.
+
+    With an order, these are made of what was found before.
+    """
     training, stages = findings.training, STAGES[: STAGES.index(complete)]
-    pose = training.recording.pose
+    pose, settings = training.recording.pose, replace(drive.settings, train_until_s=np.inf)
+    if order is not None:
+        stages, settings = (fit, prune, refine), replace(settings, order=order)
     errors: dict[float, list[Array]] = {h: [] for h in motions.BANDS_S}
     for block in np.array_split(np.arange(len(pose.t)), motions.FOLDS):
         others = np.ones(len(pose.t), dtype=np.bool_)
         others[block] = False
         rest = training.part(replace(training.recording, pose=pose.rows(others)))
         try:
-            settings = replace(drive.settings, train_until_s=np.inf)
-            found = run(stages, replace(rest, settings=settings))
+            rest = replace(rest, settings=settings)
+            found = run(stages, rest, replace(findings, training=rest) if order else None)
         except (FitError, RecordingError):
             return {}
         part = training.part(replace(training.recording, pose=pose.rows(block)))
@@ -371,6 +401,7 @@ def _sentences(found: Findings) -> tuple[str, ...]:
     return (
         *verdict.about_stamps(drive),
         *verdict.about_clocks(drive, calibration, found.timing),
+        *timings.about_sums(calibration),
         *verdict.about_mounting(drive, calibration, found.mounting),
         *verdict.about_responses(drive, calibration, found.timing),
     )
@@ -388,9 +419,9 @@ def begun(drive: Drive) -> Findings:
     return Findings(training, drive, timings.nominal_timing(training))
 
 
-def run(stages: Sequence[Stage], drive: Drive) -> Findings:
-    """Runs a row of stages over a drive and returns their findings."""
-    findings = begun(drive)
+def run(stages: Sequence[Stage], drive: Drive, findings: Findings | None = None) -> Findings:
+    """Runs a row of stages over a drive, from what is known, and returns their findings."""
+    findings = findings or begun(drive)
     for stage in stages:
         findings = stage(drive, findings)
     return findings

@@ -7,14 +7,18 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import eigh, orth
 
 from nics_drl_bridge.geometry import Array, rotate, wrap_angle
 from nics_drl_bridge.identify import clocks
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, TwistIntervals
-from nics_drl_bridge.identify.signals import followed, held
+from nics_drl_bridge.identify.motion import mirrored
+from nics_drl_bridge.identify.signals import followed, held, speed_index
 from nics_drl_bridge.identify.statistics import standard_errors
 from nics_drl_bridge.recording.recording import Stream
+from nics_drl_bridge.robot import taylor
+from nics_drl_bridge.robot.kernels import GREATEST_ORDER
 from nics_drl_bridge.robot.kinds import has_textbook, steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -27,6 +31,9 @@ MIN_LENGTH = 1e-4  # m, rad
 MOST_SLIP = 0.15  # a smaller angle between travel and heading may be slip [rad]
 REGULAR = 0.8
 BLOCKS = 8
+STRONG = 10.0  # instruments with a smaller F are weak (Staiger, Stock 1997)
+SAME = 1e-6  # part of an instrument by which it differs from others
+RIDGE = 1e-12  # of the noise of a drive without any
 
 
 @dataclass(frozen=True)
@@ -41,23 +48,67 @@ class Mounting:
 
 
 def mounting_of(
-    drive: Drive, timing: clocks.TimingEstimate, speed: Array | None
+    drive: Drive, timing: clocks.TimingEstimate, states: Array | None
 ) -> Mounting | None:
-    """Estimates the mounting by speeds (n,) up to a factor; None if the drive does not show it."""
+    """Estimates the mounting by states (n, S) at gain one; None if the drive does not show it."""
     spec, twists = drive.spec, drive.twists
     if not (has_textbook(spec) or spec.takes_cmd_vel):  # which way it faces is not known
         return None
     if spec.moves_sideways:
-        if not (spec.takes_cmd_vel or has_textbook(spec)):
-            return None
         return jackknifed(drive, twists, timing.offset, partial(_by_commands, timing))
     start, end = twists.on_clock(timing.offset)
     command = held(drive.recording.command, spec, start - timing.latency, end - timing.latency)
-    found = mounting_without_lateral_motion(twists, _response(spec, command)[:, 0])
-    if found is None or speed is None or np.isnan(found.lever_sigma[0]):
+    forward = _response(spec, command)[:, 0]
+    found = mounting_without_lateral_motion(twists, forward)
+    if found is None or states is None:
         return found
-    found.lever[1], found.lever_sigma[1] = lateral_lever(twists, found.rotation, speed)
+    if drive.recording.state is None or np.isnan(found.lever_sigma[0]):
+        found = by_instruments(twists, states, forward, spec) or found
+    place = speed_index(spec)
+    if place is not None and np.isnan(found.lever_sigma).tolist() == [False, True]:
+        speed = states[:, place]
+        found.lever[1], found.lever_sigma[1] = lateral_lever(twists, found.rotation, speed)
     return found
+
+
+def by_instruments(
+    motion: TwistIntervals, states: Array, forward: Array, spec: RobotSpec
+) -> Mounting | None:
+    """Estimates the mounting by functions of the states (n, S); None if these are too weak."""
+    # They know nothing of the noise of the twists, and whatever they do along x, they do nothing
+    # along y: limited information maximum likelihood (Anderson, Rubin 1949).
+    powers = taylor.exponents(states.shape[1], GREATEST_ORDER)
+    chi = taylor.evaluate(states / np.maximum(np.abs(states).max(axis=0), STILL), powers)
+    basis = orth(chi, rcond=SAME)
+    count, size = basis.shape
+    seen = basis @ (basis.T @ motion.twist)
+    noise = (motion.twist - seen).T @ (motion.twist - seen)
+    power = seen.T @ seen
+    noise += RIDGE * np.trace(power + noise) * np.eye(3)
+    strength, axes = eigh(power, noise)
+    flat = float(np.hypot(*axes[:2, 0]) / np.linalg.norm(axes[:, 0]))
+    if not strength[1] * (count - size) / size > STRONG or flat < FLAT:
+        return None
+    normal = axes[:, 0] / np.hypot(*axes[:2, 0])
+    if float(motion.twist[:, :2] @ [normal[1], -normal[0]] @ forward) < 0.0:
+        normal = -normal
+    travel = float(np.arctan2(-normal[0], normal[1]))
+    ahead = rotate(seen[:, :2], -travel)[:, :1]
+    sigma = standard_errors(np.hstack([ahead, seen[:, 2:]]), motion.twist @ normal)
+    if clocks.CERTAIN * sigma[1] > spec.footprint_radius:
+        return None
+    across, across_sigma, odd = 0.0, np.nan, mirrored(spec) or ()
+    aside = powers[:, [v.name in odd for v in spec.state]].sum(axis=1) % 2 == 1
+    if aside.any():  # motion along x is even in what a mirror reverses
+        even = np.hstack([orth(chi[:, ~aside], rcond=SAME), seen[:, 2:]])
+        along = rotate(motion.twist[:, :2], -travel)[:, 0]
+        beta = np.linalg.lstsq(even, along, rcond=None)[0]
+        rest = along - even[:, :-1] @ beta[:-1] - beta[-1] * motion.twist[:, 2]
+        across, across_sigma = -float(beta[-1]), float(standard_errors(even, rest)[-1])
+    return Mounting(
+        travel, np.array([-normal[2], across]), float(sigma[0]),
+        np.array([sigma[1], across_sigma]), True,
+    )  # fmt: skip
 
 
 def without_slip(found: Mounting) -> Mounting | None:

@@ -13,6 +13,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import open_loop
 from nics_drl_bridge.identify.calibration import Calibration, Response
+from nics_drl_bridge.identify.clocks import TOLD_S
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.signals import speed_index
 from nics_drl_bridge.identify.statistics import clustered_errors, minimise, uncertainty
@@ -128,19 +129,17 @@ def _without_outliers(chosen: open_loop.Windows, error: Array) -> open_loop.Wind
 
 def prediction_errors(problem: Problem, model: TaylorModel, calibration: Calibration) -> Array:
     """Returns the errors (n,) of all predictions: x, y and heading of each window [m]."""
-    parts = []
+    each = zip(*(vars(windows).values() for windows in problem.chosen), strict=True)
+    chosen = open_loop.Windows(*map(np.concatenate, each))
     with np.errstate(all="ignore"):  # a trial step may diverge; it is then rejected
-        for k, chosen in enumerate(problem.chosen):
-            if problem.courses:
-                ends = open_loop.relative_ends(problem.courses[k], model)[0]
-                predicted = open_loop.tracked_ends(chosen, calibration, ends)
-            else:
-                predicted = open_loop.predict(model, calibration, problem.drive, chosen)
-            error = predicted - chosen.end
-            error[:, 2] = HEADING_ARM_M * geometry.wrap_angle(error[:, 2])
-            parts.append(error.ravel())
-    finite = np.nan_to_num(np.concatenate(parts), nan=DIVERGED)
-    return np.asarray(np.clip(finite, -DIVERGED, DIVERGED))
+        if problem.courses:
+            ends = [open_loop.relative_ends(course, model)[0] for course in problem.courses]
+            predicted = open_loop.tracked_ends(chosen, calibration, np.concatenate(ends))
+        else:  # of all windows by one roll-out
+            predicted = open_loop.predict(model, calibration, problem.drive, chosen)
+        error = predicted - chosen.end
+        error[:, 2] = HEADING_ARM_M * geometry.wrap_angle(error[:, 2])
+    return np.asarray(np.clip(np.nan_to_num(error.ravel(), nan=DIVERGED), -DIVERGED, DIVERGED))
 
 
 def prediction_slopes(
@@ -176,13 +175,17 @@ class _Free:
     def of(cls, model: TaylorModel, calibration: Calibration, spec: RobotSpec) -> _Free:
         """Frees what neither definition nor measurement fixes."""
         # The rotation is defined by the direction without motion, of which an omnidirectional robot
-        # has none; a time from a measured state is fixed.
+        # has none. Where it is known apart from a lever arm, and where a time is known, they are
+        # fixed: a model that leaves out a term would bend them to make up for it.
         known, time = calibration.uncertainty, None
         if calibration.responses and "clock_offset_s" in known:
             time = "clock_offset_s"
         elif calibration.responses and calibration.command_latency_s > 0.0:
             time = "command_latency_s"
+        if time and known[time] <= TOLD_S and not lag_is_measured(calibration):
+            time = None
         turn = "rotation_rad" in known and not calibration.is_exact and not spec.moves_sideways
+        turn &= not (calibration.responses and "lever_arm_x_m" in known)
         names = (*([time] if time else ()), *(["rotation_rad"] if turn else ()))
         return cls(model, calibration, free_coefficients(model, calibration), time, names)
 

@@ -76,11 +76,15 @@ def nominal_lags(spec: RobotSpec) -> Array:
 
 
 def inferred_states(
-    command: Stream, spec: RobotSpec, lags: Array, latency: float, grid: Array
+    command: Stream, spec: RobotSpec, lags: Array, latency: Array | float, grid: Array
 ) -> Array:
-    """Infers states (T, S) at uniform times (T,) by first-order lags (S,) [s], with gain one."""
+    """Infers states (T, S) at uniform times (T,) by lags and latencies (S,) [s], with gain one."""
     dt, follows = float(grid[1] - grid[0]), followed(spec)
-    target = held(command, spec, grid - latency, grid + dt - latency)[:, follows]
+    late = np.broadcast_to(latency, len(follows)).tolist()
+    means = {one: held(command, spec, grid - one, grid + dt - one) for one in set(late)}
+    target = np.empty((len(grid), len(follows)))
+    for i, (one, c) in enumerate(zip(late, follows, strict=True)):
+        target[:, i] = means[one][:, c]
     long_ago = np.array([command.t[0] - 2.0])
     initial = held(command, spec, long_ago, long_ago + 1.0)[0, follows]
     states = np.empty((len(grid), len(follows)))

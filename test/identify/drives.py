@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.signal import cont2discrete, lfilter
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.identify import identify as stages
@@ -12,10 +13,13 @@ from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.recording.recording import Recording, Stream, check
 from nics_drl_bridge.recording.textbook import record
-from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.spec import RobotSpec, robot_from
 
 TICKS_PER_METRE = 70.0
 TRACK = 0.16
+STEERED = {"speed_command": (-0.5, 1.2), "steering_command": (-1.1, 1.1)}
+MOTOR, SERVO = ([1.0], [0.15, 1.0]), ([180.0], [1.0, 22.0, 180.0])  # transfer functions
+FINE_S, COMMAND_S, POSE_S, BASE = 0.002, 0.02, 0.01, 0.9
 
 
 def drive(
@@ -56,6 +60,58 @@ def drive(
         pose=Stream(arrival + pose_clock_ahead, tracked, clock),
         state=clean.state if measured_state else None,
         source="disturbed drive",
+    )
+
+
+def tricycle() -> RobotSpec:
+    """A forklift whose front wheel turns by 63 degrees."""
+    given = {"kind": "tricycle", "footprint_radius": 0.6, "parameters": {"wheelbase": BASE}}
+    return robot_from(given | {"angular_is": "steering"}, STEERED)
+
+
+def front_driven(state: np.ndarray) -> np.ndarray:
+    speed, angle = state.T
+    return np.stack([speed * np.cos(angle), 0.0 * speed, speed * np.sin(angle) / BASE], axis=1)
+
+
+def servoed(
+    twist=front_driven, seed: int = 0, latency: float = 0.1, duration: float = 60.0,
+    mounting: tuple[float, float, float] = (0.25, 0.12, 0.5), steering: float = 1.1,
+    noise: float = 5e-4, steering_servo=SERVO, dead: float = 0.0,
+) -> Recording:  # fmt: skip
+    """A drive of a robot with a motor and a servo, of which commands and poses were recorded.
+
+    Args:
+        twist: the body twist of speed and steering angle.
+        seed: of commands and noise.
+        latency: from a command's stamp to its effect [s].
+        duration: [s].
+        mounting: pose of the tracked body on the robot.
+        steering: greatest angle [rad].
+        noise: of the position [m], and half of that of the heading [rad].
+        steering_servo: transfer function.
+        dead: speed that is told and does not come [m/s].
+    """
+    rng, count = np.random.default_rng(seed), round(duration / FINE_S)
+    per_hold, late = round(0.5 / FINE_S), round(latency / FINE_S)
+    ranges = np.array([STEERED["speed_command"], (-steering, steering)]).T
+    command = np.repeat(rng.uniform(*ranges, (count // per_hold, 2)), per_hold, axis=0)
+    acting = np.concatenate([np.zeros((late, 2)), command[: count - late]])
+    acting[:, 0] = np.sign(acting[:, 0]) * np.maximum(np.abs(acting[:, 0]) - dead, 0.0)
+    columns = []
+    for each, system in zip(acting.T, (MOTOR, steering_servo), strict=True):
+        b, a, _ = cont2discrete(system, FINE_S)
+        columns.append(lfilter(b.ravel(), a, each))
+    moved = geometry.exp(twist(np.stack(columns, axis=1)) * FINE_S)
+    heading = np.cumsum(moved[:, 2]) - moved[:, 2]
+    step = geometry.rotate(moved[:, :2], heading)
+    path = np.concatenate([np.cumsum(step, axis=0) - step, heading[:, None]], axis=1)
+    rows, poses = round(COMMAND_S / FINE_S), path[:: round(POSE_S / FINE_S)]
+    poses = geometry.compose(poses, np.array(mounting))
+    poses = poses + noise * rng.normal(size=poses.shape) * [1.0, 1.0, 2.0]
+    t = FINE_S * np.arange(count)
+    return Recording(
+        Stream(t[::rows], command[::rows]), Stream(POSE_S * np.arange(len(poses)), poses)
     )
 
 

@@ -1,0 +1,56 @@
+"""Latency and lags of states that follow the commands and were not measured."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from identify.drives import MOTOR, calibrate, drive, servoed, tricycle
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.identify.clocks import TOLD_S, timing_of
+from nics_drl_bridge.identify.drive import Drive
+
+SUM = "command_latency_and_speed_lag_s"
+
+
+@pytest.mark.slow
+def test_a_servo_of_second_order_is_not_taken_for_latency():
+    found = calibrate(servoed(), tricycle())
+    assert found.command_latency_s == pytest.approx(0.1, abs=0.003)
+    assert found.uncertainty["command_latency_s"] < TOLD_S
+    speed, steering = found.responses
+    assert speed.lag_s == pytest.approx(0.15, abs=0.005)
+    assert steering.lag_s == pytest.approx(22.0 / 180.0, abs=0.015)  # damping by stiffness
+    assert SUM not in found.uncertainty
+
+
+@pytest.mark.slow
+def test_a_wide_steering_angle_does_not_bend_the_latency():
+    found = calibrate(servoed(seed=1, latency=0.06, steering_servo=MOTOR), tricycle())
+    assert found.command_latency_s == pytest.approx(0.06, abs=0.003)
+    assert [r.lag_s for r in found.responses] == pytest.approx([0.15, 0.15], abs=0.005)
+
+
+@pytest.mark.slow
+def test_of_latency_and_lag_that_noise_hides_the_sum_is_told(car):
+    recording = drive(car, 4, 20.0, latency=0.05, noise=(0.003, 0.006), measured_state=False)
+    found = calibrate(recording, car)
+    assert found.uncertainty["command_latency_s"] > TOLD_S
+    sigma = found.uncertainty[SUM]
+    both = found.command_latency_s + found.responses[0].lag_s
+    assert both == pytest.approx(0.15, abs=3.0 * sigma)
+    assert any("can hardly be told apart: trust their sum" in note for note in found.notes)
+
+
+def test_what_the_pose_tells_is_not_asked_to_be_measured(car, differential):
+    recording = replace(drive(car, duration=10.0), state=None)
+    speed, steering = car.state
+    by_twist = speed.model_copy(update={"follows": None, "twist": "vx"})
+    told = car.model_copy(update={"state": (by_twist, steering)})
+    untold = car.model_copy(
+        update={"state": (speed, steering.model_copy(update={"follows": None}))}
+    )
+    assert not any(v.must_be_measured for v in told.state)
+    with pytest.raises(RecordingError, match="'steering' of robot 'ackermann' follows no command"):
+        timing_of(Drive(recording, untold))
