@@ -113,7 +113,7 @@ def inspect(
     """Lists what a recording of any form holds, and begins the mapping that says what is what."""
     with one_sentence():
         from nics_drl_bridge.files import write_text
-        from nics_drl_bridge.recording.sources import open_source
+        from nics_drl_bridge.recording.readers import open_source
         from nics_drl_bridge.recording.survey import first_mapping, survey
 
         if mapping is not None and mapping.exists():

@@ -82,7 +82,7 @@ class TopicTable:
     messages: Sequence[Message]
     names: tuple[str, ...]
     stamped: Callable[[str], Stream]
-    notes: tuple[str, ...] = ()
+    notes: Sequence[str] = ()
 
     def column(self, which: str | int) -> Column:
         """Returns a field of all messages; RecordingError if they have none of that name."""
@@ -124,6 +124,7 @@ class Bag:
     frames: tuple[str | None, str | None] = (None, None)  # of the transforms to use
     # topics that are read, and whether they come from the robot's computer, for common stamps
     used: Mapping[str, bool] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
     _read: dict[str, TopicTable] = field(default_factory=dict)
     _stamps: dict[tuple[str, ...], dict[str, Stream]] = field(default_factory=dict)
 
@@ -152,7 +153,9 @@ class Bag:
                 messages = of_one_body(self.bag, name, messages, *self.frames)
             place = f"{self.place}: topic {name!r}"
             names = tuple(dict.fromkeys(fields_of(messages[0].content)))
-            table = TopicTable(place, name, messages, names, partial(self._stamps_of, name))
+            table = TopicTable(
+                place, name, messages, names, partial(self._stamps_of, name), self.notes
+            )
             self._read[name] = table
         return self._read[name]
 
@@ -167,8 +170,21 @@ class Bag:
                 rows = np.arange(len(messages), dtype=np.float64)[:, None]
                 data[each] = TopicData(each, receive, header, rows)
             robot = [each for each, own in self.used.items() if own]
-            self._stamps[key] = streams(data, STAMPS[which], self.place, robot)
+            self._stamps[key] = self._joined(data, STAMPS[which], robot)
         return self._stamps[key][topic]
+
+    def _joined(
+        self, data: dict[str, TopicData], stamps: roles.Stamps, robot: Sequence[str]
+    ) -> dict[str, Stream]:
+        """Stamps topics; by arrival if unasked-for headers are of no use."""
+        try:
+            return streams(data, stamps, self.place, robot)
+        except RecordingError as error:
+            if stamps != "auto":
+                raise
+            fault = str(error).removeprefix(f"{self.place}: ").partition(";")[0]
+            self.notes.append(f"{fault}; all messages were stamped by their arrival.")
+            return streams(data, "receive", self.place, robot)
 
 
 def topics_used(mapping: Mapping[str, Any], topics: Sequence[str]) -> dict[str, bool]:

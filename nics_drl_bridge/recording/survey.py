@@ -11,12 +11,11 @@ import numpy as np
 
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.recording import stamps
+from nics_drl_bridge.recording import stamping
 from nics_drl_bridge.recording.mapped import POSES
-from nics_drl_bridge.recording.plausible import implausible_pose
-from nics_drl_bridge.recording.recording import IRREGULAR
+from nics_drl_bridge.recording.mapping import UNITS
+from nics_drl_bridge.recording.recording import IRREGULAR, implausible_pose
 from nics_drl_bridge.recording.table import Column, Source, Table
-from nics_drl_bridge.recording.units import UNITS
 
 GUESSED = "# guessed"
 GAP = 5.0  # a gap is longer than this many usual steps
@@ -149,7 +148,7 @@ def _time(data: dict[str, Column]) -> tuple[str | None, Array | None]:
     """Guesses the column of stamps: by its name, and by how steadily it rises."""
     for seconds, rest in SPLIT:
         if all(each in data and data[each].dtype.kind not in "US" for each in (seconds, rest)):
-            return f"[{seconds}, {rest}]", stamps.joined(data[seconds], data[rest])
+            return f"[{seconds}, {rest}]", stamping.joined(data[seconds], data[rest])
 
     def merit(name: str) -> float:
         values = data[name].astype(np.float64)
@@ -170,7 +169,7 @@ def _time(data: dict[str, Column]) -> tuple[str | None, Array | None]:
 
 def _in_seconds(found: TableSurvey, raw: Array) -> Array:
     raw = raw[np.isfinite(raw)]
-    if (unit := stamps.likely_unit(raw)) is None:
+    if (unit := stamping.likely_unit(raw)) is None:
         return raw
     found.unit = unit
     return raw * UNITS[unit].factor

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -30,7 +30,7 @@ class Table(Protocol):
         """Names of its columns; "" for one without a name."""
 
     @property
-    def notes(self) -> tuple[str, ...]:
+    def notes(self) -> Sequence[str]:
         """A sentence on each thing that reading mended."""
 
     def column(self, which: str | int) -> Column:
@@ -102,7 +102,7 @@ def number_of(table: Table, which: str | int) -> int:
         raise RecordingError(f"{table.place}: {fault}; its columns are 0 to {len(names) - 1}.")
     named = [name for name in names if name]
     hint = nearest(which, named) if named else "they have no names: give its number, from 0"
-    raise RecordingError(f"{table.place}: has no column {which!r}; {hint.rstrip('.')}.")
+    raise RecordingError(f"{table.place}: has no column {which!r}; {hint}")
 
 
 def numbers_of(table: Table, which: str | int) -> Array:

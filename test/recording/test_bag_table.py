@@ -15,8 +15,7 @@ from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.recording.bag_file import opened
 from nics_drl_bridge.recording.mapping import Mapping
-from nics_drl_bridge.recording.readers import read_recording
-from nics_drl_bridge.recording.sources import open_source
+from nics_drl_bridge.recording.readers import open_source, read_recording
 from nics_drl_bridge.recording.survey import first_mapping, survey
 from nics_drl_bridge.robot.spec import load_robot
 

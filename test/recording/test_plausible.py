@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nics_drl_bridge.recording.plausible import implausible_pose
+from nics_drl_bridge.recording.recording import implausible_pose
 
 T = np.arange(3000) * 0.02
 

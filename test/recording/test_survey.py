@@ -5,8 +5,7 @@ import pytest
 
 from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.recording.mapping import Mapping
-from nics_drl_bridge.recording.readers import read_recording
-from nics_drl_bridge.recording.sources import open_source
+from nics_drl_bridge.recording.readers import open_source, read_recording
 from nics_drl_bridge.recording.survey import first_mapping, survey, words_of
 
 from .tables import drive, write

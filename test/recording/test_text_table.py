@@ -5,7 +5,7 @@ import pytest
 
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.recording.table import numbers_of
-from nics_drl_bridge.recording.text_table import read_text_table
+from nics_drl_bridge.recording.table_files import read_text_table
 
 NUMBERS = [(0.0, 1.5, -2.0), (0.1, 1.6, -2.5), (0.2, 1.7, -3.0)]
 
@@ -81,7 +81,7 @@ def test_a_row_that_was_cut_short_is_left_out_and_told(tmp_path):
         ("t,x\n" + "0,1\n" * 9 + "0\n1,2,3\n", "line 11 has 1 fields where most lines have 2"),
         ("speed,angle\nfast,left\n", "holds no row of numbers"),
         ("0,1\n" + "2" * 30_000, "line 2 has 30000 characters"),
-        ("0,1\0\n", "is not text of 8 bits"),
+        ("0,1\0\n", "is not text"),
     ],
 )
 def test_what_is_no_table_is_refused(tmp_path, text, sentence):
