@@ -277,7 +277,7 @@ def _degrees(t: Array, pose: Array) -> Implausible | None:
     step = np.diff(heading)
     around = np.abs(np.abs(step) - FULL_TURN_DEG) < FULL_TURN_DEG / 10.0
     every = _spaced(t)
-    rad, deg, none = (_along(pose[every], scale) for scale in (1.0, np.pi / 180.0, 0.0))
+    rad, deg, none = (led_along(pose[every], scale) for scale in (1.0, np.pi / 180.0, 0.0))
     rate = np.abs(np.diff(np.unwrap(heading, period=FULL_TURN_DEG)[every])) / np.diff(t[every])
     turns = len(rate) > 0 and np.percentile(rate, 90) > FASTEST_TURN
     if not (around.any() or turns or deg > max(ALONG, rad + LESS_ALONG, none + ALONG_BY_CHANCE)):
@@ -286,7 +286,7 @@ def _degrees(t: Array, pose: Array) -> Implausible | None:
     return Implausible(reason, cause, "heading_unit: deg")
 
 
-def _along(pose: Array, scale: float) -> float:
+def led_along(pose: Array, scale: float) -> float:
     """Returns to what share poses (T, 3) lead along their headings x scale, ahead or back."""
     x, y = np.diff(pose[:, :2], axis=0).T
     ahead = np.exp(1j * scale * pose[:, 2])

@@ -144,7 +144,7 @@ class MappedReader:
             return stamping.joined(numbers_of(table, which), nanoseconds)
         column = table.column(which)
         if column.dtype.kind in "US":
-            dates = _dates(column)
+            dates = dates_of(column)
             return numbers_of(table, which) if dates is None else dates
         return column.astype(np.float64)
 
@@ -235,7 +235,7 @@ def _table_name(wanted: str, names: Sequence[str]) -> str | None:
     return wanted if wanted in names else next(alike, None)
 
 
-def _dates(column: Column) -> Array | None:
+def dates_of(column: Column) -> Array | None:
     """Returns seconds since 1970 of dates like 2024-05-01 12:00:00.5; None if they are none."""
     text = [ZONE.sub("", str(each)).replace("/", "-") for each in column]
     if CLOCK.match(text[0]):

@@ -14,9 +14,10 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.recording.bag_file import opened
+from nics_drl_bridge.recording.guess import first_mapping
 from nics_drl_bridge.recording.mapping import Mapping
 from nics_drl_bridge.recording.readers import open_source, read_recording
-from nics_drl_bridge.recording.survey import first_mapping, survey
+from nics_drl_bridge.recording.survey import survey
 from nics_drl_bridge.robot.spec import load_robot
 
 FOREIGN = "my_car_msgs/msg/Drive"

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.config import parse_yaml
+from nics_drl_bridge.recording.guess import first_mapping
 from nics_drl_bridge.recording.mapping import Mapping
 from nics_drl_bridge.recording.readers import open_source, read_recording
-from nics_drl_bridge.recording.survey import first_mapping, survey, words_of
+from nics_drl_bridge.recording.survey import survey, words_of
 
 from .tables import drive, write
 
@@ -50,11 +51,13 @@ def test_units_that_can_only_be_others_are_guessed(tmp_path):
     columns = drive()
     wavy = {"pose.x": 3e3 * np.sin(columns["t"] * 3.0), "pose.y": columns["y"] * 1e3}
     wavy["pose.theta"] = np.degrees(columns["yaw"] * 40.0)
+    wheel = {"unit": "ticks", "ticks_per_turn": 128}
     ticks = {"Left_Tick": np.arange(200), "Right_Tick": np.arange(200) * 2}
     _, guess = surveyed(write(tmp_path / "log.csv", {"time": columns["t"] * 1e3} | wavy | ticks))
     assert guess["time"] == {"from": "time", "unit": "ms"}
     assert guess["pose"]["heading_unit"] == "deg"
-    assert guess["command"]["left_wheel"] == {"from": "Left_Tick", "unit": "ticks"}
+    assert guess["command"]["left_wheel"] == wheel | {"from": "Left_Tick"}
+    assert guess["command"]["right_wheel"] == wheel | {"from": "Right_Tick"}
 
 
 def test_gaps_backward_stamps_and_repeated_rows_are_listed(tmp_path):

@@ -1,0 +1,280 @@
+"""Tables of files: text with any separator and what loggers leave in it, numpy's, Parquet."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from importlib.util import find_spec
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+
+from nics_drl_bridge.config import no_device
+from nics_drl_bridge.errors import RecordingError, nearest
+from nics_drl_bridge.recording.table import Column, Columns, flattened
+from nics_drl_bridge.robot.noise import Latency
+
+TEXTS = (".csv", ".tsv", ".txt", ".dat", ".tum", ".log", ".data", ".asc")
+MOST_FILES = 500  # of a folder
+SEPARATORS = (",", ";", "\t", "|", None)  # None: any white space
+NO_SEPARATOR = re.compile(r"[\w\s.,;|+\"'#-]")
+MOST_BYTES = 256 * 2**20
+MOST_ROWS, LONGEST_ROW = 2_000_000, 20_000  # longest in characters
+TRIED = 400  # lines from which separator and header are found
+MOST_BROKEN = 0.01  # share of rows with another number of fields that are left out
+COMMENTS = ("#", "//", "%")
+UTF_16 = (b"\xff\xfe", b"\xfe\xff")
+TUM = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
+TUM_SUFFIX = ".tum"
+DATE = re.compile(r"(\d{4}[-/]\d\d[-/]\d\d|\d\d:\d\d:\d\d)")
+MISSING = ("", "na", "n/a", "null", "none", "-", "--", "#n/a")
+WORDS = {"true": "1", "false": "0", **dict.fromkeys(MISSING, "nan")}
+
+Row = tuple[int, list[str]]
+"""Line of the file, from 1, and fields."""
+
+
+def read_text_table(path: Path) -> Columns:
+    """Reads a table; RecordingError names the file, the line and the fix."""
+    lines, comments = _lines(path)
+    separator = _separator([text for _, text in lines[:TRIED]])
+    rows = [(line, _split(text, separator)) for line, text in lines]
+    first, width = _first_row(path, rows)
+    above = [row for _, row in rows[:first]]
+    rows, notes = _of_one_width(path, rows[first:], above, width)
+    columns = [list(column) for column in zip(*(row for _, row in rows), strict=True)]
+    # The last title that has most names: one of units, below it, repeats some.
+    titles = [row for row in above if len(row) > 1 or width == 1]
+    head = max(reversed(titles), key=lambda row: len(set(row)), default=None)
+    if head is None and comments and len(last := _split(comments[-1], separator)) == width:
+        head = last
+    if head is None and width == len(TUM) and (separator is None or path.suffix == TUM_SUFFIX):
+        head = list(TUM) if _is_tum(columns) else None
+    if head is None and (named := _labelled(columns)):
+        columns, head = named
+    columns = [_with_points(column) for column in columns]
+    names = tuple([*(head or ()), *[""] * len(columns)][: len(columns)])
+    at = np.array([line for line, _ in rows], dtype=np.intp)
+    return Columns(str(path), names, tuple(map(_typed, columns)), at, tuple(notes))
+
+
+def _lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
+    """Returns the lines with their numbers, from 1, without empty ones, and those of comments."""
+    no_device(path)
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            fault = f"is larger than {MOST_BYTES // 2**20} MB"
+            raise RecordingError(f"{path}: {fault}; cut it, or keep fewer columns.")
+        data = path.read_bytes()
+    except OSError as error:
+        raise RecordingError(f"{path}: can't be read ({error.strerror}).") from None
+    try:
+        text = data.decode("utf-16" if data[:2] in UTF_16 else "utf-8-sig")
+    except UnicodeDecodeError:
+        text = data.decode("latin-1")  # as written by old tools: a degree sign in a header
+    if "\0" in text:
+        raise RecordingError(f"{path}: is not text; save it as CSV in UTF-8.")
+    lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip()]
+    if len(lines) > MOST_ROWS:
+        raise RecordingError(f"{path}: has {len(lines)} rows; cut it to at most {MOST_ROWS}.")
+    for k, line in lines:
+        if len(line) > LONGEST_ROW:
+            fault = f"line {k} has {len(line)} characters, which no row has"
+            raise RecordingError(f"{path}: {fault}; remove it.")
+    comments = [line.lstrip("#/% ") for _, line in lines if line.lstrip().startswith(COMMENTS)]
+    return [each for each in lines if not each[1].lstrip().startswith(COMMENTS)], comments
+
+
+def _split(line: str, separator: str | None) -> list[str]:
+    if separator is None:
+        return line.split()
+    fields = line.split(separator)
+    if '"' in line:
+        fields = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
+    return [field.strip() for field in fields]
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _is_value(text: str) -> bool:
+    """True for numbers, with decimal commas too, flags and dates."""
+    return _is_number(text.replace(",", ".")) or text.lower() in WORDS or bool(DATE.match(text))
+
+
+def _separator(lines: Sequence[str]) -> str | None:
+    """Returns the separator that leaves most numbers, and fewest fields that are none."""
+
+    def score(separator: str | None) -> int:
+        fields = [field for line in lines for field in _split(line, separator) if field]
+        return sum(1 if _is_value(field) else -1 for field in fields)
+
+    best = max(SEPARATORS, key=score)
+    others = sorted(set(NO_SEPARATOR.sub("", "".join(lines))))
+    return best if score(best) > 0 or not others else max(others, key=score)
+
+
+def _first_row(path: Path, rows: Sequence[Row]) -> tuple[int, int]:
+    """Returns the first row of numbers, and how many fields the rows from there on have."""
+
+    def numeric(row: Sequence[str]) -> bool:
+        full = [field for field in row if field]
+        return 2 * sum(map(_is_value, full)) > len(full)
+
+    widths = Counter(len(row) for _, row in rows if numeric(row))
+    if not widths:
+        advice = "give a table of numbers, a column each, with or without a header"
+        raise RecordingError(f"{path}: holds no row of numbers; {advice}.")
+    width = widths.most_common(1)[0][0]
+    first = next(k for k, (_, row) in enumerate(rows) if numeric(row) and len(row) == width)
+    return first, width
+
+
+def _of_one_width(
+    path: Path, rows: Sequence[Row], above: Sequence[list[str]], width: int
+) -> tuple[list[Row], list[str]]:
+    """Leaves out headers that are repeated, and the few rows that were cut short."""
+    file, notes = path.name, []
+    full = [row for row in rows if row[1] not in above]
+    if again := len(rows) - len(full):
+        notes.append(f"{file}: {again} lines repeat the header, and were left out.")
+    whole = [row for row in full if len(row[1]) == width]
+    broken = [row for row in full if len(row[1]) != width]
+    if len(broken) > max(1.0, MOST_BROKEN * len(full)):
+        line, row = broken[0]
+        fault = f"line {line} has {len(row)} fields where most lines have {width}"
+        raise RecordingError(f"{path}: {fault}; mend or remove it and those like it.")
+    if broken:
+        where = ", ".join(str(line) for line, _ in broken[:5])
+        notes.append(f"{file}: {len(broken)} lines of another length (line {where}) were left out.")
+    while width > 1 and not any(row[width - 1] for _, row in whole):
+        width -= 1  # after a separator at the end of each line
+        whole = [(line, row[:width]) for line, row in whole]
+    return whole, notes
+
+
+def _is_tum(columns: Sequence[Sequence[str]]) -> bool:
+    """True for stamps that rise, and unit quaternions at the end."""
+    try:
+        values = np.array(columns, dtype=np.float64)
+    except ValueError:
+        return False
+    norm = np.linalg.norm(values[4:], axis=0)
+    return bool(np.median(np.abs(norm - 1.0)) < 0.01 and np.median(np.diff(values[0])) > 0.0)
+
+
+def _labelled(columns: Sequence[list[str]]) -> tuple[list[list[str]], list[str]] | None:
+    """Names columns by labels that stand in each row, as in `time: 1.2 ticks: 3 4`."""
+    found: dict[str, list[list[str]]] = {}
+    for column in columns:
+        first = column[0]
+        if first.endswith((":", "=")) and set(column) == {first}:
+            found[label := first.rstrip(":=")] = []
+        elif not found:
+            return None
+        else:
+            found[label].append(column)
+    names = [
+        name if len(some) == 1 else f"{name}[{k}]"
+        for name, some in found.items()
+        for k in range(len(some))
+    ]
+    return list(chain.from_iterable(found.values())), names
+
+
+def _with_points(column: list[str]) -> list[str]:
+    """Writes decimal commas as points."""
+    if not any("," in field for field in column):
+        return column
+    changed = [field.replace(",", ".") for field in column]
+    return changed if all(map(_is_value, changed)) else column
+
+
+def _typed(column: Sequence[str]) -> Column:
+    """Returns numbers if all fields are, of true and false too, and else text."""
+    for words in ({}, WORDS):
+        try:
+            return np.array([words.get(f.lower(), f) for f in column], dtype=np.float64)
+        except ValueError:
+            continue
+    return np.array(column, dtype=np.str_)
+
+
+def read_arrays(path: Path) -> Columns:
+    """Reads an .npz or .npy file, of records too; RecordingError if it holds objects or damage."""
+    try:
+        with no_device(path).open("rb") as file:
+            loaded = np.load(file, allow_pickle=False)
+            arrays = {"": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
+    except Exception as error:  # noqa: BLE001 - damage breaks numpy in any way
+        advice = "write numbers with numpy.save or numpy.savez, without pickle"
+        why = " ".join(str(error).split())[:200]
+        raise RecordingError(f"{path}: can't be read ({why}); {advice}.") from None
+    columns = list(flattened(arrays))
+    if not columns:
+        raise RecordingError(f"{path}: holds no columns; give arrays of one value or more a row.")
+    return Columns(str(path), tuple(name for name, _ in columns), tuple(c for _, c in columns))
+
+
+def read_parquet(path: Path) -> Columns:
+    """Reads a Parquet file; RecordingError if it is damaged, or pyarrow is missing."""
+    if find_spec("pyarrow") is None:
+        raise RecordingError(f"{path}: Parquet needs the library pyarrow; pip install pyarrow.")
+    parquet = import_module("pyarrow.parquet")
+    try:
+        table = parquet.read_table(no_device(path))
+        columns = [table.column(k).to_numpy() for k in range(table.num_columns)]
+    except Exception as error:  # noqa: BLE001 - damage breaks the reader in any way
+        why = " ".join(str(error).split())[:200]
+        raise RecordingError(f"{path}: can't be read as Parquet ({why}).") from None
+    stamps = [c.astype("datetime64[ns]").astype(str) if c.dtype.kind == "M" else c for c in columns]
+    texts = [c.astype(np.str_) if c.dtype.kind == "O" else c for c in stamps]
+    return Columns(str(path), tuple(table.column_names), tuple(texts))
+
+
+READERS: dict[str, Callable[[Path], Columns]] = {
+    ".npz": read_arrays, ".npy": read_arrays, ".parquet": read_parquet, ".pq": read_parquet,
+}  # fmt: skip
+
+
+@dataclass
+class Files:
+    """A file, or the files of a folder; RecordingError if it holds none of a known format."""
+
+    root: Path
+    latency: Latency = field(default_factory=Latency)
+    _read: dict[str, Columns] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.place, path = str(self.root), self.root
+        known = (*TEXTS, *READERS)
+        inside = [path] if path.is_file() else sorted(path.rglob("*"))
+        some = [file for file in inside if file.suffix.lower() in known or file == path]
+        if not some or (path in some and not path.is_file()):
+            raise RecordingError(f"{path}: holds no file of a known format ({', '.join(known)}).")
+        root = path.parent if path.is_file() else path
+        self._files = {file.relative_to(root).as_posix(): file for file in some[:MOST_FILES]}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of all tables."""
+        return tuple(self._files)
+
+    def table(self, name: str) -> Columns:
+        """Reads a table; RecordingError if there is none of that name, or it is unreadable."""
+        if name not in self._files:
+            raise RecordingError(f"{self.place}: has no file {name!r}; {nearest(name, self.names)}")
+        if name not in self._read:
+            file = self._files[name]
+            self._read[name] = READERS.get(file.suffix.lower(), read_text_table)(file)
+        return self._read[name]
