@@ -182,6 +182,11 @@ class PoseSource(Measured):
     frame: str | None = None  # parent and child of the transforms to use, of a topic like /tf
     child_frame: str | None = None
 
+    @property
+    def frames(self) -> tuple[str | None, str | None]:
+        """Parent and child of the transforms to use."""
+        return self.frame, self.child_frame
+
     @model_validator(mode="after")
     def _whole(self) -> PoseSource:
         if (self.x is None) != (self.y is None):

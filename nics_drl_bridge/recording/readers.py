@@ -12,7 +12,7 @@ from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.recording.bag_file import is_bag, opened
 from nics_drl_bridge.recording.bag_reader import load_bag
-from nics_drl_bridge.recording.bag_table import Bag, topics_used
+from nics_drl_bridge.recording.bag_table import Bag
 from nics_drl_bridge.recording.csv_folder import load_csv_folder
 from nics_drl_bridge.recording.mapped import read_mapped
 from nics_drl_bridge.recording.mapping import Mapping, load_mapping
@@ -144,9 +144,4 @@ def open_source(path: Path, mapping: Mapping | None = None) -> Iterator[Source]:
         yield Files(path)
         return
     with opened(path) as file:
-        bag = Bag(file)
-        if mapping is not None:
-            bag.frames = mapping.pose.frame, mapping.pose.child_frame
-            given = mapping.model_dump(by_alias=True, exclude={"robot"}, exclude_none=True)
-            bag.used = topics_used(given, bag.names)
-        yield bag
+        yield Bag(file, mapping)

@@ -6,7 +6,6 @@ import csv
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import chain
@@ -15,9 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from nics_drl_bridge.config import no_device
-from nics_drl_bridge.errors import RecordingError, nearest
-from nics_drl_bridge.recording.table import Column, Columns, flattened
-from nics_drl_bridge.robot.noise import Latency
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.recording.table import Column, Source, Table, flattened, table_of
 
 TEXTS = (".csv", ".tsv", ".txt", ".dat", ".tum", ".log", ".data", ".asc")
 MOST_FILES = 500  # of a folder
@@ -39,7 +37,7 @@ Row = tuple[int, list[str]]
 """Line of the file, from 1, and fields."""
 
 
-def read_text_table(path: Path) -> Columns:
+def read_text_table(path: Path) -> Table:
     """Reads a table; RecordingError names the file, the line and the fix."""
     lines, comments = _lines(path)
     separator = _separator([text for _, text in lines[:TRIED]])
@@ -60,7 +58,7 @@ def read_text_table(path: Path) -> Columns:
     columns = [_with_points(column) for column in columns]
     names = tuple([*(head or ()), *[""] * len(columns)][: len(columns)])
     at = np.array([line for line, _ in rows], dtype=np.intp)
-    return Columns(str(path), names, tuple(map(_typed, columns)), at, tuple(notes))
+    return table_of(str(path), names, tuple(map(_typed, columns)), at, tuple(notes))
 
 
 def _lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
@@ -210,7 +208,7 @@ def _typed(column: Sequence[str]) -> Column:
     return np.array(column, dtype=np.str_)
 
 
-def read_arrays(path: Path) -> Columns:
+def read_arrays(path: Path) -> Table:
     """Reads an .npz or .npy file, of records too; RecordingError if it holds objects or damage."""
     try:
         with no_device(path).open("rb") as file:
@@ -223,10 +221,10 @@ def read_arrays(path: Path) -> Columns:
     columns = list(flattened(arrays))
     if not columns:
         raise RecordingError(f"{path}: holds no columns; give arrays of one value or more a row.")
-    return Columns(str(path), tuple(name for name, _ in columns), tuple(c for _, c in columns))
+    return table_of(str(path), tuple(name for name, _ in columns), tuple(c for _, c in columns))
 
 
-def read_parquet(path: Path) -> Columns:
+def read_parquet(path: Path) -> Table:
     """Reads a Parquet file; RecordingError if it is damaged, or pyarrow is missing."""
     if find_spec("pyarrow") is None:
         raise RecordingError(f"{path}: Parquet needs the library pyarrow; pip install pyarrow.")
@@ -239,42 +237,28 @@ def read_parquet(path: Path) -> Columns:
         raise RecordingError(f"{path}: can't be read as Parquet ({why}).") from None
     stamps = [c.astype("datetime64[ns]").astype(str) if c.dtype.kind == "M" else c for c in columns]
     texts = [c.astype(np.str_) if c.dtype.kind == "O" else c for c in stamps]
-    return Columns(str(path), tuple(table.column_names), tuple(texts))
+    return table_of(str(path), tuple(table.column_names), tuple(texts))
 
 
-READERS: dict[str, Callable[[Path], Columns]] = {
+READERS: dict[str, Callable[[Path], Table]] = {
     ".npz": read_arrays, ".npy": read_arrays, ".parquet": read_parquet, ".pq": read_parquet,
 }  # fmt: skip
 
 
-@dataclass
-class Files:
+class Files(Source):
     """A file, or the files of a folder; RecordingError if it holds none of a known format."""
 
-    root: Path
-    latency: Latency = field(default_factory=Latency)
-    _read: dict[str, Columns] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self.place, path = str(self.root), self.root
+    def __init__(self, path: Path) -> None:
         known = (*TEXTS, *READERS)
         inside = [path] if path.is_file() else sorted(path.rglob("*"))
         some = [file for file in inside if file.suffix.lower() in known or file == path]
-        if not some or (path in some and not path.is_file()):
+        if not some:
             raise RecordingError(f"{path}: holds no file of a known format ({', '.join(known)}).")
         root = path.parent if path.is_file() else path
         self._files = {file.relative_to(root).as_posix(): file for file in some[:MOST_FILES]}
+        super().__init__(str(path), tuple(self._files))
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of all tables."""
-        return tuple(self._files)
-
-    def table(self, name: str) -> Columns:
-        """Reads a table; RecordingError if there is none of that name, or it is unreadable."""
-        if name not in self._files:
-            raise RecordingError(f"{self.place}: has no file {name!r}; {nearest(name, self.names)}")
-        if name not in self._read:
-            file = self._files[name]
-            self._read[name] = READERS.get(file.suffix.lower(), read_text_table)(file)
-        return self._read[name]
+    def read(self, name: str) -> Table:
+        """Reads a file."""
+        file = self._files[name]
+        return READERS.get(file.suffix.lower(), read_text_table)(file)
