@@ -8,7 +8,7 @@ Robots, ch. 3; the paper's reference for Table I.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import TypeVar
 
@@ -29,6 +29,7 @@ from nics_drl_bridge.robot.spec import (
 from nics_drl_bridge.robot.template import Template
 
 MOST_VARIED = 6
+AT_ONCE_S = 1e-9  # lag of a robot whose commands are what its wheels do
 T = TypeVar("T")
 
 
@@ -121,6 +122,8 @@ def textbook(spec: RobotSpec) -> Textbook:
     book = actuated(spec)
     if spec.state and all(v.twist is not None for v in spec.state):
         return _through_lags(spec, book)
+    if not spec.state and not find_kind(str(spec.textbook)).template.has_state:
+        return replace(book, lag=np.full(len(book.lag), AT_ONCE_S))
     if len(spec.state) != len(book.lag):
         have = ", ".join(v.name for v in spec.state) or "none"
         needed = f"the {spec.textbook} kinematics need a state of {len(book.lag)} actuators"
