@@ -33,6 +33,19 @@ def test_degrees_are_told(unwrapped):
     assert implausible_pose(T, values).line == "heading_unit: deg"
 
 
+@pytest.mark.parametrize("turn", [0.05, 0.3])
+def test_degrees_of_a_slow_turn_are_told_by_the_path(turn):
+    values = pose(turn=turn)
+    assert implausible_pose(T, values) is None
+    values[:, 2] = np.degrees(values[:, 2])
+    assert implausible_pose(T, values).line == "heading_unit: deg"
+
+
+def test_a_robot_that_spins_on_a_line_has_no_heading_in_degrees():
+    values = np.column_stack([np.sin(T), 0.2 * np.sin(T), 0.7 * T])
+    assert implausible_pose(T, values) is None
+
+
 @pytest.mark.parametrize(("factor", "line"), [(100.0, "unit: cm"), (1000.0, "unit: mm")])
 def test_positions_that_are_no_metres_are_told(factor, line):
     assert implausible_pose(T, pose() * [factor, factor, 1.0]).line == line

@@ -39,6 +39,29 @@ def test_parts_after_a_clock_was_set_back_are_joined():
     assert "set back once (row 100, by 101 s)" in note
 
 
+@pytest.mark.parametrize(("row", "value"), [(150, 0.0), (150, 1e9), (0, 1e9)])
+def test_a_stamp_that_fits_none_beside_it_is_left_out(row, value):
+    t = T.copy()
+    t[row] = value
+    made, rows, note = stamping.in_order(t, "log")
+    assert np.array_equal(made, np.delete(T, row))
+    assert row not in rows
+    assert f"1 stamps fit none beside them (row {row}: {value:.10g} s)" in note
+
+
+def test_rows_that_begin_with_the_last_are_turned_round():
+    t, rows, note = stamping.in_order(T[::-1], "log")
+    assert np.array_equal(t, T)
+    assert rows[0] == 299
+    assert "turned round" in note
+
+
+def test_a_clock_that_was_set_ahead_by_years_goes_on():
+    t, _, note = stamping.in_order(np.append(T[:100], T[100:] + 1.7e9), "log")
+    assert np.allclose(np.diff(t), 0.02, atol=1e-6)
+    assert "set ahead once (row 100, by 1.7e+09 s)" in note
+
+
 def test_rows_that_repeat_stamp_and_values_are_left_out():
     t, values = np.array([0.0, 0.0, 0.0, 1.0]), np.array([[1.0], [1.0], [2.0], [2.0]])
     keep, note = stamping.not_repeated(t, values, "pose")

@@ -104,3 +104,30 @@ def test_a_column_that_is_not_there_is_named(tmp_path, which, sentence):
     with pytest.raises(RecordingError) as refused:
         numbers_of(found, which)
     assert sentence in str(refused.value)
+
+
+@pytest.mark.parametrize("separator", ["~", ":", "&"])
+def test_an_odd_separator_is_found_if_no_usual_one_fits(tmp_path, separator):
+    found = table(tmp_path, "t x y\n0 1.5 2\n1 2.5 3\n".replace(" ", separator))
+    assert found.names == ("t", "x", "y")
+    assert numbers_of(found, "x").tolist() == [1.5, 2.5]
+
+
+def test_the_names_stand_above_a_row_of_units(tmp_path):
+    found = table(tmp_path, "Log of 2024-05-01, robot 3\nt,x,y\ns,m,m\n0,1,2\n1,2,3\n")
+    assert found.names == ("t", "x", "y")
+
+
+def test_numbers_with_decimal_commas_may_be_quoted(tmp_path):
+    found = table(tmp_path, 't,x\n"0,5","1,25"\n"0,6","1,75"\n')
+    assert numbers_of(found, "x").tolist() == [1.25, 1.75]
+
+
+@pytest.mark.parametrize("word", ["NA", "null", "None", "-", "nan", ""])
+def test_words_for_a_missing_value_are_none(tmp_path, word):
+    assert np.isnan(numbers_of(table(tmp_path, f"t,x\n0,{word}\n1,2\n"), "x")[0])
+
+
+def test_excel_in_utf_16_and_comments_of_matlab_are_read(tmp_path):
+    assert table(tmp_path, "t\tx\n0\t1\n", encoding="utf-16").names == ("t", "x")
+    assert table(tmp_path, "% t, x\n0,1\n1,2\n").names == ("t", "x")
