@@ -44,6 +44,7 @@ SIDES = {"front": "f", "rear": "r", "back": "b", "left": "l", "right": "r"}
 MEANINGS: dict[str, tuple[set[str], ...]] = {
     "throttle": ({"throttle"}, {"gas"}, {"accelerator"}, {"pedal"}, {"pwm"}),
     "steering": ({"steering"}, {"steer"}, {"delta"}, {"phi"}, {"servo"}),
+    "traction": ({"traction"},),
     "speed": ({"speed"}, {"velocity"}, {"vel"}, {"v"}, {"vx"}, {"linear"}),
     "side": ({"vy"}, {"linear", "y"}),
     "turn": ({"angular"}, {"omega"}, {"yawrate"}, {"yaw", "rate"}, {"wz"}, {"w"}, {"turn"}),
@@ -58,6 +59,7 @@ WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 # Commands of a kind of robot, by meaning, and its names for them.
 KINDS = (
     ("mecanum", {wheel: f"{wheel}_wheel" for wheel in WHEELS}),
+    ("tricycle", {"traction": "speed_command", "steering": "steering_command"}),
     ("omnidirectional", {"speed": "vx", "side": "vy", "turn": "wz"}),
     ("ackermann_throttle", {"throttle": "throttle", "steering": "steering"}),
     ("ackermann", {"speed": "speed_command", "steering": "steering_command"}),
@@ -81,7 +83,7 @@ class Guess(NamedTuple):
 
 def guess_pose(tables: Sequence[TableSurvey]) -> Guess | None:
     """Finds x, y and heading, or a quaternion: by their names, else by how they move."""
-    found: list[tuple[int, Guess]] = []
+    found: list[Guess] = []
     for table in tables:
         named = {tuple(unit_in(c.name)[0]): c.name for c in table.numbers if "[" not in c.name[-3:]}
         for words, name in named.items():
@@ -90,13 +92,15 @@ def guess_pose(tables: Sequence[TableSurvey]) -> Guess | None:
                 if x not in words or other is None or {*words} & (NOT_PLACES | TURNS):
                     continue
                 if turned := _turned(table, words, named):
-                    every = {*words, *words_of(table.name)}
-                    merit = 2 * bool(every & TRACKERS) - 2 * bool(every & MEASURING)
-                    keys = {"x": name, "y": other, **turned}
-                    found.append((merit + ("quaternion" in keys), Guess(table, keys)))
-    if found:
-        return max(found, key=lambda each: each[0])[1]
-    return next((guess for table in tables if (guess := _unnamed(table))), None)
+                    found.append(Guess(table, {"x": name, "y": other, **turned}))
+    found = found or [guess for table in tables for guess in _unnamed(table)]
+    return max(found, key=_trust, default=None)
+
+
+def _trust(pose: Guess) -> int:
+    words = {*words_of(f"{pose.table.name} {pose.keys['x']}")}
+    trusted = 2 * bool(words & TRACKERS) - 2 * bool(words & MEASURING)
+    return trusted + ("quaternion" in pose.keys)
 
 
 def _turned(
@@ -120,8 +124,8 @@ def _turned(
     return max(found, key=lambda each: each[0])[1] if found else {}
 
 
-def _unnamed(table: TableSurvey) -> Guess | None:
-    """Finds a quaternion after x, y, z, or x, y, heading that lead along, side by side."""
+def _unnamed(table: TableSurvey) -> Iterator[Guess]:
+    """Yields a quaternion after x, y, z, or x, y, heading that lead along, side by side."""
     names = [column.name for column in table.numbers]
     columns = [table.data[name].astype(np.float64) for name in names]
     for k in range(3, len(names) - 3):
@@ -129,14 +133,13 @@ def _unnamed(table: TableSurvey) -> Guess | None:
         turns = any(np.ptp(each) > 0.0 for each in four)
         if turns and np.nanmax(np.abs(np.linalg.norm(four, axis=0) - 1.0)) < UNIT_LENGTH:
             quaternion = f"[{', '.join(names[k : k + 4])}]"
-            return Guess(table, {"x": names[k - 3], "y": names[k - 2], "quaternion": quaternion})
+            yield Guess(table, {"x": names[k - 3], "y": names[k - 2], "quaternion": quaternion})
     for k in range(len(names) - 2):
         pose = np.stack(columns[k : k + 3], axis=1)
         pose = pose[np.isfinite(pose).all(axis=1)][:: max(1, len(pose) // 200)]
         shares = [led_along(pose, scale) for scale in (1.0, np.pi / 180.0)] if len(pose) else [0.0]
         if (np.ptp(pose, axis=0) > 0.0).all() and max(shares) > ALONG > led_along(pose, 0.0):
-            return Guess(table, dict(zip(("x", "y", "heading"), names[k : k + 3], strict=True)))
-    return None
+            yield Guess(table, dict(zip(("x", "y", "heading"), names[k : k + 3], strict=True)))
 
 
 def guess_command(
@@ -161,7 +164,9 @@ def guess_command(
             return kind, found
     some = [e for e in scored if e[0] > 1 and e[2].low < e[2].high]
     some = [e for e in some if not {*words_of(e[2].name)} & TICKS] or some
-    some = some or [e for e in scored if e[0] >= 0 and e[2].low < e[2].high][:MOST_COMMANDS]
+    maybe = [e for e in scored if e[0] >= 0 and e[2].low < e[2].high]
+    best = max((e[0] for e in maybe), default=0)
+    some = some or [e for e in maybe if e[0] == best][:MOST_COMMANDS]
     return "free", {f"command_{k}": each[1:] for k, each in enumerate(some)}
 
 
@@ -212,11 +217,13 @@ def _unit_keys(name: str, table: TableSurvey, column: Survey) -> Iterator[str]:
         counters = [c.name for c in table.numbers if {*words_of(c.name)} & TICKS]
         step = np.abs(np.diff([table.data[name].astype(np.float64) for name in counters]))
         yield "unit: ticks"
+        if "steer" in name:
+            yield "differentiate: false"
         if (t := table.t) is not None and np.ptp(t) > 0.0 and (step > 0.0).any():
             rate = float(np.median(step[step > 0.0])) * len(t) / float(np.ptp(t))
             yield f"ticks_per_turn: {2 ** round(np.log2(2.0 * np.pi * rate / USUAL_WHEEL))}"
     elif unit is not None:
-        yield f"unit: {unit}"
+        yield f"unit: {unit}" if unit != "%" else 'unit: "%"'
     elif name == "steering_command" and max(-column.low, column.high) > LARGEST_ANGLE:
         yield "unit: deg"
 

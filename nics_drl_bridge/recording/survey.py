@@ -24,7 +24,7 @@ TIMES = {"time", "times", "stamp", "timestamp", "t", "s", "sec", "secs", "second
 TIMES |= {"ms", "us", "ns", "millis", "micros", "nanos", "date", "datetime"}
 SPLIT = (("s", "ns"), ("sec", "nanosec"), ("secs", "nsecs"), ("sec", "nsec"), ("sec", "nsecs"))
 SPOKEN = {"deg": "deg", "degrees": "deg", "mm": "mm", "cm": "cm", "rpm": "rpm", "kmh": "km/h"}
-SPOKEN |= {"mps": "m/s", "rad": "rad", "m": "m"}
+SPOKEN |= {"mps": "m/s", "rad": "rad", "m": "m", "pct": "%", "percent": "%"}
 
 
 def words_of(name: str) -> list[str]:
