@@ -146,8 +146,9 @@ def import_(
         from nics_drl_bridge.recording.recording import save_recording
         from nics_drl_bridge.recording.write import check_out
 
-        if check_out(out).suffix != ".npz":
+        if out.suffix != ".npz":
             raise ConfigError(f"--out {out}: must end in .npz.")
+        check_out(out)
         drive = read_recording(source, mapping=mapping)
         save_recording(drive, out)
         for line in stream_lines(drive):

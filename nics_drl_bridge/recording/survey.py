@@ -91,13 +91,16 @@ class TableSurvey:
 
 
 def survey(source: Source) -> list[TableSurvey]:
-    """Surveys every table of a source."""
-    found = []
+    """Surveys every table of a source; RecordingError if none is readable."""
+    found, unread = [], None
     for name in source.names:
         try:
             found.append(_surveyed(name, source.table(name)))
         except RecordingError as error:  # one unreadable table leaves the others
             found.append(TableSurvey(name, 0, [], findings=[str(error)]))
+            unread = unread or error
+    if unread is not None and not any(table.columns for table in found):
+        raise unread
     _units_by_span(found)
     return found
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.config import parse_yaml
+from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.recording.guess import first_mapping
 from nics_drl_bridge.recording.mapping import Mapping
 from nics_drl_bridge.recording.readers import open_source, read_recording
@@ -129,3 +130,12 @@ def test_the_kind_of_robot_is_guessed_by_its_commands(tmp_path, names, kind):
     assert guess["robot"]["kind"] == kind
     found = read_recording(path, mapping=Mapping.model_validate(guess))
     assert found.command.values.shape == (200, len(names))
+
+
+def test_a_source_without_a_readable_table_is_refused(tmp_path):
+    (tmp_path / "log.csv").write_bytes(b"\0\1\2")
+    with pytest.raises(RecordingError, match="is not text"):
+        surveyed(tmp_path)
+    write(tmp_path / "good.csv", drive())
+    tables, _ = surveyed(tmp_path)
+    assert "is not text" in tables[1].findings[0]
