@@ -20,18 +20,7 @@ UNIT_LENGTH = 0.01  # by which a quaternion may differ from length 1
 AXES = {"x": "y", "px": "py", "tx": "ty", "posx": "posy", "easting": "northing", "east": "north"}
 HEADINGS = {"yaw", "heading", "theta", "psi", "th", "angle", "orientation", "hdg"}
 NOT_PLACES = {"linear", "angular", "twist", "velocity", "vel", "acc", "accel", "acceleration"}
-NOT_PLACES |= {
-    "gyro",
-    "mag",
-    "cmd",
-    "command",
-    "steer",
-    "steering",
-    "rate",
-    "speed",
-    "dot",
-    "wheel",
-}
+NOT_PLACES |= {"gyro", "mag", "cmd", "command", "steer", "steering", "rate", "speed", "wheel"}
 TURNS = {"q", "quat", "quaternion", "rotation", "orientation"}
 TRACKERS = {"pose", "vicon", "mocap", "vrpn", "optitrack", "gt", "truth", "tracker", "amcl", "pf"}
 COMMANDING = {"cmd", "command", "commanded", "commands", "ref", "setpoint", "target", "desired"}
@@ -39,7 +28,6 @@ COMMANDING |= {"control", "drive", "input"}
 MEASURING = {"odom", "odometry", "imu", "measured", "encoder", "feedback", "model"}
 TICKS = {"tick", "ticks", "encoder", "enc", "count", "counts"}
 NO_VALUES = {"header", "stamp", "seq", "covariance", "index", "id", "row"}
-SIDES = {"front": "f", "rear": "r", "back": "b", "left": "l", "right": "r"}
 # Words that mean a command, each set of them alone.
 MEANINGS: dict[str, tuple[set[str], ...]] = {
     "throttle": ({"throttle"}, {"gas"}, {"accelerator"}, {"pedal"}, {"pwm"}),

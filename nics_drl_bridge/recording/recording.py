@@ -16,6 +16,7 @@ from nics_drl_bridge import files, geometry
 from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.recording.mapping import UNITS
 from nics_drl_bridge.robot.noise import Latency
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -40,11 +41,7 @@ FULL_TURN_DEG = 360.0
 # A heading in degrees leads along the path to this share, better by so much than the same in
 # radians, and than none.
 ALONG, LESS_ALONG, ALONG_BY_CHANCE = 0.9, 0.2, 0.05
-UNITS_OF_STEP = (
-    ("milliseconds", "ms", 1e3),
-    ("microseconds", "us", 1e6),
-    ("nanoseconds", "ns", 1e9),
-)
+UNITS_OF_STEP = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 
 
 @dataclass(frozen=True)
@@ -323,12 +320,17 @@ def _too_fast(t: Array, pose: Array, fastest: float, hardest: float) -> Implausi
     return Implausible(reason, cause, line)
 
 
+def likely_unit(t: Array) -> str | None:
+    """Returns the unit of stamps (T,) that can't be seconds; None if they can."""
+    step = np.diff(t)
+    usual = float(np.median(step[step > 0.0])) if (step > 0.0).any() else 0.0
+    fitting = (u for u in UNITS_OF_STEP if usual * UNITS[u].factor < SLOWEST_SAMPLING_S)
+    return next(fitting, None) if usual > SLOWEST_SAMPLING_S else None
+
+
 def _too_slow(t: Array) -> Implausible | None:
-    span = np.median(np.diff(t))
-    if span <= SLOWEST_SAMPLING_S:
+    if (unit := likely_unit(t)) is None:
         return None
-    fitting = (each for each in UNITS_OF_STEP if span / each[2] < SLOWEST_SAMPLING_S)
-    name, unit, _ = next(fitting, UNITS_OF_STEP[0])
-    reason = f"there are {span:.3g} s between samples"
-    cause = f"stamps must be in seconds ({name} look like this)"
+    reason = f"there are {np.median(np.diff(t)):.3g} s between samples"
+    cause = f"stamps must be in seconds ({UNITS_OF_STEP[unit]} look like this)"
     return Implausible(reason, cause, f"time: {{from: ..., unit: {unit}}}")

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import S_PER_NS
-from nics_drl_bridge.recording.mapping import UNITS
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.recording.topic_roles import Stamps
 
@@ -35,7 +34,6 @@ MOST_BACK = 0.9  # share of steps back in rows that begin with the last
 MOST_STRAY = 0.01  # share of stamps that fit none beside them
 LONGEST_PAUSE_S = 86_400.0  # of a drive; a longer one is a clock that was set
 USUAL = 10.0  # an overflow goes on with a step of less than this many usual ones
-LONGEST_STEP_S = 2.0  # median step between rows; a longer one is of another unit
 
 
 @dataclass(frozen=True)
@@ -258,14 +256,3 @@ def not_repeated(t: Array, values: Array, name: str) -> tuple[NDArray[np.bool_],
         return np.ones(len(t), dtype=np.bool_), ""
     finding = f"{int(again.sum())} of {len(t)} rows repeat the row before them"
     return np.append(True, ~again), f"{name}: {finding}, stamp and all, and were left out."
-
-
-def likely_unit(t: Array) -> str | None:
-    """Returns the unit of stamps (T,) that can't be seconds; None if they can."""
-    step = np.diff(t)
-    step = step[step > 0.0]
-    usual = float(np.median(step)) if len(step) else 0.0
-    if usual <= LONGEST_STEP_S:
-        return None
-    fitting = (u for u in ("ms", "us", "ns") if usual * UNITS[u].factor < LONGEST_STEP_S)
-    return next(fitting, None)

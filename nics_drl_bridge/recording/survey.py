@@ -13,7 +13,7 @@ from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording import stamping
 from nics_drl_bridge.recording.mapping import UNITS
-from nics_drl_bridge.recording.recording import IRREGULAR
+from nics_drl_bridge.recording.recording import IRREGULAR, likely_unit
 from nics_drl_bridge.recording.table import Column, Source, Table
 from nics_drl_bridge.recording.values import dates_of
 
@@ -166,7 +166,7 @@ def _time(data: dict[str, Column]) -> tuple[str | None, Array | None]:
 
 def _in_seconds(found: TableSurvey, raw: Array) -> Array:
     raw = raw[np.isfinite(raw)]
-    if (unit := stamping.likely_unit(raw)) is None:
+    if (unit := likely_unit(raw)) is None:
         return raw
     found.unit = unit
     return raw * UNITS[unit].factor

@@ -25,7 +25,7 @@ from nics_drl_bridge.recording.mapping import (
     Value,
     to_si,
 )
-from nics_drl_bridge.recording.recording import Stream
+from nics_drl_bridge.recording.recording import Stream, likely_unit
 from nics_drl_bridge.recording.table import Column, Source, Table, numbers_of
 
 ZONE = re.compile(r"(Z|[+-]\d\d:?\d\d)$")
@@ -125,7 +125,7 @@ class MappedReader:
             self.say(f"{name}: {len(raw) - len(known)} rows without a stamp were left out.")
         t, note = stamping.without_overflow(raw[known], name)
         self.say(note)
-        if (unit := stamping.likely_unit(t)) is not None and time.unit is None:
+        if (unit := likely_unit(t)) is not None and time.unit is None:
             usual = f"{np.median(np.diff(t)):.4g} apart, which can't be seconds"
             line = f"time: {{from: {time.columns[0]}, unit: {unit}}}"
             fault = f"{table.place}: the stamps {time.columns[0]!r} are {usual}"

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.recording import stamping
+from nics_drl_bridge.recording.recording import likely_unit
 
 T = 100.0 + np.arange(300) * 0.02
 
@@ -71,7 +72,7 @@ def test_rows_that_repeat_stamp_and_values_are_left_out():
 
 @pytest.mark.parametrize(("step", "unit"), [(0.02, None), (20.0, "ms"), (2e4, "us"), (2e7, "ns")])
 def test_the_unit_of_stamps_that_are_no_seconds_is_named(step, unit):
-    assert stamping.likely_unit(np.arange(50) * step) == unit
+    assert likely_unit(np.arange(50) * step) == unit
 
 
 @pytest.mark.parametrize(("bits", "low"), [(16, 0.0), (32, 0.0), (16, -(2.0**15))])
