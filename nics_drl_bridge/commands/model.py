@@ -113,8 +113,9 @@ def inspect(
     """Lists what a recording of any form holds, and begins the mapping that says what is what."""
     with one_sentence():
         from nics_drl_bridge.files import write_text
-        from nics_drl_bridge.recording.sources import open_source
-        from nics_drl_bridge.recording.survey import first_mapping, survey
+        from nics_drl_bridge.recording.guess import first_mapping
+        from nics_drl_bridge.recording.readers import open_source
+        from nics_drl_bridge.recording.survey import survey
 
         if mapping is not None and mapping.exists():
             raise ConfigError(f"--map {mapping}: is there already; give another name.")
@@ -145,8 +146,9 @@ def import_(
         from nics_drl_bridge.recording.recording import save_recording
         from nics_drl_bridge.recording.write import check_out
 
-        if check_out(out).suffix != ".npz":
+        if out.suffix != ".npz":
             raise ConfigError(f"--out {out}: must end in .npz.")
+        check_out(out)
         drive = read_recording(source, mapping=mapping)
         save_recording(drive, out)
         for line in stream_lines(drive):

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.gate.inputs import Command, Estimate, Odometry, Scan
 from nics_drl_bridge.gate.limits import Limits
+from nics_drl_bridge.geometry import Bicycle
 from nics_drl_bridge.interface import Array
-from nics_drl_bridge.robot.steering import Bicycle
 
 Ranges = NDArray[np.float32]
 Record = TypeVar("Record")

@@ -260,4 +260,3 @@ def scale_of(samples: Samples, model: TaylorModel) -> Array:
     size = np.sqrt((taylor.evaluate(samples.x, model.powers) ** 2).mean(axis=0))
     spread = np.maximum(samples.dq.std(axis=0), 1e-6)
     return np.asarray(spread[:, None] / np.maximum(size, 1e-9))
-

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -12,21 +11,19 @@ import numpy as np
 
 from nics_drl_bridge.errors import RecordingError, nearest
 from nics_drl_bridge.interface import S_PER_NS
+from nics_drl_bridge.recording import mapping as mapped
 from nics_drl_bridge.recording import topic_roles as roles
 from nics_drl_bridge.recording.bag_file import BagFile, Message, times_of
 from nics_drl_bridge.recording.bag_reader import latency_of, of_one_body
-from nics_drl_bridge.recording.mapping import ARRIVAL, HEADER
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.recording.stamping import ROBOT_STREAMS, TopicData, streams
-from nics_drl_bridge.recording.table import Column
+from nics_drl_bridge.recording.table import Column, Source, Table
 from nics_drl_bridge.robot.noise import Latency
 
 LONGEST_ARRAY = 64  # of which each element is listed
-SCENES = re.compile(
-    r"/(Compressed)?Image$|/PointCloud2?$|/LaserScan$"
-)  # types of no single numbers
+SCENES = re.compile(r"/(Compressed)?Image$|/PointCloud2?$|/LaserScan$")  # of no single numbers
 PART = re.compile(r"[^.\[\]]+")
-STAMPS: dict[str, roles.Stamps] = {"": "auto", HEADER: "header", ARRIVAL: "receive"}
+STAMPS: dict[str, roles.Stamps] = {"": "auto", mapped.HEADER: "header", mapped.ARRIVAL: "receive"}
 NAMES = "name"  # field of JointState with a name for each element of the other arrays
 
 
@@ -73,105 +70,93 @@ def reader_of_field(path: str) -> Callable[[Any], Any]:
     return read
 
 
-@dataclass(frozen=True)
-class TopicTable:
-    """Messages of a topic."""
-
-    place: str
-    topic: str
-    messages: Sequence[Message]
-    names: tuple[str, ...]
-    stamped: Callable[[str], Stream]
-    notes: tuple[str, ...] = ()
-
-    def column(self, which: str | int) -> Column:
-        """Returns a field of all messages; RecordingError if they have none of that name."""
-        path = self.names[which] if isinstance(which, int) else which
-        read = reader_of_field(path)
-        try:
-            values = [read(message.content) for message in self.messages]
-        except AttributeError:
-            raise RecordingError(f"{self.place}: has no {path!r}; {self._hint(path)}") from None
-        if isinstance(values[0], str):
-            return np.array(values, dtype=np.str_)
-        try:
-            column = np.array(values, dtype=np.float64)
-        except (TypeError, ValueError):
-            column = np.zeros((0, 0))
-        if column.ndim != 1:
-            fault = f"{path!r} is no single number"
-            raise RecordingError(f"{self.place}: {fault}; {self._hint(path)}")
-        return column
-
-    def _hint(self, path: str) -> str:
-        inner = [name for name in self.names if name.startswith(path)]
-        return f"say which, as {inner[0]!r}." if inner else nearest(path, self.names)
-
-    def row(self, k: int) -> str:
-        """Names a message for errors."""
-        return f"message {k}"
-
-    def stamps(self, which: str) -> Stream | None:
-        """Returns stamps by header or arrival, and in `values` (T, 1) the message of each."""
-        return self.stamped(which)
+def column_of(
+    place: str, names: Sequence[str], messages: Sequence[Message], which: str | int
+) -> Column:
+    """Returns a field of all messages (T,); RecordingError if they have none of that name."""
+    path = names[which] if isinstance(which, int) else which
+    inner = [name for name in names if name.startswith(path)]
+    hint = f"say which, as {inner[0]!r}." if inner else nearest(path, names)
+    read = reader_of_field(path)
+    try:
+        values = [read(message.content) for message in messages]
+    except AttributeError:
+        raise RecordingError(f"{place}: has no {path!r}; {hint}") from None
+    if isinstance(values[0], str):
+        return np.array(values, dtype=np.str_)
+    try:
+        column = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError):
+        column = np.zeros((0, 0))
+    if column.ndim != 1:
+        raise RecordingError(f"{place}: {path!r} is no single number; {hint}")
+    return column
 
 
-@dataclass
-class Bag:
-    """The topics of an opened bag as tables."""
+class Bag(Source):
+    """The topics of an opened bag as tables, of transforms those between two frames."""
 
-    bag: BagFile
-    frames: tuple[str | None, str | None] = (None, None)  # of the transforms to use
-    # topics that are read, and whether they come from the robot's computer, for common stamps
-    used: Mapping[str, bool] = field(default_factory=dict)
-    _read: dict[str, TopicTable] = field(default_factory=dict)
-    _stamps: dict[tuple[str, ...], dict[str, Stream]] = field(default_factory=dict)
-
-    @property
-    def place(self) -> str:
-        """The bag's path."""
-        return self.bag.place
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Topics with messages that can be decoded."""
-        known = self.bag.types.keys() - self.bag.empty
-        scenes = {topic for topic in known if SCENES.search(self.bag.types[topic])}
-        return tuple(sorted(topic for topic in known - scenes if self.bag.knows(topic)))
+    def __init__(self, bag: BagFile, mapping: mapped.Mapping | None = None) -> None:
+        known = bag.types.keys() - bag.empty
+        scenes = {topic for topic in known if SCENES.search(bag.types[topic])}
+        super().__init__(bag.place, sorted(t for t in known - scenes if bag.knows(t)))
+        self._bag, self._frames = bag, (None, None) if mapping is None else mapping.pose.frames
+        # topics that are read, and whether they come from the robot's computer, for common stamps
+        self._used = {} if mapping is None else topics_used(mapping, self.names)
+        self._messages: dict[str, Sequence[Message]] = {}
+        self._notes: list[str] = []
+        self._stamps: dict[tuple[str, ...], dict[str, Stream]] = {}
 
     @property
     def latency(self) -> Latency:
         """Delays of scan and odometry, as far as the bag shows them."""
-        return latency_of(self.bag)
+        return latency_of(self._bag)
 
-    def table(self, name: str) -> TopicTable:
-        """Reads a topic; of transforms those between the wanted frames."""
-        if name not in self._read:
-            messages: Sequence[Message] = self.bag.messages(name)
-            if self.bag.types[name] == roles.TRANSFORMS:
-                messages = of_one_body(self.bag, name, messages, *self.frames)
-            place = f"{self.place}: topic {name!r}"
-            names = tuple(dict.fromkeys(fields_of(messages[0].content)))
-            table = TopicTable(place, name, messages, names, partial(self._stamps_of, name))
-            self._read[name] = table
-        return self._read[name]
+    def read(self, name: str) -> Table:
+        """Reads a topic."""
+        messages = self._of(name)
+        place = f"{self.place}: topic {name!r}"
+        names = tuple(dict.fromkeys(fields_of(messages[0].content)))
+        column, stamps = partial(column_of, place, names, messages), partial(self._stamps_of, name)
+        return Table(place, names, column, "message {}".format, self._notes, stamps)
+
+    def _of(self, topic: str) -> Sequence[Message]:
+        if topic not in self._messages:
+            messages: Sequence[Message] = self._bag.messages(topic)
+            if self._bag.types[topic] == roles.TRANSFORMS:
+                messages = of_one_body(self._bag, topic, messages, *self._frames)
+            self._messages[topic] = messages
+        return self._messages[topic]
 
     def _stamps_of(self, topic: str, which: str) -> Stream:
         """Stamps a topic with all that are used: only together do they show their clocks."""
-        topics = tuple(self.used) or (topic,)
+        topics = tuple(self._used) or (topic,)
         if (key := (which, *topics)) not in self._stamps:
             data = {}
             for each in topics:
-                messages = self.table(each).messages
+                messages = self._of(each)
                 receive, header = times_of(messages)
                 rows = np.arange(len(messages), dtype=np.float64)[:, None]
                 data[each] = TopicData(each, receive, header, rows)
-            robot = [each for each, own in self.used.items() if own]
-            self._stamps[key] = streams(data, STAMPS[which], self.place, robot)
+            robot = [each for each, own in self._used.items() if own]
+            self._stamps[key] = self._joined(data, STAMPS[which], robot)
         return self._stamps[key][topic]
 
+    def _joined(
+        self, data: dict[str, TopicData], stamps: roles.Stamps, robot: Sequence[str]
+    ) -> dict[str, Stream]:
+        """Stamps topics; by arrival if unasked-for headers are of no use."""
+        try:
+            return streams(data, stamps, self.place, robot)
+        except RecordingError as error:
+            if stamps != "auto":
+                raise
+            fault = str(error).removeprefix(f"{self.place}: ").partition(";")[0]
+            self._notes.append(f"{fault}; all messages were stamped by their arrival.")
+            return streams(data, "receive", self.place, robot)
 
-def topics_used(mapping: Mapping[str, Any], topics: Sequence[str]) -> dict[str, bool]:
+
+def topics_used(mapping: mapped.Mapping, topics: Sequence[str]) -> dict[str, bool]:
     """Returns the topics that a mapping names, and whether commands or the robot's sensors do."""
     found: dict[str, bool] = {}
 
@@ -187,7 +172,7 @@ def topics_used(mapping: Mapping[str, Any], topics: Sequence[str]) -> dict[str, 
             for topic in (each for each in (part, *_heads(part)) if each in topics):
                 found[topic] = found.get(topic, False) or own
 
-    walk(mapping, False)
+    walk(mapping.model_dump(by_alias=True, exclude={"robot"}, exclude_none=True), False)
     return found
 
 

@@ -8,8 +8,7 @@ import numpy as np
 from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.recording.plausible import SLOWEST_SAMPLING_S
-from nics_drl_bridge.recording.recording import Recording, Stream
+from nics_drl_bridge.recording.recording import SLOWEST_SAMPLING_S, Recording, Stream
 
 COLUMNS = {
     "cmd.csv": ("linear.x", "angular.z", "time [s]"),

@@ -288,7 +288,7 @@ def expected_motion(spec: RobotSpec) -> ExpectedMotion:
     if has_textbook(spec):
         book = textbook(spec)
         return ExpectedMotion(
-            len(spec.state),
+            len(book.lag),
             lambda state, command, t: book.respond(state, book.target(command), t),
             lambda state, _: book.twist(state),
         )

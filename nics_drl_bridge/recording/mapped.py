@@ -11,25 +11,26 @@ import numpy as np
 
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.geometry import Array, wrap_angle
-from nics_drl_bridge.recording import stamps
+from nics_drl_bridge.recording import stamping
 from nics_drl_bridge.recording.mapping import (
     COVARIANCES,
     SI,
+    UNITS,
     Mapping,
     Measured,
     PoseSource,
     Reference,
     Value,
 )
-from nics_drl_bridge.recording.plausible import implausible_pose
-from nics_drl_bridge.recording.recording import Recording, Stream, check_streams
+from nics_drl_bridge.recording.recording import Recording, Stream, check_streams, implausible_pose
 from nics_drl_bridge.recording.table import Source
-from nics_drl_bridge.recording.units import UNITS
 from nics_drl_bridge.recording.values import MappedReader, Series, together, unit_of
 
 QUATERNION_TOLERANCE = 0.05
+MOST_TILT_DEG = 40.0  # median, of a robot that drives on wheels
 MOST_UNTRACKED = 0.05  # share of poses whose quaternion is zero: the tracker had lost the body
 NO_LENGTH = 1e-9
+SHORTEST_S = 1.0
 MOST_RATIO = 100.0  # of durations of two streams of a drive
 
 
@@ -47,7 +48,7 @@ def read_mapped(source: Source, mapping: Mapping) -> Recording:
         if (stream := getattr(mapping, name)) is not None:
             found[name] = _measured(reader, name, stream)
     for name, stream in found.items():
-        keep, note = stamps.not_repeated(stream.t, stream.values, name)
+        keep, note = stamping.not_repeated(stream.t, stream.values, name)
         reader.say(note)
         found[name] = stream.rows(keep)
     names, streams = (*mapping.state, *mapping.command), cast(Any, found)
@@ -55,18 +56,19 @@ def read_mapped(source: Source, mapping: Mapping) -> Recording:
     check_streams(made, {"command": len(mapping.command), "state": len(mapping.state), "wheels": 2})
     shifted: Any = _from_zero(found, mapping.clock, reader)
     made = replace(made, **shifted, repairs=tuple(reader.notes))
-    if fault := implausible_pose(made.pose.t, made.pose.values, radius=_radius(mapping)):
-        time = mapping.pose.time or mapping.time
-        line = fault.line.replace("...", str(time.columns[0] if time else "t"))
-        said = f"{source.place}: pose: {fault.reason}; {fault.cause}"
-        raise RecordingError(f"{said}: write `{line}` into the mapping, below `pose:`.")
     return made
 
 
-def _radius(mapping: Mapping) -> float:
-    """Returns the radius of the robot [m], as far as the mapping says it."""
+def _check_units(reader: MappedReader, pose: Stream) -> None:
+    """Refuses poses, as they were recorded, that only a wrong unit explains."""
+    mapping = reader.mapping
     given = mapping.robot.get("footprint_radius") if isinstance(mapping.robot, dict) else None
-    return float(given) if isinstance(given, (int, float)) else 0.0
+    radius = float(given) if isinstance(given, (int, float)) else 0.0
+    if fault := implausible_pose(pose.t, pose.values, radius=radius):
+        time = mapping.pose.time or mapping.time
+        line = fault.line.replace("...", str(time.columns[0] if time else "t"))
+        said = f"{reader.source.place}: pose: {fault.reason}; {fault.cause}"
+        raise RecordingError(f"{said}: write `{line}` into the mapping, below `pose:`.")
 
 
 def _measured(reader: MappedReader, name: str, stream: Measured) -> Stream:
@@ -103,6 +105,7 @@ def read_pose(reader: MappedReader, pose: PoseSource) -> Stream:
             raise ConfigError(f"{fault}; check its unit.")
         parts.append(reader.series(f"pose.{key}", value, pose, held=False))
         factors.append(abs(unit_of(value).factor * value.scale))
+    _check_units(reader, together("pose", parts, held=False))
     heading = parts[2]
     parts[2] = heading._replace(values=np.unwrap(heading.values))  # as it may be interpolated
     made = together("pose", parts, held=False)
@@ -133,6 +136,13 @@ def _heading(reader: MappedReader, pose: PoseSource, given: str | Sequence[Refer
         fault = f"{where} the quaternion has the length {norm[k]:.3f} and not 1"
         raise RecordingError(f"{fault}; list its columns in the order x, y, z, w.")
     x, y, z, w = made.values.T
+    tilt = np.degrees(np.median(np.arccos(np.clip(np.abs(1.0 - 2.0 * (x * x + y * y)), 0.0, 1.0))))
+    if tilt > MOST_TILT_DEG:
+        fault = (
+            f"{reader.source.place}: pose: by its quaternion the body is tilted by {tilt:.0f} deg"
+        )
+        advice = "list its columns in the order x, y, z, w, or, if y is up, as [qz, qx, qy, qw]"
+        raise RecordingError(f"{fault}; {advice}.")
     heading = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     return Series(made.t, heading, made.clock)
 
@@ -202,6 +212,9 @@ def _from_zero(found: dict[str, Stream], main: str, reader: MappedReader) -> dic
     pose = found["pose"]
     for name, stream in found.items():
         lasts, usual = np.ptp(stream.t), max(np.ptp(pose.t), 1e-9)
+        if name == "pose" and lasts < SHORTEST_S:
+            fault = f"{reader.source.place}: the pose lasts {lasts:.3g} s"
+            raise RecordingError(f"{fault}; give the `unit:` of its `time:`, as min or h.")
         if lasts and not 1.0 / MOST_RATIO < lasts / usual < MOST_RATIO:
             fault = f"{reader.source.place}: {name} lasts {lasts:.4g} s, the pose {usual:.4g} s"
             raise RecordingError(f"{fault}; give the `unit:` of the `time:` that is wrong.")

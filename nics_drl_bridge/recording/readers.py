@@ -1,15 +1,18 @@
 """Readers of recordings: `FORMATS` recognises a recording and names the function that reads it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import ConfigError, RecordingError
-from nics_drl_bridge.recording.bag_file import is_bag
+from nics_drl_bridge.recording.bag_file import is_bag, opened
 from nics_drl_bridge.recording.bag_reader import load_bag
+from nics_drl_bridge.recording.bag_table import Bag
 from nics_drl_bridge.recording.csv_folder import load_csv_folder
 from nics_drl_bridge.recording.mapped import read_mapped
 from nics_drl_bridge.recording.mapping import Mapping, load_mapping
@@ -20,7 +23,8 @@ from nics_drl_bridge.recording.recording import (
     is_recording,
     load_recording,
 )
-from nics_drl_bridge.recording.sources import open_source
+from nics_drl_bridge.recording.table import Source
+from nics_drl_bridge.recording.table_files import Files
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot, robot_from
 
@@ -129,3 +133,15 @@ def arranged(recording: Recording, spec: RobotSpec) -> Recording:
         order = [known[part].index(name) for name in names]
         made[part] = replace(stream, values=stream.values[:, order])
     return check(replace(recording, **made, variables=spec.variable_names), spec)
+
+
+@contextmanager
+def open_source(path: Path, mapping: Mapping | None = None) -> Iterator[Source]:
+    """Opens a recording of any format; RecordingError if there is nothing to read."""
+    if not no_device(path).exists():
+        raise RecordingError(f"{path}: no such file or folder; check the path.")
+    if not is_bag(path):
+        yield Files(path)
+        return
+    with opened(path) as file:
+        yield Bag(file, mapping)

@@ -7,7 +7,7 @@ import json
 import zipfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from nics_drl_bridge import files, geometry
 from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.recording.plausible import implausible_pose
+from nics_drl_bridge.recording.mapping import UNITS
 from nics_drl_bridge.robot.noise import Latency
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -27,6 +27,21 @@ UNSEALED_FORMAT = "nics_drl_bridge/recording/1"  # without checksum; all three c
 STREAMS = ("command", "pose", "state", "wheels", "imu", "odometry")
 IRREGULAR = 0.5  # share of the median by which a step differs if it is a gap or a repetition
 JITTER, ROUNDING_S = 1e-4, 1e-6  # steps that differ by less are equally long, but for rounding
+
+LARGEST_TURN = 1.5  # a larger turn between neighbouring samples [rad] is implausible,
+TOO_FAST = 20.0  # and so is a speed of more than this many times the greatest command
+SPEED_OVER_S = 0.5
+SLOWEST_SAMPLING_S = 2.0
+# Acceleration that no wheeled robot reaches for a quarter of the time [m/s^2]: one whose radius is
+# below 1 m; and any, as race cars press themselves to the ground.
+HARDEST, HARDEST_OF_CARS, SMALL_M = 14.0, 60.0, 1.0
+SLOWEST_IN_CM = 300.0  # speed from which on millimetres are likelier than centimetres [m/s]
+FASTEST_TURN = 15.0  # a robot that turns faster for long [rad/s] does so in degrees
+FULL_TURN_DEG = 360.0
+# A heading in degrees leads along the path to this share, better by so much than the same in
+# radians, and than none.
+ALONG, LESS_ALONG, ALONG_BY_CHANCE = 0.9, 0.2, 0.05
+UNITS_OF_STEP = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 
 
 @dataclass(frozen=True)
@@ -135,6 +150,8 @@ def _fault(stream: Stream, width: int) -> str:
         return f"{reason}; check that the recording is of this robot"
     if len(t) < 2:
         return f"has {len(t)} samples; record a drive of 20 s or more"
+    if t[-1] == t[0]:
+        return f"all of its stamps are {t[0]:g} s; choose another column as its time"
     for row in np.flatnonzero(~np.isfinite(values).all(axis=1) | ~np.isfinite(t))[:1]:
         return f"row {row} holds NaN or inf; remove the row, or find out why it was recorded"
     for row in np.flatnonzero(np.diff(t) < 0.0)[:1]:
@@ -221,3 +238,99 @@ def _arrays(data: bytes) -> dict[str, NDArray[Any]]:
             return {name: arrays[name] for name in arrays.files}
     except Exception as error:  # noqa: BLE001 - damage breaks zipfile and numpy in any way
         raise ValueError(str(error) or type(error).__name__) from None
+
+
+class Implausible(NamedTuple):
+    """A fault of poses, and what explains it."""
+
+    reason: str
+    cause: str
+    line: str  # for the mapping, as `heading_unit: deg`
+
+
+def implausible_pose(
+    t: Array, pose: Array, fastest: float = np.inf, radius: float = 0.0
+) -> Implausible | None:
+    """Finds poses (T, 3) at t (T,) [s] that degrees, centimetres or milliseconds explain.
+
+    `fastest` is the greatest speed that is commanded [m/s], inf if it is not known; `radius` [m]
+    that of the robot.
+    """
+    if len(t) < 3:
+        return None
+    hardest = HARDEST if radius < SMALL_M else HARDEST_OF_CARS
+    return _too_slow(t) or _degrees(t, pose) or _too_fast(t, pose, fastest, hardest)
+
+
+def _degrees(t: Array, pose: Array) -> Implausible | None:
+    heading = pose[:, 2]
+    cause = "it must be in radians (degrees look like this)"
+    turn = np.percentile(np.abs(geometry.wrap_angle(np.diff(heading))), 95)
+    if turn > LARGEST_TURN:
+        reason = f"the heading jumps by {turn:.1f} rad between neighbouring samples"
+        return Implausible(reason, cause, "heading_unit: deg")
+    if np.abs(heading).max() <= 2.0 * np.pi + 0.1:
+        return None
+    step = np.diff(heading)
+    around = np.abs(np.abs(step) - FULL_TURN_DEG) < FULL_TURN_DEG / 10.0
+    every = _spaced(t)
+    rad, deg, none = (led_along(pose[every], scale) for scale in (1.0, np.pi / 180.0, 0.0))
+    rate = np.abs(np.diff(np.unwrap(heading, period=FULL_TURN_DEG)[every])) / np.diff(t[every])
+    turns = len(rate) > 0 and np.percentile(rate, 90) > FASTEST_TURN
+    if not (around.any() or turns or deg > max(ALONG, rad + LESS_ALONG, none + ALONG_BY_CHANCE)):
+        return None
+    reason = f"the heading is up to {np.abs(heading).max():.4g} rad"
+    return Implausible(reason, cause, "heading_unit: deg")
+
+
+def led_along(pose: Array, scale: float) -> float:
+    """Returns to what share poses (T, 3) lead along their headings x scale, ahead or back."""
+    x, y = np.diff(pose[:, :2], axis=0).T
+    ahead = np.exp(1j * scale * pose[:, 2])
+    middle = ahead[1:] + ahead[:-1]  # of two headings, whose angle is between them
+    middle = middle / np.maximum(np.abs(middle), 1e-9)
+    step = np.hypot(x, y)
+    course = (x + 1j * y) / np.maximum(step, 1e-9)
+    return float(np.abs((step * (course / middle) ** 2).sum()) / max(step.sum(), 1e-9))
+
+
+def _spaced(t: Array) -> NDArray[np.intp]:
+    """Returns the samples that are about half a second apart."""
+    return np.unique(np.floor((t - t[0]) / SPEED_OVER_S), return_index=True)[1]
+
+
+def _too_fast(t: Array, pose: Array, fastest: float, hardest: float) -> Implausible | None:
+    every = _spaced(t)
+    step, took = np.diff(pose[every, :2], axis=0), np.diff(t[every])
+    if not len(took):
+        return None
+    velocity = step / np.maximum(took, 1e-9)[:, None]
+    speed = np.percentile(np.hypot(*velocity.T), 90)
+    cause = "positions must be in metres and stamps in seconds"
+    line = "unit: mm" if speed > SLOWEST_IN_CM else "unit: cm"
+    if speed > TOO_FAST * fastest:
+        reason = f"moves at {speed:.3g} m/s, a robot whose commands end at {fastest:g} m/s"
+        return Implausible(reason, cause, line)
+    if np.isfinite(fastest) or len(took) < 3:
+        return None
+    hard = np.percentile(np.hypot(*np.diff(velocity, axis=0).T) / np.maximum(took[1:], 1e-9), 75)
+    if hard <= hardest:
+        return None
+    reason = f"moves at {speed:.3g} m/s and changes that by {hard:.3g} m/s^2"
+    return Implausible(reason, cause, line)
+
+
+def likely_unit(t: Array) -> str | None:
+    """Returns the unit of stamps (T,) that can't be seconds; None if they can."""
+    step = np.diff(t)
+    usual = float(np.median(step[step > 0.0])) if (step > 0.0).any() else 0.0
+    fitting = (u for u in UNITS_OF_STEP if usual * UNITS[u].factor < SLOWEST_SAMPLING_S)
+    return next(fitting, None) if usual > SLOWEST_SAMPLING_S else None
+
+
+def _too_slow(t: Array) -> Implausible | None:
+    if (unit := likely_unit(t)) is None:
+        return None
+    reason = f"there are {np.median(np.diff(t)):.3g} s between samples"
+    cause = f"stamps must be in seconds ({UNITS_OF_STEP[unit]} look like this)"
+    return Implausible(reason, cause, f"time: {{from: ..., unit: {unit}}}")

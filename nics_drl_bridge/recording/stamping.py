@@ -1,11 +1,13 @@
-"""Stamps: each stream's time axis and clock, by the headers' stamps or by receipt."""
+"""Stamps: clocks of topics, by headers or receipt, and repairs of stamps and counters."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import RecordingError
@@ -24,6 +26,14 @@ MAX_STALL_S = 30.0  # but by no more than this
 MAX_LATE = 0.01  # share of messages that may arrive after one with a later stamp
 MAX_UNSTAMPED = 0.05  # share that may lack a stamp at the start: a simulation has no time yet
 ROBOT_STREAMS = ("command", "state", "wheels", "imu")  # of one computer, and so of one clock
+
+BITS = (8, 16, 24, 31, 32)  # of registers that overflow
+STAMP_BITS = (16, 24, 31, 32)
+LATE_ROWS, LATE_S = 50, 1.0  # rows that come too late do so by less
+MOST_BACK = 0.9  # share of steps back in rows that begin with the last
+MOST_STRAY = 0.01  # share of stamps that fit none beside them
+LONGEST_PAUSE_S = 86_400.0  # of a drive; a longer one is a clock that was set
+USUAL = 10.0  # an overflow goes on with a step of less than this many usual ones
 
 
 @dataclass(frozen=True)
@@ -144,3 +154,105 @@ def _by_receipt(part: TopicData, origin: int) -> Stream:
 
 def _seconds(ns: Nanoseconds) -> Array:
     return np.asarray(ns * S_PER_NS, dtype=np.float64)
+
+
+def joined(seconds: NDArray[Any], nanoseconds: NDArray[Any]) -> Array:
+    """Joins stamps that were split into seconds and nanoseconds [s]."""
+    return np.asarray(seconds + nanoseconds * S_PER_NS, dtype=np.float64)
+
+
+def overflow(values: Array, scale: tuple[float, ...], bits: tuple[int, ...]) -> float | None:
+    """Returns the range of a register that overflows in values (T,), which are counts x scale.
+
+    An overflow leaves a jump of more than half of the range, after which the values go on as before
+    once the range is added. None if no range explains the jumps.
+    """
+    step = np.diff(values)
+    if not len(step):
+        return None
+    usual = float(np.percentile(np.abs(step), 95))
+    span = float(np.ptp(values))
+    for size in sorted(2.0**b * s for b in bits for s in scale):
+        jump = np.abs(step) > size / 2.0
+        if max(span, np.abs(values).max()) > size or not jump.any() or jump.mean() > 0.5:
+            continue
+        rest = np.abs(step[jump] - np.sign(step[jump]) * size)
+        if rest.max() <= USUAL * max(usual, size * 1e-9):
+            return size
+    return None
+
+
+def unwrapped(values: Array, size: float) -> tuple[Array, int]:
+    """Continues values (T,) over the overflows of a register; returns them and their number."""
+    step = np.diff(values)
+    turns = -np.round(step / size) * (np.abs(step) > size / 2.0)
+    return values + size * np.append(0.0, np.cumsum(turns)), int(np.abs(turns).sum())
+
+
+def without_overflow(t: Array, name: str) -> tuple[Array, str]:
+    """Continues stamps (T,) of a clock of 32 bits or less that began anew."""
+    if not (np.diff(t) < 0.0).any():
+        return t, ""
+    size = overflow(t, (1.0, 1e-3, 1e-6, 1e-9), STAMP_BITS)
+    if size is None:
+        return t, ""
+    made, count = unwrapped(t, size)
+    return made, f"{name}: its clock overflowed at {size:.10g} {_times(count)}, and was continued."
+
+
+def in_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
+    """Sorts the few late rows; joins parts between which the clock was set.
+
+    Returns stamps (T,) [s] that never decrease, and the row of each.
+    """
+    rows, notes = np.arange(len(t)), []
+    if len(t) > 1 and np.mean(np.diff(t) < 0.0) > MOST_BACK:
+        t, rows = t[::-1], rows[::-1]
+        notes.append(f"{name}: its rows began with the last, and were turned round.")
+    if (stray := _stray(t)).any():
+        where = f"(row {rows[stray][0]}: {t[stray][0]:.10g} s)"
+        notes.append(f"{name}: {stray.sum()} stamps fit none beside them {where}; left out.")
+        t, rows = t[~stray], rows[~stray]
+    late = np.maximum.accumulate(t) - t
+    run, longest = 0, 0
+    for each in late:  # rows in a row that are older than one before them
+        run = run + 1 if each > 0.0 else 0
+        longest = max(longest, run)
+    if 0 < longest <= LATE_ROWS and late.max() <= LATE_S:
+        order = np.argsort(t, kind="stable")
+        finding = f"{int((late > 0.0).sum())} of {len(t)} rows came after later ones"
+        notes.append(f"{name}: {finding}, by up to {late.max():.3g} s, and were sorted.")
+        t, rows = t[order], rows[order]
+    step = np.diff(t)
+    if (jump := (step < 0.0) | (step > LONGEST_PAUSE_S)).any() and not jump.all():
+        usual, k = float(np.median(step[~jump])), int(np.argmax(jump))
+        first = f"row {rows[k + 1]}, by {abs(step[k]):.3g} s"
+        said = f"{name}: the clock was set {'back' if step[k] < 0.0 else 'ahead'}"
+        joined = f"the parts were joined, a usual step of {usual:.3g} s apart"
+        notes.append(f"{said} {_times(int(jump.sum()))} ({first}); {joined}.")
+        t = t + np.append(0.0, np.cumsum(np.where(jump, usual - step, 0.0)))
+    return t, rows, " ".join(notes)
+
+
+def _stray(t: Array) -> NDArray[np.bool_]:
+    """Selects few stamps (T,) that break the order and are far from those on both sides."""
+    if len(t) < 5:
+        return np.zeros(len(t), dtype=np.bool_)
+    back = np.diff(t) < 0.0
+    beside = np.append(back, False) | np.append(False, back)
+    middle = np.median(sliding_window_view(np.pad(t, 2, mode="reflect"), 5), axis=1)
+    stray = beside & (np.abs(t - middle) > LATE_S)
+    return np.asarray(stray if stray.mean() <= MOST_STRAY else stray & False)
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
+
+
+def not_repeated(t: Array, values: Array, name: str) -> tuple[NDArray[np.bool_], str]:
+    """Selects rows (T,) that do not repeat the one before them, stamp and values (T, D)."""
+    again = (np.diff(t) == 0.0) & (np.diff(values, axis=0) == 0.0).all(axis=1)
+    if not again.any():
+        return np.ones(len(t), dtype=np.bool_), ""
+    finding = f"{int(again.sum())} of {len(t)} rows repeat the row before them"
+    return np.append(True, ~again), f"{name}: {finding}, stamp and all, and were left out."

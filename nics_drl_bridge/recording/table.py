@@ -1,11 +1,11 @@
-"""Table: named columns of a file, a topic or an archive, as a mapping refers to them."""
+"""Table: named columns of a file, a topic or an archive; Source: the tables of a recording."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,91 +18,77 @@ from nics_drl_bridge.robot.noise import Latency
 Column = NDArray[Any]  # (T,) numbers, or text
 
 
-class Table(Protocol):
-    """Columns with a place for errors; those of a bag come with stamps."""
-
-    @property
-    def place(self) -> str:
-        """Path, and topic, for errors."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of its columns; "" for one without a name."""
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """A sentence on each thing that reading mended."""
-
-    def column(self, which: str | int) -> Column:
-        """Returns a column by its name or number from 0; RecordingError if there is none."""
-
-    def row(self, k: int) -> str:
-        """Names a row for errors."""
-
-    def stamps(self, which: str) -> Stream | None:
-        """Returns stamps that come with the rows, and in `values` (T, 1) these rows, if any."""
+def _unstamped(_: str) -> None:
+    return None
 
 
-class Source(Protocol):
+@dataclass(frozen=True)
+class Table:
+    """Columns as a mapping refers to them; those of a bag come with stamps."""
+
+    place: str  # path, and topic, for errors
+    names: tuple[str, ...]  # "" for a column without one
+    column: Callable[[str | int], Column]  # by name, or number from 0; RecordingError: no such
+    row: Callable[[int], str]  # names a row for errors
+    notes: Sequence[str] = ()  # a sentence on each thing that reading mended
+    # stamps that come with the rows, and in `values` (T, 1) these rows, if any
+    stamps: Callable[[str], Stream | None] = _unstamped
+
+
+def table_of(
+    place: str,
+    names: tuple[str, ...],
+    data: Sequence[Column],
+    lines: NDArray[np.intp] | None = None,  # (T,) of the file, in which the rows stand
+    notes: Sequence[str] = (),
+) -> Table:
+    """Makes a table of columns in memory."""
+
+    def row(k: int) -> str:
+        return f"row {k}" if lines is None else f"line {lines[k]}"
+
+    return Table(place, names, lambda which: data[_number(place, names, which)], row, notes)
+
+
+class Source:
     """A recording of any format, as tables."""
 
-    @property
-    def place(self) -> str:
-        """Path, for errors."""
+    def __init__(self, place: str, names: Sequence[str]) -> None:
+        self.place, self.names = place, tuple(names)  # path, for errors; names of its tables
+        self._read: dict[str, Table] = {}
 
     @property
     def latency(self) -> Latency:
         """Delays of scan and odometry, if they show."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of all tables."""
+        return Latency()
 
     def table(self, name: str) -> Table:
-        """Reads a table; RecordingError if there is none of that name, or it is unreadable."""
+        """Returns a table; RecordingError if it is unreadable."""
+        if name not in self._read:
+            self._read[name] = self.read(name)
+        return self._read[name]
+
+    def read(self, name: str) -> Table:
+        """Reads a table."""
+        raise NotImplementedError
 
 
-@dataclass(frozen=True)
-class Columns:
-    """A table in memory."""
-
-    place: str
-    names: tuple[str, ...]
-    data: tuple[Column, ...]
-    lines: NDArray[np.intp] | None = None  # (T,) line of the file in which each row stands
-    notes: tuple[str, ...] = ()
-
-    def column(self, which: str | int) -> Column:
-        """Returns a column by its name or number from 0; RecordingError if there is none."""
-        return self.data[number_of(self, which)]
-
-    def row(self, k: int) -> str:
-        """Names a row for errors."""
-        return f"row {k}" if self.lines is None else f"line {self.lines[k]}"
-
-    def stamps(self, which: str) -> Stream | None:
-        """Returns None: the stamps of such a table are among its columns."""
-        return None
-
-
-def number_of(table: Table, which: str | int) -> int:
+def _number(place: str, names: Sequence[str], which: str | int) -> int:
     """Returns the number of a column that is given by name or number."""
-    names = table.names
     if isinstance(which, str) and which in names:
         if (count := Counter(names)[which]) > 1:
             numbers = [str(k) for k, name in enumerate(names) if name == which]
-            fault = f"{count} columns are called {which!r}"
             advice = f"give the number of the one you mean: {' or '.join(numbers)}"
-            raise RecordingError(f"{table.place}: {fault}; {advice}.")
+            raise RecordingError(f"{place}: {count} columns are called {which!r}; {advice}.")
         return names.index(which)
     if isinstance(which, int) or which.isdecimal():
         if 0 <= int(which) < len(names):
             return int(which)
-        fault = f"has no column {which}"
-        raise RecordingError(f"{table.place}: {fault}; its columns are 0 to {len(names) - 1}.")
+        columns = f"its columns are 0 to {len(names) - 1}"
+        raise RecordingError(f"{place}: has no column {which}; {columns}.")
     named = [name for name in names if name]
-    hint = nearest(which, named) if named else "they have no names: give its number, from 0"
-    raise RecordingError(f"{table.place}: has no column {which!r}; {hint.rstrip('.')}.")
+    hint = nearest(which, named) if named else "they have no names: give its number, from 0."
+    raise RecordingError(f"{place}: has no column {which!r}; {hint}")
 
 
 def numbers_of(table: Table, which: str | int) -> Array:

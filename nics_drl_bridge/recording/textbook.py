@@ -53,7 +53,7 @@ def record(
     return Recording(
         Stream(t, np.repeat(held, per_hold, axis=0)),
         Stream(t, pose[::inner]),
-        Stream(t, state[::inner]),
+        Stream(t, state[::inner]) if spec.state else None,
         source=f"textbook {spec.name}",
         variables=spec.variable_names,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -13,12 +14,22 @@ from nics_drl_bridge.errors import ConfigError, RecordingError, nearest
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.recording import mapping as schema
-from nics_drl_bridge.recording import stamps
-from nics_drl_bridge.recording.mapping import Mapping, Measured, Reference, Value
-from nics_drl_bridge.recording.recording import Stream
+from nics_drl_bridge.recording import stamping
+from nics_drl_bridge.recording.mapping import (
+    RATES,
+    UNITS,
+    Mapping,
+    Measured,
+    Reference,
+    UnitOfData,
+    Value,
+    to_si,
+)
+from nics_drl_bridge.recording.recording import Stream, likely_unit
 from nics_drl_bridge.recording.table import Column, Source, Table, numbers_of
-from nics_drl_bridge.recording.units import RATES, UNITS, UnitOfData, to_si
 
+ZONE = re.compile(r"(Z|[+-]\d\d:?\d\d)$")
+CLOCK = re.compile(r"\d\d:\d\d:\d\d")  # a time of day
 CLOSE = 1e-9  # a flag equals a number within this
 
 
@@ -70,8 +81,8 @@ class MappedReader:
         if isinstance(reference, str) and ":" in reference:
             wanted = reference.rpartition(":")[0]
         if wanted is not None:
-            hint = nearest(wanted, names).rstrip(".")
-            raise RecordingError(f"{self.source.place}: has no {wanted!r}; {hint}.")
+            hint = nearest(wanted, names)
+            raise RecordingError(f"{self.source.place}: has no {wanted!r}; {hint}")
         advice = f"write it as TABLE:{reference}, or add `in: TABLE`"
         listed = ", ".join(names[:20])
         fault = f"{self.source.place}: {reference!r} is of no table"
@@ -105,22 +116,23 @@ class MappedReader:
             if given is None:
                 example = "as in `time: t`, `time: [s, ns]`, or `time: {rate: 50}` if there is none"
                 raise RecordingError(f"{table.place}: which column is the time? Say {example}.")
+            self.say(*table.notes)
             rows = given.values[:, 0].astype(np.intp)
             return Stamped(given.t, rows, given.clock, len(table.column(0)))
         raw, name = self._raw_stamps(table, time), table.place.rpartition("/")[2]
         known = np.flatnonzero(np.isfinite(raw))
         if len(known) < len(raw):
             self.say(f"{name}: {len(raw) - len(known)} rows without a stamp were left out.")
-        t, note = stamps.without_overflow(raw[known], name)
+        t, note = stamping.without_overflow(raw[known], name)
         self.say(note)
-        if (unit := stamps.likely_unit(t)) is not None and time.unit is None:
+        if (unit := likely_unit(t)) is not None and time.unit is None:
             usual = f"{np.median(np.diff(t)):.4g} apart, which can't be seconds"
             line = f"time: {{from: {time.columns[0]}, unit: {unit}}}"
             fault = f"{table.place}: the stamps {time.columns[0]!r} are {usual}"
             raise RecordingError(
                 f"{fault}; write `{line}` into the mapping (`unit: s` if they are)."
             )
-        t, order, note = stamps.in_order(t * UNITS[time.unit or "s"].factor, name)
+        t, order, note = stamping.in_order(t * UNITS[time.unit or "s"].factor, name)
         self.say(note)
         return Stamped(t, known[order], "", len(raw))
 
@@ -129,10 +141,10 @@ class MappedReader:
         which = self._same(table, first)
         if others:
             nanoseconds = numbers_of(table, self._same(table, others[0]))
-            return stamps.joined(numbers_of(table, which), nanoseconds)
+            return stamping.joined(numbers_of(table, which), nanoseconds)
         column = table.column(which)
         if column.dtype.kind in "US":
-            dates = _dates(column)
+            dates = dates_of(column)
             return numbers_of(table, which) if dates is None else dates
         return column.astype(np.float64)
 
@@ -176,10 +188,10 @@ class MappedReader:
 
     def _continued(self, name: str, value: Value, raw: Series) -> Series:
         """Continues a counter over its overflows; an absolute angle begins near zero."""
-        size = value.wrap or stamps.overflow(raw.values, (1.0,), stamps.BITS)
+        size = value.wrap or stamping.overflow(raw.values, (1.0,), stamping.BITS)
         if size is None:
             return raw
-        values, count = stamps.unwrapped(raw.values, size)
+        values, count = stamping.unwrapped(raw.values, size)
         if not value.counts:
             values = values - size * np.round(values[0] / size)
         if count:
@@ -201,6 +213,12 @@ class MappedReader:
             at = self.stamped(other, column, time if other is table else None)
             row = np.searchsorted(at.t, made.t, side="right") - 1
             on &= _equals(column, wanted)[at.rows][np.clip(row, 0, None)] & (row >= 0)
+        if not on.any():
+            wanted = " and ".join(f"{name} is {each!r}" for name, each in value.when.items())
+            fault = (
+                f"{table.place}: {value.from_!r} never counts: there is no row in which {wanted}"
+            )
+            raise RecordingError(f"{fault}; check `when:`.")
         return made._replace(values=np.where(on, made.values, value.otherwise))
 
 
@@ -217,14 +235,16 @@ def _table_name(wanted: str, names: Sequence[str]) -> str | None:
     return wanted if wanted in names else next(alike, None)
 
 
-def _dates(column: Column) -> Array | None:
+def dates_of(column: Column) -> Array | None:
     """Returns seconds since 1970 of dates like 2024-05-01 12:00:00.5; None if they are none."""
-    text = [str(each).removesuffix("Z").removesuffix("+00:00").replace("/", "-") for each in column]
+    text = [ZONE.sub("", str(each)).replace("/", "-") for each in column]
+    if CLOCK.match(text[0]):
+        text = [f"1970-01-01T{each}" for each in text]
     try:
         ns = np.array(text, dtype="datetime64[ns]").astype(np.int64)
     except ValueError:
         return None
-    return stamps.joined(ns // NS_PER_S, ns % NS_PER_S)  # exact to a quarter of a microsecond
+    return stamping.joined(ns // NS_PER_S, ns % NS_PER_S)  # exact to a quarter of a microsecond
 
 
 def _rate(raw: Series, held: bool) -> Series:

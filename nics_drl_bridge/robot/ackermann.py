@@ -1,21 +1,48 @@
 """A car: the rear axle drives, the front wheels steer; `base_link` is the middle of the rear axle.
 
-Commanded are the rear axle's speed [m/s] and the steering angle [rad] of a virtual middle wheel.
+Commanded are the rear axle's speed [m/s] and the steering angle [rad] of a virtual middle wheel; of
+`ackermann_throttle` shares of throttle and steering in [-1, 1]: the speed comes to `speed_gain`
+[m/s] times the throttle, the steering angle to `greatest_steering` [rad] times the share; drag, a
+dead zone and slip are for a recording to show.
 """
 
-from nics_drl_bridge.robot.drivetrain import steered, steering_angle
-from nics_drl_bridge.robot.kinds import Drawing, Pivot, RobotKind, Textbook, Wheel
+from nics_drl_bridge.geometry import Bicycle
+from nics_drl_bridge.robot.kinds import (
+    Drawing,
+    Pivot,
+    RobotKind,
+    Textbook,
+    Wheel,
+    steered,
+    steering_angle,
+)
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
-from nics_drl_bridge.robot.steering import Bicycle
-from nics_drl_bridge.robot.template import STEERED, STEERED_LAGS, Template, names_of
+from nics_drl_bridge.robot.template import (
+    SHARES,
+    STEERED,
+    STEERED_LAGS,
+    Template,
+    names_of,
+    usual,
+)
 
 LENGTHS = {"wheelbase": 1.3}
 TEMPLATE = Template((STEERED,), POSE_RATES, (), STEERED_LAGS, LENGTHS)
+THROTTLE = (usual("throttle", "1", SHARES), usual("steering", "1", SHARES))
+# The lag of the speed is that of rolling on, so that it is long.
+GAINS = {"speed_gain": 3.0, "greatest_steering": 0.4, "speed_lag": 0.5, "steering_lag": 0.1}
 
 
 def kinematics(spec: RobotSpec) -> Textbook:
     """Curvature tan(angle) / wheelbase."""
     return steered(spec, Bicycle(spec.parameters["wheelbase"]), names_of(STEERED))
+
+
+def by_throttle(spec: RobotSpec) -> Textbook:
+    """The same, of shares of the greatest speed and steering angle."""
+    p = spec.parameters
+    gain = p["speed_gain"], p["greatest_steering"]
+    return steered(spec, Bicycle(p["wheelbase"]), names_of(THROTTLE), gain)
 
 
 def track_and_radius(parameters: dict[str, float]) -> tuple[float, float]:
@@ -37,3 +64,8 @@ def drawing(spec: RobotSpec) -> Drawing:
 
 
 KIND = RobotKind(kinematics, drawing, TEMPLATE)
+VARIANTS = {
+    "ackermann_throttle": RobotKind(
+        by_throttle, drawing, Template((THROTTLE,), POSE_RATES, (), GAINS, LENGTHS)
+    ),
+}

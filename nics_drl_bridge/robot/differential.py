@@ -1,12 +1,12 @@
 """A robot with two driven wheels on one axle, left and right; `base_link` is the axle's middle.
 
-Its commands are the base's forward speed [m/s] and turn rate [rad/s].
+Its commands are the base's forward speed [m/s] and turn rate [rad/s]; of `differential_wheels` the
+speeds of both wheels [rad/s].
 """
 
 import numpy as np
 
-from nics_drl_bridge.robot.drivetrain import wheeled
-from nics_drl_bridge.robot.kinds import Drawing, RobotKind, Textbook, wheels_at
+from nics_drl_bridge.robot.kinds import Drawing, RobotKind, Textbook, wheeled, wheels_at
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.template import LAGS, TWIST, WHEELS, Template, names_of
 
@@ -31,3 +31,8 @@ def drawing(spec: RobotSpec) -> Drawing:
 
 
 KIND = RobotKind(kinematics, drawing, Template((TWIST,), MOVES, (), LAGS, LENGTHS))
+VARIANTS = {
+    "differential_wheels": RobotKind(
+        kinematics, drawing, Template((WHEELS,), (), (), LAGS, LENGTHS)
+    ),
+}

@@ -6,8 +6,7 @@ Its commands are the body twist: speeds forward and to the left [m/s], and the t
 
 import numpy as np
 
-from nics_drl_bridge.robot.drivetrain import wheeled
-from nics_drl_bridge.robot.kinds import Drawing, RobotKind, Textbook, wheels_at
+from nics_drl_bridge.robot.kinds import Drawing, RobotKind, Textbook, wheeled, wheels_at
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
 from nics_drl_bridge.robot.template import FOUR_WHEELS, LAGS, SIDEWAYS, TWIST, Template, names_of
 

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from nics_drl_bridge.robot.drivetrain import wheeled
-from nics_drl_bridge.robot.kinds import RobotKind, Textbook, disc
+from nics_drl_bridge.robot.kinds import RobotKind, Textbook, disc, wheeled
 from nics_drl_bridge.robot.spec import CMD_VEL_FIELDS, POSE_RATES, POSE_UNITS, RobotSpec
 from nics_drl_bridge.robot.template import LAGS, Template, usual
 

@@ -7,8 +7,7 @@ which its drive makes wheel speeds of a turn rate (Mandow et al. 2007).
 
 import numpy as np
 
-from nics_drl_bridge.robot.drivetrain import wheeled
-from nics_drl_bridge.robot.kinds import Drawing, RobotKind, Textbook, Wheel
+from nics_drl_bridge.robot.kinds import Drawing, RobotKind, Textbook, Wheel, wheeled
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
 from nics_drl_bridge.robot.template import LAGS, TWIST, WHEELS, Template, names_of
 

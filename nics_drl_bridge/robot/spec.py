@@ -1,7 +1,8 @@
 """RobotSpec: the single definition of a robot's state and command: order, units and limits.
 
 A module here that defines `KIND`, a `kinds.RobotKind`, adds a kind of its name for `textbook:` in
-YAML files. Other packages add kinds by entry points of the group `nics_drl_bridge.kinds`.
+YAML files; its `VARIANTS` are kinds of longer names. Other packages add kinds by entry points of
+the group `nics_drl_bridge.kinds`.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from pydantic import Field, field_validator, model_validator
 from nics_drl_bridge import extensions, geometry
 from nics_drl_bridge.config import Schema, find_config, parse_yaml, read_text, validate
 from nics_drl_bridge.errors import ConfigError, nearest
-from nics_drl_bridge.robot.steering import Bicycle
+from nics_drl_bridge.geometry import Bicycle
 from nics_drl_bridge.robot.template import Ranges
 
 CmdVelField = Literal["linear.x", "linear.y", "angular.z"]
@@ -42,7 +43,7 @@ FASTEST = 1e6  # Greatest absolute value of a variable, in its unit
 def kind_names() -> list[str]:
     """Names of all kinds of robots."""
     modules = (module.name for module in iter_modules([str(Path(__file__).parent)]))
-    own = (name for name in modules if _own_kind(name) is not None)
+    own = (name for module in modules for name in _own_kinds(module))
     return sorted({*own, *extensions.known("kinds")})
 
 
@@ -50,14 +51,16 @@ def find_kind(name: str) -> Any | None:
     """Returns a `kinds.RobotKind`; None if there is none of that name."""
     if name in extensions.known("kinds"):
         return extensions.load("kinds", name)
-    return _own_kind(name)
+    return (_own_kinds(name) or _own_kinds(name.rpartition("_")[0])).get(name)
 
 
-def _own_kind(name: str) -> Any | None:
-    place = f"{__package__}.{name}"
-    if not name.isidentifier() or find_spec(place) is None:
-        return None
-    return getattr(import_module(place), "KIND", None)
+def _own_kinds(module: str) -> dict[str, Any]:
+    place = f"{__package__}.{module}"
+    if not module.isidentifier() or find_spec(place) is None:
+        return {}
+    found = import_module(place)
+    kind = getattr(found, "KIND", None)
+    return {} if kind is None else {module: kind, **getattr(found, "VARIANTS", {})}
 
 
 class Variable(Schema):

@@ -61,6 +61,11 @@ class Template:
     parameters: Mapping[str, float] = field(default_factory=dict)
     lengths: Mapping[str, float] = field(default_factory=dict)  # in radii of the footprint
 
+    @property
+    def has_state(self) -> bool:
+        """True if the motion does not follow the commands at once."""
+        return bool(self.moves or self.state)
+
     def filled(self, given: Given, ranges: Ranges) -> dict[str, Any]:
         """Returns a robot's whole file; ConfigError if the names of its commands do not fit."""
         kind = given["kind"]

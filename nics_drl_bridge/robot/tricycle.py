@@ -3,10 +3,17 @@
 Its commands are the front wheel's speed along its own direction [m/s] and steering angle [rad].
 """
 
-from nics_drl_bridge.robot.drivetrain import steered, steering_angle
-from nics_drl_bridge.robot.kinds import Drawing, Pivot, RobotKind, Textbook, Wheel
+from nics_drl_bridge.geometry import Bicycle
+from nics_drl_bridge.robot.kinds import (
+    Drawing,
+    Pivot,
+    RobotKind,
+    Textbook,
+    Wheel,
+    steered,
+    steering_angle,
+)
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.robot.steering import Bicycle
 from nics_drl_bridge.robot.template import STEERED, STEERED_LAGS, STEERED_STATE, Template, names_of
 
 TEMPLATE = Template(

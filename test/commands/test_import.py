@@ -10,9 +10,8 @@ from command_line import nics
 from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.generator import load_model
 from nics_drl_bridge.recording import textbook
-from nics_drl_bridge.recording.mapping import Mapping
+from nics_drl_bridge.recording.mapping import UNITS, Mapping
 from nics_drl_bridge.recording.recording import load_recording
-from nics_drl_bridge.recording.units import UNITS
 from nics_drl_bridge.robot.spec import load_robot
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "recordings.md"

@@ -6,8 +6,8 @@ import pytest
 from gate.rig import TICK_S, Rig, config, driving
 from nics_drl_bridge.gate.inputs import Command, EStop, Odometry, Press, Reset, Scan, Tick
 from nics_drl_bridge.gate.stops import FROZEN_INPUTS
+from nics_drl_bridge.geometry import Bicycle
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.robot.steering import Bicycle
 
 EVERY_TOPIC = "scan odom estimate e_stop command"
 WITHIN_S = 0.40

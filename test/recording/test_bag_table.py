@@ -14,10 +14,10 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.recording.bag_file import opened
+from nics_drl_bridge.recording.guess import first_mapping
 from nics_drl_bridge.recording.mapping import Mapping
-from nics_drl_bridge.recording.readers import read_recording
-from nics_drl_bridge.recording.sources import open_source
-from nics_drl_bridge.recording.survey import first_mapping, survey
+from nics_drl_bridge.recording.readers import open_source, read_recording
+from nics_drl_bridge.recording.survey import survey
 from nics_drl_bridge.robot.spec import load_robot
 
 FOREIGN = "my_car_msgs/msg/Drive"
@@ -166,3 +166,22 @@ def test_a_bag_is_surveyed_to_a_first_mapping(tmp_path):
     assert [column.name for column in tables["/drive"].columns][-2:] == ["armed", "mode"]
     assert any("50 Hz" in line for line in tables["/pose"].regularity)
     assert guess["pose"] == "/pose"
+
+
+def test_a_bag_whose_headers_were_set_back_is_stamped_by_arrival_and_says_so(tmp_path):
+    store = bags.STORE
+    with Writer(tmp_path / "set", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        poses = writer.add_connection("/pose", bags.kinds.POSE, typestore=store)
+        speed = writer.add_connection("/speed", "std_msgs/msg/Float32", typestore=store)
+        for t in bags.times():
+            stamp = t - (30.0 if t > 1.0 else 0.0)
+            pose = bags.pose_stamped(stamp, *bags.place_at(t))
+            writer.write(poses, bags.ns(t), store.serialize_cdr(pose, bags.kinds.POSE))
+            value = store.types["std_msgs/msg/Float32"](t)
+            raw = store.serialize_cdr(value, "std_msgs/msg/Float32")
+            writer.write(speed, bags.ns(t), raw)
+    found = read(tmp_path / "set", command={"v": "/speed:data"})
+    assert np.allclose(np.diff(found.pose.t), np.diff(bags.times()))
+    assert any("stamped by their arrival" in note for note in found.repairs)
+    with pytest.raises(RecordingError, match="run backwards"):
+        read(tmp_path / "set", command={"v": "/speed:data"}, time="header")

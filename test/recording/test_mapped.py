@@ -186,7 +186,7 @@ def test_a_wrong_mapping_is_told_with_the_line_to_write(tmp_path, columns, chang
     [
         ("pose: {x: 1, y: 2, heading: 3}\ncommand: {v: {form: 1}}", "did you mean 'from'?"),
         ("pose: {x: 1, y: 2}\ncommand: {v: 1}", "pose needs either heading or quaternion"),
-        ("pose: {x: 1, y: 2, heading: 3, unit: deg}\ncommand: {v: 1}", "must be one of m, cm"),
+        ("pose: {x: 1, y: 2, heading: 3, unit: deg}\ncommand: {v: 1}", "must be one of m, dm, cm"),
         (
             "pose: {x: 1, y: 2, heading: 3}\ncommand: {v: {from: 1, unit: kmph}}",
             "did you mean 'mph'?",
@@ -235,3 +235,50 @@ def test_an_imported_drive_keeps_deviations_and_repairs(tmp_path, columns):
 
 
 MAPPED = {"robot": "ackermann", "pose": {"x": 0, "y": 1, "heading": 2}, "command": {"v": 3, "w": 4}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "columns", "sentence"),
+    [
+        ({}, {"yaw": lambda d: np.degrees(d["yaw"] + d["t"])}, "write `heading_unit: deg` into"),
+        ({}, {"t": lambda d: d["t"] * 0.0}, "all of its stamps are 0 s; choose another column"),
+        ({}, {"t": lambda d: d["t"] / 3600.0}, "lasts 0.00111 s; give the `unit:` of its `time:`"),
+        (
+            {"command": {"v": {"from": "v", "when": {"w": 7}}}}, {},
+            "'v' never counts: there is no row in which w is 7.0; check `when:`",
+        ),
+        (
+            {"pose": {"x": "x", "y": "y", "quaternion": ["w", "x", "y", "z"]}},
+            {
+                "w": lambda d: np.cos(d["t"]), "x": lambda d: 0.0 * d["t"],
+                "y": lambda d: 0.0 * d["t"], "z": lambda d: np.sin(d["t"]),
+            },
+            "the body is tilted by 46 deg; list its columns in the order x, y, z, w",
+        ),
+    ],
+)  # fmt: skip
+def test_what_only_a_wrong_mapping_explains_is_refused_with_the_line_to_write(
+    tmp_path, changes, columns, sentence
+):
+    made = drive()
+    made |= {name: of(drive()) for name, of in columns.items()}
+    path = write(tmp_path / "log.csv", made)
+    with pytest.raises(RecordingError) as refused:
+        read(path, **changes)
+    assert sentence in str(refused.value)
+
+
+@pytest.mark.parametrize("form", ["2024-05-01T12:00:{:09.6f}+02:00", "12:00:{:09.6f}"])
+def test_dates_with_a_zone_and_times_of_day_are_stamps(tmp_path, form):
+    columns = drive()
+    stamps = np.array([form.format(t) for t in columns["t"]])
+    found = read(write(tmp_path / "log.csv", columns | {"t": stamps}))
+    assert np.allclose(found.pose.t, columns["t"], atol=1e-6)
+
+
+def test_poses_far_from_the_origin_of_a_fast_car_are_read(tmp_path):
+    columns = drive()
+    moved = {"x": 60.0 * columns["x"] + 4e5, "y": 60.0 * columns["y"] + 5e6}
+    path = write(tmp_path / "log.csv", columns | moved)
+    found = read(path, robot={"kind": "ackermann_throttle", "footprint_radius": 2.0})
+    assert np.allclose(np.diff(found.pose.values[:, 0]), np.diff(moved["x"]), atol=1e-6)

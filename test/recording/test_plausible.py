@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nics_drl_bridge.recording.plausible import implausible_pose
+from nics_drl_bridge.recording.recording import implausible_pose
 
 T = np.arange(3000) * 0.02
 
@@ -31,6 +31,19 @@ def test_degrees_are_told(unwrapped):
     values = pose()
     values[:, 2] = np.degrees(values[:, 2] if unwrapped else wrapped(values[:, 2]))
     assert implausible_pose(T, values).line == "heading_unit: deg"
+
+
+@pytest.mark.parametrize("turn", [0.05, 0.3])
+def test_degrees_of_a_slow_turn_are_told_by_the_path(turn):
+    values = pose(turn=turn)
+    assert implausible_pose(T, values) is None
+    values[:, 2] = np.degrees(values[:, 2])
+    assert implausible_pose(T, values).line == "heading_unit: deg"
+
+
+def test_a_robot_that_spins_on_a_line_has_no_heading_in_degrees():
+    values = np.column_stack([np.sin(T), 0.2 * np.sin(T), 0.7 * T])
+    assert implausible_pose(T, values) is None
 
 
 @pytest.mark.parametrize(("factor", "line"), [(100.0, "unit: cm"), (1000.0, "unit: mm")])

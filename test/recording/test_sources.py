@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.recording.sources import open_source
+from nics_drl_bridge.recording.readers import open_source
 
 from .tables import drive, read
 

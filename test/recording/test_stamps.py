@@ -3,7 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nics_drl_bridge.recording import stamps
+from nics_drl_bridge.recording import stamping
+from nics_drl_bridge.recording.recording import likely_unit
 
 T = 100.0 + np.arange(300) * 0.02
 
@@ -12,7 +13,7 @@ T = 100.0 + np.arange(300) * 0.02
 def test_a_clock_that_overflows_is_continued(size):
     step = size * 1e-4
     wrapped = (0.99 * size + np.arange(300) * step) % size
-    made, note = stamps.without_overflow(wrapped, "log")
+    made, note = stamping.without_overflow(wrapped, "log")
     assert np.allclose(np.diff(made), step)
     assert "overflowed at" in note
     assert "once" in note
@@ -20,35 +21,58 @@ def test_a_clock_that_overflows_is_continued(size):
 
 def test_a_clock_that_is_set_back_by_any_time_is_no_overflow():
     t = np.concatenate([T[:150], T[150:] - 3.0])
-    assert stamps.without_overflow(t, "log") == (pytest.approx(t), "")
+    assert stamping.without_overflow(t, "log") == (pytest.approx(t), "")
 
 
 def test_few_late_rows_are_sorted():
     order = np.arange(300)
     order[[100, 102]] = order[[102, 100]]
-    t, rows, note = stamps.in_order(T[order], "log")
+    t, rows, note = stamping.in_order(T[order], "log")
     assert np.array_equal(t, T)
     assert np.array_equal(rows, order)
     assert "2 of 300 rows came after later ones" in note
 
 
 def test_parts_after_a_clock_was_set_back_are_joined():
-    t, rows, note = stamps.in_order(np.concatenate([T[:100], T[:200] - 99.0]), "log")
+    t, rows, note = stamping.in_order(np.concatenate([T[:100], T[:200] - 99.0]), "log")
     assert np.allclose(np.diff(t), 0.02)
     assert np.array_equal(rows, np.arange(300))
     assert "set back once (row 100, by 101 s)" in note
 
 
+@pytest.mark.parametrize(("row", "value"), [(150, 0.0), (150, 1e9), (0, 1e9)])
+def test_a_stamp_that_fits_none_beside_it_is_left_out(row, value):
+    t = T.copy()
+    t[row] = value
+    made, rows, note = stamping.in_order(t, "log")
+    assert np.array_equal(made, np.delete(T, row))
+    assert row not in rows
+    assert f"1 stamps fit none beside them (row {row}: {value:.10g} s)" in note
+
+
+def test_rows_that_begin_with_the_last_are_turned_round():
+    t, rows, note = stamping.in_order(T[::-1], "log")
+    assert np.array_equal(t, T)
+    assert rows[0] == 299
+    assert "turned round" in note
+
+
+def test_a_clock_that_was_set_ahead_by_years_goes_on():
+    t, _, note = stamping.in_order(np.append(T[:100], T[100:] + 1.7e9), "log")
+    assert np.allclose(np.diff(t), 0.02, atol=1e-6)
+    assert "set ahead once (row 100, by 1.7e+09 s)" in note
+
+
 def test_rows_that_repeat_stamp_and_values_are_left_out():
     t, values = np.array([0.0, 0.0, 0.0, 1.0]), np.array([[1.0], [1.0], [2.0], [2.0]])
-    keep, note = stamps.not_repeated(t, values, "pose")
+    keep, note = stamping.not_repeated(t, values, "pose")
     assert keep.tolist() == [True, False, True, True]
     assert "1 of 4 rows repeat" in note
 
 
 @pytest.mark.parametrize(("step", "unit"), [(0.02, None), (20.0, "ms"), (2e4, "us"), (2e7, "ns")])
 def test_the_unit_of_stamps_that_are_no_seconds_is_named(step, unit):
-    assert stamps.likely_unit(np.arange(50) * step) == unit
+    assert likely_unit(np.arange(50) * step) == unit
 
 
 @pytest.mark.parametrize(("bits", "low"), [(16, 0.0), (32, 0.0), (16, -(2.0**15))])
@@ -56,13 +80,13 @@ def test_a_counter_that_overflows_is_continued(bits, low):
     size, steps = 2.0**bits, np.tile([5.0, 9.0, 0.0, -3.0], 500) * 2.0 ** (bits - 12)
     raw = np.cumsum(steps)
     wrapped = (raw - low) % size + low
-    found = stamps.overflow(wrapped, (1.0,), stamps.BITS)
+    found = stamping.overflow(wrapped, (1.0,), stamping.BITS)
     assert found == size
-    made, count = stamps.unwrapped(wrapped, found)
+    made, count = stamping.unwrapped(wrapped, found)
     assert np.allclose(np.diff(made), steps[1:])
     assert count > 0
 
 
 def test_a_counter_that_was_reset_has_no_overflow():
     raw = np.concatenate([np.arange(0, 30_000, 100), np.arange(0, 9000, 100)])
-    assert stamps.overflow(raw.astype(float), (1.0,), stamps.BITS) is None
+    assert stamping.overflow(raw.astype(float), (1.0,), stamping.BITS) is None

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.config import parse_yaml
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.recording.guess import first_mapping
 from nics_drl_bridge.recording.mapping import Mapping
-from nics_drl_bridge.recording.readers import read_recording
-from nics_drl_bridge.recording.sources import open_source
-from nics_drl_bridge.recording.survey import first_mapping, survey, words_of
+from nics_drl_bridge.recording.readers import open_source, read_recording
+from nics_drl_bridge.recording.survey import survey, words_of
 
 from .tables import drive, write
 
@@ -51,11 +52,13 @@ def test_units_that_can_only_be_others_are_guessed(tmp_path):
     columns = drive()
     wavy = {"pose.x": 3e3 * np.sin(columns["t"] * 3.0), "pose.y": columns["y"] * 1e3}
     wavy["pose.theta"] = np.degrees(columns["yaw"] * 40.0)
+    wheel = {"unit": "ticks", "ticks_per_turn": 128}
     ticks = {"Left_Tick": np.arange(200), "Right_Tick": np.arange(200) * 2}
     _, guess = surveyed(write(tmp_path / "log.csv", {"time": columns["t"] * 1e3} | wavy | ticks))
     assert guess["time"] == {"from": "time", "unit": "ms"}
     assert guess["pose"]["heading_unit"] == "deg"
-    assert guess["command"]["left_wheel"] == {"from": "Left_Tick", "unit": "ticks"}
+    assert guess["command"]["left_wheel"] == wheel | {"from": "Left_Tick"}
+    assert guess["command"]["right_wheel"] == wheel | {"from": "Right_Tick"}
 
 
 def test_gaps_backward_stamps_and_repeated_rows_are_listed(tmp_path):
@@ -81,3 +84,58 @@ def test_gaps_backward_stamps_and_repeated_rows_are_listed(tmp_path):
 )
 def test_names_are_split_into_words(name, words):
     assert words_of(name) == words
+
+
+SAID = {"x": "utm_easting", "y": "utm_northing", "yaw": "tracker_heading_deg"}
+MEASURES = {"v": "cmd speed [km/h]", "w": "cmd_steer_angle", "t": "stamp"}
+
+
+def test_units_and_places_are_understood_from_names(tmp_path):
+    columns = drive()
+    columns |= {"x": 4e5 + columns["x"], "yaw": np.degrees(columns["yaw"]), "v": columns["w"] * 3.6}
+    names = SAID | MEASURES
+    path = write(tmp_path / "log.csv", {names[name]: column for name, column in columns.items()})
+    _, guess = surveyed(path)
+    assert guess["pose"]["heading_unit"] == "deg"
+    found = read_recording(path, mapping=Mapping.model_validate(guess))
+    assert np.allclose(found.pose.values[:, 2], drive()["yaw"])
+    assert np.allclose(found.command.values[:, 0], columns["w"])
+
+
+def test_columns_without_names_are_a_pose_if_they_lead_along_their_heading(tmp_path):
+    columns = drive(1500) | {"v": np.sin(np.arange(1500) * 0.05)}
+    path = write(tmp_path / "log.csv", columns, header=False)
+    _, guess = surveyed(path)
+    assert guess["time"] == 0
+    assert guess["pose"] == {"x": 1, "y": 2, "heading": 3}
+    assert guess["command"] == {"command_0": 4, "command_1": 5}
+
+
+@pytest.mark.parametrize(
+    ("names", "kind"),
+    [
+        (("fl", "fr", "rl", "rr"), "mecanum"),
+        (("vx_cmd", "vy_cmd", "wz_cmd"), "omnidirectional"),
+        (("left_rpm", "right_rpm"), "differential_wheels"),
+        (("cmd_vel.linear.x", "cmd_vel.angular.z"), "differential"),
+        (("pump", "valve"), "free"),
+    ],
+)
+def test_the_kind_of_robot_is_guessed_by_its_commands(tmp_path, names, kind):
+    columns = drive()
+    columns |= {name: np.sin(columns["t"] * (k + 3)) for k, name in enumerate(names)}
+    del columns["v"], columns["w"]
+    path = write(tmp_path / "log.csv", columns)
+    _, guess = surveyed(path)
+    assert guess["robot"]["kind"] == kind
+    found = read_recording(path, mapping=Mapping.model_validate(guess))
+    assert found.command.values.shape == (200, len(names))
+
+
+def test_a_source_without_a_readable_table_is_refused(tmp_path):
+    (tmp_path / "log.csv").write_bytes(b"\0\1\2")
+    with pytest.raises(RecordingError, match="is not text"):
+        surveyed(tmp_path)
+    write(tmp_path / "good.csv", drive())
+    tables, _ = surveyed(tmp_path)
+    assert "is not text" in tables[1].findings[0]

@@ -111,7 +111,7 @@ def test_the_command_for_a_twist_leads_to_it(kind):
 @pytest.mark.parametrize("kind", KNOWN)
 def test_a_robot_known_by_its_twist_comes_to_that_of_its_actuators(kind):
     robot = made(kind)
-    command, start = 0.6 * robot.command_high, np.zeros(len(robot.state))
+    command, start = 0.6 * robot.command_high, np.zeros(len(textbook(robot).lag))
     _, state = integrate(textbook(robot), np.zeros(3), start, command, 5.0)
     assert textbook(robot).twist(state) == pytest.approx(steady_twist(robot, command), abs=1e-3)
 

@@ -9,7 +9,8 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot.kinds import find_kind, kind_names, textbook
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot, robot_from
 
-SLIPPING = ("ackermann_throttle", "free", "mecanum", "omnidirectional", "skid_steer")
+WHEELED = "differential_wheels"
+SLIPPING = ("ackermann", "ackermann_throttle", "free", "mecanum", "omnidirectional", "skid_steer")
 
 
 WIDE = {"kind": "mecanum", "footprint_radius": 0.3}
@@ -30,24 +31,23 @@ def test_two_words_are_a_whole_robot_of_every_kind(kind):
     robot = made(kind)
     assert robot.name == robot.textbook == kind
     assert RobotSpec.model_validate(robot.model_dump(mode="json")) == robot
-    if find_kind(kind).kinematics is not None:
+    if find_kind(kind).kinematics is not None and robot.state:
         assert len(textbook(robot).lag) == len(robot.state)
 
 
 @pytest.mark.parametrize("kind", kind_names())
-def test_its_state_is_its_twist_unless_it_follows_speed_and_steering(kind):
+def test_its_state_is_its_twist_unless_it_follows_commands_or_wheels_are_the_motion(kind):
     robot = made(kind)
-    if robot.steers:
-        followed = [v.follows for v in robot.state]
-        assert followed == [c.name for c in robot.command]
+    if kind == "tricycle":
+        assert [v.follows for v in robot.state] == [c.name for c in robot.command]
     else:
         dofs = ("vx", "vy", "wz") if kind in SLIPPING else ("vx", "wz")
-        assert tuple(v.twist for v in robot.state) == dofs
+        assert tuple(v.twist for v in robot.state) == (() if kind == WHEELED else dofs)
 
 
 def test_a_state_that_is_called_as_a_command_gets_another_name():
     assert [v.name for v in made("omnidirectional").state] == ["body_vx", "body_vy", "body_wz"]
-    car = made("ackermann", {"speed": (0.0, 3.0), "steering": (-0.4, 0.4)})
+    car = made("tricycle", {"speed": (0.0, 3.0), "steering": (-0.4, 0.4)})
     assert [(v.name, v.follows) for v in car.state] == [
         ("actual_speed", "speed"), ("actual_steering", "steering")
     ]  # fmt: skip
@@ -55,7 +55,7 @@ def test_a_state_that_is_called_as_a_command_gets_another_name():
 
 def test_a_state_reaches_twice_as_far_as_its_commands_where_they_tell():
     wheels = {"left_wheel": (0.0, 90.0), "right_wheel": (0.0, 90.0)}
-    assert [v.max for v in made("differential_wheels", wheels).state] == [10.0, 10.0]
+    assert [v.max for v in made("skid_steer", wheels).state] == [10.0, 10.0, 10.0]
     fast = made("skid_steer", {"forward": (-1.0, 20.0), "turn": (-0.4, 0.3)})
     assert [v.max for v in fast.state] == [40.0, 40.0, 0.8]
 
@@ -78,7 +78,7 @@ def test_commands_stand_in_the_order_of_the_recording():
 
 
 def test_names_of_the_users_own_stand_in_the_usual_order():
-    robot = made("ackermann", {"v": (-1.0, 5.0)}, command=[{"name": "v"}, {"name": "delta"}])
+    robot = made("tricycle", {"v": (-1.0, 5.0)}, command=[{"name": "v"}, {"name": "delta"}])
     assert commands(robot) == [("v", "m/s", -1.0, 5.0), ("delta", "rad", -0.5, 0.5)]
     assert [c.cmd_vel for c in robot.command] == ["linear.x", "angular.z"]
     assert [(v.name, v.follows, v.max) for v in robot.state] == [

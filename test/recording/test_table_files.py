@@ -5,7 +5,7 @@ import pytest
 
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.recording.table import numbers_of
-from nics_drl_bridge.recording.text_table import read_text_table
+from nics_drl_bridge.recording.table_files import read_text_table
 
 NUMBERS = [(0.0, 1.5, -2.0), (0.1, 1.6, -2.5), (0.2, 1.7, -3.0)]
 
@@ -81,7 +81,7 @@ def test_a_row_that_was_cut_short_is_left_out_and_told(tmp_path):
         ("t,x\n" + "0,1\n" * 9 + "0\n1,2,3\n", "line 11 has 1 fields where most lines have 2"),
         ("speed,angle\nfast,left\n", "holds no row of numbers"),
         ("0,1\n" + "2" * 30_000, "line 2 has 30000 characters"),
-        ("0,1\0\n", "is not text of 8 bits"),
+        ("0,1\0\n", "is not text"),
     ],
 )
 def test_what_is_no_table_is_refused(tmp_path, text, sentence):
@@ -104,3 +104,30 @@ def test_a_column_that_is_not_there_is_named(tmp_path, which, sentence):
     with pytest.raises(RecordingError) as refused:
         numbers_of(found, which)
     assert sentence in str(refused.value)
+
+
+@pytest.mark.parametrize("separator", ["~", ":", "&"])
+def test_an_odd_separator_is_found_if_no_usual_one_fits(tmp_path, separator):
+    found = table(tmp_path, "t x y\n0 1.5 2\n1 2.5 3\n".replace(" ", separator))
+    assert found.names == ("t", "x", "y")
+    assert numbers_of(found, "x").tolist() == [1.5, 2.5]
+
+
+def test_the_names_stand_above_a_row_of_units(tmp_path):
+    found = table(tmp_path, "Log of 2024-05-01, robot 3\nt,x,y\ns,m,m\n0,1,2\n1,2,3\n")
+    assert found.names == ("t", "x", "y")
+
+
+def test_numbers_with_decimal_commas_may_be_quoted(tmp_path):
+    found = table(tmp_path, 't,x\n"0,5","1,25"\n"0,6","1,75"\n')
+    assert numbers_of(found, "x").tolist() == [1.25, 1.75]
+
+
+@pytest.mark.parametrize("word", ["NA", "null", "None", "-", "nan", ""])
+def test_words_for_a_missing_value_are_none(tmp_path, word):
+    assert np.isnan(numbers_of(table(tmp_path, f"t,x\n0,{word}\n1,2\n"), "x")[0])
+
+
+def test_excel_in_utf_16_and_comments_of_matlab_are_read(tmp_path):
+    assert table(tmp_path, "t\tx\n0\t1\n", encoding="utf-16").names == ("t", "x")
+    assert table(tmp_path, "% t, x\n0,1\n1,2\n").names == ("t", "x")

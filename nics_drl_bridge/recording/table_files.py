@@ -1,36 +1,43 @@
-"""Reads tables of text: any separator, with header or without, and what loggers leave in them."""
+"""Tables of files: text with any separator and what loggers leave in it, numpy's, Parquet."""
 
 from __future__ import annotations
 
 import csv
 import re
 from collections import Counter
-from collections.abc import Sequence
-from itertools import zip_longest
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.recording.table import Column, Columns
+from nics_drl_bridge.recording.table import Column, Source, Table, flattened, table_of
 
+TEXTS = (".csv", ".tsv", ".txt", ".dat", ".tum", ".log", ".data", ".asc")
+MOST_FILES = 500  # of a folder
 SEPARATORS = (",", ";", "\t", "|", None)  # None: any white space
+NO_SEPARATOR = re.compile(r"[\w\s.,;|+\"'#-]")
 MOST_BYTES = 256 * 2**20
 MOST_ROWS, LONGEST_ROW = 2_000_000, 20_000  # longest in characters
 TRIED = 400  # lines from which separator and header are found
 MOST_BROKEN = 0.01  # share of rows with another number of fields that are left out
-COMMENTS = ("#", "//")
+COMMENTS = ("#", "//", "%")
+UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 TUM = ("timestamp", "tx", "ty", "tz", "qx", "qy", "qz", "qw")
 TUM_SUFFIX = ".tum"
-DATE = re.compile(r"\d{4}[-/]\d\d[-/]\d\d")
-TRUTH = {"true": "1", "false": "0", "": "nan"}
+DATE = re.compile(r"(\d{4}[-/]\d\d[-/]\d\d|\d\d:\d\d:\d\d)")
+MISSING = ("", "na", "n/a", "null", "none", "-", "--", "#n/a")
+WORDS = {"true": "1", "false": "0", **dict.fromkeys(MISSING, "nan")}
 
 Row = tuple[int, list[str]]
 """Line of the file, from 1, and fields."""
 
 
-def read_text_table(path: Path) -> Columns:
+def read_text_table(path: Path) -> Table:
     """Reads a table; RecordingError names the file, the line and the fix."""
     lines, comments = _lines(path)
     separator = _separator([text for _, text in lines[:TRIED]])
@@ -39,20 +46,19 @@ def read_text_table(path: Path) -> Columns:
     above = [row for _, row in rows[:first]]
     rows, notes = _of_one_width(path, rows[first:], above, width)
     columns = [list(column) for column in zip(*(row for _, row in rows), strict=True)]
-    head = _header(above, width)
+    # The last title that has most names: one of units, below it, repeats some.
+    titles = [row for row in above if len(row) > 1 or width == 1]
+    head = max(reversed(titles), key=lambda row: len(set(row)), default=None)
     if head is None and comments and len(last := _split(comments[-1], separator)) == width:
         head = last
     if head is None and width == len(TUM) and (separator is None or path.suffix == TUM_SUFFIX):
         head = list(TUM) if _is_tum(columns) else None
     if head is None and (named := _labelled(columns)):
         columns, head = named
-    if separator != ",":
-        columns = [_with_points(column) for column in columns]
-    names = tuple(name for name, _ in zip_longest(head or (), columns, fillvalue=""))[
-        : len(columns)
-    ]
+    columns = [_with_points(column) for column in columns]
+    names = tuple([*(head or ()), *[""] * len(columns)][: len(columns)])
     at = np.array([line for line, _ in rows], dtype=np.intp)
-    return Columns(str(path), names, tuple(map(_typed, columns)), at, tuple(notes))
+    return table_of(str(path), names, tuple(map(_typed, columns)), at, tuple(notes))
 
 
 def _lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
@@ -65,12 +71,12 @@ def _lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
         data = path.read_bytes()
     except OSError as error:
         raise RecordingError(f"{path}: can't be read ({error.strerror}).") from None
-    if b"\0" in data:
-        raise RecordingError(f"{path}: is not text of 8 bits; save it as CSV in UTF-8.")
     try:
-        text = data.decode("utf-8-sig")
+        text = data.decode("utf-16" if data[:2] in UTF_16 else "utf-8-sig")
     except UnicodeDecodeError:
         text = data.decode("latin-1")  # as written by old tools: a degree sign in a header
+    if "\0" in text:
+        raise RecordingError(f"{path}: is not text; save it as CSV in UTF-8.")
     lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip()]
     if len(lines) > MOST_ROWS:
         raise RecordingError(f"{path}: has {len(lines)} rows; cut it to at most {MOST_ROWS}.")
@@ -78,7 +84,7 @@ def _lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
         if len(line) > LONGEST_ROW:
             fault = f"line {k} has {len(line)} characters, which no row has"
             raise RecordingError(f"{path}: {fault}; remove it.")
-    comments = [line.lstrip("#/ ") for _, line in lines if line.lstrip().startswith(COMMENTS)]
+    comments = [line.lstrip("#/% ") for _, line in lines if line.lstrip().startswith(COMMENTS)]
     return [each for each in lines if not each[1].lstrip().startswith(COMMENTS)], comments
 
 
@@ -99,10 +105,9 @@ def _is_number(text: str) -> bool:
     return True
 
 
-def _is_value(text: str, comma: bool) -> bool:
-    """True for numbers, with decimal commas if `comma`, flags and dates."""
-    number = _is_number(text.replace(",", ".") if comma else text)
-    return number or text.lower() in TRUTH or DATE.match(text) is not None
+def _is_value(text: str) -> bool:
+    """True for numbers, with decimal commas too, flags and dates."""
+    return _is_number(text.replace(",", ".")) or text.lower() in WORDS or bool(DATE.match(text))
 
 
 def _separator(lines: Sequence[str]) -> str | None:
@@ -110,9 +115,11 @@ def _separator(lines: Sequence[str]) -> str | None:
 
     def score(separator: str | None) -> int:
         fields = [field for line in lines for field in _split(line, separator) if field]
-        return sum(1 if _is_value(field, separator != ",") else -1 for field in fields)
+        return sum(1 if _is_value(field) else -1 for field in fields)
 
-    return max(SEPARATORS, key=score)
+    best = max(SEPARATORS, key=score)
+    others = sorted(set(NO_SEPARATOR.sub("", "".join(lines))))
+    return best if score(best) > 0 or not others else max(others, key=score)
 
 
 def _first_row(path: Path, rows: Sequence[Row]) -> tuple[int, int]:
@@ -120,7 +127,7 @@ def _first_row(path: Path, rows: Sequence[Row]) -> tuple[int, int]:
 
     def numeric(row: Sequence[str]) -> bool:
         full = [field for field in row if field]
-        return 2 * sum(_is_value(field, comma=True) for field in full) > len(full)
+        return 2 * sum(map(_is_value, full)) > len(full)
 
     widths = Counter(len(row) for _, row in rows if numeric(row))
     if not widths:
@@ -154,14 +161,6 @@ def _of_one_width(
     return whole, notes
 
 
-def _header(above: Sequence[list[str]], width: int) -> list[str] | None:
-    """Returns the last line above the numbers that looks like names of columns."""
-    for row in reversed(above):
-        if len(row) > 1 or (width == 1 and row):
-            return row
-    return None
-
-
 def _is_tum(columns: Sequence[Sequence[str]]) -> bool:
     """True for stamps that rise, and unit quaternions at the end."""
     try:
@@ -188,23 +187,78 @@ def _labelled(columns: Sequence[list[str]]) -> tuple[list[list[str]], list[str]]
         for name, some in found.items()
         for k in range(len(some))
     ]
-    return [column for some in found.values() for column in some], names
+    return list(chain.from_iterable(found.values())), names
 
 
 def _with_points(column: list[str]) -> list[str]:
     """Writes decimal commas as points."""
+    if not any("," in field for field in column):
+        return column
     changed = [field.replace(",", ".") for field in column]
-    commas = any("," in field for field in column)
-    return changed if commas and all(_is_number(field or "0") for field in changed) else column
+    return changed if all(map(_is_value, changed)) else column
 
 
 def _typed(column: Sequence[str]) -> Column:
     """Returns numbers if all fields are, of true and false too, and else text."""
+    for words in ({}, WORDS):
+        try:
+            return np.array([words.get(f.lower(), f) for f in column], dtype=np.float64)
+        except ValueError:
+            continue
+    return np.array(column, dtype=np.str_)
+
+
+def read_arrays(path: Path) -> Table:
+    """Reads an .npz or .npy file, of records too; RecordingError if it holds objects or damage."""
     try:
-        return np.array(column, dtype=np.float64)
-    except ValueError:
-        pass
+        with no_device(path).open("rb") as file:
+            loaded = np.load(file, allow_pickle=False)
+            arrays = {"": loaded} if isinstance(loaded, np.ndarray) else dict(loaded)
+    except Exception as error:  # noqa: BLE001 - damage breaks numpy in any way
+        advice = "write numbers with numpy.save or numpy.savez, without pickle"
+        why = " ".join(str(error).split())[:200]
+        raise RecordingError(f"{path}: can't be read ({why}); {advice}.") from None
+    columns = list(flattened(arrays))
+    if not columns:
+        raise RecordingError(f"{path}: holds no columns; give arrays of one value or more a row.")
+    return table_of(str(path), tuple(name for name, _ in columns), tuple(c for _, c in columns))
+
+
+def read_parquet(path: Path) -> Table:
+    """Reads a Parquet file; RecordingError if it is damaged, or pyarrow is missing."""
+    if find_spec("pyarrow") is None:
+        raise RecordingError(f"{path}: Parquet needs the library pyarrow; pip install pyarrow.")
+    parquet = import_module("pyarrow.parquet")
     try:
-        return np.array([TRUTH.get(field.lower(), field) for field in column], dtype=np.float64)
-    except ValueError:
-        return np.array(column, dtype=np.str_)
+        table = parquet.read_table(no_device(path))
+        columns = [table.column(k).to_numpy() for k in range(table.num_columns)]
+    except Exception as error:  # noqa: BLE001 - damage breaks the reader in any way
+        why = " ".join(str(error).split())[:200]
+        raise RecordingError(f"{path}: can't be read as Parquet ({why}).") from None
+    stamps = [c.astype("datetime64[ns]").astype(str) if c.dtype.kind == "M" else c for c in columns]
+    texts = [c.astype(np.str_) if c.dtype.kind == "O" else c for c in stamps]
+    return table_of(str(path), tuple(table.column_names), tuple(texts))
+
+
+READERS: dict[str, Callable[[Path], Table]] = {
+    ".npz": read_arrays, ".npy": read_arrays, ".parquet": read_parquet, ".pq": read_parquet,
+}  # fmt: skip
+
+
+class Files(Source):
+    """A file, or the files of a folder; RecordingError if it holds none of a known format."""
+
+    def __init__(self, path: Path) -> None:
+        known = (*TEXTS, *READERS)
+        inside = [path] if path.is_file() else sorted(path.rglob("*"))
+        some = [file for file in inside if file.suffix.lower() in known or file == path]
+        if not some:
+            raise RecordingError(f"{path}: holds no file of a known format ({', '.join(known)}).")
+        root = path.parent if path.is_file() else path
+        self._files = {file.relative_to(root).as_posix(): file for file in some[:MOST_FILES]}
+        super().__init__(str(path), tuple(self._files))
+
+    def read(self, name: str) -> Table:
+        """Reads a file."""
+        file = self._files[name]
+        return READERS.get(file.suffix.lower(), read_text_table)(file)
