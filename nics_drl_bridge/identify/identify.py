@@ -25,16 +25,23 @@ from nics_drl_bridge.identify.fit import (
     regress,
 )  # fmt: skip
 from nics_drl_bridge.identify.inputs import curve_of
+from nics_drl_bridge.identify.judgement import judged, shortfall
 from nics_drl_bridge.identify.mounting import Mounting, mounted, mounting_of
 from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
-from nics_drl_bridge.identify.open_loop import SPACING_S, OpenLoop, predict, windows
-from nics_drl_bridge.identify.refine import refined
+from nics_drl_bridge.identify.open_loop import (
+    SPACING_S,
+    OpenLoop,
+    open_loop_error,
+    predict,
+    windows,
+)  # fmt: skip
+from nics_drl_bridge.identify.refine import readjusted, refined
 from nics_drl_bridge.identify.repair import check_axes, check_units, repaired
 from nics_drl_bridge.identify.signals import speed_index
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream, check
 from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.robot.taylor import TaylorModel
+from nics_drl_bridge.robot.taylor import HorizonErrors, TaylorModel
 from nics_drl_bridge.threads import one_blas_thread
 
 T = TypeVar("T")
@@ -67,11 +74,9 @@ class Findings:
     assumptions: tuple[str, ...] = ()  # sentences of `complete`
     unseen: Samples | None = None  # of the part that the fit did not see, of `judge`
     held_out: OpenLoop | None = None  # open-loop errors on that part, of `judge`
-    # of `judge`: radius of the 95 % band of predicted positions [m], and share of the held-out
-    # ends within it, by horizon [s]; empty if the drive is too short
-    bands: dict[float, float] = field(default_factory=dict)
-    coverage: dict[float, float] = field(default_factory=dict)
+    judgement: tuple[HorizonErrors, ...] = ()  # on that part, beside yardsticks, of `judge`
     notes: tuple[str, ...] = ()  # all sentences, of `judge`
+    refit: "Findings | None" = None  # on all data, of `refit`; None if the trial's model is kept
 
 
 Stage = Callable[[Drive, Findings], Findings]
@@ -211,8 +216,9 @@ def _trials(drive: Drive, findings: Findings) -> list[motions.Trial]:
 
 def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:
     """Fits the order that predicts parts of the training part best that its fits did not see."""
-    trials = _trials(drive, findings)
-    if findings.calibration.inputs:
+    again = bool(findings.trials)  # then order and curves are chosen
+    trials = list(findings.trials) or _trials(drive, findings)
+    if findings.calibration.inputs and not again:
         plain = replace(findings, calibration=replace(findings.calibration, inputs=()))
         without = _trials(drive, plain)
         if without and motions.chosen(without).error <= motions.chosen(trials).error:
@@ -302,76 +308,110 @@ def judge(drive: Drive, findings: Findings) -> Findings:
     begin = whole.recording.pose.t[0] + calibration.clock_offset_s + drive.settings.train_until_s
     rest = samples.rows(samples.t > begin)
     unseen = rest if len(rest.t) >= verdict.MIN_ROWS else None
-    held_out, trial = verdict.tried(model, calibration, whole)
-    bands = bands_of(drive, findings)
-    calibration = replace(calibration, notes=_sentences(findings))
-    judged = verdict.with_quality(model, linear, unseen, held_out, spec)
-    return replace(
+    held_out = verdict.tried(model, calibration, whole)
+    bands = {} if calibration.is_exact else bands_of(drive, findings)
+    judgement = judged(model, calibration, whole, bands)
+    rated = verdict.with_quality(model, linear, unseen, held_out, judgement, spec)
+    findings = replace(
         findings,
-        calibration=calibration,
+        calibration=replace(calibration, notes=_sentences(findings)),
         noise=motion_noise(findings.noise, whole, calibration, model, samples),
-        linear=replace(linear, model=judged) if model is linear.model else linear,
-        model=judged,
+        linear=replace(linear, model=rated) if model is linear.model else linear,
+        model=rated,
         unseen=unseen,
         held_out=held_out,
-        bands=bands,
-        coverage=coverage_of(whole, calibration, model, bands),
-        notes=(
-            *findings.repairs,
-            *calibration.notes,
-            *findings.refinement,
-            *verdict.mirror_note(known(findings.samples, "the training part", "fit"), spec),
-            *verdict.unlearnt(linear, calibration, spec),
-            *verdict.doubts(linear, held_out, calibration.is_exact),
-            *trial,
-            *findings.assumptions,
-        ),
+        judgement=judgement,
+    )
+    return replace(findings, notes=_notes(drive, findings))
+
+
+def _notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
+    """All that is to be told of a model, the gravest first."""
+    linear, _ = _fitted(findings)
+    spec, calibration = drive.spec, findings.calibration
+    return (
+        *shortfall(findings.judgement),
+        *drive.recording.repairs,
+        *findings.repairs,
+        *calibration.notes,
+        *findings.refinement,
+        *verdict.mirror_note(known(findings.samples, "the training part", "fit"), spec),
+        *verdict.unlearnt(linear, calibration, spec),
+        *verdict.doubts(linear, findings.held_out, calibration.is_exact),
+        *verdict.untried(drive, findings.held_out),
+        *findings.assumptions,
     )
 
 
 def bands_of(drive: Drive, findings: Findings) -> dict[float, float]:
     """Returns the distances within which 95 % of predictions end that a fit did not see [m]."""
     trials = findings.trials
-    errors = motions.chosen(list(trials)).errors if trials else _left_out(drive, findings)
+    errors = motions.chosen(list(trials)).errors if trials else _left_out(findings)
     told = ((h, each) for h, each in errors.items() if len(each) >= verdict.MIN_ROWS)
     return {h: float(np.percentile(each, WITHIN)) for h, each in told}
 
 
-def _left_out(drive: Drive, findings: Findings) -> dict[float, Array]:
+def _left_out(findings: Findings) -> dict[float, Array]:
     """Returns errors (W,) by horizon [s] on parts of the training part, by models of the rest."""
-    training, stages = findings.training, STAGES[: STAGES.index(complete)]
-    pose = training.recording.pose
+    training, pose = findings.training, findings.training.recording.pose
+    calibration, (_, model) = findings.calibration, _fitted(findings)
     errors: dict[float, list[Array]] = {h: [] for h in motions.BANDS_S}
     for block in np.array_split(np.arange(len(pose.t)), motions.FOLDS):
         others = np.ones(len(pose.t), dtype=np.bool_)
         others[block] = False
         rest = training.part(replace(training.recording, pose=pose.rows(others)))
-        try:
-            settings = replace(drive.settings, train_until_s=np.inf)
-            found = run(stages, replace(rest, settings=settings))
-        except (FitError, RecordingError):
-            return {}
         part = training.part(replace(training.recording, pose=pose.rows(block)))
+        found = readjusted(model, calibration, rest)
+        if found is None or model.assumed:
+            return {}
         for horizon, errors_at in errors.items():
-            chosen = windows(part, found.calibration, 0.0, part.duration_s, horizon, SPACING_S)
+            chosen = windows(part, found[1], 0.0, part.duration_s, horizon, SPACING_S)
             if len(chosen.start_t):
-                ends = predict(_fitted(found)[1], found.calibration, part, chosen)
+                ends = predict(*found, part, chosen)
                 errors_at.append(np.hypot(*(ends - chosen.end)[:, :2].T))
     return {h: np.concatenate(each) for h, each in errors.items() if each}
 
 
-def coverage_of(
-    drive: Drive, calibration: Calibration, model: TaylorModel, bands: dict[float, float]
-) -> dict[float, float]:
-    """Returns the share of held-out ends that lie within the bands, by horizon [s]."""
-    found, begin = {}, drive.settings.train_until_s
-    for horizon, radius in bands.items():
-        chosen = windows(drive, calibration, begin, drive.duration_s, horizon, SPACING_S)
-        if len(chosen.start_t):
-            ends = predict(model, calibration, drive, chosen)
-            far = np.hypot(*(ends - chosen.end)[:, :2].T)
-            found[horizon] = float((far <= radius).mean())
-    return found
+def refit(drive: Drive, findings: Findings) -> Findings:
+    """Fits the judged model anew to all data, unless it then predicts what it knew worse."""
+    until, trials = drive.settings.train_until_s, findings.trials
+    if findings.calibration.is_exact or until >= drive.duration_s:
+        return findings
+    order = motions.chosen(list(trials)).order if trials else drive.settings.order
+    settings = replace(drive.settings, order=order, train_until_s=np.inf)
+    all_of_it = replace(drive, settings=settings)
+    try:
+        start = replace(findings, training=findings.whole.under(settings))
+        final = _continued((motion, fit, prune, refine, complete), all_of_it, start)
+        worse = _error_on(final, until) > verdict.WORSE * _error_on(findings, until)
+    except (FitError, RecordingError):
+        worse = True
+    if worse:
+        note = verdict.kept(until, drive.duration_s)
+        findings = replace(findings, refinement=(*findings.refinement, note))
+        return replace(findings, notes=_notes(drive, findings))
+    linear, model = _fitted(final)
+    rated = verdict.with_quality(
+        model, linear, None, findings.held_out, findings.judgement, drive.spec
+    )
+    note = verdict.refitted(until, drive.duration_s)
+    final = replace(
+        final,
+        calibration=replace(final.calibration, notes=_sentences(final)),
+        linear=replace(linear, model=rated) if model is linear.model else linear,
+        model=verdict.with_unseen(rated, _fitted(findings)[1]),
+        refinement=(*final.refinement, note),
+    )
+    return replace(findings, refit=replace(final, notes=_notes(drive, final)))
+
+
+def _error_on(findings: Findings, until: float) -> float:
+    """Returns the mean error of open-loop predictions of the first part of a drive [m]."""
+    model, whole = _fitted(findings)[1], findings.whole
+    try:
+        return open_loop_error(model, findings.calibration, whole, 0.0, until).mean_position_error_m
+    except RecordingError:
+        return 0.0
 
 
 def _sentences(found: Findings) -> tuple[str, ...]:
@@ -386,6 +426,7 @@ def _sentences(found: Findings) -> tuple[str, ...]:
 
 STAGES: tuple[Stage, ...] = (
     repair, clocks, mounting, responses, noise, motion, inputs, fit, prune, refine, complete, judge,
+    refit,
 )  # fmt: skip
 """In order; each builds on what the stages before it found."""
 
@@ -398,7 +439,10 @@ def begun(drive: Drive) -> Findings:
 
 def run(stages: Sequence[Stage], drive: Drive) -> Findings:
     """Runs a row of stages over a drive and returns their findings."""
-    findings = begun(drive)
+    return _continued(stages, drive, begun(drive))
+
+
+def _continued(stages: Sequence[Stage], drive: Drive, findings: Findings) -> Findings:
     for stage in stages:
         findings = stage(drive, findings)
     return findings
@@ -406,18 +450,26 @@ def run(stages: Sequence[Stage], drive: Drive) -> Findings:
 
 @dataclass(frozen=True)
 class Identified:
-    """Result of an identification."""
+    """Result of an identification: a model of all data, and what a trial of it showed.
+
+    The trial learnt the first part of the drive only, and was judged on the rest.
+    """
 
     drive: Drive  # the whole drive, repaired
     model: TaylorModel  # refined and, on request, completed; with standard errors and quality
     calibration: Calibration
     fit: Fit  # the linear fit, before refinement
     samples: Samples  # that the fit used
-    unseen: Samples | None  # of the part that the fit did not see; None if there are too few
-    held_out: OpenLoop | None  # open-loop errors on that part; None if it was too short
+    unseen: Samples | None  # of the part that the trial did not see; None if there are too few
+    held_out: OpenLoop | None  # its open-loop errors on that part; None if it was too short
     noise: Noise  # of sensors and motion, each level measured or assumed
-    findings: Findings  # of all stages
+    findings: Findings  # of all stages, of the trial
     notes: tuple[str, ...]  # sentences on findings, on what was not learnt, and on assumptions
+
+    @property
+    def trial(self) -> "Identified":
+        """The model, and what belongs to it, that was judged on data that it never saw."""
+        return _result(self.findings, self.findings)
 
     @property
     def recording(self) -> Recording:
@@ -432,7 +484,12 @@ class Identified:
     @property
     def coverage(self) -> dict[float, float]:
         """Share of the held-out ends within the 95 % band of predictions, by horizon [s]."""
-        return self.findings.coverage
+        return {e.horizon_s: e.coverage for e in self.judgement if e.coverage is not None}
+
+    @property
+    def judgement(self) -> tuple[HorizonErrors, ...]:
+        """Errors on data held out, beside those of yardsticks, by horizon."""
+        return self.findings.judgement
 
     @property
     def alpha(self) -> Alpha:
@@ -456,11 +513,15 @@ def identify(
     drive = Drive(check(recording, spec), spec)
     until = TRAIN_SHARE * drive.duration_s if train_until is None else train_until
     found = run(STAGES, replace(drive, settings=Settings(order, alpha, until, assume, strict)))
-    linear, model = _fitted(found)
+    return _result(found, found.refit or found)
+
+
+def _result(trial: Findings, final: Findings) -> Identified:
+    linear, model = _fitted(final)
+    samples = known(final.samples, "the training part", "fit")
     return Identified(
-        found.whole, model, found.calibration, linear,
-        known(found.samples, "the training part", "fit"), found.unseen, found.held_out,
-        found.noise, found, found.notes,
+        final.whole, model, final.calibration, linear, samples, trial.unseen, trial.held_out,
+        trial.noise, trial, final.notes,
     )  # fmt: skip
 
 
