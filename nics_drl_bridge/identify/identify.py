@@ -38,6 +38,7 @@ from nics_drl_bridge.identify.open_loop import (
 from nics_drl_bridge.identify.refine import readjusted, refined
 from nics_drl_bridge.identify.repair import check_axes, check_units, repaired
 from nics_drl_bridge.identify.signals import speed_index
+from nics_drl_bridge.identify.structure import structures
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream, check
 from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -74,6 +75,7 @@ class Findings:
     assumptions: tuple[str, ...] = ()  # sentences of `complete`
     unseen: Samples | None = None  # of the part that the fit did not see, of `judge`
     held_out: OpenLoop | None = None  # open-loop errors on that part, of `judge`
+    structure: tuple[str, ...] = ()  # sentences on residuals that depend on X, of `judge`
     judgement: tuple[HorizonErrors, ...] = ()  # on that part, beside yardsticks, of `judge`
     notes: tuple[str, ...] = ()  # all sentences, of `judge`
     refit: "Findings | None" = None  # on all data, of `refit`; None if the trial's model is kept
@@ -97,8 +99,8 @@ def _fitted(findings: Findings) -> tuple[Fit, TaylorModel]:
 def repair(drive: Drive, findings: Findings) -> Findings:
     """Refuses other units and reversed axes; drops repeated rows and jumps, clips commands."""
     check_units(drive)
-    training, repairs = repaired(findings.training)
-    whole, _ = repaired(findings.whole)
+    training, _ = repaired(findings.training)
+    whole, repairs = repaired(findings.whole)
     check_axes(training)
     check(training.recording, drive.spec)
     return replace(findings, training=training, whole=whole, repairs=repairs)
@@ -320,6 +322,7 @@ def judge(drive: Drive, findings: Findings) -> Findings:
         model=rated,
         unseen=unseen,
         held_out=held_out,
+        structure=structure(findings),
         judgement=judgement,
     )
     return replace(findings, notes=_notes(drive, findings))
@@ -337,10 +340,19 @@ def _notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
         *findings.refinement,
         *verdict.mirror_note(known(findings.samples, "the training part", "fit"), spec),
         *verdict.unlearnt(linear, calibration, spec),
+        *findings.structure,
         *verdict.doubts(linear, findings.held_out, calibration.is_exact),
         *verdict.untried(drive, findings.held_out),
         *findings.assumptions,
     )
+
+
+def structure(findings: Findings) -> tuple[str, ...]:
+    """Says on what the residuals of the linear fit depend; where they do, its terms mislead."""
+    if findings.calibration.is_exact:
+        return ()
+    samples = known(findings.samples, "the training part", "fit")
+    return tuple(each.sentence for each in structures(_fitted(findings)[0], samples))
 
 
 def bands_of(drive: Drive, findings: Findings) -> dict[float, float]:

@@ -1,0 +1,100 @@
+"""Structure in the residuals of a fit: what rates still depend on beyond the model's terms."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify.fit import Fit
+from nics_drl_bridge.recording.recording import Samples
+from nics_drl_bridge.robot import taylor
+
+DEGREE = 3  # of the terms that are looked for
+BLOCK_S, FEWEST = 2.5, 12  # residuals this far apart are independent; blocks to tell by
+SIGNIFICANT = 3.5  # standard errors, between the blocks, of the correlation with a term
+SHARE = 0.1  # of the residual's variance that a term explains in blocks that it was not fitted to
+WORTH = 0.01  # least size of that, as a share of the rate's
+PARTS = 5  # in which blocks are left out
+ROWS = 3000  # that are looked at, as neighbours tell the same
+
+
+@dataclass(frozen=True)
+class Structure:
+    """A term of X that explains a part of what a fit leaves of a degree of freedom."""
+
+    dof: str
+    term: str  # `speed*steering^2`
+    share: float  # of the residual's variance, on blocks that it was not fitted to
+    degree: int
+    order: int  # of the fitted model
+
+    @property
+    def sentence(self) -> str:
+        """Tells it, and what to try."""
+        finding = f"What the model leaves of {self.dof} depends on {self.term}"
+        more = f"({self.share:.0%} of it, by cross-validation)"
+        way = "keep more terms (a higher alpha)" if self.degree <= self.order else (
+            f"try order {self.degree}"
+        )  # fmt: skip
+        return f"{finding} {more}: {way}, and distrust what rests on its terms, as the mounting."
+
+
+def structures(linear: Fit, samples: Samples) -> Iterator[Structure]:
+    """Finds, per degree of freedom, the term that explains most of the residuals, if any does."""
+    every = np.arange(len(samples.t)) % (1 + len(samples.t) // ROWS) == 0
+    samples, model = samples.rows(every), linear.model
+    block = np.floor((samples.t - samples.t[0]) / BLOCK_S).astype(np.intp)
+    x = samples.x
+    moved = np.ptp(x, axis=0) > 0.0
+    if not moved.any() or len(np.unique(block)) < FEWEST:
+        return
+    powers = taylor.exponents(x.shape[1], DEGREE)
+    powers = powers[(powers[:, ~moved] == 0).all(axis=1) & powers.any(axis=1)]
+    features = taylor.evaluate(x / np.maximum(np.abs(x).max(axis=0), 1e-12), powers)
+    order = int(model.powers[(model.coefficients != 0.0).any(axis=0)].sum(axis=1).max(initial=1))
+    names = [taylor.term_name(row, model.variables) for row in powers]
+    for d, dof in enumerate(model.dofs):
+        used = model.coefficients[d] != 0.0
+        if not used.any() or [
+            name for name, u in zip(model.term_names, used, strict=True) if u
+        ] == [dof]:
+            continue  # a state that is a part of the twist is so by definition
+        own = taylor.evaluate(x, model.powers[used])
+        own = own / np.maximum(np.sqrt((own**2).mean(axis=0)), 1e-12)
+        both = np.concatenate([samples.dq[:, d : d + 1], features], axis=1)
+        both = both - own @ np.linalg.lstsq(own, both, rcond=None)[0]
+        rest, more = _without_outliers(both[:, 0]), both[:, 1:]
+        told = (more**2).mean(axis=0) > 1e-6 * (features**2).mean(axis=0)  # not one of its own
+        share = np.where(told, _share(rest, more, block), -np.inf)
+        best = int(np.argmax(share))
+        size = share[best] * (rest**2).mean() / max(float((samples.dq[:, d] ** 2).mean()), 1e-18)
+        if share[best] > SHARE and size > WORTH**2:
+            degree = int(powers[best].sum())
+            yield Structure(dof, names[best], float(share[best]), degree, order)
+
+
+def _without_outliers(rest: Array) -> Array:
+    """Cuts residuals (T,) at six times their usual size."""
+    most = 6.0 * float(np.median(np.abs(rest))) / 0.6745
+    return np.clip(rest, -most, most)
+
+
+def _share(rest: Array, features: Array, block: Array) -> Array:
+    """Returns the share (K,) of a residual's (T,) variance that features (T, K) tell, each alone.
+
+    By cross-validation between blocks; below 0 for those that noise explains as well.
+    """
+    count = int(block[-1]) + 1
+    per_block = np.eye(count)[:, block]  # (N, T)
+    across, size = per_block @ (features * rest[:, None]), per_block @ features**2
+    total = float((rest**2).sum())
+    slope = across.sum(axis=0) / np.maximum(size.sum(axis=0), 1e-18)
+    spread = np.sqrt(((across - slope * size) ** 2).sum(axis=0))
+    certain = np.abs(across.sum(axis=0)) > SIGNIFICANT * np.maximum(spread, 1e-18)
+    left = np.zeros(features.shape[1])
+    for part in range(PARTS):
+        out = np.arange(count) * PARTS // count == part
+        slope = across[~out].sum(axis=0) / np.maximum(size[~out].sum(axis=0), 1e-18)
+        left += slope**2 * size[out].sum(axis=0) - 2.0 * slope * across[out].sum(axis=0)
+    return np.asarray(np.where(certain, -left / max(total, 1e-18), -np.inf))
