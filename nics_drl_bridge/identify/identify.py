@@ -12,6 +12,7 @@ from nics_drl_bridge.identify import clocks as timings
 from nics_drl_bridge.identify import motion as motions
 from nics_drl_bridge.identify import shooting, verdict
 from nics_drl_bridge.identify.assume import assume_textbook
+from nics_drl_bridge.identify.bands import bands_of
 from nics_drl_bridge.identify.calibration import Calibration, Response, align
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.fit import (
@@ -28,14 +29,8 @@ from nics_drl_bridge.identify.inputs import curve_of
 from nics_drl_bridge.identify.judgement import judged, shortfall
 from nics_drl_bridge.identify.mounting import Mounting, mounted, mounting_of
 from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
-from nics_drl_bridge.identify.open_loop import (
-    SPACING_S,
-    OpenLoop,
-    open_loop_error,
-    predict,
-    windows,
-)  # fmt: skip
-from nics_drl_bridge.identify.refine import readjusted, refined
+from nics_drl_bridge.identify.open_loop import OpenLoop, open_loop_error
+from nics_drl_bridge.identify.refine import refined
 from nics_drl_bridge.identify.repair import check_axes, check_units, repaired
 from nics_drl_bridge.identify.signals import speed_index
 from nics_drl_bridge.identify.structure import structures
@@ -48,7 +43,6 @@ from nics_drl_bridge.threads import one_blas_thread
 T = TypeVar("T")
 
 TRAIN_SHARE = 2.0 / 3.0
-WITHIN = 95.0  # percentage of predictions within the band
 
 
 @dataclass(frozen=True)
@@ -311,7 +305,10 @@ def judge(drive: Drive, findings: Findings) -> Findings:
     rest = samples.rows(samples.t > begin)
     unseen = rest if len(rest.t) >= verdict.MIN_ROWS else None
     held_out = verdict.tried(model, calibration, whole)
-    bands = {} if calibration.is_exact else bands_of(drive, findings)
+    bands: dict[float, float] = {}
+    if not calibration.is_exact and drive.duration_s > drive.settings.train_until_s:
+        derived = None if findings.width is None else aligned(findings.training, findings)
+        bands = bands_of(model, calibration, findings.training, derived)
     judgement = judged(model, calibration, whole, bands)
     rated = verdict.with_quality(model, linear, unseen, held_out, judgement, spec)
     findings = replace(
@@ -353,35 +350,6 @@ def structure(findings: Findings) -> tuple[str, ...]:
         return ()
     samples = known(findings.samples, "the training part", "fit")
     return tuple(each.sentence for each in structures(_fitted(findings)[0], samples))
-
-
-def bands_of(drive: Drive, findings: Findings) -> dict[float, float]:
-    """Returns the distances within which 95 % of predictions end that a fit did not see [m]."""
-    trials = findings.trials
-    errors = motions.chosen(list(trials)).errors if trials else _left_out(findings)
-    told = ((h, each) for h, each in errors.items() if len(each) >= verdict.MIN_ROWS)
-    return {h: float(np.percentile(each, WITHIN)) for h, each in told}
-
-
-def _left_out(findings: Findings) -> dict[float, Array]:
-    """Returns errors (W,) by horizon [s] on parts of the training part, by models of the rest."""
-    training, pose = findings.training, findings.training.recording.pose
-    calibration, (_, model) = findings.calibration, _fitted(findings)
-    errors: dict[float, list[Array]] = {h: [] for h in motions.BANDS_S}
-    for block in np.array_split(np.arange(len(pose.t)), motions.FOLDS):
-        others = np.ones(len(pose.t), dtype=np.bool_)
-        others[block] = False
-        rest = training.part(replace(training.recording, pose=pose.rows(others)))
-        part = training.part(replace(training.recording, pose=pose.rows(block)))
-        found = readjusted(model, calibration, rest)
-        if found is None or model.assumed:
-            return {}
-        for horizon, errors_at in errors.items():
-            chosen = windows(part, found[1], 0.0, part.duration_s, horizon, SPACING_S)
-            if len(chosen.start_t):
-                ends = predict(*found, part, chosen)
-                errors_at.append(np.hypot(*(ends - chosen.end)[:, :2].T))
-    return {h: np.concatenate(each) for h, each in errors.items() if each}
 
 
 def refit(drive: Drive, findings: Findings) -> Findings:
