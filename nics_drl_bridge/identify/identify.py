@@ -349,7 +349,8 @@ def structure(findings: Findings) -> tuple[str, ...]:
     if findings.calibration.is_exact:
         return ()
     samples = known(findings.samples, "the training part", "fit")
-    return tuple(each.sentence for each in structures(_fitted(findings)[0], samples))
+    found = structures(_fitted(findings)[0], samples, findings.training.spec)
+    return tuple(each.sentence for each in found)
 
 
 def refit(drive: Drive, findings: Findings) -> Findings:

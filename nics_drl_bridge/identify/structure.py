@@ -9,6 +9,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.fit import Fit
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot import taylor
+from nics_drl_bridge.robot.spec import RobotSpec
 
 DEGREE = 3  # of the terms that are looked for
 BLOCK_S, FEWEST = 2.5, 12  # residuals this far apart are independent; blocks to tell by
@@ -40,12 +41,12 @@ class Structure:
         return f"{finding} {more}: {way}, and distrust what rests on its terms, as the mounting."
 
 
-def structures(linear: Fit, samples: Samples) -> Iterator[Structure]:
+def structures(linear: Fit, samples: Samples, spec: RobotSpec) -> Iterator[Structure]:
     """Finds, per degree of freedom, the term that explains most of the residuals, if any does."""
     every = np.arange(len(samples.t)) % (1 + len(samples.t) // ROWS) == 0
     samples, model = samples.rows(every), linear.model
     block = np.floor((samples.t - samples.t[0]) / BLOCK_S).astype(np.intp)
-    x = samples.x
+    x, defined = samples.x, {v.twist for v in spec.state}  # states that are a part of the twist
     moved = np.ptp(x, axis=0) > 0.0
     if not moved.any() or len(np.unique(block)) < FEWEST:
         return
@@ -56,10 +57,8 @@ def structures(linear: Fit, samples: Samples) -> Iterator[Structure]:
     names = [taylor.term_name(row, model.variables) for row in powers]
     for d, dof in enumerate(model.dofs):
         used = model.coefficients[d] != 0.0
-        if not used.any() or [
-            name for name, u in zip(model.term_names, used, strict=True) if u
-        ] == [dof]:
-            continue  # a state that is a part of the twist is so by definition
+        if not used.any() or dof in defined:
+            continue
         own = taylor.evaluate(x, model.powers[used])
         own = own / np.maximum(np.sqrt((own**2).mean(axis=0)), 1e-12)
         both = np.concatenate([samples.dq[:, d : d + 1], features], axis=1)

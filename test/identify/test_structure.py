@@ -10,7 +10,6 @@ import pytest
 from nics_drl_bridge.identify.fit import fit
 from nics_drl_bridge.identify.structure import structures
 from nics_drl_bridge.recording.recording import Samples
-from nics_drl_bridge.robot.spec import load_robot
 
 STEP_S = 0.01
 
@@ -34,13 +33,13 @@ def test_noise_alone_is_no_structure(samples, car, seed):
     rng = np.random.default_rng(seed)
     noise = 0.05 * np.repeat(rng.normal(size=(200, 5)), 20, axis=0)
     noisy = replace(samples, dq=samples.dq + noise)
-    assert list(structures(fit(noisy, car, 2), noisy)) == []
+    assert list(structures(fit(noisy, car, 2), noisy, car)) == []
 
 
 def test_a_term_of_the_next_order_is_named_with_what_to_try(samples, car):
     x = samples.x
     slips = replace(samples, dq=samples.dq - 2.0 * np.outer(x[:, 0] * x[:, 1] ** 2, np.eye(5)[0]))
-    (found,) = structures(fit(slips, car, 2), slips)
+    (found,) = structures(fit(slips, car, 2), slips, car)
     assert (found.dof, found.term) == ("vx", "speed*steering^2")
     assert found.share > 0.1
     assert "What the model leaves of vx depends on speed*steering^2" in found.sentence
@@ -49,4 +48,4 @@ def test_a_term_of_the_next_order_is_named_with_what_to_try(samples, car):
 
 def test_a_few_seconds_do_not_tell(samples, car):
     brief = samples.rows(samples.t < 20.0)
-    assert list(structures(fit(brief, load_robot("ackermann"), 1), brief)) == []
+    assert list(structures(fit(brief, car, 1), brief, car)) == []
