@@ -257,8 +257,8 @@ def _model(plan: DemoPlan, model: SimulatorModel, identified: Identified) -> lis
     caption = "What each further term is worth; circles mark how many are kept."
     return [
         pictures.paragraph(f"Generated from {plan.recording or 'a textbook drive'}."),
-        pictures.table(HEADS, judgement_rows(identified.judgement)),
         pictures.paragraph(COMPARED),
+        pictures.table(HEADS, judgement_rows(identified.judgement)),
         pictures.code(model.report),
         pictures.picture(accuracy(identified), caption),
         *(pictures.picture(png, CAPTIONS[name]) for name, png in calibrated.items()),

@@ -12,7 +12,6 @@ from nics_drl_bridge.identify import clocks as timings
 from nics_drl_bridge.identify import motion as motions
 from nics_drl_bridge.identify import shooting, verdict
 from nics_drl_bridge.identify.assume import assume_textbook
-from nics_drl_bridge.identify.bands import bands_of
 from nics_drl_bridge.identify.calibration import Calibration, Response, align
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.fit import (
@@ -26,7 +25,7 @@ from nics_drl_bridge.identify.fit import (
     regress,
 )  # fmt: skip
 from nics_drl_bridge.identify.inputs import curve_of
-from nics_drl_bridge.identify.judgement import judged, shortfall
+from nics_drl_bridge.identify.judgement import bands_of, judged, shortfall
 from nics_drl_bridge.identify.mounting import Mounting, mounted, mounting_of
 from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
 from nics_drl_bridge.identify.open_loop import OpenLoop, open_loop_error
@@ -349,8 +348,7 @@ def structure(findings: Findings) -> tuple[str, ...]:
     if findings.calibration.is_exact:
         return ()
     samples = known(findings.samples, "the training part", "fit")
-    found = structures(_fitted(findings)[0], samples, findings.training.spec)
-    return tuple(each.sentence for each in found)
+    return tuple(structures(_fitted(findings)[0], samples, findings.training.spec))
 
 
 def refit(drive: Drive, findings: Findings) -> Findings:
@@ -360,39 +358,28 @@ def refit(drive: Drive, findings: Findings) -> Findings:
         return findings
     order = motions.chosen(list(trials)).order if trials else drive.settings.order
     settings = replace(drive.settings, order=order, train_until_s=np.inf)
-    all_of_it = replace(drive, settings=settings)
     try:
         start = replace(findings, training=findings.whole.under(settings))
-        final = _continued((motion, fit, prune, refine, complete), all_of_it, start)
-        worse = _error_on(final, until) > verdict.WORSE * _error_on(findings, until)
+        stages = (motion, fit, prune, refine, complete)
+        final = _continued(stages, replace(drive, settings=settings), start)
+        error, before = (
+            open_loop_error(_fitted(each)[1], each.calibration, each.whole, 0.0, until)
+            for each in (final, findings)
+        )
+        worse = error.mean_position_error_m > verdict.WORSE * before.mean_position_error_m
     except (FitError, RecordingError):
         worse = True
+    sentence = verdict.refitted(until, drive.duration_s, worse)
     if worse:
-        note = verdict.kept(until, drive.duration_s)
-        findings = replace(findings, refinement=(*findings.refinement, note))
+        findings = replace(findings, refinement=(*findings.refinement, sentence))
         return replace(findings, notes=_notes(drive, findings))
-    linear, model = _fitted(final)
-    rated = verdict.with_quality(
-        model, linear, None, findings.held_out, findings.judgement, drive.spec
-    )
-    note = verdict.refitted(until, drive.duration_s)
     final = replace(
         final,
         calibration=replace(final.calibration, notes=_sentences(final)),
-        linear=replace(linear, model=rated) if model is linear.model else linear,
-        model=verdict.with_unseen(rated, _fitted(findings)[1]),
-        refinement=(*final.refinement, note),
+        model=replace(_fitted(final)[1], quality=_fitted(findings)[1].quality),
+        refinement=(*final.refinement, sentence),
     )
     return replace(findings, refit=replace(final, notes=_notes(drive, final)))
-
-
-def _error_on(findings: Findings, until: float) -> float:
-    """Returns the mean error of open-loop predictions of the first part of a drive [m]."""
-    model, whole = _fitted(findings)[1], findings.whole
-    try:
-        return open_loop_error(model, findings.calibration, whole, 0.0, until).mean_position_error_m
-    except RecordingError:
-        return 0.0
 
 
 def _sentences(found: Findings) -> tuple[str, ...]:

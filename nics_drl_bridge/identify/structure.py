@@ -1,7 +1,6 @@
 """Structure in the residuals of a fit: what rates still depend on beyond the model's terms."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,33 +15,13 @@ BLOCK_S, FEWEST = 2.5, 12  # residuals this far apart are independent; blocks to
 SIGNIFICANT = 3.5  # standard errors, between the blocks, of the correlation with a term
 SHARE = 0.1  # of the residual's variance that a term explains in blocks that it was not fitted to
 WORTH = 0.01  # least size of that, as a share of the rate's
+OUTLYING = 9.0  # residuals are cut at this many times their median
 PARTS = 5  # in which blocks are left out
 ROWS = 3000  # that are looked at, as neighbours tell the same
 
 
-@dataclass(frozen=True)
-class Structure:
-    """A term of X that explains a part of what a fit leaves of a degree of freedom."""
-
-    dof: str
-    term: str  # `speed*steering^2`
-    share: float  # of the residual's variance, on blocks that it was not fitted to
-    degree: int
-    order: int  # of the fitted model
-
-    @property
-    def sentence(self) -> str:
-        """Tells it, and what to try."""
-        finding = f"What the model leaves of {self.dof} depends on {self.term}"
-        more = f"({self.share:.0%} of it, by cross-validation)"
-        way = "keep more terms (a higher alpha)" if self.degree <= self.order else (
-            f"try order {self.degree}"
-        )  # fmt: skip
-        return f"{finding} {more}: {way}, and distrust what rests on its terms, as the mounting."
-
-
-def structures(linear: Fit, samples: Samples, spec: RobotSpec) -> Iterator[Structure]:
-    """Finds, per degree of freedom, the term that explains most of the residuals, if any does."""
+def structures(linear: Fit, samples: Samples, spec: RobotSpec) -> Iterator[str]:
+    """Tells, per degree of freedom, the term that explains most of the residuals, if one does."""
     every = np.arange(len(samples.t)) % (1 + len(samples.t) // ROWS) == 0
     samples, model = samples.rows(every), linear.model
     block = np.floor((samples.t - samples.t[0]) / BLOCK_S).astype(np.intp)
@@ -63,20 +42,18 @@ def structures(linear: Fit, samples: Samples, spec: RobotSpec) -> Iterator[Struc
         own = own / np.maximum(np.sqrt((own**2).mean(axis=0)), 1e-12)
         both = np.concatenate([samples.dq[:, d : d + 1], features], axis=1)
         both = both - own @ np.linalg.lstsq(own, both, rcond=None)[0]
-        rest, more = _without_outliers(both[:, 0]), both[:, 1:]
+        most = OUTLYING * float(np.median(np.abs(both[:, 0])))
+        rest, more = np.clip(both[:, 0], -most, most), both[:, 1:]
         told = (more**2).mean(axis=0) > 1e-6 * (features**2).mean(axis=0)  # not one of its own
         share = np.where(told, _share(rest, more, block), -np.inf)
         best = int(np.argmax(share))
         size = share[best] * (rest**2).mean() / max(float((samples.dq[:, d] ** 2).mean()), 1e-18)
         if share[best] > SHARE and size > WORTH**2:
             degree = int(powers[best].sum())
-            yield Structure(dof, names[best], float(share[best]), degree, order)
-
-
-def _without_outliers(rest: Array) -> Array:
-    """Cuts residuals (T,) at six times their usual size."""
-    most = 6.0 * float(np.median(np.abs(rest))) / 0.6745
-    return np.clip(rest, -most, most)
+            way = f"try order {degree}" if degree > order else "keep more terms (a higher alpha)"
+            finding = f"What the model leaves of {dof} depends on {names[best]}"
+            more = f"({share[best]:.0%} of it, by cross-validation)"
+            yield f"{finding} {more}: {way}, and distrust what rests on its terms, as the mounting."
 
 
 def _share(rest: Array, features: Array, block: Array) -> Array:

@@ -234,22 +234,10 @@ def with_quality(
     return replace(model, quality=quality)
 
 
-def with_unseen(model: TaylorModel, trial: TaylorModel) -> TaylorModel:
-    """Returns a model of all data with the errors of its trial's rates on data held out."""
-    ours, shown = model.quality, trial.quality
-    if ours is None or shown is None:
-        return model
-    figures = {name: getattr(shown, name) for name in ("held_out_rmse", "held_out_r2")}
-    return replace(model, quality=replace(ours, **figures))
-
-
-def refitted(until: float, duration: float) -> str:
-    """Says what errors on unseen data are of."""
+def refitted(until: float, duration: float, worse: bool) -> str:
+    """Says of how much of a drive a model is, and what its errors are of."""
+    if worse:
+        why = f"fitted to all {duration:.1f} s, it was not shown to predict them as well"
+        return f"The model is of the first {until:.1f} s only: {why}."
     shown = f"errors on unseen data are those of a trial that had learnt the first {until:.1f} s"
     return f"The model was fitted to all {duration:.1f} s once it had been judged; {shown}."
-
-
-def kept(until: float, duration: float) -> str:
-    """Says why a model is not of all data."""
-    why = f"fitted to all {duration:.1f} s, it predicted them clearly worse"
-    return f"The model is of the first {until:.1f} s only: {why}."

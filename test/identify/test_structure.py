@@ -39,11 +39,9 @@ def test_noise_alone_is_no_structure(samples, car, seed):
 def test_a_term_of_the_next_order_is_named_with_what_to_try(samples, car):
     x = samples.x
     slips = replace(samples, dq=samples.dq - 2.0 * np.outer(x[:, 0] * x[:, 1] ** 2, np.eye(5)[0]))
-    (found,) = structures(fit(slips, car, 2), slips, car)
-    assert (found.dof, found.term) == ("vx", "speed*steering^2")
-    assert found.share > 0.1
-    assert "What the model leaves of vx depends on speed*steering^2" in found.sentence
-    assert "try order 3" in found.sentence
+    (sentence,) = structures(fit(slips, car, 2), slips, car)
+    assert sentence.startswith("What the model leaves of vx depends on speed*steering^2 (")
+    assert "try order 3" in sentence
 
 
 def test_a_few_seconds_do_not_tell(samples, car):
