@@ -1,7 +1,7 @@
 """The generator: from a recording to a SimulatorModel, one readable folder on disk."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 
@@ -72,13 +72,15 @@ class SimulatorModel:
     @cached_property
     def text(self) -> str:
         """The content of `model.yaml`."""
+        # The kinematics hold the input curves, of which an identification's calibration has a copy.
+        calibration = {k: v for k, v in asdict(self.calibration).items() if k != "inputs"}
         data = {
             "format": FORMAT, "control_period": self.control_period,
             "robot": self.robot.model_dump(mode="json"),
             "kinematics": self.kinematics.named.model_dump(
                 exclude_none=True, exclude_defaults=True
             ),
-            "calibration": asdict(self.calibration), "lidar": self.lidar.model_dump(mode="json"),
+            "calibration": calibration, "lidar": self.lidar.model_dump(mode="json"),
             "noise": self.noise.model_dump(mode="json"),
         }  # fmt: skip
         if self.latency.measured:
@@ -123,7 +125,7 @@ def generate(
     if (reason := why_useless(identified, robot, order)) and not anyway:
         raise FitError(reason)
     model = SimulatorModel(
-        robot, identified.model, identified.calibration, lidar,
+        robot, identified.model, replace(identified.calibration, inputs=()), lidar,
         bake(lidar, (*shapes, footprint_shape(robot))), identified.noise,
         report=fit_report(recording.source, robot, identified), latency=recording.latency,
         sensors=tuple(sensors),
@@ -190,7 +192,7 @@ def load_model(folder: str | Path) -> SimulatorModel:
         data["robot"].setdefault("angular_is", "steering")
     file = validate(data, _File, str(path))
     for key in fields(Calibration):  # its defaults are those of a robot that needs none
-        if key.name not in data["calibration"]:
+        if key.name not in (*data["calibration"], "inputs"):
             raise ConfigError(f"{path}: the key 'calibration.{key.name}' is missing; add it.")
     table = LidarTable.load(folder / TABLE_FOLDER, checked=True)
     report = read_text(folder / REPORT_FILE)

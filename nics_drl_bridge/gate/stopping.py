@@ -32,6 +32,8 @@ def shield_config(
     measured = load_yaml(path, LimitsFile).shield if path else None
     if (stopping := measured) is None:  # one command per period; brakes no harder than its limits
         rates = [] if limits is None else limits.rate[limits.linear].tolist()
+        known = zip(model.robot.state, model.kinematics.braking.tolist(), strict=True)
+        rates += [rate for v, rate in known if v.unit == SPEED and np.isfinite(rate)]
         delay = model.calibration.command_latency_s + lag(model.kinematics) + model.control_period
         deceleration = min(rates, default=UNKNOWN_DECELERATION)
         stopping = Stopping(latency=max(0.0, delay), deceleration=deceleration)

@@ -60,6 +60,7 @@ class Findings:
     # of `motion`: half-width [s] of the parabolas that gave the state; None if it was not derived
     width: float | None = None
     samples: Samples | None = None  # of the training part on one time axis, of `fit`
+    base: TaylorModel | None = None  # of the textbook's terms, of `fit`
     trials: tuple[motions.Trial, ...] = ()  # of orders, on parts of the training part, of `fit`
     regression: Regression | None = None  # on all features (Eq. 1), of `fit`
     linear: Fit | None = None  # the pruned fit (Eq. 2), of `prune`
@@ -191,39 +192,24 @@ def _with_delay(findings: Findings, samples: Samples) -> Findings:
     return replace(findings, calibration=calibration)
 
 
-def _trials(drive: Drive, findings: Findings) -> list[motions.Trial]:
-    training, order = findings.training, drive.settings.order
-    samples = aligned(training, findings)
-    trials: list[motions.Trial] = []
-    problem = motions.problem_of(training, findings.calibration, samples)
-    given = motions.inputs_of(training, findings.calibration)
-    everything = np.ones(len(samples.t), dtype=np.bool_)
-    for each in motions.ORDERS if order == "auto" else (order,):
-        try:
-            trial = motions.tried(problem, drive.spec, each, given, everything)
-        except FitError as error:
-            if not trials:
-                raise FitError(f"{drive.recording.source}: {error}") from None
-            break
-        trials += [trial] if trial else []
-    return trials
-
-
 def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:
     """Fits the order that predicts parts of the training part best that its fits did not see."""
-    again = bool(findings.trials)  # then order and curves are chosen
-    trials = list(findings.trials) or _trials(drive, findings)
-    if findings.calibration.inputs and not again:
-        plain = replace(findings, calibration=replace(findings.calibration, inputs=()))
-        without = _trials(drive, plain)
-        if without and motions.chosen(without).error <= motions.chosen(trials).error:
-            findings, trials = plain, without
-    order = motions.chosen(trials).order if trials else 1
-    samples = aligned(findings.training, findings)
-    linear = motions.linear_fit(samples, drive.spec, order)
+    training, spec, order = findings.training, drive.spec, drive.settings.order
+    samples = aligned(training, findings)
+    problem = motions.problem_of(training, findings.calibration, samples)
+    given = motions.inputs_of(training, findings.calibration)
+    try:
+        base = motions.fit_base(problem, spec, given)
+        asked = motions.hypotheses(spec, order)  # a refit knows what was chosen
+        trials = findings.trials or motions.tried(problem, spec, asked, base.values)
+    except FitError as error:
+        raise FitError(f"{drive.recording.source}: {error}") from None
+    best = motions.chosen(trials).order
+    linear = motions.linear_fit(samples, spec, best or motions.BASE_ORDER)
     return replace(
-        findings, samples=samples, regression=linear.regression, linear=linear, model=linear.model,
-        trials=tuple(trials),
+        findings, samples=samples, regression=linear.regression, linear=linear,
+        model=replace(linear.model, inputs=findings.calibration.inputs), trials=trials,
+        base=base.model,
     )  # fmt: skip
 
 
@@ -271,7 +257,13 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
     problem = motions.problem_of(findings.training, findings.calibration, samples)
     calibration = findings.calibration
     given, given_curves = motions.inputs_of(findings.training, calibration), calibration.inputs
-    found = motions.refined(problem, linear, drive.spec, given)
+    base, best = known(findings.base, "the base", "fit"), motions.chosen(findings.trials)
+    if best.order:
+        found = motions.refined(
+            problem, base, linear.model, drive.spec, given, pull=best.pull
+        )  # fmt: skip
+    else:
+        found = motions.fit_base(problem, drive.spec, given)
     calibration = replace(
         calibration, command_latency_s=float(found.values[0]),
         inputs=motions.curves_at(calibration.inputs, found.values[1:1 + 3 * len(given_curves)]),
@@ -279,8 +271,9 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
     if problem.mounted:
         calibration = motions.remounted(calibration, found)
     errors = motions.standard_errors(found)
+    model = replace(found.model, std_errors=errors, inputs=calibration.inputs)
     return replace(
-        findings, calibration=calibration, model=replace(found.model, std_errors=errors),
+        findings, calibration=calibration, model=model,
         refinement=(f"Coefficients and latency were refined by the open-loop errors over up to "
                     f"{max(shooting.HORIZONS_S):g} s.",),
     )  # fmt: skip
@@ -353,11 +346,10 @@ def structure(findings: Findings) -> tuple[str, ...]:
 
 def refit(drive: Drive, findings: Findings) -> Findings:
     """Fits the judged model anew to all data, unless it then predicts what it knew worse."""
-    until, trials = drive.settings.train_until_s, findings.trials
+    until = drive.settings.train_until_s
     if findings.calibration.is_exact or until >= drive.duration_s:
         return findings
-    order = motions.chosen(list(trials)).order if trials else drive.settings.order
-    settings = replace(drive.settings, order=order, train_until_s=np.inf)
+    settings = replace(drive.settings, train_until_s=np.inf)
     try:
         start = replace(findings, training=findings.whole.under(settings))
         stages = (motion, fit, prune, refine, complete)

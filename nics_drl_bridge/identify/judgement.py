@@ -136,13 +136,13 @@ def _with_motion(
     problem = replace(
         motion.problem_of(training, calibration, samples), spacing_s=motion.CV_SPACING_S
     )
-    _, defined = motion.by_definition(model, training.spec)
-    free = (model.coefficients != 0.0) & ~defined
+    free = (model.coefficients != 0.0) & ~motion.defined(training.spec)[:, None]
     inputs = motion.inputs_of(training, calibration)
-    found = shooting.fitted(problem, model, free, inputs, kept, EVALUATIONS)
+    found = shooting.fitted(problem, model, free, inputs, kept, EVALUATIONS, motion.PULLS[-1])
     count = 1 + 3 * len(calibration.inputs)
     calibration = replace(
         calibration, command_latency_s=float(found.values[0]),
         inputs=motion.curves_at(calibration.inputs, found.values[1:count]),
     )  # fmt: skip
-    return found.model, motion.remounted(calibration, found) if problem.mounted else calibration
+    model = replace(found.model, inputs=calibration.inputs)
+    return model, motion.remounted(calibration, found) if problem.mounted else calibration

@@ -4,9 +4,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.robot.kernels import bounds_of, next_state
 
 SMALL_TURN = 0.3  # below this angle the series of sin(a)/a is exact to the last digits [rad]
 
@@ -100,11 +102,11 @@ class Shot(NamedTuple):
     """Windows to predict from their first states: inputs of `shoot`, and what it writes."""
 
     state: Array  # (W, S) at the start
-    command: Array  # (W, T, C) during each step
-    low: Array  # (S,) least and greatest state, at which it is held
-    high: Array
-    end: Array  # (W, 3) pose at the end from that at the start; headings unwrapped
-    slope: Array  # (W, 3, P) its derivatives by the free coefficients
+    first: NDArray[np.intp]  # (W,) rows of `command` (T, C) at the start
+    command: Array
+    stop: NDArray[np.intp]  # (W, H) steps after which poses are wanted; 0: not wanted
+    end: Array  # (W, H, 3) poses then from those at the start; headings unwrapped
+    slope: Array  # (W, H, 3, P) their derivatives by the free coefficients
 
 
 class Tangent(NamedTuple):
@@ -129,13 +131,16 @@ def tangent(states: int, commands: int, terms: int, free: int) -> Tangent:
 
 @kernel
 def shoot(shot, terms, free, dt, scratch):  # type: ignore[no-untyped-def]
-    """Predicts windows of T steps of dt [s], and the derivatives by the `free` (P,) of `terms`."""
+    """Predicts windows in steps of dt [s], and the derivatives by the `free` (P,) of `terms`."""
     for w in range(shot.state.shape[0]):
         _begin(shot.state[w], scratch)
-        x, y, heading = 0.0, 0.0, 0.0
-        for n in range(shot.command.shape[1]):
-            for c in range(shot.command.shape[2]):
-                scratch.x[shot.state.shape[1] + c] = shot.command[w, n, c]
+        at_x, at_y, heading = 0.0, 0.0, 0.0
+        last = 0
+        for h in range(shot.stop.shape[1]):
+            last = max(last, shot.stop[w, h])
+        for n in range(last):
+            for i in range(shot.command.shape[1]):
+                scratch.x[shot.state.shape[1] + i] = shot.command[shot.first[w] + n, i]
             _linearise(terms, scratch)
             _follow_twist(terms, free, scratch)
             turn = scratch.rate[2] * dt
@@ -144,12 +149,15 @@ def shoot(shot, terms, free, dt, scratch):  # type: ignore[no-untyped-def]
             dx = along * (c * scratch.rate[0] - s * scratch.rate[1])
             dy = along * (s * scratch.rate[0] + c * scratch.rate[1])
             _follow_pose(scratch, dx, dy, along * c, along * s, dt)
-            x, y, heading = x + dx, y + dy, heading + turn
-            _follow_state(terms, free, scratch, shot.low, shot.high, dt)
-        shot.end[w, 0], shot.end[w, 1], shot.end[w, 2] = x, y, heading
-        for d in range(3):
-            for p in range(free.shape[0]):
-                shot.slope[w, d, p] = scratch.pose[d, p]
+            at_x, at_y, heading = at_x + dx, at_y + dy, heading + turn
+            _follow_state(terms, free, scratch, dt)
+            for h in range(shot.stop.shape[1]):
+                if shot.stop[w, h] == n + 1:
+                    end, slope = shot.end[w, h], shot.slope[w, h]
+                    end[0], end[1], end[2] = at_x, at_y, heading
+                    for d in range(3):
+                        for p in range(free.shape[0]):
+                            slope[d, p] = scratch.pose[d, p]
 
 
 @kernel
@@ -207,23 +215,34 @@ def _follow_pose(scratch, dx, dy, along_x, along_y, dt):  # type: ignore[no-unty
 
 
 @kernel
-def _follow_state(terms, free, scratch, low, high, dt):  # type: ignore[no-untyped-def]
+def _follow_state(terms, free, scratch, dt):  # type: ignore[no-untyped-def]
     states, count, before = scratch.state.shape[0], scratch.state.shape[1], scratch.before
     for i in range(states):
         for p in range(count):
             before[i, p] = scratch.state[i, p]
     for i in range(states):
+        if _is_limited(terms, i, scratch):
+            continue
         for j in range(states):
             slope = dt * scratch.jacobian[3 + i, j]
             if slope != 0.0:
                 for p in range(count):
                     scratch.state[i, p] += slope * before[j, p]
     for p in range(count):
-        if terms.dof[free[p]] >= 3:
-            scratch.state[terms.dof[free[p]] - 3, p] += dt * scratch.value[free[p]]
+        d = terms.dof[free[p]]
+        if d >= 3 and not _is_limited(terms, d - 3, scratch):
+            scratch.state[d - 3, p] += dt * scratch.value[free[p]]
     for i in range(states):
-        value = scratch.x[i] + dt * scratch.rate[3 + i]
-        if not low[i] <= value <= high[i]:
-            value = high[i] if value > high[i] else low[i]
+        bounds, rate = bounds_of(terms, i), scratch.rate[3 + i]
+        moved = next_state(scratch.x[i], rate, dt, bounds)
+        unheld = scratch.x[i] + dt * min(max(rate, bounds.fall), bounds.rise)
+        unheld -= math.copysign(dt * bounds.friction, unheld)
+        if moved != unheld:  # it sticks, or is held in its box
             scratch.state[i] = 0.0
-        scratch.x[i] = value
+        scratch.x[i] = moved
+
+
+@kernel
+def _is_limited(terms, i, scratch):  # type: ignore[no-untyped-def]
+    rate = scratch.rate[3 + i]
+    return not terms.fall[i] <= rate <= terms.rise[i]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -15,9 +16,10 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import shooting
 from nics_drl_bridge.identify.calibration import Calibration, outside_gaps
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.fit import Fit, pruned, regress
+from nics_drl_bridge.identify.fit import Fit, Library, Order, pruned, regress
 from nics_drl_bridge.identify.signals import held, inferred_states, resample, unwrapped
 from nics_drl_bridge.identify.statistics import clustered_errors
+from nics_drl_bridge.identify.yardstick import structure_of
 from nics_drl_bridge.recording.recording import (
     Recording,
     Samples,
@@ -43,6 +45,8 @@ DELAY_ORDER, DELAY_STEP_S, LONGEST_S = 2, 0.02, 0.4  # of the search for a delay
 DELAY_SCALE_S, CURVE_SCALE = 0.05, 0.1  # steps of their refinement
 LEVER_SCALE_M, TURN_SCALE = 0.05, 0.1
 CV_SPACING_S, CV_EVALUATIONS = 0.5, 25
+BASE_ORDER, BASE_EVALUATIONS = 2, 40
+PULLS = (0.1, 0.01, 0.001)  # of which each order chooses
 HORIZON_S = 5.0
 
 
@@ -137,7 +141,7 @@ def library(powers: Powers, spec: RobotSpec) -> Mask:
             allowed[d] &= (reversed_ == aside) | (order <= 1)
     if spec.state:  # commands act through the state
         allowed[:3] &= (powers[:, len(spec.state) :] == 0).all(axis=1)
-    else:  # who stands still stands still
+    if not spec.state or odd is not None:  # who gets no command comes to rest
         allowed &= order > 0
     for i, variable in enumerate(spec.state):
         alone = (order == 1) & (powers[:, i] == 1)
@@ -146,7 +150,7 @@ def library(powers: Powers, spec: RobotSpec) -> Mask:
         else:
             follows = names.index(str(variable.follows))
             allowed[3 + i] = alone | ((order == 1) & (powers[:, follows] == 1))
-    return allowed
+    return np.asarray(allowed)
 
 
 def samples_of(drive: Drive, calibration: Calibration, width: float) -> Samples:
@@ -208,7 +212,7 @@ def inputs_of(drive: Drive, calibration: Calibration) -> shooting.Inputs:
     one_clock = drive.recording.pose.clock == drive.recording.command.clock
     latency = calibration.command_latency_s
     start, scale = [latency], [DELAY_SCALE_S]
-    low, high = [min(latency, 0.0) if one_clock else latency - LONGEST_S], [latency + LONGEST_S]
+    low, high = [min(latency, -0.2) if one_clock else latency - LONGEST_S], [latency + LONGEST_S]
     for curve in calibration.inputs:
         size = max(abs(curve.least), abs(curve.most))
         start += [curve.dead, curve.least, curve.most]
@@ -242,7 +246,8 @@ def curves_at(curves: tuple[InputCurve, ...], values: Array) -> tuple[InputCurve
 class Trial:
     """A trial of one order, on parts of the training part that its fits did not see."""
 
-    order: int
+    order: int  # 0: of the textbook's terms alone
+    pull: float  # to the textbook's terms
     error: float  # mean error after `HORIZON_S`, as a share of the path
     errors: dict[float, Array]  # (W,) distances at the ends of predictions, by horizon [m]
 
@@ -263,67 +268,140 @@ def likely_delay(drive: Drive, calibration: Calibration, samples: Samples) -> fl
     return float(tries[int(np.argmin(left))]) if np.isfinite(left).all() else now
 
 
-def linear_fit(samples: Samples, spec: RobotSpec, order: int) -> Fit:
+def linear_fit(samples: Samples, spec: RobotSpec, order: int, allowed: Library = library) -> Fit:
     """Fits all terms of the library of an order to the rates (Eq. 1)."""
-    return pruned(regress(samples, spec, order, allowed=library), spec, 1.0)
+    return pruned(regress(samples, spec, order, allowed=allowed), spec, 1.0)
+
+
+def by_textbook(powers: Powers, spec: RobotSpec) -> Mask:
+    """Selects the terms (D, K) by which the twist follows commands with a lag, as textbooks do."""
+    names, states, order = spec.variable_names, len(spec.state), powers.sum(axis=1)
+    allowed, given = library(powers, spec) & (order <= 1), structure_of(spec)
+    if given is None or not states:
+        return np.asarray(allowed)
+    moves, bicycle = given
+    first = np.eye(len(names), dtype=np.int64)
+    speed = [i for i, v in enumerate(spec.state) if v.twist == "vx"]
+
+    def has(d: int, *rows: NDArray[np.int64]) -> None:
+        for row in rows:
+            allowed[d] |= (powers == row).all(axis=1)
+
+    for i, variable in enumerate(spec.state):
+        if variable.twist is None:
+            continue
+        part = POSE_RATES.index(variable.twist)
+        allowed[3 + i] = False
+        has(3 + i, first[i])  # without a constant: who gets no command comes to rest
+        commands = first[states:][np.abs(moves[part]) > 0.0]
+        if bicycle.used and variable.twist == "wz" and speed:
+            has(3 + i, first[speed[0]], *(commands + first[speed[0]]))
+        elif len(commands):
+            has(3 + i, *commands)
+    return np.asarray(allowed)
+
+
+def fit_base(
+    problem: shooting.Shooting, spec: RobotSpec, inputs: shooting.Inputs,
+    inside: Mask | None = None,
+) -> shooting.Predictive:  # fmt: skip
+    """Fits the textbook's terms, gains and lags, to predictions over seconds."""
+    samples = problem.samples if inside is None else problem.samples.rows(inside)
+    model = by_definition(linear_fit(samples, spec, BASE_ORDER, by_textbook).model, spec)
+    free = (model.coefficients != 0.0) & ~defined(spec)[:, None]
+    return shooting.fitted(problem, model, free, inputs, inside, BASE_EVALUATIONS)
 
 
 def refined(
-    problem: shooting.Shooting, linear: Fit, spec: RobotSpec, inputs: shooting.Inputs,
-    inside: Mask | None = None, evaluations: int = shooting.EVALUATIONS,
+    problem: shooting.Shooting, base: TaylorModel, linear: TaylorModel, spec: RobotSpec,
+    inputs: shooting.Inputs, inside: Mask | None = None, evaluations: int = shooting.EVALUATIONS,
+    pull: float = shooting.PULL,
 ) -> shooting.Predictive:  # fmt: skip
-    """Adjusts a linear fit, and the values of its inputs, to predictions over seconds."""
-    model, defined = by_definition(linear.model, spec)
-    free = (model.coefficients != 0.0) & ~defined
-    return shooting.fitted(problem, model, free, inputs, inside, evaluations)
+    """Adjusts the terms of a linear fit, and those of a base to which they are pulled."""
+    base, first = together(base, by_definition(linear, spec))
+    free = ((base.coefficients != 0.0) | (first != 0.0)) & ~defined(spec)[:, None]
+    return shooting.fitted(problem, base, free, inputs, inside, evaluations, pull, first)
 
 
-def by_definition(model: TaylorModel, spec: RobotSpec) -> tuple[TaylorModel, Mask]:
-    """Sets the rows of the twist that are states; returns the mask (D, K) of what is defined."""
+def together(base: TaylorModel, other: TaylorModel) -> tuple[TaylorModel, Array]:
+    """Returns a model over the terms of both, and the other's coefficients (D, K) for them."""
+    rows = {tuple(row): k for k, row in enumerate(other.powers.tolist())}
+    more = [row for row in base.powers.tolist() if tuple(row) not in rows]
+    rows |= {tuple(row): len(rows) + k for k, row in enumerate(more)}
+    powers = np.array(list(rows), dtype=np.int64)
+    coefficients, first = np.zeros((2, len(base.dofs), len(powers)))
+    coefficients[:, [rows[tuple(row)] for row in base.powers.tolist()]] = base.coefficients
+    first[:, : len(other.powers)] = other.coefficients
+    none = np.zeros((0, 0))
+    return replace(base, powers=powers, coefficients=coefficients, std_errors=none), first
+
+
+def defined(spec: RobotSpec) -> Mask:
+    """Selects the degrees of freedom (D,) that are not fitted: those of which the state tells."""
+    by_state = np.zeros(len(spec.dof_names), dtype=np.bool_)
+    for i, variable in enumerate(spec.state):
+        by_state[POSE_RATES.index(variable.twist) if variable.twist else 3 + i] = True
+    return by_state
+
+
+def by_definition(model: TaylorModel, spec: RobotSpec) -> TaylorModel:
+    """Sets the rows of the twist that are states."""
     coefficients, order = model.coefficients.copy(), model.powers.sum(axis=1)
-    defined = np.zeros(coefficients.shape, dtype=np.bool_)
     if not spec.moves_sideways:  # what is left of lateral motion is noise, unless it is a state
         coefficients[1] = 0.0
     for i, variable in enumerate(spec.state):
         if variable.twist:
             d = POSE_RATES.index(variable.twist)
             coefficients[d] = ((order == 1) & (model.powers[:, i] == 1)).astype(np.float64)
-            defined[d] = True
-        else:
-            defined[3 + i] = True
-    return replace(model, coefficients=coefficients, bounded=True), defined
+    return replace(model, coefficients=coefficients, bounded=True)
+
+
+Hypothesis = tuple[int, float]  # order, 0 for the textbook's terms alone, and pull to these
+
+
+def hypotheses(spec: RobotSpec, order: Order) -> tuple[Hypothesis, ...]:
+    """Returns those that are tried for an order, from the least free to the freest."""
+    orders = ORDERS if order == "auto" else (order,)
+    return ((0, 0.0), *((o, pull) for o in orders for pull in PULLS))
 
 
 def tried(
-    problem: shooting.Shooting, spec: RobotSpec, order: int, inputs: shooting.Inputs, inside: Mask
-) -> Trial | None:
-    """Fits to all but one of `FOLDS` parts of the rows `inside` (T,), and predicts that."""
-    sparse = replace(problem, spacing_s=CV_SPACING_S)
-    blocks = np.array_split(np.flatnonzero(inside), FOLDS)
-    errors: dict[float, list[Array]] = {h: [] for h in BANDS_S}
-    ends, paths = [], []
-    for block in blocks:
-        kept, left = inside.copy(), np.zeros_like(inside)
-        kept[block], left[block] = False, True
-        linear = linear_fit(problem.samples.rows(kept), spec, order)
-        found = refined(sparse, linear, spec, inputs, kept, CV_EVALUATIONS)
-        for horizon in BANDS_S:
-            error, path = problem.errors(found.model, found.values, horizon, left)
-            errors[horizon].append(np.hypot(error[:, 0], error[:, 1]))
-        ends.append(errors[HORIZON_S][-1])
+    problem: shooting.Shooting, spec: RobotSpec, asked: tuple[Hypothesis, ...], values: Array
+) -> tuple[Trial, ...]:
+    """Fits each hypothesis to all but one of `FOLDS` parts of a drive, and predicts that part."""
+    sparse = replace(problem, spacing_s=CV_SPACING_S, fixed=values)
+    everything = np.arange(len(problem.samples.t))
+    errors: dict[Hypothesis, list[Array]] = {hypothesis: [] for hypothesis in asked}
+    paths, judge = [], replace(sparse, horizons=BANDS_S)
+    for block in np.array_split(everything, FOLDS):
+        left = np.isin(everything, block)
+        base = fit_base(sparse, spec, shooting.NOTHING_FREE, ~left)
+        linear: dict[int, TaylorModel] = {}
+        for order, pull in asked:
+            model = base.model
+            if order:
+                if order not in linear:
+                    linear[order] = linear_fit(problem.samples.rows(~left), spec, order).model
+                model = refined(
+                    sparse, base.model, linear[order], spec, shooting.NOTHING_FREE, ~left,
+                    CV_EVALUATIONS, pull,
+                ).model  # fmt: skip
+            error, path = judge.errors(model, values, left)
+            errors[order, pull].append(np.hypot(error[..., 0], error[..., 1]))
         paths.append(path)
-    far, path = np.concatenate(ends), np.concatenate(paths)
-    if not len(far):
-        return None
-    share = float(far.mean() / max(float(path.mean()), 1e-9))
-    return Trial(order, share, {h: np.concatenate(each) for h, each in errors.items()})
+    length = max(float(np.nanmean(np.concatenate(paths)[:, -1])), 1e-9)
+    return tuple(
+        Trial(order, pull, float(np.nanmean(far[:, -1])) / length,
+              {h: each[~np.isnan(each)] for h, each in zip(BANDS_S, far.T, strict=True)})
+        for (order, pull), blocks in errors.items() for far in [np.concatenate(blocks)]
+    )  # fmt: skip
 
 
 BANDS_S = (0.5, 1.0, 2.0, HORIZON_S)
 
 
-def chosen(trials: list[Trial]) -> Trial:
-    """Returns the trial of the lowest order that a higher one does not clearly improve on."""
+def chosen(trials: Sequence[Trial]) -> Trial:
+    """Returns the first trial that none clearly improves on."""
     best = trials[0]
     for trial in trials[1:]:
         if trial.error < WORTH * best.error:

@@ -23,15 +23,18 @@ from nics_drl_bridge.robot.kernels import term_arrays
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 Mask = NDArray[np.bool_]
+Rows = NDArray[np.intp]
 Commands = Callable[[Array], Array]  # those in effect (T, C) during each step, by values (I,)
 
 HORIZONS_S = (1.0, 2.5, 5.0)
 SPACING_S = 0.25
 HEADING_ARM_M = 0.3  # a heading error counts as a position error at this distance
 FARTHEST_M = 50.0  # errors are cut at this distance per second of the horizon
-PRIOR = 0.001  # weight of the linear fit against the predictions
+PULL = 0.001  # usual weight of the first coefficients against the predictions
+REFERENCE_M_S = 0.1  # error that weighs as much, at a pull of 1, as a term as large as the rates
 DIFFERENCE = 0.02  # step of finite differences by the values of inputs, in their scale
 EVALUATIONS = 30
+LEAST_SCALE = 0.02  # of the loss: smaller errors count as their squares [m/s]
 SAME_STEP = 0.01  # share of a step by which two steps may differ
 
 
@@ -52,75 +55,83 @@ class Shooting:
     samples: Samples
     commands: Commands
     mounted: bool = False  # True if the last three values are the pose of what `q` is, in the base
+    fixed: Array | None = None  # values (I,) that are used instead of those given
     horizons: tuple[float, ...] = HORIZONS_S
     spacing_s: float = SPACING_S
 
-    def starts(self, horizon: float, inside: Mask | None = None) -> tuple[NDArray[np.intp], int]:
-        """Returns first rows (W,) of windows without gaps, of rows `inside` (T,), and steps."""
+    def starts(self, inside: Mask | None = None) -> tuple[Rows, Rows]:
+        """Returns first rows (W,) of windows, and steps (W, H) to their horizons; 0: not inside.
+
+        Windows have no gaps, and only rows `inside` (T,).
+        """
         t, dt = self.samples.t, self.samples.dt
-        steps = max(1, round(horizon / dt))
-        first = np.arange(0, max(len(t) - steps, 0), max(1, round(self.spacing_s / dt)))
-        last = first + steps
-        whole = np.abs(t[last] - t[first] - steps * dt) < SAME_STEP * dt * steps
+        last = len(t) - 1
+        first = np.arange(0, last, max(1, round(self.spacing_s / dt)))
+        steps = np.tile(np.maximum(1, np.round(np.array(self.horizons) / dt)), (len(first), 1))
+        steps = steps.astype(np.intp)
+        end = np.minimum(first[:, None] + steps, last)
+        apart = t[end] - t[first][:, None] - steps * dt
+        whole = (end - first[:, None] == steps) & (np.abs(apart) < SAME_STEP * dt * steps)
         if inside is not None:
             outside = np.append(0, np.cumsum(~inside))
-            whole &= outside[last] == outside[first]
-        return first[whole], steps
+            whole &= outside[end] == outside[first][:, None]
+        some = whole.any(axis=1)
+        return first[some], np.where(whole, steps, 0)[some]
 
-    def moved(self, first: NDArray[np.intp], steps: int) -> Array:
-        """Returns the measured poses (W, 3) at windows' ends from those at their starts."""
+    def moved(self, first: Rows, steps: Rows) -> Array:
+        """Returns the measured poses (W, H, 3) at windows' horizons from those at their starts."""
         pose = self.samples.q[:, :3]
-        return geometry.between(pose[first], pose[first + steps])
+        return geometry.between(pose[first][:, None], pose[first[:, None] + steps])
 
-    def paths(self, first: NDArray[np.intp], steps: int) -> Array:
-        """Returns the lengths (W,) of the measured paths over windows [m]."""
+    def paths(self, first: Rows, steps: Rows) -> Array:
+        """Returns the lengths (W, H) of the measured paths over windows [m]."""
         step = np.hypot(*np.diff(self.samples.q[:, :2], axis=0).T)
         length = np.append(0.0, np.cumsum(step))
-        return np.asarray(length[first + steps] - length[first])
+        return np.asarray(length[first[:, None] + steps] - length[first][:, None])
 
     def predict(
-        self, model: TaylorModel, values: Array, first: NDArray[np.intp], steps: int,
-        free: Mask | None = None,
-    ) -> tuple[Array, Array]:  # fmt: skip
-        """Returns ends (W, 3) of windows, derivatives (W, 3, P) by `free` (D, K) coefficients."""
+        self, model: TaylorModel, values: Array, first: Rows, steps: Rows, free: Mask | None = None
+    ) -> tuple[Array, Array]:
+        """Returns poses (W, H, 3), derivatives (W, H, 3, P) by `free` (D, K) coefficients."""
         free = np.zeros(model.coefficients.shape, dtype=np.bool_) if free is None else free
         used = (model.coefficients != 0.0) | free
         dofs, places = np.nonzero(used)
         terms = term_arrays(replace(model, coefficients=used.astype(np.float64)))
         terms = terms._replace(coefficient=model.coefficients[dofs, places])
         moving = np.flatnonzero(free[dofs, places]).astype(np.int64)
+        values = values if self.fixed is None else self.fixed
         command, state = self.commands(values), self.samples.q[:, 3:]
-        rows = first[:, None] + np.arange(steps)
-        count = len(first)
-        low, high = model.state_box
         shot = Shot(
-            np.ascontiguousarray(state[first]), np.ascontiguousarray(command[rows]), low, high,
-            np.zeros((count, 3)), np.zeros((count, 3, len(moving))),
+            np.ascontiguousarray(state[first]), first, np.ascontiguousarray(command), steps,
+            np.zeros((*steps.shape, 3)), np.zeros((*steps.shape, 3, len(moving))),
         )  # fmt: skip
         scratch = tangent(state.shape[1], command.shape[1], len(dofs), len(moving))
         shoot(shot, terms, moving, model.dt, scratch)
         return _seen_from(values[-3:], shot) if self.mounted else (shot.end, shot.slope)
 
     def errors(
-        self, model: TaylorModel, values: Array, horizon: float, inside: Mask | None = None
+        self, model: TaylorModel, values: Array, inside: Mask | None = None
     ) -> tuple[Array, Array]:
-        """Returns errors (W, 3) of predictions over a horizon [s], and the paths' lengths (W,)."""
-        first, steps = self.starts(horizon, inside)
+        """Returns errors (W, H, 3) of predictions, and the lengths (W, H) of paths; maybe NaN."""
+        first, steps = self.starts(inside)
         error = self.predict(model, values, first, steps)[0] - self.moved(first, steps)
-        error[:, 2] = geometry.wrap_angle(error[:, 2])
-        return error, self.paths(first, steps)
+        error[..., 2] = geometry.wrap_angle(error[..., 2])
+        error[steps == 0] = np.nan
+        return error, np.where(steps > 0, self.paths(first, steps), np.nan)
 
 
 def _seen_from(mounting: Array, shot: Shot) -> tuple[Array, Array]:
-    """Returns ends (W, 3) and their derivatives of a body at a pose (3,) in the base."""
+    """Returns ends (W, H, 3) and their derivatives of a body at a pose (3,) in the base."""
     end = geometry.between(mounting, geometry.compose(shot.end, mounting))
-    end[:, 2] = shot.end[:, 2]
-    arm = geometry.rotate(np.broadcast_to(mounting[:2], (len(end), 2)), shot.end[:, 2])
-    across = np.stack([-arm[:, 1], arm[:, 0]], axis=1)[:, :, None]
-    moved = shot.slope[:, :2] + across * shot.slope[:, 2:]
+    end[..., 2] = shot.end[..., 2]
+    arm = np.broadcast_to(mounting[:2], (*end.shape[:2], 2))
+    arm = geometry.rotate(arm, shot.end[..., 2])
+    across = np.stack([-arm[..., 1], arm[..., 0]], axis=-1)[..., None]
+    moved = shot.slope[..., :2, :] + across * shot.slope[..., 2:, :]
     c, s = np.cos(mounting[2]), np.sin(mounting[2])
-    along, aside = moved[:, 0], moved[:, 1]
-    return end, np.stack([c * along + s * aside, c * aside - s * along, shot.slope[:, 2]], axis=1)
+    along, aside = moved[..., 0, :], moved[..., 1, :]
+    rows = [c * along + s * aside, c * aside - s * along, shot.slope[..., 2, :]]
+    return end, np.stack(rows, axis=-2)
 
 
 @dataclass(frozen=True)
@@ -137,69 +148,103 @@ class Predictive:
     value_errors: Array  # (I,) standard errors of the values
 
 
+NOTHING_FREE = Inputs(*(np.zeros(0) for _ in range(4)))
+
+
 def fitted(
     problem: Shooting, model: TaylorModel, free: Mask, inputs: Inputs, inside: Mask | None = None,
-    evaluations: int = EVALUATIONS,
+    evaluations: int = EVALUATIONS, pull: float = PULL, first: Array | None = None,
 ) -> Predictive:  # fmt: skip
-    """Adjusts free coefficients (D, K) and values of inputs to the least prediction errors."""
-    unit = scale_of(problem.samples, model)[free]
-    chosen = [(*problem.starts(h, inside), h) for h in problem.horizons]
-    chosen = [each for each in chosen if len(each[0])]
-    weight = np.array([1.0, 1.0, HEADING_ARM_M])
-    count, first = len(inputs.start), model.coefficients[free]
+    """Adjusts free coefficients (D, K) and values of inputs to the least prediction errors.
 
-    def at(theta: Array) -> tuple[TaylorModel, Array]:
-        coefficients = model.coefficients.copy()
-        coefficients[free] = first + theta[count:] * unit
-        late = inputs.start + inputs.scale * theta[:count]
-        return replace(model, coefficients=coefficients), late
+    They are pulled to those of the model. The search starts at the `first` if these are better.
+    """
+    return _Search(problem, model, free, inputs, inside, pull).run(first, evaluations)
 
-    def shot(theta: Array, sloped: bool) -> tuple[Array, Array]:
-        trial, late = at(theta)
-        rest, slopes = [], []
-        for begin, steps, horizon in chosen:
-            end, slope = problem.predict(trial, late, begin, steps, free if sloped else None)
-            error = end - problem.moved(begin, steps)
-            error[:, 2] = geometry.wrap_angle(error[:, 2])
-            rest.append((np.clip(error, -FARTHEST_M, FARTHEST_M) * weight / horizon).ravel())
-            slope = slope * weight[:, None] / horizon
-            slopes.append(slope.reshape(3 * len(begin), slope.shape[2]))
-        return np.nan_to_num(np.concatenate(rest), nan=FARTHEST_M), np.concatenate(slopes)
 
-    begun, _ = shot(np.zeros(count + len(unit)), False)
-    pull = np.sqrt(PRIOR * len(begun)) * 0.1
+class _Search:
+    """Least squares over windows, by scaled values and coefficients (I + P,): zero is the model."""
 
-    def residual(theta: Array) -> Array:
-        return np.append(shot(theta, False)[0], pull * theta[count:])
+    def __init__(
+        self, problem: Shooting, model: TaylorModel, free: Mask, inputs: Inputs,
+        inside: Mask | None, pull: float,
+    ) -> None:  # fmt: skip
+        self.problem, self.model, self.free, self.inputs = problem, model, free, inputs
+        self.unit = scale_of(problem.samples, model)[free]
+        self.first, self.steps = problem.starts(inside)
+        self.wanted = self.steps > 0
+        weight = np.array([1.0, 1.0, HEADING_ARM_M])
+        self.weight = (weight / np.array(problem.horizons)[:, None])[None, :, :]
+        self.measured = problem.moved(self.first, self.steps)
+        self.count = len(inputs.start)
+        self.pull = REFERENCE_M_S * np.sqrt(pull * 3 * np.count_nonzero(self.wanted))
 
-    def jacobian(theta: Array) -> Array:
-        rest, slope = shot(theta, True)
+    def at(self, theta: Array) -> tuple[TaylorModel, Array]:
+        """Returns the model and the values of the inputs."""
+        coefficients = self.model.coefficients.copy()
+        coefficients[self.free] += theta[self.count :] * self.unit
+        late = self.inputs.start + self.inputs.scale * theta[: self.count]
+        return replace(self.model, coefficients=coefficients), late
+
+    def shot(self, theta: Array, sloped: bool) -> tuple[Array, Array]:
+        """Returns scaled errors (n,), and derivatives (n, P) by the coefficients."""
+        trial, late = self.at(theta)
+        free = self.free if sloped else None
+        end, slope = self.problem.predict(trial, late, self.first, self.steps, free)
+        error = end - self.measured
+        error[..., 2] = geometry.wrap_angle(error[..., 2])
+        rest = np.clip(error, -FARTHEST_M, FARTHEST_M) * self.weight
+        slopes = (slope * self.weight[..., None])[self.wanted]
+        rows = np.nan_to_num(rest[self.wanted].ravel(), nan=FARTHEST_M)
+        return rows, slopes.reshape(len(rows), slope.shape[-1])
+
+    def residual(self, theta: Array) -> Array:
+        """Returns what is to be small (n + P,)."""
+        return np.append(self.shot(theta, False)[0], self.pull * theta[self.count :])
+
+    def jacobian(self, theta: Array) -> Array:
+        """Returns its derivatives (n + P, I + P)."""
+        count, unit = self.count, self.unit
+        rest, slope = self.shot(theta, True)
         late = np.empty((len(rest), count))
         for c in range(count):
             aside = theta + DIFFERENCE * (np.arange(len(theta)) == c)
-            late[:, c] = (shot(aside, False)[0] - rest) / DIFFERENCE
+            late[:, c] = (self.shot(aside, False)[0] - rest) / DIFFERENCE
         slope = np.clip(np.nan_to_num(slope * unit), -1e6, 1e6)
-        own = np.concatenate([np.zeros((len(unit), count)), pull * np.eye(len(unit))], axis=1)
+        own = np.concatenate([np.zeros((len(unit), count)), self.pull * np.eye(len(unit))], axis=1)
         return np.concatenate([np.concatenate([late, slope], axis=1), own])
 
-    low = np.full(count + len(unit), -np.inf)
-    high = -low
-    low[:count] = (inputs.low - inputs.start) / inputs.scale - 1e-9
-    high[:count] = (inputs.high - inputs.start) / inputs.scale + 1e-9
-    found = least_squares(
-        residual, np.zeros(count + len(unit)), jac=jacobian, bounds=(low, high), loss="soft_l1",
-        f_scale=max(float(np.median(np.abs(begun))), 0.02), max_nfev=evaluations,
-    )  # fmt: skip
-    best, late = at(found.x)
-    rest, slope = shot(found.x, True)
-    starts = [np.repeat(problem.samples.t[begin], 3) for begin, *_ in chosen]
-    error = float(np.sqrt(np.mean(rest**2)))
-    span = np.floor(np.concatenate(starts) / max(problem.horizons)).astype(np.intp)
-    late_slope = jacobian(found.x)[: len(rest), :count] / inputs.scale
-    value_errors = clustered_errors(late_slope, rest, span)
-    return Predictive(
-        best, late, error, slope, rest, free, np.concatenate(starts), value_errors
-    )  # fmt: skip
+    def run(self, first: Array | None, evaluations: int) -> Predictive:
+        """Searches for the least errors."""
+        count, inputs, start = self.count, self.inputs, np.zeros(self.count + len(self.unit))
+        begun = self.residual(start)
+        if first is not None:
+            other = start.copy()
+            other[count:] = (first[self.free] - self.model.coefficients[self.free]) / self.unit
+            if np.abs(rest := self.residual(other)).sum() < np.abs(begun).sum():
+                start, begun = other, rest
+        low = np.full(len(start), -np.inf)
+        high = -low
+        low[:count] = (inputs.low - inputs.start) / inputs.scale - 1e-9
+        high[:count] = (inputs.high - inputs.start) / inputs.scale + 1e-9
+        found = least_squares(
+            self.residual, start, jac=self.jacobian, bounds=(low, high), loss="soft_l1",
+            f_scale=max(float(np.median(np.abs(begun))), LEAST_SCALE), max_nfev=evaluations,
+        )  # fmt: skip
+        return self.predictive(found.x)
+
+    def predictive(self, theta: Array) -> Predictive:
+        """Returns the model with what tells its uncertainty."""
+        best, late = self.at(theta)
+        rest, slope = self.shot(theta, True)
+        starts = np.repeat(self.problem.samples.t[self.first], 3 * self.wanted.sum(axis=1))
+        span = np.floor(starts / max(self.problem.horizons)).astype(np.intp)
+        errors = np.zeros(0)
+        if self.count:
+            late_slope = self.jacobian(theta)[: len(rest), : self.count] / self.inputs.scale
+            errors = clustered_errors(late_slope, rest, span)
+        error = float(np.sqrt(np.mean(rest**2)))
+        return Predictive(best, late, error, slope, rest, self.free, starts, errors)
 
 
 def scale_of(samples: Samples, model: TaylorModel) -> Array:

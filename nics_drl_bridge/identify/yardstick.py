@@ -193,7 +193,7 @@ class _Form:
         return TextbookResponse(float(delay[0]), gain, offset, lag, limit, bicycle, mounting)
 
 
-def _structure(spec: RobotSpec) -> tuple[Array, BicycleGeometry] | None:
+def structure_of(spec: RobotSpec) -> tuple[Array, BicycleGeometry] | None:
     """Asks the textbook what each command moves (3, C), and for a bicycle; None without one."""
     half = PROBE * np.maximum(spec.command_high, -spec.command_low)
     try:
@@ -219,7 +219,7 @@ def _structure(spec: RobotSpec) -> tuple[Array, BicycleGeometry] | None:
 
 def _first_guess(drive: Drive, until_s: float, clock_offset: float, offsets: bool) -> _Form:
     """Fits gains, lags and maybe offsets to motions over `GUESS_S` at the best delay, linearly."""
-    structure = _structure(drive.spec)
+    structure = structure_of(drive.spec)
     book, bicycle = structure or (np.ones((3, len(drive.spec.command))), STRAIGHT)
     seen, before = _without_jumps(drive, until_s, GUESS_S, SPACING_S)
     span = (seen.end_t - seen.start_t)[:, None]

@@ -61,6 +61,8 @@ def greatest_twist(model: SimulatorModel) -> tuple[float, float]:
         tried = np.random.default_rng(0).uniform(low, high, (MOST_CORNERS, len(ranges)))
     else:
         tried = np.array(list(product(*(np.linspace(*each, levels) for each in ranges))))
+    states = len(model.robot.state)
+    tried[:, states:] = model.kinematics.in_effect(tried[:, states:])
     twist = model.kinematics.rates(tried)[:, :3]
     return float(np.hypot(twist[:, 0], twist[:, 1]).max()), float(np.abs(twist[:, 2]).max())
 

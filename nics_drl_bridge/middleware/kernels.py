@@ -12,7 +12,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.robot.kernels import Terms, advance, rates, wrap
+from nics_drl_bridge.robot.kernels import (
+    Terms,
+    advance,
+    bounds_of,
+    next_state,
+    put_command,
+    rates,
+    wrap,
+)
 
 Array = NDArray[np.float64]
 RUNAWAY = 1e9  # Bound on poses, states and their derivatives; beyond, the model has diverged
@@ -62,7 +70,7 @@ def predict(mean, transition, command, dt, steps, motion):  # type: ignore[no-un
     size, width = mean.shape[0] - 3, command.shape[0]
     x, dq = np.ones(size + width + 1), np.zeros(3 + size)
     jacobian, step = np.zeros((3 + size, size + width)), np.eye(3 + size)
-    x[size : size + width] = command
+    put_command(x, command, motion.terms)
     for _ in range(steps):
         x[:size] = mean[3:]
         rates(dq, x, motion.terms)
@@ -78,12 +86,14 @@ def predict(mean, transition, command, dt, steps, motion):  # type: ignore[no-un
             step[0, 3 + i] = dt * (c * jacobian[0, i] - s * jacobian[1, i]) + step[0, 2] * turn
             step[1, 3 + i] = dt * (s * jacobian[0, i] + c * jacobian[1, i]) + step[1, 2] * turn
             step[2, 3 + i] = dt * jacobian[2, i]
-            for d in range(size):
-                step[3 + d, 3 + i] = (1.0 if d == i else 0.0) + dt * jacobian[3 + d, i]
+            for d in range(size):  # a limited rate does not depend on the state
+                free = motion.terms.fall[d] <= dq[3 + d] <= motion.terms.rise[d]
+                slope = dt * jacobian[3 + d, i] if free else 0.0
+                step[3 + d, 3 + i] = (1.0 if d == i else 0.0) + slope
         transition[:] = step @ transition
         advance(mean[:3], dq, dt, motion.series)
         for i in range(size):
-            mean[3 + i] += dt * dq[3 + i]
+            mean[3 + i] = next_state(mean[3 + i], dq[3 + i], dt, bounds_of(motion.terms, i))
 
 
 @kernel(allocates=True)
@@ -154,7 +164,8 @@ def expect(mean, now, motion, log):  # type: ignore[no-untyped-def]
     size, width = mean.shape[0] - 3, command.shape[0]
     x, dq = np.ones(size + width + 1), np.zeros(3 + size)
     jacobian, derivative = np.zeros((3 + size, size + width)), np.zeros((3, 3 + size))
-    x[:size], x[size : size + width] = mean[3:], command
+    x[:size] = mean[3:]
+    put_command(x, command, motion.terms)
     rates(dq, x, motion.terms)
     rates_jacobian(jacobian, x, motion.terms)
     derivative[:, 3:] = jacobian[:3, :size]

@@ -17,7 +17,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy import dynamic_window_kernels as kernels
 from nics_drl_bridge.policy.contract import SUFFIX, shipped
 from nics_drl_bridge.robot.kinds import command_for, has_textbook, reach, steady_twist
-from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
 
 Array = NDArray[np.float64]
 
@@ -47,9 +47,10 @@ def _grid(robot: RobotSpec) -> Array:
 def _settled(task: Navigation, commands: Array, model: SimulatorModel | None) -> Array:
     """Returns the body twists (K, 3) to which commands (K, C) lead when they are held.
 
-    By the model of a robot that is not driven by `cmd_vel`: its kind may know them roughly alone.
+    By the model of a robot that is not driven by `cmd_vel`: its kind may know them roughly alone;
+    and if its motors bend commands, of which its kind knows nothing.
     """
-    if model is None or task.robot.takes_cmd_vel:
+    if model is None or (task.robot.takes_cmd_vel and model.kinematics.is_plain):
         return steady_twist(task.robot, commands)
     kinematics, start = model.kinematics, np.zeros((len(commands), 3))
     state, moved = np.zeros((len(commands), kinematics.state_size)), start
@@ -163,9 +164,13 @@ class DynamicWindow:
         rays = kernels.ScanRays(directions, sight.origin, float(sight.range_max))
         lags = [value for name, value in robot.parameters.items() if name.endswith("_lag")]
         lag = max(lags, default=0.0)
+        brakes = [] if self.model is None else self.model.kinematics.braking.tolist()
+        fastest = dict(zip(POSE_RATES, np.abs(twists).max(axis=0).tolist(), strict=True))
+        slow = (fastest[v.twist] / b for v, b in zip(robot.state, brakes, strict=False) if v.twist)
         share = 1.0 - math.exp(-self.period / lag) if lag > 0.0 else 1.0
         reach = share * (twists.max(axis=0) - twists.min(axis=0)) + 1e-6
-        radius, rest = robot.footprint_radius + self.margin, 2.0 * self.period + lag
+        radius = robot.footprint_radius + self.margin
+        rest = 2.0 * self.period + lag + max(slow, default=0.0)
         ahead = kernels.LookAhead(reach, radius, 1.5 * self.period, self.steps, rest)
         return twists, rays, ahead, kernels.TwistWeights(*self.weights)
 

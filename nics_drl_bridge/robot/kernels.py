@@ -2,8 +2,8 @@
 
 A step of one robot is `rates` then `move`; `run` does the same for a batch, term by term, so that
 vector instructions process several robots at a time. Both give the same bits for every batch size.
-Shared arguments: `terms` are `Terms`; `x` contains state, command and a last entry of 1; `dq` are
-the rates; `series` is `SERIES` in the type of the other arrays.
+Shared arguments: `terms` are `Terms`; `x` contains state, command in effect and a last entry of 1;
+`dq` are the rates; `series` is `SERIES` in the type of the other arrays.
 """
 
 import math
@@ -22,10 +22,11 @@ Array = NDArray[np.float64]
 SERIES: Array = np.array([1 / 6, 1 / 120, 1 / 5040, 1 / 2, 1 / 24, 1 / 720])
 WIDE_TURN = 0.5  # For larger turns per step sine and cosine are used, not the series [rad]
 GREATEST_ORDER = 4
+DEAD, LEAST, MOST, BACK = 0, 1, 2, 3  # columns of `Terms.curves`, as in `InputCurve`
 
 
 class Terms(NamedTuple):
-    """The kept terms of a model."""
+    """The kept terms of a model, and what motors do around them."""
 
     dof: NDArray[np.int64]  # (T,) degree of freedom of each
     coefficient: Array  # (T,), or (T, n) of n robots
@@ -33,6 +34,20 @@ class Terms(NamedTuple):
     degree: NDArray[np.int64]  # (T,) number of factors
     low: Array  # (S,) least and greatest state, at which it is held
     high: Array
+    fall: Array  # (S,) greatest fall and rise of a state's rate
+    rise: Array
+    friction: Array  # (S,) by which a state is drawn to zero [unit / s]
+    curves: Array  # (C, 4) of the commands
+
+
+class Bounds(NamedTuple):
+    """What holds one state variable, as in `Terms`."""
+
+    low: float
+    high: float
+    fall: float
+    rise: float
+    friction: float
 
 
 def term_arrays(model: TaylorModel) -> Terms:
@@ -49,7 +64,20 @@ def term_arrays(model: TaylorModel) -> Terms:
         factors[row, : len(used)] = used
     count = (factors != one).sum(axis=1)
     coefficients = model.coefficients[dofs, places]
-    return Terms(dofs.astype(np.int64), coefficients, factors, count, *model.state_box)
+    fall, rise = np.ascontiguousarray(model.limits.T)
+    return Terms(
+        dofs.astype(np.int64), coefficients, factors, count, *model.state_box, fall, rise,
+        np.asarray(model.friction, np.float64), _curve_rows(model),
+    )  # fmt: skip
+
+
+def _curve_rows(model: TaylorModel) -> Array:
+    commands = model.variables[model.state_size :]
+    rows = np.tile([0.0, -np.inf, np.inf, 1.0], (len(commands), 1))
+    for curve in model.inputs:
+        row = curve.dead, curve.least, curve.most, curve.back
+        rows[commands.index(curve.command)] = row
+    return rows
 
 
 def scratch(model: TaylorModel) -> tuple[Array, Array]:
@@ -57,6 +85,51 @@ def scratch(model: TaylorModel) -> tuple[Array, Array]:
     x = np.zeros(len(model.variables) + 1)
     x[-1] = 1.0
     return x, np.zeros(len(model.dofs))
+
+
+@kernel
+def bend(command, curve):  # type: ignore[no-untyped-def]
+    """Returns the effect of a command by its curve (4,); see `InputCurve`."""
+    held = min(max(command, curve[LEAST]), curve[MOST])
+    if held < -curve[DEAD]:
+        return curve[BACK] * (held + curve[DEAD])
+    return 0.0 if held <= curve[DEAD] else held - curve[DEAD]
+
+
+@kernel
+def put_command(x, command, terms):  # type: ignore[no-untyped-def]
+    """Writes the effect of a command (C,) to `x`."""
+    first = x.shape[0] - 1 - command.shape[0]
+    for c in range(command.shape[0]):
+        x[first + c] = bend(command[c], terms.curves[c])
+
+
+@kernel
+def bounds_of(terms, i):  # type: ignore[no-untyped-def]
+    """Returns the bounds of state variable i."""
+    return Bounds(terms.low[i], terms.high[i], terms.fall[i], terms.rise[i], terms.friction[i])
+
+
+@kernel
+def next_state(value, rate, dt, bounds):  # type: ignore[no-untyped-def]
+    """Returns a state variable after dt [s]: its rate limited, then dry friction, then held."""
+    # Conditions on the bounds alone: a loop over robots is compiled once with them, once without.
+    if bounds.fall > -math.inf or bounds.rise < math.inf:
+        rate = min(max(rate, bounds.fall), bounds.rise)
+    value += dt * rate
+    if bounds.friction > 0.0:
+        stick = dt * bounds.friction
+        value = max(value - stick, min(value + stick, 0.0))
+    return min(max(value, bounds.low), bounds.high)
+
+
+@kernel
+def with_coefficients(terms, coefficient):  # type: ignore[no-untyped-def]
+    """Returns terms with other coefficients, those of a robot or of several."""
+    return Terms(
+        terms.dof, coefficient, terms.factors, terms.degree, terms.low, terms.high, terms.fall,
+        terms.rise, terms.friction, terms.curves,
+    )  # fmt: skip
 
 
 @kernel
@@ -120,7 +193,7 @@ def advance(pose, twist, dt, series):  # type: ignore[no-untyped-def]
 
 @kernel
 def run(pose, x, dq, terms, series, dt, steps):  # type: ignore[no-untyped-def]
-    """Moves n robots in place by the same number of steps of dt [s], under constant commands.
+    """Moves n robots in place by the same number of steps of dt [s], commands in effect constant.
 
     `pose` (6, n) is x, y [m], cosine, sine, unwrapped heading, and an upper bound of the path
     length [m]; `x` is (S + C + 1, n), `dq` (3 + S, n) the last step's rates, coefficients (T, n).
@@ -129,9 +202,9 @@ def run(pose, x, dq, terms, series, dt, steps):  # type: ignore[no-untyped-def]
         _rates_of_all(dq, x, terms)
         _move_all(pose, dq, dt, series)
         for d in range(3, dq.shape[0]):
-            state, rate, low, high = x[d - 3], dq[d], terms.low[d - 3], terms.high[d - 3]
+            state, rate, bounds = x[d - 3], dq[d], bounds_of(terms, d - 3)
             for i in range(state.shape[0]):
-                state[i] = min(max(state[i] + dt * rate[i], low), high)
+                state[i] = next_state(state[i], rate[i], dt, bounds)
 
 
 @kernel
@@ -197,7 +270,7 @@ def _move_widely(pose, dq, dt, series):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def rollout(poses, states, commands, terms, series, dt):  # type: ignore[no-untyped-def]
-    """Rolls out robots from the first of poses (W, T + 1, 3) under commands (W, T, C)."""
+    """Rolls out robots from the first of poses (W, T + 1, 3), commands in effect (W, T, C)."""
     size, width = states.shape[2], commands.shape[2]
     x, dq = np.ones(size + width + 1), np.zeros(3 + size)
     for w in range(poses.shape[0]):
@@ -212,7 +285,7 @@ def rollout(poses, states, commands, terms, series, dt):  # type: ignore[no-unty
             px, py, c, s = move(px, py, c, s, dq[0], dq[1], turn, dt, series)
             heading += turn
             for i in range(size):
-                x[i] = min(max(x[i] + dt * dq[3 + i], terms.low[i]), terms.high[i])
+                x[i] = next_state(x[i], dq[3 + i], dt, bounds_of(terms, i))
                 states[w, n + 1, i] = x[i]
             poses[w, n + 1, 0], poses[w, n + 1, 1], poses[w, n + 1, 2] = px, py, heading
 

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import combinations_with_replacement
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import ConfigDict, Field
+from pydantic import AllowInfNan, ConfigDict, Field, NonNegativeFloat
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.config import Schema
 from nics_drl_bridge.errors import ModelError
+from nics_drl_bridge.robot.curve import InputCurve, bent
 
 Array = NDArray[np.float64]
 
@@ -21,7 +23,11 @@ BEYOND = 0.25  # share of its range by which a bounded state may leave it, on bo
 
 @dataclass(frozen=True)
 class TaylorModel:
-    """`dQ/dt = A chi(X)` without the pruned terms (Eq. 1, 2)."""
+    """`dQ/dt = A chi(X)` without the pruned terms (Eq. 1, 2), and what motors do around them.
+
+    Commands of X are those in effect, after the input curves. The rate of a state is cut to its
+    limits; then dry friction draws the state to zero, where it sticks.
+    """
 
     variables: tuple[str, ...]  # V names of X = [state, command]
     dofs: tuple[str, ...]  # D = 3 + S names of dQ/dt: vx, vy, wz, then the state's rates
@@ -36,6 +42,17 @@ class TaylorModel:
     std_errors: Array = field(default_factory=lambda: np.zeros((0, 0)))
     quality: Quality | None = None
     bounded: bool = False  # True if the state is held in the recording's box, widened
+    inputs: tuple[InputCurve, ...] = ()  # of the commands that have one
+    friction: Array = field(default_factory=lambda: np.zeros(0))  # (S,) [unit of the state / s]
+    # (S, 2) greatest fall and rise of each state's rate [unit of the state / s]
+    limits: Array = field(default_factory=lambda: np.zeros((0, 2)))
+
+    def __post_init__(self) -> None:
+        if not self.friction.size:
+            object.__setattr__(self, "friction", np.zeros(self.state_size))
+        if not self.limits.size:
+            unlimited = np.tile([-np.inf, np.inf], (self.state_size, 1))
+            object.__setattr__(self, "limits", unlimited)
 
     @property
     def state_size(self) -> int:
@@ -54,17 +71,32 @@ class TaylorModel:
         """Number of non-zero coefficients."""
         return int(np.count_nonzero(self.coefficients))
 
+    @property
+    def is_plain(self) -> bool:
+        """True if the motors do nothing beside the terms."""
+        return not (self.inputs or self.friction.any() or np.isfinite(self.limits).any())
+
+    @property
+    def braking(self) -> Array:
+        """Greatest rate towards zero (S,) of each state, from both sides; infinite if unlimited."""
+        return np.asarray(np.minimum(-self.limits[:, 0], self.limits[:, 1]))
+
+    def in_effect(self, command: ArrayLike) -> Array:
+        """Returns the commands in effect (..., C) of commands, by the input curves."""
+        return bent(command, self.variables[self.state_size :], self.inputs)
+
     def rates(self, x: ArrayLike) -> Array:
-        """Returns dQ/dt (..., D) at X (..., V)."""
+        """Returns dQ/dt (..., D) at X (..., V), whose commands are those in effect."""
         return evaluate(x, self.powers) @ self.coefficients.T
 
     def step(self, pose: ArrayLike, state: ArrayLike, command: ArrayLike) -> tuple[Array, Array]:
         """Returns pose (..., 3) and state (..., S) after a step of `dt` along the exact arc."""
         state = np.asarray(state, dtype=np.float64)
-        x = np.concatenate([state, np.asarray(command, dtype=np.float64)], axis=-1)
-        dq = self.rates(x) * self.dt
-        held = np.clip(state + dq[..., 3:], *self.state_box)
-        return geometry.compose(pose, geometry.exp(dq[..., :3])), held
+        dq = self.rates(np.concatenate([state, self.in_effect(command)], axis=-1)) * self.dt
+        moved = state + np.clip(dq[..., 3:], *(self.dt * self.limits.T))
+        stick = self.dt * self.friction
+        moved = np.maximum(moved - stick, np.minimum(moved + stick, 0.0))
+        return geometry.compose(pose, geometry.exp(dq[..., :3])), np.clip(moved, *self.state_box)
 
     @property
     def term_names(self) -> tuple[str, ...]:
@@ -115,11 +147,15 @@ class TaylorModel:
             for dof, row in zip(self.dofs, self.coefficients, strict=True)
         }
         box = zip(self.low.tolist(), self.high.tolist(), strict=True)
+        states, limits = self.variables[: self.state_size], map(tuple, self.limits.tolist())
+        friction = {s: f for s, f in zip(states, self.friction.tolist(), strict=True) if f > 0.0}
+        limited = {s: k for s, k in zip(states, limits, strict=True) if np.isfinite(k).any()}
         return NamedTaylorModel.model_construct(
             dt=self.dt, units=dict(zip(self.dofs, self.dof_units, strict=True)), terms=terms,
             valid=dict(zip(self.variables, box, strict=True)), assumed=self.assumed,
             standard_errors=self.named_errors if self.std_errors.size else None,
-            quality=self.quality, bounded=self.bounded,
+            quality=self.quality, bounded=self.bounded, inputs=self.inputs,
+            friction=friction or None, limits=limited or None,
         )  # fmt: skip
 
 
@@ -219,6 +255,10 @@ class Quality:
     judgement: tuple[HorizonErrors, ...] = ()  # by horizon, ascending
 
 
+Fall = Annotated[float, AllowInfNan(), Field(lt=0.0)]
+Rise = Annotated[float, AllowInfNan(), Field(gt=0.0)]
+
+
 class NamedTaylorModel(Schema):
     """A TaylorModel by names, as `model.yaml` holds it; `valid` is the range of each variable."""
 
@@ -230,6 +270,9 @@ class NamedTaylorModel(Schema):
     standard_errors: dict[str, dict[str, float]] | None = None
     quality: Quality | None = None
     bounded: bool = False
+    inputs: tuple[InputCurve, ...] = ()
+    friction: dict[str, NonNegativeFloat] | None = None  # by state
+    limits: dict[str, tuple[Fall, Rise]] | None = None  # by state
 
     def model(self) -> TaylorModel:
         """Returns the model as arrays. Raises ModelError if the names do not fit each other."""
@@ -246,8 +289,27 @@ class NamedTaylorModel(Schema):
         powers = np.array([parsed[name] for name in names], dtype=np.int64)
         rows = [[self.terms[dof].get(name, 0.0) for name in names] for dof in dofs]
         low, high = np.array(list(self.valid.values())).reshape(len(variables), 2).T
+        states, friction, limits = (
+            variables[: len(dofs) - 3],
+            self.friction or {},
+            self.limits or {},
+        )
+        self._check_stages(states, variables[len(states) :])
         return TaylorModel(
             variables, dofs, units, powers.reshape(len(names), len(variables)),
             np.array(rows, dtype=np.float64).reshape(len(dofs), len(names)), self.dt, low, high,
-            self.assumed, quality=self.quality, bounded=self.bounded,
+            self.assumed, quality=self.quality, bounded=self.bounded, inputs=self.inputs,
+            friction=np.array([friction.get(name, 0.0) for name in states]),
+            limits=np.array([limits.get(name, (-np.inf, np.inf)) for name in states]),
         ).with_errors(self.standard_errors or {})  # fmt: skip
+
+    def _check_stages(self, states: tuple[str, ...], commands: tuple[str, ...]) -> None:
+        curved = [curve.command for curve in self.inputs]
+        keys = ("inputs", curved, commands), ("friction", self.friction, states)
+        for key, names, known in (*keys, ("limits", self.limits, states)):
+            for name in names or ():
+                if name not in known:
+                    fault = f"key {key!r} has {name!r}, not one of ({', '.join(known)})"
+                    raise ModelError(f"kinematics: {fault}; correct the name.")
+        if len(set(curved)) < len(curved):
+            raise ModelError("kinematics: key 'inputs' has a command twice; keep one.")

@@ -11,7 +11,15 @@ import numpy as np
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, X, Y
-from nics_drl_bridge.robot.kernels import Terms, delayed, move, rates, wrap
+from nics_drl_bridge.robot.kernels import (
+    bounds_of,
+    delayed,
+    move,
+    next_state,
+    rates,
+    with_coefficients,
+    wrap,
+)
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import impact_kernels as impact
 from nics_drl_bridge.sim.impact_kernels import AFTER, DEPTH, STOP, TIME, TURN, VX, VY, Moving
@@ -27,15 +35,12 @@ MOST_MOVES = 1000
 def rates_at(n: int, m: int, j: int, state: State, motion: Dynamics, single: Single) -> None:
     """Writes to `single.dq` the rates of robot m in substep j, by the command then in effect."""
     row = delayed(j, state.delay[n, m], motion.substeps, state.history.shape[2])
-    size, terms = state.state.shape[2], motion.terms
+    size = state.state.shape[2]
     for s in range(size):
         single.x[s] = state.state[n, m, s]
     for c in range(state.history.shape[3]):
         single.x[size + c] = state.history[n, m, row, c]
-    own = Terms(
-        terms.dof, state.coefficient[n, m], terms.factors, terms.degree, terms.low, terms.high
-    )  # fmt: skip
-    rates(single.dq, single.x, own)
+    rates(single.dq, single.x, with_coefficients(motion.terms, state.coefficient[n, m]))
 
 
 @kernel
@@ -188,9 +193,8 @@ def move_carefully(
                 flight, dq = single.flights[first + m], single.dq
                 flight[VX], flight[VY], flight[TURN], flight[STOP] = dq[0], dq[1], dq[2], dt
                 for s in range(state.state.shape[2]):
-                    value = state.state[n, m, s] + dt * dq[3 + s]
-                    value = min(max(value, motion.terms.low[s]), motion.terms.high[s])
-                    state.state[n, m, s] = value
+                    now, bounds = state.state[n, m, s], bounds_of(motion.terms, s)
+                    state.state[n, m, s] = next_state(now, dq[3 + s], dt, bounds)
                 if events[m, DEPTH] < 0.0:
                     _leave(m, dt, scene, nearby, single, moving)
         _settle(dt, scene, nearby, events, touched, moving)

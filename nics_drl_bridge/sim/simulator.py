@@ -52,7 +52,11 @@ class CommandBox:
     ) -> None:
         first, margin = len(robot.state), TOLERANCE * (robot.command_high - robot.command_low)
         self._tell, self._names = tell, robot.variable_names[first:]
-        self._range = model.low[first:], model.high[first:]
+        edges = np.stack([model.low[first:], model.high[first:]])
+        for curve in model.inputs:  # the model's box is of commands in effect
+            place = self._names.index(curve.command)
+            edges[:, place] = curve.sent(edges[:, place])
+        self._range = edges[0], edges[1]
         self._low: Array = self._range[0] - margin
         self._high: Array = self._range[1] + margin
         for _, term in model.assumed:
@@ -84,7 +88,8 @@ def _check_speed(model: TaylorModel, robot: RobotSpec, world: World) -> None:
     """Raises ConfigError if a robot could cross a whole world in one step of its kinematics."""
     first = len(robot.state)
     most = np.maximum(np.abs(model.low), np.abs(model.high))
-    limits = np.maximum(np.abs(robot.command_low), np.abs(robot.command_high))
+    ends = model.in_effect([robot.command_low, robot.command_high])
+    limits = np.abs(ends).max(axis=0)
     most[first:] = np.maximum(most[first:], limits)
     products = np.prod(most**model.powers, axis=1)
     step = float((np.abs(model.coefficients[:2]) @ products).max() * model.dt)

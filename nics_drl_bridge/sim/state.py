@@ -23,7 +23,7 @@ class State(NamedTuple):
 
     pose: Array  # (N, M, 3) true pose of `base_link` in `map`
     state: Array  # (N, M, S) true state
-    history: Array  # (N, M, H, C) commands, newest first
+    history: Array  # (N, M, H, C) commands in effect, newest first
     bodies: Array  # (N, K + M, 7) obstacles, then robots, columns as in `lidar.exact_kernels`
     odom: Array  # (N, M, 3) pose by odometry, which drifts; it begins at the start pose
     twist: Array  # (N, M, 3) measured body twist

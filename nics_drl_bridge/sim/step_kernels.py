@@ -13,7 +13,7 @@ from numba.experimental import structref
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
-from nics_drl_bridge.robot.kernels import Terms, delayed, run, wrap
+from nics_drl_bridge.robot.kernels import bend, delayed, run, with_coefficients, wrap
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import obstacle_kernels as obstacles
 from nics_drl_bridge.sim import sensing_kernels as sensing
@@ -49,14 +49,14 @@ def pack(part: Part) -> Any:
 
 
 @kernel
-def _send(history: Array, commands: Array, begin: int) -> None:
+def _send(history: Array, commands: Array, begin: int, curves: Array) -> None:
     for i in range(commands.shape[0]):
         for m in range(commands.shape[1]):
             for h in range(history.shape[2] - 1, 0, -1):
                 for c in range(commands.shape[2]):
                     history[begin + i, m, h, c] = history[begin + i, m, h - 1, c]
             for c in range(commands.shape[2]):
-                history[begin + i, m, 0, c] = commands[i, m, c]
+                history[begin + i, m, 0, c] = bend(commands[i, m, c], curves[c])
 
 
 @kernel
@@ -76,8 +76,7 @@ def move_freely(begin: int, end: int, state: State, motion: Dynamics, lanes: Lan
             for t in range(lanes.coefficient.shape[0]):
                 lanes.coefficient[t, i] = state.coefficient[n, m, t]
             late[i] = state.delay[n, m] % substeps  # its command changes once, after this many
-    own = motion.terms
-    terms = Terms(own.dof, lanes.coefficient, own.factors, own.degree, own.low, own.high)
+    terms = with_coefficients(motion.terms, lanes.coefficient)
     at, used = 0, (end - begin) * robots
     while at < substeps:
         until = substeps
@@ -145,7 +144,7 @@ def _step(
 ) -> None:  # fmt: skip
     """See `step_worlds`; without reference counts, which took longer than the step."""
     many, end = state.pose.shape[1], begin + commands.shape[0]
-    _send(state.history, commands, begin)
+    _send(state.history, commands, begin, motion.terms.curves)
     block = scratch.lanes.pose.shape[1] // many
     for low in range(begin, end, block):
         high = min(low + block, end)
