@@ -12,7 +12,6 @@ import argparse
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -68,7 +67,9 @@ def under(control: str | None, recording: Recording) -> Recording:
 
 def judged(found: Identified, recording: Recording, control: str | None) -> dict[str, Any]:
     """Returns the errors of a model, and of its yardsticks, on what it has not seen."""
-    # The yardsticks know the commands that were given, whatever a control made of them.
+    # The trial: what is written was fitted to the last third, too. The yardsticks know the commands
+    # that were given, whatever a control made of them.
+    found = found.trial
     drive, calibration, until = found.drive, found.calibration, found.train_until_s
     chosen = windows(drive, calibration, until, drive.duration_s, HORIZON_S, SPACING_S)
     ends = chosen.start if control == "standing" else predict(
@@ -83,7 +84,9 @@ def judged(found: Identified, recording: Recording, control: str | None) -> dict
         "heading_error_rad": heading,
         "yardstick_share": off(yardstick.predict(given, chosen), chosen)[1],
         "constant_twist_share": off(kept_twist(drive, chosen), chosen)[1],
-        "coverage_95": coverage(found),
+        "coverage_95": found.coverage.get(HORIZON_S, float("nan")),
+        "coverages_95": {f"{horizon:g}": share for horizon, share in found.coverage.items()},
+        "errors_m": {f"{at.horizon_s:g}": at.model.position_m for at in found.judgement},
         "path_m": float(chosen.path.mean()),
         "windows": len(chosen.start_t),
     }
@@ -95,14 +98,6 @@ def off(ends: Array, chosen: Windows) -> tuple[float, float, float]:
     error = float(np.hypot(apart[:, 0], apart[:, 1]).mean())
     heading = float(np.abs(geometry.wrap_angle(apart[:, 2])).mean())
     return error, error / float(chosen.path.mean()), heading
-
-
-def coverage(found: Identified) -> float:
-    """Returns the share of held-out ends within the model's 95 % band after 5 s; NaN if untold."""
-    # The seam to `identify`: a figure by horizon [s], as soon as it predicts its uncertainty.
-    told = getattr(found, "coverage", None)
-    told = told.get(HORIZON_S) if isinstance(told, Mapping) else told
-    return float("nan") if told is None else float(told)
 
 
 def figures(source: Path, mapping: Path, truth: Truth, control: str | None) -> dict[str, Any]:
@@ -130,7 +125,7 @@ def left_out(source: Path, mapping: Path, control: str | None) -> dict[str, Any]
     spec, recording = robot_and_drive(source, None, TopicRoles(), mapping)
     recording = under(control, recording)
     since = recording.pose.t - recording.pose.t[0]
-    errors = []
+    errors, paths = [], []
     for start in np.arange(0.0, since[-1] - SEGMENT_S, SEGMENT_S):
         others = recording.pose.rows((since < start) | (since >= start + SEGMENT_S))
         found = identify(
@@ -141,11 +136,12 @@ def left_out(source: Path, mapping: Path, control: str | None) -> dict[str, Any]
             drive, found.calibration, start, start + SEGMENT_S, HORIZON_S, SPACING_S
         )  # fmt: skip
         ends = predict(found.model, found.calibration, drive, chosen)
+        paths.append(float(chosen.path.mean()))
         errors.append(off(chosen.start if control == "standing" else ends, chosen))
     error, share, heading = (float(mean) for mean in np.mean(errors, axis=0))
     return {
         "error_m": error, "share_of_path": share, "heading_error_rad": heading,
-        "errors_m": [each[0] for each in errors],
+        "errors_m": [each[0] for each in errors], "path_m": float(np.mean(paths)),
     }  # fmt: skip
 
 

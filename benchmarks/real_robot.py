@@ -112,7 +112,7 @@ def main() -> int:
     try:
         recording, robot = read_recording(options.recording), load_robot(options.robot)
         begin = time.perf_counter()
-        found = identify(recording, robot, train_until=options.train_until)
+        found = identify(recording, robot, train_until=options.train_until).trial
         seconds = time.perf_counter() - begin
         found = under(options.control, found, recording, robot)
         result = results(found, options.recording, seconds)

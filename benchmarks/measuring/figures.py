@@ -27,9 +27,11 @@ README = told(
         "errors below the paper's Table I (`docs/kinematics.md`)",
     ),
     (
-        "real_robot",
-        "a real car, 5 s open-loop on the unseen last third of a 45 s drive",
-        "{mean_position_error_m|.3f} m over a path of {mean_path_m|.2f} m",
+        "real_drives",
+        "a real car, 5 s open-loop on each segment of 11 s of a 45 s drive, left out in turn",
+        "{left_out.xtark_random_drive_45s.error_m|.3f} m and "
+        "{left_out.xtark_random_drive_45s.heading_error_rad|.3f} rad over a path of "
+        "{left_out.xtark_random_drive_45s.path_m|.2f} m",
     ),
     (
         "real_drives",

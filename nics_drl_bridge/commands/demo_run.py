@@ -18,6 +18,8 @@ from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, Polic
 from nics_drl_bridge.files import write_text
 from nics_drl_bridge.generator import SimulatorModel, generate, save_model
 from nics_drl_bridge.identify.identify import Identified
+from nics_drl_bridge.identify.judgement import shortfall
+from nics_drl_bridge.identify.report import COMPARED, HEADS, judgement_rows
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.policy import evaluation
 from nics_drl_bridge.policy.evaluation import FIRST_SEED, Episode, Summary, deviation, successes
@@ -100,6 +102,7 @@ def run(plan: DemoPlan, say: Say) -> str:
     ]
     name, file = model.robot.name, plan.out / "report.html"
     lead = f"Robot {name!r} in the world {plan.world!r}, policy {learned.policy!r}."
+    lead = " ".join([*shortfall(identified.judgement), lead])
     write_text(file, pictures.page("nics_drl_bridge: demo", lead, sections))
     return (
         f"demo: in process {successes(here)}/{plan.episodes}, "
@@ -254,6 +257,8 @@ def _model(plan: DemoPlan, model: SimulatorModel, identified: Identified) -> lis
     caption = "What each further term is worth; circles mark how many are kept."
     return [
         pictures.paragraph(f"Generated from {plan.recording or 'a textbook drive'}."),
+        pictures.paragraph(COMPARED),
+        pictures.table(HEADS, judgement_rows(identified.judgement)),
         pictures.code(model.report),
         pictures.picture(accuracy(identified), caption),
         *(pictures.picture(png, CAPTIONS[name]) for name, png in calibrated.items()),

@@ -52,6 +52,12 @@ class Drive:
         """Returns a drive of the same robot with other streams."""
         return self if recording is self.recording else replace(self, recording=recording)
 
+    def under(self, settings: Settings) -> Drive:
+        """Returns the same drive, as far as it is prepared, with other options."""
+        same = replace(self, settings=settings)
+        vars(same).update(vars(self) | {"settings": settings})
+        return same
+
     @property
     def duration_s(self) -> float:
         """Time from the first pose to the last [s]."""

@@ -26,23 +26,30 @@ from nics_drl_bridge.identify.fit import (
     regress,
 )  # fmt: skip
 from nics_drl_bridge.identify.inputs import curve_of
+from nics_drl_bridge.identify.judgement import bands_of, judged, shortfall
 from nics_drl_bridge.identify.mounting import Mounting, mounted, mounting_of
 from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
-from nics_drl_bridge.identify.open_loop import SPACING_S, OpenLoop, predict, windows
+from nics_drl_bridge.identify.open_loop import (
+    SPACING_S,
+    OpenLoop,
+    open_loop_error,
+    predict,
+    windows,
+)  # fmt: skip
 from nics_drl_bridge.identify.orders import ORDERS, about_orders, through_state
 from nics_drl_bridge.identify.refine import refined
 from nics_drl_bridge.identify.repair import check_axes, check_units, repaired
 from nics_drl_bridge.identify.signals import speed_index
+from nics_drl_bridge.identify.structure import structures
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream, check
 from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.robot.taylor import TaylorModel
+from nics_drl_bridge.robot.taylor import HorizonErrors, TaylorModel
 from nics_drl_bridge.threads import one_blas_thread
 
 T = TypeVar("T")
 
 TRAIN_SHARE = 2.0 / 3.0
-WITHIN = 95.0  # percentage of predictions within the band
 
 
 @dataclass(frozen=True)
@@ -70,11 +77,10 @@ class Findings:
     assumptions: tuple[str, ...] = ()  # sentences of `complete`
     unseen: Samples | None = None  # of the part that the fit did not see, of `judge`
     held_out: OpenLoop | None = None  # open-loop errors on that part, of `judge`
-    # of `judge`: radius of the 95 % band of predicted positions [m], and share of the held-out
-    # ends within it, by horizon [s]; empty if the drive is too short
-    bands: dict[float, float] = field(default_factory=dict)
-    coverage: dict[float, float] = field(default_factory=dict)
+    structure: tuple[str, ...] = ()  # sentences on residuals that depend on X, of `judge`
+    judgement: tuple[HorizonErrors, ...] = ()  # on that part, beside yardsticks, of `judge`
     notes: tuple[str, ...] = ()  # all sentences, of `judge`
+    refit: "Findings | None" = None  # on all data, of `refit`; None if the trial's model is kept
 
 
 Stage = Callable[[Drive, Findings], Findings]
@@ -95,8 +101,8 @@ def _fitted(findings: Findings) -> tuple[Fit, TaylorModel]:
 def repair(drive: Drive, findings: Findings) -> Findings:
     """Refuses other units and reversed axes; drops repeated rows and jumps, clips commands."""
     check_units(drive)
-    training, repairs = repaired(findings.training)
-    whole, _ = repaired(findings.whole)
+    training, _ = repaired(findings.training)
+    whole, repairs = repaired(findings.whole)
     check_axes(training)
     check(training.recording, drive.spec)
     return replace(findings, training=training, whole=whole, repairs=repairs)
@@ -201,9 +207,10 @@ def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:
     training, spec, order = findings.training, drive.spec, drive.settings.order
     samples = aligned(training, findings)
     try:
-        base = motions.base_of(training, findings.calibration, samples)
-        asked = motions.hypotheses(spec, order)
-        trials = motions.tried(base.problem, spec, asked, base.inputs.start)
+        base = motions.base_of(training, findings.calibration, samples, findings.base)
+        trials, asked = findings.trials, motions.hypotheses(spec, order)
+        if not trials:  # a refit knows what was chosen
+            trials = motions.tried(base.problem, spec, asked, base.inputs.start)
     except FitError as error:
         raise FitError(f"{drive.recording.source}: {error}") from None
     best = motions.chosen(trials).order
@@ -227,7 +234,7 @@ def fit(drive: Drive, findings: Findings) -> Findings:
         known(calibration.responses or None, "the response of each state", "responses")
     samples, trials = align(findings.training, calibration), findings.trials
     inferred = drive.recording.state is None and not calibration.is_exact
-    if settings.order == "auto" and inferred:
+    if settings.order == "auto" and inferred and not trials:  # a refit knows them
         trials = _trials_of_orders(drive, findings)
     order = ORDER if settings.order == "auto" else settings.order
     order = motions.chosen(list(trials)).order if trials else order
@@ -252,7 +259,7 @@ def _trials_of_orders(drive: Drive, findings: Findings) -> tuple[motions.Trial, 
         if motions.HORIZON_S not in errors:
             break
         share = float(errors[motions.HORIZON_S].mean() / max(float(path.mean()), 1e-9))
-        trials.append(motions.Trial(order, share, errors))
+        trials.append(motions.Trial(order, 0.0, share, errors))
     return tuple(trials)
 
 
@@ -291,12 +298,15 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
         calibration, command_latency_s=float(found.values[0]),
         inputs=motions.curves_at(base.actuators, found.values),
     )  # fmt: skip
+    values = found.values.copy()
     if base.problem.mounted:
         calibration = motions.remounted(calibration, found)
+        values[-3:] = 0.0
+    base = replace(base, inputs=replace(base.inputs, start=values))
     errors = motions.standard_errors(found)
     model = replace(found.model, std_errors=errors, inputs=calibration.inputs)
     return replace(
-        findings, calibration=calibration, model=model,
+        findings, calibration=calibration, model=model, base=base,
         refinement=(f"Coefficients and latency were refined by the open-loop errors over up to "
                     f"{max(shooting.HORIZONS_S):g} s.",),
     )  # fmt: skip
@@ -319,39 +329,54 @@ def judge(drive: Drive, findings: Findings) -> Findings:
     begin = whole.recording.pose.t[0] + calibration.clock_offset_s + drive.settings.train_until_s
     rest = samples.rows(samples.t > begin)
     unseen = rest if len(rest.t) >= verdict.MIN_ROWS else None
-    held_out, trial = verdict.tried(model, calibration, whole)
-    bands = bands_of(drive, findings)
-    calibration = replace(calibration, notes=_sentences(findings))
-    judged = verdict.with_quality(model, linear, unseen, held_out, spec)
-    return replace(
+    held_out = verdict.tried(model, calibration, whole)
+    bands: dict[float, float] = {}
+    if not calibration.is_exact and drive.duration_s > drive.settings.train_until_s:
+        derived = None
+        if findings.base is not None:
+            derived = aligned(findings.training, findings), findings.base
+        bands = bands_of(model, calibration, findings.training, derived)
+    judgement = judged(model, calibration, whole, bands)
+    rated = verdict.with_quality(model, linear, unseen, held_out, judgement, spec)
+    findings = replace(
         findings,
-        calibration=calibration,
+        calibration=replace(calibration, notes=_sentences(findings)),
         noise=motion_noise(findings.noise, whole, calibration, model, samples),
-        linear=replace(linear, model=judged) if model is linear.model else linear,
-        model=judged,
+        linear=replace(linear, model=rated) if model is linear.model else linear,
+        model=rated,
         unseen=unseen,
         held_out=held_out,
-        bands=bands,
-        coverage=coverage_of(whole, calibration, model, bands),
-        notes=(
-            *findings.repairs,
-            *calibration.notes,
-            *findings.refinement,
-            *verdict.mirror_note(known(findings.samples, "the training part", "fit"), spec),
-            *verdict.unlearnt(linear, calibration, spec),
-            *verdict.doubts(linear, held_out, calibration.is_exact),
-            *trial,
-            *findings.assumptions,
-        ),
+        structure=structure(findings),
+        judgement=judgement,
+    )
+    return replace(findings, notes=_notes(drive, findings))
+
+
+def _notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
+    """All that is to be told of a model, the gravest first."""
+    linear, _ = _fitted(findings)
+    spec, calibration = drive.spec, findings.calibration
+    return (
+        *shortfall(findings.judgement),
+        *drive.recording.repairs,
+        *findings.repairs,
+        *calibration.notes,
+        *findings.refinement,
+        *verdict.mirror_note(known(findings.samples, "the training part", "fit"), spec),
+        *verdict.unlearnt(linear, calibration, spec),
+        *findings.structure,
+        *verdict.doubts(linear, findings.held_out, calibration.is_exact),
+        *verdict.untried(drive, findings.held_out),
+        *findings.assumptions,
     )
 
 
-def bands_of(drive: Drive, findings: Findings) -> dict[float, float]:
-    """Returns the distances within which 95 % of predictions end that a fit did not see [m]."""
-    trials = findings.trials
-    errors = motions.chosen(trials).errors if trials else _left_out(drive, findings)
-    told = ((h, each) for h, each in errors.items() if len(each) >= verdict.MIN_ROWS)
-    return {h: float(np.percentile(each, WITHIN)) for h, each in told}
+def structure(findings: Findings) -> tuple[str, ...]:
+    """Says on what the residuals of the linear fit depend; where they do, its terms mislead."""
+    if findings.calibration.is_exact:
+        return ()
+    samples = known(findings.samples, "the training part", "fit")
+    return tuple(structures(_fitted(findings)[0], samples, findings.training.spec))
 
 
 def _left_out(drive: Drive, findings: Findings, order: int | None = None) -> dict[float, Array]:
@@ -382,18 +407,34 @@ def _left_out(drive: Drive, findings: Findings, order: int | None = None) -> dic
     return {h: np.concatenate(each) for h, each in errors.items() if each}
 
 
-def coverage_of(
-    drive: Drive, calibration: Calibration, model: TaylorModel, bands: dict[float, float]
-) -> dict[float, float]:
-    """Returns the share of held-out ends that lie within the bands, by horizon [s]."""
-    found, begin = {}, drive.settings.train_until_s
-    for horizon, radius in bands.items():
-        chosen = windows(drive, calibration, begin, drive.duration_s, horizon, SPACING_S)
-        if len(chosen.start_t):
-            ends = predict(model, calibration, drive, chosen)
-            far = np.hypot(*(ends - chosen.end)[:, :2].T)
-            found[horizon] = float((far <= radius).mean())
-    return found
+def refit(drive: Drive, findings: Findings) -> Findings:
+    """Fits the judged model anew to all data, unless it then predicts what it knew worse."""
+    until = drive.settings.train_until_s
+    if findings.calibration.is_exact or until >= drive.duration_s:
+        return findings
+    settings = replace(drive.settings, train_until_s=np.inf)
+    try:
+        start = replace(findings, training=findings.whole.under(settings))
+        stages = (motion, fit, prune, refine, complete)
+        final = run(stages, replace(drive, settings=settings), start)
+        error, before = (
+            open_loop_error(_fitted(each)[1], each.calibration, each.whole, 0.0, until)
+            for each in (final, findings)
+        )
+        worse = error.mean_position_error_m > verdict.WORSE * before.mean_position_error_m
+    except (FitError, RecordingError):
+        worse = True
+    sentence = verdict.refitted(until, drive.duration_s, worse)
+    if worse:
+        findings = replace(findings, refinement=(*findings.refinement, sentence))
+        return replace(findings, notes=_notes(drive, findings))
+    final = replace(
+        final,
+        calibration=replace(final.calibration, notes=_sentences(final)),
+        model=replace(_fitted(final)[1], quality=_fitted(findings)[1].quality),
+        refinement=(*final.refinement, sentence),
+    )
+    return replace(findings, refit=replace(final, notes=_notes(drive, final)))
 
 
 def _sentences(found: Findings) -> tuple[str, ...]:
@@ -409,6 +450,7 @@ def _sentences(found: Findings) -> tuple[str, ...]:
 
 STAGES: tuple[Stage, ...] = (
     repair, clocks, mounting, responses, noise, motion, inputs, fit, prune, refine, complete, judge,
+    refit,
 )  # fmt: skip
 """In order; each builds on what the stages before it found."""
 
@@ -429,18 +471,26 @@ def run(stages: Sequence[Stage], drive: Drive, findings: Findings | None = None)
 
 @dataclass(frozen=True)
 class Identified:
-    """Result of an identification."""
+    """Result of an identification: a model of all data, and what a trial of it showed.
+
+    The trial learnt the first part of the drive only, and was judged on the rest.
+    """
 
     drive: Drive  # the whole drive, repaired
     model: TaylorModel  # refined and, on request, completed; with standard errors and quality
     calibration: Calibration
     fit: Fit  # the linear fit, before refinement
     samples: Samples  # that the fit used
-    unseen: Samples | None  # of the part that the fit did not see; None if there are too few
-    held_out: OpenLoop | None  # open-loop errors on that part; None if it was too short
+    unseen: Samples | None  # of the part that the trial did not see; None if there are too few
+    held_out: OpenLoop | None  # its open-loop errors on that part; None if it was too short
     noise: Noise  # of sensors and motion, each level measured or assumed
-    findings: Findings  # of all stages
+    findings: Findings  # of all stages, of the trial
     notes: tuple[str, ...]  # sentences on findings, on what was not learnt, and on assumptions
+
+    @property
+    def trial(self) -> "Identified":
+        """The model, and what belongs to it, that was judged on data that it never saw."""
+        return _result(self.findings, self.findings)
 
     @property
     def recording(self) -> Recording:
@@ -455,7 +505,12 @@ class Identified:
     @property
     def coverage(self) -> dict[float, float]:
         """Share of the held-out ends within the 95 % band of predictions, by horizon [s]."""
-        return self.findings.coverage
+        return {e.horizon_s: e.coverage for e in self.judgement if e.coverage is not None}
+
+    @property
+    def judgement(self) -> tuple[HorizonErrors, ...]:
+        """Errors on data held out, beside those of yardsticks, by horizon."""
+        return self.findings.judgement
 
     @property
     def alpha(self) -> Alpha:
@@ -479,11 +534,15 @@ def identify(
     drive = Drive(check(recording, spec), spec)
     until = TRAIN_SHARE * drive.duration_s if train_until is None else train_until
     found = run(STAGES, replace(drive, settings=Settings(order, alpha, until, assume, strict)))
-    linear, model = _fitted(found)
+    return _result(found, found.refit or found)
+
+
+def _result(trial: Findings, final: Findings) -> Identified:
+    linear, model = _fitted(final)
+    samples = known(final.samples, "the training part", "fit")
     return Identified(
-        found.whole, model, found.calibration, linear,
-        known(found.samples, "the training part", "fit"), found.unseen, found.held_out,
-        found.noise, found, found.notes,
+        final.whole, model, final.calibration, linear, samples, trial.unseen, trial.held_out,
+        trial.noise, trial, final.notes,
     )  # fmt: skip
 
 

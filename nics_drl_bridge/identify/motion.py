@@ -319,17 +319,27 @@ class Base:
     found: shooting.Predictive
 
 
-def base_of(drive: Drive, calibration: Calibration, samples: Samples) -> Base:
-    """Fits the textbook with and without input curves, friction and limits; keeps what predicts."""
+def base_of(
+    drive: Drive, calibration: Calibration, samples: Samples, known: Base | None = None
+) -> Base:
+    """Fits the textbook with and without input curves, friction and limits; keeps what predicts.
 
-    def attempt(actuators: Actuators) -> tuple[float, Base]:
+    A known base is fitted anew, to other data.
+    """
+
+    def fitted(actuators: Actuators) -> Base:
         problem = problem_of(drive, samples, actuators)
         inputs = inputs_of(drive, calibration.command_latency_s, samples, actuators)
-        sparse = replace(problem, spacing_s=BASE_SPACING_S)
-        found = fit_base(sparse, drive.spec, inputs)
-        error = min(t.error for t in tried(problem, drive.spec, SKETCH, found.values))
-        return error, Base(actuators, problem, replace(inputs, start=found.values), found)
+        found = fit_base(replace(problem, spacing_s=BASE_SPACING_S), drive.spec, inputs)
+        return Base(actuators, problem, replace(inputs, start=found.values), found)
 
+    def attempt(actuators: Actuators) -> tuple[float, Base]:
+        base = fitted(actuators)
+        trials = tried(base.problem, drive.spec, SKETCH, base.found.values)
+        return min(trial.error for trial in trials), base
+
+    if known is not None:
+        return fitted(replace(known.actuators, curves=calibration.inputs))
     error, best = attempt(Actuators(calibration.inputs))
     speeds = tuple(v.name for v in drive.spec.state if v.twist == "vx")
     plain = [lambda now: replace(now, curves=())] if calibration.inputs else []

@@ -61,6 +61,18 @@ def refined(
     return merged(model, linear, {}), calibration, note
 
 
+def readjusted(
+    model: TaylorModel, calibration: Calibration, drive: Drive
+) -> tuple[TaylorModel, Calibration] | None:
+    """Adjusts a refined model to another drive, term by term; None if that is not possible."""
+    problem = problem_of(model, calibration, drive)
+    try:
+        found = None if problem is None else refine(problem, model, calibration)
+    except np.linalg.LinAlgError:
+        return None
+    return None if found is None else (found.model, found.calibration)
+
+
 def by_definition(
     model: TaylorModel, calibration: Calibration, spec: RobotSpec
 ) -> tuple[TaylorModel, Calibration]:

@@ -1,16 +1,17 @@
-"""Repair of a drive: drops repeated rows and jumps, clips commands; refuses units and axes."""
+"""Repair of a drive: faulty rows, jumps of the localiser, commands; refuses units and axes."""
 
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.signals import interval_means
+from nics_drl_bridge.identify.signals import interval_means, unwrapped
 from nics_drl_bridge.identify.statistics import unexplained
 from nics_drl_bridge.recording.recording import Recording, Stream
 
@@ -20,6 +21,13 @@ USUAL = 60.0  # (percentile that counts as usual: jumps in 20 % of the rows spoi
 REACH = 1.5  # than this many times the distance that the greatest command allows in that time,
 HEADING_REACH = 0.1  # than this angle [rad], for a heading,
 STATE_SHARE = 0.2  # and than this share of the usual range, for a state
+# A localiser jumps for good where a step differs from the motion around it by more than
+FARTHER = 3.0  # this many times the distance at the speed (turn rate) that 95 % of the drive keep,
+SPEED_OVER_S = 0.5  # over this time,
+UNUSUAL = 12.0  # than this many usual differences (`USUAL`),
+JUMP_SHARE, JUMP_TURN = 0.5, 0.3  # than this share of the robot's radius, or than this angle [rad]
+AROUND, TOLD = 5, 3  # steps on either side of one; jumps that are told one by one
+MOST_JUMPS = 0.02  # of the steps: more of them are noise
 MOST = 0.15  # jumps in more than this share of the rows are not faults of single samples
 EXCESS = 0.01  # commands may exceed their limits by this share of their range
 WRONG_UNIT = 5.0  # times the limit is another unit: degrees are 57, rpm 9.5 times larger
@@ -31,9 +39,9 @@ CONSISTENT, INCONSISTENT = 0.9, 0.6  # direction of travel in the body frame; 1 
 
 
 def repaired(drive: Drive) -> tuple[Drive, tuple[str, ...]]:
-    """Drops repeated rows and jumps, and clips commands; returns one sentence per kind of fault."""
+    """Drops rows, joins what jumps split, clips commands; a sentence on each kind of fault."""
     notes: list[str] = []
-    for repair in (_without_repetitions, _without_jumps, _within_limits):
+    for repair in (_without_repetitions, _without_jumps, _joined, _within_limits):
         drive = drive.part(repair(drive, notes))
     return drive, tuple(notes)
 
@@ -90,6 +98,49 @@ def _jumps_of_state(state: Stream) -> NDArray[np.bool_]:
         low, high = np.percentile(column, (5.0, 95.0))
         out |= _stands_out(column, np.full(len(column), max(STATE_SHARE * (high - low), 1e-9)))
     return out
+
+
+def _joined(drive: Drive, notes: list[str]) -> Recording:
+    """Moves all poses after a jump of the localiser to where the motion before it leads."""
+    recording, t, pose = drive.recording, drive.sample_t, drive.recording.pose.values
+    span = np.diff(t)
+    if len(span) < 2 * AROUND + 1:
+        return recording
+    moved = geometry.log(geometry.between(pose[:-1], pose[1:]))
+    around = np.pad(moved / np.maximum(span, 1e-9)[:, None], ((AROUND, AROUND), (0, 0)), "edge")
+    usual = np.median(sliding_window_view(around, 2 * AROUND + 1, axis=0), axis=2)
+    expected = usual * span[:, None]
+    apart = np.stack([np.hypot(*(moved - expected)[:, :2].T), np.abs((moved - expected)[:, 2])])
+    jump = (apart > _greatest(drive, apart)).any(axis=0)
+    if not jump.any() or jump.mean() > MOST_JUMPS:
+        return recording
+    place, told = pose.copy(), []
+    for k in np.flatnonzero(jump):
+        here = geometry.compose(place[k], geometry.exp(expected[k]))
+        place[k + 1 :] = geometry.compose(
+            here, geometry.between(place[k + 1], place[k + 1 :])
+        )  # fmt: skip
+        size = f"{apart[0, k]:.2f} m, {apart[1, k]:.2f} rad"
+        told.append(f"at {t[k + 1] - t[0]:.2f} s ({size})")
+    some = ", ".join(told[:TOLD]) + (f" and {len(told) - TOLD} more" if len(told) > TOLD else "")
+    finding = f"jumps {some} as no speed of this robot explains"
+    notes.append(f"pose: {finding}; the drive is split there: it goes on from where it was before.")
+    return replace(recording, pose=replace(recording.pose, values=place))
+
+
+def _greatest(drive: Drive, apart: Array) -> Array:
+    """Returns by how much steps (2, T) in metres and radians may differ from those around them."""
+    t, pose = drive.sample_t, unwrapped(drive.recording.pose.values)
+    every = np.unique(np.searchsorted(t, np.arange(t[0], t[-1], SPEED_OVER_S)))
+    took = np.maximum(np.diff(t[every]), 1e-9)
+    gone = np.abs(np.diff(pose[every], axis=0))
+    rates = np.stack([np.hypot(*gone[:, :2].T), gone[:, 2]]) / took
+    speeds = [abs(v) for c in drive.spec.command if c.unit == "m/s" for v in (c.min, c.max)]
+    fastest = np.percentile(rates, 95.0, axis=1) if len(took) else np.zeros(2)
+    fastest[0] = max(fastest[0], REACH / FARTHER * max(speeds, default=0.0))
+    floor = np.array([JUMP_SHARE * drive.spec.footprint_radius, JUMP_TURN])
+    floor = np.maximum(floor, UNUSUAL * np.percentile(apart, USUAL, axis=1))
+    return np.asarray(np.maximum(floor[:, None], FARTHER * fastest[:, None] * np.diff(t)))
 
 
 def _stands_out(values: Array, least: Array, turning: bool = False) -> NDArray[np.bool_]:

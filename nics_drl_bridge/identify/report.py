@@ -1,6 +1,6 @@
 """Fit report: the model's equations, the quality of its fit, and what could not be learnt."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from textwrap import fill
 
@@ -8,10 +8,11 @@ import numpy as np
 
 from nics_drl_bridge.identify.fit import ORDER, Alpha
 from nics_drl_bridge.identify.identify import Identified
+from nics_drl_bridge.identify.judgement import shortfall
 from nics_drl_bridge.identify.statistics import Curve
 from nics_drl_bridge.identify.verdict import FAR_OFF
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.robot.taylor import TaylorModel
+from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, TaylorModel
 
 WIDTH = 96
 CURVE_POINTS = 8
@@ -29,7 +30,9 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
     around = list(stages(spec, identified))
     notes = identified.notes or ("Nothing had to be corrected.",)
     sections: dict[str, Iterable[str]] = {
-        f"Fit report: robot {spec.name!r} from {source}": (),
+        f"Fit report: robot {spec.name!r} from {source}": (
+            fill(warning, WIDTH - 2) for warning in shortfall(identified.judgement)
+        ),
         f"Kept {model.terms_kept} of {total} terms, step {model.dt:g} s "
         f"(X = {', '.join(model.variables)}), with standard errors:": equations_with_errors(model),
         **({"What motors do around the terms (standard uncertainties):": around} if around else {}),
@@ -41,6 +44,7 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
             identified
         ),
         f"Open loop, on data held out from the fit (after {until:.1f} s):": _held_out(identified),
+        **_compared(identified.judgement),
         "Valid where the drive was:": (
             f"{name:<24} {low:.4g} to {high:.4g} {units[name]}" for name, low, high in ranges
         ),
@@ -158,6 +162,37 @@ def _held_out(identified: Identified) -> Iterator[str]:
             yield f"{dof:<24} RMSE {rmse:.3g} {unit}, R2 {r2:.6f}"
 
 
+HEADS = ("after", "path", "model", "fitted textbook", "twist kept", "95 % within", "held")
+COMPARED = "By horizon, mean errors of position [m] (share of the path) and heading [rad]:"
+
+
+def judgement_rows(judgement: Sequence[HorizonErrors]) -> list[tuple[str, ...]]:
+    """Returns a table of predictions beside those of yardsticks, a row per horizon for `HEADS`."""
+
+    def cell(errors: EndErrors | None, path: float) -> str:
+        if errors is None:
+            return "-"
+        share = f" ({errors.position_m / path:.1%})" if path > 0.0 else ""
+        return f"{errors.position_m:.3g}{share} {errors.heading_rad:.2g}"
+
+    return [
+        (
+            f"{at.horizon_s:g} s", f"{at.path_m:.3g} m",
+            *(cell(errors, at.path_m) for errors in (at.model, at.textbook, at.kept_twist)),
+            "-" if at.band_m is None else f"{at.band_m:.3g} m",
+            "-" if at.coverage is None else f"{at.coverage:.1%}",
+        )
+        for at in judgement
+    ]  # fmt: skip
+
+
+def _compared(judgement: Sequence[HorizonErrors]) -> dict[str, Iterator[str]]:
+    rows = [HEADS, *judgement_rows(judgement)]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ("  ".join(map(str.rjust, row, widths)) for row in rows)
+    return {COMPARED: lines} if judgement else {}
+
+
 @dataclass(frozen=True)
 class CalibratedValue:
     """One estimate; without a value if it could not be made."""
@@ -242,7 +277,7 @@ def why_useless(identified: Identified, spec: RobotSpec, order: int = ORDER) -> 
 
 
 def _suspicion(identified: Identified, spec: RobotSpec, order: int) -> str:
-    recording, unmoved = identified.recording, identified.fit.unmoved
+    recording, unmoved = identified.recording, identified.trial.fit.unmoved
     rows = recording.pose if recording.state is None else recording.state
     apart = f"{np.median(np.diff(rows.t)):.2g} s apart"
     coarsest = (0.0, "")

@@ -20,13 +20,14 @@ from nics_drl_bridge.identify.signals import moved_commands
 from nics_drl_bridge.identify.statistics import errors_of
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.robot.taylor import Quality, TaylorModel
+from nics_drl_bridge.robot.taylor import HorizonErrors, Quality, TaylorModel
 
 MIN_ROWS = 20
 FEW_LEVELS = 2
 ILL_CONDITIONED = 1e6
 FAR_OFF = 0.25  # predictions whose mean error exceeds this share of the path are not to be trusted
 UNEXPLAINED = 0.5
+WORSE = 1.25  # times the trial's error on the part that both know; a refit beyond is not believed
 MANY_OUTLIERS = 0.001
 MIRRORED = -0.5  # correlation of yaw rate and steering below which the robot turns the wrong way
 
@@ -187,31 +188,35 @@ def mirror_note(samples: Samples, spec: RobotSpec) -> Iterator[str]:
             return
 
 
-def tried(
-    model: TaylorModel, calibration: Calibration, drive: Drive
-) -> tuple[OpenLoop | None, list[str]]:
-    """Tries a model on the unseen part of a drive; a sentence says if that is too short."""
+def tried(model: TaylorModel, calibration: Calibration, drive: Drive) -> OpenLoop | None:
+    """Tries a model on the unseen part of a drive; None if that is too short."""
     until = drive.settings.train_until_s
     try:
-        return open_loop_error(model, calibration, drive, until, drive.duration_s), []
+        return open_loop_error(model, calibration, drive, until, drive.duration_s)
     except RecordingError:
-        left = max(drive.duration_s - until, 0.0)
-        return None, [
+        return None
+
+
+def untried(drive: Drive, held_out: OpenLoop | None) -> Iterator[str]:
+    """Tells of a drive too short to try a model on unseen data."""
+    if held_out is None:
+        left = max(drive.duration_s - drive.settings.train_until_s, 0.0)
+        yield (
             f"The last {left:.1f} s, held out of the fit, are too short for a prediction over "
             f"{HORIZON_S:g} s: the model was not tried on unseen data; record 20 s or more."
-        ]
+        )
 
 
 def with_quality(
     model: TaylorModel, linear: Fit, unseen: Samples | None, held_out: OpenLoop | None,
-    spec: RobotSpec,
+    judgement: tuple[HorizonErrors, ...], spec: RobotSpec,
 ) -> TaylorModel:  # fmt: skip
     """Returns the model with its figures of merit."""
 
     def by_dof(values: Array) -> dict[str, float]:
         return {dof: float(value) for dof, value in zip(model.dofs, values, strict=True)}
 
-    figures: dict[str, Any] = {"held_out_rmse": {}, "held_out_r2": {}}
+    figures: dict[str, Any] = {"held_out_rmse": {}, "held_out_r2": {}, "judgement": judgement}
     if unseen is not None:
         believed = unseen.rows(plausible(unseen.x, spec))
         errors = map(by_dof, errors_of(model, believed))
@@ -227,3 +232,12 @@ def with_quality(
     figures |= {name: by_dof(getattr(linear, name)) for name in measures}
     quality = Quality(samples=len(linear.regression.samples.t), **figures)
     return replace(model, quality=quality)
+
+
+def refitted(until: float, duration: float, worse: bool) -> str:
+    """Says of how much of a drive a model is, and what its errors are of."""
+    if worse:
+        why = f"fitted to all {duration:.1f} s, it was not shown to predict them as well"
+        return f"The model is of the first {until:.1f} s only: {why}."
+    shown = f"errors on unseen data are those of a trial that had learnt the first {until:.1f} s"
+    return f"The model was fitted to all {duration:.1f} s once it had been judged; {shown}."

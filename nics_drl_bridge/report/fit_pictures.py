@@ -64,9 +64,9 @@ def fit_pictures(spec: RobotSpec, identified: Identified) -> dict[str, bytes]:
     """The pictures of a fit by name, as far as the recording shows them, each a PNG."""
     pictures = {"accuracy": accuracy(identified)}
     if identified.held_out is not None:
-        pictures["paths"] = held_out_paths(identified)
+        pictures["paths"] = held_out_paths(identified.trial)
     if identified.unseen is not None and np.abs(identified.unseen.dq).max() > LEAST_RATE:
-        pictures["residuals"] = residuals(identified, identified.unseen)
+        pictures["residuals"] = residuals(identified.trial, identified.unseen)
     if (np.ptp(identified.recording.command.values, axis=0) > 0.0).any():
         pictures["alignment"] = alignment(spec, identified)
     return pictures

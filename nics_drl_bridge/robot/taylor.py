@@ -236,6 +236,30 @@ def parse_term(text: str, names: tuple[str, ...]) -> NDArray[np.int64]:
 
 
 @dataclass(frozen=True)
+class EndErrors:
+    """Mean errors at the ends of predictions."""
+
+    position_m: float
+    heading_rad: float
+
+
+@dataclass(frozen=True)
+class HorizonErrors:
+    """Errors of predictions of one length, on data that the fit never saw, and of yardsticks."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid")  # errors may be inf
+
+    horizon_s: float
+    windows: int  # number of predictions
+    path_m: float  # mean length of the measured path
+    model: EndErrors
+    kept_twist: EndErrors  # of a robot that keeps the twist of the start
+    textbook: EndErrors | None = None  # of the textbook, fitted to the same part; None: not fitted
+    band_m: float | None = None  # distance within which 95 % of the ends are expected
+    coverage: float | None = None  # share of the ends within it
+
+
+@dataclass(frozen=True)
 class Quality:
     """Figures of merit, by degree of freedom where they are mappings."""
 
@@ -254,6 +278,7 @@ class Quality:
     open_loop_position_error_m: float = 0.0
     open_loop_heading_error_rad: float = 0.0
     open_loop_path_m: float = 0.0
+    judgement: tuple[HorizonErrors, ...] = ()  # by horizon, ascending
 
 
 Fall = Annotated[float, AllowInfNan(), Field(lt=0.0)]

@@ -127,8 +127,9 @@ def identified() -> Found:
             if robot == "ackermann":
                 given = disturbed
             result = identify(drive(spec, **given), spec)
-            numbers = numbers_of(asdict(result.calibration))
-            found[f"{robot} {name}"] = projected([*result.model.coefficients.ravel(), *numbers])
+            for each, of in ((result.trial, ""), (result, ", all data")):
+                numbers = [*each.model.coefficients.ravel(), *numbers_of(asdict(each.calibration))]
+                found[f"{robot} {name}{of}"] = projected(numbers)
     return found
 
 

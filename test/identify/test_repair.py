@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from identify.drives import drive
+from identify.drives import drive, without
+from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify.calibration import Calibration, align
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.fit import fit
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.repair import repaired
+from nics_drl_bridge.recording.readers import robot_and_drive
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
+from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import load_robot
 
+ROOT = Path(__file__).resolve().parents[2]
+JUMPING = ROOT.parent / "shared" / "recordings" / "f110_frictionmaps" / "DS1"
 ROBOTS = ("ackermann", "differential", "mecanum")
 
 
@@ -57,6 +63,37 @@ def test_a_recording_without_faults_is_not_touched(name, noise):
     found, notes = repaired(whole)
     assert notes == ()
     assert found is whole
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("jump", [(0.4, -0.5, 0.0), (0.0, 0.0, 1.0), (30.0, 0.0, -2.0)])
+def test_a_drive_goes_on_after_a_jump_of_the_localiser_as_it_moved(name, jump):
+    spec = load_robot(name)
+    plain = drive(spec, duration=20.0, noise=(5e-4, 1e-3))
+    late = plain.pose.t > 12.0
+    values = plain.pose.values.copy()
+    values[late] = geometry.compose(np.array(jump), values[late])
+    jumped = Drive(replace(plain, pose=replace(plain.pose, values=values)), spec)
+    found, (note,) = repaired(jumped)
+    assert "jumps at 12.01 s (" in note
+    assert "the drive is split there" in note
+    moved, true = (geometry.between(v[:-1], v[1:]) for v in (found.recording.pose.values, values))
+    k = int(np.argmax(late)) - 1
+    assert np.delete(moved, k, axis=0) == pytest.approx(np.delete(true, k, axis=0), abs=1e-9)
+    assert np.abs(moved[k, :2]).max() < 0.03
+
+
+def test_a_gap_in_the_poses_is_no_jump(differential):
+    gappy = without(drive(differential, duration=20.0, noise=(5e-4, 1e-3)), 8.0, 11.0)
+    assert repaired(Drive(gappy, differential))[1] == ()
+
+
+@pytest.mark.skipif(not JUMPING.exists(), reason=f"no recording of others at {JUMPING}")
+def test_the_jump_of_a_real_localiser_is_found_and_told():
+    mapping = ROOT / "examples" / "recordings" / "f110_folder.yaml"
+    spec, recording = robot_and_drive(JUMPING, None, TopicRoles(), mapping)
+    _, notes = repaired(Drive(recording, spec))
+    assert [note for note in notes if "jumps at 27.46 s (0.95 m, 0.12 rad)" in note]
 
 
 @pytest.mark.slow

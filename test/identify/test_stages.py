@@ -21,11 +21,14 @@ ADDED = {
     "mounting": {"speed", "mounting", "calibration"},
     "responses": {"calibration"},
     "noise": {"calibration", "noise"},
+    "motion": set(),
+    "inputs": set(),
     "fit": {"samples", "regression"},
     "prune": {"linear", "model"},
     "refine": {"model", "calibration", "refinement"},
     "complete": {"model", "assumptions"},
-    "judge": {"calibration", "noise", "model", "unseen", "held_out", "notes"},
+    "judge": {"calibration", "noise", "model", "unseen", "held_out", "judgement", "notes"},
+    "refit": {"refit"},
 }
 SETTINGS = Settings(train_until_s=14.0, assume=True)
 

@@ -1,0 +1,148 @@
+"""Judgement of a model: its predictions of unseen data, their band, and those of yardsticks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri, stdtrit
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify import motion, shooting
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.open_loop import HORIZON_S, SPACING_S, Windows, predict, windows
+from nics_drl_bridge.identify.refine import readjusted
+from nics_drl_bridge.identify.yardstick import (
+    Yardstick,
+    fit_yardstick,
+    kept_twist,
+    twists_before,
+)  # fmt: skip
+from nics_drl_bridge.recording.recording import Samples
+from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, TaylorModel
+
+HORIZONS_S = (0.5, 1.0, 2.0, HORIZON_S, 10.0)
+BANDED_S = HORIZONS_S[:4]
+FOLDS = 5
+EVALUATIONS = 8  # of the fit to all but one part, which starts at the fit to all
+WITHIN, FEWEST = 95.0, 20  # percentage of the ends within a band, of so many at least
+
+
+def judged(
+    model: TaylorModel, calibration: Calibration, drive: Drive, bands: dict[float, float]
+) -> tuple[HorizonErrors, ...]:
+    """Compares predictions of the held-out part, by the horizons that fit into it.
+
+    `bands` are distances within which 95 % of the ends are expected [m], by horizon [s].
+    """
+    begin, told = drive.settings.train_until_s, []
+    textbook = None if calibration.is_exact else textbook_of(drive, calibration)
+    for horizon in HORIZONS_S:
+        chosen = windows(drive, calibration, begin, drive.duration_s, horizon, SPACING_S)
+        if not len(chosen.start_t):
+            break
+        ends = predict(model, calibration, drive, chosen)
+        twist = twists_before(drive, chosen.start_t)
+        band, far = bands.get(horizon), np.hypot(*(ends - chosen.end)[:, :2].T)
+        told.append(HorizonErrors(
+            horizon, len(far), float(chosen.path.mean()), errors_of_ends(ends, chosen),
+            errors_of_ends(kept_twist(drive, chosen, twist), chosen),
+            None if textbook is None
+            else errors_of_ends(textbook.predict(drive, chosen, twist), chosen),
+            band, None if band is None else float((far <= band).mean()),
+        ))  # fmt: skip
+    return tuple(told)
+
+
+def textbook_of(drive: Drive, calibration: Calibration) -> Yardstick | None:
+    """Fits the textbook to the training part; None if that is too short."""
+    try:
+        return fit_yardstick(drive, drive.settings.train_until_s, calibration.clock_offset_s)
+    except RecordingError:
+        return None
+
+
+def errors_of_ends(ends: Array, chosen: Windows) -> EndErrors:
+    """Returns the mean errors of predicted ends (W, 3)."""
+    apart = ends - chosen.end
+    heading = np.abs(geometry.wrap_angle(apart[:, 2])).mean()
+    return EndErrors(float(np.hypot(*apart[:, :2].T).mean()), float(heading))
+
+
+def shortfall(judgement: tuple[HorizonErrors, ...]) -> Iterator[str]:
+    """Says which yardsticks a model does not beat after 5 s."""
+    for at in (each for each in judgement if each.horizon_s == HORIZON_S):
+        named = {"the fitted textbook": at.textbook, "a robot that keeps its twist": at.kept_twist}
+        better = {name: errors.position_m for name, errors in named.items() if errors is not None}
+        better = {name: m for name, m in better.items() if not at.model.position_m < m}
+        if better:
+            off = f"end {at.model.position_m:.3g} m off after {at.horizon_s:g} s"
+            those = " and ".join(f"those of {name} {error:.3g} m" for name, error in better.items())
+            finding = f"The model does not beat {' and '.join(better)}"
+            yield f"{finding}: on unseen data its predictions {off}, {those}."
+
+
+def bands_of(
+    model: TaylorModel, calibration: Calibration, training: Drive,
+    derived: tuple[Samples, motion.Base] | None,
+) -> dict[float, float]:  # fmt: skip
+    """Returns the distances [m] within which 95 % of predictions are expected to end, by horizon.
+
+    Parts of the training part are predicted by the model, adjusted to the others. `derived` are
+    the samples of a motion that was taken from the poses, and what the model departed from.
+    """
+    pose = training.recording.pose
+    errors: dict[float, list[Array]] = {h: [] for h in BANDED_S}
+    for block in np.array_split(np.arange(len(pose.t)), FOLDS):
+        others = np.ones(len(pose.t), dtype=np.bool_)
+        others[block] = False
+        if derived is None:
+            rest = training.part(replace(training.recording, pose=pose.rows(others)))
+            found = readjusted(model, calibration, rest)
+        else:
+            at = pose.t[block[[0, -1]]] + calibration.clock_offset_s
+            kept = (derived[0].t < at[0]) | (derived[0].t > at[1])
+            found = _with_motion(model, calibration, training, *derived, kept)
+        if found is None:
+            return {}
+        part = training.part(replace(training.recording, pose=pose.rows(block)))
+        for horizon, told in errors.items():
+            chosen = windows(part, found[1], 0.0, part.duration_s, horizon, SPACING_S)
+            if len(chosen.start_t):
+                told.append(np.hypot(*(predict(*found, part, chosen) - chosen.end)[:, :2].T))
+    every = {h: np.concatenate(told) for h, told in errors.items() if told}
+    return {
+        h: float(np.percentile(e, WITHIN)) * widened(training.duration_s / h)
+        for h, e in every.items()
+        if len(e) >= FEWEST
+    }
+
+
+def widened(count: float) -> float:
+    """Returns by how much a band of so many independent predictions is to be wider (Student)."""
+    count, tail = max(count, 3.0), 0.5 + WITHIN / 200.0
+    return float(stdtrit(count - 1.0, tail) / ndtri(tail) * np.sqrt(1.0 + 1.0 / count))
+
+
+def _with_motion(
+    model: TaylorModel, calibration: Calibration, training: Drive, samples: Samples,
+    base: motion.Base, kept: NDArray[np.bool_],
+) -> tuple[TaylorModel, Calibration]:  # fmt: skip
+    """Adjusts a model with a motion as state, and its inputs, to the rows that are kept (T,)."""
+    problem = motion.problem_of(training, samples, base.actuators)
+    problem = replace(problem, spacing_s=motion.CV_SPACING_S)
+    free = (model.coefficients != 0.0) & ~motion.defined(training.spec)[:, None]
+    found = shooting.fitted(
+        problem, model, free, base.inputs, kept, EVALUATIONS, motion.PULLS[-1]
+    )  # fmt: skip
+    calibration = replace(
+        calibration, command_latency_s=float(found.values[0]),
+        inputs=motion.curves_at(base.actuators, found.values),
+    )  # fmt: skip
+    model = replace(found.model, inputs=calibration.inputs)
+    return model, motion.remounted(calibration, found) if problem.mounted else calibration
