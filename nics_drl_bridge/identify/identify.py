@@ -42,6 +42,7 @@ from nics_drl_bridge.identify.repair import check_axes, check_units, repaired
 from nics_drl_bridge.identify.signals import speed_index
 from nics_drl_bridge.identify.structure import structures
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream, check
+from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import HorizonErrors, TaylorModel
@@ -68,6 +69,7 @@ class Findings:
     # of `motion`: half-width [s] of the parabolas that gave the state; None if it was not derived
     width: float | None = None
     samples: Samples | None = None  # of the training part on one time axis, of `fit`
+    clear: tuple[InputCurve, ...] = ()  # input curves beyond doubt, of `inputs`
     base: motions.Base | None = None  # of the textbook's terms, of `fit`
     trials: tuple[motions.Trial, ...] = ()  # of orders, on parts of the training part, of `fit`
     regression: Regression | None = None  # on all features (Eq. 1), of `fit`
@@ -188,11 +190,11 @@ def inputs(drive: Drive, findings: Findings) -> Findings:
         return findings
     training, samples = findings.training, aligned(findings.training, findings)
     findings = _with_delay(findings, samples)
-    curves = (
-        curve_of(aligned(training, findings), drive.spec, c) for c in range(len(drive.spec.command))
-    )
-    calibration = replace(findings.calibration, inputs=tuple(c for c in curves if c is not None))
-    findings = replace(findings, calibration=calibration)
+    samples, places = aligned(training, findings), range(len(drive.spec.command))
+    curves = [c for place in places if (c := curve_of(samples, drive.spec, place)) is not None]
+    calibration = replace(findings.calibration, inputs=tuple(c.curve for c in curves))
+    clear = tuple(c.curve for c in curves if c.is_clear)
+    findings = replace(findings, calibration=calibration, clear=clear)
     return _with_delay(findings, aligned(training, findings))
 
 
@@ -207,7 +209,9 @@ def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:
     training, spec, order = findings.training, drive.spec, drive.settings.order
     samples = aligned(training, findings)
     try:
-        base = motions.base_of(training, findings.calibration, samples, findings.base)
+        base = motions.base_of(
+            training, findings.calibration, samples, findings.clear, findings.base
+        )
         trials, asked = findings.trials, motions.hypotheses(spec, order)
         if not trials:  # a refit knows what was chosen
             trials = motions.tried(base.problem, spec, asked, base.inputs.start)

@@ -16,7 +16,7 @@ LAGS_S = (0.05, 0.15, 0.4, 1.0, 2.0)
 DEAD = np.linspace(0.0, 0.45, 10)  # shares of the command's reach
 FULL = np.linspace(0.15, 1.0, 18)
 WORTH = 0.03  # a curve takes at least this share of what is left without it
-STEERED = 0.25  # one of the turn rate this, as understeer looks alike
+CLEAR = 0.25  # one of the turn rate this, as understeer looks alike; then it is beyond doubt
 STRIDE_S = 0.04
 
 
@@ -28,13 +28,18 @@ class Candidate:
     gain: float  # share of the unexplained variance that it explains
     drives: bool  # True if of the speed
 
+    @property
+    def is_clear(self) -> bool:
+        """True if it is beyond doubt."""
+        return self.gain >= CLEAR
 
-def curve_of(samples: Samples, spec: RobotSpec, place: int) -> InputCurve | None:
+
+def curve_of(samples: Samples, spec: RobotSpec, place: int) -> Candidate | None:
     """Returns the best curve of the command at a place; None if a straight line does as well."""
     twists = [POSE_RATES.index(v.twist) for v in spec.state if v.twist]
     found = [f for dof in twists if (f := _of_component(samples, spec, place, dof)) is not None]
     best = max(found, key=lambda each: each.gain, default=None)
-    return best.curve if best and best.gain >= (WORTH if best.drives else STEERED) else None
+    return best if best and best.gain >= (WORTH if best.drives else CLEAR) else None
 
 
 def _of_component(samples: Samples, spec: RobotSpec, place: int, dof: int) -> Candidate | None:

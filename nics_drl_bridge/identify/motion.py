@@ -320,11 +320,12 @@ class Base:
 
 
 def base_of(
-    drive: Drive, calibration: Calibration, samples: Samples, known: Base | None = None
-) -> Base:
+    drive: Drive, calibration: Calibration, samples: Samples, clear: tuple[InputCurve, ...] = (),
+    known: Base | None = None,
+) -> Base:  # fmt: skip
     """Fits the textbook with and without input curves, friction and limits; keeps what predicts.
 
-    A known base is fitted anew, to other data.
+    Clear curves are not doubted. A known base is fitted anew, to other data.
     """
 
     def fitted(actuators: Actuators) -> Base:
@@ -342,7 +343,8 @@ def base_of(
         return fitted(replace(known.actuators, curves=calibration.inputs))
     error, best = attempt(Actuators(calibration.inputs))
     speeds = tuple(v.name for v in drive.spec.state if v.twist == "vx")
-    plain = [lambda now: replace(now, curves=())] if calibration.inputs else []
+    doubted = len(calibration.inputs) > len(clear)
+    plain = [lambda now: replace(now, curves=clear)] if doubted else []
     more = [lambda now: replace(now, friction=speeds), lambda now: replace(now, limits=speeds)]
     for change in (*plain, *(more if speeds else ())):
         other, base = attempt(change(best.actuators))
