@@ -237,7 +237,9 @@ def curves_at(curves: tuple[InputCurve, ...], values: Array) -> tuple[InputCurve
     """Returns curves with other values (3 * n,)."""
     rows = zip(curves, values.reshape(-1, 3).tolist(), strict=True)
     return tuple(
-        InputCurve(command=c.command, dead=max(dead, 0.0), least=least, most=most)
+        InputCurve(
+            command=c.command, dead=max(dead, 0.0), least=min(least, 0.0), most=max(most, 0.0)
+        )
         for c, (dead, least, most) in rows
     )
 
