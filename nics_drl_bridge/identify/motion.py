@@ -197,7 +197,7 @@ def surrogate(spec: RobotSpec) -> RobotSpec:
 
 @dataclass(frozen=True)
 class Actuators:
-    """What is asked of motors besides their gains and lags: input curves, friction, limits."""
+    """Findings on motors besides their gains and lags: input curves, friction, limits."""
 
     curves: tuple[InputCurve, ...] = ()
     friction: tuple[str, ...] = ()  # states with dry friction
