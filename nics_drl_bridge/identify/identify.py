@@ -307,12 +307,16 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
         calibration = motions.remounted(calibration, found)
         values[-3:] = 0.0
     base = replace(base, inputs=replace(base.inputs, start=values))
+    lags = motions.lags_of(base.found.model, spec)
+    if sums := motions.apart(calibration, findings.timing.latency, lags):
+        told = {n: e for n, e in calibration.uncertainty.items() if n != "command_latency_s"}
+        calibration = replace(calibration, uncertainty=told)
     errors = motions.standard_errors(found)
     model = replace(found.model, std_errors=errors, inputs=calibration.inputs)
     return replace(
         findings, calibration=calibration, model=model, base=base,
         refinement=(f"Coefficients and latency were refined by the open-loop errors over up to "
-                    f"{max(shooting.HORIZONS_S):g} s.",),
+                    f"{max(shooting.HORIZONS_S):g} s.", *sums),
     )  # fmt: skip
 
 
@@ -515,6 +519,20 @@ class Identified:
     def judgement(self) -> tuple[HorizonErrors, ...]:
         """Errors on data held out, beside those of yardsticks, by horizon."""
         return self.findings.judgement
+
+    @property
+    def dead_zone(self) -> float:
+        """Greatest value of the command that drives it at which the robot stands; 0 if none."""
+        # A state with dry friction begins to move where the command's effect exceeds that.
+        model, zones = self.model, [0.0]
+        names = list(model.variables)
+        for curve in model.inputs:
+            term = np.zeros(len(names), dtype=np.int64)
+            term[names.index(curve.command)] = 1
+            gains = model.coefficients[3:, (model.powers == term).all(axis=1)].sum(axis=1)
+            held = [f / g for f, g in zip(model.friction, gains, strict=True) if f > 0.0 < g]
+            zones.append(curve.dead + max(held, default=0.0))
+        return max(zones)
 
     @property
     def alpha(self) -> Alpha:

@@ -41,6 +41,7 @@ FINE_S, COARSE_S, COARSE_FROM_S = 0.01, 0.02, 0.015  # steps of models, by that 
 ORDERS = (1, 2, 3)  # of which `auto` chooses
 WORTH = 0.95  # a higher order is worth its terms if it takes the error to this share
 FOLDS = 3
+TOLD_S = 0.005  # by which two estimates of a latency may differ
 DELAY_ORDER, DELAY_STEP_S, LONGEST_S = 2, 0.02, 0.4  # of the search for a delay
 DELAY_SCALE_S, CURVE_SCALE = 0.05, 0.1  # steps of their refinement
 STRONG = 95.0  # percentile of the rates at which limits are first sought
@@ -216,7 +217,8 @@ def problem_of(drive: Drive, samples: Samples, actuators: Actuators) -> shooting
     def shaped(model: TaylorModel, values: Array) -> TaylorModel:
         return with_actuators(model, spec, actuators, values)
 
-    return shooting.Shooting(samples, commands, shaped, mounted=not spec.state)
+    noise, _ = drive.pose_noise or (0.0, 0.0)
+    return shooting.Shooting(samples, commands, shaped, not spec.state, noise)
 
 
 def curves_at(actuators: Actuators, values: Array) -> tuple[InputCurve, ...]:
@@ -492,6 +494,26 @@ def chosen(trials: Sequence[Trial]) -> Trial:
         if trial.error < WORTH * best.error:
             best = trial
     return best
+
+
+def lags_of(model: TaylorModel, spec: RobotSpec) -> dict[str, float]:
+    """Returns the lags [s] by which a base's states follow, by name."""
+    alone, found = model.powers.sum(axis=1) == 1, {}
+    for i, variable in enumerate(spec.state):
+        rate = float(model.coefficients[3 + i, alone & (model.powers[:, i] == 1)].sum())
+        if variable.twist and rate < 0.0:
+            found[variable.name] = -1.0 / rate
+    return found
+
+
+def apart(calibration: Calibration, other: float, lags: dict[str, float]) -> tuple[str, ...]:
+    """Says of a latency that predictions and regression [s] tell differently: trust its sums."""
+    latency = calibration.command_latency_s
+    if abs(latency - other) <= TOLD_S or not lags:
+        return ()
+    sums = ", ".join(f"{latency + lag:.3f} s for {name}" for name, lag in lags.items())
+    ways = f"{latency:.3f} s by predictions, {other:.3f} s by regression"
+    return (f"Latency can't be told from the lags ({ways}): trust their sums, {sums}.",)
 
 
 def standard_errors(found: shooting.Predictive) -> Array:

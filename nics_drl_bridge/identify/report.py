@@ -223,6 +223,8 @@ def estimates(identified: Identified) -> dict[str, CalibratedValue]:
     clocks = "pose and commands are on one clock" if one_clock else "no command changed"
     both = "clock_offset_s" in sigma
     latency = "only its sum with the clock offset is known" if both else "no command changed"
+    if identified.findings.width is not None and not both:
+        latency = "it can't be told from the lags"
     turned = mounting is None or mounting.turns
     turns = "the drive shows too few directions of motion" if turned else "the robot never turned"
     unknown = recording.wheels is None

@@ -27,7 +27,7 @@ Rows = NDArray[np.intp]
 Commands = Callable[[Array], Array]  # those in effect (T, C) during each step, by values (I,)
 Shape = Callable[[TaylorModel, Array], TaylorModel]  # a model with friction and limits by values
 
-HORIZONS_S = (1.0, 2.5, 5.0)
+HORIZONS_S = (0.3, 1.0, 2.5, 5.0)  # the shortest tells a latency from a lag
 SPACING_S = 0.25
 HEADING_ARM_M = 0.3  # a heading error counts as a position error at this distance
 FARTHEST_M = 50.0  # errors are cut at this distance per second of the horizon
@@ -58,6 +58,7 @@ class Shooting:
     commands: Commands
     shaped: Shape
     mounted: bool = False  # True if the last three values are the pose of what `q` is, in the base
+    noise_m: float = 0.0  # standard deviation of measured positions
     fixed: Array | None = None  # values (I,) that are used instead of those given
     horizons: tuple[float, ...] = HORIZONS_S
     spacing_s: float = SPACING_S
@@ -178,7 +179,8 @@ class _Search:
         self.first, self.steps = problem.starts(inside)
         self.wanted = self.steps > 0
         weight = np.array([1.0, 1.0, HEADING_ARM_M])
-        self.weight = (weight / np.array(problem.horizons)[:, None])[None, :, :]
+        usual = np.array(problem.horizons) + problem.noise_m / REFERENCE_M_S
+        self.weight = (weight / usual[:, None])[None, :, :]
         self.measured = problem.moved(self.first, self.steps)
         self.count = len(inputs.start)
         self.pull = REFERENCE_M_S * np.sqrt(pull * 3 * np.count_nonzero(self.wanted))

@@ -56,7 +56,7 @@ def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate)
         why = "since nothing measured on the commands' clock follows them"
         advice = "the latency is taken as zero. Record the wheels or the state to tell them apart"
         yield f"Only the sum of clock offset and command latency can be known, {why}; {advice}."
-    if timing.separated and calibration.command_latency_s > 0.0:
+    if timing.separated and calibration.command_latency_s > 0.0 and "command_latency_s" in sigma:
         late = f"{calibration.command_latency_s:.4f} s (+- {sigma['command_latency_s']:.4f} s)"
         yield f"Commands take effect {late} after their stamps."
 
