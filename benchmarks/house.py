@@ -23,8 +23,10 @@ CONTROLS = {
 }
 PACKAGE = Path(__file__).resolve().parents[1] / "nics_drl_bridge"
 BARS = {
-    "modules": 180,
-    "lines": 33_000,
+    # 180 and 33,000 until it read any recording, knew ten kinds of robots instead of six, and what
+    # motors do, and judged itself by yardsticks.
+    "modules": 194,
+    "lines": 38_700,
     "single_importers": 50,
     "circles": 0,
     "max_arguments": 10,
