@@ -186,17 +186,16 @@ def test_predictions_over_seconds_have_the_derivatives_that_differences_show(com
     car, steps = motors(), 300
     every = np.repeat(car.in_effect(commands), SUBSTEPS, axis=0)
     first = np.arange(0, 300, 50)
-    rows = first[:, None] + np.arange(steps)
     state = rolled_states(car, every)[first]
     free = np.arange(car.terms_kept)
 
     def ends(terms):
         shot = Shot(
-            state, np.ascontiguousarray(every[rows]), *car.state_box,
-            np.zeros((len(first), 3)), np.zeros((len(first), 3, len(free))),
+            state, first, every, np.full((len(first), 1), steps),
+            np.zeros((len(first), 1, 3)), np.zeros((len(first), 1, 3, len(free))),
         )  # fmt: skip
         shoot(shot, terms, free, car.dt, tangent(2, 2, len(free), len(free)))
-        return shot.end, shot.slope
+        return shot.end[:, 0], shot.slope[:, 0]
 
     terms, slight = term_arrays(car), 1e-7
     end, slope = ends(terms)

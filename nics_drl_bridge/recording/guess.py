@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +13,7 @@ from nics_drl_bridge.recording.mapped import POSES
 from nics_drl_bridge.recording.mapping import UNITS
 from nics_drl_bridge.recording.recording import implausible_pose, led_along
 from nics_drl_bridge.recording.survey import Survey, TableSurvey, unit_in, words_of
+from nics_drl_bridge.robot.spec import find_kind, kind_names
 
 GUESSED = "# guessed"
 UNIT_LENGTH = 0.01  # by which a quaternion may differ from length 1
@@ -44,10 +45,9 @@ MEANINGS: dict[str, tuple[set[str], ...]] = {
     "rear_right": ({"rr"}, {"rear", "right"}, {"br"}, {"back", "right"}),
 }
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
-# Commands of a kind of robot, by meaning, and its names for them.
+# Commands of a kind of robot, by meaning, and its names for them; other kinds have `words`.
 KINDS = (
     ("mecanum", {wheel: f"{wheel}_wheel" for wheel in WHEELS}),
-    ("tricycle", {"traction": "speed_command", "steering": "steering_command"}),
     ("omnidirectional", {"speed": "vx", "side": "vy", "turn": "wz"}),
     ("ackermann_throttle", {"throttle": "throttle", "steering": "steering"}),
     ("ackermann", {"speed": "speed_command", "steering": "steering_command"}),
@@ -141,7 +141,8 @@ def guess_command(
         and not (pose and table is pose.table and column.name in re.split(r"[\[\], ]+", taken))
         and column.name not in (taken, *table.stamp_columns)
     ]  # fmt: skip
-    for kind, names in KINDS:
+    own = [(kind, _words_of(kind)) for kind in kind_names()]
+    for kind, names in (*((k, w) for k, w in own if w), *KINDS):
         found = {}
         for meaning, name in names.items():
             fitting = [e for e in scored if e[0] >= 0 and _means(meaning, e[1], e[2].name)]
@@ -156,6 +157,11 @@ def guess_command(
     best = max((e[0] for e in maybe), default=0)
     some = some or [e for e in maybe if e[0] == best][:MOST_COMMANDS]
     return "free", {f"command_{k}": each[1:] for k, each in enumerate(some)}
+
+
+def _words_of(kind: str) -> Mapping[str, str]:
+    found = find_kind(kind)
+    return {} if found is None else found.template.words
 
 
 def _merit(table: TableSurvey, column: Survey) -> int:

@@ -60,6 +60,8 @@ class Template:
     state: tuple[Given, ...] = ()  # a state that follows the commands
     parameters: Mapping[str, float] = field(default_factory=dict)
     lengths: Mapping[str, float] = field(default_factory=dict)  # in radii of the footprint
+    # its commands by words that others have for them, from which `nics inspect` guesses the kind
+    words: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def has_state(self) -> bool:

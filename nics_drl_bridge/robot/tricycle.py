@@ -19,6 +19,7 @@ from nics_drl_bridge.robot.template import STEERED, STEERED_LAGS, STEERED_STATE,
 TEMPLATE = Template(
     commands=(STEERED,), state=STEERED_STATE, parameters=STEERED_LAGS,
     lengths={"wheelbase": 1.0, "track": 0.8, "wheel_radius": 0.2},
+    words={"traction": "speed_command", "steering": "steering_command"},
 )  # fmt: skip
 
 
