@@ -10,8 +10,8 @@ import numpy as np
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import clocks as timings
+from nics_drl_bridge.identify import hypotheses, shooting, verdict
 from nics_drl_bridge.identify import motion as motions
-from nics_drl_bridge.identify import shooting, verdict
 from nics_drl_bridge.identify.assume import assume_textbook
 from nics_drl_bridge.identify.calibration import Calibration, Response, align
 from nics_drl_bridge.identify.drive import Drive, Settings
@@ -25,7 +25,7 @@ from nics_drl_bridge.identify.fit import (
     pruned,
     regress,
 )  # fmt: skip
-from nics_drl_bridge.identify.inputs import curve_of
+from nics_drl_bridge.identify.forms import curve_of, likely_delay
 from nics_drl_bridge.identify.judgement import bands_of, judged, shortfall
 from nics_drl_bridge.identify.mounting import Mounting, mounted, mounting_of
 from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
@@ -36,11 +36,11 @@ from nics_drl_bridge.identify.open_loop import (
     predict,
     windows,
 )  # fmt: skip
-from nics_drl_bridge.identify.orders import ORDERS, about_orders, through_state
 from nics_drl_bridge.identify.refine import refined
 from nics_drl_bridge.identify.repair import check_axes, check_units, repaired
 from nics_drl_bridge.identify.signals import speed_index
 from nics_drl_bridge.identify.structure import structures
+from nics_drl_bridge.identify.terms import linear_fit, through_state
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream, check
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.noise import Noise
@@ -51,6 +51,7 @@ from nics_drl_bridge.threads import one_blas_thread
 T = TypeVar("T")
 
 TRAIN_SHARE = 2.0 / 3.0
+ORDERS_OF_INFERRED = (2, 3, 4)  # of which `auto` chooses if the state follows commands
 
 
 @dataclass(frozen=True)
@@ -70,8 +71,8 @@ class Findings:
     width: float | None = None
     samples: Samples | None = None  # of the training part on one time axis, of `fit`
     clear: tuple[InputCurve, ...] = ()  # input curves beyond doubt, of `inputs`
-    base: motions.Base | None = None  # of the textbook's terms, of `fit`
-    trials: tuple[motions.Trial, ...] = ()  # of orders, on parts of the training part, of `fit`
+    base: hypotheses.Base | None = None  # of the textbook's terms, of `fit`
+    trials: tuple[hypotheses.Trial, ...] = ()  # of orders, on parts of the training part, of `fit`
     regression: Regression | None = None  # on all features (Eq. 1), of `fit`
     linear: Fit | None = None  # the pruned fit (Eq. 2), of `prune`
     model: TaylorModel | None = None  # of `prune`; then of `refine` and `complete`
@@ -199,7 +200,7 @@ def inputs(drive: Drive, findings: Findings) -> Findings:
 
 
 def _with_delay(findings: Findings, samples: Samples) -> Findings:
-    delay = motions.likely_delay(findings.training, findings.calibration, samples)
+    delay = likely_delay(findings.training, findings.calibration, samples)
     calibration = replace(findings.calibration, command_latency_s=delay)
     return replace(findings, calibration=calibration)
 
@@ -209,20 +210,19 @@ def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:
     training, spec, order = findings.training, drive.spec, drive.settings.order
     samples = aligned(training, findings)
     try:
-        base = motions.base_of(
+        base = hypotheses.base_of(
             training, findings.calibration, samples, findings.clear, findings.base
         )
-        trials, asked = findings.trials, motions.hypotheses(spec, order)
-        if not trials:  # a refit knows what was chosen
-            trials = motions.tried(base.problem, spec, asked, base.inputs.start)
+        trials = findings.trials  # a refit knows what was chosen
+        trials = trials or base.draft.tried(hypotheses.hypotheses(order))
     except FitError as error:
         raise FitError(f"{drive.recording.source}: {error}") from None
-    best = motions.chosen(trials).order
-    curves = motions.curves_at(base.actuators, base.inputs.start)
+    best = hypotheses.chosen(trials).order
+    curves = base.draft.form.curves_at(base.draft.inputs, base.found.values)
     calibration = replace(findings.calibration, inputs=curves)
     findings = replace(findings, calibration=calibration)
     samples = aligned(training, findings)
-    linear = motions.linear_fit(samples, spec, best or motions.BASE_ORDER)
+    linear = linear_fit(samples, spec, best or hypotheses.BASE_ORDER)
     return replace(
         findings, samples=samples, regression=linear.regression, linear=linear,
         model=replace(linear.model, inputs=curves), trials=trials, base=base,
@@ -241,7 +241,7 @@ def fit(drive: Drive, findings: Findings) -> Findings:
     if settings.order == "auto" and inferred and not trials:  # a refit knows them
         trials = _trials_of_orders(drive, findings)
     order = ORDER if settings.order == "auto" else settings.order
-    order = motions.chosen(list(trials)).order if trials else order
+    order = hypotheses.chosen(list(trials)).order if trials else order
     centred = "lever_arm_y_m" in calibration.uncertainty
     library = partial(through_state, centred=centred) if inferred else None
     try:
@@ -253,17 +253,17 @@ def fit(drive: Drive, findings: Findings) -> Findings:
     return replace(findings, samples=samples, regression=regression, trials=trials)
 
 
-def _trials_of_orders(drive: Drive, findings: Findings) -> tuple[motions.Trial, ...]:
+def _trials_of_orders(drive: Drive, findings: Findings) -> tuple[hypotheses.Trial, ...]:
     """Tries each order on parts of the training part that its fits did not see."""
     training, trials = findings.training, []
-    span = 0.0, training.duration_s, motions.HORIZON_S, SPACING_S
+    span = 0.0, training.duration_s, hypotheses.HORIZON_S, SPACING_S
     path = windows(training, findings.calibration, *span).path
-    for order in ORDERS:
+    for order in ORDERS_OF_INFERRED:
         errors = _left_out(drive, findings, order)
-        if motions.HORIZON_S not in errors:
+        if hypotheses.HORIZON_S not in errors:
             break
-        share = float(errors[motions.HORIZON_S].mean() / max(float(path.mean()), 1e-9))
-        trials.append(motions.Trial(order, 0.0, share, errors))
+        share = float(errors[hypotheses.HORIZON_S].mean() / max(float(path.mean()), 1e-9))
+        trials.append(hypotheses.Trial(order, 0.0, share, errors))
     return tuple(trials)
 
 
@@ -284,34 +284,33 @@ def refine(drive: Drive, findings: Findings) -> Findings:
     if findings.calibration.is_exact:
         return findings
     model, calibration, note = refined(linear.model, findings.calibration, findings.training)
-    sentences = (note, *about_orders(findings.trials))
+    sentences = (note, *hypotheses.about_orders(findings.trials))
     return replace(findings, model=model, calibration=calibration, refinement=sentences)
 
 
 def _refined_motion(drive: Drive, findings: Findings) -> Findings:
     linear, _ = _fitted(findings)
     calibration, spec = findings.calibration, drive.spec
-    base, best = known(findings.base, "the base", "fit"), motions.chosen(findings.trials)
+    base, best = known(findings.base, "the base", "fit"), hypotheses.chosen(findings.trials)
+    draft, book = base.draft, base.found.model
     if best.order:
-        found = motions.refined(
-            base.problem, base.found.model, linear.model, spec, base.inputs, pull=best.pull
-        )
+        found = draft.refined(book, linear.model, pull=best.pull)
     else:
-        found = motions.fit_base(base.problem, spec, base.inputs)
+        found = draft.base(other=book)
     calibration = replace(
         calibration, command_latency_s=float(found.values[0]),
-        inputs=motions.curves_at(base.actuators, found.values),
+        inputs=draft.form.curves_at(draft.inputs, found.values),
     )  # fmt: skip
     values = found.values.copy()
-    if base.problem.mounted:
-        calibration = motions.remounted(calibration, found)
+    if draft.problem.mounted:
+        calibration = hypotheses.remounted(calibration, found)
         values[-3:] = 0.0
-    base = replace(base, inputs=replace(base.inputs, start=values))
-    lags = motions.lags_of(base.found.model, spec)
-    if sums := motions.apart(calibration, findings.timing.latency, lags):
+    base = replace(base, draft=replace(draft, inputs=replace(draft.inputs, start=values)))
+    lags = hypotheses.lags_of(base.found.model, spec)
+    if sums := hypotheses.apart(calibration, findings.timing.latency, lags):
         told = {n: e for n, e in calibration.uncertainty.items() if n != "command_latency_s"}
         calibration = replace(calibration, uncertainty=told)
-    errors = motions.standard_errors(found)
+    errors = hypotheses.standard_errors(found)
     model = replace(found.model, std_errors=errors, inputs=calibration.inputs)
     return replace(
         findings, calibration=calibration, model=model, base=base,
@@ -396,8 +395,8 @@ def _left_out(drive: Drive, findings: Findings, order: int | None = None) -> dic
     pose, settings = training.recording.pose, replace(drive.settings, train_until_s=np.inf)
     if order is not None:
         stages, settings = (fit, prune, refine), replace(settings, order=order)
-    errors: dict[float, list[Array]] = {h: [] for h in motions.BANDS_S}
-    for block in np.array_split(np.arange(len(pose.t)), motions.FOLDS):
+    errors: dict[float, list[Array]] = {h: [] for h in hypotheses.BANDS_S}
+    for block in np.array_split(np.arange(len(pose.t)), hypotheses.FOLDS):
         others = np.ones(len(pose.t), dtype=np.bool_)
         others[block] = False
         rest = training.part(replace(training.recording, pose=pose.rows(others)))

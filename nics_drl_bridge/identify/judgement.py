@@ -12,11 +12,13 @@ from scipy.special import ndtri, stdtrit
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify import motion, shooting
+from nics_drl_bridge.identify import hypotheses, shooting
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.forms import problem_of
 from nics_drl_bridge.identify.open_loop import HORIZON_S, SPACING_S, Windows, predict, windows
 from nics_drl_bridge.identify.refine import readjusted
+from nics_drl_bridge.identify.terms import defined
 from nics_drl_bridge.identify.yardstick import (
     Yardstick,
     fit_yardstick,
@@ -89,7 +91,7 @@ def shortfall(judgement: tuple[HorizonErrors, ...]) -> Iterator[str]:
 
 def bands_of(
     model: TaylorModel, calibration: Calibration, training: Drive,
-    derived: tuple[Samples, motion.Base] | None,
+    derived: tuple[Samples, hypotheses.Base] | None,
 ) -> dict[float, float]:  # fmt: skip
     """Returns the distances [m] within which 95 % of predictions are expected to end, by horizon.
 
@@ -131,18 +133,21 @@ def widened(count: float) -> float:
 
 def _with_motion(
     model: TaylorModel, calibration: Calibration, training: Drive, samples: Samples,
-    base: motion.Base, kept: NDArray[np.bool_],
+    base: hypotheses.Base, kept: NDArray[np.bool_],
 ) -> tuple[TaylorModel, Calibration]:  # fmt: skip
     """Adjusts a model with a motion as state, and its inputs, to the rows that are kept (T,)."""
-    problem = motion.problem_of(training, samples, base.actuators)
-    problem = replace(problem, spacing_s=motion.CV_SPACING_S)
-    free = (model.coefficients != 0.0) & ~motion.defined(training.spec)[:, None]
+    draft = base.draft
+    problem = problem_of(training, samples, draft.form, draft.inputs)
+    problem = replace(problem, spacing_s=hypotheses.SPACING_S)
+    free = (model.coefficients != 0.0) & ~defined(training.spec)[:, None]
     found = shooting.fitted(
-        problem, model, free, base.inputs, kept, EVALUATIONS, motion.PULLS[-1]
+        problem, model, free, draft.inputs, kept, EVALUATIONS, hypotheses.PULLS[-1]
     )  # fmt: skip
     calibration = replace(
         calibration, command_latency_s=float(found.values[0]),
-        inputs=motion.curves_at(base.actuators, found.values),
+        inputs=draft.form.curves_at(draft.inputs, found.values),
     )  # fmt: skip
     model = replace(found.model, inputs=calibration.inputs)
-    return model, motion.remounted(calibration, found) if problem.mounted else calibration
+    if problem.mounted:
+        calibration = hypotheses.remounted(calibration, found)
+    return model, calibration

@@ -236,6 +236,11 @@ def _follow_state(terms, free, scratch, dt):  # type: ignore[no-untyped-def]
         bounds, rate = bounds_of(terms, i), scratch.rate[3 + i]
         moved = next_state(scratch.x[i], rate, dt, bounds)
         unheld = scratch.x[i] + dt * min(max(rate, bounds.fall), bounds.rise)
+        slower = 1.0 + dt * bounds.drag * abs(unheld)
+        if slower > 1.0:
+            unheld /= slower
+            for p in range(count):
+                scratch.state[i, p] /= slower * slower
         unheld -= math.copysign(dt * bounds.friction, unheld)
         if moved != unheld:  # it sticks, or is held in its box
             scratch.state[i] = 0.0

@@ -13,7 +13,7 @@ from nics_drl_bridge.geometry import Array, rotate, wrap_angle
 from nics_drl_bridge.identify import clocks
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, TwistIntervals
-from nics_drl_bridge.identify.motion import mirrored
+from nics_drl_bridge.identify.terms import mirrored, tyres_slip
 from nics_drl_bridge.identify.signals import followed, held, speed_index
 from nics_drl_bridge.identify.statistics import standard_errors
 from nics_drl_bridge.recording.recording import Stream
@@ -26,6 +26,7 @@ TURN_SCALE_M = 0.2  # a yaw rate counts as the speed at this distance
 DISTINCT = 4.0  # the second direction of motion must exceed the noise by this factor
 MIN_SECOND = 0.05  # it must have at least this share of the size of the first
 STILL = 1e-3
+ONE_WAY = 0.05  # share of all turning that does not count as the other way
 FLAT = 0.02  # less of the direction without extent lies in the plane: it only never turned
 MIN_LENGTH = 1e-4  # m, rad
 MOST_SLIP = 0.15  # a smaller angle between travel and heading may be slip [rad]
@@ -44,7 +45,7 @@ class Mounting:
     lever: Array  # (2,) position of the tracked point in `base_link` [m]
     rotation_sigma: float  # [rad]
     lever_sigma: Array  # (2,) [m]; NaN for a component that could not be learnt
-    turns: bool  # True if the robot turned at all
+    ways: int  # in which the robot turned: 2 for left and right
 
 
 def mounting_of(
@@ -60,6 +61,8 @@ def mounting_of(
     command = held(drive.recording.command, spec, start - timing.latency, end - timing.latency)
     forward = _response(spec, command)[:, 0]
     found = mounting_without_lateral_motion(twists, forward)
+    if found is not None and states is None and tyres_slip(spec):
+        return with_slip(twists, found, spec) or found
     if found is None or states is None:
         return found
     if drive.recording.state is None or np.isnan(found.lever_sigma[0]):
@@ -107,8 +110,26 @@ def by_instruments(
         across, across_sigma = -float(beta[-1]), float(standard_errors(even, rest)[-1])
     return Mounting(
         travel, np.array([-normal[2], across]), float(sigma[0]),
-        np.array([sigma[1], across_sigma]), True,
+        np.array([sigma[1], across_sigma]), 2,
     )  # fmt: skip
+
+
+def with_slip(motion: TwistIntervals, plain: Mounting, spec: RobotSpec) -> Mounting | None:
+    """Estimates the mounting on a car that slips aside by its lateral acceleration; None: too weak.
+
+    Tyres give way in proportion to the force on them: a slip of speed^2 x turn rate (Gillespie).
+    """
+    along = rotate(motion.twist[:, :2], -plain.rotation)
+    turn = motion.twist[:, 2]
+    chi = np.stack([along[:, 0], turn, (along**2).sum(axis=1) * turn], axis=1)
+    beta = np.linalg.lstsq(chi, along[:, 1], rcond=None)[0]
+    sigma = standard_errors(chi, along[:, 1] - chi @ beta)
+    too_weak = clocks.CERTAIN * sigma[1] > spec.footprint_radius
+    if too_weak or abs(beta[2]) < clocks.CERTAIN * sigma[2]:
+        return None
+    rotation = plain.rotation + float(np.arctan(beta[0]))
+    lever = np.array([float(beta[1]), 0.0])
+    return Mounting(rotation, lever, float(sigma[0]), np.array([sigma[1], np.nan]), plain.ways)
 
 
 def without_slip(found: Mounting) -> Mounting | None:
@@ -142,7 +163,8 @@ def mounting_without_lateral_motion(motion: TwistIntervals, forward: Array) -> M
     size = size / np.sqrt(len(rows))
     if size[0] < STILL:
         return None
-    turns, lever, lever_sigma = bool(np.abs(rows[:, 2]).mean() > STILL), 0.0, np.nan
+    turn, lever, lever_sigma = rows[:, 2] / max(float(np.abs(rows[:, 2]).mean()), STILL), 0.0, np.nan
+    ways = sum(float(np.maximum(side * turn, 0.0).mean()) > ONE_WAY for side in (1.0, -1.0))
     if size[1] < max(DISTINCT * size[2], MIN_SECOND * size[0]):
         sigma = size[1] / size[0] / np.sqrt(len(rows))
         travel = float(np.arctan2(axes[0, 1], axes[0, 0]))
@@ -159,7 +181,7 @@ def mounting_without_lateral_motion(motion: TwistIntervals, forward: Array) -> M
         travel, lever = travel + np.pi, -lever
     return Mounting(
         float(wrap_angle(travel)), np.array([lever, 0.0]),
-        float(sigma), np.array([lever_sigma, np.nan]), turns,
+        float(sigma), np.array([lever_sigma, np.nan]), ways,
     )  # fmt: skip
 
 
@@ -201,7 +223,7 @@ def _by_commands(
     scale = float(np.hypot(gain[0, 0], gain[0, 1]))
     return Mounting(
         float(wrap_angle(rotation)), np.array([across[1], -across[0]]), float(spread[0, 1] / scale),
-        np.full(2, float(spread[2, 0] / abs(gain[2, 2]))), True,
+        np.full(2, float(spread[2, 0] / abs(gain[2, 2]))), 2,
     )  # fmt: skip
 
 

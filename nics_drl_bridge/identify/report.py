@@ -225,7 +225,7 @@ def estimates(identified: Identified) -> dict[str, CalibratedValue]:
     latency = "only its sum with the clock offset is known" if both else "no command changed"
     if identified.findings.width is not None and not both:
         latency = "it can't be told from the lags"
-    turned = mounting is None or mounting.turns
+    turned = mounting is None or mounting.ways > 0
     turns = "the drive shows too few directions of motion" if turned else "the robot never turned"
     unknown = recording.wheels is None
     wheels = "no wheel speeds were recorded" if unknown else "the wheels do not show it"

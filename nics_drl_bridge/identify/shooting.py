@@ -34,7 +34,7 @@ FARTHEST_M = 50.0  # errors are cut at this distance per second of the horizon
 PULL = 0.001  # usual weight of the first coefficients against the predictions
 REFERENCE_M_S = 0.1  # error that weighs as much, at a pull of 1, as a term as large as the rates
 DIFFERENCE = 0.02  # step of finite differences by the values of inputs, in their scale
-EVALUATIONS, TOLERANCE = 40, 1e-4
+EVALUATIONS, TOLERANCE = 60, 1e-6
 INSIDE = 0.05  # share of its range by which a value starts from its bounds
 LEAST_SCALE = 0.02  # of the loss: smaller errors count as their squares [m/s]
 SAME_STEP = 0.01  # share of a step by which two steps may differ
@@ -44,10 +44,22 @@ SAME_STEP = 0.01  # share of a step by which two steps may differ
 class Inputs:
     """Values on which the commands in effect depend, as a delay [s], and their bounds."""
 
+    names: tuple[str, ...]  # of values
     start: Array  # (I,)
     scale: Array  # (I,)
     low: Array  # (I,)
-    high: Array  # (I,)
+    high: Array  # (I,); values where it is not above `low` are known
+
+    @property
+    def sought(self) -> Rows:
+        """Places of the values that are not known."""
+        return np.flatnonzero(self.high > self.low)
+
+    def begun_at(self, other: Inputs) -> Inputs:
+        """Starts from the values of other inputs, where these have them."""
+        known = dict(zip(other.names, other.start.tolist(), strict=True))
+        start = [known.get(name, at) for name, at in zip(self.names, self.start, strict=True)]
+        return replace(self, start=np.clip(start, self.low, self.high))
 
 
 @dataclass(frozen=True)
@@ -150,10 +162,10 @@ class Predictive:
     residual: Array  # (n,)
     free: Mask  # (D, K)
     starts: Array  # (n,) start of the window of each residual [s]
-    value_errors: Array  # (I,) standard errors of the values
+    value_errors: Array  # (I,) standard errors of the values; NaN of those that were known
 
 
-NOTHING_FREE = Inputs(*(np.zeros(0) for _ in range(4)))
+NOTHING_FREE = Inputs((), *(np.zeros(0) for _ in range(4)))
 
 
 def fitted(
@@ -182,14 +194,16 @@ class _Search:
         usual = np.array(problem.horizons) + problem.noise_m / REFERENCE_M_S
         self.weight = (weight / usual[:, None])[None, :, :]
         self.measured = problem.moved(self.first, self.steps)
-        self.count = len(inputs.start)
+        self.sought = inputs.sought
+        self.count = len(self.sought)
         self.pull = REFERENCE_M_S * np.sqrt(pull * 3 * np.count_nonzero(self.wanted))
 
     def at(self, theta: Array) -> tuple[TaylorModel, Array]:
         """Returns the model and the values of the inputs."""
         coefficients = self.model.coefficients.copy()
         coefficients[self.free] += theta[self.count :] * self.unit
-        late = self.inputs.start + self.inputs.scale * theta[: self.count]
+        late = self.inputs.start.copy()
+        late[self.sought] += self.inputs.scale[self.sought] * theta[: self.count]
         late = late if self.problem.fixed is None else self.problem.fixed
         return self.problem.shaped(replace(self.model, coefficients=coefficients), late), late
 
@@ -223,7 +237,7 @@ class _Search:
 
     def run(self, first: Array | None, evaluations: int) -> Predictive:
         """Searches for the least errors."""
-        count, inputs, start = self.count, self.inputs, np.zeros(self.count + len(self.unit))
+        count, start = self.count, np.zeros(self.count + len(self.unit))
         begun = self.residual(start)
         if first is not None:
             other = start.copy()
@@ -232,8 +246,9 @@ class _Search:
                 start, begun = other, rest
         low = np.full(len(start), -np.inf)
         high = -low
-        low[:count] = (inputs.low - inputs.start) / inputs.scale - 1e-9
-        high[:count] = (inputs.high - inputs.start) / inputs.scale + 1e-9
+        inputs, at = self.inputs, self.sought
+        low[:count] = ((inputs.low - inputs.start) / inputs.scale)[at]
+        high[:count] = ((inputs.high - inputs.start) / inputs.scale)[at]
         aside = INSIDE * (high - low)[:count]  # at a bound the search would stay there
         start[:count] = np.clip(0.0, low[:count] + aside, high[:count] - aside)
         found = least_squares(
@@ -249,10 +264,11 @@ class _Search:
         rest, slope = self.shot(theta, True)
         starts = np.repeat(self.problem.samples.t[self.first], 3 * self.wanted.sum(axis=1))
         span = np.floor(starts / max(self.problem.horizons)).astype(np.intp)
-        errors = np.zeros(0)
+        errors = np.full(len(self.inputs.start), np.nan)
         if self.count:
-            late_slope = self.jacobian(theta)[: len(rest), : self.count] / self.inputs.scale
-            errors = clustered_errors(late_slope, rest, span)
+            late_slope = self.jacobian(theta)[: len(rest), : self.count]
+            scale = self.inputs.scale[self.sought]
+            errors[self.sought] = clustered_errors(late_slope / scale, rest, span)
         error = float(np.sqrt(np.mean(rest**2)))
         return Predictive(best, late, error, slope, rest, self.free, starts, errors)
 

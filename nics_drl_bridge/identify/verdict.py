@@ -76,7 +76,8 @@ def about_mounting(
         turned = f"{calibration.rotation_rad:.4f} rad (+- {sigma:.4f} rad)"
         yield f"The direction of travel lies {turned} from the tracked body's heading."
     if not known_x:
-        why = "all of the path had one curvature" if mounting.turns else "the robot never turned"
+        slips = "slip and noise hide it"
+        why = ("the robot never turned", "all of the path had one curvature", slips)[mounting.ways]
         finding = f"Where the tracked point lies on the robot could not be learnt, since {why}"
         advice = "it is taken as base_link, and the rotation holds for this curvature"
         yield f"{finding}: {advice}; drive left, right and straight on to learn it."

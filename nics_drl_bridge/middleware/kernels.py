@@ -64,6 +64,12 @@ def rates_jacobian(jacobian, x, terms):  # type: ignore[no-untyped-def]
             jacobian[dof[k], factors[k, f]] += product
 
 
+@kernel
+def _kept(value, dt, drag):  # type: ignore[no-untyped-def]
+    """Returns the share of a change of a state that drag leaves in a step."""
+    return 1.0 / (1.0 + dt * drag * abs(value)) ** 2
+
+
 @kernel(allocates=True)
 def predict(mean, transition, command, dt, steps, motion):  # type: ignore[no-untyped-def]
     """Moves the mean by `steps` of `dt` [s] under a command (C,), multiplying the transition."""
@@ -89,7 +95,8 @@ def predict(mean, transition, command, dt, steps, motion):  # type: ignore[no-un
             for d in range(size):  # a limited rate does not depend on the state
                 free = motion.terms.fall[d] <= dq[3 + d] <= motion.terms.rise[d]
                 slope = dt * jacobian[3 + d, i] if free else 0.0
-                step[3 + d, 3 + i] = (1.0 if d == i else 0.0) + slope
+                kept = _kept(mean[3 + d] + dt * dq[3 + d], dt, motion.terms.drag[d])
+                step[3 + d, 3 + i] = kept * ((1.0 if d == i else 0.0) + slope)
         transition[:] = step @ transition
         advance(mean[:3], dq, dt, motion.series)
         for i in range(size):

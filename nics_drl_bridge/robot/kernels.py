@@ -37,6 +37,7 @@ class Terms(NamedTuple):
     fall: Array  # (S,) greatest fall and rise of a state's rate
     rise: Array
     friction: Array  # (S,) by which a state is drawn to zero [unit / s]
+    drag: Array  # (S,) times the square of a state, likewise [1 / (unit s)]
     curves: Array  # (C, 4) of the commands
 
 
@@ -48,6 +49,7 @@ class Bounds(NamedTuple):
     fall: float
     rise: float
     friction: float
+    drag: float
 
 
 def term_arrays(model: TaylorModel) -> Terms:
@@ -67,7 +69,8 @@ def term_arrays(model: TaylorModel) -> Terms:
     fall, rise = np.ascontiguousarray(model.limits.T)
     return Terms(
         dofs.astype(np.int64), coefficients, factors, count, *model.state_box, fall, rise,
-        np.asarray(model.friction, np.float64), _curve_rows(model),
+        np.asarray(model.friction, np.float64), np.asarray(model.drag, np.float64),
+        _curve_rows(model),
     )  # fmt: skip
 
 
@@ -107,16 +110,20 @@ def put_command(x, command, terms):  # type: ignore[no-untyped-def]
 @kernel
 def bounds_of(terms, i):  # type: ignore[no-untyped-def]
     """Returns the bounds of state variable i."""
-    return Bounds(terms.low[i], terms.high[i], terms.fall[i], terms.rise[i], terms.friction[i])
+    return Bounds(
+        terms.low[i], terms.high[i], terms.fall[i], terms.rise[i], terms.friction[i], terms.drag[i]
+    )  # fmt: skip
 
 
 @kernel
 def next_state(value, rate, dt, bounds):  # type: ignore[no-untyped-def]
-    """Returns a state variable after dt [s]: its rate limited, then dry friction, then held."""
+    """Returns a state variable after dt [s]: its rate limited, then drag, dry friction, then held."""
     # Conditions on the bounds alone: a loop over robots is compiled once with them, once without.
     if bounds.fall > -math.inf or bounds.rise < math.inf:
         rate = min(max(rate, bounds.fall), bounds.rise)
     value += dt * rate
+    if bounds.drag > 0.0:
+        value /= 1.0 + dt * bounds.drag * abs(value)
     if bounds.friction > 0.0:
         stick = dt * bounds.friction
         value = max(value - stick, min(value + stick, 0.0))
@@ -128,7 +135,7 @@ def with_coefficients(terms, coefficient):  # type: ignore[no-untyped-def]
     """Returns terms with other coefficients, those of a robot or of several."""
     return Terms(
         terms.dof, coefficient, terms.factors, terms.degree, terms.low, terms.high, terms.fall,
-        terms.rise, terms.friction, terms.curves,
+        terms.rise, terms.friction, terms.drag, terms.curves,
     )  # fmt: skip
 
 

@@ -26,7 +26,7 @@ class TaylorModel:
     """`dQ/dt = A chi(X)` without the pruned terms (Eq. 1, 2), and what motors do around them.
 
     Commands of X are those in effect, after the input curves. The rate of a state is cut to its
-    limits; then dry friction draws the state to zero, where it sticks.
+    limits; then drag by its square slows it, and dry friction draws it to zero, where it sticks.
     """
 
     variables: tuple[str, ...]  # V names of X = [state, command]
@@ -44,12 +44,14 @@ class TaylorModel:
     bounded: bool = False  # True if the state is held in the recording's box, widened
     inputs: tuple[InputCurve, ...] = ()  # of the commands that have one
     friction: Array = field(default_factory=lambda: np.zeros(0))  # (S,) [unit of the state / s]
+    drag: Array = field(default_factory=lambda: np.zeros(0))  # (S,) [1 / (unit of the state s)]
     # (S, 2) greatest fall and rise of each state's rate [unit of the state / s]
     limits: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
     def __post_init__(self) -> None:
-        if not self.friction.size:
-            object.__setattr__(self, "friction", np.zeros(self.state_size))
+        for name in ("friction", "drag"):
+            if not getattr(self, name).size:
+                object.__setattr__(self, name, np.zeros(self.state_size))
         if not self.limits.size:
             unlimited = np.tile([-np.inf, np.inf], (self.state_size, 1))
             object.__setattr__(self, "limits", unlimited)
@@ -74,7 +76,12 @@ class TaylorModel:
     @property
     def is_plain(self) -> bool:
         """True if the motors do nothing beside the terms."""
-        return not (self.inputs or self.friction.any() or np.isfinite(self.limits).any())
+        return not self.inputs and self.is_free
+
+    @property
+    def is_free(self) -> bool:
+        """True if the rates of the state are those of the terms."""
+        return not (self.friction.any() or self.drag.any() or np.isfinite(self.limits).any())
 
     @property
     def braking(self) -> Array:
@@ -89,14 +96,15 @@ class TaylorModel:
         """Returns dQ/dt (..., D) in a step from X (..., V), whose commands are those in effect."""
         x = np.asarray(x, dtype=np.float64)
         dq = evaluate(x, self.powers) @ self.coefficients.T
-        if self.friction.any() or np.isfinite(self.limits).any():
+        if not self.is_free:
             state = x[..., : self.state_size]
             dq[..., 3:] = (self._moved(state, dq[..., 3:] * self.dt) - state) / self.dt
         return dq
 
     def _moved(self, state: Array, change: Array) -> Array:
-        """Returns states (..., S) that change in a step, as their limits and friction let them."""
+        """Returns states (..., S) that change in a step, as limits, drag and friction let them."""
         moved = state + np.clip(change, *(self.dt * self.limits.T))
+        moved = moved / (1.0 + self.dt * self.drag * np.abs(moved))
         stick = self.dt * self.friction
         return np.asarray(np.maximum(moved - stick, np.minimum(moved + stick, 0.0)))
 
@@ -121,12 +129,13 @@ class TaylorModel:
         return tuple(term_name(row, names) for row in self.powers)
 
     def restraint(self, dof: str) -> str:
-        """Returns limits and friction of a degree of freedom as text, beginning with a comma."""
+        """Returns limits, drag and friction of a degree of freedom as text, beginning with a comma."""
         d = self.dofs.index(dof) - 3
         if d < 0:
             return ""
-        friction = self.friction[d]
-        less = f", less dry friction of {friction:.4g}" if friction else ""
+        friction, drag, name = self.friction[d], self.drag[d], self.variables[d]
+        less = f", less {drag:.4g}*{name}*|{name}|" if drag else ""
+        less += f", less dry friction of {friction:.4g}" if friction else ""
         return ends(*self.limits[d].tolist()) + less
 
     @property
@@ -174,14 +183,17 @@ class TaylorModel:
         }
         box = zip(self.low.tolist(), self.high.tolist(), strict=True)
         states, limits = self.variables[: self.state_size], map(tuple, self.limits.tolist())
-        friction = {s: f for s, f in zip(states, self.friction.tolist(), strict=True) if f > 0.0}
+        friction, drag = (
+            {s: each for s, each in zip(states, values.tolist(), strict=True) if each > 0.0}
+            for values in (self.friction, self.drag)
+        )
         limited = {s: k for s, k in zip(states, limits, strict=True) if np.isfinite(k).any()}
         return NamedTaylorModel.model_construct(
             dt=self.dt, units=dict(zip(self.dofs, self.dof_units, strict=True)), terms=terms,
             valid=dict(zip(self.variables, box, strict=True)), assumed=self.assumed,
             standard_errors=self.named_errors if self.std_errors.size else None,
             quality=self.quality, bounded=self.bounded, inputs=self.inputs,
-            friction=friction or None, limits=limited or None,
+            friction=friction or None, drag=drag or None, limits=limited or None,
         )  # fmt: skip
 
 
@@ -298,6 +310,7 @@ class NamedTaylorModel(Schema):
     bounded: bool = False
     inputs: tuple[InputCurve, ...] = ()
     friction: dict[str, NonNegativeFloat] | None = None  # by state
+    drag: dict[str, NonNegativeFloat] | None = None  # by state
     limits: dict[str, tuple[Fall, Rise]] | None = None  # by state
 
     def model(self) -> TaylorModel:
@@ -315,23 +328,22 @@ class NamedTaylorModel(Schema):
         powers = np.array([parsed[name] for name in names], dtype=np.int64)
         rows = [[self.terms[dof].get(name, 0.0) for name in names] for dof in dofs]
         low, high = np.array(list(self.valid.values())).reshape(len(variables), 2).T
-        states, friction, limits = (
-            variables[: len(dofs) - 3],
-            self.friction or {},
-            self.limits or {},
-        )
+        states = variables[: len(dofs) - 3]
+        friction, drag, limits = self.friction or {}, self.drag or {}, self.limits or {}
         self._check_stages(states, variables[len(states) :])
         return TaylorModel(
             variables, dofs, units, powers.reshape(len(names), len(variables)),
             np.array(rows, dtype=np.float64).reshape(len(dofs), len(names)), self.dt, low, high,
             self.assumed, quality=self.quality, bounded=self.bounded, inputs=self.inputs,
             friction=np.array([friction.get(name, 0.0) for name in states]),
+            drag=np.array([drag.get(name, 0.0) for name in states]),
             limits=np.array([limits.get(name, (-np.inf, np.inf)) for name in states]),
         ).with_errors(self.standard_errors or {})  # fmt: skip
 
     def _check_stages(self, states: tuple[str, ...], commands: tuple[str, ...]) -> None:
         curved = [curve.command for curve in self.inputs]
         keys = ("inputs", curved, commands), ("friction", self.friction, states)
+        keys = *keys, ("drag", self.drag, states)
         for key, names, known in (*keys, ("limits", self.limits, states)):
             for name in names or ():
                 if name not in known:

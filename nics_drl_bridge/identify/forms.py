@@ -1,0 +1,229 @@
+"""Forms: what motors and tyres do to commands, found in a motion and sought by predictions.
+
+Input curves are those of Hammerstein models: a dead zone, saturation, a gain of its own backwards.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.signal import lfilter
+
+from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify import shooting
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.signals import held
+from nics_drl_bridge.identify.terms import linear_fit, sided
+from nics_drl_bridge.identify.yardstick import structure_of
+from nics_drl_bridge.recording.recording import Samples
+from nics_drl_bridge.robot.curve import InputCurve, curved
+from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
+from nics_drl_bridge.robot.taylor import TaylorModel
+
+LAGS_S = (0.05, 0.15, 0.4, 1.0, 2.0)
+DEAD = np.linspace(0.0, 0.45, 10)  # shares of the command's reach
+FULL = np.linspace(0.15, 1.0, 18)
+WORTH = 0.03  # a curve takes at least this share of what is left without it
+CLEAR = 0.25  # one of the turn rate this, as understeer looks alike; then it is beyond doubt
+STRIDE_S = 0.04
+DELAY_ORDER, DELAY_STEP_S, LONGEST_S = 2, 0.02, 0.4  # of the search for a delay
+DELAY_SCALE_S, CURVE_SCALE = 0.05, 0.1  # steps of their refinement
+BACK_SCALE, BACK_RANGE = 0.2, (0.2, 5.0)  # of a gain backwards
+TWO_WAY = 0.05  # share of the rows in which a command drives backwards, to tell its gain
+STRONG = 95.0  # percentile of the rates at which limits are first sought
+LEVER_SCALE_M, TURN_SCALE = 0.05, 0.1
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A curve that explains a component of the twist better than none."""
+
+    curve: InputCurve
+    gain: float  # share of the unexplained variance that it explains
+    drives: bool  # True if of the speed
+
+    @property
+    def is_clear(self) -> bool:
+        """True if it is beyond doubt."""
+        return self.gain >= CLEAR
+
+
+def curve_of(samples: Samples, spec: RobotSpec, place: int) -> Candidate | None:
+    """Returns the best curve of the command at a place; None if a straight line does as well."""
+    twists = [POSE_RATES.index(v.twist) for v in spec.state if v.twist]
+    found = [f for dof in twists if (f := _of_component(samples, spec, place, dof)) is not None]
+    best = max(found, key=lambda each: each.gain, default=None)
+    return best if best and best.gain >= (WORTH if best.drives else CLEAR) else None
+
+
+def _of_component(samples: Samples, spec: RobotSpec, place: int, dof: int) -> Candidate | None:
+    states = len(spec.state)
+    command = samples.x[:, states:]
+    twist = {v.twist: samples.x[:, i] for i, v in enumerate(spec.state) if v.twist}
+    target, speed = twist[POSE_RATES[dof]], twist.get("vx", np.zeros(len(samples.t)))
+    stride = max(1, round(STRIDE_S / samples.dt))
+    reach = np.array([command[:, place].min(), command[:, place].max()])
+
+    def left(dead: float, full: float) -> float:
+        curve = _curve("", reach, dead, full)
+        least = np.inf
+        for lag in LAGS_S:
+            columns = [np.ones(len(target))]
+            for c in range(command.shape[1]):
+                u = curve.of(command[:, c]) if c == place else command[:, c]
+                share = 1.0 - np.exp(-samples.dt / lag)
+                low = lfilter([share], [1.0, share - 1.0], u)
+                columns += [low] if dof == 0 else [low, low * speed]
+            chi = np.stack(columns, axis=1)[::stride]
+            rest = target[::stride] - chi @ np.linalg.lstsq(chi, target[::stride], rcond=None)[0]
+            least = min(least, float(rest @ rest))
+        return least
+
+    plain = left(0.0, 1.0)
+    tries = [(left(0.0, full), 0.0, full) for full in FULL]
+    full = min(tries)[2]
+    tries += [(left(dead, full), dead, full) for dead in DEAD if dead < full]
+    least, dead, full = min(tries)
+    gain = 1.0 - least / max(plain, 1e-300)
+    if gain < WORTH:
+        return None
+    return Candidate(_curve(spec.command[place].name, reach, dead, full), gain, dof == 0)
+
+
+def _curve(name: str, reach: Array, dead: float, full: float) -> InputCurve:
+    size = float(np.abs(reach).max())
+    return InputCurve(
+        command=name, dead=dead * size, least=max(float(reach[0]), -full * size),
+        most=min(float(reach[1]), full * size),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Form:
+    """Effects that a model of a motion has besides gains and lags."""
+
+    curves: tuple[InputCurve, ...] = ()
+    friction: tuple[str, ...] = ()  # states with dry friction
+    limits: tuple[str, ...] = ()  # states with a greatest fall and rise
+    back: tuple[str, ...] = ()  # commands whose curve has a gain of its own backwards
+    drag: tuple[str, ...] = ()  # states with a drag by their square; their pull falls with them
+    tyres: bool = False  # True if a car turns less at speed than its textbook, and slips aside
+
+    def curves_at(self, inputs: shooting.Inputs, values: Array) -> tuple[InputCurve, ...]:
+        """Returns the input curves for values (I,)."""
+        at = dict(zip(inputs.names, values.tolist(), strict=True))
+        return tuple(
+            InputCurve(
+                command=c.command,
+                dead=max(at[f"dead {c.command}"], 0.0),
+                least=min(at[f"least {c.command}"], 0.0),
+                most=max(at[f"most {c.command}"], 0.0),
+                back=at[f"back {c.command}"],
+            )
+            for c in self.curves
+        )
+
+    def actuated(self, model: TaylorModel, inputs: shooting.Inputs, values: Array) -> TaylorModel:
+        """Returns a model with friction and limits for values (I,)."""
+        at = dict(zip(inputs.names, values.tolist(), strict=True))
+        states = model.variables[: model.state_size]
+        friction = [max(at.get(f"friction {name}", 0.0), 0.0) for name in states]
+        drag = [max(at.get(f"drag {name}", 0.0), 0.0) for name in states]
+        limits = [[-at.get(f"fall {n}", np.inf), at.get(f"rise {n}", np.inf)] for n in states]
+        return replace(
+            model, friction=np.array(friction), drag=np.array(drag),
+            limits=np.array(limits).reshape(-1, 2),
+        )  # fmt: skip
+
+
+def problem_of(
+    drive: Drive, samples: Samples, form: Form, inputs: shooting.Inputs
+) -> shooting.Shooting:
+    """Returns the prediction problem of a drive on one time axis."""
+    command, spec, t, dt = drive.recording.command, drive.spec, samples.t, samples.dt
+
+    def commands(values: Array) -> Array:
+        begin, curves = t - float(values[0]), form.curves_at(inputs, values)
+        bent = replace(command, values=curved(command.values, spec, curves))
+        return held(bent, spec, begin, begin + dt)
+
+    def shaped(model: TaylorModel, values: Array) -> TaylorModel:
+        return form.actuated(model, inputs, values)
+
+    noise, _ = drive.pose_noise or (0.0, 0.0)
+    return shooting.Shooting(samples, commands, shaped, not spec.state, noise)
+
+
+def inputs_of(drive: Drive, latency: float, samples: Samples, form: Form) -> shooting.Inputs:
+    """Returns the values that are sought besides coefficients: latency, and those of a form."""
+    one_clock = drive.recording.pose.clock == drive.recording.command.clock
+    least = min(latency, 0.0) if one_clock else latency - LONGEST_S
+    rows = {"latency": (latency, DELAY_SCALE_S, least, latency + LONGEST_S)}
+    for curve in form.curves:
+        name, size = curve.command, max(abs(curve.least), abs(curve.most))
+        step, known = CURVE_SCALE * size, (curve.back, curve.back)
+        rows |= {
+            f"dead {name}": (curve.dead, step, 0.0, 0.5 * size if curve.dead else 0.0),
+            f"least {name}": (curve.least, step, 1.5 * curve.least, 0.5 * curve.least),
+            f"most {name}": (curve.most, step, 0.5 * curve.most, 1.5 * curve.most),
+            f"back {name}": (curve.back, BACK_SCALE, *(BACK_RANGE if name in form.back else known)),
+        }
+    rates = {v.name: samples.dq[:, 3 + i] for i, v in enumerate(drive.spec.state)}
+    for name in form.friction:
+        size = float(np.percentile(np.abs(rates[name]), STRONG))
+        rows[f"friction {name}"] = (0.1 * size, 0.1 * size, 0.0, size)
+    for name in form.drag:
+        value = samples.x[:, [v.name for v in drive.spec.state].index(name)]
+        size = float(np.percentile(np.abs(rates[name]), STRONG) / max(np.mean(value**2), 1e-3))
+        rows[f"drag {name}"] = (0.1 * size, 0.1 * size, 0.0, size)
+    for name in form.limits:
+        for word, rate in (("fall", -rates[name]), ("rise", rates[name])):
+            size = max(float(np.percentile(rate, STRONG)), 1e-3)
+            rows[f"{word} {name}"] = (size, 0.3 * size, 0.1 * size, 10.0 * size)
+    if not drive.spec.state:  # what is left of the mounting
+        reach = 2.0 * drive.spec.footprint_radius
+        aside = reach if sided(drive.spec) else 0.0
+        rows["x"] = (0.0, LEVER_SCALE_M, -reach, reach)
+        rows["y"] = (0.0, LEVER_SCALE_M, -aside, aside)
+        rows["heading"] = (0.0, TURN_SCALE, -np.pi, np.pi)
+    return shooting.Inputs(tuple(rows), *np.array(list(rows.values())).T)
+
+
+def two_way(drive: Drive, samples: Samples) -> tuple[InputCurve, ...]:
+    """Returns curves without effect of commands that drive the robot both ways."""
+    given, spec = structure_of(drive.spec), drive.spec
+    if given is None:
+        return ()
+    command, found = samples.x[:, len(spec.state) :], []
+    for place in np.flatnonzero(np.abs(given[0][0]) > 0.0):
+        reach = command[:, place]
+        if min((reach < 0.0).mean(), (reach > 0.0).mean()) > TWO_WAY:
+            low, high = float(reach.min()), float(reach.max())
+            found.append(InputCurve(command=spec.command[place].name, least=low, most=high))
+    return tuple(found)
+
+
+def with_back(form: Form, curves: tuple[InputCurve, ...]) -> Form:
+    """Returns a form in which the commands of curves have gains of their own backwards."""
+    bent = {c.command for c in form.curves}
+    more = tuple(c for c in curves if c.command not in bent)
+    return replace(form, curves=form.curves + more, back=tuple(c.command for c in curves))
+
+
+def likely_delay(drive: Drive, calibration: Calibration, samples: Samples) -> float:
+    """Returns the delay [s] of the commands by which they best explain the rates of the state."""
+    form, now = Form(calibration.inputs), calibration.command_latency_s
+    inputs = inputs_of(drive, now, samples, form)
+    problem = problem_of(drive, samples, form, inputs)
+    one_clock = drive.recording.pose.clock == drive.recording.command.clock
+    tries = np.arange(0.0, LONGEST_S, DELAY_STEP_S) - (0.0 if one_clock else LONGEST_S / 2.0)
+    states, left = len(drive.spec.state), []
+    free = [3 + i for i, v in enumerate(drive.spec.state) if v.twist] or [0, 2]
+    for delay in tries:
+        command = problem.commands(np.append(delay, inputs.start[1:]))
+        x = np.concatenate([samples.x[:, :states], command], axis=1)
+        found = linear_fit(replace(samples, x=x), drive.spec, DELAY_ORDER)
+        left.append(float((1.0 - found.r2[free]).sum()))
+    return float(tries[int(np.argmin(left))]) if np.isfinite(left).all() else now

@@ -1,0 +1,257 @@
+"""Hypotheses on a motion: a base by the textbook, and orders of terms that depart from it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify import shooting
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.fit import Order
+from nics_drl_bridge.identify.forms import Form, inputs_of, problem_of, two_way, with_back
+from nics_drl_bridge.identify.statistics import clustered_errors
+from nics_drl_bridge.identify.terms import (
+    Mask,
+    by_definition,
+    by_textbook,
+    defined,
+    linear_fit,
+    together,
+    tyres_slip,
+)  # fmt: skip
+from nics_drl_bridge.recording.recording import Samples
+from nics_drl_bridge.robot.curve import InputCurve
+from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.taylor import TaylorModel
+
+ORDERS = (1, 2, 3)  # of which `auto` chooses
+PULLS = (0.1, 0.01, 0.001)  # of which each order chooses
+WORTH = 0.95  # a higher order is worth its terms if it takes the error to this share
+FOLDS = 3
+TOLD_S = 0.005  # by which two estimates of a latency may differ
+SPACING_S, EVALUATIONS = 0.5, 25  # of trials
+BASE_ORDER, BASE_EVALUATIONS = 3, 100
+SKETCH = ((0, 0.0), (3, 0.01))  # hypotheses by which forms are judged
+HORIZON_S = 5.0
+BANDS_S = (0.5, 1.0, 2.0, HORIZON_S)
+
+Hypothesis = tuple[int, float]  # order, 0 for the textbook's terms alone, and pull to these
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A trial of one order, on parts of the training part that its fits did not see."""
+
+    order: int  # 0: of the textbook's terms alone
+    pull: float  # to the textbook's terms
+    error: float  # mean error after `HORIZON_S`, as a share of the path
+    errors: dict[float, Array]  # (W,) distances at the ends of predictions, by horizon [m]
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A form, and the prediction problem by which its models are fitted."""
+
+    spec: RobotSpec
+    form: Form
+    inputs: shooting.Inputs
+    problem: shooting.Shooting
+
+    def base(
+        self, inside: Mask | None = None, other: TaylorModel | None = None
+    ) -> shooting.Predictive:
+        """Fits the textbook's terms, gains and lags; the search may start at another model."""
+        samples, spec = self.problem.samples, self.spec
+        samples = samples if inside is None else samples.rows(inside)
+        allowed = partial(by_textbook, tyres=self.form.tyres, drag=bool(self.form.drag))
+        model = by_definition(linear_fit(samples, spec, BASE_ORDER, allowed).model, spec)
+        model, first = (model, None) if other is None else together(model, other)
+        free = (model.coefficients != 0.0) & ~defined(spec)[:, None]
+        return shooting.fitted(
+            self.problem, model, free, self.inputs, inside, BASE_EVALUATIONS, first=first
+        )  # fmt: skip
+
+    def refined(
+        self, base: TaylorModel, linear: TaylorModel, inside: Mask | None = None,
+        evaluations: int = shooting.EVALUATIONS, pull: float = shooting.PULL,
+    ) -> shooting.Predictive:  # fmt: skip
+        """Adjusts the terms of a linear fit, and those of a base to which they are pulled."""
+        base, first = together(base, by_definition(linear, self.spec))
+        free = ((base.coefficients != 0.0) | (first != 0.0)) & ~defined(self.spec)[:, None]
+        return shooting.fitted(
+            self.problem, base, free, self.inputs, inside, evaluations, pull, first
+        )  # fmt: skip
+
+    def tried(self, asked: tuple[Hypothesis, ...]) -> tuple[Trial, ...]:
+        """Fits each to all but one of `FOLDS` parts of a drive, and predicts that part."""
+        values, everything = self.inputs.start, np.arange(len(self.problem.samples.t))
+        problem = replace(self.problem, spacing_s=SPACING_S, fixed=values)
+        given = replace(self, problem=problem, inputs=shooting.NOTHING_FREE)
+        errors: dict[Hypothesis, list[Array]] = {hypothesis: [] for hypothesis in asked}
+        paths, judge = [], replace(problem, horizons=BANDS_S)
+        for block in np.array_split(everything, FOLDS):
+            left = np.isin(everything, block)
+            for hypothesis, model in given.models(asked, ~left):
+                error, path = judge.errors(model, values, left)
+                errors[hypothesis].append(np.hypot(error[..., 0], error[..., 1]))
+            paths.append(path)
+        length = max(float(np.nanmean(np.concatenate(paths)[:, -1])), 1e-9)
+        return tuple(
+            Trial(*hypothesis, float(np.nanmean(far[:, -1])) / length,
+                  {h: each[~np.isnan(each)] for h, each in zip(BANDS_S, far.T, strict=True)})
+            for hypothesis, blocks in errors.items() for far in [np.concatenate(blocks)]
+        )  # fmt: skip
+
+    def models(
+        self, asked: tuple[Hypothesis, ...], inside: Mask
+    ) -> Iterator[tuple[Hypothesis, TaylorModel]]:
+        """Yields the model of each hypothesis, fitted to the rows inside (T,)."""
+        samples, base = self.problem.samples.rows(inside), self.base(inside).model
+        orders = {order for order, _ in asked if order}
+        linear = {order: linear_fit(samples, self.spec, order).model for order in orders}
+        for order, pull in asked:
+            found = base
+            if order:
+                found = self.refined(base, linear[order], inside, EVALUATIONS, pull).model
+            yield (order, pull), found
+
+
+@dataclass(frozen=True)
+class Base:
+    """The textbook's terms with the form that predict best: what models depart from."""
+
+    draft: Draft  # its inputs start from the values found
+    found: shooting.Predictive
+
+
+def base_of(
+    drive: Drive, calibration: Calibration, samples: Samples, clear: tuple[InputCurve, ...] = (),
+    known: Base | None = None,
+) -> Base:  # fmt: skip
+    """Fits the textbook with and without each part of a form; keeps what predicts.
+
+    Clear curves are not doubted. A known base is fitted anew, to other data.
+    """
+
+    def fitted(form: Form, before: Base | None = None) -> Base:
+        inputs = inputs_of(drive, calibration.command_latency_s, samples, form)
+        inputs = inputs.begun_at(before.draft.inputs) if before else inputs
+        problem = problem_of(drive, samples, form, inputs)
+        draft = Draft(drive.spec, form, inputs, replace(problem, spacing_s=SPACING_S))
+        found = draft.base(other=before.found.model if before else None)
+        inputs = replace(inputs, start=found.values)
+        return Base(replace(draft, inputs=inputs, problem=problem), found)
+
+    def error_of(base: Base) -> float:
+        import os
+
+        trials = base.draft.tried(SKETCH)
+        if os.environ.get("DBG"):
+            print(
+                "   try",
+                dict(zip(base.draft.inputs.names, base.found.values.round(3))),
+                ("t" if base.draft.form.tyres else "")+("d" if base.draft.form.drag else ""),
+                [round(t.error, 4) for t in trials],
+                round(base.found.error, 4),
+                flush=True,
+            )
+        return trials[0].error
+
+    if known is not None:
+        return fitted(replace(known.draft.form, curves=calibration.inputs))
+    best = fitted(Form(calibration.inputs))
+    error = error_of(best)
+    if len(calibration.inputs) > len(clear) and error_of(plain := fitted(Form(clear))) < error:
+        best, error = plain, error_of(plain)
+    for change in changes(drive, samples):
+        base = fitted(change(best.draft.form), best)
+        other = error_of(base)
+        if other < WORTH * error:
+            best, error = base, other
+    return best
+
+
+def changes(drive: Drive, samples: Samples) -> Iterator[Callable[[Form], Form]]:
+    """Yields what may be added to the form of a robot's motion."""
+    speeds = tuple(v.name for v in drive.spec.state if v.twist == "vx")
+    if tyres_slip(drive.spec):
+        yield lambda form: replace(form, tyres=True)
+    if speeds:
+        yield lambda form: replace(form, drag=speeds)
+        yield lambda form: replace(form, friction=speeds)
+        yield lambda form: replace(form, limits=speeds)
+        if backwards := two_way(drive, samples):
+            yield lambda form: with_back(form, backwards)
+
+
+def hypotheses(order: Order) -> tuple[Hypothesis, ...]:
+    """Returns those that are tried for an order, from the least free to the freest."""
+    orders = ORDERS if order == "auto" else (order,)
+    return ((0, 0.0), *((o, pull) for o in orders for pull in PULLS))
+
+
+def chosen(trials: Sequence[Trial]) -> Trial:
+    """Returns the first trial that none clearly improves on."""
+    best = trials[0]
+    for trial in trials[1:]:
+        if trial.error < WORTH * best.error:
+            best = trial
+    return best
+
+
+def lags_of(model: TaylorModel, spec: RobotSpec) -> dict[str, float]:
+    """Returns the lags [s] by which a base's states follow, by name."""
+    alone, found = model.powers.sum(axis=1) == 1, {}
+    for i, variable in enumerate(spec.state):
+        rate = float(model.coefficients[3 + i, alone & (model.powers[:, i] == 1)].sum())
+        if variable.twist and rate < 0.0:
+            found[variable.name] = -1.0 / rate
+    return found
+
+
+def apart(calibration: Calibration, other: float, lags: dict[str, float]) -> tuple[str, ...]:
+    """Says of a latency that predictions and regression [s] tell differently: trust its sums."""
+    latency = calibration.command_latency_s
+    if abs(latency - other) <= TOLD_S or not lags:
+        return ()
+    sums = ", ".join(f"{latency + lag:.3f} s for {name}" for name, lag in lags.items())
+    ways = f"{latency:.3f} s by predictions, {other:.3f} s by regression"
+    return (f"Latency can't be told from the lags ({ways}): trust their sums, {sums}.",)
+
+
+def standard_errors(found: shooting.Predictive) -> Array:
+    """Returns standard errors (D, K) of the free coefficients; NaN for the others."""
+    span = max(shooting.HORIZONS_S)
+    cluster = np.floor((found.starts - found.starts.min()) / span).astype(np.intp)
+    errors = np.full(found.free.shape, np.nan)
+    errors[found.free] = clustered_errors(found.jacobian, found.residual, cluster)
+    return errors
+
+
+def remounted(calibration: Calibration, found: shooting.Predictive) -> Calibration:
+    """Adds the mounting that predictions show to what the calibration has."""
+    mounting = geometry.compose(found.values[-3:], calibration.mounting)
+    x, y, heading = map(float, mounting)
+    names, errors = ("lever_arm_x_m", "lever_arm_y_m", "rotation_rad"), found.value_errors[-3:]
+    if np.isnan(errors[1]):  # it was not sought, and is as uncertain as the rotation makes it
+        errors = np.array([errors[0], abs(x) * errors[2], errors[2]])
+    sigma = dict(zip(names, map(float, errors), strict=True))
+    return replace(
+        calibration, rotation_rad=-heading, lever_arm_m=(x, y),
+        uncertainty={**calibration.uncertainty, **sigma},
+    )  # fmt: skip
+
+
+def about_orders(trials: Sequence[Trial]) -> Iterator[str]:
+    """Tells of a higher order than the usual one."""
+    if trials and (best := chosen(list(trials))) is not trials[0]:
+        errors = ", ".join(f"{trial.error:.1%} by order {trial.order}" for trial in trials)
+        finding = f"The model has terms up to order {best.order}"
+        unseen = f"predictions over {HORIZON_S:g} s of parts that a fit did not see"
+        yield f"{finding}: {unseen} end {errors} of the path away."

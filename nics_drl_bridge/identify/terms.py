@@ -1,0 +1,178 @@
+"""Terms that a model may have: by mirror symmetry, by its textbook, and through its state."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify.excitation import terms_through_state
+from nics_drl_bridge.identify.fit import Fit, Library, pruned, regress
+from nics_drl_bridge.identify.yardstick import structure_of
+from nics_drl_bridge.recording.recording import Samples
+from nics_drl_bridge.robot.kinds import steady_twist
+from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
+from nics_drl_bridge.robot.taylor import TaylorModel
+
+Mask = NDArray[np.bool_]
+Powers = NDArray[np.int64]
+
+
+def mirrored(spec: RobotSpec) -> tuple[str, ...] | None:
+    """Names the variables that change sign in a mirror; None if the textbook does not tell."""
+    rng = np.random.default_rng(0)
+    some = rng.uniform(0.1, 0.9, (8, len(spec.command))) * np.maximum(
+        spec.command_high, -spec.command_low
+    )
+    try:
+        twist = steady_twist(spec, some) * np.array([1.0, -1.0, -1.0])
+        for signs in product((1.0, -1.0), repeat=len(spec.command)):
+            if np.allclose(steady_twist(spec, some * signs), twist):
+                break
+        else:
+            return None
+    except ConfigError:
+        return None
+    odd = [c.name for c, sign in zip(spec.command, signs, strict=True) if sign < 0.0]
+    aside = [v.name for v in spec.state if v.twist in ("vy", "wz") or v.follows in odd]
+    return (*aside, *odd)
+
+
+def sided(spec: RobotSpec) -> bool:
+    """True if a lever arm along y can be told from unequal wheels: not if one turns the robot."""
+    return spec.moves_sideways or mirrored(spec) is not None
+
+
+def tyres_slip(spec: RobotSpec) -> bool:
+    """True if the motion of a car that steers in front is a state: it may slip aside."""
+    given = structure_of(spec)
+    told = {v.twist for v in spec.state} >= {"vx", "vy", "wz"}
+    return told and given is not None and given[1].used and not given[1].front_drive
+
+
+def library(powers: Powers, spec: RobotSpec) -> Mask:
+    """Selects the terms (D, K) that each degree of freedom may have.
+
+    A state that is a component of the twist is so by definition. Slip along y acts in proportion.
+    Beyond the first order, what a mirror reverses is made of what it reverses.
+    """
+    names, odd = spec.variable_names, mirrored(spec)
+    order = powers.sum(axis=1)
+    slip = [names.index(v.name) for v in spec.state if v.twist == "vy"]
+    allowed = np.ones((len(spec.dof_names), len(powers)), dtype=np.bool_)
+    allowed[:, (powers[:, slip].sum(axis=1) > 0) & (order > 1)] = False
+    if odd is not None:
+        reversed_ = powers[:, [n in odd for n in names]].sum(axis=1) % 2 == 1
+        for d, name in enumerate(spec.dof_names):
+            aside = name in ("vy", "wz") or name.removeprefix("d_") in odd
+            allowed[d] &= (reversed_ == aside) | (order <= 1)
+    if spec.state:  # commands act through the state
+        allowed[:3] &= (powers[:, len(spec.state) :] == 0).all(axis=1)
+    if not spec.state or odd is not None:  # who gets no command comes to rest
+        allowed &= order > 0
+    for i, variable in enumerate(spec.state):
+        alone = (order == 1) & (powers[:, i] == 1)
+        if variable.twist:
+            allowed[POSE_RATES.index(variable.twist)] = alone
+        else:
+            follows = names.index(str(variable.follows))
+            allowed[3 + i] = alone | ((order == 1) & (powers[:, follows] == 1))
+    return np.asarray(allowed)
+
+
+def through_state(powers: Powers, spec: RobotSpec, centred: bool) -> Mask:
+    """Selects the terms (D, K) that each degree of freedom may have.
+
+    Where poses are those of the robot's `centred` reference point, motion along x is even in what a
+    mirror reverses, and beyond the first order the rest is odd. States lag behind their commands.
+    """
+    names, odd, order = spec.variable_names, mirrored(spec), powers.sum(axis=1)
+    unmoved = [name for name, most in zip(names, powers.max(axis=0), strict=True) if most == 0]
+    allowed = np.ones((len(spec.dof_names), len(powers)), dtype=np.bool_)
+    allowed[:3] = terms_through_state(powers, spec, tuple(unmoved))
+    if odd is not None and centred:
+        aside = powers[:, [name in odd for name in names]].sum(axis=1) % 2 == 1
+        allowed[0] &= ~aside
+        allowed[1:3] &= aside | (order <= 1)
+    for i, variable in enumerate(spec.state):
+        own = [names.index(variable.name), names.index(str(variable.follows))]
+        allowed[3 + i] = (order == 1) & powers[:, own].any(axis=1)
+    return allowed
+
+
+def by_textbook(
+    powers: Powers, spec: RobotSpec, tyres: bool = False, drag: bool = False
+) -> Mask:
+    """Selects the terms (D, K) by which the twist follows commands with a lag, as textbooks do."""
+    names, states, order = spec.variable_names, len(spec.state), powers.sum(axis=1)
+    allowed, given = library(powers, spec) & (order <= 1), structure_of(spec)
+    if given is None or not states:
+        return np.asarray(allowed)
+    moves, bicycle = given
+    first = np.eye(len(names), dtype=np.int64)
+    speed = [i for i, v in enumerate(spec.state) if v.twist == "vx"]
+
+    def has(d: int, *rows: NDArray[np.int64]) -> None:
+        for row in rows:
+            allowed[d] |= (powers == row).all(axis=1)
+
+    for i, variable in enumerate(spec.state):
+        if variable.twist is None:
+            continue
+        part = POSE_RATES.index(variable.twist)
+        allowed[3 + i] = False
+        if tyres and speed and variable.twist != "vx":  # by the lateral acceleration
+            turn = [v.twist for v in spec.state].index("wz")
+            has(3 + i, 2 * first[speed[0]] + first[turn])
+        has(3 + i, first[i])  # without a constant: who gets no command comes to rest
+        if drag and variable.twist == "vx":
+            push = first[states:][np.abs(moves[part]) > 0.0]
+            has(3 + i, *(push + first[i]))
+        commands = first[states:][np.abs(moves[part]) > 0.0]
+        if bicycle.used and variable.twist == "wz" and speed:
+            has(3 + i, first[speed[0]], *(commands + first[speed[0]]))
+        elif len(commands):
+            has(3 + i, *commands)
+    return np.asarray(allowed)
+
+
+def linear_fit(samples: Samples, spec: RobotSpec, order: int, allowed: Library = library) -> Fit:
+    """Fits all terms of the library of an order to the rates (Eq. 1)."""
+    return pruned(regress(samples, spec, order, allowed=allowed), spec, 1.0)
+
+
+def together(base: TaylorModel, other: TaylorModel) -> tuple[TaylorModel, Array]:
+    """Returns a model over the terms of both, and the other's coefficients (D, K) for them."""
+    rows = {tuple(row): k for k, row in enumerate(other.powers.tolist())}
+    more = [row for row in base.powers.tolist() if tuple(row) not in rows]
+    rows |= {tuple(row): len(rows) + k for k, row in enumerate(more)}
+    powers = np.array(list(rows), dtype=np.int64)
+    coefficients, first = np.zeros((2, len(base.dofs), len(powers)))
+    coefficients[:, [rows[tuple(row)] for row in base.powers.tolist()]] = base.coefficients
+    first[:, : len(other.powers)] = other.coefficients
+    none = np.zeros((0, 0))
+    return replace(base, powers=powers, coefficients=coefficients, std_errors=none), first
+
+
+def defined(spec: RobotSpec) -> Mask:
+    """Selects the degrees of freedom (D,) that are not fitted: those of which the state tells."""
+    by_state = np.zeros(len(spec.dof_names), dtype=np.bool_)
+    for i, variable in enumerate(spec.state):
+        by_state[POSE_RATES.index(variable.twist) if variable.twist else 3 + i] = True
+    return by_state
+
+
+def by_definition(model: TaylorModel, spec: RobotSpec) -> TaylorModel:
+    """Sets the rows of the twist that are states."""
+    coefficients, order = model.coefficients.copy(), model.powers.sum(axis=1)
+    if not spec.moves_sideways:  # what is left of lateral motion is noise, unless it is a state
+        coefficients[1] = 0.0
+    for i, variable in enumerate(spec.state):
+        if variable.twist:
+            d = POSE_RATES.index(variable.twist)
+            coefficients[d] = ((order == 1) & (model.powers[:, i] == 1)).astype(np.float64)
+    return replace(model, coefficients=coefficients, bounded=True)
