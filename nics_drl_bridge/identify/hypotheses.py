@@ -34,14 +34,13 @@ ORDERS = (1, 2, 3)  # of which `auto` chooses
 PULLS = (0.1, 0.01, 0.001)  # of which each order chooses
 WORTH = 0.95  # a higher order is worth its terms if it takes the error to this share
 FOLDS = 3
-TOLD_S = 0.005  # by which two estimates of a latency may differ
 SPACING_S, EVALUATIONS = 0.5, 25  # of trials
 BASE_ORDER, BASE_EVALUATIONS = 3, 100
-SKETCH = ((0, 0.0), (3, 0.01))  # hypotheses by which forms are judged
 HORIZON_S = 5.0
 BANDS_S = (0.5, 1.0, 2.0, HORIZON_S)
 
 Hypothesis = tuple[int, float]  # order, 0 for the textbook's terms alone, and pull to these
+TEXTBOOK = 0, 0.0
 
 
 @dataclass(frozen=True)
@@ -149,19 +148,7 @@ def base_of(
         return Base(replace(draft, inputs=inputs, problem=problem), found)
 
     def error_of(base: Base) -> float:
-        import os
-
-        trials = base.draft.tried(SKETCH)
-        if os.environ.get("DBG"):
-            print(
-                "   try",
-                dict(zip(base.draft.inputs.names, base.found.values.round(3))),
-                ("t" if base.draft.form.tyres else "")+("d" if base.draft.form.drag else ""),
-                [round(t.error, 4) for t in trials],
-                round(base.found.error, 4),
-                flush=True,
-            )
-        return trials[0].error
+        return base.draft.tried((TEXTBOOK,))[0].error
 
     if known is not None:
         return fitted(replace(known.draft.form, curves=calibration.inputs))
@@ -193,7 +180,7 @@ def changes(drive: Drive, samples: Samples) -> Iterator[Callable[[Form], Form]]:
 def hypotheses(order: Order) -> tuple[Hypothesis, ...]:
     """Returns those that are tried for an order, from the least free to the freest."""
     orders = ORDERS if order == "auto" else (order,)
-    return ((0, 0.0), *((o, pull) for o in orders for pull in PULLS))
+    return (TEXTBOOK, *((o, pull) for o in orders for pull in PULLS))
 
 
 def chosen(trials: Sequence[Trial]) -> Trial:
@@ -215,14 +202,11 @@ def lags_of(model: TaylorModel, spec: RobotSpec) -> dict[str, float]:
     return found
 
 
-def apart(calibration: Calibration, other: float, lags: dict[str, float]) -> tuple[str, ...]:
-    """Says of a latency that predictions and regression [s] tell differently: trust its sums."""
-    latency = calibration.command_latency_s
-    if abs(latency - other) <= TOLD_S or not lags:
-        return ()
+def about_lags(latency: float, lags: dict[str, float]) -> str:
+    """Says that a latency [s] and lags that predictions told are known as their sums."""
+    # A second lag of a servo is a latency to a model that has one.
     sums = ", ".join(f"{latency + lag:.3f} s for {name}" for name, lag in lags.items())
-    ways = f"{latency:.3f} s by predictions, {other:.3f} s by regression"
-    return (f"Latency can't be told from the lags ({ways}): trust their sums, {sums}.",)
+    return f"Latency ({latency:.3f} s) can't be told from the lags: trust their sums, {sums}."
 
 
 def standard_errors(found: shooting.Predictive) -> Array:

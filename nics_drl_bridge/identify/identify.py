@@ -307,7 +307,9 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
         values[-3:] = 0.0
     base = replace(base, draft=replace(draft, inputs=replace(draft.inputs, start=values)))
     lags = hypotheses.lags_of(base.found.model, spec)
-    if sums := hypotheses.apart(calibration, findings.timing.latency, lags):
+    sums: tuple[str, ...] = ()
+    if lags:
+        sums = (hypotheses.about_lags(calibration.command_latency_s, lags),)
         told = {n: e for n, e in calibration.uncertainty.items() if n != "command_latency_s"}
         calibration = replace(calibration, uncertainty=told)
     errors = hypotheses.standard_errors(found)

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri, stdtrit
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
@@ -118,17 +117,7 @@ def bands_of(
             if len(chosen.start_t):
                 told.append(np.hypot(*(predict(*found, part, chosen) - chosen.end)[:, :2].T))
     every = {h: np.concatenate(told) for h, told in errors.items() if told}
-    return {
-        h: float(np.percentile(e, WITHIN)) * widened(training.duration_s / h)
-        for h, e in every.items()
-        if len(e) >= FEWEST
-    }
-
-
-def widened(count: float) -> float:
-    """Returns by how much a band of so many independent predictions is to be wider (Student)."""
-    count, tail = max(count, 3.0), 0.5 + WITHIN / 200.0
-    return float(stdtrit(count - 1.0, tail) / ndtri(tail) * np.sqrt(1.0 + 1.0 / count))
+    return {h: float(np.percentile(e, WITHIN)) for h, e in every.items() if len(e) >= FEWEST}
 
 
 def _with_motion(

@@ -163,7 +163,11 @@ def mounting_without_lateral_motion(motion: TwistIntervals, forward: Array) -> M
     size = size / np.sqrt(len(rows))
     if size[0] < STILL:
         return None
-    turn, lever, lever_sigma = rows[:, 2] / max(float(np.abs(rows[:, 2]).mean()), STILL), 0.0, np.nan
+    turn, lever, lever_sigma = (
+        rows[:, 2] / max(float(np.abs(rows[:, 2]).mean()), STILL),
+        0.0,
+        np.nan,
+    )
     ways = sum(float(np.maximum(side * turn, 0.0).mean()) > ONE_WAY for side in (1.0, -1.0))
     if size[1] < max(DISTINCT * size[2], MIN_SECOND * size[0]):
         sigma = size[1] / size[0] / np.sqrt(len(rows))

@@ -82,7 +82,7 @@ def stages(spec: RobotSpec, identified: Identified) -> Iterator[str]:
     """Yields a line per value of the stages around the terms, with the calibration's uncertainty.
 
     Of those the names are `throttle.dead`, `.least`, `.most` and `.back` of a command, `vx.fall`,
-    `.rise` and `.friction` of a state.
+    `.rise`, `.friction` and `.drag` of a state.
     """
     model, sigma = identified.model, identified.calibration.uncertainty
     units = dict(zip(spec.variable_names, spec.variable_units, strict=True))
@@ -96,12 +96,14 @@ def stages(spec: RobotSpec, identified: Identified) -> Iterator[str]:
             ("back", "gain backwards, of that forwards", "", 1.0),
         )
     ]
-    rates = zip(model.variables, model.dof_units[3:], model.limits, model.friction, strict=False)
-    for state, unit, (fall, rise), friction in rates:
+    actuators = model.limits, model.friction, model.drag
+    rates = zip(model.variables, model.dof_units[3:], *actuators, strict=False)
+    for state, unit, (fall, rise), friction, drag in rates:
         values += [
             (f"{state}.fall", "greatest fall", fall, unit, -np.inf),
             (f"{state}.rise", "greatest rise", rise, unit, np.inf),
             (f"{state}.friction", "dry friction", friction, unit, 0.0),
+            (f"{state}.drag", "drag, times its square", drag, "", 0.0),
         ]
     for key, words, value, unit, usual in values:
         if value != usual:

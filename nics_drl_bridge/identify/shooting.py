@@ -33,6 +33,7 @@ HEADING_ARM_M = 0.3  # a heading error counts as a position error at this distan
 FARTHEST_M = 50.0  # errors are cut at this distance per second of the horizon
 PULL = 0.001  # usual weight of the first coefficients against the predictions
 REFERENCE_M_S = 0.1  # error that weighs as much, at a pull of 1, as a term as large as the rates
+DRIFT_M_S = 0.01  # by which good predictions go astray: noise counts as time
 DIFFERENCE = 0.02  # step of finite differences by the values of inputs, in their scale
 EVALUATIONS, TOLERANCE = 60, 1e-6
 INSIDE = 0.05  # share of its range by which a value starts from its bounds
@@ -191,7 +192,7 @@ class _Search:
         self.first, self.steps = problem.starts(inside)
         self.wanted = self.steps > 0
         weight = np.array([1.0, 1.0, HEADING_ARM_M])
-        usual = np.array(problem.horizons) + problem.noise_m / REFERENCE_M_S
+        usual = np.array(problem.horizons) + problem.noise_m / DRIFT_M_S
         self.weight = (weight / usual[:, None])[None, :, :]
         self.measured = problem.moved(self.first, self.steps)
         self.sought = inputs.sought

@@ -104,9 +104,7 @@ def through_state(powers: Powers, spec: RobotSpec, centred: bool) -> Mask:
     return allowed
 
 
-def by_textbook(
-    powers: Powers, spec: RobotSpec, tyres: bool = False, drag: bool = False
-) -> Mask:
+def by_textbook(powers: Powers, spec: RobotSpec, tyres: bool = False, drag: bool = False) -> Mask:
     """Selects the terms (D, K) by which the twist follows commands with a lag, as textbooks do."""
     names, states, order = spec.variable_names, len(spec.state), powers.sum(axis=1)
     allowed, given = library(powers, spec) & (order <= 1), structure_of(spec)

@@ -342,9 +342,9 @@ class NamedTaylorModel(Schema):
 
     def _check_stages(self, states: tuple[str, ...], commands: tuple[str, ...]) -> None:
         curved = [curve.command for curve in self.inputs]
-        keys = ("inputs", curved, commands), ("friction", self.friction, states)
-        keys = *keys, ("drag", self.drag, states)
-        for key, names, known in (*keys, ("limits", self.limits, states)):
+        by_state = {"friction": self.friction, "drag": self.drag, "limits": self.limits}
+        keys = (("inputs", curved, commands), *((k, v, states) for k, v in by_state.items()))
+        for key, names, known in keys:
             for name in names or ():
                 if name not in known:
                     fault = f"key {key!r} has {name!r}, not one of ({', '.join(known)})"
