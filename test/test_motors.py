@@ -18,7 +18,9 @@ from nics_drl_bridge.identify.open_loop import predict, windows
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.shapes import Circle
+from nics_drl_bridge.middleware import kernels
 from nics_drl_bridge.middleware.ekf import Estimator
+from nics_drl_bridge.middleware.kernels import MotionModel
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.kernels import SERIES, rollout, run, term_arrays
@@ -48,7 +50,8 @@ def motors() -> TaylorModel:
             InputCurve(command="throttle", dead=DEAD, least=-0.5, most=0.8, back=0.6),
             InputCurve(command="steering", dead=0.02),
         ),
-        friction=np.array([0.2, 0.0]), limits=np.array([[-2.5, 1.5], [-np.inf, 6.0]]),
+        friction=np.array([0.2, 0.0]), drag=np.array([0.4, 0.0]),
+        limits=np.array([[-2.5, 1.5], [-np.inf, 6.0]]),
     )  # fmt: skip
 
 
@@ -86,7 +89,7 @@ def test_the_drive_shows_every_stage(commands, path):
     assert (speed == 0.0).sum() > 5
     assert (np.abs(commands[:, 0]) < DEAD).any()
     assert (np.abs(commands[:, 0]) > 0.8).any()
-    raw = replace(car, inputs=()), replace(car, friction=np.zeros(2))
+    raw = replace(car, inputs=()), *(replace(car, **{k: np.zeros(2)}) for k in ("friction", "drag"))
     for other in (*raw, replace(car, limits=np.tile([-np.inf, np.inf], (2, 1)))):
         ends = rolled(other, commands)[0]
         assert np.hypot(*(ends[-1] - path[0][-1])[:2]) > 0.02
@@ -158,6 +161,19 @@ def test_the_estimator_predicts_the_path_of_the_model(model, commands, path):
     assert_same_path(poses, path[0])
 
 
+def test_the_estimator_knows_how_drag_dampens_an_error_of_the_speed():
+    motion = MotionModel(term_arrays(motors()), SERIES, 0, 0)
+
+    def ahead(speed: float) -> tuple[float, float]:
+        mean, transition = np.array([0.0, 0.0, 0.0, speed, 0.0]), np.eye(5)
+        kernels.predict(mean, transition, np.zeros(2), 0.01, 20, motion)
+        return mean[3], transition[3, 3]
+
+    slight = 1e-6
+    (speed, slope), (faster, _) = ahead(1.2), ahead(1.2 + slight)
+    assert slope == pytest.approx((faster - speed) / slight, rel=1e-4)
+
+
 def test_the_estimator_expects_the_twist_of_a_command_in_effect(model):
     sent = replace(
         model, kinematics=replace(motors(), powers=np.eye(4, dtype=np.int64)[[0, 2]],
@@ -219,6 +235,7 @@ def test_a_model_that_is_written_steps_as_it_did(model, tmp_path, commands):
     for one, other in zip(model.kinematics.step(*pose), read.kinematics.step(*pose), strict=True):
         assert np.array_equal(one, other)
     assert "dead: 0.12" in model.text
+    assert "less 0.4*vx*|vx|, less dry friction of 0.2" in model.kinematics.restraint("d_vx")
     assert "inputs" not in replace(model, kinematics=replace(motors(), inputs=())).text
 
 
@@ -249,6 +266,7 @@ def test_a_warning_is_of_the_command_that_was_sent(model):
         ({"inputs": ({"command": "gas"},)}, "key 'inputs' has 'gas', not one of"),
         ({"inputs": ({"command": "throttle"},) * 2}, "key 'inputs' has a command twice"),
         ({"friction": {"speed": 0.1}}, "key 'friction' has 'speed'"),
+        ({"drag": {"speed": 0.1}}, "key 'drag' has 'speed'"),
         ({"limits": {"throttle": (-1.0, 1.0)}}, "key 'limits' has 'throttle'"),
     ],
 )

@@ -28,6 +28,7 @@ FULL = np.linspace(0.15, 1.0, 18)
 WORTH = 0.03  # a curve takes at least this share of what is left without it
 CLEAR = 0.25  # one of the turn rate this, as understeer looks alike; then it is beyond doubt
 STRIDE_S = 0.04
+NOTHING = 1e-6  # [m/s, rad/s]
 DELAY_ORDER, DELAY_STEP_S, LONGEST_S = 2, 0.02, 0.4  # of the search for a delay
 DELAY_SCALE_S, CURVE_SCALE = 0.05, 0.1  # steps of their refinement
 BACK_SCALE, BACK_RANGE = 0.2, (0.2, 5.0)  # of a gain backwards
@@ -82,11 +83,13 @@ def _of_component(samples: Samples, spec: RobotSpec, place: int, dof: int) -> Ca
         return least
 
     plain = left(0.0, 1.0)
+    if plain < NOTHING**2 * len(target):
+        return None
     tries = [(left(0.0, full), 0.0, full) for full in FULL]
     full = min(tries)[2]
     tries += [(left(dead, full), dead, full) for dead in DEAD if dead < full]
     least, dead, full = min(tries)
-    gain = 1.0 - least / max(plain, 1e-300)
+    gain = 1.0 - least / plain
     if gain < WORTH:
         return None
     return Candidate(_curve(spec.command[place].name, reach, dead, full), gain, dof == 0)

@@ -13,9 +13,9 @@ from nics_drl_bridge.geometry import Array, rotate, wrap_angle
 from nics_drl_bridge.identify import clocks
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, TwistIntervals
-from nics_drl_bridge.identify.terms import mirrored, tyres_slip
 from nics_drl_bridge.identify.signals import followed, held, speed_index
 from nics_drl_bridge.identify.statistics import standard_errors
+from nics_drl_bridge.identify.terms import mirrored, tyres_slip
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.kernels import GREATEST_ORDER

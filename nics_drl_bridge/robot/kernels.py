@@ -117,7 +117,7 @@ def bounds_of(terms, i):  # type: ignore[no-untyped-def]
 
 @kernel
 def next_state(value, rate, dt, bounds):  # type: ignore[no-untyped-def]
-    """Returns a state variable after dt [s]: its rate limited, then drag, dry friction, then held."""
+    """Returns a state variable after dt [s]: rate limited, drag, dry friction, then held."""
     # Conditions on the bounds alone: a loop over robots is compiled once with them, once without.
     if bounds.fall > -math.inf or bounds.rise < math.inf:
         rate = min(max(rate, bounds.fall), bounds.rise)

@@ -129,7 +129,7 @@ class TaylorModel:
         return tuple(term_name(row, names) for row in self.powers)
 
     def restraint(self, dof: str) -> str:
-        """Returns limits, drag and friction of a degree of freedom as text, beginning with a comma."""
+        """Returns limits, drag, friction of a degree of freedom as text, beginning with a comma."""
         d = self.dofs.index(dof) - 3
         if d < 0:
             return ""

@@ -144,3 +144,35 @@ def calibrate(recording: Recording, spec: RobotSpec) -> Calibration:
     row = (stages.clocks, stages.mounting, stages.responses, stages.noise)
     found = stages.run(row, Drive(check(recording, spec), spec))
     return replace(found.calibration, notes=stages._sentences(found))
+
+
+def slipping_car(
+    seed: int = 0, duration: float = 40.0, dead: float = 0.1, friction: float = 0.3,
+    drag: float = 0.15, slip: float = 0.015, mounting: tuple[float, float, float] = (0.08, 0, 0.1),
+) -> tuple[RobotSpec, Recording]:  # fmt: skip
+    """A car by throttle that slips aside and turns less at speed; only its poses were seen."""
+    limits = {"throttle": (-0.3, 0.6), "steering": (-1.0, 1.0)}
+    given = {"kind": "ackermann_throttle", "footprint_radius": 0.25}
+    spec = robot_from(given | {"parameters": {"wheelbase": 0.26}}, limits)
+    rng, count = np.random.default_rng(seed), round(duration / COMMAND_S)
+    draws = rng.uniform(*np.array(list(limits.values())).T, (count // 40 + 1, 2))
+    command = np.repeat(np.where(rng.random(draws.shape) < 0.15, 0.0, draws), 40, axis=0)[:count]
+    state, poses = np.zeros(6), []
+    for u, steering in np.repeat(command, round(COMMAND_S / FINE_S), axis=0):
+        poses.append(state[:3].copy())
+        x, y, heading, v, angle, turn = state
+        push = 9.0 * np.sign(u) * max(abs(u) - dead, 0.0) - 0.5 * v - drag * v * abs(v)
+        wanted = v * np.tan(angle) / (0.26 + 0.03 * v * v)
+        aside = -slip * v * v * turn
+        c, s = np.cos(heading), np.sin(heading)
+        v += FINE_S * push
+        v = np.sign(v) * max(abs(v) - FINE_S * friction, 0.0)
+        state = np.array([
+            x + FINE_S * (c * state[3] - s * aside), y + FINE_S * (s * state[3] + c * aside),
+            heading + FINE_S * turn, v, angle + FINE_S * (0.4 * steering - angle) / 0.06,
+            turn + FINE_S * (wanted - turn) / 0.04,
+        ])  # fmt: skip
+    pose = geometry.compose(np.array(poses), np.array(mounting, np.float64))[::5]
+    pose = pose + 0.0003 * rng.normal(size=pose.shape)
+    t = FINE_S * 5.0 * np.arange(len(pose))
+    return spec, Recording(Stream(COMMAND_S * np.arange(count), command), Stream(t, pose))

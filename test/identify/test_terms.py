@@ -9,7 +9,7 @@ from identify.drives import MOTOR, servoed, tricycle
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.identify import STAGES, Identified, complete, identify, run
-from nics_drl_bridge.identify.orders import through_state
+from nics_drl_bridge.identify.terms import through_state
 from nics_drl_bridge.robot import taylor
 
 BASE = 0.9

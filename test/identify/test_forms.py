@@ -1,0 +1,102 @@
+"""What motors and tyres do besides gains and lags: found in a motion, sought by name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from identify.drives import slipping_car
+from nics_drl_bridge.identify.drive import Drive, Settings
+from nics_drl_bridge.identify.forms import Form, curve_of, inputs_of, two_way, with_back
+from nics_drl_bridge.identify.identify import STAGES, Findings, aligned, inputs, run
+from nics_drl_bridge.recording.recording import Samples
+from nics_drl_bridge.robot.curve import InputCurve
+from nics_drl_bridge.robot.taylor import TaylorModel
+
+CURVE = InputCurve(command="throttle", dead=0.05, least=-0.3, most=0.5)
+
+
+@pytest.fixture(scope="module")
+def found() -> Findings:
+    """Findings on a car's motion before its input curves."""
+    spec, recording = slipping_car()
+    drive = Drive(recording, spec)
+    drive = replace(drive, settings=Settings(train_until_s=drive.duration_s))
+    return run(STAGES[: STAGES.index(inputs)], drive)
+
+
+@pytest.fixture(scope="module")
+def samples(found) -> Samples:
+    return aligned(found.training, found)
+
+
+def form_inputs(found, samples, form):
+    return inputs_of(found.training, 0.05, samples, form)
+
+
+def test_a_dead_zone_is_seen_in_the_speed_that_a_throttle_makes(found, samples):
+    candidate = curve_of(samples, found.training.spec, 0)
+    assert candidate is not None
+    assert candidate.curve.command == "throttle"
+    assert candidate.curve.dead == pytest.approx(0.1, abs=0.05)
+    assert candidate.drives
+
+
+def test_a_command_in_proportion_to_what_it_does_has_no_curve(found, samples):
+    follows = replace(samples, x=samples.x.copy())
+    share = 1.0 - np.exp(-samples.dt / 0.4)
+    follows.x[:, 0] = lfilter([share], [1.0, share - 1.0], samples.x[:, 3])
+    follows.x[:, 1:3] = 0.0
+    assert curve_of(follows, found.training.spec, 0) is None
+
+
+def test_values_are_sought_by_name_from_what_the_motion_shows(found, samples):
+    form = Form((CURVE,), friction=("vx",), limits=("vx",), drag=("vx",))
+    sought = form_inputs(found, samples, form)
+    assert sought.names == (
+        "latency", "dead throttle", "least throttle", "most throttle", "back throttle",
+        "friction vx", "drag vx", "fall vx", "rise vx",
+    )  # fmt: skip
+    known = set(sought.names) - {sought.names[i] for i in sought.sought}
+    assert known == {"back throttle"}
+    assert (sought.low <= sought.start).all() and (sought.start <= sought.high).all()
+
+
+def test_a_form_that_grows_starts_where_the_smaller_one_ended(found, samples):
+    small = form_inputs(found, samples, Form((CURVE,)))
+    ended = replace(small, start=small.start + [0.02, 0.01, 0.0, 0.03, 0.0])
+    larger = form_inputs(found, samples, Form((CURVE,), drag=("vx",))).begun_at(ended)
+    assert larger.start[:5] == pytest.approx(ended.start)
+    assert larger.start[5] > 0.0
+
+
+def test_values_become_curves_friction_limits_and_drag(found, samples):
+    form = Form((CURVE,), ("vx",), ("vx",), ("throttle",), ("vx",))
+    sought = form_inputs(found, samples, form)
+    values = np.array([0.03, 0.12, -0.2, 0.4, 0.8, 0.25, 0.15, 3.0, 2.0])
+    (curve,) = form.curves_at(sought, values)
+    assert curve == InputCurve(command="throttle", dead=0.12, least=-0.2, most=0.4, back=0.8)
+    spec = found.training.spec
+    none = np.zeros((len(spec.dof_names), 1))
+    model = TaylorModel(
+        spec.variable_names, spec.dof_names, spec.dof_units,
+        np.zeros((1, len(spec.variable_names)), dtype=np.int64), none, 0.01, none[:5, 0],
+        none[:5, 0],
+    )  # fmt: skip
+    model = form.actuated(model, sought, values)
+    assert model.friction.tolist() == [0.25, 0.0, 0.0]
+    assert model.drag.tolist() == [0.15, 0.0, 0.0]
+    assert model.limits[0].tolist() == [-3.0, 2.0]
+
+
+def test_only_a_command_that_drives_both_ways_may_have_a_gain_of_its_own_backwards(found, samples):
+    (both,) = two_way(found.training, samples)
+    assert both.command == "throttle"
+    form = with_back(Form(), (both,))
+    assert form.back == ("throttle",)
+    assert len(form_inputs(found, samples, form).sought) == 4  # it has no dead zone
+    forwards = replace(samples, x=np.abs(samples.x))
+    assert two_way(found.training, forwards) == ()

@@ -1,0 +1,94 @@
+"""Which textbook, with which effects and which more terms, predicts what its fit did not see."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from identify.drives import slipping_car
+from nics_drl_bridge.identify.drive import Drive, Settings
+from nics_drl_bridge.identify.hypotheses import (
+    Trial,
+    about_lags,
+    base_of,
+    chosen,
+    hypotheses,
+    lags_of,
+)  # fmt: skip
+from nics_drl_bridge.identify.identify import STAGES, aligned, fit, identify, run
+from nics_drl_bridge.identify.terms import by_textbook
+from nics_drl_bridge.robot import taylor
+
+
+def base(**given):
+    spec, recording = slipping_car(**given)
+    drive = Drive(recording, spec)
+    drive = replace(drive, settings=Settings(train_until_s=drive.duration_s))
+    found = run(STAGES[: STAGES.index(fit)], drive)
+    samples = aligned(found.training, found)
+    best = base_of(found.training, found.calibration, samples, found.clear)
+    names, values = best.draft.inputs.names, best.found.values.tolist()
+    return best.draft.form, dict(zip(names, values, strict=True))
+
+
+@pytest.mark.slow
+def test_a_car_with_dead_zone_drag_and_friction_shows_all_of_them():
+    form, values = base(seed=3)
+    assert form.tyres
+    assert form.drag == form.friction == ("vx",)
+    assert values["dead throttle"] == pytest.approx(0.1, abs=0.01)
+    assert values["friction vx"] == pytest.approx(0.3, abs=0.1)
+
+
+@pytest.mark.slow
+def test_a_car_without_drag_and_friction_is_given_none():
+    form, values = base(seed=3, drag=0.0, friction=0.0, dead=0.0)
+    assert values.get("dead throttle", 0.0) < 0.01
+    assert values.get("friction vx", 0.0) < 0.05
+    assert values.get("drag vx", 0.0) < 0.02
+    assert form.limits == ()
+
+
+@pytest.mark.slow
+def test_a_car_that_slips_is_predicted_and_its_lever_is_not_bent_by_the_slip():
+    spec, recording = slipping_car(seed=5, duration=60.0)
+    found = identify(recording, spec, alpha="auto")
+    assert found.held_out is not None
+    assert found.held_out.mean_position_error_m < 0.03 * found.held_out.mean_path_m
+    sigma = found.calibration.uncertainty
+    assert abs(found.calibration.lever_arm_m[0] - 0.08) < 3.0 * sigma["lever_arm_x_m"]
+    assert abs(found.calibration.rotation_rad + 0.1) < 3.0 * sigma["rotation_rad"]
+    assert "command_latency_s" not in sigma
+    assert any("can't be told from the lags" in note for note in found.notes)
+
+
+def trial(order, error):
+    return Trial(order, 0.0, error, {5.0: np.array([error])})
+
+
+def test_a_higher_order_has_to_be_worth_its_terms():
+    assert chosen([trial(0, 0.10), trial(1, 0.096), trial(2, 0.12)]).order == 0
+    assert chosen([trial(0, 0.10), trial(1, 0.09), trial(2, 0.0857)]).order == 1
+
+
+def test_hypotheses_go_from_the_textbook_to_the_freest():
+    assert [order for order, _ in hypotheses("auto")] == [0, 1, 1, 1, 2, 2, 2, 3, 3, 3]
+    assert {order for order, _ in hypotheses(2)} == {0, 2}
+
+
+def test_a_latency_is_told_as_its_sums_with_the_lags():
+    sentence = about_lags(0.05, {"vx": 0.2, "wz": 0.1})
+    assert "trust their sums, 0.250 s for vx, 0.150 s for wz" in sentence
+
+
+def test_a_lag_is_what_the_state_itself_takes_from_its_rate():
+    spec, _ = slipping_car(duration=1.0)
+    powers = taylor.exponents(len(spec.variable_names), 1)
+    allowed = by_textbook(powers, spec)
+    model = taylor.TaylorModel(
+        spec.variable_names, spec.dof_names, spec.dof_units, powers,
+        np.where(allowed, -4.0, 0.0), 0.01, np.zeros(5), np.zeros(5),
+    )  # fmt: skip
+    assert lags_of(model, spec) == {"vx": 0.25, "vy": 0.25, "wz": 0.25}
