@@ -26,7 +26,7 @@ BARS = {
     # 180 and 33,000 until it read any recording, knew ten kinds of robots instead of six, and what
     # motors do, and judged itself by yardsticks.
     "modules": 194,
-    "lines": 38_700,
+    "lines": 38_900,
     "single_importers": 50,
     "circles": 0,
     "max_arguments": 10,

@@ -62,12 +62,13 @@ def test_values_are_sought_by_name_from_what_the_motion_shows(found, samples):
     )  # fmt: skip
     known = set(sought.names) - {sought.names[i] for i in sought.sought}
     assert known == {"back throttle"}
-    assert (sought.low <= sought.start).all() and (sought.start <= sought.high).all()
+    assert (sought.low <= sought.start).all()
+    assert (sought.start <= sought.high).all()
 
 
 def test_a_form_that_grows_starts_where_the_smaller_one_ended(found, samples):
     small = form_inputs(found, samples, Form((CURVE,)))
-    ended = replace(small, start=small.start + [0.02, 0.01, 0.0, 0.03, 0.0])
+    ended = replace(small, start=small.start + np.array([0.02, 0.01, 0.0, 0.03, 0.0]))
     larger = form_inputs(found, samples, Form((CURVE,), drag=("vx",))).begun_at(ended)
     assert larger.start[:5] == pytest.approx(ended.start)
     assert larger.start[5] > 0.0

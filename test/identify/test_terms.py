@@ -1,15 +1,21 @@
-"""The order of robots whose states follow the commands and were not measured."""
+"""Terms that a model may have, and the order of robots whose states follow the commands."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from identify.drives import MOTOR, servoed, tricycle
+from identify.drives import MOTOR, servoed, slipping_car, tricycle
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.identify import STAGES, Identified, complete, identify, run
-from nics_drl_bridge.identify.terms import through_state
+from nics_drl_bridge.identify.terms import (
+    by_textbook,
+    mirrored,
+    through_state,
+    together,
+    tyres_slip,
+)
 from nics_drl_bridge.robot import taylor
 
 BASE = 0.9
@@ -80,3 +86,49 @@ def test_a_mirror_leaves_even_terms_along_x_and_odd_ones_across():
     assert not any("command" in name for name in along + across)
     sided = through_state(powers, spec, centred=False)
     assert sided[0][names.index("speed*steering")]
+
+
+def test_a_mirror_turns_the_steering_and_what_it_moves_aside():
+    spec, _ = slipping_car(duration=1.0)
+    assert mirrored(spec) == ("vy", "wz", "steering")
+
+
+def test_the_twist_of_a_car_follows_its_commands_and_with_tyres_its_lateral_acceleration():
+    spec, _ = slipping_car(duration=1.0)
+    powers = taylor.exponents(len(spec.variable_names), 3)
+
+    def terms(dof: str, **given: bool) -> set[str]:
+        allowed = by_textbook(powers, spec, **given)[spec.dof_names.index(dof)]
+        return {taylor.term_name(row, spec.variable_names) for row in powers[allowed]}
+
+    assert terms("d_vx") == {"vx", "throttle"}
+    assert terms("d_vx", drag=True) == {"vx", "throttle", "vx*throttle"}
+    assert terms("d_wz") == {"vx", "wz", "vx*steering"}
+    assert terms("d_wz", tyres=True) - terms("d_wz") == {"vx^2*wz"}
+    assert terms("d_vy", tyres=True) == {"vy", "vx^2*wz"}
+
+
+def test_only_cars_that_steer_in_front_slip_by_their_tyres(differential):
+    spec, _ = slipping_car(duration=1.0)
+    assert tyres_slip(spec)
+    assert not tyres_slip(differential)
+    assert not tyres_slip(tricycle())
+
+
+def test_two_models_are_put_together_over_the_terms_of_both():
+    spec, _ = slipping_car(duration=1.0)
+    one, other = (model_of(spec, names) for names in (["vx", "throttle"], ["wz", "vx"]))
+    base, first = together(one, other)
+    at = {taylor.term_name(row, spec.variable_names): k for k, row in enumerate(base.powers)}
+    assert set(at) == {"vx", "throttle", "wz"}
+    assert base.coefficients[0, [at["vx"], at["throttle"], at["wz"]]].tolist() == [1.0, 2.0, 0.0]
+    assert first[0, [at["vx"], at["throttle"], at["wz"]]].tolist() == [2.0, 0.0, 1.0]
+
+
+def model_of(spec, names):
+    powers = np.array([[n == name for n in spec.variable_names] for name in names]).astype(np.int64)
+    rows = np.tile(1.0 + np.arange(len(names)), (len(spec.dof_names), 1))
+    box = np.zeros(len(spec.variable_names))
+    return taylor.TaylorModel(
+        spec.variable_names, spec.dof_names, spec.dof_units, powers, rows, 0.01, box, box
+    )  # fmt: skip

@@ -1,0 +1,76 @@
+"""Motion as state: the twist of robots of which only the pose was seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from identify.drives import slipping_car
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.motion import (
+    WIDTHS_S,
+    by_motion,
+    grid_of,
+    half_width,
+    known_state,
+    samples_of,
+    surrogate,
+    with_motion,
+)  # fmt: skip
+from nics_drl_bridge.recording.recording import Stream
+
+MOUNTED = Calibration(rotation_rad=-0.1, lever_arm_m=(0.08, 0.0))
+
+
+@pytest.fixture(scope="module")
+def drive() -> Drive:
+    spec, recording = slipping_car(duration=20.0)
+    return Drive(recording, spec)
+
+
+def test_a_twist_that_was_not_measured_is_taken_from_the_pose(drive, car):
+    assert by_motion(drive.spec, drive.recording)
+    assert not by_motion(car, drive.recording)
+    measured = Stream(drive.recording.pose.t, np.zeros((len(drive.recording.pose.t), 3)))
+    assert not by_motion(drive.spec, replace(drive.recording, state=measured))
+
+
+def test_noisier_poses_are_smoothed_over_longer(drive):
+    assert half_width(drive) == WIDTHS_S[0]
+    noise = np.random.default_rng(0).normal(0.0, 0.01, drive.recording.pose.values.shape)
+    pose = replace(drive.recording.pose, values=drive.recording.pose.values + noise)
+    assert half_width(Drive(replace(drive.recording, pose=pose), drive.spec)) > WIDTHS_S[0]
+
+
+@pytest.mark.parametrize(("every", "step"), [(0.01, 0.01), (0.0071, 0.01), (0.04, 0.02)])
+def test_the_step_divides_the_control_period_whatever_the_poses_rate(drive, every, step):
+    pose = drive.recording.pose
+    other = replace(pose, t=every * np.arange(len(pose.t)))
+    grid = grid_of(Drive(replace(drive.recording, pose=other), drive.spec), Calibration(), 0.1)
+    assert np.diff(grid) == pytest.approx(step)
+
+
+def test_the_twist_is_that_of_the_base_wherever_the_tracked_body_sits(drive):
+    grid = grid_of(drive, MOUNTED, 0.1)
+    moved = with_motion(drive, MOUNTED, grid, 0.07)
+    speed, aside, turn = known_state(moved).values.T
+    assert aside == pytest.approx(-0.015 * speed**2 * turn, abs=0.03)
+    bare = known_state(with_motion(drive, Calibration(), grid, 0.07)).values[:, 1]
+    assert np.abs(bare).mean() > 5.0 * np.abs(aside + 0.015 * speed**2 * turn).mean()
+
+
+def test_samples_have_the_commands_in_effect_after_their_latency(drive):
+    late = replace(MOUNTED, command_latency_s=0.1)
+    grid = grid_of(drive, late, 0.1)
+    at = samples_of(with_motion(drive, late, grid, 0.07), late, 0.07)
+    command, row = drive.recording.command, 500
+    before = np.searchsorted(command.t, at.t[row] - 0.1 + 1e-9, "right") - 1
+    assert at.x[row, 3:] == pytest.approx(command.values[before])
+
+
+def test_a_surrogate_has_a_state_for_each_command(drive):
+    names = [(v.name, v.follows) for v in surrogate(drive.spec).state]
+    assert names == [("throttle_state", "throttle"), ("steering_state", "steering")]

@@ -1,0 +1,102 @@
+"""Models and delays are found by the errors of predictions over seconds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from identify.drives import slipping_car
+from nics_drl_bridge import geometry
+from nics_drl_bridge.identify.shooting import NOTHING_FREE, Inputs, Shooting, fitted
+from nics_drl_bridge.recording.recording import Samples
+from nics_drl_bridge.robot.kernels import SERIES, rollout, term_arrays
+from nics_drl_bridge.robot.taylor import TaylorModel
+
+DT, STEPS, DELAY = 0.02, 2000, 0.1
+
+
+@pytest.fixture(scope="module")
+def car() -> TaylorModel:
+    """vx' = 4 throttle - 2 vx, wz' = 8 steering - 5 wz."""
+    spec, _ = slipping_car(duration=1.0)
+    names = ("vx", "wz", "throttle", "steering")
+    powers = np.array([[n == name for n in spec.variable_names] for name in names], dtype=np.int64)
+    rows = np.zeros((6, 4))
+    rows[0, 0] = rows[2, 1] = 1.0
+    rows[3], rows[5] = [-2.0, 0.0, 4.0, 0.0], [0.0, -5.0, 0.0, 8.0]
+    box = np.zeros(5)
+    return TaylorModel(
+        spec.variable_names, spec.dof_names, spec.dof_units, powers, rows, DT, box, box
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def problem(car) -> Shooting:
+    """A drive of it, whose commands act after a delay."""
+    rng, t = np.random.default_rng(2), DT * np.arange(STEPS + 1)
+    command = np.repeat(rng.uniform(-1.0, 1.0, (STEPS // 20, 2)), 20, axis=0)
+    late = np.roll(command, round(DELAY / DT), axis=0)
+    poses, states = np.zeros((1, STEPS + 1, 3)), np.zeros((1, STEPS + 1, 3))
+    rollout(poses, states, late[None], term_arrays(car), SERIES, DT)
+    q = np.concatenate([poses[0], states[0]], axis=1)
+    x = np.concatenate([states[0, :-1], command], axis=1)
+    samples = Samples(t, q, np.vstack([x, x[-1:]]), np.gradient(q, DT, axis=0), DT)
+
+    def commands(values):
+        at = np.arange(STEPS + 1) - values[0] / DT
+        return np.stack([np.interp(at, np.arange(STEPS), column) for column in command.T], axis=1)
+
+    return Shooting(samples, commands, lambda model, values: model)
+
+
+DELAYS = Inputs(("latency",), *(np.array([value]) for value in (0.05, 0.05, 0.0, 0.4)))
+
+
+def test_coefficients_and_a_delay_are_found_together(car, problem):
+    off = replace(car, coefficients=car.coefficients * np.where(car.coefficients == 1.0, 1.0, 1.3))
+    free = (car.coefficients != 0.0) & (np.arange(6) >= 3)[:, None]
+    found = fitted(problem, off, free, DELAYS)
+    assert found.model.coefficients[free] == pytest.approx(car.coefficients[free], rel=0.02)
+    assert found.values[0] == pytest.approx(DELAY, abs=0.003)
+    assert found.value_errors[0] < 0.01
+
+
+def test_a_value_between_equal_bounds_stays_and_has_no_error(car, problem):
+    known = replace(DELAYS, start=np.array([0.08]), low=np.array([0.08]), high=np.array([0.08]))
+    found = fitted(problem, car, car.coefficients == 4.0, known)
+    assert found.values.tolist() == [0.08]
+    assert np.isnan(found.value_errors).all()
+
+
+def test_rows_outside_are_neither_started_from_nor_passed(problem):
+    inside = np.ones(STEPS + 1, dtype=np.bool_)
+    inside[700:800] = False
+    first, steps = problem.starts(inside)
+    for a, row in zip(first, steps, strict=True):
+        assert inside[a : a + row.max() + 1].all()
+    assert len(first) < len(problem.starts()[0])
+
+
+def test_a_window_does_not_pass_a_gap(problem):
+    t = problem.samples.t + np.where(np.arange(STEPS + 1) >= 1000, 0.5, 0.0)
+    first, steps = replace(problem, samples=replace(problem.samples, t=t)).starts()
+    assert not ((first < 1000) & (first + steps.max(axis=1) >= 1000)).any()
+
+
+def test_predictions_are_seen_from_where_the_tracked_body_is(car, problem):
+    first, steps = problem.starts()
+    values = np.array([DELAY, 0.2, -0.1, 0.3])
+    base, _ = problem.predict(car, values, first, steps)
+    seen, _ = replace(problem, mounted=True).predict(car, values, first, steps)
+    mounting = values[1:]
+    expected = geometry.between(mounting, geometry.compose(base, mounting))
+    assert seen[..., :2] == pytest.approx(expected[..., :2])
+
+
+def test_nothing_free_leaves_the_model(car, problem):
+    fixed = replace(problem, fixed=np.array([DELAY]))
+    found = fitted(fixed, car, np.zeros((6, 4), dtype=np.bool_), NOTHING_FREE)
+    assert np.array_equal(found.model.coefficients, car.coefficients)
+    assert found.error < 0.005
