@@ -109,20 +109,20 @@ class _File(Schema):
 
 def generate(
     recording: Recording, robot: RobotSpec, lidar: LidarSpec, shapes: Sequence[Shape],
-    order: int = fit.ORDER, alpha: fit.Alpha = "auto", assume: bool = False, strict: bool = False,
-    anyway: bool = False, sensors: Sequence[Sensor] = (),
+    order: fit.Order = "auto", alpha: fit.Alpha = "auto", assume: bool = False,
+    strict: bool = False, anyway: bool = False, sensors: Sequence[Sensor] = (),
 ) -> tuple[SimulatorModel, Identified]:  # fmt: skip
     """Calibrates, fits and prunes the kinematics, and bakes the lidar table.
 
     The shapes of obstacles are baked, and the robot's own footprint. `order` is that of the Taylor
-    model, `alpha` the pruning threshold of Eq. 2. `assume` fills in from the textbook what the
-    drive did not show, marked as assumed; `strict` refuses a drive that did not excite every input
-    alone; `anyway` accepts predictions hardly better than a standing robot's; `sensors` are beside
-    its lidar. Raises RecordingError for a recording that is unfit for the robot, FitError for a
-    useless model.
+    model, `auto` for the one that predicts best, `alpha` the pruning threshold of Eq. 2. `assume`
+    fills in from the textbook what the drive did not show, marked as assumed; `strict` refuses a
+    drive that did not excite every input alone; `anyway` accepts predictions hardly better than a
+    standing robot's; `sensors` are beside its lidar. Raises RecordingError for a recording that is
+    unfit for the robot, FitError for a useless model.
     """
     identified = identify(recording, robot, order=order, alpha=alpha, assume=assume, strict=strict)
-    if (reason := why_useless(identified, robot, order)) and not anyway:
+    if (reason := why_useless(identified, robot)) and not anyway:
         raise FitError(reason)
     model = SimulatorModel(
         robot, identified.model, replace(identified.calibration, inputs=()), lidar,

@@ -186,7 +186,7 @@ def generate(
     sensor: Annotated[
         list[Path] | None, Option(help="YAML of a further sensor, docs/sensors.md; repeatable.")
     ] = None,
-    order: Annotated[int, Option(min=1, max=4, help="Order of the Taylor model.")] = 2,
+    order: Annotated[str, Option(help="Order of the Taylor model, 1 to 4, or auto.")] = "auto",
     alpha: Annotated[str, Option(help="Pruning of Eq. 2, 0 to 1, or auto for the knee.")] = "auto",
     assume_textbook: Annotated[
         bool, Option(help="Fill in from the textbook what the drive did not show.")
@@ -202,7 +202,7 @@ def generate(
     with one_sentence():
         from nics_drl_bridge.generator import check_place, save_model
         from nics_drl_bridge.generator import generate as generate_model
-        from nics_drl_bridge.identify.fit import parse_alpha
+        from nics_drl_bridge.identify.fit import parse_alpha, parse_order
         from nics_drl_bridge.lidar.sensor import load_sensor
         from nics_drl_bridge.lidar.spec import load_lidar
         from nics_drl_bridge.recording.readers import robot_and_drive
@@ -210,7 +210,7 @@ def generate(
         from nics_drl_bridge.sim.world import load_world
 
         check_place(out)
-        first, threshold = load_lidar(lidar), parse_alpha(alpha)
+        first, threshold, terms = load_lidar(lidar), parse_alpha(alpha), parse_order(order)
         further = tuple(load_sensor(file) for file in sensor or ())
         shapes = load_world(world).shapes
         with intact(recording, salvage) as whole:
@@ -218,7 +218,7 @@ def generate(
             spec, drive = robot_and_drive(whole, robot, roles, mapping)
         drive = replace(drive, source=str(recording))
         model, identified = generate_model(
-            drive, spec, first, shapes, order, threshold, assume_textbook, strict, anyway, further
+            drive, spec, first, shapes, terms, threshold, assume_textbook, strict, anyway, further
         )
         save_model(model, out)
         if pictures:

@@ -37,6 +37,13 @@ def parse_alpha(text: str) -> Alpha:
     raise ConfigError(f"alpha is {text!r}; it must be a number from 0 to 1, or auto.")
 
 
+def parse_order(text: str) -> Order:
+    """Parses the order of a model: 1 to 4, or `auto`; else ConfigError."""
+    if text not in ("auto", "1", "2", "3", "4"):
+        raise ConfigError(f"order is {text!r}; it must be 1, 2, 3 or 4, or auto.")
+    return "auto" if text == "auto" else int(text)
+
+
 @dataclass(frozen=True)
 class Regression:
     """Least squares of dQ/dt on all features (Eq. 1)."""

@@ -120,21 +120,21 @@ class Form:
         return tuple(
             InputCurve(
                 command=c.command,
-                dead=max(at[f"dead {c.command}"], 0.0),
-                least=min(at[f"least {c.command}"], 0.0),
-                most=max(at[f"most {c.command}"], 0.0),
-                back=at[f"back {c.command}"],
+                dead=max(at[f"{c.command}.dead"], 0.0),
+                least=min(at[f"{c.command}.least"], 0.0),
+                most=max(at[f"{c.command}.most"], 0.0),
+                back=at[f"{c.command}.back"],
             )
             for c in self.curves
         )
 
     def actuated(self, model: TaylorModel, inputs: shooting.Inputs, values: Array) -> TaylorModel:
-        """Returns a model with friction and limits for values (I,)."""
+        """Returns a model with friction, drag and limits for values (I,)."""
         at = dict(zip(inputs.names, values.tolist(), strict=True))
         states = model.variables[: model.state_size]
-        friction = [max(at.get(f"friction {name}", 0.0), 0.0) for name in states]
-        drag = [max(at.get(f"drag {name}", 0.0), 0.0) for name in states]
-        limits = [[-at.get(f"fall {n}", np.inf), at.get(f"rise {n}", np.inf)] for n in states]
+        friction = [max(at.get(f"{name}.friction", 0.0), 0.0) for name in states]
+        drag = [max(at.get(f"{name}.drag", 0.0), 0.0) for name in states]
+        limits = [[-at.get(f"{n}.fall", np.inf), at.get(f"{n}.rise", np.inf)] for n in states]
         return replace(
             model, friction=np.array(friction), drag=np.array(drag),
             limits=np.array(limits).reshape(-1, 2),
@@ -168,23 +168,23 @@ def inputs_of(drive: Drive, latency: float, samples: Samples, form: Form) -> sho
         name, size = curve.command, max(abs(curve.least), abs(curve.most))
         step, known = CURVE_SCALE * size, (curve.back, curve.back)
         rows |= {
-            f"dead {name}": (curve.dead, step, 0.0, 0.5 * size if curve.dead else 0.0),
-            f"least {name}": (curve.least, step, 1.5 * curve.least, 0.5 * curve.least),
-            f"most {name}": (curve.most, step, 0.5 * curve.most, 1.5 * curve.most),
-            f"back {name}": (curve.back, BACK_SCALE, *(BACK_RANGE if name in form.back else known)),
+            f"{name}.dead": (curve.dead, step, 0.0, 0.5 * size if curve.dead else 0.0),
+            f"{name}.least": (curve.least, step, 1.5 * curve.least, 0.5 * curve.least),
+            f"{name}.most": (curve.most, step, 0.5 * curve.most, 1.5 * curve.most),
+            f"{name}.back": (curve.back, BACK_SCALE, *(BACK_RANGE if name in form.back else known)),
         }
     rates = {v.name: samples.dq[:, 3 + i] for i, v in enumerate(drive.spec.state)}
     for name in form.friction:
         size = float(np.percentile(np.abs(rates[name]), STRONG))
-        rows[f"friction {name}"] = (0.1 * size, 0.1 * size, 0.0, size)
+        rows[f"{name}.friction"] = (0.1 * size, 0.1 * size, 0.0, size)
     for name in form.drag:
         value = samples.x[:, [v.name for v in drive.spec.state].index(name)]
         size = float(np.percentile(np.abs(rates[name]), STRONG) / max(np.mean(value**2), 1e-3))
-        rows[f"drag {name}"] = (0.1 * size, 0.1 * size, 0.0, size)
+        rows[f"{name}.drag"] = (0.1 * size, 0.1 * size, 0.0, size)
     for name in form.limits:
         for word, rate in (("fall", -rates[name]), ("rise", rates[name])):
             size = max(float(np.percentile(rate, STRONG)), 1e-3)
-            rows[f"{word} {name}"] = (size, 0.3 * size, 0.1 * size, 10.0 * size)
+            rows[f"{name}.{word}"] = (size, 0.3 * size, 0.1 * size, 10.0 * size)
     if not drive.spec.state:  # what is left of the mounting
         reach = 2.0 * drive.spec.footprint_radius
         aside = reach if sided(drive.spec) else 0.0

@@ -22,6 +22,7 @@ from nics_drl_bridge.identify.terms import (
     by_textbook,
     defined,
     linear_fit,
+    stable,
     together,
     tyres_slip,
 )  # fmt: skip
@@ -52,6 +53,13 @@ class Trial:
     error: float  # mean error after `HORIZON_S`, as a share of the path
     errors: dict[float, Array]  # (W,) distances at the ends of predictions, by horizon [m]
 
+    @property
+    def level(self) -> float:
+        """Geometric mean of the mean errors over all horizons that fit; infinite if none does."""
+        # Over half a second what drives a robot shows best, over five where it ends.
+        means = [float(each.mean()) for each in self.errors.values() if len(each)]
+        return float(np.exp(np.mean(np.log(means)))) if means else np.inf
+
 
 @dataclass(frozen=True)
 class Draft:
@@ -72,9 +80,10 @@ class Draft:
         model = by_definition(linear_fit(samples, spec, BASE_ORDER, allowed).model, spec)
         model, first = (model, None) if other is None else together(model, other)
         free = (model.coefficients != 0.0) & ~defined(spec)[:, None]
-        return shooting.fitted(
+        found = shooting.fitted(
             self.problem, model, free, self.inputs, inside, BASE_EVALUATIONS, first=first
         )  # fmt: skip
+        return replace(found, model=stable(found.model, spec))
 
     def refined(
         self, base: TaylorModel, linear: TaylorModel, inside: Mask | None = None,
@@ -100,9 +109,10 @@ class Draft:
                 error, path = judge.errors(model, values, left)
                 errors[hypothesis].append(np.hypot(error[..., 0], error[..., 1]))
             paths.append(path)
-        length = max(float(np.nanmean(np.concatenate(paths)[:, -1])), 1e-9)
+        path = np.concatenate(paths)[:, -1]
+        length = float(path[~np.isnan(path)].sum())
         return tuple(
-            Trial(*hypothesis, float(np.nanmean(far[:, -1])) / length,
+            Trial(*hypothesis, float(np.nansum(far[:, -1])) / length if length else np.nan,
                   {h: each[~np.isnan(each)] for h, each in zip(BANDS_S, far.T, strict=True)})
             for hypothesis, blocks in errors.items() for far in [np.concatenate(blocks)]
         )  # fmt: skip
@@ -148,16 +158,16 @@ def base_of(
         return Base(replace(draft, inputs=inputs, problem=problem), found)
 
     def error_of(base: Base) -> float:
-        # Over half a second what drives a robot shows best, over five where it ends.
-        (trial,) = base.draft.tried((TEXTBOOK,))
-        return float(np.exp(np.mean([np.log(e.mean()) for e in trial.errors.values()])))
+        return base.draft.tried((TEXTBOOK,))[0].level
 
     if known is not None:
         return fitted(replace(known.draft.form, curves=calibration.inputs))
     best = fitted(Form(calibration.inputs))
     error = error_of(best)
-    if len(calibration.inputs) > len(clear) and error_of(plain := fitted(Form(clear))) < error:
-        best, error = plain, error_of(plain)
+    if len(calibration.inputs) > len(clear):
+        plain = fitted(Form(clear))
+        if (other := error_of(plain)) < error or np.isinf(other):  # too short a drive tells nothing
+            best, error = plain, other
     for change, worth in changes(drive, samples):
         if (form := change(best.draft.form)) == best.draft.form:
             continue
@@ -225,12 +235,11 @@ def standard_errors(found: shooting.Predictive) -> Array:
 
 def remounted(calibration: Calibration, found: shooting.Predictive) -> Calibration:
     """Adds the mounting that predictions show to what the calibration has."""
-    mounting = geometry.compose(found.values[-3:], calibration.mounting)
-    x, y, heading = map(float, mounting)
-    names, errors = ("lever_arm_x_m", "lever_arm_y_m", "rotation_rad"), found.value_errors[-3:]
-    if np.isnan(errors[1]):  # it was not sought, and is as uncertain as the rotation makes it
-        errors = np.array([errors[0], abs(x) * errors[2], errors[2]])
-    sigma = dict(zip(names, map(float, errors), strict=True))
+    x, y, heading = map(float, geometry.compose(found.values[-3:], calibration.mounting))
+    names = ("lever_arm_x_m", "lever_arm_y_m", "rotation_rad")
+    errors = zip(names, map(float, found.value_errors[-3:]), strict=True)
+    sigma = {name: error for name, error in errors if not np.isnan(error)}
+    y = y if "lever_arm_y_m" in sigma else calibration.lever_arm_m[1]
     return replace(
         calibration, rotation_rad=-heading, lever_arm_m=(x, y),
         uncertainty={**calibration.uncertainty, **sigma},
@@ -244,3 +253,19 @@ def about_orders(trials: Sequence[Trial]) -> Iterator[str]:
         finding = f"The model has terms up to order {best.order}"
         unseen = f"predictions over {HORIZON_S:g} s of parts that a fit did not see"
         yield f"{finding}: {unseen} end {errors} of the path away."
+
+
+def about_forms(base: Base, trials: Sequence[Trial]) -> Iterator[str]:
+    """Names what a model of a motion has beside the textbook's terms, and what it gains by it."""
+    form, best = base.draft.form, chosen(trials)
+    parts = [f"an input curve of {curve.command}" for curve in form.curves]
+    words = ("drag", form.drag), ("dry friction", form.friction), ("limits", form.limits)
+    parts += [f"{word} of {', '.join(names)}" for word, names in words if names]
+    parts += ["tyres that slip"] * form.tyres
+    parts += [f"terms up to order {best.order}"] * (best.order > 0)
+    shares = f"{trials[0].error:.1%} of the path away by the textbook with these effects"
+    shares += f", {best.error:.1%} with the terms" * (best.order > 0)
+    named = f"The model is the textbook with {', '.join(parts) or 'nothing else'}"
+    if np.isfinite(best.error):
+        unseen = f"predictions over {HORIZON_S:g} s of parts that a fit did not see"
+        yield f"{named}: {unseen} end {shares}."

@@ -223,6 +223,8 @@ def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:
     findings = replace(findings, calibration=calibration)
     samples = aligned(training, findings)
     linear = linear_fit(samples, spec, best or hypotheses.BASE_ORDER)
+    if drive.settings.strict:
+        verdict.refuse_unexcited(linear.regression.excitation, spec)
     return replace(
         findings, samples=samples, regression=linear.regression, linear=linear,
         model=replace(linear.model, inputs=curves), trials=trials, base=base,
@@ -300,6 +302,7 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
     calibration = replace(
         calibration, command_latency_s=float(found.values[0]),
         inputs=draft.form.curves_at(draft.inputs, found.values),
+        uncertainty=calibration.uncertainty | found.named_errors(draft.inputs.names),
     )  # fmt: skip
     values = found.values.copy()
     if draft.problem.mounted:
@@ -317,7 +320,8 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
     return replace(
         findings, calibration=calibration, model=model, base=base,
         refinement=(f"Coefficients and latency were refined by the open-loop errors over up to "
-                    f"{max(shooting.HORIZONS_S):g} s.", *sums),
+                    f"{max(shooting.HORIZONS_S):g} s.", *sums,
+                    *hypotheses.about_forms(base, findings.trials)),
     )  # fmt: skip
 
 

@@ -29,7 +29,6 @@ STILL = 1e-3
 ONE_WAY = 0.05  # share of all turning that does not count as the other way
 FLAT = 0.02  # less of the direction without extent lies in the plane: it only never turned
 MIN_LENGTH = 1e-4  # m, rad
-MOST_SLIP = 0.15  # a smaller angle between travel and heading may be slip [rad]
 REGULAR = 0.8
 BLOCKS = 8
 STRONG = 10.0  # instruments with a smaller F are weak (Staiger, Stock 1997)
@@ -62,7 +61,7 @@ def mounting_of(
     forward = _response(spec, command)[:, 0]
     found = mounting_without_lateral_motion(twists, forward)
     if found is not None and states is None and tyres_slip(spec):
-        return with_slip(twists, found, spec) or found
+        return with_slip(twists, found, spec)
     if found is None or states is None:
         return found
     if drive.recording.state is None or np.isnan(found.lever_sigma[0]):
@@ -114,8 +113,8 @@ def by_instruments(
     )  # fmt: skip
 
 
-def with_slip(motion: TwistIntervals, plain: Mounting, spec: RobotSpec) -> Mounting | None:
-    """Estimates the mounting on a car that slips aside by its lateral acceleration; None: too weak.
+def with_slip(motion: TwistIntervals, plain: Mounting, spec: RobotSpec) -> Mounting:
+    """Estimates the mounting on a car that may slip aside, by its lateral acceleration.
 
     Tyres give way in proportion to the force on them: a slip of speed^2 x turn rate (Gillespie).
     """
@@ -124,19 +123,13 @@ def with_slip(motion: TwistIntervals, plain: Mounting, spec: RobotSpec) -> Mount
     chi = np.stack([along[:, 0], turn, (along**2).sum(axis=1) * turn], axis=1)
     beta = np.linalg.lstsq(chi, along[:, 1], rcond=None)[0]
     sigma = standard_errors(chi, along[:, 1] - chi @ beta)
-    too_weak = clocks.CERTAIN * sigma[1] > spec.footprint_radius
-    if too_weak or abs(beta[2]) < clocks.CERTAIN * sigma[2]:
-        return None
+    if not clocks.CERTAIN * sigma[1] < spec.footprint_radius:  # slip hides it
+        return replace(plain, lever=np.zeros(2), lever_sigma=np.full(2, np.nan))
+    if abs(beta[2]) < clocks.CERTAIN * sigma[2]:
+        return plain
     rotation = plain.rotation + float(np.arctan(beta[0]))
     lever = np.array([float(beta[1]), 0.0])
     return Mounting(rotation, lever, float(sigma[0]), np.array([sigma[1], np.nan]), plain.ways)
-
-
-def without_slip(found: Mounting) -> Mounting | None:
-    """Believes of a robot that slips only a rotation that no slip explains."""
-    if abs(found.rotation) < MOST_SLIP:
-        return None
-    return replace(found, lever=np.zeros(2), lever_sigma=np.full(2, np.nan))
 
 
 def mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:

@@ -6,7 +6,7 @@ from textwrap import fill
 
 import numpy as np
 
-from nics_drl_bridge.identify.fit import ORDER, Alpha
+from nics_drl_bridge.identify.fit import Alpha
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.judgement import shortfall
 from nics_drl_bridge.identify.statistics import Curve
@@ -263,7 +263,7 @@ def is_useless(error: float, standing: float, path: float, radius: float) -> boo
     return not error <= max(MOST_LEFT * standing, FAR_OFF * path, radius)
 
 
-def why_useless(identified: Identified, spec: RobotSpec, order: int = ORDER) -> str:
+def why_useless(identified: Identified, spec: RobotSpec) -> str:
     """Returns a sentence on why a model is useless, by median errors; empty if it is not."""
     held_out, recording = identified.held_out, identified.recording
     if held_out is None:
@@ -277,10 +277,10 @@ def why_useless(identified: Identified, spec: RobotSpec, order: int = ORDER) -> 
     way = f"after {held_out.horizon_s:g} s and a path of {held_out.mean_path_m:.2f} m"
     still = f"where a robot that stood still would be {standing:.2f} m off"
     fault = f"the fitted model is of no use: on unseen data its predictions {end} {way}, {still}"
-    return f"{recording.source}: {fault}; {_suspicion(identified, spec, order)}."
+    return f"{recording.source}: {fault}; {_suspicion(identified, spec)}."
 
 
-def _suspicion(identified: Identified, spec: RobotSpec, order: int) -> str:
+def _suspicion(identified: Identified, spec: RobotSpec) -> str:
     recording, unmoved = identified.recording, identified.trial.fit.unmoved
     rows = recording.pose if recording.state is None else recording.state
     apart = f"{np.median(np.diff(rows.t)):.2g} s apart"
@@ -298,8 +298,8 @@ def _suspicion(identified: Identified, spec: RobotSpec, order: int) -> str:
     if unmoved:
         reason = f"{', '.join(unmoved)} never moved in its first {identified.train_until_s:.0f} s"
         return f"{reason}, from which it is learnt, so change it from the beginning on"
-    if identified.alpha != "auto" or order < ORDER:
-        return f"it may lack terms, so leave the order at {ORDER} and alpha at `auto`"
+    if identified.alpha != "auto" or identified.drive.settings.order == 1:
+        return "it may lack terms, so leave order and alpha at `auto`"
     got = "that nothing held the robot up, that it got each command, that its pose did not jump"
     shown = f"{got} and that rows {apart} show how it responds"
     return f"the recording does not show why, so make sure {shown}, and record anew"

@@ -165,6 +165,11 @@ class Predictive:
     starts: Array  # (n,) start of the window of each residual [s]
     value_errors: Array  # (I,) standard errors of the values; NaN of those that were known
 
+    def named_errors(self, names: tuple[str, ...]) -> dict[str, float]:
+        """Returns the errors of values that belong to a command or a state, as `throttle.dead`."""
+        errors = zip(names, self.value_errors.tolist(), strict=True)
+        return {name: error for name, error in errors if "." in name and not np.isnan(error)}
+
 
 NOTHING_FREE = Inputs((), *(np.zeros(0) for _ in range(4)))
 

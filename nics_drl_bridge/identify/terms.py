@@ -21,6 +21,8 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 Mask = NDArray[np.bool_]
 Powers = NDArray[np.int64]
 
+NOTHING = 1e-9  # spread of a rate that is none
+
 
 def mirrored(spec: RobotSpec) -> tuple[str, ...] | None:
     """Names the variables that change sign in a mirror; None if the textbook does not tell."""
@@ -140,7 +142,19 @@ def by_textbook(powers: Powers, spec: RobotSpec, tyres: bool = False, drag: bool
 
 def linear_fit(samples: Samples, spec: RobotSpec, order: int, allowed: Library = library) -> Fit:
     """Fits all terms of the library of an order to the rates (Eq. 1)."""
-    return pruned(regress(samples, spec, order, allowed=allowed), spec, 1.0)
+    found = pruned(regress(samples, spec, order, allowed=allowed), spec, 1.0)
+    moved = samples.dq.std(axis=0) > NOTHING
+    coefficients = np.where(moved[:, None], found.model.coefficients, 0.0)
+    return replace(found, model=replace(found.model, coefficients=coefficients))
+
+
+def stable(model: TaylorModel, spec: RobotSpec) -> TaylorModel:
+    """Returns a model in which no state grows by itself."""
+    coefficients, alone = model.coefficients.copy(), model.powers.sum(axis=1) == 1
+    for i in range(len(spec.state)):
+        own = alone & (model.powers[:, i] == 1)
+        coefficients[3 + i, own] = np.minimum(coefficients[3 + i, own], 0.0)
+    return replace(model, coefficients=coefficients)
 
 
 def together(base: TaylorModel, other: TaylorModel) -> tuple[TaylorModel, Array]:

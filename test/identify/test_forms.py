@@ -57,11 +57,11 @@ def test_values_are_sought_by_name_from_what_the_motion_shows(found, samples):
     form = Form((CURVE,), friction=("vx",), limits=("vx",), drag=("vx",))
     sought = form_inputs(found, samples, form)
     assert sought.names == (
-        "latency", "dead throttle", "least throttle", "most throttle", "back throttle",
-        "friction vx", "drag vx", "fall vx", "rise vx",
+        "latency", "throttle.dead", "throttle.least", "throttle.most", "throttle.back",
+        "vx.friction", "vx.drag", "vx.fall", "vx.rise",
     )  # fmt: skip
     known = set(sought.names) - {sought.names[i] for i in sought.sought}
-    assert known == {"back throttle"}
+    assert known == {"throttle.back"}
     assert (sought.low <= sought.start).all()
     assert (sought.start <= sought.high).all()
 

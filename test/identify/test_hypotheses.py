@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from identify.drives import slipping_car
+from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.hypotheses import (
     Trial,
@@ -38,16 +40,16 @@ def test_a_car_with_dead_zone_drag_and_friction_shows_all_of_them():
     form, values = base(seed=3)
     assert form.tyres
     assert form.drag == form.friction == ("vx",)
-    assert values["dead throttle"] == pytest.approx(0.1, abs=0.01)
-    assert values["friction vx"] == pytest.approx(0.3, abs=0.1)
+    assert values["throttle.dead"] == pytest.approx(0.1, abs=0.01)
+    assert values["vx.friction"] == pytest.approx(0.3, abs=0.1)
 
 
 @pytest.mark.slow
 def test_a_car_without_drag_and_friction_is_given_none():
     form, values = base(seed=3, drag=0.0, friction=0.0, dead=0.0)
-    assert values.get("dead throttle", 0.0) < 0.01
-    assert values.get("friction vx", 0.0) < 0.05
-    assert values.get("drag vx", 0.0) < 0.02
+    assert values.get("throttle.dead", 0.0) < 0.01
+    assert values.get("vx.friction", 0.0) < 0.05
+    assert values.get("vx.drag", 0.0) < 0.02
     assert form.limits == ()
 
 
@@ -61,6 +63,10 @@ def test_a_car_that_slips_is_predicted_and_its_lever_is_not_bent_by_the_slip():
     assert abs(found.calibration.lever_arm_m[0] - 0.08) < 3.0 * sigma["lever_arm_x_m"]
     assert abs(found.calibration.rotation_rad + 0.1) < 3.0 * sigma["rotation_rad"]
     assert "command_latency_s" not in sigma
+    assert 0.0 < sigma["throttle.dead"] < 0.02
+    assert any(
+        "The model is the textbook with an input curve of throttle" in n for n in found.notes
+    )
     assert any("can't be told from the lags" in note for note in found.notes)
 
 
@@ -92,3 +98,28 @@ def test_a_lag_is_what_the_state_itself_takes_from_its_rate():
         np.where(allowed, -4.0, 0.0), 0.01, np.zeros(5), np.zeros(5),
     )  # fmt: skip
     assert lags_of(model, spec) == {"vx": 0.25, "vy": 0.25, "wz": 0.25}
+
+
+@pytest.mark.parametrize("duration", [4.0, 8.0])
+def test_a_drive_too_short_for_predictions_over_seconds_gets_the_textbook_in_silence(duration):
+    spec, recording = slipping_car(duration=duration)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = identify(recording, spec, alpha="auto")
+    assert chosen(found.findings.trials).order == 0
+
+
+def test_no_state_grows_by_itself_however_little_it_moved():
+    spec, recording = slipping_car(duration=12.0)
+    model = identify(recording, spec, alpha="auto").model
+    alone = model.powers.sum(axis=1) == 1
+    for i, _ in enumerate(spec.state):
+        assert (model.coefficients[3 + i, alone & (model.powers[:, i] == 1)] <= 0.0).all()
+
+
+def test_strict_refuses_a_motion_that_a_command_never_moved():
+    spec, recording = slipping_car(duration=12.0)
+    command = recording.command
+    straight = replace(command, values=command.values * [1.0, 0.0])
+    with pytest.raises(FitError, match="steering"):
+        identify(replace(recording, command=straight), spec, strict=True)

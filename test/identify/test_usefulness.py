@@ -145,7 +145,7 @@ def test_what_the_textbook_fills_in_is_judged_with_it(car):
 def test_a_model_of_too_few_terms_is_not_put_down_to_the_recording(car):
     found = identify(record(car, np.random.default_rng(0), 60.0), car, alpha=0.5)
     sentence = why_useless(found, car)
-    assert sentence.endswith("it may lack terms, so leave the order at 2 and alpha at `auto`.")
+    assert sentence.endswith("it may lack terms, so leave order and alpha at `auto`.")
 
 
 @pytest.mark.slow
