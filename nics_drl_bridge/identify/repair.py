@@ -13,7 +13,15 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.signals import interval_means, unwrapped
 from nics_drl_bridge.identify.statistics import unexplained
-from nics_drl_bridge.recording.recording import Recording, Stream
+from nics_drl_bridge.recording.recording import (
+    BETTER,
+    MIRRORED,
+    Recording,
+    Stream,
+    along_path,
+    clockwise_line,
+    shows_axes,
+)
 
 NEIGHBOURS = 3  # a jump is measured by the median difference from this many samples on either side
 STEPS = 6.0  # it is larger than this many usual changes from sample to sample,
@@ -33,9 +41,6 @@ EXCESS = 0.01  # commands may exceed their limits by this share of their range
 WRONG_UNIT = 5.0  # times the limit is another unit: degrees are 57, rpm 9.5 times larger
 UNIT_PERCENTILE = 75.0
 TRAVEL_SHARE = 0.1  # of the footprint's radius: least distance to measure a direction of travel
-MIN_DIRECTIONS = 30
-MIN_TURN = 1.0  # a reversed axis does not show in a drive that turned by less than this [rad]
-CONSISTENT, INCONSISTENT = 0.9, 0.6  # direction of travel in the body frame; 1 is perfect
 
 
 def repaired(drive: Drive) -> tuple[Drive, tuple[str, ...]]:
@@ -217,32 +222,22 @@ def check_units(drive: Drive) -> None:
 def check_axes(drive: Drive) -> None:
     """Refuses poses whose heading turns against the direction of travel (RecordingError)."""
     # If only mirrored headings make the direction constant, then x, y or heading is reversed.
-    recording = drive.recording
-    path = np.append(0.0, np.cumsum(np.hypot(*np.diff(drive.dated.values[:, :2], axis=0).T)))
+    recording, values = drive.recording, drive.dated.values
     apart = max(TRAVEL_SHARE * drive.spec.footprint_radius, 1e-3)
-    some = drive.dated.rows(np.unique(np.searchsorted(path, np.arange(0.0, path[-1], apart))))
-    t, pose = some.t, some.values
-    if len(t) < MIN_DIRECTIONS or np.ptp(np.unwrap(pose[:, 2])) < MIN_TURN:
-        return
-    other = pose * np.array([1.0, 1.0, -1.0])
-    if not drive.spec.moves_sideways:
-        as_given, mirrored = _steadiness(pose), _steadiness(other)
-    elif recording.state is not None and recording.state.clock == recording.pose.clock:
-        as_given, mirrored = (_explained(t, p, recording.state) for p in (pose, other))
-    else:
-        return
-    if as_given < INCONSISTENT and mirrored > CONSISTENT:
+    some = drive.dated.rows(along_path(values, apart))
+    line = "" if drive.spec.moves_sideways else clockwise_line(some.values)
+    state = recording.state
+    if drive.spec.moves_sideways and state is not None and state.clock == recording.pose.clock:
+        other = some.values * np.array([1.0, 1.0, -1.0])
+        as_given, mirrored = (_explained(some.t, p, state) for p in (some.values, other))
+        clear = shows_axes(some.values) and mirrored > max(MIRRORED, BETTER + as_given)
+        line = "scale: -1" if clear else ""
+    if line:
         fault = "heading and path turn opposite ways; one of x, y and heading is reversed"
-        advice = "they must be x forward, y left, heading counter-clockwise (REP-103)"
-        raise RecordingError(f"{recording.source}: pose: {fault}: {advice}.")
-
-
-def _steadiness(pose: Array) -> float:
-    """Returns the constancy (0 to 1) of the body-frame axis of travel, forward or backward."""
-    moved = geometry.log(geometry.between(pose[:-1], pose[1:]))[:, :2]
-    size = np.hypot(*moved.T)
-    course = np.exp(2j * np.arctan2(moved[:, 1], moved[:, 0]))
-    return float(np.abs((size * course).sum()) / max(float(size.sum()), 1e-12))
+        known = "as that of a compass" if "offset" in line else "counted clockwise"
+        advice = f"for a heading {known} write `heading: {{from: ..., {line}}}` below `pose:`"
+        other = "exchange x and y" if "offset" in line else "turn x or y so, or remove such a scale"
+        raise RecordingError(f"{recording.source}: pose: {fault}: {advice}; or {other} (REP-103).")
 
 
 def _explained(t: Array, pose: Array, state: Stream) -> float:

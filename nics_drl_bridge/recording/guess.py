@@ -11,7 +11,12 @@ import numpy as np
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.mapped import POSES
 from nics_drl_bridge.recording.mapping import UNITS
-from nics_drl_bridge.recording.recording import implausible_pose, led_along
+from nics_drl_bridge.recording.recording import (
+    along_path,
+    clockwise_line,
+    implausible_pose,
+    led_along,
+)
 from nics_drl_bridge.recording.survey import Survey, TableSurvey, unit_in, words_of
 from nics_drl_bridge.robot.spec import find_kind, kind_names
 
@@ -239,7 +244,17 @@ def _pose_lines(pose: Guess, alone: bool, common: str | None) -> list[str]:
         fault = implausible_pose(*found, radius=_radius(found, 0.0)) if found else None
         if fault is not None and not fault.line.startswith("time"):
             said.append(f"  {fault.line}  {GUESSED}: else {fault.reason}")
-    return lines + said
+    return [_turned_round(line, pose, said) for line in lines] + said
+
+
+def _turned_round(line: str, pose: Guess, said: Sequence[str]) -> str:
+    """Returns the heading's line as that of a compass, if the path only leads along such a one."""
+    found = _values(pose, said) if line.startswith("  heading: ") else None
+    keys = clockwise_line(found[1][along_path(found[1], _radius(found))]) if found else ""
+    if not keys:
+        return line
+    why = "else heading and path turn opposite ways"
+    return f"  heading: {{from: {line.partition(': ')[2]}, {keys}}}  {GUESSED}: {why}"
 
 
 def _values(pose: Guess, lines: Sequence[str]) -> tuple[Array, Array] | None:

@@ -41,6 +41,9 @@ FULL_TURN_DEG = 360.0
 # A heading in degrees leads along the path to this share, better by so much than the same in
 # radians, and than none.
 ALONG, LESS_ALONG, ALONG_BY_CHANCE = 0.9, 0.2, 0.05
+MIN_DIRECTIONS = 30  # a reversed axis shows in a path of more pieces than this,
+MIN_TURN = 1.0  # that turns by this [rad],
+MIRRORED, BETTER = 0.9, 0.15  # and leads along mirrored headings, by so much more than as given
 UNITS_OF_STEP = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 
 
@@ -283,15 +286,44 @@ def _degrees(t: Array, pose: Array) -> Implausible | None:
     return Implausible(reason, cause, "heading_unit: deg")
 
 
+def along_path(pose: Array, apart: float) -> NDArray[np.intp]:
+    """Returns the poses (of T, 3) that are about as far `apart` [m] on their path."""
+    path = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T)))
+    return np.unique(np.searchsorted(path, np.arange(0.0, path[-1], apart)))
+
+
+def shows_axes(pose: Array) -> bool:
+    """True if poses (T, 3), apart on their path, turn far enough to show a reversed axis."""
+    return len(pose) >= MIN_DIRECTIONS and np.ptp(np.unwrap(pose[:, 2])) >= MIN_TURN
+
+
+def clockwise_line(pose: Array) -> str:
+    """Returns the keys that turn the heading of poses (T, 3), apart on their path, round.
+
+    As in `scale: -1`; empty unless the path leads along the mirrored headings alone.
+    """
+    if not shows_axes(pose):
+        return ""
+    mirrored = _course(pose, -1.0)
+    if abs(mirrored) < max(MIRRORED, BETTER + led_along(pose, 1.0)):
+        return ""
+    return "scale: -1" if mirrored.real > 0.0 else f"scale: -1, offset: {np.pi / 2.0:.5g}"
+
+
 def led_along(pose: Array, scale: float) -> float:
     """Returns to what share poses (T, 3) lead along their headings x scale, ahead or back."""
+    return abs(_course(pose, scale))
+
+
+def _course(pose: Array, scale: float) -> complex:
+    """Returns the mean of exp(2i x direction of travel), as seen from the headings x scale."""
     x, y = np.diff(pose[:, :2], axis=0).T
     ahead = np.exp(1j * scale * pose[:, 2])
     middle = ahead[1:] + ahead[:-1]  # of two headings, whose angle is between them
     middle = middle / np.maximum(np.abs(middle), 1e-9)
     step = np.hypot(x, y)
     course = (x + 1j * y) / np.maximum(step, 1e-9)
-    return float(np.abs((step * (course / middle) ** 2).sum()) / max(step.sum(), 1e-9))
+    return complex((step * (course / middle) ** 2).sum() / max(step.sum(), 1e-9))
 
 
 def _spaced(t: Array) -> NDArray[np.intp]:

@@ -11,7 +11,9 @@ import pytest
 from identify.drives import drive
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import FitError, RecordingError
+from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify
+from nics_drl_bridge.identify.repair import check_axes
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.kernels import SERIES, rollout, term_arrays
 from nics_drl_bridge.robot.kinds import textbook
@@ -206,6 +208,16 @@ def test_a_reversed_axis_of_the_pose_is_refused(name, axis):
     values[:, axis] *= -1.0
     with pytest.raises(RecordingError, match="one of x, y and heading is reversed"):
         identify(replace(recording, pose=replace(recording.pose, values=values)), spec)
+
+
+def test_the_heading_of_a_compass_is_refused_with_the_line_to_write(car):
+    """On a wide curve the course is nearly steady with the wrong heading, too."""
+    t = np.arange(0.0, 60.0, 0.02)
+    recording = driven(car, np.stack([0.8 + 0.0 * t, 0.1 * np.sin(0.35 * t)], axis=1))
+    values = recording.pose.values.copy()
+    values[:, 2] = np.pi / 2.0 - values[:, 2]
+    with pytest.raises(RecordingError, match=r"heading: {from: ..., scale: -1, offset: 1.5708}"):
+        check_axes(Drive(replace(recording, pose=replace(recording.pose, values=values)), car))
 
 
 def test_a_reversed_axis_of_a_robot_that_moves_sideways_is_not_silent(mecanum):

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from nics_drl_bridge.recording.recording import implausible_pose
+from nics_drl_bridge.recording.recording import along_path, clockwise_line, implausible_pose
 
 T = np.arange(3000) * 0.02
 
@@ -54,3 +54,22 @@ def test_positions_that_are_no_metres_are_told(factor, line):
 def test_milliseconds_are_told():
     assert "(microseconds look like this)" in implausible_pose(T * 1e6, pose()).cause
     assert implausible_pose(T * 1e3, pose()).line == "time: {from: ..., unit: ms}"
+
+
+def line_of(values, size=0.05):
+    return clockwise_line(values[along_path(values, size)])
+
+
+@pytest.mark.parametrize(("speed", "turn"), [(0.6, 0.5), (20.0, 0.2)])
+def test_the_heading_of_a_compass_is_told_with_what_turns_it_round(speed, turn):
+    """A race car's course is steady to 0.7 even as seen from the wrong heading."""
+    values = pose(speed, turn)
+    assert line_of(values) == ""
+    assert line_of(values * [1.0, 1.0, -1.0]) == "scale: -1"
+    assert line_of(values * [1.0, 1.0, -1.0] + [0.0, 0.0, np.pi / 2]) == "scale: -1, offset: 1.5708"
+
+
+def test_a_straight_drive_or_a_robot_that_only_spins_does_not_show_a_compass():
+    straight = pose(turn=0.02) * [1.0, 1.0, -1.0]
+    assert line_of(straight) == ""
+    assert line_of(np.column_stack([np.sin(T), 0.2 * np.sin(T), 0.7 * T])) == ""

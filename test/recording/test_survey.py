@@ -102,6 +102,17 @@ def test_units_and_places_are_understood_from_names(tmp_path):
     assert np.allclose(found.command.values[:, 0], columns["w"])
 
 
+def test_the_heading_of_a_compass_is_guessed_where_the_path_leads_along_it(tmp_path):
+    columns = drive(3000)
+    columns["yaw"] = np.degrees(np.pi / 2.0 - columns["yaw"]) % 360.0
+    path = write(tmp_path / "log.csv", columns)
+    _, guess = surveyed(path)
+    assert guess["pose"]["heading"] == {"from": "yaw", "scale": -1, "offset": 1.5708}
+    found = read_recording(path, mapping=Mapping.model_validate(guess))
+    apart = found.pose.values[:, 2] - drive(3000)["yaw"]
+    assert np.abs(np.angle(np.exp(1j * apart))).max() < 1e-4
+
+
 def test_columns_without_names_are_a_pose_if_they_lead_along_their_heading(tmp_path):
     columns = drive(1500) | {"v": np.sin(np.arange(1500) * 0.05)}
     path = write(tmp_path / "log.csv", columns, header=False)
