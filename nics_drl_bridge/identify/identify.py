@@ -37,7 +37,7 @@ from nics_drl_bridge.identify.open_loop import (
     windows,
 )  # fmt: skip
 from nics_drl_bridge.identify.refine import refined
-from nics_drl_bridge.identify.repair import check_axes, check_units, repaired
+from nics_drl_bridge.identify.repair import check_axes, check_commands, check_units, repaired
 from nics_drl_bridge.identify.signals import speed_index
 from nics_drl_bridge.identify.structure import structures
 from nics_drl_bridge.identify.terms import linear_fit, through_state
@@ -102,11 +102,12 @@ def _fitted(findings: Findings) -> tuple[Fit, TaylorModel]:
 
 
 def repair(drive: Drive, findings: Findings) -> Findings:
-    """Refuses other units and reversed axes; drops repeated rows and jumps, clips commands."""
+    """Refuses other units, axes and orders; drops repeated rows and jumps, clips commands."""
     check_units(drive)
     training, _ = repaired(findings.training)
     whole, repairs = repaired(findings.whole)
     check_axes(training)
+    repairs += check_commands(training)
     check(training.recording, drive.spec)
     return replace(findings, training=training, whole=whole, repairs=repairs)
 

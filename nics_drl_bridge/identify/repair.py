@@ -11,8 +11,9 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.signals import interval_means, unwrapped
+from nics_drl_bridge.identify.signals import held, interval_means, unwrapped
 from nics_drl_bridge.identify.statistics import unexplained
+from nics_drl_bridge.recording.mapping import UNITS
 from nics_drl_bridge.recording.recording import (
     BETTER,
     MIRRORED,
@@ -22,6 +23,8 @@ from nics_drl_bridge.recording.recording import (
     clockwise_line,
     shows_axes,
 )
+from nics_drl_bridge.robot.kinds import has_textbook, textbook
+from nics_drl_bridge.robot.spec import CMD_VEL_FIELDS
 
 NEIGHBOURS = 3  # a jump is measured by the median difference from this many samples on either side
 STEPS = 6.0  # it is larger than this many usual changes from sample to sample,
@@ -40,6 +43,11 @@ MOST = 0.15  # jumps in more than this share of the rows are not faults of singl
 EXCESS = 0.01  # commands may exceed their limits by this share of their range
 WRONG_UNIT = 5.0  # times the limit is another unit: degrees are 57, rpm 9.5 times larger
 UNIT_PERCENTILE = 75.0
+FARTHEST_STEERED, STEERED_PERCENTILE = 3.2, 95.0  # angle of a wheel [rad]
+# Commands are compared with the motion over this time [s], that many times or more, at any delay
+DELAYS_S, COMPARED_S, MIN_COMPARED = np.linspace(-1.0, 1.5, 26), 1.0, 20  # and offset of clocks;
+ALIKE, NEAR = 0.85, 1.2  # from this correlation on, another unit explains sizes by up to this ratio
+CONFUSED = {"m/s": ("km/h", "cm/s", "mm/s"), "rad/s": ("deg/s", "rpm"), "rad": ()}
 TRAVEL_SHARE = 0.1  # of the footprint's radius: least distance to measure a direction of travel
 
 
@@ -217,6 +225,72 @@ def check_units(drive: Drive) -> None:
                 fault = f"is {size:.4g} and more where its limit is {limit:g} {unit}"
                 alike = "degrees, millimetres or revolutions per minute look like this"
                 raise RecordingError(f"{name} {fault}; it must be in {unit} ({alike}).")
+    for variable, column in zip(spec.command, recording.command.values.T, strict=True):
+        size = float(np.percentile(np.abs(column), STEERED_PERCENTILE))
+        if variable.steers and size > FARTHEST_STEERED:
+            fault = f"{variable.name} is {size:.4g} rad and more, and no wheel steers so far"
+            line = f"{variable.name}: {{from: ..., unit: deg}}"
+            raise RecordingError(
+                f"{recording.source}: {fault}; degrees look like this: write `{line}`."
+            )
+
+
+def check_commands(drive: Drive) -> tuple[str, ...]:
+    """Refuses swapped commands, with a RecordingError; a sentence on each in another unit.
+
+    By how the speed and the turn rate that they ask for compare with those that were driven.
+    """
+    spec, pair = drive.spec, _asked_and_driven(drive)
+    if pair is None:
+        return ()
+    asked, driven, alike = pair
+    commands = {CMD_VEL_FIELDS.index(c.cmd_vel): c for c in spec.command if c.cmd_vel is not None}
+    if commands and min(alike[0, 1], alike[1, 0]) > ALIKE and np.trace(alike) < ALIKE:
+        names = " and ".join(c.name for c in spec.command)
+        fault = f"{names} are swapped: each moves the robot as the other should"
+        raise RecordingError(f"{drive.recording.source}: {fault}; exchange their columns.")
+    notes = []
+    for place, field in enumerate((0, 2)):
+        times = float(asked[:, place].std() / max(driven[:, place].std(), 1e-9))
+        name, unit = (
+            (commands[field].name, commands[field].unit) if commands else ("speed", "rad/s")
+        )
+        other = next(
+            (u for u in CONFUSED[unit] if 1.0 / NEAR < times * UNITS[u].factor < NEAR), None
+        )
+        if alike[place, place] > ALIKE and other and (commands or not field):
+            finding = f"The commands ask for {times:.3g} times the {name} that was driven"
+            notes.append(
+                f"{finding}: if they are in {other}, write `unit: {other}` beside `from:`."
+            )
+    return tuple(notes)
+
+
+def _asked_and_driven(drive: Drive) -> tuple[Array, Array, Array] | None:
+    """Returns speed and turn rate (n, 2), as commanded and as driven, and how alike (2, 2).
+
+    None if that does not show, as of robots that move sideways.
+    """
+    spec, recording, t = drive.spec, drive.recording, drive.dated.t
+    wheels = "wheel_radius" in spec.parameters and "wheel_radius" not in spec.assumed
+    known = spec.takes_cmd_vel or (wheels and has_textbook(spec))
+    start = np.arange(t[0], t[-1] - COMPARED_S, COMPARED_S / 2.0)
+    if spec.moves_sideways or not known or len(start) < MIN_COMPARED:
+        return None
+    first, last = (np.searchsorted(t, at) for at in (start, start + COMPARED_S))
+    moved = geometry.log(geometry.between(drive.dated.values[first], drive.dated.values[last]))
+    moved = moved / (t[last] - t[first])[:, None]
+    axis = np.sqrt(((moved[:, 0] + 1j * moved[:, 1]) ** 2).sum())  # of travel, ahead or back
+    axis = axis / max(abs(axis), 1e-9)
+    driven = np.stack([moved[:, :2] @ [axis.real, axis.imag], moved[:, 2]], axis=1)
+    best = np.zeros((2, 2)), driven
+    for delay in DELAYS_S:
+        command = held(recording.command, spec, t[first] - delay, t[last] - delay)
+        twist = spec.in_fields(command) if spec.takes_cmd_vel else textbook(spec).steady(command)
+        with np.errstate(invalid="ignore"):  # of what never changed
+            alike = np.corrcoef(twist[:, [0, 2]].T, driven.T)[:2, 2:]
+        best = max(best, (np.abs(np.nan_to_num(alike)), twist[:, [0, 2]]), key=lambda e: e[0].sum())
+    return best[1], driven, best[0]
 
 
 def check_axes(drive: Drive) -> None:

@@ -262,7 +262,8 @@ def implausible_pose(
     if len(t) < 3:
         return None
     hardest = HARDEST if radius < SMALL_M else HARDEST_OF_CARS
-    return _too_slow(t) or _degrees(t, pose) or _too_fast(t, pose, fastest, hardest)
+    degrees = _degrees(t, pose) or _radians(pose[_spaced(t)])
+    return _too_slow(t) or degrees or _too_fast(t, pose, fastest, hardest)
 
 
 def _degrees(t: Array, pose: Array) -> Implausible | None:
@@ -277,13 +278,26 @@ def _degrees(t: Array, pose: Array) -> Implausible | None:
     step = np.diff(heading)
     around = np.abs(np.abs(step) - FULL_TURN_DEG) < FULL_TURN_DEG / 10.0
     every = _spaced(t)
-    rad, deg, none = (led_along(pose[every], scale) for scale in (1.0, np.pi / 180.0, 0.0))
     rate = np.abs(np.diff(np.unwrap(heading, period=FULL_TURN_DEG)[every])) / np.diff(t[every])
     turns = len(rate) > 0 and np.percentile(rate, 90) > FASTEST_TURN
-    if not (around.any() or turns or deg > max(ALONG, rad + LESS_ALONG, none + ALONG_BY_CHANCE)):
+    if not (around.any() or turns or _only_along(pose[every], np.pi / 180.0)):
         return None
     reason = f"the heading is up to {np.abs(heading).max():.4g} rad"
     return Implausible(reason, cause, "heading_unit: deg")
+
+
+def _radians(pose: Array) -> Implausible | None:
+    if not _only_along(pose, 180.0 / np.pi):
+        return None
+    reason = f"the heading is up to {np.abs(pose[:, 2]).max():.2g} rad, and the path leads along"
+    cause = "it was in radians, and is taken as degrees"
+    return Implausible(f"{reason} 57 times as much", cause, "heading_unit: rad")
+
+
+def _only_along(pose: Array, scale: float) -> bool:
+    """True if poses (T, 3) lead along headings x scale, and not along them as they are."""
+    led, as_given, none = (led_along(pose, each) for each in (scale, 1.0, 0.0))
+    return led > max(ALONG, as_given + LESS_ALONG, none + ALONG_BY_CHANCE)
 
 
 def along_path(pose: Array, apart: float) -> NDArray[np.intp]:
@@ -294,7 +308,8 @@ def along_path(pose: Array, apart: float) -> NDArray[np.intp]:
 
 def shows_axes(pose: Array) -> bool:
     """True if poses (T, 3), apart on their path, turn far enough to show a reversed axis."""
-    return len(pose) >= MIN_DIRECTIONS and np.ptp(np.unwrap(pose[:, 2])) >= MIN_TURN
+    turned = float(np.ptp(np.unwrap(pose[:, 2]))) if len(pose) else 0.0
+    return len(pose) >= MIN_DIRECTIONS and turned >= MIN_TURN
 
 
 def clockwise_line(pose: Array) -> str:

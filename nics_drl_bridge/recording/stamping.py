@@ -27,6 +27,10 @@ MAX_LATE = 0.01  # share of messages that may arrive after one with a later stam
 MAX_UNSTAMPED = 0.05  # share that may lack a stamp at the start: a simulation has no time yet
 ROBOT_STREAMS = ("command", "state", "wheels", "imu")  # of one computer, and so of one clock
 
+SPLIT = (("s", "ns"), ("sec", "nanosec"), ("secs", "nsecs"), ("sec", "nsec"), ("sec", "nsecs"))
+ROWS_A_SECOND = 5  # from which on stamps in whole seconds lack the rest
+COUNTING = 16.0  # times the usual step of a counter fit between its overflows, which lose
+LOST, PARTS = 2.0, 10  # no more than this many steps; its values are in all of so many parts
 BITS = (8, 16, 24, 31, 32)  # of registers that overflow
 STAMP_BITS = (16, 24, 31, 32)
 LATE_ROWS, LATE_S = 50, 1.0  # rows that come too late do so by less
@@ -187,6 +191,24 @@ def unwrapped(values: Array, size: float) -> tuple[Array, int]:
     step = np.diff(values)
     turns = -np.round(step / size) * (np.abs(step) > size / 2.0)
     return values + size * np.append(0.0, np.cumsum(turns)), int(np.abs(turns).sum())
+
+
+def counter(values: Array) -> float | None:
+    """Returns where whole numbers (T,) overflow that pass through their range as a counter's do."""
+    size = overflow(values, (1.0,), BITS) if (values == np.round(values)).all() else None
+    if size is None:
+        return None
+    step = np.abs(np.diff(values))
+    usual, lost = float(np.percentile(step, 95)), size - step[step > size / 2.0]
+    calm = COUNTING * usual < size and (np.abs(lost) <= LOST * usual).all()
+    return size if calm and np.histogram(values, PARTS)[0].all() else None
+
+
+def rows_a_second(t: Array) -> int:
+    """Returns how many stamps (T,) in whole seconds repeat, as if their rest were lost; else 0."""
+    seconds = len(np.unique(t))
+    lost = 1 < seconds <= len(t) / ROWS_A_SECOND and (t == np.round(t)).all()
+    return round(len(t) / seconds) if lost else 0
 
 
 def without_overflow(t: Array, name: str) -> tuple[Array, str]:

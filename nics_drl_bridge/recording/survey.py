@@ -22,7 +22,6 @@ MOST_COLUMNS = 200  # of a table
 MOST_BACK = 0.05  # share of steps of a column of stamps that may go back
 TIMES = {"time", "times", "stamp", "timestamp", "t", "s", "sec", "secs", "seconds", "elapsed"}
 TIMES |= {"ms", "us", "ns", "millis", "micros", "nanos", "date", "datetime"}
-SPLIT = (("s", "ns"), ("sec", "nanosec"), ("secs", "nsecs"), ("sec", "nsec"), ("sec", "nsecs"))
 SPOKEN = {"deg": "deg", "degrees": "deg", "mm": "mm", "cm": "cm", "rpm": "rpm", "kmh": "km/h"}
 SPOKEN |= {"mps": "m/s", "rad": "rad", "m": "m", "pct": "%", "percent": "%"}
 
@@ -142,7 +141,7 @@ def _range(column: Column) -> tuple[float, float]:
 
 def _time(data: dict[str, Column]) -> tuple[str | None, Array | None]:
     """Guesses the column of stamps: by its name, and by how steadily it rises."""
-    for seconds, rest in SPLIT:
+    for seconds, rest in stamping.SPLIT:
         if all(each in data and data[each].dtype.kind not in "US" for each in (seconds, rest)):
             return f"[{seconds}, {rest}]", stamping.joined(data[seconds], data[rest])
 

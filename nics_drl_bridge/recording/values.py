@@ -121,6 +121,8 @@ class MappedReader:
             return Stamped(given.t, rows, given.clock, len(table.column(0)))
         raw, name = self._raw_stamps(table, time), table.place.rpartition("/")[2]
         known = np.flatnonzero(np.isfinite(raw))
+        if (each := stamping.rows_a_second(raw[known])) and len(time.columns) == 1:
+            raise RecordingError(_without_rest(table, time.columns[0], each))
         if len(known) < len(raw):
             self.say(f"{name}: {len(raw) - len(known)} rows without a stamp were left out.")
         t, note = stamping.without_overflow(raw[known], name)
@@ -174,6 +176,11 @@ class MappedReader:
             missing = f"{int((~known).sum())} of {len(raw)} rows have no value"
             self.say(f"{name}: {missing}, and were left out.")
         made = Series(at.t[known], raw[known], clock)
+        plain = unit_of(value).si in ("", "rad/s", "m/s") and value.wrap is None
+        if plain and not value.counts and (size := stamping.counter(made.values)):
+            fault = f"{table.place}: {which!r} is a counter that overflows at {size:.10g}"
+            advice = f"write `{{from: {which}, unit: ticks, ticks_per_turn: ...}}`"
+            raise RecordingError(f"{fault}, no speed: {advice} for {name}.")
         made = self._in_si(name, value, made, held)
         return self._where(value, made, table, time) if value.when else made
 
@@ -245,6 +252,14 @@ def dates_of(column: Column) -> Array | None:
     except ValueError:
         return None
     return stamping.joined(ns // NS_PER_S, ns % NS_PER_S)  # exact to a quarter of a microsecond
+
+
+def _without_rest(table: Table, column: Reference, rows: int) -> str:
+    """Returns a sentence on stamps that lack the part below a second, with the line to write."""
+    rest = (b for a, b in stamping.SPLIT if a == column and b in table.names)
+    line = next((f"time: [{column}, {b}]" for b in rest), f"time: {{rate: {rows}}}")
+    fault = f"{table.place}: the stamps {column!r} are whole seconds, of {rows} rows each"
+    return f"{fault}; write `{line}` into the mapping, or choose another column."
 
 
 def _rate(raw: Series, held: bool) -> Series:

@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from identify.drives import drive, without
+from identify.drives import drive, tricycle, without
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.identify.calibration import Calibration, align
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.fit import fit
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.repair import repaired
+from nics_drl_bridge.identify.repair import check_commands, check_units, repaired
 from nics_drl_bridge.recording.readers import robot_and_drive
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
 from nics_drl_bridge.recording.topic_roles import TopicRoles
-from nics_drl_bridge.robot.spec import load_robot
+from nics_drl_bridge.robot.spec import load_robot, robot_from
 
 ROOT = Path(__file__).resolve().parents[2]
 JUMPING = ROOT.parent / "shared" / "recordings" / "f110_frictionmaps" / "DS1"
@@ -86,6 +86,46 @@ def test_a_drive_goes_on_after_a_jump_of_the_localiser_as_it_moved(name, jump):
 def test_a_gap_in_the_poses_is_no_jump(differential):
     gappy = without(drive(differential, duration=20.0, noise=(5e-4, 1e-3)), 8.0, 11.0)
     assert repaired(Drive(gappy, differential))[1] == ()
+
+
+def test_steering_in_degrees_is_refused_though_the_limits_are_those_recorded():
+    angles = np.degrees(1.1) * np.sin(np.arange(500))
+    plain = drive(tricycle(), duration=5.0)
+    command = replace(plain.command, values=np.stack([0.0 * angles, angles], axis=1))
+    limits = {"speed_command": (-1.0, 1.0), "steering_command": (-64.0, 64.0)}
+    spec = robot_from({"kind": "tricycle", "footprint_radius": 0.6}, limits)
+    with pytest.raises(RecordingError, match=r"write `steering_command: {from: ..., unit: deg}`"):
+        check_units(Drive(replace(plain, command=command), spec))
+
+
+@pytest.mark.parametrize("name", ["ackermann", "differential"])
+@pytest.mark.parametrize("ahead", [0.0, 0.4])
+def test_a_swapped_speed_and_turn_is_refused_by_what_they_move(name, ahead):
+    plain, spec = drive(load_robot(name), pose_clock_ahead=ahead, rotation=0.4), load_robot(name)
+    assert check_commands(Drive(plain, spec)) == ()
+    command = replace(plain.command, values=plain.command.values[:, ::-1])
+    with pytest.raises(RecordingError, match="_command are swapped: each moves the robot as"):
+        check_commands(Drive(replace(plain, command=command), spec))
+
+
+@pytest.mark.parametrize(("column", "unit", "times"), [(0, "km/h", 3.6), (1, "deg/s", 57.3)])
+def test_a_speed_that_another_unit_explains_is_told(differential, column, unit, times):
+    plain = drive(differential, latency=0.2)
+    values = plain.command.values * np.where(np.arange(2) == column, times, 1.0)
+    other = replace(plain, command=replace(plain.command, values=values))
+    (note,) = check_commands(Drive(other, differential))
+    assert f"if they are in {unit}, write `unit: {unit}`" in note
+
+
+def test_wheels_in_rpm_are_told_if_their_radius_is_known():
+    parameters = {"wheel_radius": 0.05, "track": 0.3, "wheel_lag": 0.1}
+    wheels = {"kind": "differential_wheels", "footprint_radius": 0.2}
+    known, unknown = robot_from(wheels | {"parameters": parameters}), robot_from(wheels)
+    plain = drive(known, measured_state=False)
+    assert check_commands(Drive(plain, known)) == ()
+    other = replace(plain, command=replace(plain.command, values=plain.command.values * 9.55))
+    assert "write `unit: rpm` beside `from:`" in check_commands(Drive(other, known))[0]
+    assert check_commands(Drive(other, unknown)) == ()
 
 
 @pytest.mark.skipif(not JUMPING.exists(), reason=f"no recording of others at {JUMPING}")

@@ -255,6 +255,16 @@ MAPPED = {"robot": "ackermann", "pose": {"x": 0, "y": 1, "heading": 2}, "command
             },
             "the body is tilted by 46 deg; list its columns in the order x, y, z, w",
         ),
+        (
+            {"command": {"v": {"from": "v", "unit": "rpm"}}},
+            {"v": lambda d: np.arange(200) * 2017 % 2**16},
+            "'v' is a counter that overflows at 65536, no speed: write `{from: v, unit: ticks, ",
+        ),
+        (
+            {"time": "sec"}, {"sec": lambda d: d["t"] // 1, "nanosec": lambda d: d["t"] % 1 * 1e9},
+            "whole seconds, of 50 rows each; write `time: [sec, nanosec]` into the mapping",
+        ),
+        ({}, {"t": lambda d: d["t"] // 1}, "of 50 rows each; write `time: {rate: 50}`"),
     ],
 )  # fmt: skip
 def test_what_only_a_wrong_mapping_explains_is_refused_with_the_line_to_write(
@@ -266,6 +276,13 @@ def test_what_only_a_wrong_mapping_explains_is_refused_with_the_line_to_write(
     with pytest.raises(RecordingError) as refused:
         read(path, **changes)
     assert sentence in str(refused.value)
+
+
+@pytest.mark.parametrize("pwm", [np.where(np.arange(400) % 100 < 50, -127, 127), np.zeros(400)])
+def test_commands_in_whole_numbers_are_no_counters(tmp_path, pwm):
+    columns = drive(400) | {"v": pwm + np.arange(400) % 2}
+    found = read(write(tmp_path / "log.csv", columns))
+    assert np.array_equal(np.unique(found.command.values[:, 0]), np.unique(columns["v"]))
 
 
 @pytest.mark.parametrize("form", ["2024-05-01T12:00:{:09.6f}+02:00", "12:00:{:09.6f}"])

@@ -41,6 +41,13 @@ def test_degrees_of_a_slow_turn_are_told_by_the_path(turn):
     assert implausible_pose(T, values).line == "heading_unit: deg"
 
 
+@pytest.mark.parametrize("unwrapped", [True, False])
+def test_radians_that_are_taken_as_degrees_are_told(unwrapped):
+    values = pose()
+    values[:, 2] = np.radians(values[:, 2] if unwrapped else wrapped(values[:, 2]))
+    assert implausible_pose(T, values).line == "heading_unit: rad"
+
+
 def test_a_robot_that_spins_on_a_line_has_no_heading_in_degrees():
     values = np.column_stack([np.sin(T), 0.2 * np.sin(T), 0.7 * T])
     assert implausible_pose(T, values) is None
