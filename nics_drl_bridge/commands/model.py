@@ -173,7 +173,8 @@ def generate(
     recording: Annotated[Path, Argument(help="A bag, an .npz recording, or tables with a --map.")],
     out: Annotated[Path, Option(help="Folder of the model to write.")],
     robot: Annotated[
-        str | None, Option(help="A shipped robot or a YAML file; else the map's, else ackermann.")
+        str | None,
+        Option(help="A shipped robot or a YAML file; else the map's or import's, or ackermann."),
     ] = None,
     mapping: Annotated[
         Path | None,

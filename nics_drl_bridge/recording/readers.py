@@ -26,7 +26,7 @@ from nics_drl_bridge.recording.recording import (
 from nics_drl_bridge.recording.table import Source
 from nics_drl_bridge.recording.table_files import Files
 from nics_drl_bridge.recording.topic_roles import TopicRoles
-from nics_drl_bridge.robot.spec import RobotSpec, load_robot, robot_from
+from nics_drl_bridge.robot.spec import RobotSpec, definition, load_robot, robot_from
 
 DEFAULT_ROBOT = "ackermann"
 
@@ -81,34 +81,51 @@ def _by_mapping(
 ) -> Recording:
     if topics != TopicRoles():
         raise ConfigError("--topics and --topic do not go with --map; name the topics in the map.")
-    given = mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
+    given = _loaded(mapping)
     with open_source(path, given) as source:
         recording = read_mapped(source, given)
+    if given.robot is not None:
+        recording = replace(recording, robot=definition(given.robot))
     return recording if spec is None else arranged(recording, spec)
+
+
+def _loaded(mapping: Mapping | str | Path) -> Mapping:
+    return mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
 
 
 def robot_and_drive(
     path: Path, robot: str | None, topics: TopicRoles, mapping: Mapping | str | Path | None
 ) -> tuple[RobotSpec, Recording]:
-    """Reads a drive with its robot: the one that is named, or the mapping's, or a shipped car."""
-    if robot is None and mapping is not None:
-        given = mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
+    """Reads a drive with its robot: that named, else the mapping's, the recording's, or a car."""
+    if mapping is not None:
+        given = _loaded(mapping)
+        given = given if robot is None else given.model_copy(update={"robot": robot})
         drive = read_recording(path, None, topics, given)
         spec = robot_of(given, drive)
         return spec, arranged(drive, spec)
-    spec = load_robot(robot or DEFAULT_ROBOT)
-    return spec, read_recording(path, spec, topics, mapping)
+    if not is_recording(path):
+        spec = load_robot(robot or DEFAULT_ROBOT)
+        return spec, read_recording(path, spec, topics)
+    drive = read_recording(path, None, topics)
+    spec = _ranged(robot or drive.robot or DEFAULT_ROBOT, drive, drive.variables)
+    return spec, drive if drive.robot is None else arranged(drive, spec)
 
 
 def robot_of(mapping: Mapping | str | Path, recording: Recording) -> RobotSpec:
     """Returns the robot of a mapping, whose commands reach as far as in its recording."""
-    given = mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
-    if given.robot is None:
+    given = _loaded(mapping)
+    if (robot := given.robot or recording.robot) is None:
         raise ConfigError("the mapping names no robot; add `robot:` to it, or give --robot.")
-    names = recording.variables[-recording.command.values.shape[1] :] or tuple(given.command)
-    low, high = (f(recording.command.values, axis=0) for f in (np.min, np.max))
-    ranges = {name: (float(a), float(b)) for name, a, b in zip(names, low, high, strict=True)}
-    return robot_from(given.robot, ranges)
+    return _ranged(robot, recording, recording.variables or tuple(given.command))
+
+
+def _ranged(
+    robot: str | dict[str, Any], recording: Recording, variables: tuple[str, ...]
+) -> RobotSpec:
+    """Returns a robot; ranges of commands that it leaves out are those that were recorded."""
+    low, high = (f(recording.command.values, axis=0).tolist() for f in (np.min, np.max))
+    names = variables[-len(low) :]
+    return robot_from(robot, dict(zip(names, zip(low, high, strict=True), strict=False)))
 
 
 def arranged(recording: Recording, spec: RobotSpec) -> Recording:

@@ -74,6 +74,7 @@ class Recording:
     odometry: Stream | None = None  # (T, 3) vx, vy [m/s], yaw rate [rad/s] of the wheels
     source: str = "recording"  # its origin, for reports and errors
     variables: tuple[str, ...] = ()  # names of X = [state, command] of the recorded robot, if known
+    robot: dict[str, Any] | None = None  # its definition as in its YAML file, if a mapping says it
     latency: Latency = field(default_factory=Latency)  # of scan and odometry, if it shows
     repairs: tuple[str, ...] = ()  # a sentence on each thing that reading mended, as of its clocks
 
@@ -178,6 +179,8 @@ def save_recording(recording: Recording, path: str | Path) -> None:
         "variables": recording.variables,
         "repairs": recording.repairs,
     }
+    if recording.robot is not None:
+        meta["robot"] = recording.robot
     if recording.latency.measured:
         meta["latency"] = recording.latency.model_dump(mode="json")
     buffer = io.BytesIO()
@@ -199,12 +202,11 @@ def load_recording(path: str | Path) -> Recording:
         if version not in (FORMAT, PLAIN_FORMAT, COMMENT_FORMAT, UNSEALED_FORMAT):
             advice = "record it anew or use the version of the package that wrote it"
             raise RecordingError(f"{path}: format {version!r} is not {FORMAT!r}; {advice}.")
-        streams = {name: _stream(arrays, name, clock) for name, clock in meta["clocks"].items()}
+        streams: Any = {n: _stream(arrays, n, clock) for n, clock in meta["clocks"].items()}
         latency = Latency.model_validate(meta.get("latency", {}))
         variables, repairs = tuple(meta["variables"]), tuple(meta.get("repairs", ()))
-        return Recording(
-            **streams, source=str(path), variables=variables, latency=latency, repairs=repairs
-        )
+        found = Recording(**streams, source=str(path), variables=variables, latency=latency)
+        return replace(found, repairs=repairs, robot=meta.get("robot"))
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file; check the path.") from None
     except (AttributeError, KeyError, RecursionError, TypeError) as error:

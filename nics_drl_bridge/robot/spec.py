@@ -337,14 +337,19 @@ def robot_from(given: str | Path | Mapping[str, Any], ranges: Ranges | None = No
     ranges of commands, state and parameters. `ranges` (least, greatest) of recorded commands, by
     name, are theirs unless given. Raises ConfigError.
     """
-    if isinstance(given, Mapping):
-        source, data = "robot", dict(given)
-    else:
-        path = find_config(given, "robots")
-        source, data = str(path), parse_yaml(read_text(path), str(path))
+    data = definition(given)
+    source = "robot" if isinstance(given, Mapping) else str(find_config(given, "robots"))
     if "kind" in data:
         data = _of_kind(data, ranges or {}, source)
     return validate(data, RobotSpec, source)
+
+
+def definition(given: str | Path | Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the content of a robot's YAML file, by what `robot_from` takes."""
+    if isinstance(given, Mapping):
+        return dict(given)
+    path = find_config(given, "robots")
+    return parse_yaml(read_text(path), str(path))
 
 
 def _of_kind(data: dict[str, Any], ranges: Ranges, source: str) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from nics_drl_bridge.recording.recording import load_recording, save_recording
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import load_robot
 
-from .tables import drive, read, write
+from .tables import MAP, drive, read, write
 
 
 @pytest.fixture
@@ -216,7 +216,35 @@ def test_commands_come_in_the_order_of_the_robot(tmp_path, columns):
     with pytest.raises(ConfigError, match="the command is v, w, that of the robot 'ackermann'"):
         arranged(read(path), load_robot("ackermann"))
     with pytest.raises(ConfigError, match="names no robot; add `robot:` to it"):
-        robot_of(Mapping.model_validate(given | {"robot": None}), found)
+        robot_of(Mapping.model_validate(given | {"robot": None}), read(path))
+
+
+LORRY = "kind: tricycle\nfootprint_radius: 0.9\nparameters: {wheelbase: 1.2}\n"
+STEERED = {"speed_command": {"from": "v", "scale": 3.0}, "steering_command": {"from": "w"}}
+
+
+def test_a_robots_file_is_the_same_robot_however_it_is_named(tmp_path, columns):
+    (tmp_path / "lorry.yaml").write_text(LORRY)
+    path, robot = write(tmp_path / "log.csv", columns), str(tmp_path / "lorry.yaml")
+    given = MAP | {"command": STEERED}
+    one, other = (Mapping.model_validate(given | {"robot": each}) for each in ("car", robot))
+    spec, _ = robot_and_drive(path, robot, TopicRoles(), one)
+    assert spec == robot_and_drive(path, None, TopicRoles(), other)[0]
+    assert spec.command_high.tolist() == [1.5, 0.3]  # as recorded
+
+
+def test_an_imported_drive_keeps_its_robot_as_text(tmp_path, columns):
+    (tmp_path / "lorry.yaml").write_text(LORRY)
+    given = MAP | {"command": STEERED, "robot": str(tmp_path / "lorry.yaml")}
+    mapping = Mapping.model_validate(given)
+    spec, drive = robot_and_drive(write(tmp_path / "log.csv", columns), None, TopicRoles(), mapping)
+    save_recording(drive, tmp_path / "drive.npz")
+    (tmp_path / "lorry.yaml").unlink()
+    back, again = robot_and_drive(tmp_path / "drive.npz", None, TopicRoles(), None)
+    assert back == spec
+    assert same(drive, again)
+    bare, _ = robot_and_drive(tmp_path / "drive.npz", "ackermann", TopicRoles(), None)
+    assert bare.name == "ackermann"
 
 
 def test_an_imported_drive_keeps_deviations_and_repairs(tmp_path, columns):
