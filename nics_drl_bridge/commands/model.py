@@ -113,7 +113,7 @@ def inspect(
     """Lists what a recording of any form holds, and begins the mapping that says what is what."""
     with one_sentence():
         from nics_drl_bridge.files import write_text
-        from nics_drl_bridge.recording.guess import first_mapping
+        from nics_drl_bridge.recording.guess import NOT_USED, first_mapping
         from nics_drl_bridge.recording.readers import open_source
         from nics_drl_bridge.recording.survey import survey
 
@@ -132,6 +132,9 @@ def inspect(
             typer.echo(f"A first mapping, to edit; --map FILE writes it:\n\n{text}")
             return
         write_text(mapping, text)
+        for line in text.splitlines():
+            if line.startswith(NOT_USED):
+                typer.echo(line.removeprefix("# "))
         typer.echo(f"a first mapping is in {mapping}: edit it, then nics import or nics generate")
 
 

@@ -19,6 +19,7 @@ from nics_drl_bridge.recording.recording import (
 )
 from nics_drl_bridge.recording.survey import Survey, TableSurvey, unit_in, words_of
 from nics_drl_bridge.robot.spec import find_kind, kind_names
+from nics_drl_bridge.robot.template import names_of
 
 GUESSED = "# guessed"
 UNIT_LENGTH = 0.01  # by which a quaternion may differ from length 1
@@ -59,6 +60,7 @@ KINDS = (
     ("differential", {"speed": "forward_command", "turn": "turn_command"}),
     ("differential_wheels", {"left": "left_wheel", "right": "right_wheel"}),
 )
+NOT_USED, MOST_LISTED = "# not used", 12
 MOST_COMMANDS = 4  # of columns that only might be commands
 USUAL_WHEEL = 5.0  # [rad/s], by which the ticks of a turn are guessed
 RADIUS = 0.2  # of a robot [m], unless it is as large as a car, since
@@ -139,29 +141,51 @@ def guess_command(
     tables: Sequence[TableSurvey], pose: Guess | None
 ) -> tuple[str, dict[str, tuple[TableSurvey, Survey]]]:
     """Finds columns that drive a robot of a known kind; else any that may be commands."""
-    taken = ", ".join(pose.keys.values()) if pose else ""
+    taken = _columns_of(pose) if pose else []
     scored = [
         (_merit(table, column), table, column) for table in tables for column in table.numbers
-        if (column.low < column.high or column.low) and not {*words_of(column.name)} & NO_VALUES
-        and not (pose and table is pose.table and column.name in re.split(r"[\[\], ]+", taken))
-        and column.name not in (taken, *table.stamp_columns)
+        if not {*words_of(column.name)} & NO_VALUES
+        and not (pose and table is pose.table and column.name in taken)
+        and column.name not in table.stamp_columns
     ]  # fmt: skip
     own = [(kind, _words_of(kind)) for kind in kind_names()]
-    for kind, names in (*((k, w) for k, w in own if w), *KINDS):
-        found = {}
-        for meaning, name in names.items():
-            fitting = [e for e in scored if e[0] >= 0 and _means(meaning, e[1], e[2].name)]
-            if fitting:
-                _, table, column = max(fitting, key=lambda e: (e[0], e[2].low < e[2].high))
-                found[name] = table, column
-        if len(found) == len(names) == len({(id(t), c.name) for t, c in found.values()}):
-            return kind, found
+    fitting = [(kind, _by_meaning(names, scored)) for kind, names in (*own, *KINDS) if names]
+    # A column that was zero throughout may be a command that was not used, if all others fit.
+    still = [sum(_is_still(c) for _, c in found.values()) for _, found in fitting]
+    known = [k for k, (_, found) in enumerate(fitting) if still[k] < len(found)]
+    if known:
+        return fitting[min(known, key=lambda k: still[k])]
     some = [e for e in scored if e[0] > 1 and e[2].low < e[2].high]
     some = [e for e in some if not {*words_of(e[2].name)} & TICKS] or some
     maybe = [e for e in scored if e[0] >= 0 and e[2].low < e[2].high]
     best = max((e[0] for e in maybe), default=0)
     some = some or [e for e in maybe if e[0] == best][:MOST_COMMANDS]
     return "free", {f"command_{k}": each[1:] for k, each in enumerate(some)}
+
+
+def _by_meaning(
+    names: Mapping[str, str], scored: Sequence[tuple[int, TableSurvey, Survey]]
+) -> dict[str, tuple[TableSurvey, Survey]]:
+    """Finds a column for each of a kind's commands; none if one is missing or serves twice."""
+    found = {}
+    for meaning, name in names.items():
+        fitting = [e for e in scored if e[0] >= 0 and _means(meaning, e[1], e[2].name)]
+        if fitting:
+            best = max(fitting, key=lambda e: (not _is_still(e[2]), e[0], e[2].low < e[2].high))
+            found[name] = best[1:]
+    columns = {(id(table), column.name) for table, column in found.values()}
+    return found if len(found) == len(names) == len(columns) else {}
+
+
+def _is_still(column: Survey) -> bool:
+    return column.low == column.high == 0.0
+
+
+def _look_alikes(kind: str) -> list[str]:
+    """Returns the other kinds of robots that have the same commands."""
+    each = {name: find_kind(name) for name in kind_names()}
+    ways = {n: [{*names_of(way)} for way in k.template.commands] for n, k in each.items() if k}
+    return [n for n in ways if n != kind and any(way in ways[n] for way in ways.get(kind, ()))]
 
 
 def _words_of(kind: str) -> Mapping[str, str]:
@@ -189,10 +213,11 @@ def first_mapping(tables: Sequence[TableSurvey]) -> str:
     alone, pose = len(tables) == 1, guess_pose(tables)
     kind, commands = guess_command(tables, pose)
     times = [t.time for t in tables if t.time is not None]
-    common = max({*times}, key=times.count) if times else None
+    common = max(times, key=times.count) if times else None
     where = _pose_lines(pose, alone, common) if pose else ["pose:", "  x: ", "  y: "]
     radius = _radius(_values(pose, where) if pose else None)
-    lines = [f"robot: {{kind: {kind}, footprint_radius: {radius}}}  {GUESSED}; radius in m"]
+    alike = "".join(f", or {each}" for each in _look_alikes(kind))
+    lines = [f"robot: {{kind: {kind}, footprint_radius: {radius}}}  {GUESSED}{alike}; radius in m"]
     if common is not None:
         lines.append(f"time: {common}  {GUESSED}")
     elif any(table.t is None and table.rows for table in tables):
@@ -200,14 +225,50 @@ def first_mapping(tables: Sequence[TableSurvey]) -> str:
     if pose is None:
         lines.append("# no pose was found: give x, y, and heading or quaternion")
     lines += where
+    lines += _clock_lines(pose, commands)
     lines.append("command:" if commands else "command:  # none was found: NAME: COLUMN")
     for name, (table, column) in commands.items():
         keys = [f"from: {table.reference(column.name, alone)}", *_unit_keys(name, table, column)]
         if table.time not in (common, None):
             keys.append(f"time: {table.time}")
         value = f"{{{', '.join(keys)}}}" if len(keys) > 1 else keys[0].removeprefix("from: ")
-        lines.append(f"  {name}: {value}  {GUESSED}")
-    return "\n".join(lines) + "\n"
+        lines.append(f"  {name}: {value}  {GUESSED}{'; it is 0' * _is_still(column)}")
+    return "\n".join([*lines, *_not_used(tables, pose, commands)]) + "\n"
+
+
+def _clock_lines(
+    pose: Guess | None, commands: Mapping[str, tuple[TableSurvey, Survey]]
+) -> list[str]:
+    """Returns the line that gives the pose a clock of its own, if it shares no time."""
+    if pose is None or (t := pose.table.t) is None or not pose.table.stamps:
+        return []
+    spans = [table.t[[0, -1]] for table, _ in commands.values() if table.t is not None]
+    apart = [last < t[0] or first > t[-1] for first, last in spans]
+    why = "shares no time with the commands"
+    return [f"  clock: tracker  {GUESSED}: {why}"] if apart and all(apart) else []
+
+
+def _not_used(
+    tables: Sequence[TableSurvey],
+    pose: Guess | None,
+    commands: Mapping[str, tuple[TableSurvey, Survey]],
+) -> list[str]:
+    """Returns a comment that names the columns of changing numbers that a mapping lacks."""
+    taken = {(id(table), column.name) for table, column in commands.values()}
+    taken |= {(id(pose.table), each) for each in _columns_of(pose)} if pose else set()
+    rest = [
+        table.reference(c.name, len(tables) == 1).strip('"')
+        for table in tables for c in table.numbers
+        if c.low < c.high and not {*words_of(c.name)} & NO_VALUES
+        and (id(table), c.name) not in taken and c.name not in table.stamp_columns
+    ]  # fmt: skip
+    more = f" and {len(rest) - MOST_LISTED} more" if len(rest) > MOST_LISTED else ""
+    return [f"{NOT_USED}: {', '.join(rest[:MOST_LISTED])}{more}"] if rest else []
+
+
+def _columns_of(pose: Guess) -> list[str]:
+    named = list(pose.keys.values())
+    return [*named, *re.split(r"[\[\], ]+", ", ".join(named))]
 
 
 def _unit_keys(name: str, table: TableSurvey, column: Survey) -> Iterator[str]:

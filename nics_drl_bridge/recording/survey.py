@@ -37,6 +37,8 @@ def unit_in(name: str) -> tuple[list[str], str | None]:
     if (bracket := re.search(r"[\[(]\s*([^\d\])]+?)\s*[\])]$", name)) and bracket[1] in UNITS:
         return words_of(name[: bracket.start()]), bracket[1]
     *words, last = words_of(name) or [""]
+    if "rpm" in words:
+        return [word for word in (*words, last) if word != "rpm"], "rpm"
     return (words, SPOKEN[last]) if words and last in SPOKEN else ([*words, last], None)
 
 
@@ -78,7 +80,7 @@ class TableSurvey:
 
     @property
     def regularity(self) -> list[str]:
-        """Sentences on rate, gaps, stamps that run backwards, and repeated rows."""
+        """Sentences on rate, gaps, stamps that run backwards, repeated rows and missing values."""
         known = self.t is not None and len(self.t) > 1
         return list(_regularity(self.t, self.data)) if known and self.t is not None else []
 
@@ -172,7 +174,7 @@ def _in_seconds(found: TableSurvey, raw: Array) -> Array:
 
 
 def _regularity(t: Array, data: dict[str, Column]) -> Iterator[str]:
-    """Yields sentences on rate, gaps, stamps that run backwards, and repeated rows."""
+    """Yields sentences on rate, gaps, stamps that run backwards, and rows that lack or repeat."""
     step = np.diff(t)
     usual = float(np.median(step[step > 0.0])) if (step > 0.0).any() else np.nan
     yield f"{1.0 / usual:.4g} Hz, {float(np.ptp(t)):.1f} s"
@@ -181,9 +183,14 @@ def _regularity(t: Array, data: dict[str, Column]) -> Iterator[str]:
         yield f"gaps: {gaps}, the longest of {step.max():.3g} s after {where:.1f} s"
     if back := int((step < 0.0).sum()):
         yield f"stamps that run backwards: {back}"
-    numbers = [c.astype(np.float64) for c in data.values() if c.dtype.kind not in "US"]
-    same = np.all([c[1:] == c[:-1] for c in numbers if len(c) == len(t)], axis=0) & (step == 0.0)
+    numbers = {name: c.astype(np.float64) for name, c in data.items() if c.dtype.kind not in "US"}
+    whole = [c for c in numbers.values() if len(c) == len(t)]
+    same = np.all([c[1:] == c[:-1] for c in whole], axis=0) & (step == 0.0)
     if again := int((step == 0.0).sum()):
         yield f"stamps like the one before: {again}, in rows that repeat all of it: {same.sum()}"
     if (np.abs(step - usual) > IRREGULAR * usual).mean() > IRREGULAR:
         yield "stamps are uneven: rows arrive in bursts"
+    missing = {name: int(np.isnan(c).sum()) for name, c in numbers.items()}
+    for count in sorted({*missing.values()} - {0}):
+        names = ", ".join(name for name, each in missing.items() if each == count)
+        yield f"{count} of {len(t)} rows have no {names}"

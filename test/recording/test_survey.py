@@ -16,9 +16,14 @@ NAMES = {"x": "vicon x", "y": "vicon y", "yaw": "vicon yaw", "v": "throttle", "w
 
 
 def surveyed(path):
+    tables, text = written(path)
+    return tables, parse_yaml(text, "guess")
+
+
+def written(path):
     with open_source(path) as source:
         tables = survey(source)
-    return tables, parse_yaml(first_mapping(tables), "guess")
+    return tables, first_mapping(tables)
 
 
 def test_a_first_mapping_reads_a_table_whose_columns_are_called_as_usual(tmp_path):
@@ -150,3 +155,71 @@ def test_a_source_without_a_readable_table_is_refused(tmp_path):
     write(tmp_path / "good.csv", drive())
     tables, _ = surveyed(tmp_path)
     assert "is not text" in tables[1].findings[0]
+
+
+def test_columns_of_numbers_that_a_mapping_does_not_use_are_named(tmp_path):
+    columns = {NAMES.get(name, name): column for name, column in drive().items()}
+    more = {"brake_pct": columns["t"], "spare": 0.0 * columns["t"], "seq": np.arange(200)}
+    _, text = written(write(tmp_path / "log.csv", columns | more))
+    assert text.splitlines()[-1] == "# not used: brake_pct"
+
+
+def test_a_command_that_was_zero_throughout_stays_one(tmp_path):
+    columns = {NAMES.get(name, name): column for name, column in drive().items()}
+    path = write(tmp_path / "log.csv", columns | {"steering": 0.0 * columns["t"]})
+    assert "  steering: steering  # guessed; it is 0" in written(path)[1]
+    _, guess = surveyed(path)
+    assert guess["robot"]["kind"] == "ackermann_throttle"
+
+
+def test_fields_of_a_twist_that_are_zero_make_no_robot_that_moves_sideways(tmp_path):
+    columns = drive()
+    twist = {"cmd.linear.x": columns.pop("v"), "cmd.angular.z": columns.pop("w")}
+    still = {"cmd.linear.y": np.zeros(200)}
+    _, guess = surveyed(write(tmp_path / "log.csv", columns | still | twist))
+    assert guess["robot"]["kind"] == "differential"
+
+
+def test_a_pose_that_shares_no_time_with_the_commands_has_a_clock_of_its_own(tmp_path):
+    columns = drive()
+    write(tmp_path / "pose.csv", {name: columns[name] for name in ("t", "x", "y", "yaw")})
+    late = {"t": columns["t"] + 1.7e9, "throttle": columns["v"], "steering": columns["w"]}
+    write(tmp_path / "cmd.csv", late)
+    _, guess = surveyed(tmp_path)
+    assert guess["pose"]["clock"] == "tracker"
+    found = read_recording(tmp_path, mapping=Mapping.model_validate(guess))
+    assert found.pose.t[0] == found.command.t[0] == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize("name", ["left_rpm", "rpm_left", "motor_rpm_left_cmd"])
+def test_revolutions_a_minute_are_understood_anywhere_in_a_name(tmp_path, name):
+    columns = drive()
+    columns |= {name: np.sin(columns["t"]), name.replace("left", "right"): np.cos(columns["t"])}
+    del columns["v"], columns["w"]
+    _, guess = surveyed(write(tmp_path / "log.csv", columns))
+    assert guess["command"]["left_wheel"] == {"from": name, "unit": "rpm"}
+
+
+@pytest.mark.parametrize(
+    ("names", "alike"),
+    [
+        (("cmd_vel.linear.x", "cmd_vel.angular.z"), "{kind: differential, *, or skid_steer; "),
+        (("speed_cmd", "steering_cmd"), "{kind: ackermann, *, or tricycle; "),
+        (("throttle", "steering"), "{kind: ackermann_throttle, *guessed; "),
+    ],
+)
+def test_kinds_of_robots_with_the_same_commands_are_named_beside_the_guess(tmp_path, names, alike):
+    columns = drive()
+    columns |= {names[0]: columns.pop("v"), names[1]: columns.pop("w")}
+    _, text = written(write(tmp_path / "log.csv", columns))
+    start, end = alike.split("*")
+    assert start in text.splitlines()[0]
+    assert end in text.splitlines()[0]
+
+
+def test_rows_that_lack_a_pose_are_listed(tmp_path):
+    columns = drive()
+    for name in ("x", "y", "yaw"):
+        columns[name][40:52] = np.nan
+    (table,), _ = surveyed(write(tmp_path / "log.csv", columns))
+    assert "12 of 200 rows have no x, y, yaw" in table.regularity
