@@ -150,7 +150,8 @@ class _Topics:
     def missing(self, roles: Sequence[str], words: str) -> str:
         """Tells that no topic has any of the roles, with the fix."""
         kinds = dict.fromkeys(kind for role in roles for kind in TYPES[role])
-        advice = f"record one of type {', '.join(kinds)}"
+        advice = f"record one of type {', '.join(kinds)}, or say what is what with --map, which "
+        advice += "`nics inspect BAG --map my.yaml` begins"
         fitting = [f"{role}={topic}" for role in roles for topic in self._fitting(role)]
         if fitting:
             advice = f"say which does, as in --topic {fitting[0]}"

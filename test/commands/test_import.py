@@ -24,8 +24,8 @@ def folder(tmp_path_factory):
     drive = textbook.record(load_robot("ackermann"), np.random.default_rng(0), duration=30.0)
     row = np.searchsorted(drive.command.t, drive.pose.t + 1e-9, side="right") - 1
     command = drive.command.values[np.clip(row, 0, None)]
-    table = np.column_stack([drive.pose.t, drive.pose.values, command])
-    head = "time,x,y,yaw,cmd_speed,cmd_steering"
+    table = np.column_stack([drive.pose.t, drive.pose.values, command, drive.pose.t])
+    head = "time,x,y,yaw,cmd_speed,cmd_steering,battery_volts"
     np.savetxt(room / "drive.csv", table, delimiter=",", header=head, comments="")
     return room
 
@@ -34,6 +34,7 @@ def test_a_log_becomes_a_mapping_a_recording_and_a_model(folder, tmp_path):
     done = nics("inspect", folder / "drive.csv", "--map", "my.yaml", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "cmd_steering" in done.stdout
+    assert "\nnot used: battery_volts\n" in done.stdout
     assert "# guessed" in (tmp_path / "my.yaml").read_text()
     again = nics("inspect", folder / "drive.csv", "--map", "my.yaml", cwd=tmp_path)
     assert "is there already" in again.stderr
@@ -44,6 +45,7 @@ def test_a_log_becomes_a_mapping_a_recording_and_a_model(folder, tmp_path):
     assert "command" in done.stdout
     kept = load_recording(tmp_path / "drive.npz")
     assert kept.variables == ("speed_command", "steering_command")
+    assert kept.robot == {"kind": "ackermann", "footprint_radius": 0.2}
 
 
 @pytest.mark.slow

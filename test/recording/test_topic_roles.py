@@ -95,6 +95,7 @@ def test_without_a_topic_of_a_fitting_type_the_types_are_listed():
 
 def test_an_empty_topic_plays_no_role():
     sentence = refused(USUAL, empty=("/cmd_vel",))
+    assert "which `nics inspect BAG --map my.yaml` begins" in sentence
     assert "no topic is known to hold the commands" in sentence
     assert "/cmd_vel (geometry_msgs/msg/Twist, empty)" in sentence
     sentence = refused(USUAL, empty=("/cmd_vel",), cmd_vel="/cmd_vel")
