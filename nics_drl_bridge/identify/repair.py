@@ -24,7 +24,6 @@ from nics_drl_bridge.recording.recording import (
     shows_axes,
 )
 from nics_drl_bridge.robot.kinds import has_textbook, textbook
-from nics_drl_bridge.robot.spec import CMD_VEL_FIELDS
 
 NEIGHBOURS = 3  # a jump is measured by the median difference from this many samples on either side
 STEPS = 6.0  # it is larger than this many usual changes from sample to sample,
@@ -47,7 +46,7 @@ FARTHEST_STEERED, STEERED_PERCENTILE = 3.2, 95.0  # angle of a wheel [rad]
 # Commands are compared with the motion over this time [s], that many times or more, at any delay
 DELAYS_S, COMPARED_S, MIN_COMPARED = np.linspace(-1.0, 1.5, 26), 1.0, 20  # and offset of clocks;
 ALIKE, NEAR = 0.85, 1.2  # from this correlation on, another unit explains sizes by up to this ratio
-CONFUSED = {"m/s": ("km/h", "cm/s", "mm/s"), "rad/s": ("deg/s", "rpm"), "rad": ()}
+CONFUSED = {"m/s": ("km/h", "cm/s", "mm/s"), "rad/s": ("deg/s", "rpm")}
 TRAVEL_SHARE = 0.1  # of the footprint's radius: least distance to measure a direction of travel
 
 
@@ -230,9 +229,8 @@ def check_units(drive: Drive) -> None:
         if variable.steers and size > FARTHEST_STEERED:
             fault = f"{variable.name} is {size:.4g} rad and more, and no wheel steers so far"
             line = f"{variable.name}: {{from: ..., unit: deg}}"
-            raise RecordingError(
-                f"{recording.source}: {fault}; degrees look like this: write `{line}`."
-            )
+            advice = f"write `{line}` for degrees, or a `scale:` for a steering wheel"
+            raise RecordingError(f"{recording.source}: {fault}; {advice}.")
 
 
 def check_commands(drive: Drive) -> tuple[str, ...]:
@@ -244,25 +242,20 @@ def check_commands(drive: Drive) -> tuple[str, ...]:
     if pair is None:
         return ()
     asked, driven, alike = pair
-    commands = {CMD_VEL_FIELDS.index(c.cmd_vel): c for c in spec.command if c.cmd_vel is not None}
-    if commands and min(alike[0, 1], alike[1, 0]) > ALIKE and np.trace(alike) < ALIKE:
-        names = " and ".join(c.name for c in spec.command)
-        fault = f"{names} are swapped: each moves the robot as the other should"
-        raise RecordingError(f"{drive.recording.source}: {fault}; exchange their columns.")
+    fields = {"linear.x": 0, "angular.z": 1}
+    told = [(fields[c.cmd_vel], c.name, c.unit) for c in spec.command if c.cmd_vel in fields]
+    if told and min(alike[0, 1], alike[1, 0]) > ALIKE and np.trace(alike) < ALIKE:
+        fault = " and ".join(c.name for c in spec.command) + " are swapped: each moves the robot as"
+        advice = "the other should; exchange their columns"
+        raise RecordingError(f"{drive.recording.source}: {fault} {advice}.")
     notes = []
-    for place, field in enumerate((0, 2)):
+    for place, name, unit in told or [(0, "speed", "rad/s")]:
         times = float(asked[:, place].std() / max(driven[:, place].std(), 1e-9))
-        name, unit = (
-            (commands[field].name, commands[field].unit) if commands else ("speed", "rad/s")
-        )
-        other = next(
-            (u for u in CONFUSED[unit] if 1.0 / NEAR < times * UNITS[u].factor < NEAR), None
-        )
-        if alike[place, place] > ALIKE and other and (commands or not field):
-            finding = f"The commands ask for {times:.3g} times the {name} that was driven"
-            notes.append(
-                f"{finding}: if they are in {other}, write `unit: {other}` beside `from:`."
-            )
+        for other in CONFUSED.get(unit, ()) if alike[place, place] > ALIKE else ():
+            if 1.0 / NEAR < times * UNITS[other].factor < NEAR:
+                finding = f"The commands ask for {times:.3g} times the {name} that was driven"
+                advice = f"write `unit: {other}` beside `from:`"
+                notes.append(f"{finding}: if they are in {other}, {advice}.")
     return tuple(notes)
 
 
@@ -272,12 +265,13 @@ def _asked_and_driven(drive: Drive) -> tuple[Array, Array, Array] | None:
     None if that does not show, as of robots that move sideways.
     """
     spec, recording, t = drive.spec, drive.recording, drive.dated.t
-    wheels = "wheel_radius" in spec.parameters and "wheel_radius" not in spec.assumed
-    known = spec.takes_cmd_vel or (wheels and has_textbook(spec))
+    wheels = all(c.unit == "rad/s" for c in spec.command) and "wheel_radius" in spec.parameters
+    wheels = wheels and "wheel_radius" not in spec.assumed and has_textbook(spec)
     start = np.arange(t[0], t[-1] - COMPARED_S, COMPARED_S / 2.0)
-    if spec.moves_sideways or not known or len(start) < MIN_COMPARED:
+    first, last = np.searchsorted(t, start), np.searchsorted(t, start + COMPARED_S)
+    first, last = first[last > first], last[last > first]
+    if spec.moves_sideways or not (spec.takes_cmd_vel or wheels) or len(first) < MIN_COMPARED:
         return None
-    first, last = (np.searchsorted(t, at) for at in (start, start + COMPARED_S))
     moved = geometry.log(geometry.between(drive.dated.values[first], drive.dated.values[last]))
     moved = moved / (t[last] - t[first])[:, None]
     axis = np.sqrt(((moved[:, 0] + 1j * moved[:, 1]) ** 2).sum())  # of travel, ahead or back

@@ -206,9 +206,10 @@ def counter(values: Array) -> float | None:
 
 def rows_a_second(t: Array) -> int:
     """Returns how many stamps (T,) in whole seconds repeat, as if their rest were lost; else 0."""
-    seconds = len(np.unique(t))
-    lost = 1 < seconds <= len(t) / ROWS_A_SECOND and (t == np.round(t)).all()
-    return round(len(t) / seconds) if lost else 0
+    seconds = np.unique(t)
+    usual = np.median(np.diff(seconds)) if len(seconds) > 1 else 0.0
+    lost = usual == 1.0 and (t == np.round(t)).all() and len(t) >= ROWS_A_SECOND * len(seconds)
+    return round(len(t) / len(seconds)) if lost else 0
 
 
 def without_overflow(t: Array, name: str) -> tuple[Array, str]:

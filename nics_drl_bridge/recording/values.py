@@ -121,7 +121,8 @@ class MappedReader:
             return Stamped(given.t, rows, given.clock, len(table.column(0)))
         raw, name = self._raw_stamps(table, time), table.place.rpartition("/")[2]
         known = np.flatnonzero(np.isfinite(raw))
-        if (each := stamping.rows_a_second(raw[known])) and len(time.columns) == 1:
+        alone = len(time.columns) == 1 and time.unit in (None, "s")
+        if alone and (each := stamping.rows_a_second(raw[known])):
             raise RecordingError(_without_rest(table, time.columns[0], each))
         if len(known) < len(raw):
             self.say(f"{name}: {len(raw) - len(known)} rows without a stamp were left out.")

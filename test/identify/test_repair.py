@@ -19,7 +19,7 @@ from nics_drl_bridge.identify.repair import check_commands, check_units, repaire
 from nics_drl_bridge.recording.readers import robot_and_drive
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
 from nics_drl_bridge.recording.topic_roles import TopicRoles
-from nics_drl_bridge.robot.spec import load_robot, robot_from
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot, robot_from
 
 ROOT = Path(__file__).resolve().parents[2]
 JUMPING = ROOT.parent / "shared" / "recordings" / "f110_frictionmaps" / "DS1"
@@ -115,6 +115,15 @@ def test_a_speed_that_another_unit_explains_is_told(differential, column, unit, 
     other = replace(plain, command=replace(plain.command, values=values))
     (note,) = check_commands(Drive(other, differential))
     assert f"if they are in {unit}, write `unit: {unit}`" in note
+
+
+def test_commands_in_volts_and_poses_with_gaps_are_compared_without_harm(differential):
+    plain = without(drive(differential), 5.0, 9.0)
+    forward = differential.command[0].model_dump() | {"unit": "V"}
+    one = differential.model_dump() | {"state": (), "command": (forward,)}
+    command = replace(plain.command, values=plain.command.values[:, :1])
+    volts = Drive(replace(plain, command=command), RobotSpec.model_validate(one))
+    assert check_commands(volts) == check_commands(Drive(plain, differential)) == ()
 
 
 def test_wheels_in_rpm_are_told_if_their_radius_is_known():

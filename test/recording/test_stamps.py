@@ -90,3 +90,17 @@ def test_a_counter_that_overflows_is_continued(bits, low):
 def test_a_counter_that_was_reset_has_no_overflow():
     raw = np.concatenate([np.arange(0, 30_000, 100), np.arange(0, 9000, 100)])
     assert stamping.overflow(raw.astype(float), (1.0,), stamping.BITS) is None
+
+
+def test_stamps_in_whole_seconds_lack_their_rest_but_rows_that_share_milliseconds_do_not():
+    assert stamping.rows_a_second(np.floor(T)) == 50
+    assert stamping.rows_a_second(np.repeat(np.arange(50) * 20.0, 6)) == 0
+    assert stamping.rows_a_second(np.arange(50.0)) == 0
+
+
+def test_a_counter_is_told_from_commands_that_jump_to_and_fro():
+    raw = np.cumsum(np.tile([50.0, 90.0, 0.0, -30.0], 5000))
+    assert stamping.counter(raw % 2.0**16) == 2.0**16
+    assert stamping.counter(raw) is None
+    full = np.where(np.arange(400) % 100 < 50, -127.0, 127.0)
+    assert stamping.counter(full + np.arange(400) % 2) is None
