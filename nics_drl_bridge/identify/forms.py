@@ -53,7 +53,9 @@ class Candidate:
 
 def curve_of(samples: Samples, spec: RobotSpec, place: int) -> Candidate | None:
     """Returns the best curve of the command at a place; None if a straight line does as well."""
-    twists = [POSE_RATES.index(v.twist) for v in spec.state if v.twist]
+    given = structure_of(spec)
+    acts = np.ones(3) if given is None else given[0][:, place]  # what it drives
+    twists = [dof for v in spec.state if v.twist and acts[dof := POSE_RATES.index(v.twist)]]
     found = [f for dof in twists if (f := _of_component(samples, spec, place, dof)) is not None]
     best = max(found, key=lambda each: each.gain, default=None)
     return best if best and best.gain >= (WORTH if best.drives else CLEAR) else None

@@ -13,12 +13,12 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import shooting
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.excitation import unmoved_variables
 from nics_drl_bridge.identify.fit import Order
 from nics_drl_bridge.identify.forms import Form, inputs_of, problem_of, two_way, with_back
 from nics_drl_bridge.identify.statistics import clustered_errors
 from nics_drl_bridge.identify.terms import (
     Mask,
-    by_definition,
     by_textbook,
     defined,
     linear_fit,
@@ -77,7 +77,7 @@ class Draft:
         samples, spec = self.problem.samples, self.spec
         samples = samples if inside is None else samples.rows(inside)
         allowed = partial(by_textbook, tyres=self.form.tyres, drag=bool(self.form.drag))
-        model = by_definition(linear_fit(samples, spec, BASE_ORDER, allowed).model, spec)
+        model = linear_fit(samples, spec, BASE_ORDER, allowed).model
         model, first = (model, None) if other is None else together(model, other)
         free = (model.coefficients != 0.0) & ~defined(spec)[:, None]
         found = shooting.fitted(
@@ -90,21 +90,32 @@ class Draft:
         evaluations: int = shooting.EVALUATIONS, pull: float = shooting.PULL,
     ) -> shooting.Predictive:  # fmt: skip
         """Adjusts the terms of a linear fit, and those of a base to which they are pulled."""
-        base, first = together(base, by_definition(linear, self.spec))
+        base, first = together(base, linear)
         free = ((base.coefficients != 0.0) | (first != 0.0)) & ~defined(self.spec)[:, None]
         return shooting.fitted(
             self.problem, base, free, self.inputs, inside, evaluations, pull, first
         )  # fmt: skip
 
+    def error_of(self, found: shooting.Predictive) -> float:
+        """Returns the mean distance of predicted ends to measured ones, over all horizons [m]."""
+        error = self.problem.errors(found.model, found.values)[0]
+        return float(np.nanmean(np.hypot(error[..., 0], error[..., 1])))
+
     def tried(self, asked: tuple[Hypothesis, ...]) -> tuple[Trial, ...]:
-        """Fits each to all but one of `FOLDS` parts of a drive, and predicts that part."""
-        values, everything = self.inputs.start, np.arange(len(self.problem.samples.t))
+        """Fits each to all but one of `FOLDS` parts of a drive, and predicts that part.
+
+        A part without which a variable would not have moved is not left out.
+        """
+        samples, values = self.problem.samples, self.inputs.start
+        everything, unmoved = np.arange(len(samples.t)), unmoved_variables(samples, self.spec)
         problem = replace(self.problem, spacing_s=SPACING_S, fixed=values)
         given = replace(self, problem=problem, inputs=shooting.NOTHING_FREE)
         errors: dict[Hypothesis, list[Array]] = {hypothesis: [] for hypothesis in asked}
-        paths, judge = [], replace(problem, horizons=BANDS_S)
+        paths, judge = [np.zeros((0, len(BANDS_S)))], replace(problem, horizons=BANDS_S)
         for block in np.array_split(everything, FOLDS):
             left = np.isin(everything, block)
+            if unmoved_variables(samples.rows(~left), self.spec) != unmoved:
+                continue
             for hypothesis, model in given.models(asked, ~left):
                 error, path = judge.errors(model, values, left)
                 errors[hypothesis].append(np.hypot(error[..., 0], error[..., 1]))
@@ -114,7 +125,8 @@ class Draft:
         return tuple(
             Trial(*hypothesis, float(np.nansum(far[:, -1])) / length if length else np.nan,
                   {h: each[~np.isnan(each)] for h, each in zip(BANDS_S, far.T, strict=True)})
-            for hypothesis, blocks in errors.items() for far in [np.concatenate(blocks)]
+            for hypothesis, blocks in errors.items()
+            for far in [np.concatenate(blocks) if blocks else np.zeros((0, len(BANDS_S)))]
         )  # fmt: skip
 
     def models(

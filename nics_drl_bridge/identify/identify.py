@@ -296,10 +296,9 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
     calibration, spec = findings.calibration, drive.spec
     base, best = known(findings.base, "the base", "fit"), hypotheses.chosen(findings.trials)
     draft, book = base.draft, base.found.model
-    if best.order:
-        found = draft.refined(book, linear.model, pull=best.pull)
-    else:
-        found = draft.base(other=book)
+    found = draft.refined(book, linear.model, pull=best.pull) if best.order else None
+    if found is None or draft.error_of(found) > verdict.WORSE * draft.error_of(base.found):
+        found = draft.base(other=book)  # a search may go astray
     calibration = replace(
         calibration, command_latency_s=float(found.values[0]),
         inputs=draft.form.curves_at(draft.inputs, found.values),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import product
 
 import numpy as np
@@ -10,8 +12,8 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.excitation import terms_through_state
-from nics_drl_bridge.identify.fit import Fit, Library, pruned, regress
+from nics_drl_bridge.identify.excitation import STILL, terms_through_state, unmoved_variables
+from nics_drl_bridge.identify.fit import Fit, pruned, regress
 from nics_drl_bridge.identify.yardstick import structure_of
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.kinds import steady_twist
@@ -44,6 +46,11 @@ def mirrored(spec: RobotSpec) -> tuple[str, ...] | None:
     return (*aside, *odd)
 
 
+def is_reversed(name: str, odd: tuple[str, ...]) -> bool:
+    """True if a variable or a rate of the twist changes sign in a mirror that reverses `odd`."""
+    return name in ("vy", "wz") or name.removeprefix("d_") in odd
+
+
 def sided(spec: RobotSpec) -> bool:
     """True if a lever arm along y can be told from unequal wheels: not if one turns the robot."""
     return spec.moves_sideways or mirrored(spec) is not None
@@ -56,11 +63,12 @@ def tyres_slip(spec: RobotSpec) -> bool:
     return told and given is not None and given[1].used and not given[1].front_drive
 
 
-def library(powers: Powers, spec: RobotSpec) -> Mask:
+def library(powers: Powers, spec: RobotSpec, held: tuple[str, ...] = ()) -> Mask:
     """Selects the terms (D, K) that each degree of freedom may have.
 
     A state that is a component of the twist is so by definition. Slip along y acts in proportion.
-    Beyond the first order, what a mirror reverses is made of what it reverses.
+    Beyond the first order, what a mirror reverses is made of what it reverses. Commands that were
+    `held` at one value act as a constant.
     """
     names, odd = spec.variable_names, mirrored(spec)
     order = powers.sum(axis=1)
@@ -70,12 +78,13 @@ def library(powers: Powers, spec: RobotSpec) -> Mask:
     if odd is not None:
         reversed_ = powers[:, [n in odd for n in names]].sum(axis=1) % 2 == 1
         for d, name in enumerate(spec.dof_names):
-            aside = name in ("vy", "wz") or name.removeprefix("d_") in odd
-            allowed[d] &= (reversed_ == aside) | (order <= 1)
+            allowed[d] &= (reversed_ == is_reversed(name, odd)) | (order <= 1)
     if spec.state:  # commands act through the state
         allowed[:3] &= (powers[:, len(spec.state) :] == 0).all(axis=1)
     if not spec.state or odd is not None:  # who gets no command comes to rest
-        allowed &= order > 0
+        pushed = [is_reversed(name, odd or ()) for name in held]
+        rest = [is_reversed(name, odd or ()) not in pushed for name in spec.dof_names]
+        allowed[rest] &= order > 0
     for i, variable in enumerate(spec.state):
         alone = (order == 1) & (powers[:, i] == 1)
         if variable.twist:
@@ -106,15 +115,19 @@ def through_state(powers: Powers, spec: RobotSpec, centred: bool) -> Mask:
     return allowed
 
 
-def by_textbook(powers: Powers, spec: RobotSpec, tyres: bool = False, drag: bool = False) -> Mask:
+def by_textbook(
+    powers: Powers, spec: RobotSpec, held: tuple[str, ...] = (), tyres: bool = False,
+    drag: bool = False,
+) -> Mask:  # fmt: skip
     """Selects the terms (D, K) by which the twist follows commands with a lag, as textbooks do."""
     names, states, order = spec.variable_names, len(spec.state), powers.sum(axis=1)
-    allowed, given = library(powers, spec) & (order <= 1), structure_of(spec)
+    allowed, given = library(powers, spec, held) & (order <= 1), structure_of(spec)
     if given is None or not states:
         return np.asarray(allowed)
     moves, bicycle = given
     first = np.eye(len(names), dtype=np.int64)
     speed = [i for i, v in enumerate(spec.state) if v.twist == "vx"]
+    paced = bool(speed) and powers[:, speed].any()  # else its speed never changed
 
     def has(d: int, *rows: NDArray[np.int64]) -> None:
         for row in rows:
@@ -125,7 +138,7 @@ def by_textbook(powers: Powers, spec: RobotSpec, tyres: bool = False, drag: bool
             continue
         part = POSE_RATES.index(variable.twist)
         allowed[3 + i] = False
-        if tyres and speed and variable.twist != "vx":  # by the lateral acceleration
+        if tyres and paced and variable.twist != "vx":  # by the lateral acceleration
             turn = [v.twist for v in spec.state].index("wz")
             has(3 + i, 2 * first[speed[0]] + first[turn])
         has(3 + i, first[i])  # without a constant: who gets no command comes to rest
@@ -133,19 +146,64 @@ def by_textbook(powers: Powers, spec: RobotSpec, tyres: bool = False, drag: bool
             push = first[states:][np.abs(moves[part]) > 0.0]
             has(3 + i, *(push + first[i]))
         commands = first[states:][np.abs(moves[part]) > 0.0]
-        if bicycle.used and variable.twist == "wz" and speed:
+        if bicycle.used and variable.twist == "wz" and paced:
             has(3 + i, first[speed[0]], *(commands + first[speed[0]]))
-        elif len(commands):
-            has(3 + i, *commands)
+            continue
+        has(3 + i, *commands)
+        if any(command @ [name in held for name in names] for command in commands):
+            has(3 + i, 0 * first[i])
     return np.asarray(allowed)
 
 
-def linear_fit(samples: Samples, spec: RobotSpec, order: int, allowed: Library = library) -> Fit:
-    """Fits all terms of the library of an order to the rates (Eq. 1)."""
-    found = pruned(regress(samples, spec, order, allowed=allowed), spec, 1.0)
-    moved = samples.dq.std(axis=0) > NOTHING
-    coefficients = np.where(moved[:, None], found.model.coefficients, 0.0)
-    return replace(found, model=replace(found.model, coefficients=coefficients))
+def linear_fit(
+    samples: Samples, spec: RobotSpec, order: int, allowed: Callable[..., Mask] = library
+) -> Fit:
+    """Fits all terms of the library of an order to the rates (Eq. 1); the twist by definition."""
+    variables = (*spec.state, *spec.command)
+    unmoved, mean = unmoved_variables(samples, spec), samples.x.mean(axis=0)
+    least = STILL * np.array([v.max - v.min for v in variables])
+    at = {
+        v.name: float(value) * bool(abs(value) > some)
+        for v, value, some in zip(variables, mean, least, strict=True)
+        if v.name in unmoved
+    }
+    held = tuple(c.name for c in spec.command if at.get(c.name))
+    regression = regress(samples, spec, order, allowed=partial(allowed, held=held))
+    found = pruned(regression, spec, 1.0)
+    still = samples.dq.std(axis=0) <= NOTHING
+    still[3:] |= np.array([v.name in at for v in spec.state], dtype=np.bool_)
+    coefficients = np.where(still[:, None], 0.0, found.model.coefficients)
+    model = replace(found.model, coefficients=coefficients)
+    return replace(found, model=_by_definition(model, spec, at))
+
+
+def _by_definition(model: TaylorModel, spec: RobotSpec, at: dict[str, float]) -> TaylorModel:
+    """Sets the rows of the twist that are states; one that stayed `at` a value is a constant."""
+    first = np.eye(len(model.variables), dtype=np.int64)
+    rows = [0 * first[0], *first[: len(spec.state)]]
+    more = [row for row in rows if not (model.powers == row).all(axis=1).any()]
+    powers = np.concatenate([model.powers, np.reshape(more, (-1, len(first))).astype(np.int64)])
+    coefficients = np.zeros((len(model.dofs), len(powers)))
+    coefficients[:, : len(model.powers)] = model.coefficients
+    if not spec.moves_sideways:  # what is left of lateral motion is noise, unless it is a state
+        coefficients[1] = 0.0
+    for i, variable in enumerate(spec.state):
+        if variable.twist:
+            value = at.get(variable.name)
+            own = rows[0] if value is not None else first[i]
+            alone = (powers == own).all(axis=1)
+            coefficients[POSE_RATES.index(variable.twist)] = alone * (
+                1.0 if value is None else value
+            )
+    kept = coefficients.any(axis=0)
+    none = np.zeros((0, 0))
+    return replace(
+        model,
+        powers=powers[kept],
+        coefficients=coefficients[:, kept],
+        std_errors=none,
+        bounded=True,
+    )
 
 
 def stable(model: TaylorModel, spec: RobotSpec) -> TaylorModel:
@@ -176,15 +234,3 @@ def defined(spec: RobotSpec) -> Mask:
     for i, variable in enumerate(spec.state):
         by_state[POSE_RATES.index(variable.twist) if variable.twist else 3 + i] = True
     return by_state
-
-
-def by_definition(model: TaylorModel, spec: RobotSpec) -> TaylorModel:
-    """Sets the rows of the twist that are states."""
-    coefficients, order = model.coefficients.copy(), model.powers.sum(axis=1)
-    if not spec.moves_sideways:  # what is left of lateral motion is noise, unless it is a state
-        coefficients[1] = 0.0
-    for i, variable in enumerate(spec.state):
-        if variable.twist:
-            d = POSE_RATES.index(variable.twist)
-            coefficients[d] = ((order == 1) & (model.powers[:, i] == 1)).astype(np.float64)
-    return replace(model, coefficients=coefficients, bounded=True)
