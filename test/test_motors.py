@@ -40,7 +40,7 @@ DEAD, PERIODS, SUBSTEPS = 0.12, 60, 10
 
 
 def motors() -> TaylorModel:
-    """vx' = 5 throttle - 0.8 vx, wz' = 4 vx steering - 5 wz, behind motors that bend all of it."""
+    """vx' = 5 throttle - 0.8 vx, wz' = 8 vx steering - 5 wz, behind motors that bend all of it."""
     powers = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 0, 0, 1]])
     rows = [[1.0, 0, 0, 0], [0.0] * 4, [0, 1.0, 0, 0], [-0.8, 0, 5.0, 0], [0, -5.0, 0, 8.0]]
     return TaylorModel(
@@ -52,6 +52,7 @@ def motors() -> TaylorModel:
         ),
         friction=np.array([0.2, 0.0]), drag=np.array([0.4, 0.0]),
         limits=np.array([[-2.5, 1.5], [-np.inf, 6.0]]),
+        back_emf=np.array([[1.1, 0.0], [0.0, 0.7]]),
     )  # fmt: skip
 
 
@@ -90,7 +91,8 @@ def test_the_drive_shows_every_stage(commands, path):
     assert (np.abs(commands[:, 0]) < DEAD).any()
     assert (np.abs(commands[:, 0]) > 0.8).any()
     raw = replace(car, inputs=()), *(replace(car, **{k: np.zeros(2)}) for k in ("friction", "drag"))
-    for other in (*raw, replace(car, limits=np.tile([-np.inf, np.inf], (2, 1)))):
+    free = replace(car, limits=np.tile([-np.inf, np.inf], (2, 1)))
+    for other in (*raw, free, replace(car, back_emf=np.zeros((2, 2)))):
         ends = rolled(other, commands)[0]
         assert np.hypot(*(ends[-1] - path[0][-1])[:2]) > 0.02
 
@@ -161,12 +163,13 @@ def test_the_estimator_predicts_the_path_of_the_model(model, commands, path):
     assert_same_path(poses, path[0])
 
 
-def test_the_estimator_knows_how_drag_dampens_an_error_of_the_speed():
+@pytest.mark.parametrize("throttle", [0.0, -0.3])
+def test_the_estimator_knows_how_drag_and_back_emf_dampen_an_error_of_the_speed(throttle):
     motion = MotionModel(term_arrays(motors()), SERIES, 0, 0)
 
     def ahead(speed: float) -> tuple[float, float]:
         mean, transition = np.array([0.0, 0.0, 0.0, speed, 0.0]), np.eye(5)
-        kernels.predict(mean, transition, np.zeros(2), 0.01, 20, motion)
+        kernels.predict(mean, transition, np.array([throttle, 0.0]), 0.01, 10, motion)
         return mean[3], transition[3, 3]
 
     slight = 1e-6
@@ -267,6 +270,8 @@ def test_a_warning_is_of_the_command_that_was_sent(model):
         ({"inputs": ({"command": "throttle"},) * 2}, "key 'inputs' has a command twice"),
         ({"friction": {"speed": 0.1}}, "key 'friction' has 'speed'"),
         ({"drag": {"speed": 0.1}}, "key 'drag' has 'speed'"),
+        ({"back_emf": {"speed": {}}}, "key 'back_emf' has 'speed'"),
+        ({"back_emf": {"vx": {"gas": 0.1}}}, "key 'back_emf' has 'gas'"),
         ({"limits": {"throttle": (-1.0, 1.0)}}, "key 'limits' has 'throttle'"),
     ],
 )

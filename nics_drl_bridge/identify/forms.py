@@ -113,7 +113,7 @@ class Form:
     friction: tuple[str, ...] = ()  # states with dry friction
     limits: tuple[str, ...] = ()  # states with a greatest fall and rise
     back: tuple[str, ...] = ()  # commands whose curve has a gain of its own backwards
-    drag: tuple[str, ...] = ()  # states with a drag by their square; their pull falls with them
+    drag: tuple[str, ...] = ()  # states with a drag by their square, and a back-EMF
     tyres: bool = False  # True if a car turns less at speed than its textbook, and slips aside
 
     def curves_at(self, inputs: shooting.Inputs, values: Array) -> tuple[InputCurve, ...]:
@@ -137,8 +137,10 @@ class Form:
         friction = [max(at.get(f"{name}.friction", 0.0), 0.0) for name in states]
         drag = [max(at.get(f"{name}.drag", 0.0), 0.0) for name in states]
         limits = [[-at.get(f"{n}.fall", np.inf), at.get(f"{n}.rise", np.inf)] for n in states]
+        commands = model.variables[model.state_size :]
+        emf = [[max(at.get(f"{s}.back_emf.{c}", 0.0), 0.0) for c in commands] for s in states]
         return replace(
-            model, friction=np.array(friction), drag=np.array(drag),
+            model, friction=np.array(friction), drag=np.array(drag), back_emf=np.array(emf),
             limits=np.array(limits).reshape(-1, 2),
         )  # fmt: skip
 
@@ -183,6 +185,11 @@ def inputs_of(drive: Drive, latency: float, samples: Samples, form: Form) -> sho
         value = samples.x[:, [v.name for v in drive.spec.state].index(name)]
         size = float(np.percentile(np.abs(rates[name]), STRONG) / max(np.mean(value**2), 1e-3))
         rows[f"{name}.drag"] = (0.1 * size, 0.1 * size, 0.0, size)
+        for place in _drivers(drive.spec):
+            effect = np.abs(samples.x[:, len(drive.spec.state) + place] * value)
+            size = float(np.percentile(np.abs(rates[name]), STRONG) / max(effect.mean(), 1e-3))
+            key = f"{name}.back_emf.{drive.spec.command[place].name}"
+            rows[key] = (0.1 * size, 0.1 * size, 0.0, size)
     for name in form.limits:
         for word, rate in (("fall", -rates[name]), ("rise", rates[name])):
             size = max(float(np.percentile(rate, STRONG)), 1e-3)
@@ -198,16 +205,20 @@ def inputs_of(drive: Drive, latency: float, samples: Samples, form: Form) -> sho
 
 def two_way(drive: Drive, samples: Samples) -> tuple[InputCurve, ...]:
     """Returns curves without effect of commands that drive the robot both ways."""
-    given, spec = structure_of(drive.spec), drive.spec
-    if given is None:
-        return ()
+    spec = drive.spec
     command, found = samples.x[:, len(spec.state) :], []
-    for place in np.flatnonzero(np.abs(given[0][0]) > 0.0):
+    for place in _drivers(spec):
         reach = command[:, place]
         if min((reach < 0.0).mean(), (reach > 0.0).mean()) > TWO_WAY:
             low, high = float(reach.min()), float(reach.max())
             found.append(InputCurve(command=spec.command[place].name, least=low, most=high))
     return tuple(found)
+
+
+def _drivers(spec: RobotSpec) -> tuple[int, ...]:
+    """Returns the places of the commands that drive a robot ahead, as its textbook tells."""
+    given = structure_of(spec)
+    return () if given is None else tuple(np.flatnonzero(given[0][0]).tolist())
 
 
 def with_back(form: Form, curves: tuple[InputCurve, ...]) -> Form:

@@ -76,7 +76,7 @@ class Draft:
         """Fits the textbook's terms, gains and lags; the search may start at another model."""
         samples, spec = self.problem.samples, self.spec
         samples = samples if inside is None else samples.rows(inside)
-        allowed = partial(by_textbook, tyres=self.form.tyres, drag=bool(self.form.drag))
+        allowed = partial(by_textbook, tyres=self.form.tyres)
         model = linear_fit(samples, spec, BASE_ORDER, allowed).model
         model, first = (model, None) if other is None else together(model, other)
         free = (model.coefficients != 0.0) & ~defined(spec)[:, None]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.robot.kernels import bounds_of, next_state
+from nics_drl_bridge.robot.kernels import bounds_of, emf_of, next_state
 
 SMALL_TURN = 0.3  # below this angle the series of sin(a)/a is exact to the last digits [rad]
 
@@ -187,6 +187,10 @@ def _linearise(terms, scratch):  # type: ignore[no-untyped-def]
                 scratch.jacobian[d, terms.factors[k, f]] += rest
         scratch.value[k] = value
         scratch.rate[d] += coefficient * value
+    for i in range(terms.emf.shape[0]):
+        braking = emf_of(i, scratch.x, terms)
+        scratch.rate[3 + i] -= braking * scratch.x[i]
+        scratch.jacobian[3 + i, i] -= braking
 
 
 @kernel

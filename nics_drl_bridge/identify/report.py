@@ -82,7 +82,7 @@ def stages(spec: RobotSpec, identified: Identified) -> Iterator[str]:
     """Yields a line per value of the stages around the terms, with the calibration's uncertainty.
 
     Of those the names are `throttle.dead`, `.least`, `.most` and `.back` of a command, `vx.fall`,
-    `.rise`, `.friction` and `.drag` of a state.
+    `.rise`, `.friction` and `.drag` of a state, `vx.back_emf.throttle` of both.
     """
     model, sigma = identified.model, identified.calibration.uncertainty
     units = dict(zip(spec.variable_names, spec.variable_units, strict=True))
@@ -105,6 +105,12 @@ def stages(spec: RobotSpec, identified: Identified) -> Iterator[str]:
             (f"{state}.friction", "dry friction", friction, unit, 0.0),
             (f"{state}.drag", "drag, times its square", drag, "", 0.0),
         ]
+    emf = zip(model.variables, model.back_emf.tolist(), strict=False)
+    values += [
+        (f"{state}.back_emf.{command}", f"back-EMF, times {state} and |{command}|", value, "", 0.0)
+        for state, row in emf
+        for command, value in zip(model.variables[model.state_size :], row, strict=True)
+    ]
     for key, words, value, unit, usual in values:
         if value != usual:
             spread = f" +- {sigma[key]:.2g}" if key in sigma else ""

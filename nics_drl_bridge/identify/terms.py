@@ -116,9 +116,8 @@ def through_state(powers: Powers, spec: RobotSpec, centred: bool) -> Mask:
 
 
 def by_textbook(
-    powers: Powers, spec: RobotSpec, held: tuple[str, ...] = (), tyres: bool = False,
-    drag: bool = False,
-) -> Mask:  # fmt: skip
+    powers: Powers, spec: RobotSpec, held: tuple[str, ...] = (), tyres: bool = False
+) -> Mask:
     """Selects the terms (D, K) by which the twist follows commands with a lag, as textbooks do."""
     names, states, order = spec.variable_names, len(spec.state), powers.sum(axis=1)
     allowed, given = library(powers, spec, held) & (order <= 1), structure_of(spec)
@@ -142,9 +141,6 @@ def by_textbook(
             turn = [v.twist for v in spec.state].index("wz")
             has(3 + i, 2 * first[speed[0]] + first[turn])
         has(3 + i, first[i])  # without a constant: who gets no command comes to rest
-        if drag and variable.twist == "vx":
-            push = first[states:][np.abs(moves[part]) > 0.0]
-            has(3 + i, *(push + first[i]))
         commands = first[states:][np.abs(moves[part]) > 0.0]
         if bicycle.used and variable.twist == "wz" and paced:
             has(3 + i, first[speed[0]], *(commands + first[speed[0]]))

@@ -16,6 +16,7 @@ from nics_drl_bridge.robot.kernels import (
     Terms,
     advance,
     bounds_of,
+    emf_of,
     next_state,
     put_command,
     rates,
@@ -62,6 +63,8 @@ def rates_jacobian(jacobian, x, terms):  # type: ignore[no-untyped-def]
                 if other != f:
                     product *= x[factors[k, other]]
             jacobian[dof[k], factors[k, f]] += product
+    for i in range(terms.emf.shape[0]):
+        jacobian[3 + i, i] -= emf_of(i, x, terms)
 
 
 @kernel

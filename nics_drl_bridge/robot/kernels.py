@@ -39,6 +39,7 @@ class Terms(NamedTuple):
     friction: Array  # (S,) by which a state is drawn to zero [unit / s]
     drag: Array  # (S,) times the square of a state, likewise [1 / (unit s)]
     curves: Array  # (C, 4) of the commands
+    emf: Array  # (S, C) times a state and the size of a command in effect; (0, 0) if all are 0
 
 
 class Bounds(NamedTuple):
@@ -70,7 +71,7 @@ def term_arrays(model: TaylorModel) -> Terms:
     return Terms(
         dofs.astype(np.int64), coefficients, factors, count, *model.state_box, fall, rise,
         np.asarray(model.friction, np.float64), np.asarray(model.drag, np.float64),
-        _curve_rows(model),
+        _curve_rows(model), model.back_emf if model.back_emf.any() else np.zeros((0, 0)),
     )  # fmt: skip
 
 
@@ -135,7 +136,7 @@ def with_coefficients(terms, coefficient):  # type: ignore[no-untyped-def]
     """Returns terms with other coefficients, those of a robot or of several."""
     return Terms(
         terms.dof, coefficient, terms.factors, terms.degree, terms.low, terms.high, terms.fall,
-        terms.rise, terms.friction, terms.drag, terms.curves,
+        terms.rise, terms.friction, terms.drag, terms.curves, terms.emf,
     )  # fmt: skip
 
 
@@ -148,6 +149,17 @@ def rates(dq, x, terms):  # type: ignore[no-untyped-def]
         for factor in range(terms.degree[k]):
             product *= x[terms.factors[k, factor]]
         dq[terms.dof[k]] += product
+    for i in range(terms.emf.shape[0]):
+        dq[3 + i] -= emf_of(i, x, terms) * x[i]
+
+
+@kernel
+def emf_of(i, x, terms):  # type: ignore[no-untyped-def]
+    """Returns the rate [1/s] at which the commands in effect brake state variable i."""
+    total, states = 0.0, terms.emf.shape[0]
+    for c in range(terms.emf.shape[1]):
+        total += terms.emf[i, c] * abs(x[states + c])
+    return total
 
 
 @kernel
@@ -241,6 +253,13 @@ def _rates_of_all(dq, x, terms):  # type: ignore[no-untyped-def]
         else:  # the constant
             for i in range(n):
                 rate[i] += value[i]
+    states = terms.emf.shape[0]
+    for d in range(states):
+        rate, state = dq[3 + d], x[d]
+        for c in range(terms.emf.shape[1]):
+            emf, command = terms.emf[d, c], x[states + c]
+            for i in range(n):
+                rate[i] -= emf * abs(command[i]) * state[i]
 
 
 @kernel

@@ -25,8 +25,9 @@ BEYOND = 0.25  # share of its range by which a bounded state may leave it, on bo
 class TaylorModel:
     """`dQ/dt = A chi(X)` without the pruned terms (Eq. 1, 2), and what motors do around them.
 
-    Commands of X are those in effect, after the input curves. The rate of a state is cut to its
-    limits; then drag by its square slows it, and dry friction draws it to zero, where it sticks.
+    Commands of X are those in effect, after the input curves. A motor pulls the less the faster it
+    turns: by its back-EMF. The rate of a state is cut to its limits; then drag by its square slows
+    it, and dry friction draws it to zero, where it sticks.
     """
 
     variables: tuple[str, ...]  # V names of X = [state, command]
@@ -45,6 +46,8 @@ class TaylorModel:
     inputs: tuple[InputCurve, ...] = ()  # of the commands that have one
     friction: Array = field(default_factory=lambda: np.zeros(0))  # (S,) [unit of the state / s]
     drag: Array = field(default_factory=lambda: np.zeros(0))  # (S,) [1 / (unit of the state s)]
+    # (S, C) by which each command in effect, of either sign, brakes [1 / (its unit s)]
+    back_emf: Array = field(default_factory=lambda: np.zeros((0, 0)))
     # (S, 2) greatest fall and rise of each state's rate [unit of the state / s]
     limits: Array = field(default_factory=lambda: np.zeros((0, 2)))
 
@@ -52,6 +55,9 @@ class TaylorModel:
         for name in ("friction", "drag"):
             if not getattr(self, name).size:
                 object.__setattr__(self, name, np.zeros(self.state_size))
+        if not self.back_emf.size:
+            none = np.zeros((self.state_size, len(self.variables) - self.state_size))
+            object.__setattr__(self, "back_emf", none)
         if not self.limits.size:
             unlimited = np.tile([-np.inf, np.inf], (self.state_size, 1))
             object.__setattr__(self, "limits", unlimited)
@@ -81,7 +87,8 @@ class TaylorModel:
     @property
     def is_free(self) -> bool:
         """True if the rates of the state are those of the terms."""
-        return not (self.friction.any() or self.drag.any() or np.isfinite(self.limits).any())
+        still = self.friction, self.drag, self.back_emf, np.isfinite(self.limits)
+        return not any(each.any() for each in still)
 
     @property
     def braking(self) -> Array:
@@ -95,10 +102,17 @@ class TaylorModel:
     def rates(self, x: ArrayLike) -> Array:
         """Returns dQ/dt (..., D) in a step from X (..., V), whose commands are those in effect."""
         x = np.asarray(x, dtype=np.float64)
-        dq = evaluate(x, self.powers) @ self.coefficients.T
+        dq = self._free_rates(x)
         if not self.is_free:
             state = x[..., : self.state_size]
             dq[..., 3:] = (self._moved(state, dq[..., 3:] * self.dt) - state) / self.dt
+        return dq
+
+    def _free_rates(self, x: Array) -> Array:
+        """Returns dQ/dt (..., D) by the terms and the back-EMF."""
+        dq = evaluate(x, self.powers) @ self.coefficients.T
+        states = self.state_size
+        dq[..., 3:] -= np.abs(x[..., states:]) @ self.back_emf.T * x[..., :states]
         return dq
 
     def _moved(self, state: Array, change: Array) -> Array:
@@ -112,7 +126,7 @@ class TaylorModel:
         """Returns pose (..., 3) and state (..., S) after a step of `dt` along the exact arc."""
         state = np.asarray(state, dtype=np.float64)
         x = np.concatenate([state, self.in_effect(command)], axis=-1)
-        dq = evaluate(x, self.powers) @ self.coefficients.T * self.dt
+        dq = self._free_rates(x) * self.dt
         moved = np.clip(self._moved(state, dq[..., 3:]), *self.state_box)
         return geometry.compose(pose, geometry.exp(dq[..., :3])), moved
 
@@ -124,9 +138,13 @@ class TaylorModel:
     @property
     def shown_terms(self) -> tuple[str, ...]:
         """Names of the K terms, those of commands in effect primed: `throttle'`."""
+        return tuple(term_name(row, self.shown_names) for row in self.powers)
+
+    @property
+    def shown_names(self) -> tuple[str, ...]:
+        """Names of the variables, those of commands in effect primed."""
         curved = [curve.command for curve in self.inputs]
-        names = tuple(f"{name}'" if name in curved else name for name in self.variables)
-        return tuple(term_name(row, names) for row in self.powers)
+        return tuple(f"{name}'" if name in curved else name for name in self.variables)
 
     def restraint(self, dof: str) -> str:
         """Returns limits, drag, friction of a degree of freedom as text, beginning with a comma."""
@@ -134,7 +152,10 @@ class TaylorModel:
         if d < 0:
             return ""
         friction, drag, name = self.friction[d], self.drag[d], self.variables[d]
-        less = f", less {drag:.4g}*{name}*|{name}|" if drag else ""
+        shown = self.shown_names[self.state_size :]
+        emf = zip(self.back_emf[d].tolist(), shown, strict=True)
+        less = "".join(f", less {k:.4g}*{name}*|{command}|" for k, command in emf if k)
+        less += f", less {drag:.4g}*{name}*|{name}|" if drag else ""
         less += f", less dry friction of {friction:.4g}" if friction else ""
         return ends(*self.limits[d].tolist()) + less
 
@@ -187,6 +208,11 @@ class TaylorModel:
             {s: each for s, each in zip(states, values.tolist(), strict=True) if each > 0.0}
             for values in (self.friction, self.drag)
         )
+        commands = self.variables[len(states) :]
+        emf = {
+            s: named for s, row in zip(states, self.back_emf.tolist(), strict=True)
+            if (named := {c: k for c, k in zip(commands, row, strict=True) if k > 0.0})
+        }  # fmt: skip
         limited = {s: k for s, k in zip(states, limits, strict=True) if np.isfinite(k).any()}
         return NamedTaylorModel.model_construct(
             dt=self.dt, units=dict(zip(self.dofs, self.dof_units, strict=True)), terms=terms,
@@ -194,6 +220,7 @@ class TaylorModel:
             standard_errors=self.named_errors if self.std_errors.size else None,
             quality=self.quality, bounded=self.bounded, inputs=self.inputs,
             friction=friction or None, drag=drag or None, limits=limited or None,
+            back_emf=emf or None,
         )  # fmt: skip
 
 
@@ -311,6 +338,7 @@ class NamedTaylorModel(Schema):
     inputs: tuple[InputCurve, ...] = ()
     friction: dict[str, NonNegativeFloat] | None = None  # by state
     drag: dict[str, NonNegativeFloat] | None = None  # by state
+    back_emf: dict[str, dict[str, NonNegativeFloat]] | None = None  # by state and command
     limits: dict[str, tuple[Fall, Rise]] | None = None  # by state
 
     def model(self) -> TaylorModel:
@@ -330,7 +358,8 @@ class NamedTaylorModel(Schema):
         low, high = np.array(list(self.valid.values())).reshape(len(variables), 2).T
         states = variables[: len(dofs) - 3]
         friction, drag, limits = self.friction or {}, self.drag or {}, self.limits or {}
-        self._check_stages(states, variables[len(states) :])
+        commands, emf = variables[len(states) :], self.back_emf or {}
+        self._check_stages(states, commands)
         return TaylorModel(
             variables, dofs, units, powers.reshape(len(names), len(variables)),
             np.array(rows, dtype=np.float64).reshape(len(dofs), len(names)), self.dt, low, high,
@@ -338,12 +367,17 @@ class NamedTaylorModel(Schema):
             friction=np.array([friction.get(name, 0.0) for name in states]),
             drag=np.array([drag.get(name, 0.0) for name in states]),
             limits=np.array([limits.get(name, (-np.inf, np.inf)) for name in states]),
+            back_emf=np.array([[emf.get(s, {}).get(c, 0.0) for c in commands] for s in states]),
         ).with_errors(self.standard_errors or {})  # fmt: skip
 
     def _check_stages(self, states: tuple[str, ...], commands: tuple[str, ...]) -> None:
         curved = [curve.command for curve in self.inputs]
         by_state = {"friction": self.friction, "drag": self.drag, "limits": self.limits}
-        keys = (("inputs", curved, commands), *((k, v, states) for k, v in by_state.items()))
+        emf = self.back_emf or {}
+        keys = (
+            ("inputs", curved, commands), *((k, v, states) for k, v in by_state.items()),
+            ("back_emf", emf, states), *(("back_emf", row, commands) for row in emf.values()),
+        )  # fmt: skip
         for key, names, known in keys:
             for name in names or ():
                 if name not in known:

@@ -58,7 +58,7 @@ def test_values_are_sought_by_name_from_what_the_motion_shows(found, samples):
     sought = form_inputs(found, samples, form)
     assert sought.names == (
         "latency", "throttle.dead", "throttle.least", "throttle.most", "throttle.back",
-        "vx.friction", "vx.drag", "vx.fall", "vx.rise",
+        "vx.friction", "vx.drag", "vx.back_emf.throttle", "vx.fall", "vx.rise",
     )  # fmt: skip
     known = set(sought.names) - {sought.names[i] for i in sought.sought}
     assert known == {"throttle.back"}
@@ -77,7 +77,7 @@ def test_a_form_that_grows_starts_where_the_smaller_one_ended(found, samples):
 def test_values_become_curves_friction_limits_and_drag(found, samples):
     form = Form((CURVE,), ("vx",), ("vx",), ("throttle",), ("vx",))
     sought = form_inputs(found, samples, form)
-    values = np.array([0.03, 0.12, -0.2, 0.4, 0.8, 0.25, 0.15, 3.0, 2.0])
+    values = np.array([0.03, 0.12, -0.2, 0.4, 0.8, 0.25, 0.15, 1.2, 3.0, 2.0])
     (curve,) = form.curves_at(sought, values)
     assert curve == InputCurve(command="throttle", dead=0.12, least=-0.2, most=0.4, back=0.8)
     spec = found.training.spec
@@ -90,6 +90,7 @@ def test_values_become_curves_friction_limits_and_drag(found, samples):
     model = form.actuated(model, sought, values)
     assert model.friction.tolist() == [0.25, 0.0, 0.0]
     assert model.drag.tolist() == [0.15, 0.0, 0.0]
+    assert model.back_emf[0].tolist() == [1.2, 0.0]
     assert model.limits[0].tolist() == [-3.0, 2.0]
 
 

@@ -97,12 +97,12 @@ def test_the_twist_of_a_car_follows_its_commands_and_with_tyres_its_lateral_acce
     spec, _ = slipping_car(duration=1.0)
     powers = taylor.exponents(len(spec.variable_names), 3)
 
-    def terms(dof: str, **given: bool) -> set[str]:
+    def terms(dof: str, **given: object) -> set[str]:
         allowed = by_textbook(powers, spec, **given)[spec.dof_names.index(dof)]
         return {taylor.term_name(row, spec.variable_names) for row in powers[allowed]}
 
     assert terms("d_vx") == {"vx", "throttle"}
-    assert terms("d_vx", drag=True) == {"vx", "throttle", "vx*throttle"}
+    assert terms("d_vx", held=("throttle",)) == {"1", "vx", "throttle"}
     assert terms("d_wz") == {"vx", "wz", "vx*steering"}
     assert terms("d_wz", tyres=True) - terms("d_wz") == {"vx^2*wz"}
     assert terms("d_vy", tyres=True) == {"vy", "vx^2*wz"}
