@@ -64,17 +64,20 @@ def unmoved_variables(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
 
 def commands_together(samples: Samples, spec: RobotSpec) -> tuple[str, ...]:
     """Returns the commands that moved, but were linearly dependent."""
-    commands = enumerate(spec.command, start=len(spec.state))
-    moved = [i for i, c in commands if samples.x[:, i].std() >= STILL * (c.max - c.min)]
-    if len(moved) < 2:
-        return ()
-    unit = samples.x[:, moved] - samples.x[:, moved].mean(axis=0)
-    unit = unit / np.linalg.norm(unit, axis=0)
-    size, axes = np.linalg.svd(unit, full_matrices=False)[1:]
-    if size[-1] > TOGETHER:
-        return ()
-    part_of = np.abs(axes[size <= TOGETHER]).max(axis=0) > 0.1
-    return tuple(spec.variable_names[i] for i, p in zip(moved, part_of, strict=True) if p)
+    part_of = np.abs(combinations(samples, spec)).max(axis=0, initial=0.0) > 0.1
+    return tuple(c.name for c, part in zip(spec.command, part_of, strict=True) if part)
+
+
+def combinations(samples: Samples, spec: RobotSpec) -> Array:
+    """Returns orthonormal combinations (N, C) of the commands, by their sizes, that stayed put."""
+    command = samples.x[:, len(spec.state) :]
+    reach = np.array([c.max - c.min for c in spec.command])
+    moved = np.flatnonzero(command.std(axis=0) >= STILL * reach)
+    unit = command[:, moved] - command[:, moved].mean(axis=0)
+    size, axes = np.linalg.svd(unit / np.linalg.norm(unit, axis=0), full_matrices=False)[1:]
+    found = np.zeros((np.count_nonzero(size <= TOGETHER), len(reach)))
+    found[:, moved] = axes[size <= TOGETHER]
+    return found
 
 
 def levels(samples: Samples, spec: RobotSpec) -> dict[str, int]:
@@ -84,8 +87,11 @@ def levels(samples: Samples, spec: RobotSpec) -> dict[str, int]:
 
 
 def independent_columns(chi: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Splits columns into an independent set and copies; earlier, low-order ones are kept first."""
-    unit = chi / np.linalg.norm(chi, axis=0)
+    """Splits columns into an independent set and copies; earlier, low-order ones are kept first.
+
+    One that is nothing but zeros counts as a copy.
+    """
+    unit = chi / np.maximum(np.linalg.norm(chi, axis=0), np.finfo(np.float64).tiny)
     apart = np.abs(np.diag(qr(unit, mode="r")[0])) > DEPENDENT  # no pivoting: from predecessors
     return np.flatnonzero(apart), np.flatnonzero(~apart)
 

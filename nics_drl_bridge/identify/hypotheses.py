@@ -38,6 +38,7 @@ FOLDS = 3
 SPACING_S, EVALUATIONS = 0.5, 25  # of trials
 BASE_ORDER, BASE_EVALUATIONS = 3, 100
 HORIZON_S = 5.0
+LONGEST_LAG_S = 2.0  # a state that takes longer is rolling on: it hides no latency
 BANDS_S = (0.5, 1.0, 2.0, HORIZON_S)
 
 Hypothesis = tuple[int, float]  # order, 0 for the textbook's terms alone, and pull to these
@@ -224,7 +225,7 @@ def lags_of(model: TaylorModel, spec: RobotSpec) -> dict[str, float]:
     alone, found = model.powers.sum(axis=1) == 1, {}
     for i, variable in enumerate(spec.state):
         rate = float(model.coefficients[3 + i, alone & (model.powers[:, i] == 1)].sum())
-        if variable.twist and rate < 0.0:
+        if variable.twist and rate * LONGEST_LAG_S < -1.0:
             found[variable.name] = -1.0 / rate
     return found
 

@@ -40,7 +40,7 @@ from nics_drl_bridge.identify.refine import refined
 from nics_drl_bridge.identify.repair import check_axes, check_commands, check_units, repaired
 from nics_drl_bridge.identify.signals import speed_index
 from nics_drl_bridge.identify.structure import structures
-from nics_drl_bridge.identify.terms import linear_fit, through_state
+from nics_drl_bridge.identify.terms import linear_fit, shared, through_state
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream, check
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.noise import Noise
@@ -317,6 +317,7 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
         calibration = replace(calibration, uncertainty=told)
     errors = hypotheses.standard_errors(found)
     model = replace(found.model, std_errors=errors, inputs=calibration.inputs)
+    model = shared(model, spec, known(findings.samples, "the training part", "fit"))
     return replace(
         findings, calibration=calibration, model=model, base=base,
         refinement=(f"Coefficients and latency were refined by the open-loop errors over up to "

@@ -9,10 +9,17 @@ from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import orth
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.excitation import STILL, terms_through_state, unmoved_variables
+from nics_drl_bridge.identify.excitation import (
+    STILL,
+    TOGETHER,
+    combinations,
+    terms_through_state,
+    unmoved_variables,
+)
 from nics_drl_bridge.identify.fit import Fit, pruned, regress
 from nics_drl_bridge.identify.yardstick import structure_of
 from nics_drl_bridge.recording.recording import Samples
@@ -200,6 +207,36 @@ def _by_definition(model: TaylorModel, spec: RobotSpec, at: dict[str, float]) ->
         std_errors=none,
         bounded=True,
     )
+
+
+def shared(model: TaylorModel, spec: RobotSpec, samples: Samples) -> TaylorModel:
+    """Shares what commands of one unit do that always moved together, as four wheels of three ways.
+
+    By the least coefficients of all that make the same of these commands.
+    """
+    still, command = combinations(samples, spec), samples.x[:, len(spec.state) :]
+    parts = np.abs(still).max(axis=0, initial=0.0) > NOTHING
+    constant = still / np.maximum(command.std(axis=0), NOTHING)
+    if len({c.unit for c, part in zip(spec.command, parts.tolist(), strict=True) if part}) != 1:
+        return model
+    if np.abs(constant @ command.mean(axis=0)).max() > TOGETHER:
+        return model
+    normal = orth(constant.T)
+    onto = np.eye(len(model.variables))
+    onto[len(spec.state) :, len(spec.state) :] -= normal @ normal.T
+    rows: dict[tuple[int, ...], Array] = {}
+    for powers, effect in zip(model.powers.tolist(), model.coefficients.T, strict=True):
+        factors = np.repeat(np.arange(len(powers)), powers)
+        for places in product(*(np.flatnonzero(np.abs(onto[f]) > NOTHING) for f in factors)):
+            term = np.bincount(np.array(places, dtype=np.int64), minlength=len(powers))
+            share = float(np.prod(onto[factors, list(places)]))
+            key = tuple(term.tolist())
+            rows[key] = rows.get(key, np.zeros(len(effect))) + share * effect
+    coefficients = np.array(list(rows.values())).T
+    kept = (np.abs(coefficients) > NOTHING).any(axis=0)
+    powers = np.array(list(rows), dtype=np.int64)[kept]
+    none = np.zeros((0, 0))
+    return replace(model, powers=powers, coefficients=coefficients[:, kept], std_errors=none)
 
 
 def stable(model: TaylorModel, spec: RobotSpec) -> TaylorModel:

@@ -133,7 +133,9 @@ def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> Iterator
     if missing := ", ".join(name for name in excitation.unmoved if name not in already):
         yield f"Drive with {missing} changing over the whole range to learn them."
     if together := _list(excitation.together):
-        holds = "the model holds for this proportion only; drive with each changing on its own"
+        units = {c.unit for c in spec.command if c.name in excitation.together}
+        shares = "all have a share of what they did" if len(units) == 1 else "one has all of it"
+        holds = f"{shares}, and the model holds where they move so; drive each on its own to learn"
         yield f"{together} always moved together, so their effects can't be told apart: {holds}."
     if copies := _list([v.name for v in spec.state if v.name in linear.regression.dependent]):
         why = "always followed from the other variables, so their effects can't be told apart"
