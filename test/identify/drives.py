@@ -149,6 +149,7 @@ def calibrate(recording: Recording, spec: RobotSpec) -> Calibration:
 def slipping_car(
     seed: int = 0, duration: float = 40.0, dead: float = 0.1, friction: float = 0.3,
     drag: float = 0.15, slip: float = 0.015, mounting: tuple[float, float, float] = (0.08, 0, 0.1),
+    throttle: float | None = None,
 ) -> tuple[RobotSpec, Recording]:  # fmt: skip
     """A car by throttle that slips aside and turns less at speed; only its poses were seen."""
     limits = {"throttle": (-0.3, 0.6), "steering": (-1.0, 1.0)}
@@ -157,6 +158,8 @@ def slipping_car(
     rng, count = np.random.default_rng(seed), round(duration / COMMAND_S)
     draws = rng.uniform(*np.array(list(limits.values())).T, (count // 40 + 1, 2))
     command = np.repeat(np.where(rng.random(draws.shape) < 0.15, 0.0, draws), 40, axis=0)[:count]
+    if throttle is not None:
+        command[:, 0] = throttle
     state, poses = np.zeros(6), []
     for u, steering in np.repeat(command, round(COMMAND_S / FINE_S), axis=0):
         poses.append(state[:3].copy())

@@ -53,6 +53,13 @@ def test_a_command_in_proportion_to_what_it_does_has_no_curve(found, samples):
     assert curve_of(follows, found.training.spec, 0) is None
 
 
+def test_a_command_that_does_not_drive_a_robot_has_no_curve_by_its_speed(found, samples):
+    slower = replace(samples, x=samples.x.copy())
+    slower.x[:, 0] -= 2.0 * np.maximum(np.abs(samples.x[:, 4]) - 0.4, 0.0)
+    slower.x[:, 1:3] = 0.0
+    assert curve_of(slower, found.training.spec, 1) is None
+
+
 def test_values_are_sought_by_name_from_what_the_motion_shows(found, samples):
     form = Form((CURVE,), friction=("vx",), limits=("vx",), drag=("vx",))
     sought = form_inputs(found, samples, form)

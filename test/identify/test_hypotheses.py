@@ -98,6 +98,8 @@ def test_a_lag_is_what_the_state_itself_takes_from_its_rate():
         np.where(allowed, -4.0, 0.0), 0.01, np.zeros(5), np.zeros(5),
     )  # fmt: skip
     assert lags_of(model, spec) == {"vx": 0.25, "vy": 0.25, "wz": 0.25}
+    rolling = replace(model, coefficients=0.01 * model.coefficients)
+    assert lags_of(rolling, spec) == {}
 
 
 @pytest.mark.parametrize("duration", [4.0, 8.0])

@@ -8,15 +8,27 @@ import pytest
 from identify.drives import MOTOR, servoed, slipping_car, tricycle
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, Settings
-from nics_drl_bridge.identify.identify import STAGES, Identified, complete, identify, run
+from nics_drl_bridge.identify.identify import (
+    STAGES,
+    Identified,
+    aligned,
+    complete,
+    fit,
+    identify,
+    run,
+)
 from nics_drl_bridge.identify.terms import (
     by_textbook,
+    linear_fit,
     mirrored,
+    shared,
     through_state,
     together,
     tyres_slip,
 )
+from nics_drl_bridge.recording.recording import samples_on_one_clock
 from nics_drl_bridge.robot import taylor
+from nics_drl_bridge.robot.spec import robot_from
 
 BASE = 0.9
 
@@ -132,3 +144,54 @@ def model_of(spec, names):
     return taylor.TaylorModel(
         spec.variable_names, spec.dof_names, spec.dof_units, powers, rows, 0.01, box, box
     )  # fmt: skip
+
+
+def held_throttle(**given):
+    spec, recording = slipping_car(throttle=0.25, friction=0.0, duration=20.0, **given)
+    drive = Drive(recording, spec, Settings(train_until_s=20.0))
+    found = run(STAGES[: STAGES.index(fit)], drive)
+    return spec, aligned(found.training, found)
+
+
+def test_a_command_held_at_one_value_pushes_as_a_constant():
+    spec, samples = held_throttle()
+    model = linear_fit(samples, spec, 3, by_textbook).model
+    assert model.rates(np.zeros(5))[3] == pytest.approx(9.0 * 0.15, rel=0.2)
+    assert model.rates([0.0, 0, 0, 0, 0.5])[5] == pytest.approx(0.0, abs=0.1)  # it steers only
+
+
+def test_a_speed_that_never_changed_is_a_constant_of_the_twist():
+    spec, samples = held_throttle()
+    steady = samples.rows(samples.t > samples.t[0] + 10.0)
+    steady.x[:, :2] = 2.0, 0.0
+    model = linear_fit(steady, spec, 3, by_textbook).model
+    assert model.rates(np.zeros(5))[:3] == pytest.approx([2.0, 0.0, 0.0])
+    turning = model.rates([0.0, 0.0, 0.0, 0.25, 0.5])
+    assert turning[3] == 0.0
+    assert turning[5] > 1.0
+
+
+def test_wheels_that_always_move_together_share_what_they_do():
+    four = {"kind": "mecanum", "footprint_radius": 0.4, "state": []}
+    names = ("front_left", "front_right", "rear_left", "rear_right")
+    spec = robot_from(four, dict.fromkeys((f"{name}_wheel" for name in names), (-9.0, 9.0)))
+    rng = np.random.default_rng(2)
+    three = rng.uniform(-8.0, 8.0, (400, 3))
+    wheels = np.column_stack([three, three[:, 0] + three[:, 1] - three[:, 2]])[:, [0, 2, 3, 1]]
+    powers = np.eye(4, dtype=np.int64)[:3]  # the last wheel does nothing
+    alone = taylor.TaylorModel(
+        spec.variable_names, spec.dof_names, spec.dof_units, powers,
+        rng.normal(size=(3, 3)), 0.05, wheels.min(axis=0), wheels.max(axis=0),
+    )  # fmt: skip
+    still = np.zeros((400, 3))
+    samples = samples_on_one_clock(0.05 * np.arange(400), still, still[:, :0], wheels)
+    model = shared(alone, spec, samples)
+    assert model.rates(wheels) == pytest.approx(alone.rates(wheels))
+    assert (model.coefficients @ model.powers @ [1.0, -1.0, -1.0, 1.0]) == pytest.approx(0.0)
+    assert np.abs(model.coefficients).min() > 0.0
+
+
+def test_commands_that_move_on_their_own_share_nothing():
+    spec, samples = held_throttle()
+    model = linear_fit(samples, spec, 2, by_textbook).model
+    assert shared(model, spec, samples) is model
