@@ -24,6 +24,7 @@ from nics_drl_bridge.identify.report import CalibratedValue, estimates
 from nics_drl_bridge.identify.signals import DIFFERENCE, held, moved_commands, nominal_lags
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.report.pictures import DARK, MEASURED, MODEL, OTHER, panels, png
+from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.noise import Level
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.threads import one_blas_thread
@@ -45,7 +46,8 @@ CAPTIONS = {
     "mounting": "Velocities before and after correction: base_link of a robot that can't move "
     "sideways has no lateral velocity.",
     "wheels": "Wheel speeds against the motion: the scale, and which wheel is the left one.",
-    "inputs": "What motors make of commands, over the range that the drive sent.",
+    "inputs": "What motors make of commands, over the range that the drive sent, and of the rates "
+    "that the terms ask of them.",
     "noise": "Noise of the sensors, and how the error of predictions grows beside the drift that "
     "simulator and estimator use.",
 }
@@ -287,13 +289,16 @@ def wheels(identified: Identified, found: dict[str, CalibratedValue]) -> bytes |
 
 
 def inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
-    """Draws the curve of each command that has one, and where the drive's commands lie."""
-    curves = identified.model.inputs
-    if not curves:
+    """Draws the curve of each command that has one, and what becomes of the rates of states."""
+    model = identified.model
+    curves, restrained = model.inputs, [dof for dof in model.dofs if model.restraint(dof)]
+    if not (count := len(curves) + len(restrained)):
         return None
-    figure, grid = panels(1, len(curves), (4.2 * len(curves), 3.8))
+    figure, grid = panels(1, count, (4.2 * count, 3.8))
+    for axes, dof in zip(grid[len(curves) :], restrained, strict=True):
+        _restraint(axes, identified, dof)
     names = [command.name for command in spec.command]
-    for axes, curve in zip(grid, curves, strict=True):
+    for axes, curve in zip(grid, curves, strict=False):
         place = names.index(curve.command)
         sent, unit = identified.recording.command.values[:, place], spec.command[place].unit
         command = np.linspace(sent.min(), sent.max(), CURVE_POINTS)
@@ -307,6 +312,24 @@ def inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
         axes.set(xlabel=f"{curve.command} [{unit}]", ylabel=f"{curve.command}' [{unit}]")
         _finish(axes, fill(curve.equation.replace("-+", "∓"), TITLE))
     return png(figure)
+
+
+def _restraint(axes: Axes, identified: Identified, dof: str) -> None:
+    """Draws the rates of a state as measured, and as limits, drag and friction let them be."""
+    model, samples, d = identified.model, identified.samples, identified.model.dofs.index(dof)
+    some = slice(None, None, max(1, len(samples.t) // MOST_POINTS))
+    asked = taylor.evaluate(samples.x[some], model.powers) @ model.coefficients[d]
+    axes.plot(asked, samples.dq[some, d], ".", markersize=3, color=MEASURED, label="measured")
+    held = model.rates(samples.x[some])[:, d]
+    axes.plot(asked, held, ".", markersize=3, color=MODEL, label="model")
+    for word, edge in zip(("fall", "rise"), model.limits[d - 3].tolist(), strict=True):
+        sigma = identified.calibration.uncertainty.get(f"{model.variables[d - 3]}.{word}", 0.0)
+        if np.isfinite(edge):
+            axes.axhline(edge, color=MODEL, linestyle="--")
+            axes.axhspan(edge - 2.0 * sigma, edge + 2.0 * sigma, color=MODEL, alpha=0.25)
+    unit = model.dof_units[d]
+    axes.set(xlabel=f"{dof} by its terms [{unit}]", ylabel=f"{dof} [{unit}]")
+    _finish(axes, fill(dof + model.restraint(dof), TITLE))
 
 
 def _finish(axes: Axes, title: str) -> None:
