@@ -38,10 +38,8 @@ def compared(found: Identified, truth: Truth) -> dict[str, dict[str, Any]]:
     }
     for name, true in truth.mounting.items():
         sigma = calibration.uncertainty.get(name, float("nan"))
-        # One that was left out is zero, and its estimate was up to as far from it.
-        width = STANDARD_ERRORS * sigma * (2.0 if values[name] == 0.0 else 1.0)
         told = not np.isnan(sigma)
-        near = abs(values[name] - true) <= width if told else values[name] == 0.0
+        near = abs(values[name] - true) <= STANDARD_ERRORS * sigma if told else values[name] == 0.0
         rows[name] = {"true": true, "found": values[name], "sigma": sigma, "near": bool(near)}
     if truth.latency_s is not None and "command_latency_s" in calibration.uncertainty:
         rows["latency_s"] = _row(truth.latency_s, calibration.command_latency_s, LATENCY_S)
