@@ -32,6 +32,7 @@ NOTHING = 1e-6  # [m/s, rad/s]
 DELAY_ORDER, DELAY_STEP_S, LONGEST_S = 2, 0.02, 0.4  # of the search for a delay
 DELAY_SCALE_S, CURVE_SCALE = 0.05, 0.1  # steps of their refinement
 BACK_SCALE, BACK_RANGE = 0.2, (0.2, 5.0)  # of a gain backwards
+SMALL_DEAD = 0.05  # share of a command's reach at which the search for a dead zone begins
 TWO_WAY = 0.05  # share of the rows in which a command drives backwards, to tell its gain
 STRONG = 95.0  # percentile of the rates at which limits are first sought
 LEVER_SCALE_M, TURN_SCALE = 0.05, 0.1
@@ -219,6 +220,18 @@ def _drivers(spec: RobotSpec) -> tuple[int, ...]:
     """Returns the places of the commands that drive a robot ahead, as its textbook tells."""
     given = structure_of(spec)
     return () if given is None else tuple(np.flatnonzero(given[0][0]).tolist())
+
+
+def with_dead(form: Form, drive: Drive, samples: Samples) -> Form:
+    """Returns a form in which each command that drives the robot has a dead zone."""
+    bent = {c.command: c for c in form.curves}
+    for place in _drivers(drive.spec):
+        name, reach = drive.spec.command[place].name, samples.x[:, len(drive.spec.state) + place]
+        low, high = min(float(reach.min()), 0.0), max(float(reach.max()), 0.0)
+        curve = bent.get(name, InputCurve(command=name, least=low, most=high))
+        if not curve.dead:
+            bent[name] = curve.model_copy(update={"dead": SMALL_DEAD * max(-low, high)})
+    return replace(form, curves=tuple(bent.values()))
 
 
 def with_back(form: Form, curves: tuple[InputCurve, ...]) -> Form:

@@ -15,7 +15,14 @@ from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.excitation import unmoved_variables
 from nics_drl_bridge.identify.fit import Order
-from nics_drl_bridge.identify.forms import Form, inputs_of, problem_of, two_way, with_back
+from nics_drl_bridge.identify.forms import (
+    Form,
+    inputs_of,
+    problem_of,
+    two_way,
+    with_back,
+    with_dead,
+)
 from nics_drl_bridge.identify.statistics import clustered_errors
 from nics_drl_bridge.identify.terms import (
     Mask,
@@ -200,6 +207,7 @@ def changes(drive: Drive, samples: Samples) -> Iterator[tuple[Callable[[Form], F
         yield lambda form: replace(form, drag=speeds, friction=speeds), WORTH
         yield lambda form: replace(form, drag=()), 1.0 / WORTH
         yield lambda form: replace(form, friction=()), 1.0 / WORTH
+        yield lambda form: with_dead(form, drive, samples), WORTH
         yield lambda form: replace(form, limits=speeds), WORTH
         if backwards := two_way(drive, samples):
             yield lambda form: with_back(form, backwards), WORTH

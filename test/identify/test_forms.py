@@ -10,7 +10,14 @@ from scipy.signal import lfilter
 
 from identify.drives import slipping_car
 from nics_drl_bridge.identify.drive import Drive, Settings
-from nics_drl_bridge.identify.forms import Form, curve_of, inputs_of, two_way, with_back
+from nics_drl_bridge.identify.forms import (
+    Form,
+    curve_of,
+    inputs_of,
+    two_way,
+    with_back,
+    with_dead,
+)  # fmt: skip
 from nics_drl_bridge.identify.identify import STAGES, Findings, aligned, inputs, run
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve
@@ -99,6 +106,14 @@ def test_values_become_curves_friction_limits_and_drag(found, samples):
     assert model.drag.tolist() == [0.15, 0.0, 0.0]
     assert model.back_emf[0].tolist() == [1.2, 0.0]
     assert model.limits[0].tolist() == [-3.0, 2.0]
+
+
+def test_a_dead_zone_is_tried_of_the_command_that_drives_alone(found, samples):
+    (curve,) = with_dead(Form(), found.training, samples).curves
+    assert curve.command == "throttle"
+    assert 0.0 < curve.dead < 0.05
+    assert with_dead(Form((CURVE,)), found.training, samples).curves == (CURVE,)
+    assert with_back(with_dead(Form(), found.training, samples), (curve,)).back == ("throttle",)
 
 
 def test_only_a_command_that_drives_both_ways_may_have_a_gain_of_its_own_backwards(found, samples):
