@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.geometry import Array, east_and_north
 from nics_drl_bridge.recording.mapped import POSES
 from nics_drl_bridge.recording.mapping import UNITS
 from nics_drl_bridge.recording.recording import (
@@ -25,6 +25,8 @@ GUESSED = "# guessed"
 UNIT_LENGTH = 0.01  # by which a quaternion may differ from length 1
 # Words of names: of a place, and what goes with x; of headings, and of neither.
 AXES = {"x": "y", "px": "py", "tx": "ty", "posx": "posy", "easting": "northing", "east": "north"}
+GLOBE = {"longitude": "latitude", "lon": "lat", "lng": "lat", "long": "lat"}
+AXES |= GLOBE
 HEADINGS = {"yaw", "heading", "theta", "psi", "th", "angle", "orientation", "hdg"}
 NOT_PLACES = {"linear", "angular", "twist", "velocity", "vel", "acc", "accel", "acceleration"}
 NOT_PLACES |= {"gyro", "mag", "cmd", "command", "steer", "steering", "rate", "speed", "wheel"}
@@ -298,7 +300,8 @@ def _pose_lines(pose: Guess, alone: bool, common: str | None) -> list[str]:
         lines.append(f"  {key}: {column if many else table.reference(column, True)}")
     if table.time not in (common, None):
         lines.append(f"  time: {table.time}")
-    units = {"unit": unit_in(keys["x"])[1], "heading_unit": unit_in(keys.get("heading", ""))[1]}
+    place = "deg" if {*words_of(keys["x"])} & {*GLOBE} else unit_in(keys["x"])[1]
+    units = {"unit": place, "heading_unit": unit_in(keys.get("heading", ""))[1]}
     said = [f"  {key}: {unit}  {GUESSED}" for key, unit in units.items() if unit]
     for _ in range(0 if said else len(units)):
         found = _values(pose, said)
@@ -330,6 +333,8 @@ def _values(pose: Guess, lines: Sequence[str]) -> tuple[Array, Array] | None:
     for key, part in (("unit", np.s_[:, :2]), ("heading_unit", np.s_[:, 2])):
         if named := re.search(rf"^  {key}: (\S+)", "\n".join(lines), re.MULTILINE):
             values[part] *= UNITS[named[1]].factor
+            if key == "unit" and UNITS[named[1]].si == "rad":
+                values[part] = np.stack(east_and_north(*values[part].T), axis=1)
     return table.t[whole], values[whole]
 
 

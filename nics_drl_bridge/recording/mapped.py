@@ -10,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 
 from nics_drl_bridge.errors import ConfigError, RecordingError
-from nics_drl_bridge.geometry import Array, wrap_angle
+from nics_drl_bridge.geometry import Array, east_and_north, wrap_angle
 from nics_drl_bridge.recording import stamping
 from nics_drl_bridge.recording.mapping import (
     COVARIANCES,
@@ -91,7 +91,7 @@ def read_pose(reader: MappedReader, pose: PoseSource) -> Stream:
     """Reads poses, with their deviations where a covariance is mapped."""
     if pose.x is None:
         pose = _of_message(reader, pose)
-    parts, factors = [], []
+    parts, factors, whole = [], [], list[Value]()
     for key, kinds in SI["pose"].items():
         value: Value | None = getattr(pose, key)
         if value is None:
@@ -100,11 +100,17 @@ def read_pose(reader: MappedReader, pose: PoseSource) -> Stream:
             continue
         unit = value.unit or (pose.heading_unit if key == "heading" else pose.unit)
         value = value.model_copy(update={"unit": unit})
+        kinds = kinds if key != "y" else (unit_of(whole[0]).si,)
+        whole.append(value)
         if unit_of(value).si not in kinds:
             fault = f"pose.{key}: is in {unit_of(value).si}, not in {kinds[0]}"
             raise ConfigError(f"{fault}; check its unit.")
         parts.append(reader.series(f"pose.{key}", value, pose, held=False))
         factors.append(abs(unit_of(value).factor * value.scale))
+        if key == "y" and unit_of(value).si == "rad":  # longitude, latitude; covariances are in m
+            ground = east_and_north(parts[0].values, parts[1].values)
+            parts = [each._replace(values=v) for each, v in zip(parts, ground, strict=True)]
+            factors = [1.0, 1.0]
     _check_units(reader, together("pose", parts, held=False))
     heading = parts[2]
     parts[2] = heading._replace(values=np.unwrap(heading.values))  # as it may be interpolated

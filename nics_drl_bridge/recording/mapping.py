@@ -175,7 +175,8 @@ class PoseSource(Measured):
     heading: AValue | None = None
     # instead of the heading: x, y, z, w, or the field of a message
     quaternion: str | tuple[Reference, Reference, Reference, Reference] | None = None
-    unit: Annotated[str, _of_kind(("m",))] = "m"  # of x and y, and in the covariance
+    # of x and y, and in the covariance; an angle if they are longitude and latitude
+    unit: Annotated[str, _of_kind(("m", "rad"))] = "m"
     heading_unit: Annotated[str, _of_kind(("rad",))] = "rad"
     # variances of x, y, heading; or all of a 3 x 3 or 6 x 6 matrix, by rows; or a message's field
     covariance: str | list[Reference] | None = None
@@ -239,7 +240,7 @@ class Mapping(Schema):
 
 
 SI: dict[str, dict[str, tuple[str, ...]]] = {
-    "pose": {"x": ("m",), "y": ("m",), "heading": ("rad",)},
+    "pose": {"x": ("m", "rad"), "y": ("m", "rad"), "heading": ("rad",)},
     "wheels": dict.fromkeys(("left", "right"), ("m/s", "rad/s", "ticks/s", "1", "V")),
     "imu": {"ax": ("m/s^2",), "ay": ("m/s^2",), "yaw_rate": ("rad/s",)},
     "odometry": {"vx": ("m/s",), "vy": ("m/s",), "wz": ("rad/s",)},

@@ -327,3 +327,17 @@ def test_poses_far_from_the_origin_of_a_fast_car_are_read(tmp_path):
     path = write(tmp_path / "log.csv", columns | moved)
     found = read(path, robot={"kind": "ackermann_throttle", "footprint_radius": 2.0})
     assert np.allclose(np.diff(found.pose.values[:, 0]), np.diff(moved["x"]), atol=1e-6)
+
+
+def test_longitude_and_latitude_are_places_on_the_ground(tmp_path):
+    columns = drive()
+    far = columns | {  # 111.2 km to a degree of latitude at 48 degrees north, 74.6 km of longitude
+        "lon": 11.5 + columns["x"] / 74.626e3, "lat": 48.0 + columns["y"] / 111.197e3,
+    }  # fmt: skip
+    path = write(tmp_path / "log.csv", far)
+    pose = {"x": "lon", "y": "lat", "heading": "yaw", "unit": "deg"}
+    found = read(path, pose=pose).pose.values[:, :2]
+    moved = np.stack([columns["x"], columns["y"]], axis=1)
+    assert np.allclose(found - found[0], moved - moved[0], rtol=1e-3, atol=1e-4)
+    with pytest.raises(ConfigError, match=r"pose.y: is in m, not in rad; check its unit"):
+        read(path, pose=pose | {"y": {"from": "y", "unit": "m"}})
