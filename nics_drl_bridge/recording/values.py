@@ -117,8 +117,11 @@ class MappedReader:
                 example = "as in `time: t`, `time: [s, ns]`, or `time: {rate: 50}` if there is none"
                 raise RecordingError(f"{table.place}: which column is the time? Say {example}.")
             self.say(*table.notes)
-            rows = given.values[:, 0].astype(np.intp)
-            return Stamped(given.t, rows, given.clock, len(table.column(0)))
+            rows, usual = given.values[:, 0].astype(np.intp), self.mapping.time
+            asked = usual is not None and usual.from_ == schema.HEADER
+            main = stamping.HEADER if asked else stamping.RECEIVE  # the mapping's own clock
+            clock = "" if given.clock == main else given.clock
+            return Stamped(given.t, rows, clock, len(table.column(0)))
         raw, name = self._raw_stamps(table, time), table.place.rpartition("/")[2]
         known = np.flatnonzero(np.isfinite(raw))
         if len(known) < len(raw):
