@@ -385,11 +385,13 @@ def _notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
 
 
 def structure(findings: Findings) -> tuple[str, ...]:
-    """Says on what the residuals of the linear fit depend; where they do, its terms mislead."""
+    """Says on what the residuals of the model depend; where they do, its terms mislead."""
     if findings.calibration.is_exact:
         return ()
-    samples = known(findings.samples, "the training part", "fit")
-    return tuple(structures(_fitted(findings)[0], samples, findings.training.spec))
+    (linear, model), training = _fitted(findings), findings.training
+    tried = max((trial.order for trial in findings.trials), default=0)
+    samples, still = aligned(training, findings), linear.unmoved
+    return tuple(structures(model, samples, training.spec, still, tried))
 
 
 def _left_out(drive: Drive, findings: Findings, order: int | None = None) -> dict[float, Array]:
