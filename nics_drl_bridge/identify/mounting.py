@@ -59,7 +59,8 @@ def mounting_of(
     start, end = twists.on_clock(timing.offset)
     command = held(drive.recording.command, spec, start - timing.latency, end - timing.latency)
     forward = _response(spec, command)[:, 0]
-    found = mounting_without_lateral_motion(twists, forward)
+    _, noise = drive.pose_noise or (0.0, 0.0)
+    found = mounting_without_lateral_motion(twists, forward, noise)
     if found is not None and states is None and tyres_slip(spec):
         return with_slip(twists, found, spec)
     if found is None or states is None:
@@ -146,8 +147,13 @@ def mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
     return replace(calibration, rotation_rad=rotation, lever_arm_m=(x, y), uncertainty=uncertainty)
 
 
-def mounting_without_lateral_motion(motion: TwistIntervals, forward: Array) -> Mounting | None:
-    """Estimates the mounting of a robot that never moves sideways; None if it is not shown."""
+def mounting_without_lateral_motion(
+    motion: TwistIntervals, forward: Array, noise: float = 0.0
+) -> Mounting | None:
+    """Estimates the mounting of a robot that never moves sideways; None if it is not shown.
+
+    Turning that a noise of the heading [rad] explains is none.
+    """
     # The lateral speed of the tracked point is then yaw rate x lever arm: `cos(rotation) uy -
     # sin(rotation) ux - lever_x wz = 0`, the direction in which the twists have no extent. On a
     # single curvature the lever arm is set to zero. Of the speed (n,) only the sign matters.
@@ -156,11 +162,9 @@ def mounting_without_lateral_motion(motion: TwistIntervals, forward: Array) -> M
     size = size / np.sqrt(len(rows))
     if size[0] < STILL:
         return None
-    turn, lever, lever_sigma = (
-        rows[:, 2] / max(float(np.abs(rows[:, 2]).mean()), STILL),
-        0.0,
-        np.nan,
-    )
+    turn, lever, lever_sigma = motion.twist[:, 2], 0.0, np.nan
+    certain = np.abs(turn) > clocks.CERTAIN * np.sqrt(2.0) * noise / (motion.end - motion.start)
+    turn = certain * turn / max(float(np.abs(turn).mean()), STILL)
     ways = sum(float(np.maximum(side * turn, 0.0).mean()) > ONE_WAY for side in (1.0, -1.0))
     if size[1] < max(DISTINCT * size[2], MIN_SECOND * size[0]):
         sigma = size[1] / size[0] / np.sqrt(len(rows))

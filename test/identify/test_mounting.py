@@ -101,3 +101,16 @@ def test_a_car_that_drives_backwards_first_faces_where_it_is_told_to(car):
     assert found is not None
     assert abs(found.rotation) == pytest.approx(np.pi, abs=0.01)
     assert found.lever[0] == pytest.approx(-0.08, abs=0.005)
+
+
+@pytest.mark.parametrize(("bend", "ways"), [(0.0, 0), (0.5, 1), (-0.5, 1)])
+def test_the_noise_of_a_heading_is_no_turning(bend, ways):
+    rng, n = np.random.default_rng(0), np.arange(900)
+    heading_noise = 0.005
+    heading = heading_noise * rng.normal(size=901)
+    twist = np.stack([0.5 + 0.0 * n, 0.0 * n, 0.5 * bend + np.diff(heading) / 0.1], axis=1)
+    motion = TwistIntervals(0.1 * n, 0.1 * n + 0.1, twist)
+    found = mounting_without_lateral_motion(motion, np.ones(900), heading_noise)
+    assert found is not None
+    assert found.ways == ways
+    assert np.isnan(found.lever_sigma[0])
