@@ -80,11 +80,12 @@ def about_mounting(
         turned = f"{calibration.rotation_rad:.4f} rad (+- {sigma:.4f} rad)"
         yield f"The direction of travel lies {turned} from the tracked body's heading."
     if not known_x:
-        slips = "slip and noise hide it"
-        why = ("the robot never turned", "all of the path had one curvature", slips)[mounting.ways]
+        ways = "the robot never turned", "all of the path had one curvature", "noise hides it"
+        why = "slip looks alike" if mounting.slip and mounting.ways else ways[mounting.ways]
         finding = f"Where the tracked point lies on the robot could not be learnt, since {why}"
         advice = "it is taken as base_link, and the rotation holds for this curvature"
-        yield f"{finding}: {advice}; drive left, right and straight on to learn it."
+        drive_so = "drive left, right and straight on, forwards and backwards, to learn it"
+        yield f"{finding}: {advice}; {drive_so}."
     elif (x, y) != (0.0, 0.0):
         yield f"The tracked point lies at x {x:.4f} m, y {y:.4f} m of base_link."
     if known_x and not known_y and not drive.spec.moves_sideways:
