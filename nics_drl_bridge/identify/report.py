@@ -46,7 +46,9 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
         f"Open loop, on data held out from the fit (after {until:.1f} s):": _held_out(identified),
         **_compared(identified.judgement),
         "Valid where the drive was:": (
-            f"{name:<24} {low:.4g} to {high:.4g} {units[name]}" for name, low, high in ranges
+            f"{name:<24} {low:.4g} to {high:.4g} {units[name]}"
+            + " (assumed)" * (model.bounded and f"d_{name}" in dict(model.assumed))
+            for name, low, high in ranges
         ),
         "Calibration (standard uncertainties):": (e.text for e in estimates(identified).values()),
         "Noise that the simulator and the estimator use (standard deviations):": (

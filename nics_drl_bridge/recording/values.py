@@ -117,8 +117,8 @@ class MappedReader:
                 example = "as in `time: t`, `time: [s, ns]`, or `time: {rate: 50}` if there is none"
                 raise RecordingError(f"{table.place}: which column is the time? Say {example}.")
             self.say(*table.notes)
-            rows, usual = given.values[:, 0].astype(np.intp), self.mapping.time
-            asked = usual is not None and usual.from_ == schema.HEADER
+            rows = given.values[:, 0].astype(np.intp)
+            asked = getattr(self.mapping.time, "from_", None) == schema.HEADER
             main = stamping.HEADER if asked else stamping.RECEIVE  # the mapping's own clock
             clock = "" if given.clock == main else given.clock
             return Stamped(given.t, rows, clock, len(table.column(0)))
