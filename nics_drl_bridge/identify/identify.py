@@ -378,7 +378,8 @@ def _notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
         *verdict.mirror_note(known(findings.samples, "the training part", "fit"), spec),
         *verdict.unlearnt(linear, calibration, spec),
         *findings.structure,
-        *verdict.doubts(linear, findings.held_out, calibration.is_exact),
+        *(verdict.doubts_of_fit(linear, calibration.is_exact) if findings.width is None else ()),
+        *verdict.doubts(findings.held_out),
         *verdict.untried(drive, findings.held_out),
         *findings.assumptions,
     )

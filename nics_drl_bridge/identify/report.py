@@ -23,7 +23,7 @@ ENDS = (1.0, 99.0)  # percentiles that bound the range of a state
 
 def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
     """Returns the report on a recording from a source as text for people."""
-    model, total = identified.model, identified.fit.regression.terms_total
+    model = identified.model
     latency, until = identified.recording.latency.sentences(), identified.train_until_s
     units = dict(zip(spec.variable_names, spec.variable_units, strict=True))
     ranges = zip(model.variables, model.low, model.high, strict=True)
@@ -33,16 +33,10 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
         f"Fit report: robot {spec.name!r} from {source}": (
             fill(warning, WIDTH - 2) for warning in shortfall(identified.judgement)
         ),
-        f"Kept {model.terms_kept} of {total} terms, step {model.dt:g} s "
+        f"Kept {_count(identified)}, step {model.dt:g} s "
         f"(X = {', '.join(model.variables)}), with standard errors:": equations_with_errors(model),
         **({"What motors do around the terms (standard uncertainties):": around} if around else {}),
-        fill(_pruning(identified.alpha), WIDTH): (),
-        "Cross-validated error against the number of terms, largest first, * for those kept:": (
-            line for curve in identified.fit.curves for line in _curve(curve)
-        ),
-        "Error of the linear fit per degree of freedom, on the part it was fitted to:": _errors(
-            identified
-        ),
+        **_linear_fit(identified),
         f"Open loop, on data held out from the fit (after {until:.1f} s):": _held_out(identified),
         **_compared(identified.judgement),
         "Valid where the drive was:": (
@@ -122,6 +116,27 @@ def with_error(value: float, error: float | None) -> str:
     leading = error / 10.0**exponent
     digits = max(0, -exponent + (leading < 1.95 or leading >= 9.5))
     return f"({value:.{digits}f} +- {error:.{digits}f})"
+
+
+def _count(identified: Identified) -> str:
+    """Tells the number of terms, and of how many where pruning chose them."""
+    by_motion, total = identified.findings.width is not None, identified.fit.regression.terms_total
+    return f"{identified.model.terms_kept}" + f" of {total}" * (not by_motion) + " terms"
+
+
+def _linear_fit(identified: Identified) -> dict[str, Iterable[str]]:
+    """Tells of the pruned linear fit, where it gave the terms: not those of a motion."""
+    if identified.findings.width is not None:
+        return {}
+    return {
+        fill(_pruning(identified.alpha), WIDTH): (),
+        "Cross-validated error against the number of terms, largest first, * for those kept:": (
+            line for curve in identified.fit.curves for line in _curve(curve)
+        ),
+        "Error of the linear fit per degree of freedom, on the part it was fitted to:": _errors(
+            identified
+        ),
+    }
 
 
 def _pruning(alpha: Alpha) -> str:

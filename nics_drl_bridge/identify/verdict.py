@@ -149,8 +149,8 @@ def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> Iterator
         yield f"{coarse} took two values only: {finding}; drive with values in between."
 
 
-def doubts(linear: Fit, held_out: OpenLoop | None, exact: bool) -> Iterator[str]:
-    """Tells each reason to doubt the fit or its predictions."""
+def doubts_of_fit(linear: Fit, exact: bool) -> Iterator[str]:
+    """Tells each reason to doubt a linear fit."""
     dofs = linear.model.dofs
     for dof, outliers, condition in zip(dofs, linear.outliers, linear.condition, strict=True):
         if outliers > MANY_OUTLIERS:
@@ -165,6 +165,10 @@ def doubts(linear: Fit, held_out: OpenLoop | None, exact: bool) -> Iterator[str]
     if lost := _list([dof for dof, share in explained if share < UNEXPLAINED and dof in fitted]):
         why = "the robot did not follow its commands in a way that a polynomial can describe"
         yield f"The model explains less than half of {lost}: {why}; do not trust its predictions."
+
+
+def doubts(held_out: OpenLoop | None) -> Iterator[str]:
+    """Tells each reason to doubt the predictions."""
     if held_out is None or not held_out.mean_path_m > 0.0:
         return
     share = held_out.mean_position_error_m / held_out.mean_path_m
