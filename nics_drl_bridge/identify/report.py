@@ -312,8 +312,8 @@ def _suspicion(identified: Identified, spec: RobotSpec) -> str:
     if share > COARSE:
         coarse = f"{name} changes by {share:.0%} of its range between rows that are {apart}"
         return f"{coarse}, so record at a higher rate"
-    if unmoved:
-        reason = f"{', '.join(unmoved)} never moved in its first {identified.train_until_s:.0f} s"
+    if still := ", ".join(c.name for c in spec.command if c.name in unmoved):
+        reason = f"{still} never moved in its first {identified.train_until_s:.0f} s"
         return f"{reason}, from which it is learnt, so change it from the beginning on"
     if identified.alpha != "auto" or identified.drive.settings.order == 1:
         return "it may lack terms, so leave order and alpha at `auto`"

@@ -118,14 +118,19 @@ def about_responses(
 
 def refuse_unexcited(excitation: Excitation, spec: RobotSpec) -> None:
     """Refuses a drive, with a FitError, that did not move every input independently."""
-    commands = {c.name for c in spec.command}
-    still = [n for n in excitation.unmoved if n in commands] or excitation.unmoved
+    sensed = [v.name for v in spec.state if v.twist is None and v.name in excitation.unmoved]
+    still = _commands(excitation.unmoved, spec) or sensed
     for names, fault, way in (
         (still, "never moved", "changing over the whole range"),
         (excitation.together, "always moved together", "each changing on its own"),
     ):
         if told := _list(names):
             raise FitError(f"{told} {fault}; drive with {told} {way}, or allow a model without.")
+
+
+def _commands(names: Sequence[str], spec: RobotSpec) -> list[str]:
+    """Returns those names that are commands: what a driver can move."""
+    return [c.name for c in spec.command if c.name in names]
 
 
 def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> Iterator[str]:
@@ -135,7 +140,8 @@ def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> Iterator
     if unmoved := ", ".join(excitation.unmoved):
         finding = f"The model has no terms of {unmoved}, which never moved"
         yield f"{finding}: it holds for this drive's constant value only."
-    if missing := ", ".join(name for name in excitation.unmoved if name not in already):
+    still = _commands(excitation.unmoved, spec)
+    if missing := ", ".join(name for name in still if name not in already):
         yield f"Drive with {missing} changing over the whole range to learn them."
     if together := _list(excitation.together):
         holds = "the model holds for this proportion only; drive with each changing on its own"
