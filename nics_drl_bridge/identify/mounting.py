@@ -47,6 +47,17 @@ class Mounting:
     ways: int  # in which the robot turned: 2 for left and right
     slip: bool = False  # True if the lever can't be told from slip
 
+    @property
+    def hidden(self) -> tuple[str, str]:
+        """Why the lever arm along x and y could not be learnt; empty where it was."""
+        known_x, known_y = ~np.isnan(self.lever_sigma)
+        along = "" if known_y else "no speed was known apart from the tracked one"
+        if known_x:
+            return "", along
+        ways = "the robot never turned", "all of the path had one curvature", "noise hides it"
+        why = "slip looks alike" if self.slip and self.ways else ways[self.ways]
+        return why, why
+
 
 def mounting_of(
     drive: Drive, timing: clocks.TimingEstimate, states: Array | None

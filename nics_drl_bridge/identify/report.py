@@ -23,7 +23,7 @@ ENDS = (1.0, 99.0)  # percentiles that bound the range of a state
 
 def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
     """Returns the report on a recording from a source as text for people."""
-    model = identified.model
+    model, noise = identified.model, identified.calibration.position_noise_m
     latency, until = identified.recording.latency.sentences(), identified.train_until_s
     units = dict(zip(spec.variable_names, spec.variable_units, strict=True))
     ranges = zip(model.variables, model.low, model.high, strict=True)
@@ -31,7 +31,7 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
     notes = identified.notes or ("Nothing had to be corrected.",)
     sections: dict[str, Iterable[str]] = {
         f"Fit report: robot {spec.name!r} from {source}": (
-            fill(warning, WIDTH - 2) for warning in shortfall(identified.judgement)
+            fill(warning, WIDTH - 2) for warning in shortfall(identified.judgement, noise)
         ),
         f"Kept {_count(identified)}, step {model.dt:g} s "
         f"(X = {', '.join(model.variables)}), with standard errors:": equations_with_errors(model),
@@ -244,17 +244,17 @@ def estimates(identified: Identified) -> dict[str, CalibratedValue]:
     latency = "only its sum with the clock offset is known" if both else "no command changed"
     if identified.findings.width is not None and not both:
         latency = "it can't be told from the lags"
-    turned = mounting is None or mounting.ways > 0
-    turns = "the drive shows too few directions of motion" if turned else "the robot never turned"
+    few = "the drive shows too few directions of motion"
+    hidden = (few, few) if mounting is None else mounting.hidden
     unknown = recording.wheels is None
     wheels = "no wheel speeds were recorded" if unknown else "the wheels do not show it"
     rows = {
         "clock_offset_s": ("clock offset", found.clock_offset_s, "s", clocks),
         "command_latency_s": ("command latency", found.command_latency_s, "s", latency),
         "burst_period_s": ("period of bursts", None, "s", "the poses are stamped one by one"),
-        "rotation_rad": ("rotation of base_link", found.rotation_rad, "rad", turns),
-        "lever_arm_x_m": ("lever arm x", found.lever_arm_m[0], "m", turns),
-        "lever_arm_y_m": ("lever arm y", found.lever_arm_m[1], "m", turns),
+        "rotation_rad": ("rotation of base_link", found.rotation_rad, "rad", few),
+        "lever_arm_x_m": ("lever arm x", found.lever_arm_m[0], "m", hidden[0]),
+        "lever_arm_y_m": ("lever arm y", found.lever_arm_m[1], "m", hidden[1]),
         "wheel_scale": ("wheel scale", found.wheel_scale, "m/s per unit", wheels),
         "turn_scale": ("turn scale", found.turn_scale, "rad/s per unit", wheels),
     }

@@ -74,22 +74,22 @@ def about_mounting(
         yield f"How the tracked body sits on the robot could not be learnt, and {taken}."
         return
     x, y = calibration.lever_arm_m
-    known_x, known_y = ~np.isnan(mounting.lever_sigma)
+    names = "lever_arm_x_m", "lever_arm_y_m"  # of which predictions may have told one later
+    found = (name in calibration.uncertainty for name in names)
+    x_hidden, y_hidden = (why * (not f) for why, f in zip(mounting.hidden, found, strict=True))
     if calibration.rotation_rad != 0.0:
         sigma = calibration.uncertainty.get("rotation_rad", mounting.rotation_sigma)
         turned = f"{calibration.rotation_rad:.4f} rad (+- {sigma:.4f} rad)"
         yield f"The direction of travel lies {turned} from the tracked body's heading."
-    if not known_x:
-        ways = "the robot never turned", "all of the path had one curvature", "noise hides it"
-        why = "slip looks alike" if mounting.slip and mounting.ways else ways[mounting.ways]
-        finding = f"Where the tracked point lies on the robot could not be learnt, since {why}"
+    if x_hidden:
+        finding = f"Where the tracked point lies on the robot could not be learnt, since {x_hidden}"
         advice = "it is taken as base_link, and the rotation holds for this curvature"
         drive_so = "drive left, right and straight on, forwards and backwards, to learn it"
         yield f"{finding}: {advice}; {drive_so}."
     elif (x, y) != (0.0, 0.0):
         yield f"The tracked point lies at x {x:.4f} m, y {y:.4f} m of base_link."
-    if known_x and not known_y and not drive.spec.moves_sideways:
-        why = "since no speed was known apart from the tracked one; it is taken as zero"
+    if y_hidden and not x_hidden and not drive.spec.moves_sideways:
+        why = f"since {y_hidden}; it is taken as zero"
         yield f"The tracked point's place along y could not be learnt, {why}."
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.excitation import Excitation
-from nics_drl_bridge.identify.verdict import refuse_unexcited, unlearnt
+from nics_drl_bridge.identify.mounting import Mounting
+from nics_drl_bridge.identify.verdict import about_mounting, refuse_unexcited, unlearnt
 from nics_drl_bridge.robot.spec import robot_from
 
 
@@ -37,3 +39,24 @@ def test_a_car_that_never_moves_sideways_is_not_refused(throttled, car):
         refuse_unexcited(Excitation(("vy", "wz", "steering"), (), {}), throttled)
     with pytest.raises(FitError, match="steering never moved"):  # a sensor that is stuck
         refuse_unexcited(Excitation(("steering",), (), {}), car)
+
+
+def of_mounting(spec, sigma: tuple[float, float], **learnt: float) -> str:
+    mounting = Mounting(0.0, np.array([0.1, 0.0]), 0.001, np.array(sigma), 2)
+    calibration = Calibration(lever_arm_m=(0.1, 0.0), uncertainty=learnt)
+    return " ".join(about_mounting(SimpleNamespace(spec=spec), calibration, mounting))
+
+
+def test_a_lever_arm_that_was_not_learnt_has_one_reason(throttled):
+    unknown = Mounting(0.0, np.zeros(2), 0.001, np.array([0.001, np.nan]), 2)
+    assert unknown.hidden == ("", "no speed was known apart from the tracked one")
+    sentence = of_mounting(throttled, (0.001, np.nan), lever_arm_x_m=0.001)
+    assert "along y could not be learnt, since no speed was known apart" in sentence
+    sentence = of_mounting(throttled, (np.nan, np.nan))
+    assert "since noise hides it" in sentence
+    assert "along y" not in sentence
+
+
+def test_a_lever_arm_that_predictions_told_is_learnt(throttled):
+    learnt = {"lever_arm_x_m": 0.001, "lever_arm_y_m": 0.002}
+    assert "could not be learnt" not in of_mounting(throttled, (0.001, np.nan), **learnt)
