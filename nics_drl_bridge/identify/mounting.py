@@ -49,7 +49,7 @@ class Mounting:
 
     @property
     def hidden(self) -> tuple[str, str]:
-        """Why the lever arm along x and y could not be learnt; empty where it was."""
+        """Reasons that the lever arm along x, and y, could not be learnt; empty where it was."""
         known_x, known_y = ~np.isnan(self.lever_sigma)
         along = "" if known_y else "no speed was known apart from the tracked one"
         if known_x:

@@ -10,7 +10,7 @@ import numpy as np
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.clocks import TimingEstimate
+from nics_drl_bridge.identify.clocks import CERTAIN, TimingEstimate
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.excitation import Excitation, plausible
 from nics_drl_bridge.identify.fit import Fit
@@ -60,8 +60,9 @@ def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate)
         why = "since nothing measured on the commands' clock follows them"
         advice = "the latency is taken as zero. Record the wheels or the state to tell them apart"
         yield f"Only the sum of clock offset and command latency can be known, {why}; {advice}."
-    if timing.separated and calibration.command_latency_s > 0.0 and "command_latency_s" in sigma:
-        late = f"{calibration.command_latency_s:.4f} s (+- {sigma['command_latency_s']:.4f} s)"
+    latency, spread = calibration.command_latency_s, sigma.get("command_latency_s", np.inf)
+    if timing.separated and latency > CERTAIN * spread:
+        late = f"{latency:.4f} s (+- {spread:.4f} s)"
         yield f"Commands take effect {late} after their stamps."
 
 

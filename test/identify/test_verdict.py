@@ -7,11 +7,19 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from identify.drives import drive
 from nics_drl_bridge.errors import FitError
 from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.clocks import timing_of
+from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.excitation import Excitation
 from nics_drl_bridge.identify.mounting import Mounting
-from nics_drl_bridge.identify.verdict import about_mounting, refuse_unexcited, unlearnt
+from nics_drl_bridge.identify.verdict import (
+    about_clocks,
+    about_mounting,
+    refuse_unexcited,
+    unlearnt,
+)
 from nics_drl_bridge.robot.spec import robot_from
 
 
@@ -60,3 +68,11 @@ def test_a_lever_arm_that_was_not_learnt_has_one_reason(throttled):
 def test_a_lever_arm_that_predictions_told_is_learnt(throttled):
     learnt = {"lever_arm_x_m": 0.001, "lever_arm_y_m": 0.002}
     assert "could not be learnt" not in of_mounting(throttled, (0.001, np.nan), **learnt)
+
+
+@pytest.mark.parametrize(("sigma", "told"), [(0.0343, False), (0.0001, False), (0.00005, True)])
+def test_a_latency_below_three_standard_errors_is_not_told(car, sigma, told):
+    tried = Drive(drive(car, duration=10.0), car)
+    calibration = Calibration(command_latency_s=0.0003, uncertainty={"command_latency_s": sigma})
+    sentences = " ".join(about_clocks(tried, calibration, timing_of(tried)))
+    assert ("Commands take effect 0.0003 s" in sentences) == told
