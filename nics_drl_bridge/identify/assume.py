@@ -4,8 +4,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from nics_drl_bridge.robot.kinds import Textbook, textbook
-from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.identify.yardstick import structure_of
+from nics_drl_bridge.robot.kinds import Textbook, reach, textbook
+from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 MIN_OPERATING_POINT = 1e-3
@@ -23,12 +24,14 @@ def assume_textbook(
     point = dict(zip(model.variables, (model.low + model.high) / 2.0, strict=True))
     found = _Completion(model.dt, spec, textbook(spec), unmoved, point, rows, list(model.assumed))
     for i, variable in enumerate(spec.state):
-        if variable.name in unmoved:
+        if variable.twist:  # by definition
+            rows[variable.twist] = {variable.name: 1.0}
+        elif variable.name in unmoved:
             found.restore_twist(i)
     for i in range(len(spec.state)):
         found.restore_rate(i)
-    completed = named.model_copy(update={"terms": rows, "assumed": tuple(found.assumed)})
-    return completed.model(), tuple(found.notes)
+    update = {"terms": rows, "assumed": tuple(found.assumed), "valid": found.widened(named.valid)}
+    return named.model_copy(update=update).model(), tuple(found.notes)
 
 
 @dataclass(frozen=True)
@@ -56,7 +59,7 @@ class _Completion:
                     coefficient, source = learnt / value, f"measured at {name} = {value:g}"
                 else:
                     coefficient = self._slope(d, product)
-                    source = "from the parameters in the robot's YAML file"
+                    source = self.source
                 if coefficient == 0.0:
                     continue
                 self.rows[dof][product] = coefficient
@@ -76,28 +79,76 @@ class _Completion:
             value += float(np.prod(signs) * self.book.twist(state)[d])
         return value / (2.0 * DIFFERENCE) ** len(index)
 
+    def widened(self, valid: dict[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+        """Returns the ranges, as wide as commands reach for parts of the twist that are assumed."""
+        told = {dof for dof, _ in self.assumed}
+        for variable in self.spec.state:
+            if variable.twist and f"d_{variable.name}" in told:
+                far = float(reach(self.spec)[POSE_RATES.index(variable.twist)])
+                low, high = valid[variable.name]
+                valid = valid | {variable.name: (min(low, -far), max(high, far))}
+        return valid
+
+    @property
+    def source(self) -> str:
+        """Says where the parameters of the textbook are from."""
+        if not (assumed := ", ".join(self.spec.assumed)):
+            return "from the parameters in the robot's YAML file"
+        return f"by default, as the robot's YAML file gives no {assumed}"
+
     def restore_rate(self, i: int) -> None:
         """Makes a state follow the commands that never moved, with its lag (learnt or nominal)."""
-        book, name, commands = self.book, self.spec.state[i].name, self.spec.command
-        row, here = self.rows[f"d_{name}"], np.array([self.point[c.name] for c in commands])
-        rate = -row[name] if name in row else float(-np.expm1(-self.dt / book.lag[i])) / self.dt
-        added, constant = {}, 0.0
-        for j, command in enumerate(commands):
-            step = np.where(np.arange(len(commands)) == j, DIFFERENCE, 0.0)
-            slope = (book.target(here + step)[i] - book.target(here - step)[i]) / (2.0 * DIFFERENCE)
-            if command.name in self.unmoved and not abs(slope) < 1e-9:
-                added[command.name] = rate * float(slope)
-                constant -= added[command.name] * here[j]
+        name, row = self.spec.state[i].name, self.rows[f"d_{self.spec.state[i].name}"]
+        lag, source = float(self.book.lag[i]), f" ({self.source})"
+        rate = float(-np.expm1(-self.dt / lag)) / self.dt
+        if name in row:
+            rate, lag, source = -row[name], -1.0 / row[name], ""
+        added = self._turning(i, row, rate)
+        if added is None:
+            added = self._following(i, row, rate)
         if not added:
             return
         if name not in row:
             added[name] = -rate
-        constant += row.pop("1", 0.0)
-        if name in row and abs(constant) > 1e-9 * rate:
-            row["1"] = constant
         row.update(added)
         self.assumed.extend((f"d_{name}", term) for term in added)
+        follows = ", ".join(term for term in added if term != name)
         self.notes.append(
-            f"Assumed, not learnt: {name} follows {', '.join(t for t in added if t != name)} with "
-            f"a lag of {book.lag[i]:g} s as in the robot's YAML file."
+            f"Assumed, not learnt: {name} follows {follows} with a lag of {lag:.3g} s{source}."
         )
+
+    def _following(self, i: int, row: dict[str, float], rate: float) -> dict[str, float]:
+        """Returns the terms by which a state follows commands, each on its own."""
+        commands, target = self.spec.command, self.book.target
+        here, added, constant = np.array([self.point[c.name] for c in commands]), {}, 0.0
+        for j, command in enumerate(commands):
+            step = np.where(np.arange(len(commands)) == j, DIFFERENCE, 0.0)
+            slope = (target(here + step)[i] - target(here - step)[i]) / (2.0 * DIFFERENCE)
+            if command.name in self.unmoved and not abs(slope) < 1e-9:
+                added[command.name] = rate * float(slope)
+                constant -= added[command.name] * here[j]
+        if added:
+            constant += row.pop("1", 0.0)
+            if self.spec.state[i].name in row and abs(constant) > 1e-9 * rate:
+                row["1"] = constant
+        return added
+
+    def _turning(self, i: int, row: dict[str, float], rate: float) -> dict[str, float] | None:
+        """Returns the term by which a car turns whose state is its twist; None for other rates.
+
+        It is the product of speed and steering, measured at a constant if there is one.
+        """
+        given, state = structure_of(self.spec), {v.twist: v.name for v in self.spec.state}
+        turned = self.spec.state[i].twist == "wz" and "vx" in state
+        if given is None or not given[1].used or not turned:
+            return None
+        k = int(np.argmax(np.abs(given[0][2])))
+        names = state["vx"], self.spec.command[k].name
+        still = [name for name in names if name in self.unmoved]
+        if not still:
+            return {}
+        learnt = row.pop("*".join(name for name in names if name not in still) or "1", None)
+        value = float(np.prod([self.point[name] for name in still]))
+        if learnt is not None and abs(value) > MIN_OPERATING_POINT:
+            return {"*".join(names): learnt / value}
+        return {"*".join(names): rate * float(given[0][2, k]) / given[1].wheelbase}

@@ -43,6 +43,7 @@ WITHIN_TICK = 12.0**-0.5
 MIN_TIME_S = 5e-4
 CERTAIN = 3.0  # a correction below this many standard uncertainties is not made
 CLUSTER_S = 2.5  # residuals further apart are independent
+MIN_EARLY_S = 0.03  # smaller ones may be a lag of another form
 TOLD_S = 0.005  # a latency that is less certain can't be told from a lag
 
 
@@ -166,6 +167,7 @@ class TimingEstimate:
     lags: Array  # (S,) of the inferred states [s]; empty if the state was measured
     lag_sigma: Array  # (S,) [s]; NaN for a nominal lag
     separated: bool  # True if offset and latency could be separated
+    early: float = 0.0  # by which motion on the commands' clock precedes them: no clock of it [s]
 
 
 def timing_of(drive: Drive) -> TimingEstimate:
@@ -194,7 +196,8 @@ def timing_of(drive: Drive) -> TimingEstimate:
     delay = delay_of_response(command, spec, target)
     latency = if_certain(max(delay.value, 0.0), delay.sigma, MIN_TIME_S)
     sigma = {"command_latency_s": delay.sigma}
-    return TimingEstimate(0.0, latency, sigma, delay.lags, delay.lag_sigma, True)
+    early = if_certain(max(-delay.value, 0.0), delay.sigma, MIN_EARLY_S)
+    return TimingEstimate(0.0, latency, sigma, delay.lags, delay.lag_sigma, True, early)
 
 
 def apart(drive: Drive, timing: TimingEstimate) -> TimingEstimate:
@@ -223,7 +226,10 @@ def apart(drive: Drive, timing: TimingEstimate) -> TimingEstimate:
     lags, lag_sigma = timing.lags.copy(), timing.lag_sigma.copy()
     lags[moved], lag_sigma[moved] = np.maximum(sums - least, 0.0), np.hypot(*sigma)
     latency = least if timing.separated else 0.0
-    return TimingEstimate(latency - least, latency, errors, lags, lag_sigma, timing.separated)
+    return replace(
+        timing, offset=latency - least, latency=latency, sigma=errors, lags=lags,
+        lag_sigma=lag_sigma,
+    )  # fmt: skip
 
 
 def _delays(

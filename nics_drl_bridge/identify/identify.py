@@ -371,7 +371,7 @@ def _notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
     linear, _ = _fitted(findings)
     spec, calibration = drive.spec, findings.calibration
     return (
-        *shortfall(findings.judgement),
+        *shortfall(findings.judgement, calibration.position_noise_m),
         *drive.recording.repairs,
         *findings.repairs,
         *calibration.notes,
@@ -379,18 +379,21 @@ def _notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
         *verdict.mirror_note(known(findings.samples, "the training part", "fit"), spec),
         *verdict.unlearnt(linear, calibration, spec),
         *findings.structure,
-        *verdict.doubts(linear, findings.held_out, calibration.is_exact),
+        *(verdict.doubts_of_fit(linear, calibration.is_exact) if findings.width is None else ()),
+        *verdict.doubts(findings.held_out),
         *verdict.untried(drive, findings.held_out),
         *findings.assumptions,
     )
 
 
 def structure(findings: Findings) -> tuple[str, ...]:
-    """Says on what the residuals of the linear fit depend; where they do, its terms mislead."""
+    """Says on what the residuals of the model depend; where they do, its terms mislead."""
     if findings.calibration.is_exact:
         return ()
-    samples = known(findings.samples, "the training part", "fit")
-    return tuple(structures(_fitted(findings)[0], samples, findings.training.spec))
+    (linear, model), training = _fitted(findings), findings.training
+    tried = max((trial.order for trial in findings.trials), default=0)
+    samples, still = aligned(training, findings), linear.unmoved
+    return tuple(structures(model, samples, training.spec, still, tried))
 
 
 def _left_out(drive: Drive, findings: Findings, order: int | None = None) -> dict[float, Array]:

@@ -19,7 +19,7 @@ from nics_drl_bridge.identify.terms import mirrored, tyres_slip
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.kernels import GREATEST_ORDER
-from nics_drl_bridge.robot.kinds import has_textbook, steady_twist
+from nics_drl_bridge.robot.kinds import has_textbook, slips, steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec
 
 TURN_SCALE_M = 0.2  # a yaw rate counts as the speed at this distance
@@ -45,6 +45,18 @@ class Mounting:
     rotation_sigma: float  # [rad]
     lever_sigma: Array  # (2,) [m]; NaN for a component that could not be learnt
     ways: int  # in which the robot turned: 2 for left and right
+    slip: bool = False  # True if the lever can't be told from slip
+
+    @property
+    def hidden(self) -> tuple[str, str]:
+        """Reasons that the lever arm along x, and y, could not be learnt; empty where it was."""
+        known_x, known_y = ~np.isnan(self.lever_sigma)
+        along = "" if known_y else "no speed was known apart from the tracked one"
+        if known_x:
+            return "", along
+        ways = "the robot never turned", "all of the path had one curvature", "noise hides it"
+        why = "slip looks alike" if self.slip and self.ways else ways[self.ways]
+        return why, why
 
 
 def mounting_of(
@@ -59,8 +71,9 @@ def mounting_of(
     start, end = twists.on_clock(timing.offset)
     command = held(drive.recording.command, spec, start - timing.latency, end - timing.latency)
     forward = _response(spec, command)[:, 0]
-    found = mounting_without_lateral_motion(twists, forward)
-    if found is not None and states is None and tyres_slip(spec):
+    _, noise = drive.pose_noise or (0.0, 0.0)
+    found = mounting_without_lateral_motion(twists, forward, noise)
+    if found is not None and states is None and (tyres_slip(spec) or slips(spec)):
         return with_slip(twists, found, spec)
     if found is None or states is None:
         return found
@@ -114,22 +127,32 @@ def by_instruments(
 
 
 def with_slip(motion: TwistIntervals, plain: Mounting, spec: RobotSpec) -> Mounting:
-    """Estimates the mounting on a car that may slip aside, by its lateral acceleration.
+    """Estimates the mounting on a robot that may slip aside when it turns.
 
-    Tyres give way in proportion to the force on them: a slip of speed^2 x turn rate (Gillespie).
+    Tyres of a car give way in proportion to the force on them: a slip of speed^2 x turn rate
+    (Gillespie). What skids slips the other way backwards: without that, it looks like a lever arm.
     """
     along = rotate(motion.twist[:, :2], -plain.rotation)
-    turn = motion.twist[:, 2]
-    chi = np.stack([along[:, 0], turn, (along**2).sum(axis=1) * turn], axis=1)
+    speed, turn = along[:, 0], motion.twist[:, 2]
+    skids = slips(spec)
+    slip = speed * turn if skids else (along**2).sum(axis=1) * turn
+    chi = np.stack([speed, turn, slip], axis=1)
     beta = np.linalg.lstsq(chi, along[:, 1], rcond=None)[0]
     sigma = standard_errors(chi, along[:, 1] - chi @ beta)
-    if not clocks.CERTAIN * sigma[1] < spec.footprint_radius:  # slip hides it
-        return replace(plain, lever=np.zeros(2), lever_sigma=np.full(2, np.nan))
+    hidden = skids and _ways(speed * np.abs(turn)) < 2
+    if hidden or not clocks.CERTAIN * sigma[1] < spec.footprint_radius:
+        return replace(plain, lever=np.zeros(2), lever_sigma=np.full(2, np.nan), slip=True)
     if abs(beta[2]) < clocks.CERTAIN * sigma[2]:
         return plain
     rotation = plain.rotation + float(np.arctan(beta[0]))
     lever = np.array([float(beta[1]), 0.0])
     return Mounting(rotation, lever, float(sigma[0]), np.array([sigma[1], np.nan]), plain.ways)
+
+
+def _ways(values: Array, certain: NDArray[np.bool_] | bool = True) -> int:
+    """Counts the signs that values (n,) certainly have, but for a small share of all."""
+    least = ONE_WAY * max(float(np.abs(values).mean()), STILL)
+    return sum(float((certain * np.maximum(s * values, 0.0)).mean()) > least for s in (1.0, -1.0))
 
 
 def mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
@@ -146,8 +169,13 @@ def mounted(calibration: Calibration, mounting: Mounting | None) -> Calibration:
     return replace(calibration, rotation_rad=rotation, lever_arm_m=(x, y), uncertainty=uncertainty)
 
 
-def mounting_without_lateral_motion(motion: TwistIntervals, forward: Array) -> Mounting | None:
-    """Estimates the mounting of a robot that never moves sideways; None if it is not shown."""
+def mounting_without_lateral_motion(
+    motion: TwistIntervals, forward: Array, noise: float = 0.0
+) -> Mounting | None:
+    """Estimates the mounting of a robot that never moves sideways; None if it is not shown.
+
+    Turning that a noise of the heading [rad] explains is none.
+    """
     # The lateral speed of the tracked point is then yaw rate x lever arm: `cos(rotation) uy -
     # sin(rotation) ux - lever_x wz = 0`, the direction in which the twists have no extent. On a
     # single curvature the lever arm is set to zero. Of the speed (n,) only the sign matters.
@@ -156,12 +184,9 @@ def mounting_without_lateral_motion(motion: TwistIntervals, forward: Array) -> M
     size = size / np.sqrt(len(rows))
     if size[0] < STILL:
         return None
-    turn, lever, lever_sigma = (
-        rows[:, 2] / max(float(np.abs(rows[:, 2]).mean()), STILL),
-        0.0,
-        np.nan,
-    )
-    ways = sum(float(np.maximum(side * turn, 0.0).mean()) > ONE_WAY for side in (1.0, -1.0))
+    turn, lever, lever_sigma = motion.twist[:, 2], 0.0, np.nan
+    certain = np.abs(turn) > clocks.CERTAIN * np.sqrt(2.0) * noise / (motion.end - motion.start)
+    ways = _ways(turn, certain)
     if size[1] < max(DISTINCT * size[2], MIN_SECOND * size[0]):
         sigma = size[1] / size[0] / np.sqrt(len(rows))
         travel = float(np.arctan2(axes[0, 1], axes[0, 0]))

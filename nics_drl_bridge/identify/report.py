@@ -23,7 +23,7 @@ ENDS = (1.0, 99.0)  # percentiles that bound the range of a state
 
 def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
     """Returns the report on a recording from a source as text for people."""
-    model, total = identified.model, identified.fit.regression.terms_total
+    model, noise = identified.model, identified.calibration.position_noise_m
     latency, until = identified.recording.latency.sentences(), identified.train_until_s
     units = dict(zip(spec.variable_names, spec.variable_units, strict=True))
     ranges = zip(model.variables, model.low, model.high, strict=True)
@@ -31,22 +31,18 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
     notes = identified.notes or ("Nothing had to be corrected.",)
     sections: dict[str, Iterable[str]] = {
         f"Fit report: robot {spec.name!r} from {source}": (
-            fill(warning, WIDTH - 2) for warning in shortfall(identified.judgement)
+            fill(warning, WIDTH - 2) for warning in shortfall(identified.judgement, noise)
         ),
-        f"Kept {model.terms_kept} of {total} terms, step {model.dt:g} s "
+        f"Kept {_count(identified)}, step {model.dt:g} s "
         f"(X = {', '.join(model.variables)}), with standard errors:": equations_with_errors(model),
         **({"What motors do around the terms (standard uncertainties):": around} if around else {}),
-        fill(_pruning(identified.alpha), WIDTH): (),
-        "Cross-validated error against the number of terms, largest first, * for those kept:": (
-            line for curve in identified.fit.curves for line in _curve(curve)
-        ),
-        "Error of the linear fit per degree of freedom, on the part it was fitted to:": _errors(
-            identified
-        ),
+        **_linear_fit(identified),
         f"Open loop, on data held out from the fit (after {until:.1f} s):": _held_out(identified),
         **_compared(identified.judgement),
         "Valid where the drive was:": (
-            f"{name:<24} {low:.4g} to {high:.4g} {units[name]}" for name, low, high in ranges
+            f"{name:<24} {low:.4g} to {high:.4g} {units[name]}"
+            + " (assumed)" * (model.bounded and f"d_{name}" in dict(model.assumed))
+            for name, low, high in ranges
         ),
         "Calibration (standard uncertainties):": (e.text for e in estimates(identified).values()),
         "Noise that the simulator and the estimator use (standard deviations):": (
@@ -126,6 +122,27 @@ def with_error(value: float, error: float | None) -> str:
     leading = error / 10.0**exponent
     digits = max(0, -exponent + (leading < 1.95 or leading >= 9.5))
     return f"({value:.{digits}f} +- {error:.{digits}f})"
+
+
+def _count(identified: Identified) -> str:
+    """Tells the number of terms, and of how many where pruning chose them."""
+    by_motion, total = identified.findings.width is not None, identified.fit.regression.terms_total
+    return f"{identified.model.terms_kept}" + f" of {total}" * (not by_motion) + " terms"
+
+
+def _linear_fit(identified: Identified) -> dict[str, Iterable[str]]:
+    """Tells of the pruned linear fit, where it gave the terms: not those of a motion."""
+    if identified.findings.width is not None:
+        return {}
+    return {
+        fill(_pruning(identified.alpha), WIDTH): (),
+        "Cross-validated error against the number of terms, largest first, * for those kept:": (
+            line for curve in identified.fit.curves for line in _curve(curve)
+        ),
+        "Error of the linear fit per degree of freedom, on the part it was fitted to:": _errors(
+            identified
+        ),
+    }
 
 
 def _pruning(alpha: Alpha) -> str:
@@ -233,17 +250,17 @@ def estimates(identified: Identified) -> dict[str, CalibratedValue]:
     latency = "only its sum with the clock offset is known" if both else "no command changed"
     if identified.findings.width is not None and not both:
         latency = "it can't be told from the lags"
-    turned = mounting is None or mounting.ways > 0
-    turns = "the drive shows too few directions of motion" if turned else "the robot never turned"
+    few = "the drive shows too few directions of motion"
+    hidden = (few, few) if mounting is None else mounting.hidden
     unknown = recording.wheels is None
     wheels = "no wheel speeds were recorded" if unknown else "the wheels do not show it"
     rows = {
         "clock_offset_s": ("clock offset", found.clock_offset_s, "s", clocks),
         "command_latency_s": ("command latency", found.command_latency_s, "s", latency),
         "burst_period_s": ("period of bursts", None, "s", "the poses are stamped one by one"),
-        "rotation_rad": ("rotation of base_link", found.rotation_rad, "rad", turns),
-        "lever_arm_x_m": ("lever arm x", found.lever_arm_m[0], "m", turns),
-        "lever_arm_y_m": ("lever arm y", found.lever_arm_m[1], "m", turns),
+        "rotation_rad": ("rotation of base_link", found.rotation_rad, "rad", few),
+        "lever_arm_x_m": ("lever arm x", found.lever_arm_m[0], "m", hidden[0]),
+        "lever_arm_y_m": ("lever arm y", found.lever_arm_m[1], "m", hidden[1]),
         "wheel_scale": ("wheel scale", found.wheel_scale, "m/s per unit", wheels),
         "turn_scale": ("turn scale", found.turn_scale, "rad/s per unit", wheels),
     }
@@ -301,8 +318,8 @@ def _suspicion(identified: Identified, spec: RobotSpec) -> str:
     if share > COARSE:
         coarse = f"{name} changes by {share:.0%} of its range between rows that are {apart}"
         return f"{coarse}, so record at a higher rate"
-    if unmoved:
-        reason = f"{', '.join(unmoved)} never moved in its first {identified.train_until_s:.0f} s"
+    if still := ", ".join(c.name for c in spec.command if c.name in unmoved):
+        reason = f"{still} never moved in its first {identified.train_until_s:.0f} s"
         return f"{reason}, from which it is learnt, so change it from the beginning on"
     if identified.alpha != "auto" or identified.drive.settings.order == 1:
         return "it may lack terms, so leave order and alpha at `auto`"

@@ -1,14 +1,14 @@
-"""Structure in the residuals of a fit: what rates still depend on beyond the model's terms."""
+"""Structure in the residuals of a model: what rates still depend on beyond its terms."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
 import numpy as np
 
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.fit import Fit
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.taylor import TaylorModel
 
 DEGREE = 3  # of the terms that are looked for
 BLOCK_S, FEWEST = 2.5, 12  # residuals this far apart are independent; blocks to tell by
@@ -20,27 +20,33 @@ PARTS = 5  # in which blocks are left out
 ROWS = 3000  # that are looked at, as neighbours tell the same
 
 
-def structures(linear: Fit, samples: Samples, spec: RobotSpec) -> Iterator[str]:
-    """Tells, per degree of freedom, the term that explains most of the residuals, if one does."""
+def structures(
+    model: TaylorModel, samples: Samples, spec: RobotSpec, unmoved: Collection[str] = (),
+    tried: int = 0,
+) -> Iterator[str]:  # fmt: skip
+    """Tells, per degree of freedom, the term that explains most of the residuals, if one does.
+
+    `unmoved` variables hold nothing but noise; `tried` is the greatest order that was tried.
+    """
     every = np.arange(len(samples.t)) % (1 + len(samples.t) // ROWS) == 0
-    samples, model = samples.rows(every), linear.model
+    samples = samples.rows(every)
     block = np.floor((samples.t - samples.t[0]) / BLOCK_S).astype(np.intp)
-    x, defined = samples.x, {v.twist for v in spec.state}  # states that are a part of the twist
-    moved = np.ptp(x, axis=0) > 0.0
+    x, moved = samples.x, np.ptp(samples.x, axis=0) > 0.0
+    moved &= [name not in unmoved for name in model.variables]
     if not moved.any() or len(np.unique(block)) < FEWEST:
         return
     powers = taylor.exponents(x.shape[1], DEGREE)
     powers = powers[(powers[:, ~moved] == 0).all(axis=1) & powers.any(axis=1)]
     features = taylor.evaluate(x / np.maximum(np.abs(x).max(axis=0), 1e-12), powers)
-    order = int(model.powers[(model.coefficients != 0.0).any(axis=0)].sum(axis=1).max(initial=1))
-    names = [taylor.term_name(row, model.variables) for row in powers]
+    left = samples.dq - model.rates(x)
+    known = {v.twist for v in spec.state} | {f"d_{name}" for name in unmoved}
     for d, dof in enumerate(model.dofs):
         used = model.coefficients[d] != 0.0
-        if not used.any() or dof in defined:
+        if not used.any() or dof in known:
             continue
         own = taylor.evaluate(x, model.powers[used])
         own = own / np.maximum(np.sqrt((own**2).mean(axis=0)), 1e-12)
-        both = np.concatenate([samples.dq[:, d : d + 1], features], axis=1)
+        both = np.concatenate([left[:, d : d + 1], features], axis=1)
         both = both - own @ np.linalg.lstsq(own, both, rcond=None)[0]
         most = OUTLYING * float(np.median(np.abs(both[:, 0])))
         rest, more = np.clip(both[:, 0], -most, most), both[:, 1:]
@@ -49,11 +55,23 @@ def structures(linear: Fit, samples: Samples, spec: RobotSpec) -> Iterator[str]:
         best = int(np.argmax(share))
         size = share[best] * (rest**2).mean() / max(float((samples.dq[:, d] ** 2).mean()), 1e-18)
         if share[best] > SHARE and size > WORTH**2:
-            degree = int(powers[best].sum())
-            way = f"try order {degree}" if degree > order else "keep more terms (a higher alpha)"
-            finding = f"What the model leaves of {dof} depends on {names[best]}"
-            more = f"({share[best]:.0%} of it, by cross-validation)"
-            yield f"{finding} {more}: {way}, and distrust what rests on its terms, as the mounting."
+            name = taylor.term_name(powers[best], model.variables)
+            finding = f"What the model leaves of {dof} depends on {name}"
+            way = _way(model, int(powers[best].sum()), tried)
+            yield f"{finding} ({share[best]:.0%} of it, by cross-validation): {way}."
+
+
+def _way(model: TaylorModel, degree: int, tried: int) -> str:
+    """Says what to do about a term of a degree that a model lacks."""
+    order = int(model.powers[(model.coefficients != 0.0).any(axis=0)].sum(axis=1).max(initial=1))
+    if degree > max(order, tried):
+        way = f"try order {degree}"
+    elif model.bounded or tried > order:
+        way = "no order that was tried predicts better with it"
+    else:
+        way = "keep more terms (a higher alpha)"
+    by_terms = "" if model.bounded else ", and distrust what rests on its terms, as the mounting"
+    return way + by_terms
 
 
 def _share(rest: Array, features: Array, block: Array) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.clocks import TimingEstimate
+from nics_drl_bridge.identify.clocks import CERTAIN, TimingEstimate
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.excitation import Excitation, plausible
 from nics_drl_bridge.identify.fit import Fit
@@ -50,14 +50,19 @@ def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate)
         offset = f"{calibration.clock_offset_s:.4f} s (+- {sigma['clock_offset_s']:.4f} s)"
         finding = "Pose and commands are stamped by different clocks"
         yield f"{finding}: {offset} added to the pose's stamps gives the commands' clock."
+    if timing.early > 0.0:
+        finding = f"The robot moves {timing.early:.2f} s before its commands"
+        cause = "the pose is stamped by another clock; give it a `clock:` of its own in the mapping"
+        yield f"{finding}: {cause}."
     if not moved_commands(recording.command).any():
         yield "No command ever changed, so clock offset and latency could not be learnt."
     elif not timing.separated and clocks_differ:
         why = "since nothing measured on the commands' clock follows them"
         advice = "the latency is taken as zero. Record the wheels or the state to tell them apart"
         yield f"Only the sum of clock offset and command latency can be known, {why}; {advice}."
-    if timing.separated and calibration.command_latency_s > 0.0 and "command_latency_s" in sigma:
-        late = f"{calibration.command_latency_s:.4f} s (+- {sigma['command_latency_s']:.4f} s)"
+    latency, spread = calibration.command_latency_s, sigma.get("command_latency_s", np.inf)
+    if timing.separated and latency > CERTAIN * spread:
+        late = f"{latency:.4f} s (+- {spread:.4f} s)"
         yield f"Commands take effect {late} after their stamps."
 
 
@@ -70,21 +75,22 @@ def about_mounting(
         yield f"How the tracked body sits on the robot could not be learnt, and {taken}."
         return
     x, y = calibration.lever_arm_m
-    known_x, known_y = ~np.isnan(mounting.lever_sigma)
+    names = "lever_arm_x_m", "lever_arm_y_m"  # of which predictions may have told one later
+    found = (name in calibration.uncertainty for name in names)
+    x_hidden, y_hidden = (why * (not f) for why, f in zip(mounting.hidden, found, strict=True))
     if calibration.rotation_rad != 0.0:
         sigma = calibration.uncertainty.get("rotation_rad", mounting.rotation_sigma)
         turned = f"{calibration.rotation_rad:.4f} rad (+- {sigma:.4f} rad)"
         yield f"The direction of travel lies {turned} from the tracked body's heading."
-    if not known_x:
-        slips = "slip and noise hide it"
-        why = ("the robot never turned", "all of the path had one curvature", slips)[mounting.ways]
-        finding = f"Where the tracked point lies on the robot could not be learnt, since {why}"
+    if x_hidden:
+        finding = f"Where the tracked point lies on the robot could not be learnt, since {x_hidden}"
         advice = "it is taken as base_link, and the rotation holds for this curvature"
-        yield f"{finding}: {advice}; drive left, right and straight on to learn it."
+        drive_so = "drive left, right and straight on, forwards and backwards, to learn it"
+        yield f"{finding}: {advice}; {drive_so}."
     elif (x, y) != (0.0, 0.0):
         yield f"The tracked point lies at x {x:.4f} m, y {y:.4f} m of base_link."
-    if known_x and not known_y and not drive.spec.moves_sideways:
-        why = "since no speed was known apart from the tracked one; it is taken as zero"
+    if y_hidden and not x_hidden and not drive.spec.moves_sideways:
+        why = f"since {y_hidden}; it is taken as zero"
         yield f"The tracked point's place along y could not be learnt, {why}."
 
 
@@ -113,14 +119,19 @@ def about_responses(
 
 def refuse_unexcited(excitation: Excitation, spec: RobotSpec) -> None:
     """Refuses a drive, with a FitError, that did not move every input independently."""
-    commands = {c.name for c in spec.command}
-    still = [n for n in excitation.unmoved if n in commands] or excitation.unmoved
+    sensed = [v.name for v in spec.state if v.twist is None and v.name in excitation.unmoved]
+    still = _commands(excitation.unmoved, spec) or sensed
     for names, fault, way in (
         (still, "never moved", "changing over the whole range"),
         (excitation.together, "always moved together", "each changing on its own"),
     ):
         if told := _list(names):
             raise FitError(f"{told} {fault}; drive with {told} {way}, or allow a model without.")
+
+
+def _commands(names: Sequence[str], spec: RobotSpec) -> list[str]:
+    """Returns those names that are commands: what a driver can move."""
+    return [c.name for c in spec.command if c.name in names]
 
 
 def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> Iterator[str]:
@@ -130,7 +141,8 @@ def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> Iterator
     if unmoved := ", ".join(excitation.unmoved):
         finding = f"The model has no terms of {unmoved}, which never moved"
         yield f"{finding}: it holds for this drive's constant value only."
-    if missing := ", ".join(name for name in excitation.unmoved if name not in already):
+    still = _commands(excitation.unmoved, spec)
+    if missing := ", ".join(name for name in still if name not in already):
         yield f"Drive with {missing} changing over the whole range to learn them."
     if together := _list(excitation.together):
         units = {c.unit for c in spec.command if c.name in excitation.together}
@@ -146,8 +158,8 @@ def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> Iterator
         yield f"{coarse} took two values only: {finding}; drive with values in between."
 
 
-def doubts(linear: Fit, held_out: OpenLoop | None, exact: bool) -> Iterator[str]:
-    """Tells each reason to doubt the fit or its predictions."""
+def doubts_of_fit(linear: Fit, exact: bool) -> Iterator[str]:
+    """Tells each reason to doubt a linear fit."""
     dofs = linear.model.dofs
     for dof, outliers, condition in zip(dofs, linear.outliers, linear.condition, strict=True):
         if outliers > MANY_OUTLIERS:
@@ -162,6 +174,10 @@ def doubts(linear: Fit, held_out: OpenLoop | None, exact: bool) -> Iterator[str]
     if lost := _list([dof for dof, share in explained if share < UNEXPLAINED and dof in fitted]):
         why = "the robot did not follow its commands in a way that a polynomial can describe"
         yield f"The model explains less than half of {lost}: {why}; do not trust its predictions."
+
+
+def doubts(held_out: OpenLoop | None) -> Iterator[str]:
+    """Tells each reason to doubt the predictions."""
     if held_out is None or not held_out.mean_path_m > 0.0:
         return
     share = held_out.mean_position_error_m / held_out.mean_path_m

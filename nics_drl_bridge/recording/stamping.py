@@ -19,7 +19,9 @@ from nics_drl_bridge.recording.topic_roles import Stamps
 Nanoseconds = NDArray[np.int64]
 
 RECEIVE, HEADER = "receive", "header"
-SAME_CLOCK_S = (-0.001, 0.05)  # median delay from header to receipt on the recorder's own clock
+# Median delay from header to receipt on the recorder's own clock: a localiser may take its time,
+# but nothing is received before it was stamped.
+SAME_CLOCK_S = (-0.001, 1.0)
 MAX_WANDER_S = 1.0  # the delay from headers of one clock to their receipt varies by less
 STALLED = 2.0  # percentage of messages that a stalled recorder may have received even later,
 MAX_STALL_S = 30.0  # but by no more than this
@@ -62,8 +64,8 @@ def streams(
     of_robot: Collection[str] = ROBOT_STREAMS,
 ) -> dict[str, Stream]:
     """Stamps each stream, from near 0 on; RecordingError: headers are missing or unusable."""
-    # With `auto`, by headers if there are any. Those less than 50 ms before their receipt are of
-    # the recorder's clock, others of a foreign one: shifted by the median delay, they leave a small
+    # With `auto`, by headers if there are any. Those less than 1 s before their receipt are of the
+    # recorder's clock, others of a foreign one: shifted by the median delay, they leave a small
     # offset for calibration. Command, state, wheels and IMU share one clock, by receipt if need be.
     # Late messages are sorted; those before a simulation's first time are dropped.
     if stamps != "receive":

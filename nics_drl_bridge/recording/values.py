@@ -118,7 +118,10 @@ class MappedReader:
                 raise RecordingError(f"{table.place}: which column is the time? Say {example}.")
             self.say(*table.notes)
             rows = given.values[:, 0].astype(np.intp)
-            return Stamped(given.t, rows, given.clock, len(table.column(0)))
+            asked = getattr(self.mapping.time, "from_", None) == schema.HEADER
+            main = stamping.HEADER if asked else stamping.RECEIVE  # the mapping's own clock
+            clock = "" if given.clock == main else given.clock
+            return Stamped(given.t, rows, clock, len(table.column(0)))
         raw, name = self._raw_stamps(table, time), table.place.rpartition("/")[2]
         known = np.flatnonzero(np.isfinite(raw))
         alone = len(time.columns) == 1 and time.unit in (None, "s")

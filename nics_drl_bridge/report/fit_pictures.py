@@ -64,7 +64,8 @@ def write_pictures(spec: RobotSpec, identified: Identified, folder: str | Path) 
 
 def fit_pictures(spec: RobotSpec, identified: Identified) -> dict[str, bytes]:
     """The pictures of a fit by name, as far as the recording shows them, each a PNG."""
-    pictures = {"accuracy": accuracy(identified)}
+    by_motion = identified.findings.width is not None  # pruning did not choose its terms
+    pictures = {} if by_motion else {"accuracy": accuracy(identified)}
     if identified.held_out is not None:
         pictures["paths"] = held_out_paths(identified.trial)
     if identified.unseen is not None and np.abs(identified.unseen.dq).max() > LEAST_RATE:

@@ -244,10 +244,13 @@ def _by_turn_rate(spec: RobotSpec) -> RobotSpec:
 
 def commands_twist(spec: RobotSpec) -> bool:
     """True if a robot's commands are the components of its body twist, but for their lags."""
-    if not all(command.is_twist for command in spec.command):
-        return False
+    return all(command.is_twist for command in spec.command) and not slips(spec)
+
+
+def slips(spec: RobotSpec) -> bool:
+    """True if a robot's kind moves otherwise than the twist that is commanded."""
     kind = None if spec.textbook is None else find_kind(spec.textbook)
-    return not getattr(kind, "slips", False)
+    return bool(getattr(kind, "slips", False))
 
 
 def steered(

@@ -120,7 +120,7 @@ class RobotSpec(Schema):
     # its kind: textbook kinematics, to make recordings, or to assume what a drive did not show
     textbook: str | None = None
     parameters: dict[str, float] = Field(default_factory=dict)  # [m, s], see the module of its kind
-    assumed: tuple[str, ...] = ()  # parameters that its kind guessed from the size of the footprint
+    assumed: tuple[str, ...] = ()  # parameters that its kind guessed, lengths by the footprint
     # meaning of `angular.z` for a robot that steers: a turn rate [rad/s], as in any Twist, or the
     # steering angle [rad] itself
     angular_is: Literal["turn_rate", "steering"] = "turn_rate"

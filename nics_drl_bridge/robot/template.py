@@ -79,8 +79,8 @@ class Template:
         own, radius = given.get("parameters", {}), given.get("footprint_radius")
         if isinstance(own, Mapping) and isinstance(radius, int | float):
             sizes = {name: round(share * radius, 4) for name, share in self.lengths.items()}
-            data["parameters"] = {**sizes, **self.parameters, **own}
-            data["assumed"] = sorted(set(sizes) - set(own))
+            usual = {**sizes, **self.parameters}
+            data["parameters"], data["assumed"] = {**usual, **own}, sorted(set(usual) - set(own))
         return data
 
     def _command(self, given: Given, ranges: Ranges) -> Any:

@@ -8,8 +8,10 @@ import pytest
 
 from identify.drives import MOTOR, calibrate, drive, servoed, tricycle
 from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.clocks import TOLD_S, timing_of
 from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.verdict import about_clocks
 
 SUM = "command_latency_and_speed_lag_s"
 
@@ -41,6 +43,17 @@ def test_of_latency_and_lag_that_noise_hides_the_sum_is_told(car):
     both = found.command_latency_s + found.responses[0].lag_s
     assert both == pytest.approx(0.15, abs=3.0 * sigma)
     assert any("can hardly be told apart: trust their sum" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("ahead", [0.0, 0.2])
+def test_a_robot_that_moves_before_its_commands_has_poses_of_another_clock(car, ahead):
+    recording = drive(car, 4, 20.0, latency=0.05, noise=(0.001, 0.002), measured_state=False)
+    pose = replace(recording.pose, t=recording.pose.t - ahead)
+    tried = Drive(replace(recording, pose=pose), car)
+    timing = timing_of(tried)
+    assert timing.latency == pytest.approx(0.0 if ahead else 0.05, abs=0.01)
+    told = " ".join(about_clocks(tried, Calibration(), timing))
+    assert ("The robot moves 0.15 s before its commands" in told) == (ahead > 0.0)
 
 
 def test_what_the_pose_tells_is_not_asked_to_be_measured(car, differential):

@@ -15,7 +15,8 @@ from nics_drl_bridge.identify.identify import cut, identify
 from nics_drl_bridge.identify.open_loop import open_loop_error, predict, windows
 from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.robot.kernels import SERIES, rollout, term_arrays
-from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.spec import RobotSpec, robot_from
+from nics_drl_bridge.robot.taylor import TaylorModel
 
 
 def term(model, dof: str, name: str) -> float:
@@ -193,3 +194,49 @@ def test_a_wheel_that_always_follows_from_the_others_is_named(name, request):
     told = "rear_right_wheel always followed from the other variables" in notes
     assert told == (name == "mecanum")
     assert "left_wheel always followed" not in notes
+
+
+def by_throttle(steering: float, **given) -> tuple[RobotSpec, TaylorModel]:
+    """A car by throttle, and its model of a drive that held one steering."""
+    names = ("vx", "vy", "wz", "throttle", "steering")
+    spec = robot_from({"kind": "ackermann_throttle", "footprint_radius": 0.2, **given}, {})
+    powers = np.eye(5, dtype=np.int64)[[0, 2, 3]]
+    rows = np.zeros((6, 3))
+    rows[0, 0], rows[3, [0, 2]] = 1.0, (-2.0, 6.0)
+    if steering:
+        rows[2, 1], rows[5, :2] = 1.0, (10.0 * 1.5 * steering, -10.0)
+    low = np.array([-1.0, -0.01, -0.01, -0.5, steering])
+    high = np.array([2.0, 0.01, 0.01, 0.5, steering])
+    model = TaylorModel(
+        names, spec.dof_names, spec.dof_units, powers, rows, 0.02, low, high, bounded=True
+    )
+    return spec, model
+
+
+@pytest.mark.parametrize("steering", [0.0, 0.2])
+def test_what_is_assumed_of_a_car_by_its_motion_turns_it_by_its_speed(steering):
+    spec, model = by_throttle(steering)
+    still = ("vy", "steering") if steering else ("vy", "wz", "steering")
+    completed, notes = assume_textbook(model, spec, still)
+    turned = term(completed, "d_wz", "vx*steering") / -term(completed, "d_wz", "wz")
+    curvature = spec.parameters["greatest_steering"] / spec.parameters["wheelbase"]
+    assert turned == pytest.approx(1.5 if steering else curvature, rel=1e-6)
+    assert term(completed, "d_wz", "steering") == 0.0
+    assert all(dof == "d_wz" for dof, _ in completed.assumed)  # no twist, which is by definition
+    pose, state = np.zeros(3), np.array([1.0, 0.0, 0.0])
+    for _ in range(100):
+        state[0] = 1.0
+        pose, state = completed.step(pose, state, np.array([1.0 / 3.0, 0.3]))
+    assert state[2] == pytest.approx(0.3 * turned, rel=0.01)
+    assert completed.rates(np.array([0.0, 0.0, 0.0, 0.0, 0.3]))[5] == 0.0
+    assert len(notes) == 1
+
+
+def test_parameters_that_nobody_gave_are_told():
+    spec, model = by_throttle(0.0)
+    _, (note,) = assume_textbook(model, spec, ("vy", "wz", "steering"))
+    assert "by default, as the robot's YAML file gives no greatest_steering" in note
+    every = {name: spec.parameters[name] for name in spec.parameters}
+    spec, model = by_throttle(0.0, parameters=every)
+    _, (note,) = assume_textbook(model, spec, ("vy", "wz", "steering"))
+    assert "a lag of 0.1 s (from the parameters in the robot's YAML file)" in note

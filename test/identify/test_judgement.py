@@ -14,7 +14,7 @@ from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.judgement import HORIZONS_S, shortfall
 from nics_drl_bridge.identify.report import fit_report
 from nics_drl_bridge.robot.spec import load_robot
-from nics_drl_bridge.robot.taylor import EndErrors, NamedTaylorModel
+from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, NamedTaylorModel
 
 MENDED = "clock: 3 stamps ran backwards, and were left out."
 
@@ -63,13 +63,20 @@ def test_the_judgement_is_kept_in_the_file_of_the_model(found):
 )
 def test_a_model_that_does_not_beat_a_yardstick_says_so_on_top(found, yardstick, named):
     at = replace(found.judgement[3], **{yardstick: EndErrors(1e-3, 0.1)})
-    (sentence,) = shortfall((at,))
+    (sentence,) = shortfall((at,), found.calibration.position_noise_m)
     assert sentence.startswith(f"The model does not beat {named}: on unseen data")
     assert f"those of {named} 0.001 m" in sentence
     beaten = replace(found, findings=replace(found.findings, judgement=(at,)))
     top = fit_report("here", load_robot("differential"), beaten).split("\n\n")[0]
     assert " ".join(top.split()).endswith(sentence)
     assert "does not beat" not in fit_report("here", load_robot("differential"), found)
+
+
+@pytest.mark.parametrize(("noise", "told"), [(0.0, 1), (0.001, 0)])
+def test_what_the_noise_of_the_pose_may_be_is_a_draw(noise, told):
+    model, textbook, kept = (EndErrors(error, 0.01) for error in (0.00747, 0.00692, 1.0))
+    at = HorizonErrors(5.0, 200, 2.0, model, kept, textbook)
+    assert len(list(shortfall((at,), noise))) == told
 
 
 @pytest.mark.slow

@@ -10,7 +10,9 @@ from nics_drl_bridge.identify.mounting import (
     by_instruments,
     jackknifed,
     mounting_without_lateral_motion,
+    with_slip,
 )
+from nics_drl_bridge.robot.spec import robot_from
 
 
 def mean_of_twists(_, twists: TwistIntervals) -> Mounting:
@@ -101,3 +103,48 @@ def test_a_car_that_drives_backwards_first_faces_where_it_is_told_to(car):
     assert found is not None
     assert abs(found.rotation) == pytest.approx(np.pi, abs=0.01)
     assert found.lever[0] == pytest.approx(-0.08, abs=0.005)
+
+
+@pytest.mark.parametrize(("bend", "ways"), [(0.0, 0), (0.5, 1), (-0.5, 1)])
+def test_the_noise_of_a_heading_is_no_turning(bend, ways):
+    rng, n = np.random.default_rng(0), np.arange(900)
+    heading_noise = 0.005
+    heading = heading_noise * rng.normal(size=901)
+    twist = np.stack([0.5 + 0.0 * n, 0.0 * n, 0.5 * bend + np.diff(heading) / 0.1], axis=1)
+    motion = TwistIntervals(0.1 * n, 0.1 * n + 0.1, twist)
+    found = mounting_without_lateral_motion(motion, np.ones(900), heading_noise)
+    assert found is not None
+    assert found.ways == ways
+    assert np.isnan(found.lever_sigma[0])
+
+
+def skidded(slip: float, slowest: float, seed: int = 0) -> TwistIntervals:
+    """Noisy twists of a point 0.1 m before the middle of a robot that slips in proportion."""
+    rng, n = np.random.default_rng(seed), np.arange(900)
+    speed = np.repeat(rng.uniform(slowest, 1.0, 90), 10)
+    turn = np.repeat(rng.uniform(-1.0, 1.0, 90), 10)
+    twist = np.stack([speed, 0.1 * turn + slip * speed * turn, turn], axis=1)
+    twist += rng.normal(size=twist.shape) * 0.02
+    return TwistIntervals(0.1 * n, 0.1 * n + 0.1, twist)
+
+
+@pytest.mark.parametrize("slip", [0.0, -0.12])
+def test_a_lever_is_told_from_the_slip_of_a_robot_that_skids_both_ways(slip):
+    spec = robot_from({"kind": "skid_steer", "footprint_radius": 0.4}, {})
+    motion = skidded(slip, -0.6)
+    plain = mounting_without_lateral_motion(motion, motion.twist[:, 0])
+    found = with_slip(motion, plain, spec)
+    assert found.lever[0] == pytest.approx(0.1, abs=0.005)
+    assert found.lever_sigma[0] < 0.005
+
+
+@pytest.mark.parametrize("slip", [0.0, -0.12])
+def test_slip_of_a_robot_that_skids_forwards_only_is_no_lever(slip):
+    spec = robot_from({"kind": "skid_steer", "footprint_radius": 0.4}, {})
+    motion = skidded(slip, 0.2)
+    plain = mounting_without_lateral_motion(motion, motion.twist[:, 0])
+    assert plain.lever_sigma[0] < 0.005  # as if it were certain
+    found = with_slip(motion, plain, spec)
+    assert np.isnan(found.lever_sigma).all()
+    assert not found.lever.any()
+    assert found.slip

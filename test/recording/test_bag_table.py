@@ -144,8 +144,16 @@ def test_all_times_may_be_those_of_arrival(tmp_path):
     assert clocks.pose.clock != clocks.command.clock  # the headers are of a foreign clock
     arrived = read(bag, command=command, time="arrival")
     assert arrived.pose.clock == arrived.command.clock
+
+
+@pytest.mark.parametrize("offset", [0.0, 5.0])
+def test_a_clock_that_the_mapping_names_decides(tmp_path, offset):
+    bag = bags.write(tmp_path / "bag", {"/pose": bags.poses(offset=offset), "/v": bags.commands()})
+    command = {"v": "/v:linear.x"}
     own = read(bag, command=command, pose={"in": "/pose", "clock": "mocap"})
-    assert own.pose.clock == "mocap"
+    assert (own.pose.clock, own.command.clock) == ("mocap", "robot")
+    same = read(bag, command=command, pose={"in": "/pose", "clock": "robot"})
+    assert (same.pose.clock, same.command.clock) == ("robot", "robot")
 
 
 def test_the_covariance_of_a_message_gives_deviations(tmp_path):

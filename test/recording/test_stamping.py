@@ -40,7 +40,25 @@ def test_headers_of_the_recorders_clock_share_it_with_what_has_none():
     assert np.allclose(made["command"].t, T)
 
 
-@pytest.mark.parametrize("offset", [-3600.0, -0.2, 0.5, 1e6])
+@pytest.mark.parametrize("delay", [0.02, 0.07, 0.3, 0.9])
+def test_the_time_that_a_localiser_needs_is_no_other_clock(delay):
+    late = delay + np.random.default_rng(0).uniform(-0.01, 0.02, len(T))
+    made = streams({"command": COMMAND, "pose": topic("/pose", T, T + late)}, "auto", "drive")
+    assert made["pose"].clock == made["command"].clock == RECEIVE
+    assert np.allclose(made["pose"].t - made["command"].t, 0.0)
+
+
+def test_what_is_late_on_a_foreign_clock_shares_it():
+    data = {
+        "command": topic("/cmd_vel", T + 12.0, T + TRANSPORT),
+        "pose": topic("/pose", T + 12.0, T + 0.3),
+    }
+    made = streams(data, "auto", "drive")
+    assert made["pose"].clock == made["command"].clock == HEADER
+    assert np.allclose(made["pose"].t, made["command"].t)
+
+
+@pytest.mark.parametrize("offset", [-3600.0, -1.5, 0.1, 0.5, 1e6])
 def test_headers_of_a_foreign_clock_keep_their_steps_and_lose_the_offset(offset):
     pose = topic("/pose", T + offset, T + TRANSPORT)
     made = streams({"command": COMMAND, "pose": pose}, "auto", "drive")

@@ -7,6 +7,7 @@ import pytest
 from identify.drives import drive, with_wheels
 
 from nics_drl_bridge.identify.identify import Identified, identify
+from nics_drl_bridge.identify.mounting import Mounting
 from nics_drl_bridge.identify.report import estimates, fit_report
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.report.fit_pictures import (
@@ -97,6 +98,15 @@ def test_what_was_not_possible_has_no_picture_and_the_report_says_why(exact):
         "wheel scale: not estimated, no wheel speeds were recorded",
     ):
         assert part in text
+
+
+def test_the_table_gives_the_reason_that_the_sentence_gives(exact):
+    _, identified = exact
+    mounting = Mounting(0.0, np.zeros(2), 0.001, np.array([0.001, np.nan]), 2)
+    known = replace(identified, findings=replace(identified.findings, mounting=mounting))
+    known = replace(known, calibration=replace(known.calibration, uncertainty={}))
+    (_, y), found = mounting.hidden, estimates(known)
+    assert found["lever_arm_y_m"].text == f"lever arm y: not estimated, {y}"
 
 
 def test_the_text_has_value_uncertainty_and_unit(disturbed):

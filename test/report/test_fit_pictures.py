@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -41,6 +43,16 @@ def test_the_report_names_errors_pruning_and_validity(found):
     text = fit_report("here", spec, identified)
     for part in ("with standard errors", "Eq. 2", "knee", "condition number", "Valid where"):
         assert part in text
+
+
+def test_what_pruning_would_have_kept_is_not_told_of_a_motion(found):
+    spec, identified = found
+    by_motion = replace(identified, findings=replace(identified.findings, width=0.1))
+    text = fit_report("here", spec, by_motion)
+    for part in ("Eq. 2", "Cross-validated", "linear fit", f"{identified.model.terms_kept} of"):
+        assert part not in text
+    assert f"Kept {identified.model.terms_kept} terms, step" in text
+    assert "accuracy" not in fit_pictures(spec, by_motion)
 
 
 @pytest.mark.parametrize(
