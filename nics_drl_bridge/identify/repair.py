@@ -295,11 +295,15 @@ def check_axes(drive: Drive) -> None:
     some = drive.dated.rows(along_path(values, apart))
     line = "" if drive.spec.moves_sideways else clockwise_line(some.values)
     state = recording.state
-    if drive.spec.moves_sideways and state is not None and state.clock == recording.pose.clock:
+    if (
+        drive.spec.moves_sideways
+        and state is not None
+        and state.clock == recording.pose.clock
+        and shows_axes(some.values)
+    ):
         other = some.values * np.array([1.0, 1.0, -1.0])
         as_given, mirrored = (_explained(some.t, p, state) for p in (some.values, other))
-        clear = shows_axes(some.values) and mirrored > max(MIRRORED, BETTER + as_given)
-        line = "scale: -1" if clear else ""
+        line = "scale: -1" if mirrored > max(MIRRORED, BETTER + as_given) else ""
     if line:
         fault = "heading and path turn opposite ways; one of x, y and heading is reversed"
         known = "as that of a compass" if "offset" in line else "counted clockwise"

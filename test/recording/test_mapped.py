@@ -186,7 +186,7 @@ def test_a_wrong_mapping_is_told_with_the_line_to_write(tmp_path, columns, chang
     [
         ("pose: {x: 1, y: 2, heading: 3}\ncommand: {v: {form: 1}}", "did you mean 'from'?"),
         ("pose: {x: 1, y: 2}\ncommand: {v: 1}", "pose needs either heading or quaternion"),
-        ("pose: {x: 1, y: 2, heading: 3, unit: deg}\ncommand: {v: 1}", "must be one of m, dm, cm"),
+        ("pose: {x: 1, y: 2, heading: 3, unit: ms}\ncommand: {v: 1}", "must be one of m, dm, cm"),
         (
             "pose: {x: 1, y: 2, heading: 3}\ncommand: {v: {from: 1, unit: kmph}}",
             "did you mean 'mph'?",
