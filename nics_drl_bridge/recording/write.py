@@ -31,6 +31,7 @@ Storage = Literal["mcap", "sqlite3"]
 
 NPZ = ".npz"
 START_NS = 1_700_000_000 * NS_PER_S  # time stamp of second 0 of the commands' clock
+APART_NS = 3600 * NS_PER_S  # by which other clocks lag behind: no delay, to whoever reads them
 FRAMES = ("odom", "base_link")
 NO_HASH = f"RIHS01_{'0' * 64}"  # of a type that is known only by its text
 CHUNK_BYTES = 1 << 16  # damage costs a whole chunk, since each checksum covers a whole chunk
@@ -69,8 +70,10 @@ def write_bag(
             sink.add_topic(topic, kind)
             stamps = np.round(stream.t * NS_PER_S).astype(np.int64) + START_NS
             # By their receipt, streams of other clocks start together with the commands.
-            late = 0.0 if stream.clock == command.clock else float(command.t[0] - stream.t[0])
-            receive = stamps + round(late * NS_PER_S)
+            receive = stamps
+            if stream.clock != command.clock:
+                receive = stamps + round(float(command.t[0] - stream.t[0]) * NS_PER_S)
+                stamps = stamps - APART_NS
             for k, values in enumerate(stream.values):
                 message = make(messages.header(int(stamps[k])), values)
                 sink.write(topic, int(receive[k]), bytes(store.serialize_cdr(message, kind)))
