@@ -105,7 +105,7 @@ def test_parameters_and_a_state_that_are_given_stand():
     state = [{"name": "vx", "max": 3.0}, {"name": "angle", "unit": "rad", "min": -1, "max": 1}]
     robot = made("differential", parameters={"track": 0.5}, state=state)
     assert robot.parameters["track"] == 0.5
-    assert robot.assumed == ("wheel_radius",)
+    assert robot.assumed == ("wheel_lag", "wheel_radius")  # lengths by the footprint, usual lags
     assert [(v.name, v.twist, v.max) for v in robot.state] == [
         ("vx", "vx", 3.0), ("angle", None, 1.0)
     ]  # fmt: skip
