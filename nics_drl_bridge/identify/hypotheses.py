@@ -238,10 +238,10 @@ def lags_of(model: TaylorModel, spec: RobotSpec) -> dict[str, float]:
     return found
 
 
-def about_lags(latency: float, lags: dict[str, float]) -> str:
-    """Says that a latency [s] and lags that predictions told are known as their sums."""
+def about_lags(latency: float, lags: dict[str, float], beside: float) -> str:
+    """Says that a latency [s] is known as its sum with lags, found `beside` one of their own."""
     # A second lag of a servo is a latency to a model that has one.
-    sums = ", ".join(f"{latency + lag:.3f} s for {name}" for name, lag in lags.items())
+    sums = ", ".join(f"{beside + lag:.3f} s for {name}" for name, lag in lags.items())
     return f"Latency ({latency:.3f} s) can't be told from the lags: trust their sums, {sums}."
 
 

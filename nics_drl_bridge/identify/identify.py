@@ -312,7 +312,8 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
     lags = hypotheses.lags_of(base.found.model, spec)
     sums: tuple[str, ...] = ()
     if lags:
-        sums = (hypotheses.about_lags(calibration.command_latency_s, lags),)
+        beside = float(base.found.values[0])
+        sums = (hypotheses.about_lags(calibration.command_latency_s, lags, beside),)
         told = {n: e for n, e in calibration.uncertainty.items() if n != "command_latency_s"}
         calibration = replace(calibration, uncertainty=told)
     errors = hypotheses.standard_errors(found)
