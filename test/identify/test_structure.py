@@ -9,7 +9,6 @@ import pytest
 
 from nics_drl_bridge.identify.fit import fit
 from nics_drl_bridge.identify.structure import structures
-from nics_drl_bridge.identify.terms import by_definition
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.spec import RobotSpec, robot_from
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -45,9 +44,8 @@ def motion_of(spec, friction=0.3, noise=0.05) -> tuple[TaylorModel, Samples]:
     x[:, names.index("throttle")] = np.repeat(rng.uniform(-1.0, 1.0, 100), 40)
     low, high = -np.ones((2, len(names))) * [[1.0], [-1.0]]
     first = np.eye(len(names), dtype=np.int64)
-    zero = np.zeros((6, len(names)))
-    model = TaylorModel(names, spec.dof_names, spec.dof_units, first, zero, STEP_S, low, high)
-    model = by_definition(model, spec)
+    rows = np.eye(6, len(names)) * (np.arange(6) < 3)[:, None]  # the twist is the state
+    model = TaylorModel(names, spec.dof_names, spec.dof_units, first, rows, STEP_S, low, high)
     model.coefficients[3, [names.index("vx"), names.index("throttle")]] = -2.0, 3.0
     model = replace(model, friction=np.array([friction, 0.0, 0.0]))
     rates = model.rates(x)
