@@ -45,7 +45,9 @@ def motion_of(spec, friction=0.3, noise=0.05) -> tuple[TaylorModel, Samples]:
     low, high = -np.ones((2, len(names))) * [[1.0], [-1.0]]
     first = np.eye(len(names), dtype=np.int64)
     rows = np.eye(6, len(names)) * (np.arange(6) < 3)[:, None]  # the twist is the state
-    model = TaylorModel(names, spec.dof_names, spec.dof_units, first, rows, STEP_S, low, high)
+    model = TaylorModel(
+        names, spec.dof_names, spec.dof_units, first, rows, STEP_S, low, high, bounded=True
+    )
     model.coefficients[3, [names.index("vx"), names.index("throttle")]] = -2.0, 3.0
     model = replace(model, friction=np.array([friction, 0.0, 0.0]))
     rates = model.rates(x)
