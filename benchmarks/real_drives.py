@@ -135,13 +135,16 @@ def left_out(source: Path, mapping: Path, control: str | None) -> dict[str, Any]
         chosen = windows(
             drive, found.calibration, start, start + SEGMENT_S, HORIZON_S, SPACING_S
         )  # fmt: skip
+        if not len(chosen.start_t):  # its clocks were taken to share nothing
+            errors.append((np.inf,) * 3)
+            continue
         ends = predict(found.model, found.calibration, drive, chosen)
         paths.append(float(chosen.path.mean()))
         errors.append(off(chosen.start if control == "standing" else ends, chosen))
     error, share, heading = (float(mean) for mean in np.mean(errors, axis=0))
     return {
         "error_m": error, "share_of_path": share, "heading_error_rad": heading,
-        "errors_m": [each[0] for each in errors], "path_m": float(np.mean(paths)),
+        "errors_m": [each[0] for each in errors], "path_m": float(np.mean(paths)) if paths else 0.0,
     }  # fmt: skip
 
 
