@@ -34,6 +34,7 @@ DELAY_SCALE_S, CURVE_SCALE = 0.05, 0.1  # steps of their refinement
 BACK_SCALE, BACK_RANGE = 0.2, (0.2, 5.0)  # of a gain backwards
 SMALL_DEAD = 0.05  # share of a command's reach at which the search for a dead zone begins
 TWO_WAY = 0.05  # share of the rows in which a command drives backwards, to tell its gain
+NEAR_END = 0.01  # share of a command's reach by which it must exceed the end of its curve
 STRONG = 95.0  # percentile of the rates at which limits are first sought
 LEVER_SCALE_M, TURN_SCALE = 0.05, 0.1
 
@@ -239,6 +240,32 @@ def with_back(form: Form, curves: tuple[InputCurve, ...]) -> Form:
     bent = {c.command for c in form.curves}
     more = tuple(c for c in curves if c.command not in bent)
     return replace(form, curves=form.curves + more, back=tuple(c.command for c in curves))
+
+
+def reached(model: TaylorModel, drive: Drive, samples: Samples) -> TaylorModel:
+    """Returns a model without the ends of curves, and limits of rates, that a drive never reached.
+
+    Its range of a command in effect is that of what was sent.
+    """
+    names, sent = [c.name for c in drive.spec.command], drive.recording.command.values
+    low, high, curves, limits = model.low.copy(), model.high.copy(), [], model.limits.copy()
+    for curve in model.inputs:
+        place = names.index(curve.command)
+        least, most = float(sent[:, place].min()), float(sent[:, place].max())
+        beyond = NEAR_END * max(-least, most)
+        curve = curve.model_copy(update={
+            "least": curve.least if least < curve.least - beyond else -np.inf,
+            "most": curve.most if most > curve.most + beyond else np.inf,
+        })  # fmt: skip
+        edges = curve.of([least, most])
+        low[model.state_size + place], high[model.state_size + place] = edges
+        if curve != InputCurve(command=curve.command):
+            curves.append(curve)
+    free = replace(model, limits=np.zeros((0, 2)), drag=np.zeros(0), friction=np.zeros(0))
+    asked = free.rates(samples.x)[:, 3:]
+    limits[:, 0] = np.where(asked.min(axis=0) < limits[:, 0], limits[:, 0], -np.inf)
+    limits[:, 1] = np.where(asked.max(axis=0) > limits[:, 1], limits[:, 1], np.inf)
+    return replace(model, inputs=tuple(curves), low=low, high=high, limits=limits)
 
 
 def likely_delay(drive: Drive, calibration: Calibration, samples: Samples) -> float:

@@ -280,13 +280,17 @@ def about_forms(base: Base, trials: Sequence[Trial]) -> Iterator[str]:
     """Names what a model of a motion has beside the textbook's terms, and what it gains by it."""
     form, best = base.draft.form, chosen(trials)
     parts = [f"an input curve of {curve.command}" for curve in form.curves]
-    words = ("drag", form.drag), ("dry friction", form.friction), ("limits", form.limits)
+    words = (
+        ("drag and back-EMF", form.drag),
+        ("dry friction", form.friction),
+        ("limits", form.limits),
+    )
     parts += [f"{word} of {', '.join(names)}" for word, names in words if names]
     parts += ["tyres that slip"] * form.tyres
-    parts += [f"terms up to order {best.order}"] * (best.order > 0)
-    shares = f"{trials[0].error:.1%} of the path away by the textbook with these effects"
+    shares = f"{trials[0].error:.1%} of the path away" + " by that" * (best.order > 0)
     shares += f", {best.error:.1%} with the terms" * (best.order > 0)
-    named = f"The model is the textbook with {', '.join(parts) or 'nothing else'}"
+    named = f"The model is the textbook{' with ' * bool(parts)}{', '.join(parts)}"
+    named += f", and terms up to order {best.order}" * (best.order > 0)
     if np.isfinite(best.error):
         unseen = f"predictions over {HORIZON_S:g} s of parts that a fit did not see"
         yield f"{named}: {unseen} end {shares}."

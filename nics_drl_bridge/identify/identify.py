@@ -25,7 +25,7 @@ from nics_drl_bridge.identify.fit import (
     pruned,
     regress,
 )  # fmt: skip
-from nics_drl_bridge.identify.forms import curve_of, likely_delay
+from nics_drl_bridge.identify.forms import curve_of, likely_delay, reached
 from nics_drl_bridge.identify.judgement import bands_of, judged, shortfall
 from nics_drl_bridge.identify.mounting import Mounting, mounted, mounting_of
 from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
@@ -572,6 +572,8 @@ def identify(
 def _result(trial: Findings, final: Findings) -> Identified:
     linear, model = _fitted(final)
     samples = known(final.samples, "the training part", "fit")
+    if final.width is not None:
+        model = reached(model, final.whole, samples)
     return Identified(
         final.whole, model, final.calibration, linear, samples, trial.unseen, trial.held_out,
         trial.noise, trial, final.notes,

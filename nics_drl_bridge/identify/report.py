@@ -25,13 +25,14 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
     """Returns the report on a recording from a source as text for people."""
     model, noise = identified.model, identified.calibration.position_noise_m
     latency, until = identified.recording.latency.sentences(), identified.train_until_s
-    units = dict(zip(spec.variable_names, spec.variable_units, strict=True))
+    units = units_of(spec)
     ranges = zip(model.variables, model.low, model.high, strict=True)
     around = list(stages(spec, identified))
     notes = identified.notes or ("Nothing had to be corrected.",)
     sections: dict[str, Iterable[str]] = {
         f"Fit report: robot {spec.name!r} from {source}": (
-            fill(warning, WIDTH - 2) for warning in shortfall(identified.judgement, noise)
+            fill(warning, WIDTH - 2, subsequent_indent="  ")
+            for warning in shortfall(identified.judgement, noise)
         ),
         f"Kept {_count(identified)}, step {model.dt:g} s "
         f"(X = {', '.join(model.variables)}), with standard errors:": equations_with_errors(model),
@@ -74,6 +75,12 @@ def equations_with_errors(model: TaylorModel) -> list[str]:
     return lines
 
 
+def units_of(spec: RobotSpec) -> dict[str, str]:
+    """Returns the units of a robot's variables, by name; none of shares."""
+    names = zip(spec.variable_names, spec.variable_units, strict=True)
+    return {name: unit * (unit != "1") for name, unit in names}
+
+
 def stages(spec: RobotSpec, identified: Identified) -> Iterator[str]:
     """Yields a line per value of the stages around the terms, with the calibration's uncertainty.
 
@@ -81,7 +88,7 @@ def stages(spec: RobotSpec, identified: Identified) -> Iterator[str]:
     `.rise`, `.friction` and `.drag` of a state, `vx.back_emf.throttle` of both.
     """
     model, sigma = identified.model, identified.calibration.uncertainty
-    units = dict(zip(spec.variable_names, spec.variable_units, strict=True))
+    units = units_of(spec)
     values = [
         (f"{curve.command}.{name}", words, getattr(curve, name), unit, usual)
         for curve in model.inputs
@@ -323,6 +330,9 @@ def _suspicion(identified: Identified, spec: RobotSpec) -> str:
         return f"{reason}, from which it is learnt, so change it from the beginning on"
     if identified.alpha != "auto" or identified.drive.settings.order == 1:
         return "it may lack terms, so leave order and alpha at `auto`"
+    for note in identified.notes:
+        if note.startswith("pose: jumps "):
+            return f"its pose {note.removeprefix('pose: ').partition(';')[0]}, so record anew"
     got = "that nothing held the robot up, that it got each command, that its pose did not jump"
     shown = f"{got} and that rows {apart} show how it responds"
     return f"the recording does not show why, so make sure {shown}, and record anew"

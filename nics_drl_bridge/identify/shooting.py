@@ -38,6 +38,7 @@ DIFFERENCE = 0.02  # step of finite differences by the values of inputs, in thei
 EVALUATIONS, TOLERANCE = 60, 1e-6
 INSIDE = 0.05  # share of its range by which a value starts from its bounds
 LEAST_SCALE = 0.02  # of the loss: smaller errors count as their squares [m/s]
+NO_ERROR = 1e-9
 SAME_STEP = 0.01  # share of a step by which two steps may differ
 
 
@@ -166,9 +167,12 @@ class Predictive:
     value_errors: Array  # (I,) standard errors of the values; NaN of those that were known
 
     def named_errors(self, names: tuple[str, ...]) -> dict[str, float]:
-        """Returns the errors of values that belong to a command or a state, as `throttle.dead`."""
+        """Returns the errors of values that belong to a command or a state, as `throttle.dead`.
+
+        Those that the predictions do not depend on have none.
+        """
         errors = zip(names, self.value_errors.tolist(), strict=True)
-        return {name: error for name, error in errors if "." in name and not np.isnan(error)}
+        return {name: error for name, error in errors if "." in name and error > NO_ERROR}
 
 
 NOTHING_FREE = Inputs((), *(np.zeros(0) for _ in range(4)))

@@ -50,7 +50,7 @@ def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate)
         offset = f"{calibration.clock_offset_s:.4f} s (+- {sigma['clock_offset_s']:.4f} s)"
         finding = "Pose and commands are stamped by different clocks"
         yield f"{finding}: {offset} added to the pose's stamps gives the commands' clock."
-    if timing.early > 0.0:
+    if timing.early > 0.0 and calibration.command_latency_s <= 0.0:
         finding = f"The robot moves {timing.early:.2f} s before its commands"
         cause = "the pose is stamped by another clock; give it a `clock:` of its own in the mapping"
         yield f"{finding}: {cause}."

@@ -104,7 +104,7 @@ class Bag(Source):
         # topics that are read, and whether they come from the robot's computer, for common stamps
         self._used = {} if mapping is None else topics_used(mapping, self.names)
         self._messages: dict[str, Sequence[Message]] = {}
-        self._notes: list[str] = []
+        self._notes: dict[str, list[str]] = {}  # by topic
         self._stamps: dict[tuple[str, ...], dict[str, Stream]] = {}
 
     @property
@@ -118,7 +118,8 @@ class Bag(Source):
         place = f"{self.place}: topic {name!r}"
         names = tuple(dict.fromkeys(fields_of(messages[0].content)))
         column, stamps = partial(column_of, place, names, messages), partial(self._stamps_of, name)
-        return Table(place, names, column, "message {}".format, self._notes, stamps)
+        notes = self._notes.setdefault(name, [])
+        return Table(place, names, column, "message {}".format, notes, stamps)
 
     def _of(self, topic: str) -> Sequence[Message]:
         if topic not in self._messages:
@@ -139,12 +140,14 @@ class Bag(Source):
                 rows = np.arange(len(messages), dtype=np.float64)[:, None]
                 data[each] = TopicData(each, receive, header, rows)
             robot = [each for each, own in self._used.items() if own]
-            self._stamps[key] = self._joined(data, STAMPS[which], robot)
+            notes = self._notes.setdefault(topic, [])
+            self._stamps[key] = self._joined(data, STAMPS[which], robot, notes)
         return self._stamps[key][topic]
 
     def _joined(
-        self, data: dict[str, TopicData], stamps: roles.Stamps, robot: Sequence[str]
-    ) -> dict[str, Stream]:
+        self, data: dict[str, TopicData], stamps: roles.Stamps, robot: Sequence[str],
+        notes: list[str],
+    ) -> dict[str, Stream]:  # fmt: skip
         """Stamps topics; by arrival if unasked-for headers are of no use."""
         try:
             return streams(data, stamps, self.place, robot)
@@ -152,7 +155,7 @@ class Bag(Source):
             if stamps != "auto":
                 raise
             fault = str(error).removeprefix(f"{self.place}: ").partition(";")[0]
-            self._notes.append(f"{fault}; all messages were stamped by their arrival.")
+            notes.append(f"{fault}; all messages were stamped by their arrival.")
             return streams(data, "receive", self.place, robot)
 
 

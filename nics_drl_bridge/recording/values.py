@@ -30,6 +30,7 @@ from nics_drl_bridge.recording.table import Column, Source, Table, numbers_of
 
 ZONE = re.compile(r"(Z|[+-]\d\d:?\d\d)$")
 CLOCK = re.compile(r"\d\d:\d\d:\d\d")  # a time of day
+AT_ONCE = 0.25  # rows so much closer than usual come at once
 CLOSE = 1e-9  # a flag equals a number within this
 
 
@@ -267,8 +268,12 @@ def _without_rest(table: Table, column: Reference, rows: int) -> str:
 
 
 def _rate(raw: Series, held: bool) -> Series:
-    """Differentiates a counter: exact between two stamps, so that its integral stays."""
-    last = np.append(np.diff(raw.t) > 0.0, True)  # of rows with one stamp
+    """Differentiates a counter: exact between two stamps, so that its integral stays.
+
+    Of rows that come at once only the last is used: ticks between them would be of no time.
+    """
+    span = np.diff(raw.t)
+    last = np.append(span > AT_ONCE * span.mean() if len(span) else span > 0.0, True)
     t, values = raw.t[last], raw.values[last]
     rate = np.diff(values) / np.diff(t)
     at = t[:-1] if held else (t[:-1] + t[1:]) / 2.0

@@ -427,6 +427,8 @@ def _curve(drive: Drive, calibration: Calibration, name: str) -> ShiftCurve | No
             signal = (wheels.t - float(np.median(np.diff(wheels.t))), wheels.t, wheels.values)
         lags = np.array([r.lag_s for r in calibration.responses])
         lags = lags if len(lags) == len(spec.state) else nominal_lags(spec)
+        if not len(lags):  # nothing lags behind: the fit found the latency by predictions
+            return None
         left = clocks.response_residual(command, spec, signal)
         delays = calibration.command_latency_s - value if of_clock else value
         rest = [left(lags, d) for d in delays]

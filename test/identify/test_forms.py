@@ -14,6 +14,7 @@ from nics_drl_bridge.identify.forms import (
     Form,
     curve_of,
     inputs_of,
+    reached,
     two_way,
     with_back,
     with_dead,
@@ -124,3 +125,31 @@ def test_only_a_command_that_drives_both_ways_may_have_a_gain_of_its_own_backwar
     assert len(form_inputs(found, samples, form).sought) == 4  # it has no dead zone
     forwards = replace(samples, x=np.abs(samples.x))
     assert two_way(found.training, forwards) == ()
+
+
+def test_ends_and_limits_that_the_drive_never_reached_are_left_out(found, samples):
+    spec, size = found.training.spec, len(samples.x[0])
+    powers = np.eye(size, dtype=np.int64)[[3]]
+    gains = np.zeros((6, 1))
+    gains[3] = 5.0
+    sent = found.training.recording.command.values[:, 0]
+    asked = 5.0 * samples.x[:, 3]
+
+    def written(most: float, rise: float) -> TaylorModel:
+        curve = InputCurve(command="throttle", dead=0.1, least=1.2 * sent.min(), most=most)
+        limits = np.tile([-np.inf, np.inf], (3, 1))
+        limits[0] = 2.0 * asked.min(), rise
+        model = TaylorModel(
+            spec.variable_names, spec.dof_names, spec.dof_units, powers, gains, 0.01,
+            np.zeros(size), np.zeros(size), inputs=(curve,), limits=limits,
+        )  # fmt: skip
+        return reached(model, found.training, samples)
+
+    beyond = written(1.1 * sent.max(), 2.0 * asked.max())
+    assert beyond.inputs == (InputCurve(command="throttle", dead=0.1),)
+    assert not np.isfinite(beyond.limits).any()
+    assert beyond.high[3] == pytest.approx(sent.max() - 0.1)
+    within = written(0.8 * sent.max(), 0.5 * asked.max())
+    assert within.inputs[0].most == pytest.approx(0.8 * sent.max())
+    assert within.inputs[0].least == -np.inf
+    assert within.limits[0].tolist() == [-np.inf, 0.5 * asked.max()]

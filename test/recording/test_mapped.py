@@ -97,6 +97,16 @@ def test_quaternions_are_headings_and_variances_deviations(tmp_path, columns):
     assert read(path, pose=pose | {"covariance": ["q"] * 3}).pose.sigma is None
 
 
+def test_counts_that_come_at_once_are_of_the_time_since_the_burst_before(tmp_path, columns):
+    t = np.repeat(columns["t"][::2], 2)
+    t[1::2] += 0.001
+    bursts = {"t": t, "x": t, "y": 0.0 * t, "yaw": 0.0 * t, "n": np.round(700.0 * t), "w": 0.0 * t}
+    path = write(tmp_path / "log.csv", bursts)
+    found = read(path, command={"left": {"from": "n", "unit": "ticks", "ticks_per_turn": 100}})
+    speed = 700.0 * 2.0 * np.pi / 100.0
+    assert found.command.values == pytest.approx(speed, rel=0.05)  # not that of a millisecond
+
+
 def test_the_rate_of_a_counter_holds_until_the_stamp_that_shows_it(tmp_path, columns):
     speed = np.where(columns["t"] < 2.0, 400.0, 900.0)
     ticks = 65_000.0 + np.append(0.0, np.cumsum(speed[:-1] * 0.02))
