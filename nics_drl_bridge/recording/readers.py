@@ -26,6 +26,7 @@ from nics_drl_bridge.recording.recording import (
 from nics_drl_bridge.recording.table import Source
 from nics_drl_bridge.recording.table_files import Files
 from nics_drl_bridge.recording.topic_roles import TopicRoles
+from nics_drl_bridge.recording.values import unit_of
 from nics_drl_bridge.robot.spec import RobotSpec, definition, load_robot, robot_from
 
 DEFAULT_ROBOT = "ackermann"
@@ -86,7 +87,25 @@ def _by_mapping(
         recording = read_mapped(source, given)
     if given.robot is not None:
         recording = replace(recording, robot=definition(given.robot))
-    return recording if spec is None else arranged(recording, spec)
+    if spec is None:
+        return recording
+    _check_units(given, spec)
+    return arranged(recording, spec)
+
+
+def _check_units(mapping: Mapping, spec: RobotSpec) -> None:
+    """Refuses units of commands and states of another kind than the robot's (ConfigError)."""
+    for stream, values in (("command", spec.command), ("state", spec.state)):
+        for variable in values:
+            value = getattr(mapping, stream).get(variable.name)
+            if value is None or value.scale != 1.0 or value.maximum is not None:
+                continue  # what is scaled may have become what is needed
+            si = unit_of(value).si
+            if si and si != variable.unit != "1":
+                turns = si.startswith("ticks") and variable.unit.startswith("rad")
+                cure = "add `ticks_per_turn:`" if turns else "check its unit, or give `scale:`"
+                fault = f"{stream}.{variable.name}: is in {si}, where {variable.unit} is needed"
+                raise ConfigError(f"{fault}; {cure}.")
 
 
 def _loaded(mapping: Mapping | str | Path) -> Mapping:
@@ -102,6 +121,7 @@ def robot_and_drive(
         given = given if robot is None else given.model_copy(update={"robot": robot})
         drive = read_recording(path, None, topics, given)
         spec = robot_of(given, drive)
+        _check_units(given, spec)
         return spec, arranged(drive, spec)
     if not is_recording(path):
         spec = load_robot(robot or DEFAULT_ROBOT)

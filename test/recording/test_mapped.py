@@ -351,3 +351,28 @@ def test_longitude_and_latitude_are_places_on_the_ground(tmp_path):
     assert np.allclose(found - found[0], moved - moved[0], rtol=1e-3, atol=1e-4)
     with pytest.raises(ConfigError, match=r"pose.y: is in m, not in rad; check its unit"):
         read(path, pose=pose | {"y": {"from": "y", "unit": "m"}})
+
+
+@pytest.mark.parametrize(
+    ("value", "says"),
+    [
+        ({"from": "w", "unit": "m/s"}, "command.steering_command: is in m/s, where rad is needed"),
+        (
+            {"from": "w", "unit": "V"},
+            "is in V, where rad is needed; check its unit, or give `scale",
+        ),
+        ({"from": "w", "unit": "%"}, "is in 1, where rad is needed"),
+        ({"from": "w", "unit": "ticks", "differentiate": False}, "add `ticks_per_turn:`"),
+    ],
+)
+def test_a_unit_of_another_kind_than_the_command_s_is_refused(tmp_path, columns, value, says):
+    path = write(tmp_path / "log.csv", columns)
+    robot = {"kind": "ackermann", "footprint_radius": 0.2, "parameters": {"wheelbase": 0.3}}
+    given = {
+        "robot": robot, "time": "t", "pose": {"x": "x", "y": "y", "heading": "yaw"},
+        "command": {"speed_command": {"from": "v", "unit": "km/h"}, "steering_command": value},
+    }  # fmt: skip
+    with pytest.raises(ConfigError, match=says):
+        robot_and_drive(path, None, TopicRoles(), Mapping.model_validate(given))
+    scaled = given | {"command": given["command"] | {"steering_command": value | {"scale": 0.5}}}
+    robot_and_drive(path, None, TopicRoles(), Mapping.model_validate(scaled))
