@@ -102,8 +102,7 @@ def run(plan: DemoPlan, say: Say) -> str:
     ]
     name, file = model.robot.name, plan.out / "report.html"
     lead = f"Robot {name!r} in the world {plan.world!r}, policy {learned.policy!r}."
-    noise = identified.calibration.position_noise_m
-    lead = " ".join([*shortfall(identified.judgement, noise), lead])
+    lead = " ".join([*shortfall(identified.judgement), lead])
     write_text(file, pictures.page("nics_drl_bridge: demo", lead, sections))
     return (
         f"demo: in process {successes(here)}/{plan.episodes}, "

@@ -372,7 +372,7 @@ def _notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
     linear, _ = _fitted(findings)
     spec, calibration = drive.spec, findings.calibration
     return (
-        *shortfall(findings.judgement, calibration.position_noise_m),
+        *shortfall(findings.judgement),
         *drive.recording.repairs,
         *findings.repairs,
         *calibration.notes,

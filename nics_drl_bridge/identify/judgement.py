@@ -75,15 +75,12 @@ def errors_of_ends(ends: Array, chosen: Windows) -> EndErrors:
     return EndErrors(float(np.hypot(*apart[:, :2].T).mean()), float(heading))
 
 
-def shortfall(judgement: tuple[HorizonErrors, ...], noise_m: float) -> Iterator[str]:
-    """Says which yardsticks a model does not beat after 5 s, or the most that was held out.
-
-    What the noise of measured positions [m] may be is a draw.
-    """
+def shortfall(judgement: tuple[HorizonErrors, ...]) -> Iterator[str]:
+    """Says which yardsticks a model does not beat after 5 s, or the most that was held out."""
     for at in [each for each in judgement if each.horizon_s <= HORIZON_S][-1:]:
         named = {"the fitted textbook": at.textbook, "a robot that keeps its twist": at.kept_twist}
         better = {name: errors.position_m for name, errors in named.items() if errors is not None}
-        better = {name: m for name, m in better.items() if not at.model.position_m < m + noise_m}
+        better = {name: m for name, m in better.items() if not at.model.position_m < m}
         if better:
             off = f"end {at.model.position_m:.3g} m off after {at.horizon_s:g} s"
             those = " and ".join(f"those of {name} {error:.3g} m" for name, error in better.items())

@@ -23,7 +23,7 @@ ENDS = (1.0, 99.0)  # percentiles that bound the range of a state
 
 def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
     """Returns the report on a recording from a source as text for people."""
-    model, noise = identified.model, identified.calibration.position_noise_m
+    model = identified.model
     latency, until = identified.recording.latency.sentences(), identified.train_until_s
     units = units_of(spec)
     ranges = zip(model.variables, model.low, model.high, strict=True)
@@ -32,7 +32,7 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
     sections: dict[str, Iterable[str]] = {
         f"Fit report: robot {spec.name!r} from {source}": (
             fill(warning, WIDTH - 2, subsequent_indent="  ")
-            for warning in shortfall(identified.judgement, noise)
+            for warning in shortfall(identified.judgement)
         ),
         f"Kept {_count(identified)}, step {model.dt:g} s "
         f"(X = {', '.join(model.variables)}), with standard errors:": equations_with_errors(model),
