@@ -47,8 +47,8 @@ def motors() -> TaylorModel:
         CAR.variable_names, CAR.dof_names, CAR.dof_units, powers, np.array(rows), 0.01,
         np.array([-1.0, -1.0, -0.6, -1.0]), np.array([2.0, 1.0, 0.7, 1.0]),
         inputs=(
-            InputCurve(command="throttle", dead=DEAD, least=-0.5, most=0.8, back=0.6),
-            InputCurve(command="steering", dead=0.02),
+            InputCurve(command="throttle", dead=DEAD, least=-0.5, most=0.8, back=0.6, delay=0.02),
+            InputCurve(command="steering", dead=0.02, delay=0.13),
         ),
         friction=np.array([0.2, 0.0]), drag=np.array([0.4, 0.0]),
         limits=np.array([[-2.5, 1.5], [-np.inf, 6.0]]),
@@ -77,12 +77,22 @@ def path(commands) -> tuple[np.ndarray, np.ndarray]:
     """Poses (T + 1, 3) and states (T + 1, S) at the ends of periods, step by step of the model."""
     car, pose, state = motors(), np.zeros(3), np.zeros(2)
     poses, states = [pose], [state]
-    for command in commands:
-        for _ in range(SUBSTEPS):
-            pose, state = car.step(pose, state, command)
+    for command in late(car, commands):
+        pose, state = car.step(pose, state, command)
         poses.append(pose)
         states.append(state)
-    return np.array(poses), np.array(states)
+    return np.array(poses)[::SUBSTEPS], np.array(states)[::SUBSTEPS]
+
+
+def late(car, commands):
+    """Commands (T SUBSTEPS, C) that act in each step, of those (T, C) sent in each period."""
+    every = np.repeat(commands, SUBSTEPS, axis=0)
+    delays = np.round(car.delays / car.dt).astype(int)
+    ahead = (
+        np.concatenate([np.zeros(n), row[: -n or None]])
+        for n, row in zip(delays, every.T, strict=True)
+    )
+    return np.stack(list(ahead), axis=1)
 
 
 def test_the_drive_shows_every_stage(commands, path):
@@ -92,14 +102,15 @@ def test_the_drive_shows_every_stage(commands, path):
     assert (np.abs(commands[:, 0]) > 0.8).any()
     raw = replace(car, inputs=()), *(replace(car, **{k: np.zeros(2)}) for k in ("friction", "drag"))
     free = replace(car, limits=np.tile([-np.inf, np.inf], (2, 1)))
-    for other in (*raw, free, replace(car, back_emf=np.zeros((2, 2)))):
+    swift = replace(car, inputs=tuple(c.model_copy(update={"delay": 0.0}) for c in car.inputs))
+    for other in (*raw, free, swift, replace(car, back_emf=np.zeros((2, 2)))):
         ends = rolled(other, commands)[0]
         assert np.hypot(*(ends[-1] - path[0][-1])[:2]) > 0.02
 
 
 def rolled(car, commands):
     poses, states = np.zeros((1, PERIODS * SUBSTEPS + 1, 3)), np.zeros((1, 601, 2))
-    every = np.repeat(car.in_effect(commands), SUBSTEPS, axis=0)[None]
+    every = car.in_effect(late(car, commands))[None]
     rollout(poses, states, every, term_arrays(car), SERIES, car.dt)
     return poses[0, ::SUBSTEPS], states[0, ::SUBSTEPS]
 
@@ -142,11 +153,11 @@ def test_robots_that_might_touch_follow_the_model_too(model):
     start = np.array([[0.0, 0.0, 0.0], [0.0, 0.41, 0.0]])
     simulator.reset([0], starts=start[None])
     pose, state = start, np.zeros((2, 2))
-    for throttle in (0.7, 0.7, 0.7, 0.2, -0.9, -0.9):
-        command = np.tile([throttle, 0.0], (2, 1))
-        simulator.step(command[None])
-        for _ in range(SUBSTEPS):
-            pose, state = model.kinematics.step(pose, state, command)
+    commands = np.array([[throttle, 0.0] for throttle in (0.7, 0.7, 0.7, 0.2, -0.9, -0.9)])
+    for command in commands:
+        simulator.step(np.tile(command, (1, 2, 1)))
+    for command in late(model.kinematics, commands):
+        pose, state = model.kinematics.step(pose, state, np.tile(command, (2, 1)))
     assert not simulator.data.collided.any()
     assert np.abs(pose[:, 0]).min() > 0.1
     assert_same_path(simulator.data.pose[0], pose)
@@ -185,7 +196,9 @@ def test_the_estimator_expects_the_twist_of_a_command_in_effect(model):
     estimator = Estimator(sent)
     estimator.reset(0, np.zeros(3))
     estimator.command(0, np.array([0.3, 0.0]))
-    assert estimator.at(1)[1] == pytest.approx([0.3 - DEAD, 0.0, 0.0])
+    for time, speed in ((0.01, 0.0), (0.02, 0.0), (0.021, 0.3 - DEAD)):
+        twist = estimator.at(round(time * NS_PER_S))[1]
+        assert twist == pytest.approx([speed, 0.0, 0.0]), f"the throttle acts after 0.02 s: {time}"
 
 
 def test_a_batch_of_robots_moves_as_each_alone(commands, path):
@@ -194,16 +207,16 @@ def test_a_batch_of_robots_moves_as_each_alone(commands, path):
     lanes = terms._replace(coefficient=np.tile(terms.coefficient[:, None], count))
     pose, x, dq = np.zeros((6, count)), np.zeros((5, count)), np.zeros((5, count))
     pose[2], x[4] = 1.0, 1.0
-    for command in commands:
+    for command in late(car, commands):
         x[2:4] = car.in_effect(command)[:, None]
-        run(pose, x, dq, lanes, SERIES, car.dt, SUBSTEPS)
+        run(pose, x, dq, lanes, SERIES, car.dt, 1)
     assert np.allclose(pose[:2, -1], path[0][-1, :2], rtol=0.0, atol=1e-9)
     assert (pose == pose[:, :1]).all()
 
 
 def test_predictions_over_seconds_have_the_derivatives_that_differences_show(commands):
     car, steps = motors(), 300
-    every = np.repeat(car.in_effect(commands), SUBSTEPS, axis=0)
+    every = car.in_effect(late(car, commands))
     first = np.arange(0, 300, 50)
     state = rolled_states(car, every)[first]
     free = np.arange(car.terms_kept)

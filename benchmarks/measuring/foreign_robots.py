@@ -38,6 +38,7 @@ class ForeignRobot:
     commands: dict[str, tuple[float, float]]  # least and greatest, by name in the mapping
     robot: dict[str, Any]  # what a user would say of it in a mapping
     latency_s: float = 0.06  # from a command's stamp to its effect
+    delays_s: tuple[float, ...] = ()  # of the commands after that; none if empty
     mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)  # pose of the tracked body
     pose_s: float = 0.01  # between poses
     arm_known: bool = True  # the tracked point's x is defined, as no other point moves alike
@@ -81,13 +82,13 @@ ROBOTS: dict[str, ForeignRobot] = {
         {"speed_command": (-0.5, 1.2), "steering_command": (-1.1, 1.1)},
         {"kind": "tricycle", "footprint_radius": 0.6, "angular_is": "steering",
          "parameters": {"wheelbase": 0.9}},
-        mounting=(0.25, 0.12, 0.5), latency_s=0.1,
+        mounting=(0.25, 0.12, 0.5), latency_s=0.1, delays_s=(0.0, 0.15),
     ),
     "omni": ForeignRobot(
         physics.OMNI, (0.2, 0.07, 0.08, 0.09, 1.0, 0.99, 1.015),
         {"vx": (-0.8, 0.8), "vy": (-0.8, 0.8), "wz": (-2.0, 2.0)},
         {"kind": "omnidirectional", "footprint_radius": 0.25},
-        mounting=(0.05, -0.03, -0.2), latency_s=0.05, pose_s=0.02,
+        mounting=(0.05, -0.03, -0.2), latency_s=0.05, delays_s=(0.0, 0.0, 0.1), pose_s=0.02,
     ),
     "ticks": ForeignRobot(
         physics.TICKS, (0.0975, 0.0985, 0.34, 0.1),
@@ -146,9 +147,11 @@ def foreign_drive(robot: ForeignRobot, seed: int, duration_s: float = 90.0) -> F
     stamp = np.arange(0.0, duration_s, COMMAND_S)
     columns = [_varied(rng, stamp, low, high) for low, high in robot.commands.values()]
     values = np.stack(columns, axis=1)
-    acting = np.searchsorted(stamp, np.arange(fine) * STEP_S - robot.latency_s + 1e-9, "right") - 1
+    delays = robot.latency_s + np.array(robot.delays_s or np.zeros(len(columns)))
+    sent = np.arange(fine)[:, None] * STEP_S - delays + 1e-9
+    acting = np.searchsorted(stamp, sent, "right") - 1
     states = np.zeros((fine + 1, physics.STATES))
-    command = np.where(acting[:, None] < 0, 0.0, values[np.maximum(acting, 0)])
+    command = np.where(acting < 0, 0.0, np.take_along_axis(values, np.maximum(acting, 0), axis=0))
     parameters = np.append(robot.values, np.zeros(12 - len(robot.values)))
     physics.integrate(states, command, robot.physics, parameters, STEP_S)
     seen = states[::stride]

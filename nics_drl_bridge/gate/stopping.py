@@ -34,7 +34,8 @@ def shield_config(
         rates = [] if limits is None else limits.rate[limits.linear].tolist()
         brakes = zip(model.robot.state, model.kinematics.braking.tolist(), strict=True)
         hardest = [rate for v, rate in brakes if v.unit == SPEED]
-        delay = model.calibration.command_latency_s + lag(model.kinematics) + model.control_period
+        reacts = model.calibration.command_latency_s + float(model.kinematics.delays.max(initial=0))
+        delay = reacts + lag(model.kinematics) + model.control_period
         deceleration = min(min(rates, default=UNKNOWN_DECELERATION), min(hardest, default=np.inf))
         stopping = Stopping(latency=max(0.0, delay), deceleration=deceleration)
     values = stopping.model_copy(update=dict(given or {}))

@@ -11,9 +11,9 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import MAX_GAP_S, MIN_STAMPS, Drive
-from nics_drl_bridge.identify.signals import held, inferred_states, resample, unwrapped
+from nics_drl_bridge.identify.signals import inferred_states, resample, taken, unwrapped
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
-from nics_drl_bridge.robot.curve import InputCurve
+from nics_drl_bridge.robot.curve import InputCurve, delays
 
 STEP_S = 0.01  # step of the samples where the pose's own step is not usable
 STEP_RANGE_S = (0.002, 0.02)
@@ -45,7 +45,7 @@ class Calibration:
     rotation_rad: float = 0.0  # heading of `base_link` minus the heading of the tracked body
     lever_arm_m: tuple[float, float] = (0.0, 0.0)  # (x, y) of the tracked point in `base_link`
     responses: tuple[Response, ...] = ()  # of the state variables; empty if the state was measured
-    inputs: tuple[InputCurve, ...] = ()  # of the commands that have a dead zone or saturate
+    inputs: tuple[InputCurve, ...] = ()  # of the commands that do not act as they are, or at once
     burst_period_s: NonNegativeFloat = 0.0  # between bursts of poses; 0 without bursts
     position_noise_m: NonNegativeFloat = 0.0  # standard deviation of x and y of the pose
     heading_noise_rad: NonNegativeFloat = 0.0
@@ -104,7 +104,7 @@ def align(drive: Drive, calibration: Calibration) -> Samples:
         grid,
         calibration.to_base(tracked),
         states_at(drive, calibration, grid),
-        held(recording.command, drive.spec, begin, begin + step),
+        taken(recording.command, drive.spec, calibration.inputs, begin, begin + step),
     )
     known = outside_gaps(samples.t, t, step)
     if recording.state is not None:
@@ -131,7 +131,8 @@ def states_at(drive: Drive, calibration: Calibration, grid: Array) -> Array:
     step = float(grid[1] - grid[0])
     lead = int(np.ceil(max(0.0, grid[0] - recording.command.t[0]) / step)) + 1
     longer = np.concatenate([grid[0] + step * np.arange(-lead, 0), grid])
-    latency = calibration.command_latency_s
+    late = delays([r.command for r in calibration.responses], calibration.inputs)
+    latency = calibration.command_latency_s + late
     return gains * inferred_states(recording.command, drive.spec, lags, latency, longer)[lead:]
 
 

@@ -1,7 +1,7 @@
 """Clocks: a drive's offset, latency and lags, each the shift that best explains it by commands."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from nics_drl_bridge.identify.statistics import (
 )
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot import taylor
+from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.kernels import GREATEST_ORDER
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -168,6 +169,13 @@ class TimingEstimate:
     lag_sigma: Array  # (S,) [s]; NaN for a nominal lag
     separated: bool  # True if offset and latency could be separated
     early: float = 0.0  # by which motion on the commands' clock precedes them: no clock of it [s]
+    # (S,) by which inferred states follow their commands after the latency, beside lags [s]
+    delays: Array = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def late(self) -> Array:
+        """Latency of all commands (), or (S,) of those that inferred states follow [s]."""
+        return self.latency + (self.delays if self.delays.size else np.zeros(()))
 
 
 def timing_of(drive: Drive) -> TimingEstimate:
@@ -204,7 +212,7 @@ def apart(drive: Drive, timing: TimingEstimate) -> TimingEstimate:
     """Sharpens a timing by a delay and a lag of each command of its own.
 
     What stands between command and motion beside one lag, as a servo of higher order, adds to a
-    command's delay: the latency is the least delay, and the rest counts as lag.
+    command's delay: the latency is the least delay.
     """
     if drive.recording.state is not None or not drive.spec.state or len(timing.sigma) != 1:
         return timing
@@ -223,13 +231,22 @@ def apart(drive: Drive, timing: TimingEstimate) -> TimingEstimate:
         if errors[name] > TOLD_S:
             names = (_of_sum(drive.spec.state[i].name) for i in moved)
             errors |= zip(names, map(float, sigma[1]), strict=True)
-    lags, lag_sigma = timing.lags.copy(), timing.lag_sigma.copy()
-    lags[moved], lag_sigma[moved] = np.maximum(sums - least, 0.0), np.hypot(*sigma)
+    lags, lag_sigma, further = timing.lags.copy(), timing.lag_sigma.copy(), 0.0 * timing.lags
+    further[moved] = np.where(alike, 0.0, delay - least)
+    for i, own in zip(moved[~alike], sigma[0, ~alike].tolist(), strict=True):
+        errors[f"{drive.spec.state[i].follows}.delay"] = own
+    lags[moved], lag_sigma[moved] = np.maximum(sums - least - further[moved], 0.0), np.hypot(*sigma)
     latency = least if timing.separated else 0.0
     return replace(
         timing, offset=latency - least, latency=latency, sigma=errors, lags=lags,
-        lag_sigma=lag_sigma,
+        lag_sigma=lag_sigma, delays=further,
     )  # fmt: skip
+
+
+def late_inputs(spec: RobotSpec, timing: TimingEstimate) -> tuple[InputCurve, ...]:
+    """Returns the commands that act later than the latency of all, as their states follow them."""
+    later = {v.follows: d for v, d in zip(spec.state, timing.delays, strict=False) if d > 0.0}
+    return tuple(InputCurve(command=str(name), delay=d) for name, d in later.items())
 
 
 def _delays(
@@ -340,7 +357,7 @@ def expected_states(drive: Drive, twists: TwistIntervals, timing: TimingEstimate
     if state is not None:
         return signals.interval_means(state.t, state.values, start, end)
     grid = np.arange(min(start[0], command.t[0]) - 1.0, end[-1] + 0.01, 0.01)
-    states = signals.inferred_states(command, drive.spec, timing.lags, timing.latency, grid)
+    states = signals.inferred_states(command, drive.spec, timing.lags, timing.late, grid)
     return signals.interval_means(grid, states, start, end)
 
 

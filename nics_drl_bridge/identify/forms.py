@@ -14,11 +14,11 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import shooting
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.signals import held
+from nics_drl_bridge.identify.signals import taken
 from nics_drl_bridge.identify.terms import linear_fit, sided
 from nics_drl_bridge.identify.yardstick import structure_of
 from nics_drl_bridge.recording.recording import Samples
-from nics_drl_bridge.robot.curve import InputCurve, curved
+from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 
@@ -30,6 +30,7 @@ CLEAR = 0.25  # one of the turn rate this, as understeer looks alike; then it is
 STRIDE_S = 0.04
 NOTHING = 1e-6  # [m/s, rad/s]
 DELAY_ORDER, DELAY_STEP_S, LONGEST_S = 2, 0.02, 0.4  # of the search for a delay
+ALIKE_S = 0.01  # delays of commands that differ by less are tried as one
 DELAY_SCALE_S, CURVE_SCALE = 0.05, 0.1  # steps of their refinement
 BACK_SCALE, BACK_RANGE = 0.2, (0.2, 5.0)  # of a gain backwards
 SMALL_DEAD = 0.05  # share of a command's reach at which the search for a dead zone begins
@@ -117,20 +118,31 @@ class Form:
     back: tuple[str, ...] = ()  # commands whose curve has a gain of its own backwards
     drag: tuple[str, ...] = ()  # states with a drag by their square, and a back-EMF
     tyres: bool = False  # True if a car turns less at speed than its textbook, and slips aside
+    delays: tuple[tuple[str, float], ...] = ()  # likely ones of all commands [s]; (): they share it
+
+    def latency_at(self, inputs: shooting.Inputs, values: Array) -> float:
+        """Returns the common latency of the commands for values (I,): the least delay [s]."""
+        at = dict(zip(inputs.names, values.tolist(), strict=True))
+        return float(min((at[f"{name}.delay"] for name, _ in self.delays), default=at["latency"]))
 
     def curves_at(self, inputs: shooting.Inputs, values: Array) -> tuple[InputCurve, ...]:
         """Returns the input curves for values (I,)."""
         at = dict(zip(inputs.names, values.tolist(), strict=True))
-        return tuple(
+        latency, curves = self.latency_at(inputs, values), {c.command: c for c in self.curves}
+        for name, _ in self.delays:
+            curves.setdefault(name, InputCurve(command=name))
+        found = (
             InputCurve(
-                command=c.command,
-                dead=max(at[f"{c.command}.dead"], 0.0),
-                least=min(at[f"{c.command}.least"], 0.0),
-                most=max(at[f"{c.command}.most"], 0.0),
-                back=at[f"{c.command}.back"],
+                command=name,
+                dead=max(at.get(f"{name}.dead", c.dead), 0.0),
+                least=min(at.get(f"{name}.least", c.least), 0.0),
+                most=max(at.get(f"{name}.most", c.most), 0.0),
+                back=at.get(f"{name}.back", c.back),
+                delay=at.get(f"{name}.delay", latency) - latency,
             )
-            for c in self.curves
+            for name, c in curves.items()
         )
+        return tuple(c for c in found if c != InputCurve(command=c.command))
 
     def actuated(self, model: TaylorModel, inputs: shooting.Inputs, values: Array) -> TaylorModel:
         """Returns a model with friction, drag and limits for values (I,)."""
@@ -154,9 +166,8 @@ def problem_of(
     command, spec, t, dt = drive.recording.command, drive.spec, samples.t, samples.dt
 
     def commands(values: Array) -> Array:
-        begin, curves = t - float(values[0]), form.curves_at(inputs, values)
-        bent = replace(command, values=curved(command.values, spec, curves))
-        return held(bent, spec, begin, begin + dt)
+        begin = t - form.latency_at(inputs, values)
+        return taken(command, spec, form.curves_at(inputs, values), begin, begin + dt)
 
     def shaped(model: TaylorModel, values: Array) -> TaylorModel:
         return form.actuated(model, inputs, values)
@@ -169,16 +180,22 @@ def inputs_of(drive: Drive, latency: float, samples: Samples, form: Form) -> sho
     """Returns the values that are sought besides coefficients: latency, and those of a form."""
     one_clock = drive.recording.pose.clock == drive.recording.command.clock
     least = min(latency, 0.0) if one_clock else latency - LONGEST_S
-    rows = {"latency": (latency, DELAY_SCALE_S, least, latency + LONGEST_S)}
+    bounds = least, latency + LONGEST_S
+    rows = {
+        "latency": (latency, DELAY_SCALE_S, *(bounds if not form.delays else (latency, latency)))
+    }
+    rows |= {f"{name}.delay": (at, DELAY_SCALE_S, *bounds) for name, at in form.delays}
     for curve in form.curves:
         name, size = curve.command, max(abs(curve.least), abs(curve.most))
-        step, known = CURVE_SCALE * size, (curve.back, curve.back)
-        rows |= {
-            f"{name}.dead": (curve.dead, step, 0.0, 0.5 * size if curve.dead else 0.0),
-            f"{name}.least": (curve.least, step, 1.5 * curve.least, 0.5 * curve.least),
-            f"{name}.most": (curve.most, step, 0.5 * curve.most, 1.5 * curve.most),
-            f"{name}.back": (curve.back, BACK_SCALE, *(BACK_RANGE if name in form.back else known)),
-        }
+        if np.isfinite(size):
+            step = CURVE_SCALE * size
+            rows |= {
+                f"{name}.dead": (curve.dead, step, 0.0, 0.5 * size if curve.dead else 0.0),
+                f"{name}.least": (curve.least, step, 1.5 * curve.least, 0.5 * curve.least),
+                f"{name}.most": (curve.most, step, 0.5 * curve.most, 1.5 * curve.most),
+            }
+        if name in form.back:
+            rows[f"{name}.back"] = (curve.back, BACK_SCALE, *BACK_RANGE)
     rates = {v.name: samples.dq[:, 3 + i] for i, v in enumerate(drive.spec.state)}
     for name in form.friction:
         size = float(np.percentile(np.abs(rates[name]), STRONG))
@@ -270,16 +287,43 @@ def reached(model: TaylorModel, drive: Drive, samples: Samples) -> TaylorModel:
 
 def likely_delay(drive: Drive, calibration: Calibration, samples: Samples) -> float:
     """Returns the delay [s] of the commands by which they best explain the rates of the state."""
+    tries, late = _delayed(drive, calibration, samples)
+    left = [_left(drive.spec, samples, command) for command in late]
+    found = np.isfinite(left).all()
+    return float(tries[int(np.argmin(left))]) if found else calibration.command_latency_s
+
+
+def likely_delays(
+    drive: Drive, calibration: Calibration, samples: Samples
+) -> tuple[tuple[str, float], ...]:
+    """Returns likewise the delay of each command beside the others; nothing if they are alike."""
+    tries, late = _delayed(drive, calibration, samples)
+    now, found = int(np.abs(tries - calibration.command_latency_s).argmin()), []
+    for place, command in enumerate(drive.spec.command):
+        mixed = np.repeat(late[now][None], len(tries), axis=0)
+        mixed[..., place] = late[..., place]
+        left = [_left(drive.spec, samples, each) for each in mixed]
+        if np.ptp(left) > 0.0 and np.isfinite(left).all():
+            found.append((command.name, float(tries[int(np.argmin(left))])))
+    delays = [delay for _, delay in found]
+    return tuple(found) if np.ptp(delays or [0.0]) > ALIKE_S else ()
+
+
+def _delayed(drive: Drive, calibration: Calibration, samples: Samples) -> tuple[Array, Array]:
+    """Returns delays (N,) that may be [s], and the commands in effect (N, T, C) by each."""
     form, now = Form(calibration.inputs), calibration.command_latency_s
     inputs = inputs_of(drive, now, samples, form)
     problem = problem_of(drive, samples, form, inputs)
     one_clock = drive.recording.pose.clock == drive.recording.command.clock
     tries = np.arange(0.0, LONGEST_S, DELAY_STEP_S) - (0.0 if one_clock else LONGEST_S / 2.0)
-    states, left = len(drive.spec.state), []
-    free = [3 + i for i, v in enumerate(drive.spec.state) if v.twist] or [0, 2]
-    for delay in tries:
-        command = problem.commands(np.append(delay, inputs.start[1:]))
-        x = np.concatenate([samples.x[:, :states], command], axis=1)
-        found = linear_fit(replace(samples, x=x), drive.spec, DELAY_ORDER)
-        left.append(float((1.0 - found.r2[free]).sum()))
-    return float(tries[int(np.argmin(left))]) if np.isfinite(left).all() else now
+    late = [problem.commands(np.append(delay, inputs.start[1:])) for delay in tries]
+    return tries, np.array(late)
+
+
+def _left(spec: RobotSpec, samples: Samples, command: Array) -> float:
+    """Returns how much of the rates of the state commands in effect (T, C) leave unexplained."""
+    states = len(spec.state)
+    free = [3 + i for i, v in enumerate(spec.state) if v.twist] or [0, 2]
+    x = np.concatenate([samples.x[:, :states], command], axis=1)
+    found = linear_fit(replace(samples, x=x), spec, DELAY_ORDER)
+    return float((1.0 - found.r2[free]).sum())

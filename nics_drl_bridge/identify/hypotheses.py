@@ -18,6 +18,7 @@ from nics_drl_bridge.identify.fit import Order
 from nics_drl_bridge.identify.forms import (
     Form,
     inputs_of,
+    likely_delays,
     problem_of,
     two_way,
     with_back,
@@ -188,7 +189,7 @@ def base_of(
         plain = fitted(Form(clear))
         if (other := error_of(plain)) < error or np.isinf(other):  # too short a drive tells nothing
             best, error = plain, other
-    for change, worth in changes(drive, samples):
+    for change, worth in changes(drive, calibration, samples):
         if (form := change(best.draft.form)) == best.draft.form:
             continue
         base = fitted(form, best)
@@ -197,7 +198,9 @@ def base_of(
     return best
 
 
-def changes(drive: Drive, samples: Samples) -> Iterator[tuple[Callable[[Form], Form], float]]:
+def changes(
+    drive: Drive, calibration: Calibration, samples: Samples
+) -> Iterator[tuple[Callable[[Form], Form], float]]:
     """Yields changes of the form of a robot's motion, and to which share each takes the error."""
     # Drag and friction are hard to tell apart: both are tried, then each without the other.
     speeds = tuple(v.name for v in drive.spec.state if v.twist == "vx")
@@ -207,6 +210,9 @@ def changes(drive: Drive, samples: Samples) -> Iterator[tuple[Callable[[Form], F
         yield lambda form: replace(form, drag=speeds, friction=speeds), WORTH
         yield lambda form: replace(form, drag=()), 1.0 / WORTH
         yield lambda form: replace(form, friction=()), 1.0 / WORTH
+    if delays := likely_delays(drive, calibration, samples):
+        yield lambda form: replace(form, delays=delays), WORTH
+    if speeds:
         yield lambda form: with_dead(form, drive, samples), WORTH
         yield lambda form: replace(form, limits=speeds), WORTH
         if backwards := two_way(drive, samples):
@@ -229,12 +235,13 @@ def chosen(trials: Sequence[Trial]) -> Trial:
 
 
 def lags_of(model: TaylorModel, spec: RobotSpec) -> dict[str, float]:
-    """Returns the lags [s] by which a base's states follow, by name."""
+    """Returns the lags [s] by which a base's states follow, by name, with their own delays."""
     alone, found = model.powers.sum(axis=1) == 1, {}
+    delays = model.delays[model.drivers]
     for i, variable in enumerate(spec.state):
         rate = float(model.coefficients[3 + i, alone & (model.powers[:, i] == 1)].sum())
         if variable.twist and rate * LONGEST_LAG_S < -1.0:
-            found[variable.name] = -1.0 / rate
+            found[variable.name] = float(delays[i]) - 1.0 / rate
     return found
 
 
@@ -279,7 +286,8 @@ def about_orders(trials: Sequence[Trial]) -> Iterator[str]:
 def about_forms(base: Base, trials: Sequence[Trial]) -> Iterator[str]:
     """Names what a model of a motion has beside the textbook's terms, and what it gains by it."""
     form, best = base.draft.form, chosen(trials)
-    parts = [f"an input curve of {curve.command}" for curve in form.curves]
+    parts = [f"an input curve of {curve.command}" for curve in form.curves if curve.bends]
+    parts += ["a delay of each command"] * bool(form.delays)
     words = (
         ("drag and back-EMF", form.drag),
         ("dry friction", form.friction),

@@ -129,6 +129,7 @@ def clocks(drive: Drive, findings: Findings) -> Findings:
     calibration = replace(
         findings.calibration,
         responses=tuple(responses),
+        inputs=timings.late_inputs(drive.spec, found),
         clock_offset_s=found.offset,
         command_latency_s=found.latency,
         burst_period_s=training.bursts.period_s if training.bursts else 0.0,
@@ -276,17 +277,18 @@ def prune(drive: Drive, findings: Findings) -> Findings:
     if findings.width is not None:  # what a mirror allows is kept: the predictions weigh it
         return findings
     linear = pruned(regression, drive.spec, drive.settings.alpha)
-    return replace(findings, linear=linear, model=linear.model)
+    model = replace(linear.model, inputs=findings.calibration.inputs)
+    return replace(findings, linear=linear, model=model)
 
 
 def refine(drive: Drive, findings: Findings) -> Findings:
     """Adjusts model and calibration to predictions over seconds, unless the drive is exact."""
-    linear, _ = _fitted(findings)
+    _, model = _fitted(findings)
     if findings.width is not None:
         return _refined_motion(drive, findings)
     if findings.calibration.is_exact:
         return findings
-    model, calibration, note = refined(linear.model, findings.calibration, findings.training)
+    model, calibration, note = refined(model, findings.calibration, findings.training)
     sentences = (note, *hypotheses.about_orders(findings.trials))
     return replace(findings, model=model, calibration=calibration, refinement=sentences)
 
@@ -300,7 +302,7 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
     if found is None or draft.error_of(found) > verdict.WORSE * draft.error_of(base.found):
         found = draft.base(other=book)  # a search may go astray
     calibration = replace(
-        calibration, command_latency_s=float(found.values[0]),
+        calibration, command_latency_s=draft.form.latency_at(draft.inputs, found.values),
         inputs=draft.form.curves_at(draft.inputs, found.values),
         uncertainty=calibration.uncertainty | found.named_errors(draft.inputs.names),
     )  # fmt: skip
@@ -309,10 +311,11 @@ def _refined_motion(drive: Drive, findings: Findings) -> Findings:
         calibration = hypotheses.remounted(calibration, found)
         values[-3:] = 0.0
     base = replace(base, draft=replace(draft, inputs=replace(draft.inputs, start=values)))
-    lags = hypotheses.lags_of(base.found.model, spec)
+    curves = draft.form.curves_at(draft.inputs, base.found.values)
+    lags = hypotheses.lags_of(replace(base.found.model, inputs=curves), spec)
     sums: tuple[str, ...] = ()
     if lags:
-        beside = float(base.found.values[0])
+        beside = draft.form.latency_at(draft.inputs, base.found.values)
         sums = (hypotheses.about_lags(calibration.command_latency_s, lags, beside),)
         told = {n: e for n, e in calibration.uncertainty.items() if n != "command_latency_s"}
         calibration = replace(calibration, uncertainty=told)
@@ -534,14 +537,15 @@ class Identified:
     def dead_zone(self) -> float:
         """Greatest value of the command that drives it at which the robot stands; 0 if none."""
         # A state with dry friction begins to move where the command's effect exceeds that.
-        model, zones = self.model, [0.0]
-        names = list(model.variables)
-        for curve in model.inputs:
-            term = np.zeros(len(names), dtype=np.int64)
-            term[names.index(curve.command)] = 1
-            gains = model.coefficients[3:, (model.powers == term).all(axis=1)].sum(axis=1)
-            held = [f / g for f, g in zip(model.friction, gains, strict=True) if f > 0.0 < g]
-            zones.append(curve.dead + max(held, default=0.0))
+        model, states = self.model, self.model.state_size
+        dead = {curve.command: curve.dead for curve in model.inputs}
+        zones = [0.0, *dead.values()]
+        for i, place in enumerate(states + model.drivers):
+            alone = np.arange(len(model.variables)) == place
+            gain = abs(model.coefficients[3 + i, (model.powers == alone).all(axis=1)].sum())
+            if model.friction[i] * gain > 0.0:
+                zone = dead.get(model.variables[place], 0.0)
+                zones.append(zone + float(model.friction[i] / gain))
         return max(zones)
 
     @property

@@ -133,7 +133,7 @@ def _with_motion(
         problem, model, free, draft.inputs, kept, EVALUATIONS, hypotheses.PULLS[-1]
     )  # fmt: skip
     calibration = replace(
-        calibration, command_latency_s=float(found.values[0]),
+        calibration, command_latency_s=draft.form.latency_at(draft.inputs, found.values),
         inputs=draft.form.curves_at(draft.inputs, found.values),
     )  # fmt: skip
     model = replace(found.model, inputs=calibration.inputs)

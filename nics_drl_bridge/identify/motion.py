@@ -12,14 +12,13 @@ from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration, outside_gaps
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.signals import held, inferred_states, resample, unwrapped
+from nics_drl_bridge.identify.signals import inferred_states, resample, taken, unwrapped
 from nics_drl_bridge.recording.recording import (
     Recording,
     Samples,
     Stream,
     samples_on_one_clock,
 )  # fmt: skip
-from nics_drl_bridge.robot.curve import curved
 from nics_drl_bridge.robot.spec import POSE_RATES, CommandVariable, RobotSpec, StateVariable
 
 WIDTHS_S = (0.07, 0.1, 0.15, 0.2)  # half-widths of the parabolas that give the twist
@@ -88,9 +87,8 @@ def samples_of(drive: Drive, calibration: Calibration, width: float) -> Samples:
     step = round(float(grid[-1] - grid[0]) / (len(grid) - 1), 9)
     t = drive.sample_t + calibration.clock_offset_s
     tracked = resample(t, unwrapped(drive.recording.pose.values), grid, 0.5 * width)
-    begin, stream = grid - calibration.command_latency_s, drive.recording.command
-    bent = replace(stream, values=curved(stream.values, spec, calibration.inputs))
-    command = held(bent, spec, begin, begin + step)
+    begin = grid - calibration.command_latency_s
+    command = taken(drive.recording.command, spec, calibration.inputs, begin, begin + step)
     samples = samples_on_one_clock(grid, calibration.to_base(tracked), state.values, command)
     return replace(samples.rows(outside_gaps(samples.t, t, step)), dt=step)
 

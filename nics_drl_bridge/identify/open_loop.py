@@ -13,8 +13,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration, states_at
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.kernels import follow
-from nics_drl_bridge.identify.signals import followed, held
-from nics_drl_bridge.recording.recording import Stream
+from nics_drl_bridge.identify.signals import followed, taken
 from nics_drl_bridge.robot.kernels import SERIES, rollout, term_arrays
 from nics_drl_bridge.robot.taylor import TaylorModel
 
@@ -109,7 +108,7 @@ def _by_one_rollout(
     # Whole steps before the first window: windows of regular poses then begin and end on the grid.
     grid = start.min() + model.dt * np.arange(-lead, (end.max() - start.min()) / model.dt + 2.0)
     begin = grid - calibration.command_latency_s
-    command = held(_in_effect(model, drive), spec, begin, begin + model.dt)
+    command = taken(recording.command, spec, model.inputs, begin, begin + model.dt)
     gains = np.array([r.gain for r in calibration.responses])
     state = gains * command[0, followed(spec)]
     path = _roll(model, state[None], command[None])[0][0, :-1]
@@ -124,16 +123,12 @@ def _from_measured_states(
     start, end = (t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t))
     steps = int(np.ceil(float((end - start).max()) / model.dt - 1e-6)) + 1
     begin = start[:, None] + model.dt * np.arange(steps) - calibration.command_latency_s
-    command = held(_in_effect(model, drive), drive.spec, begin, begin + model.dt)
+    sent = drive.recording.command
+    command = taken(sent, drive.spec, model.inputs, begin, begin + model.dt)
     poses, states = _roll(model, states_at(drive, calibration, start), command)
     exact = (end - start) / model.dt
     step = np.floor(exact + 1e-6).astype(np.intp)
     return poses, states, command, step, np.clip(exact - step, 0.0, 1.0)
-
-
-def _in_effect(model: TaylorModel, drive: Drive) -> Stream:
-    stream = drive.recording.command
-    return replace(stream, values=model.in_effect(stream.values))
 
 
 def _roll(model: TaylorModel, state: Array, command: Array) -> tuple[Array, Array]:

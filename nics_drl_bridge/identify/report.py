@@ -84,8 +84,8 @@ def units_of(spec: RobotSpec) -> dict[str, str]:
 def stages(spec: RobotSpec, identified: Identified) -> Iterator[str]:
     """Yields a line per value of the stages around the terms, with the calibration's uncertainty.
 
-    Of those the names are `throttle.dead`, `.least`, `.most` and `.back` of a command, `vx.fall`,
-    `.rise`, `.friction` and `.drag` of a state, `vx.back_emf.throttle` of both.
+    Of those the names are `throttle.dead`, `.least`, `.most`, `.back` and `.delay` of a command,
+    `vx.fall`, `.rise`, `.friction` and `.drag` of a state, `vx.back_emf.throttle` of both.
     """
     model, sigma = identified.model, identified.calibration.uncertainty
     units = units_of(spec)
@@ -97,6 +97,7 @@ def stages(spec: RobotSpec, identified: Identified) -> Iterator[str]:
             ("least", "does no more below", units[curve.command], -np.inf),
             ("most", "does no more above", units[curve.command], np.inf),
             ("back", "gain backwards, of that forwards", "", 1.0),
+            ("delay", "acts after the latency of all by", "s", 0.0),
         )
     ]
     actuators = model.limits, model.friction, model.drag

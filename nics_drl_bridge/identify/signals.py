@@ -1,5 +1,7 @@
 """Signals in time: held commands, the states that follow them, means, resampled poses, noise."""
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
@@ -8,6 +10,7 @@ from scipy.signal import lfilter
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.robot import taylor
+from nics_drl_bridge.robot.curve import InputCurve, bent, delays
 from nics_drl_bridge.robot.spec import RobotSpec
 
 SMOOTHING_BATCH = 64
@@ -15,6 +18,18 @@ DEFAULT_LAG_S = 0.1
 DIFFERENCE = 6
 DIFFERENCE_GAIN = np.sqrt(924.0)  # white noise grows by this in a sixth difference
 GAUSSIAN_MAD = 0.6745
+
+
+def taken(
+    command: Stream, spec: RobotSpec, curves: tuple[InputCurve, ...], start: Array, end: Array
+) -> Array:
+    """Returns means (..., C) of commands in effect over intervals (...) [s], by their curves."""
+    names = [c.name for c in spec.command]
+    stream = replace(command, values=bent(command.values, names, curves))
+    late, means = delays(names, curves), held(stream, spec, start, end)
+    for c in np.flatnonzero(late):
+        means[..., c] = held(stream, spec, start - late[c], end - late[c])[..., c]
+    return means
 
 
 def held(

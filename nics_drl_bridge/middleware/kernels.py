@@ -37,11 +37,16 @@ class MotionModel(NamedTuple):
     step_ns: int  # the model's step [ns]
     longest_ns: int  # longest gap that is predicted [ns]
 
+    @property
+    def longest_delay_ns(self) -> int:
+        """Longest delay of a command after the common latency [ns]."""
+        return int(self.terms.late.max(initial=0)) * self.step_ns
+
 
 class Log(NamedTuple):
     """Commands in the order in which they take effect; the first is in effect before, too."""
 
-    effective: NDArray[np.int64]  # (K,) [ns]
+    effective: NDArray[np.int64]  # (K,) of those that are not delayed further [ns]
     commands: Array  # (K, C)
 
 
@@ -142,26 +147,36 @@ def logged(log, effective_ns, command, low, high, needed_ns):  # type: ignore[no
 
 
 @kernel(allocates=True)
+def take(command, time, motion, log):  # type: ignore[no-untyped-def]
+    """Writes the commands (C,) in effect just before a time; returns when the next one is [ns]."""
+    following = np.iinfo(np.int64).max
+    for c in range(command.shape[0]):
+        late = motion.terms.late[c] * motion.step_ns
+        k = in_effect(log, time - late)
+        command[c] = log.commands[k, c]
+        if k + 1 < log.effective.shape[0]:
+            following = min(following, log.effective[k + 1] + late)
+    return following
+
+
+@kernel(allocates=True)
 def carry(mean, transition, begin, end, motion, log):  # type: ignore[no-untyped-def]
     """Moves a mean between two times, command by command, in place, see `predict`.
 
     Over a gap that is too long, or if the model diverges, the pose is kept and the state zero.
     """
-    step, commands = motion.step_ns, log.commands
+    step = motion.step_ns
     if end - begin > motion.longest_ns:
         mean[3:] = 0.0
         return
-    before = mean[:3].copy()
-    now, k = begin, in_effect(log, begin + 1)
+    before, command, now = mean[:3].copy(), np.empty(log.commands.shape[1]), begin
     while now < end:
-        until = end
-        if k + 1 < log.effective.shape[0] and log.effective[k + 1] < end:
-            until = log.effective[k + 1]
+        until = min(take(command, now + 1, motion, log), end)
         steps, rest = (until - now) // step, (until - now) % step
-        predict(mean, transition, commands[k], step / NS_PER_S, steps, motion)
+        predict(mean, transition, command, step / NS_PER_S, steps, motion)
         if rest > 0:
-            predict(mean, transition, commands[k], rest / NS_PER_S, 1, motion)
-        now, k = until, k + 1
+            predict(mean, transition, command, rest / NS_PER_S, 1, motion)
+        now = until
     if not (np.all(np.abs(mean) < RUNAWAY) and np.all(np.abs(transition) < RUNAWAY)):
         mean[:3], mean[3:] = before, 0.0
         transition[:] = np.eye(mean.shape[0])
@@ -170,7 +185,8 @@ def carry(mean, transition, begin, end, motion, log):  # type: ignore[no-untyped
 @kernel(allocates=True)
 def expect(mean, now, motion, log):  # type: ignore[no-untyped-def]
     """Expected body twist (3,) at the time of the mean, and its derivative (3, 3 + S)."""
-    command = log.commands[in_effect(log, now)]
+    command = np.empty(log.commands.shape[1])
+    take(command, now, motion, log)
     size, width = mean.shape[0] - 3, command.shape[0]
     x, dq = np.ones(size + width + 1), np.zeros(3 + size)
     jacobian, derivative = np.zeros((3 + size, size + width)), np.zeros((3, 3 + size))

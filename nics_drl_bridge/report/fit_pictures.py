@@ -292,7 +292,8 @@ def wheels(identified: Identified, found: dict[str, CalibratedValue]) -> bytes |
 def inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
     """Draws the curve of each command that has one, and what becomes of the rates of states."""
     model = identified.model
-    curves, restrained = model.inputs, [dof for dof in model.dofs if model.restraint(dof)]
+    curves = [curve for curve in model.inputs if curve.bends]
+    restrained = [dof for dof in model.dofs if model.restraint(dof)]
     if not (count := len(curves) + len(restrained)):
         return None
     figure, grid = panels(1, count, (4.2 * count, 3.8))

@@ -1,9 +1,9 @@
-"""InputCurve: what a motor makes of a command, before the kinematics."""
+"""InputCurve: what a motor makes of a command, and when, before the kinematics."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any, Protocol
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,6 +24,12 @@ class InputCurve(Schema):
     least: End = -np.inf
     most: End = np.inf
     back: float = Field(default=1.0, ge=0.0)  # gain of negative commands; that of positive ones: 1
+    delay: float = Field(default=0.0, ge=0.0)  # after the latency of all commands [s]
+
+    @property
+    def bends(self) -> bool:
+        """True if it does more than to delay the command."""
+        return self != InputCurve(command=self.command, delay=self.delay)
 
     @property
     def equation(self) -> str:
@@ -31,7 +37,8 @@ class InputCurve(Schema):
         name, dead = self.command, f"{self.dead:.4g}"
         text = f"0 within +-{dead}, else {name} -+ {dead}" if self.dead else name
         text += ends(self.least, self.most, name)
-        return f"{name}' = {text}" + (f", backwards times {self.back:.4g}" * (self.back != 1.0))
+        text += f", backwards times {self.back:.4g}" * (self.back != 1.0)
+        return f"{name}' = {text}" + f", {self.delay:.3f} s later" * (self.delay > 0.0)
 
     def of(self, command: ArrayLike) -> Array:
         """Returns the commands in effect (...): beyond the dead zone, in proportion."""
@@ -64,14 +71,7 @@ def bent(command: ArrayLike, names: Sequence[str], curves: tuple[InputCurve, ...
     return values
 
 
-class Commanded(Protocol):
-    """Anything with commands that have names: a RobotSpec, which kernels must not depend on."""
-
-    @property
-    def command(self) -> Sequence[Any]:
-        """Its commands in order."""
-
-
-def curved(command: ArrayLike, spec: Commanded, curves: tuple[InputCurve, ...]) -> Array:
-    """Returns the commands in effect (..., C) of a robot's, by its curves."""
-    return bent(command, [c.name for c in spec.command], curves)
+def delays(names: Sequence[str], curves: tuple[InputCurve, ...]) -> Array:
+    """Returns the delays (C,) of commands with C names beyond their common latency [s]."""
+    known = {curve.command: curve.delay for curve in curves}
+    return np.array([known.get(name, 0.0) for name in names])

@@ -39,6 +39,7 @@ class Terms(NamedTuple):
     friction: Array  # (S,) by which a state is drawn to zero [unit / s]
     drag: Array  # (S,) times the square of a state, likewise [1 / (unit s)]
     curves: Array  # (C, 4) of the commands
+    late: NDArray[np.int64]  # (C,) delays of the commands after their common latency [steps]
     emf: Array  # (S, C) times a state and the size of a command in effect; (0, 0) if all are 0
 
 
@@ -71,7 +72,8 @@ def term_arrays(model: TaylorModel) -> Terms:
     return Terms(
         dofs.astype(np.int64), coefficients, factors, count, *model.state_box, fall, rise,
         np.asarray(model.friction, np.float64), np.asarray(model.drag, np.float64),
-        _curve_rows(model), model.back_emf if model.back_emf.any() else np.zeros((0, 0)),
+        _curve_rows(model), np.round(model.delays / model.dt).astype(np.int64),
+        model.back_emf if model.back_emf.any() else np.zeros((0, 0)),
     )  # fmt: skip
 
 
@@ -136,7 +138,7 @@ def with_coefficients(terms, coefficient):  # type: ignore[no-untyped-def]
     """Returns terms with other coefficients, those of a robot or of several."""
     return Terms(
         terms.dof, coefficient, terms.factors, terms.degree, terms.low, terms.high, terms.fall,
-        terms.rise, terms.friction, terms.drag, terms.curves, terms.emf,
+        terms.rise, terms.friction, terms.drag, terms.curves, terms.late, terms.emf,
     )  # fmt: skip
 
 

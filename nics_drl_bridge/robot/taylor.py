@@ -14,7 +14,7 @@ from pydantic import AllowInfNan, ConfigDict, Field, NonNegativeFloat
 from nics_drl_bridge import geometry
 from nics_drl_bridge.config import Schema
 from nics_drl_bridge.errors import ModelError
-from nics_drl_bridge.robot.curve import InputCurve, bent, ends
+from nics_drl_bridge.robot.curve import InputCurve, bent, delays, ends
 
 Array = NDArray[np.float64]
 
@@ -95,8 +95,20 @@ class TaylorModel:
         """Greatest rate towards zero (S,) of each state, from both sides; infinite if unlimited."""
         return np.asarray(np.minimum(-self.limits[:, 0], self.limits[:, 1]))
 
+    @property
+    def delays(self) -> Array:
+        """Delays (C,) of the commands beyond their common latency [s]."""
+        return delays(self.variables[self.state_size :], self.inputs)
+
+    @property
+    def drivers(self) -> NDArray[np.intp]:
+        """Place (S,) of the command that moves each state most, over the box of X."""
+        reach = np.maximum(np.abs(self.low), np.abs(self.high))
+        size = np.abs(self.coefficients[3:]) * np.prod(reach**self.powers, axis=1)
+        return np.asarray(np.argmax(size @ (self.powers[:, self.state_size :] > 0), axis=1))
+
     def in_effect(self, command: ArrayLike) -> Array:
-        """Returns the commands in effect (..., C) of commands, by the input curves."""
+        """Returns what commands (..., C) come to after their delays, by the input curves."""
         return bent(command, self.variables[self.state_size :], self.inputs)
 
     def rates(self, x: ArrayLike) -> Array:

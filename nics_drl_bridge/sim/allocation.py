@@ -34,7 +34,7 @@ class Sizes:
     worlds: int  # N
     robots: int  # M in each
     obstacles: int  # K in each
-    longest_delay: int  # greatest latency of commands [substeps]
+    longest_delay: int  # greatest common latency of commands [substeps]
     longest_age: int  # greatest age of an observation [substeps]
 
     @property
@@ -55,7 +55,9 @@ def allocate(model: SimulatorModel, sizes: Sizes) -> arrays.State:
     shape, bodies = (sizes.worlds, sizes.robots), sizes.obstacles + sizes.robots
     noise = [*model.noise.odometry, *model.noise.simulated_drift(model.robot)]
     # One row for the newest; an age within a period needs the end of the period before it, too.
-    rows, sent = (-(-most // substeps) + 1 for most in (sizes.longest_age, sizes.longest_delay))
+    terms = term_arrays(model.kinematics)
+    longest = sizes.longest_delay + int(terms.late.max(initial=0))
+    rows, sent = (-(-most // substeps) + 1 for most in (sizes.longest_age, longest))
     return arrays.State(
         pose=np.zeros((*shape, 3)), state=np.zeros((*shape, len(model.robot.state))),
         history=np.zeros((*shape, sent, len(model.robot.command))),
@@ -65,7 +67,7 @@ def allocate(model: SimulatorModel, sizes: Sizes) -> arrays.State:
         collided=np.zeros(shape, np.uint8), steps=np.zeros(sizes.worlds, np.int64),
         seeds=np.zeros(sizes.worlds, np.int64),
         faults=np.tile(model.lidar.fault_parameters, (*shape, 1)),
-        coefficient=np.tile(term_arrays(model.kinematics).coefficient, (*shape, 1)),
+        coefficient=np.tile(terms.coefficient, (*shape, 1)),
         delay=np.full(shape, delay, np.int64), age=np.zeros(shape, np.int64),
         noise=np.tile(noise, (*shape, 1)), velocity=np.zeros((sizes.worlds, sizes.obstacles, 3)),
         past=np.zeros((*shape, rows, PAST)), marks=np.zeros((sizes.worlds, sizes.obstacles, MARK)),
@@ -118,10 +120,11 @@ def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int)
     side = int(np.sqrt(2.0 * bodies)) if sizes.crowded else 1
     corners = max(int(np.diff(scanner.table.outlines.corner).max(initial=4)), 4)
     x, dq = scratch(kinematics)
+    commands = len(kinematics.variables) - kinematics.state_size
     return arrays.Scratch(
         lanes=arrays.Lanes(
             pose=np.zeros((6, lanes)), x=np.ones((len(kinematics.variables) + 1, lanes)),
-            dq=np.zeros((len(kinematics.dofs), lanes)), late=np.zeros(lanes, np.int64),
+            dq=np.zeros((len(kinematics.dofs), lanes)), late=np.zeros((commands, lanes), np.int64),
             coefficient=np.zeros((np.count_nonzero(kinematics.coefficients), lanes)),
         ),
         single=arrays.Single(

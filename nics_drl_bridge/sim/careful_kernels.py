@@ -34,11 +34,12 @@ MOST_MOVES = 1000
 @kernel
 def rates_at(n: int, m: int, j: int, state: State, motion: Dynamics, single: Single) -> None:
     """Writes to `single.dq` the rates of robot m in substep j, by the command then in effect."""
-    row = delayed(j, state.delay[n, m], motion.substeps, state.history.shape[2])
-    size = state.state.shape[2]
+    size, sent = state.state.shape[2], state.history.shape[2]
     for s in range(size):
         single.x[s] = state.state[n, m, s]
     for c in range(state.history.shape[3]):
+        delay = state.delay[n, m] + motion.terms.late[c]
+        row = delayed(j, delay, motion.substeps, sent)
         single.x[size + c] = state.history[n, m, row, c]
     rates(single.dq, single.x, with_coefficients(motion.terms, state.coefficient[n, m]))
 

@@ -33,7 +33,7 @@ class State(NamedTuple):
     seeds: Integers  # (N,) of the episode
     faults: Array  # (N, M, P) of each robot's lidar, columns as in `lidar.fault_kernels`
     coefficient: Array  # (N, M, T), in the order of `robot.kernels.term_arrays`
-    delay: Integers  # (N, M) latency of the commands [substeps], at most `longest_delay`
+    delay: Integers  # (N, M) common latency of the commands [substeps], at most `longest_delay`
     age: Integers  # (N, M) of scan and odometry when reported [substeps], at most `longest_age`
     # (N, M, 2 + 3 + S) std of odometry [m/s, rad/s]; after a second, of x, y, heading, state
     noise: Array
@@ -92,7 +92,7 @@ class Lanes(NamedTuple):
     x: Array  # (V + 1, L)
     dq: Array  # (D, L)
     coefficient: Array  # (T, L)
-    late: Integers  # (L,) substep at which the command of each changes
+    late: Integers  # (C, L) substep at which a command of each changes
 
 
 class Single(NamedTuple):

@@ -75,18 +75,20 @@ def move_freely(begin: int, end: int, state: State, motion: Dynamics, lanes: Lan
                 x[s, i] = state.state[n, m, s]
             for t in range(lanes.coefficient.shape[0]):
                 lanes.coefficient[t, i] = state.coefficient[n, m, t]
-            late[i] = state.delay[n, m] % substeps  # its command changes once, after this many
+            for c in range(late.shape[0]):  # each command changes once, after this many
+                late[c, i] = (state.delay[n, m] + motion.terms.late[c]) % substeps
     terms = with_coefficients(motion.terms, lanes.coefficient)
     at, used = 0, (end - begin) * robots
     while at < substeps:
         until = substeps
-        for i in range(used):
-            if late[i] > at:
-                until = min(until, late[i])
-            if late[i] == at or at == 0:
-                n, m = begin + i // robots, i % robots
-                row = delayed(at, state.delay[n, m], substeps, history.shape[2])
-                for c in range(history.shape[3]):
+        for c in range(late.shape[0]):
+            for i in range(used):
+                if late[c, i] > at:
+                    until = min(until, late[c, i])
+                if late[c, i] == at or at == 0:
+                    n, m = begin + i // robots, i % robots
+                    delay = state.delay[n, m] + motion.terms.late[c]
+                    row = delayed(at, delay, substeps, history.shape[2])
                     x[size + c, i] = history[n, m, row, c]
         run(where, x, lanes.dq, terms, motion.series, motion.dt, until - at)
         at = until

@@ -77,7 +77,7 @@ def front_driven(state: np.ndarray) -> np.ndarray:
 def servoed(
     twist=front_driven, seed: int = 0, latency: float = 0.1, duration: float = 60.0,
     mounting: tuple[float, float, float] = (0.25, 0.12, 0.5), steering: float = 1.1,
-    noise: float = 5e-4, steering_servo=SERVO, dead: float = 0.0,
+    noise: float = 5e-4, steering_servo=SERVO, dead: float = 0.0, later: float = 0.0,
 ) -> Recording:  # fmt: skip
     """A drive of a robot with a motor and a servo, of which commands and poses were recorded.
 
@@ -91,12 +91,15 @@ def servoed(
         noise: of the position [m], and half of that of the heading [rad].
         steering_servo: transfer function.
         dead: speed that is told and does not come [m/s].
+        later: by which the steering acts after the speed [s].
     """
     rng, count = np.random.default_rng(seed), round(duration / FINE_S)
     per_hold, late = round(0.5 / FINE_S), round(latency / FINE_S)
     ranges = np.array([STEERED["speed_command"], (-steering, steering)]).T
     command = np.repeat(rng.uniform(*ranges, (count // per_hold, 2)), per_hold, axis=0)
     acting = np.concatenate([np.zeros((late, 2)), command[: count - late]])
+    if later:
+        acting[:, 1] = np.append(np.zeros(round(later / FINE_S)), acting[:, 1])[:count]
     acting[:, 0] = np.sign(acting[:, 0]) * np.maximum(np.abs(acting[:, 0]) - dead, 0.0)
     columns = []
     for each, system in zip(acting.T, (MOTOR, steering_servo), strict=True):

@@ -23,8 +23,22 @@ def test_a_servo_of_second_order_is_not_taken_for_latency():
     assert found.uncertainty["command_latency_s"] < TOLD_S
     speed, steering = found.responses
     assert speed.lag_s == pytest.approx(0.15, abs=0.005)
-    assert steering.lag_s == pytest.approx(22.0 / 180.0, abs=0.015)  # damping by stiffness
+    (curve,) = found.inputs  # a part of its lag looks like a delay
+    assert (curve.command, curve.bends) == (steering.command, False)
+    total = curve.delay + steering.lag_s
+    assert total == pytest.approx(22.0 / 180.0, abs=0.015)  # damping by stiffness
     assert SUM not in found.uncertainty
+
+
+@pytest.mark.slow
+def test_a_command_that_acts_later_than_the_others_has_a_delay():
+    found = calibrate(servoed(steering_servo=MOTOR, later=0.12), tricycle())
+    assert found.command_latency_s == pytest.approx(0.1, abs=0.003)
+    (curve,) = found.inputs
+    assert curve.command == "steering_command"
+    assert curve.delay == pytest.approx(0.12, abs=0.005)
+    assert abs(curve.delay - 0.12) < 3.0 * found.uncertainty["steering_command.delay"]
+    assert [r.lag_s for r in found.responses] == pytest.approx([0.15, 0.15], abs=0.01)
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from nics_drl_bridge.identify.forms import (
     Form,
     curve_of,
     inputs_of,
+    problem_of,
     reached,
     two_way,
     with_back,
@@ -72,21 +73,36 @@ def test_values_are_sought_by_name_from_what_the_motion_shows(found, samples):
     form = Form((CURVE,), friction=("vx",), limits=("vx",), drag=("vx",))
     sought = form_inputs(found, samples, form)
     assert sought.names == (
-        "latency", "throttle.dead", "throttle.least", "throttle.most", "throttle.back",
+        "latency", "throttle.dead", "throttle.least", "throttle.most",
         "vx.friction", "vx.drag", "vx.back_emf.throttle", "vx.fall", "vx.rise",
     )  # fmt: skip
-    known = set(sought.names) - {sought.names[i] for i in sought.sought}
-    assert known == {"throttle.back"}
+    assert len(sought.sought) == len(sought.names)
     assert (sought.low <= sought.start).all()
     assert (sought.start <= sought.high).all()
 
 
 def test_a_form_that_grows_starts_where_the_smaller_one_ended(found, samples):
     small = form_inputs(found, samples, Form((CURVE,)))
-    ended = replace(small, start=small.start + np.array([0.02, 0.01, 0.0, 0.03, 0.0]))
+    ended = replace(small, start=small.start + np.array([0.02, 0.01, 0.0, 0.03]))
     larger = form_inputs(found, samples, Form((CURVE,), drag=("vx",))).begun_at(ended)
-    assert larger.start[:5] == pytest.approx(ended.start)
-    assert larger.start[5] > 0.0
+    assert larger.start[:4] == pytest.approx(ended.start)
+    assert larger.start[4] > 0.0
+
+
+def test_the_least_delay_of_the_commands_is_their_latency(found, samples):
+    form = Form((CURVE,), delays=(("throttle", 0.08), ("steering", 0.02)))
+    sought = form_inputs(found, samples, form)
+    assert sought.names[:3] == ("latency", "throttle.delay", "steering.delay")
+    assert 0 not in sought.sought
+    assert form.latency_at(sought, sought.start) == 0.02
+    (curve,) = form.curves_at(sought, sought.start)
+    assert (curve.command, curve.delay) == ("throttle", pytest.approx(0.06))
+    delayed = problem_of(found.training, samples, form, sought).commands(sought.start)
+    shared = replace(sought, start=np.where(np.arange(len(sought.start)) == 1, 0.02, sought.start))
+    alike = problem_of(found.training, samples, form, shared).commands(shared.start)
+    step = round(0.06 / samples.dt)
+    assert delayed[step:, 0] == pytest.approx(alike[:-step, 0])
+    assert np.array_equal(delayed[:, 1], alike[:, 1])
 
 
 def test_values_become_curves_friction_limits_and_drag(found, samples):
