@@ -62,7 +62,7 @@ KINDS = (
     ("differential", {"speed": "forward_command", "turn": "turn_command"}),
     ("differential_wheels", {"left": "left_wheel", "right": "right_wheel"}),
 )
-NOT_USED, MOST_LISTED = "# not used", 12
+NOT_USED, MOST_LISTED = "# not used", 20  # of a table
 MOST_COMMANDS = 4  # of columns that only might be commands
 USUAL_WHEEL = 5.0  # [rad/s], by which the ticks of a turn are guessed
 RADIUS = 0.2  # of a robot [m], unless it is as large as a car, since
@@ -254,18 +254,27 @@ def _not_used(
     tables: Sequence[TableSurvey],
     pose: Guess | None,
     commands: Mapping[str, tuple[TableSurvey, Survey]],
-) -> list[str]:
-    """Returns a comment that names the columns of changing numbers that a mapping lacks."""
+) -> Iterator[str]:
+    """Yields a comment for each table that names the columns of values that a mapping lacks."""
     taken = {(id(table), column.name) for table, column in commands.values()}
     taken |= {(id(pose.table), each) for each in _columns_of(pose)} if pose else set()
-    rest = [
-        table.reference(c.name, len(tables) == 1).strip('"')
-        for table in tables for c in table.numbers
-        if c.low < c.high and not {*words_of(c.name)} & NO_VALUES
-        and (id(table), c.name) not in taken and c.name not in table.stamp_columns
-    ]  # fmt: skip
-    more = f" and {len(rest) - MOST_LISTED} more" if len(rest) > MOST_LISTED else ""
-    return [f"{NOT_USED}: {', '.join(rest[:MOST_LISTED])}{more}"] if rest else []
+    for table in tables:
+        rest = [
+            f"{c.name}{_fault(c)}"
+            for c in table.columns
+            if not {*words_of(c.name)} & NO_VALUES
+            and (id(table), c.name) not in taken and c.name not in table.stamp_columns
+        ]  # fmt: skip
+        place = "" if len(tables) == 1 else f"{table.name}: "
+        more = f" and {len(rest) - MOST_LISTED} more" if len(rest) > MOST_LISTED else ""
+        if rest:
+            yield f"{NOT_USED}: {place}{', '.join(rest[:MOST_LISTED])}{more}"
+
+
+def _fault(column: Survey) -> str:
+    if column.low < column.high:
+        return ""
+    return " (constant)" if column.low == column.high else " (no numbers)"
 
 
 def _columns_of(pose: Guess) -> list[str]:
