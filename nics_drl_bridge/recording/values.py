@@ -181,9 +181,9 @@ class MappedReader:
             missing = f"{int((~known).sum())} of {len(raw)} rows have no value"
             self.say(f"{name}: {missing}, and were left out.")
         made = Series(at.t[known], raw[known], clock)
-        plain = unit_of(value).si in ("", "rad/s", "m/s") and value.wrap is None
-        if plain and not value.counts and (size := stamping.counter(made.values)):
-            fault = f"{table.place}: {which!r} is a counter that overflows at {size:.10g}"
+        plain = unit_of(value).si in ("", "rad/s", "m/s", "ticks/s") and value.wrap is None
+        if plain and not value.counts and (does := stamping.counter(made.values)):
+            fault = f"{table.place}: {which!r} is a counter that {does}"
             advice = f"write `{{from: {which}, unit: ticks, ticks_per_turn: ...}}`"
             raise RecordingError(f"{fault}, no speed: {advice} for {name}.")
         made = self._in_si(name, value, made, held)
@@ -194,6 +194,10 @@ class MappedReader:
         factor *= 1.0 if value.maximum is None else value.maximum
         if value.wrap is not None or value.counts:
             raw = self._continued(name, value, raw)
+        if value.counts and stamping.comes_back(raw.values):
+            fault = f"{self.source.place}: {value.from_!r} goes up and down like a speed"
+            advice = f"write `unit: {value.unit or 'ticks'}/s` for {name}"
+            raise RecordingError(f"{fault}, and is no counter: {advice}.")
         if value.counts:
             raw = _rate(raw, held)
         return raw._replace(values=raw.values * factor + value.offset)
