@@ -241,13 +241,18 @@ def first_mapping(tables: Sequence[TableSurvey]) -> str:
 def _clock_lines(
     pose: Guess | None, commands: Mapping[str, tuple[TableSurvey, Survey]]
 ) -> list[str]:
-    """Returns the line that gives the pose a clock of its own, if it shares no time."""
+    """Returns the line that gives the pose a clock of its own, if it has one by its stamps."""
     if pose is None or (t := pose.table.t) is None or not pose.table.stamps:
         return []
-    spans = [table.t[[0, -1]] for table, _ in commands.values() if table.t is not None]
-    apart = [last < t[0] or first > t[-1] for first, last in spans]
-    why = "shares no time with the commands"
-    return [f"  clock: tracker  {GUESSED}: {why}"] if apart and all(apart) else []
+    others = [(table.unit, table.t) for table, _ in commands.values() if table.t is not None]
+    whys = {
+        "shares no time with the commands": [u[-1] < t[0] or u[0] > t[-1] for _, u in others],
+        "one counts from its first row, and in another unit": [
+            unit != pose.table.unit and 0.0 in (u[0], t[0]) for unit, u in others
+        ],
+    }
+    said = [f"  clock: tracker  {GUESSED}: {why}" for why, each in whys.items() if all(each)]
+    return said[:1] if others else []
 
 
 def _not_used(

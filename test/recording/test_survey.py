@@ -205,6 +205,26 @@ def test_a_pose_that_shares_no_time_with_the_commands_has_a_clock_of_its_own(tmp
     assert found.pose.t[0] == found.command.t[0] == pytest.approx(0.0)
 
 
+@pytest.mark.parametrize(
+    ("unit", "since", "own"), [(1e9, 0.0, True), (1.0, 0.0, False), (1e9, 5.0, False)]
+)
+def test_a_pose_that_counts_from_its_first_row_in_another_unit_has_a_clock(
+    tmp_path, unit, since, own
+):
+    columns = drive()
+    pose = {name: columns[name] for name in ("t", "x", "y", "yaw")}
+    write(tmp_path / "pose.csv", pose | {"t": unit * (since + columns["t"])})
+    later = {"t": since + 0.13 + columns["t"], "throttle": columns["v"], "steering": columns["w"]}
+    write(tmp_path / "cmd.csv", later)
+    assert ("clock" in surveyed(tmp_path)[1]["pose"]) == own
+
+
+def test_the_motion_capture_of_a_real_car_is_guessed_to_have_a_clock(shared_recordings):
+    _, guess = surveyed(shared_recordings / "xtark_ackermann" / "random_drive_45s")
+    assert guess["pose"]["time"] == {"from": 7, "unit": "ns"}
+    assert guess["pose"]["clock"] == "tracker"
+
+
 @pytest.mark.parametrize("name", ["left_rpm", "rpm_left", "motor_rpm_left_cmd"])
 def test_revolutions_a_minute_are_understood_anywhere_in_a_name(tmp_path, name):
     columns = drive()
