@@ -23,6 +23,7 @@ from nics_drl_bridge.recording.recording import (
     clockwise_line,
     shows_axes,
 )
+from nics_drl_bridge.recording.stamping import not_repeated
 from nics_drl_bridge.robot.kinds import has_textbook, textbook
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -69,11 +70,10 @@ def _with_rows(recording: Recording, name: str, keep: NDArray[np.bool_]) -> Reco
 def _without_repetitions(drive: Drive, notes: list[str]) -> Recording:
     recording = drive.recording
     for name, stream in recording.streams.items():
-        again = (np.diff(stream.t) == 0.0) & (np.diff(stream.values, axis=0) == 0.0).all(axis=1)
-        if again.any():
-            recording = _with_rows(recording, name, np.append(True, ~again))
-            finding = f"{int(again.sum())} of {len(stream.t)} rows repeat the row before them"
-            notes.append(f"{name}: {finding}, stamp and all, and were left out.")
+        keep, note = not_repeated(stream.t, stream.values, name)
+        if note:
+            recording = _with_rows(recording, name, keep)
+            notes.append(note)
     return recording
 
 

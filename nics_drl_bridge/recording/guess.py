@@ -63,6 +63,7 @@ KINDS = (
     ("differential_wheels", {"left": "left_wheel", "right": "right_wheel"}),
 )
 NOT_USED, MOST_LISTED = "# not used", 20  # of a table
+WHY_NOT = " (no numbers)", " (constant)"
 MOST_COMMANDS = 4  # of columns that only might be commands
 USUAL_WHEEL = 5.0  # [rad/s], by which the ticks of a turn are guessed
 RADIUS = 0.2  # of a robot [m], unless it is as large as a car, since
@@ -265,8 +266,7 @@ def _not_used(
     taken |= {(id(pose.table), each) for each in _columns_of(pose)} if pose else set()
     for table in tables:
         rest = [
-            f"{c.name}{_fault(c)}"
-            for c in table.columns
+            c.name + ("" if c.low < c.high else WHY_NOT[c.low == c.high]) for c in table.columns
             if not {*words_of(c.name)} & NO_VALUES
             and (id(table), c.name) not in taken and c.name not in table.stamp_columns
         ]  # fmt: skip
@@ -274,12 +274,6 @@ def _not_used(
         more = f" and {len(rest) - MOST_LISTED} more" if len(rest) > MOST_LISTED else ""
         if rest:
             yield f"{NOT_USED}: {place}{', '.join(rest[:MOST_LISTED])}{more}"
-
-
-def _fault(column: Survey) -> str:
-    if column.low < column.high:
-        return ""
-    return " (constant)" if column.low == column.high else " (no numbers)"
 
 
 def _columns_of(pose: Guess) -> list[str]:

@@ -133,9 +133,8 @@ def _heading(reader: MappedReader, pose: PoseSource, given: str | Sequence[Refer
     norm = np.linalg.norm(made.values, axis=1)
     lost = norm < NO_LENGTH
     if lost.any() and lost.mean() <= MOST_UNTRACKED:
-        reader.say(
-            f"pose: {int(lost.sum())} of {len(lost)} rows without orientation were left out."
-        )
+        some = f"{int(lost.sum())} of {len(lost)} rows without orientation"
+        reader.say(f"pose: {some} were left out.")
         made, norm = made.rows(~lost), norm[~lost]
     for k in np.flatnonzero(np.abs(norm - 1.0) > QUATERNION_TOLERANCE)[:1]:
         where = f"{reader.source.place}: pose: {made.t[k] - made.t[0]:.3f} s from the start"
@@ -144,11 +143,9 @@ def _heading(reader: MappedReader, pose: PoseSource, given: str | Sequence[Refer
     x, y, z, w = made.values.T
     tilt = np.degrees(np.median(np.arccos(np.clip(np.abs(1.0 - 2.0 * (x * x + y * y)), 0.0, 1.0))))
     if tilt > MOST_TILT_DEG:
-        fault = (
-            f"{reader.source.place}: pose: by its quaternion the body is tilted by {tilt:.0f} deg"
-        )
+        fault = f"pose: by its quaternion the body is tilted by {tilt:.0f} deg"
         advice = "list its columns in the order x, y, z, w, or, if y is up, as [qz, qx, qy, qw]"
-        raise RecordingError(f"{fault}; {advice}.")
+        raise RecordingError(f"{reader.source.place}: {fault}; {advice}.")
     heading = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     return Series(made.t, heading, made.clock)
 
