@@ -14,6 +14,7 @@ from nics_drl_bridge.geometry import Array, east_and_north, wrap_angle
 from nics_drl_bridge.recording import stamping
 from nics_drl_bridge.recording.mapping import (
     COVARIANCES,
+    ROBOT_CLOCK,
     SI,
     UNITS,
     Mapping,
@@ -54,7 +55,7 @@ def read_mapped(source: Source, mapping: Mapping) -> Recording:
     names, streams = (*mapping.state, *mapping.command), cast(Any, found)
     made = Recording(**streams, source=source.place, variables=names, latency=source.latency)
     check_streams(made, {"command": len(mapping.command), "state": len(mapping.state), "wheels": 2})
-    shifted: Any = _from_zero(found, mapping.clock, reader)
+    shifted: Any = _from_zero(found, mapping.clock or ROBOT_CLOCK, reader)
     made = replace(made, **shifted, repairs=tuple(reader.notes))
     return made
 

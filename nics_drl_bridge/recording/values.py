@@ -17,6 +17,7 @@ from nics_drl_bridge.recording import mapping as schema
 from nics_drl_bridge.recording import stamping
 from nics_drl_bridge.recording.mapping import (
     RATES,
+    ROBOT_CLOCK,
     UNITS,
     Mapping,
     Measured,
@@ -163,7 +164,7 @@ class MappedReader:
         table, which = self.place(value.from_, stream.in_)
         column, time = numbers_of(table, which), value.time or stream.time
         at = self.stamped(table, column, time)
-        clock = value.clock or stream.clock or at.clock or self.mapping.clock
+        clock = value.clock or stream.clock or self.mapping.clock or at.clock or ROBOT_CLOCK
         raw = column[at.rows]
         for k in np.flatnonzero(np.isinf(raw))[:1]:
             where = f"{table.place}: {table.row(int(at.rows[k]))}"
