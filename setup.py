@@ -58,6 +58,7 @@ EXTRAS = {
         "hypothesis",
         "mypy",
         "pre-commit",
+        "pyarrow",
         "pytest",
         "pytest-timeout",
         "pytest-xdist",

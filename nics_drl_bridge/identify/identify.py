@@ -103,11 +103,11 @@ def _fitted(findings: Findings) -> tuple[Fit, TaylorModel]:
 
 def repair(drive: Drive, findings: Findings) -> Findings:
     """Refuses other units, axes and orders; drops repeated rows and jumps, clips commands."""
-    check_units(drive)
     training, _ = repaired(findings.training)
     whole, repairs = repaired(findings.whole)
+    repairs += check_commands(training, findings.training.recording.command)
+    check_units(drive)
     check_axes(training)
-    repairs += check_commands(training)
     check(training.recording, drive.spec)
     return replace(findings, training=training, whole=whole, repairs=repairs)
 

@@ -23,7 +23,9 @@ from nics_drl_bridge.recording.recording import (
     clockwise_line,
     shows_axes,
 )
+from nics_drl_bridge.recording.stamping import not_repeated
 from nics_drl_bridge.robot.kinds import has_textbook, textbook
+from nics_drl_bridge.robot.spec import RobotSpec
 
 NEIGHBOURS = 3  # a jump is measured by the median difference from this many samples on either side
 STEPS = 6.0  # it is larger than this many usual changes from sample to sample,
@@ -46,6 +48,8 @@ FARTHEST_STEERED, STEERED_PERCENTILE = 3.2, 95.0  # angle of a wheel [rad]
 # Commands are compared with the motion over this time [s], that many times or more, at any delay
 DELAYS_S, COMPARED_S, MIN_COMPARED = np.linspace(-1.0, 1.5, 26), 1.0, 20  # and offset of clocks;
 ALIKE, NEAR = 0.85, 1.2  # from this correlation on, another unit explains sizes by up to this ratio
+SWAPPED = 0.6  # least correlation of each of two commands with what the other should move
+PLACES = {"linear.x": 0, "angular.z": 1, "throttle": 0, "steering": 1}  # in speed and turn rate
 CONFUSED = {"m/s": ("km/h", "cm/s", "mm/s"), "rad/s": ("deg/s", "rpm")}
 TRAVEL_SHARE = 0.1  # of the footprint's radius: least distance to measure a direction of travel
 
@@ -66,11 +70,10 @@ def _with_rows(recording: Recording, name: str, keep: NDArray[np.bool_]) -> Reco
 def _without_repetitions(drive: Drive, notes: list[str]) -> Recording:
     recording = drive.recording
     for name, stream in recording.streams.items():
-        again = (np.diff(stream.t) == 0.0) & (np.diff(stream.values, axis=0) == 0.0).all(axis=1)
-        if again.any():
-            recording = _with_rows(recording, name, np.append(True, ~again))
-            finding = f"{int(again.sum())} of {len(stream.t)} rows repeat the row before them"
-            notes.append(f"{name}: {finding}, stamp and all, and were left out.")
+        keep, note = not_repeated(stream.t, stream.values, name)
+        if note:
+            recording = _with_rows(recording, name, keep)
+            notes.append(note)
     return recording
 
 
@@ -233,23 +236,24 @@ def check_units(drive: Drive) -> None:
             raise RecordingError(f"{recording.source}: {fault}; {advice}.")
 
 
-def check_commands(drive: Drive) -> tuple[str, ...]:
+def check_commands(drive: Drive, command: Stream | None = None) -> tuple[str, ...]:
     """Refuses swapped commands, with a RecordingError; a sentence on each in another unit.
 
-    By how the speed and the turn rate that they ask for compare with those that were driven.
+    By how the speed and the turn rate that they ask for, or those before they were clipped,
+    compare with those that were driven.
     """
-    spec, pair = drive.spec, _asked_and_driven(drive)
+    spec, pair = drive.spec, _asked_and_driven(drive, command or drive.recording.command)
     if pair is None:
         return ()
     asked, driven, alike = pair
-    fields = {"linear.x": 0, "angular.z": 1}
-    told = [(fields[c.cmd_vel], c.name, c.unit) for c in spec.command if c.cmd_vel in fields]
-    if told and min(alike[0, 1], alike[1, 0]) > ALIKE and np.trace(alike) < ALIKE:
-        fault = " and ".join(c.name for c in spec.command) + " are swapped: each moves the robot as"
-        advice = "the other should; exchange their columns"
-        raise RecordingError(f"{drive.recording.source}: {fault} {advice}.")
-    notes = []
-    for place, name, unit in told or [(0, "speed", "rad/s")]:
+    places, notes = _places(spec), []
+    if len(places) == 2 and min(alike[0, 1], alike[1, 0]) > max(SWAPPED, np.trace(alike)):
+        one, other = (c.name for c in spec.command)
+        fault = f"{one} and {other} are swapped: each moves the robot as the other should"
+        advice = f"write the column of `{other}:` behind `{one}:`, and the other way round"
+        raise RecordingError(f"{drive.recording.source}: {fault}; {advice}.")
+    told = [(c.name, c.unit) for c in spec.command] if places else [("speed", "rad/s")]
+    for place, (name, unit) in zip(places or [0], told, strict=True):
         times = float(asked[:, place].std() / max(driven[:, place].std(), 1e-9))
         for other in CONFUSED.get(unit, ()) if alike[place, place] > ALIKE else ():
             if 1.0 / NEAR < times * UNITS[other].factor < NEAR:
@@ -259,18 +263,24 @@ def check_commands(drive: Drive) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _asked_and_driven(drive: Drive) -> tuple[Array, Array, Array] | None:
+def _places(spec: RobotSpec) -> list[int]:
+    """Returns the places of commands in speed and turn rate; none if any of them is another."""
+    keys = [c.cmd_vel or c.name for c in spec.command]
+    return [PLACES[key] for key in keys] if {*keys} <= {*PLACES} else []
+
+
+def _asked_and_driven(drive: Drive, command: Stream) -> tuple[Array, Array, Array] | None:
     """Returns speed and turn rate (n, 2), as commanded and as driven, and how alike (2, 2).
 
     None if that does not show, as of robots that move sideways.
     """
-    spec, recording, t = drive.spec, drive.recording, drive.dated.t
+    spec, t, places = drive.spec, drive.dated.t, _places(drive.spec)
     wheels = all(c.unit == "rad/s" for c in spec.command) and "wheel_radius" in spec.parameters
     wheels = wheels and "wheel_radius" not in spec.assumed and has_textbook(spec)
     start = np.arange(t[0], t[-1] - COMPARED_S, COMPARED_S / 2.0)
     first, last = np.searchsorted(t, start), np.searchsorted(t, start + COMPARED_S)
     first, last = first[last > first], last[last > first]
-    if spec.moves_sideways or not (spec.takes_cmd_vel or wheels) or len(first) < MIN_COMPARED:
+    if spec.moves_sideways or not (places or wheels) or len(first) < MIN_COMPARED:
         return None
     moved = geometry.log(geometry.between(drive.dated.values[first], drive.dated.values[last]))
     moved = moved / (t[last] - t[first])[:, None]
@@ -279,11 +289,11 @@ def _asked_and_driven(drive: Drive) -> tuple[Array, Array, Array] | None:
     driven = np.stack([moved[:, :2] @ [axis.real, axis.imag], moved[:, 2]], axis=1)
     best = np.zeros((2, 2)), driven
     for delay in DELAYS_S:
-        command = held(recording.command, spec, t[first] - delay, t[last] - delay)
-        twist = spec.in_fields(command) if spec.takes_cmd_vel else textbook(spec).steady(command)
+        sent, twist = held(command, spec, t[first] - delay, t[last] - delay), np.zeros_like(driven)
+        twist[:, places or [0, 1]] = sent if places else textbook(spec).steady(sent)[:, [0, 2]]
         with np.errstate(invalid="ignore"):  # of what never changed
-            alike = np.corrcoef(twist[:, [0, 2]].T, driven.T)[:2, 2:]
-        best = max(best, (np.abs(np.nan_to_num(alike)), twist[:, [0, 2]]), key=lambda e: e[0].sum())
+            alike = np.corrcoef(twist.T, driven.T)[:2, 2:]
+        best = max(best, (np.abs(np.nan_to_num(alike)), twist), key=lambda e: e[0].sum())
     return best[1], driven, best[0]
 
 

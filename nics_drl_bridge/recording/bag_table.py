@@ -132,31 +132,26 @@ class Bag(Source):
     def _stamps_of(self, topic: str, which: str) -> Stream:
         """Stamps a topic with all that are used: only together do they show their clocks."""
         topics = tuple(self._used) or (topic,)
-        if (key := (which, *topics)) not in self._stamps:
+        bare = [each for each in topics if not np.any(times_of(self._of(each))[1])]
+        # Beside topics without headers these are compared with the arrival, as if nobody asked.
+        stamps = "auto" if which == mapped.HEADER and bare and topic not in bare else STAMPS[which]
+        if (key := (which, stamps, *topics)) not in self._stamps:
             data = {}
             for each in topics:
                 messages = self._of(each)
-                receive, header = times_of(messages)
                 rows = np.arange(len(messages), dtype=np.float64)[:, None]
-                data[each] = TopicData(each, receive, header, rows)
+                data[each] = TopicData(each, *times_of(messages), rows)
             robot = [each for each, own in self._used.items() if own]
-            notes = self._notes.setdefault(topic, [])
-            self._stamps[key] = self._joined(data, STAMPS[which], robot, notes)
+            try:
+                self._stamps[key] = streams(data, stamps, self.place, robot)
+            except RecordingError as error:
+                if which:
+                    raise
+                fault = str(error).removeprefix(f"{self.place}: ").partition(";")[0]
+                note = f"{fault}; all messages were stamped by their arrival."
+                self._notes.setdefault(topic, []).append(note)
+                self._stamps[key] = streams(data, "receive", self.place, robot)
         return self._stamps[key][topic]
-
-    def _joined(
-        self, data: dict[str, TopicData], stamps: roles.Stamps, robot: Sequence[str],
-        notes: list[str],
-    ) -> dict[str, Stream]:  # fmt: skip
-        """Stamps topics; by arrival if unasked-for headers are of no use."""
-        try:
-            return streams(data, stamps, self.place, robot)
-        except RecordingError as error:
-            if stamps != "auto":
-                raise
-            fault = str(error).removeprefix(f"{self.place}: ").partition(";")[0]
-            notes.append(f"{fault}; all messages were stamped by their arrival.")
-            return streams(data, "receive", self.place, robot)
 
 
 def topics_used(mapping: mapped.Mapping, topics: Sequence[str]) -> dict[str, bool]:

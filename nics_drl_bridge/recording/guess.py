@@ -62,7 +62,8 @@ KINDS = (
     ("differential", {"speed": "forward_command", "turn": "turn_command"}),
     ("differential_wheels", {"left": "left_wheel", "right": "right_wheel"}),
 )
-NOT_USED, MOST_LISTED = "# not used", 12
+NOT_USED, MOST_LISTED = "# not used", 20  # of a table
+WHY_NOT = " (no numbers)", " (constant)"
 MOST_COMMANDS = 4  # of columns that only might be commands
 USUAL_WHEEL = 5.0  # [rad/s], by which the ticks of a turn are guessed
 RADIUS = 0.2  # of a robot [m], unless it is as large as a car, since
@@ -241,31 +242,38 @@ def first_mapping(tables: Sequence[TableSurvey]) -> str:
 def _clock_lines(
     pose: Guess | None, commands: Mapping[str, tuple[TableSurvey, Survey]]
 ) -> list[str]:
-    """Returns the line that gives the pose a clock of its own, if it shares no time."""
+    """Returns the line that gives the pose a clock of its own, if it has one by its stamps."""
     if pose is None or (t := pose.table.t) is None or not pose.table.stamps:
         return []
-    spans = [table.t[[0, -1]] for table, _ in commands.values() if table.t is not None]
-    apart = [last < t[0] or first > t[-1] for first, last in spans]
-    why = "shares no time with the commands"
-    return [f"  clock: tracker  {GUESSED}: {why}"] if apart and all(apart) else []
+    others = [(table.unit, table.t) for table, _ in commands.values() if table.t is not None]
+    whys = {
+        "shares no time with the commands": [u[-1] < t[0] or u[0] > t[-1] for _, u in others],
+        "one counts from its first row, and in another unit": [
+            unit != pose.table.unit and 0.0 in (u[0], t[0]) for unit, u in others
+        ],
+    }
+    said = [f"  clock: tracker  {GUESSED}: {why}" for why, each in whys.items() if all(each)]
+    return said[:1] if others else []
 
 
 def _not_used(
     tables: Sequence[TableSurvey],
     pose: Guess | None,
     commands: Mapping[str, tuple[TableSurvey, Survey]],
-) -> list[str]:
-    """Returns a comment that names the columns of changing numbers that a mapping lacks."""
+) -> Iterator[str]:
+    """Yields a comment for each table that names the columns of values that a mapping lacks."""
     taken = {(id(table), column.name) for table, column in commands.values()}
     taken |= {(id(pose.table), each) for each in _columns_of(pose)} if pose else set()
-    rest = [
-        table.reference(c.name, len(tables) == 1).strip('"')
-        for table in tables for c in table.numbers
-        if c.low < c.high and not {*words_of(c.name)} & NO_VALUES
-        and (id(table), c.name) not in taken and c.name not in table.stamp_columns
-    ]  # fmt: skip
-    more = f" and {len(rest) - MOST_LISTED} more" if len(rest) > MOST_LISTED else ""
-    return [f"{NOT_USED}: {', '.join(rest[:MOST_LISTED])}{more}"] if rest else []
+    for table in tables:
+        rest = [
+            c.name + ("" if c.low < c.high else WHY_NOT[c.low == c.high]) for c in table.columns
+            if not {*words_of(c.name)} & NO_VALUES
+            and (id(table), c.name) not in taken and c.name not in table.stamp_columns
+        ]  # fmt: skip
+        place = "" if len(tables) == 1 else f"{table.name}: "
+        more = f" and {len(rest) - MOST_LISTED} more" if len(rest) > MOST_LISTED else ""
+        if rest:
+            yield f"{NOT_USED}: {place}{', '.join(rest[:MOST_LISTED])}{more}"
 
 
 def _columns_of(pose: Guess) -> list[str]:

@@ -14,6 +14,7 @@ from nics_drl_bridge.geometry import Array, east_and_north, wrap_angle
 from nics_drl_bridge.recording import stamping
 from nics_drl_bridge.recording.mapping import (
     COVARIANCES,
+    ROBOT_CLOCK,
     SI,
     UNITS,
     Mapping,
@@ -54,7 +55,7 @@ def read_mapped(source: Source, mapping: Mapping) -> Recording:
     names, streams = (*mapping.state, *mapping.command), cast(Any, found)
     made = Recording(**streams, source=source.place, variables=names, latency=source.latency)
     check_streams(made, {"command": len(mapping.command), "state": len(mapping.state), "wheels": 2})
-    shifted: Any = _from_zero(found, mapping.clock, reader)
+    shifted: Any = _from_zero(found, mapping.clock or ROBOT_CLOCK, reader)
     made = replace(made, **shifted, repairs=tuple(reader.notes))
     return made
 
@@ -133,9 +134,8 @@ def _heading(reader: MappedReader, pose: PoseSource, given: str | Sequence[Refer
     norm = np.linalg.norm(made.values, axis=1)
     lost = norm < NO_LENGTH
     if lost.any() and lost.mean() <= MOST_UNTRACKED:
-        reader.say(
-            f"pose: {int(lost.sum())} of {len(lost)} rows without orientation were left out."
-        )
+        some = f"{int(lost.sum())} of {len(lost)} rows without orientation"
+        reader.say(f"pose: {some} were left out.")
         made, norm = made.rows(~lost), norm[~lost]
     for k in np.flatnonzero(np.abs(norm - 1.0) > QUATERNION_TOLERANCE)[:1]:
         where = f"{reader.source.place}: pose: {made.t[k] - made.t[0]:.3f} s from the start"
@@ -144,11 +144,9 @@ def _heading(reader: MappedReader, pose: PoseSource, given: str | Sequence[Refer
     x, y, z, w = made.values.T
     tilt = np.degrees(np.median(np.arccos(np.clip(np.abs(1.0 - 2.0 * (x * x + y * y)), 0.0, 1.0))))
     if tilt > MOST_TILT_DEG:
-        fault = (
-            f"{reader.source.place}: pose: by its quaternion the body is tilted by {tilt:.0f} deg"
-        )
+        fault = f"pose: by its quaternion the body is tilted by {tilt:.0f} deg"
         advice = "list its columns in the order x, y, z, w, or, if y is up, as [qz, qx, qy, qw]"
-        raise RecordingError(f"{fault}; {advice}.")
+        raise RecordingError(f"{reader.source.place}: {fault}; {advice}.")
     heading = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     return Series(made.t, heading, made.clock)
 

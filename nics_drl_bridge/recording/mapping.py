@@ -230,7 +230,7 @@ class Mapping(Schema):
     robot: str | dict[str, Any] | None = None  # a shipped robot's name, a path, or its definition
     in_: str | None = Field(default=None, alias="in")  # as in a stream, for all that name none
     time: Annotated[Time | None, _short("from")] = None
-    clock: str = ROBOT_CLOCK
+    clock: str | None = None
     pose: Annotated[PoseSource, BeforeValidator(lambda v: {"in": v} if isinstance(v, str) else v)]
     command: dict[str, AValue] = Field(min_length=1)  # by the names of the robot's commands
     state: dict[str, AValue] = Field(default_factory=dict)  # likewise

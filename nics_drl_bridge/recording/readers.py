@@ -71,10 +71,9 @@ def read_recording(
     if not path.exists():
         raise RecordingError(f"{path}: no such file or folder; check the path.")
     names = " nor ".join(each.name for each in FORMATS)
-    advice = (
-        f"say what is what in it with --map; `nics inspect {path.name} --map my.yaml` begins one"
-    )
-    raise RecordingError(f"{path}: is neither {names}; {advice}.")
+    begin = f"`nics inspect {path.name} --map my.yaml` begins one"
+    fault = f"{path}: is neither {names}"
+    raise RecordingError(f"{fault}; say what is what in it with --map; {begin}.")
 
 
 def _by_mapping(

@@ -33,6 +33,9 @@ SPLIT = (("s", "ns"), ("sec", "nanosec"), ("secs", "nsecs"), ("sec", "nsec"), ("
 ROWS_A_SECOND = 5  # from which on stamps in whole seconds lack the rest
 COUNTING = 16.0  # times the usual step of a counter fit between its overflows, which lose
 LOST, PARTS = 2.0, 10  # no more than this many steps; its values are in all of so many parts
+GROWN, ONE_WAY = 2000.0, 0.95  # or they go so far, which is this share of all their steps
+BACK, WITHIN = 0.2, 25.0  # a speed goes this share of its steps back at once, within so many
+TREMBLING = 4.0  # ticks of a wheel that stands
 BITS = (8, 16, 24, 31, 32)  # of registers that overflow
 STAMP_BITS = (16, 24, 31, 32)
 LATE_ROWS, LATE_S = 50, 1.0  # rows that come too late do so by less
@@ -195,15 +198,28 @@ def unwrapped(values: Array, size: float) -> tuple[Array, int]:
     return values + size * np.append(0.0, np.cumsum(turns)), int(np.abs(turns).sum())
 
 
-def counter(values: Array) -> float | None:
-    """Returns where whole numbers (T,) overflow that pass through their range as a counter's do."""
-    size = overflow(values, (1.0,), BITS) if (values == np.round(values)).all() else None
+def counter(values: Array) -> str:
+    """Returns what whole numbers (T,) do as a counter's alone: they overflow, or go on and on."""
+    step, whole = np.abs(np.diff(values)), bool((values == np.round(values)).all())
+    gone = float(abs(values[-1] - values[0]))
+    if whole and gone > max(GROWN, ONE_WAY * step.sum()):
+        return f"went on by {gone:.10g}"
+    size = overflow(values, (1.0,), BITS) if whole else None
     if size is None:
-        return None
-    step = np.abs(np.diff(values))
+        return ""
     usual, lost = float(np.percentile(step, 95)), size - step[step > size / 2.0]
     calm = COUNTING * usual < size and (np.abs(lost) <= LOST * usual).all()
-    return size if calm and np.histogram(values, PARTS)[0].all() else None
+    return f"overflows at {size:.10g}" if calm and np.histogram(values, PARTS)[0].all() else ""
+
+
+def comes_back(values: Array) -> bool:
+    """True for values (T,) that go up and down within few of their steps, as no counter's do."""
+    step = np.diff(values)
+    step = step[step != 0.0]
+    size = np.abs(step)
+    back = np.minimum(size[1:], size[:-1])[step[1:] * step[:-1] < 0.0].sum()
+    near = TREMBLING < np.ptp(values) < WITHIN * np.percentile(size, 95)
+    return bool(near and back > BACK * size.sum())
 
 
 def rows_a_second(t: Array) -> int:

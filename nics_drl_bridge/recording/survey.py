@@ -131,7 +131,10 @@ def _surveyed(name: str, table: Table) -> TableSurvey:
         found.t = given.t
     else:
         found.stamps, raw = _time(data)
-        found.t = None if raw is None else _in_seconds(found, raw)
+        if raw is not None:
+            raw = raw[np.isfinite(raw)]
+            found.unit = likely_unit(raw)
+            found.t = raw * UNITS[found.unit or "s"].factor
     return found
 
 
@@ -163,14 +166,6 @@ def _time(data: dict[str, Column]) -> tuple[str | None, Array | None]:
     if best is None or merit(best) < 0.25:
         return None, None
     return best, values[best]
-
-
-def _in_seconds(found: TableSurvey, raw: Array) -> Array:
-    raw = raw[np.isfinite(raw)]
-    if (unit := likely_unit(raw)) is None:
-        return raw
-    found.unit = unit
-    return raw * UNITS[unit].factor
 
 
 def _regularity(t: Array, data: dict[str, Column]) -> Iterator[str]:

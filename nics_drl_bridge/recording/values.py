@@ -17,6 +17,7 @@ from nics_drl_bridge.recording import mapping as schema
 from nics_drl_bridge.recording import stamping
 from nics_drl_bridge.recording.mapping import (
     RATES,
+    ROBOT_CLOCK,
     UNITS,
     Mapping,
     Measured,
@@ -104,10 +105,8 @@ class MappedReader:
             self._stamped[key] = self._of_stamps(table, time)
         found = self._stamped[key]
         if found.total != count:
-            fault = f"{found.total} stamps can't be those of {count} values"
-            raise RecordingError(
-                f"{table.place}: {fault}; say which are, by `time:` beside `from:`."
-            )
+            fault = f"{table.place}: {found.total} stamps can't be those of {count} values"
+            raise RecordingError(f"{fault}; say which are, by `time:` beside `from:`.")
         return found
 
     def _of_stamps(self, table: Table, time: schema.Time | None) -> Stamped:
@@ -134,11 +133,9 @@ class MappedReader:
         self.say(note)
         if (unit := likely_unit(t)) is not None and time.unit is None:
             usual = f"{np.median(np.diff(t)):.4g} apart, which can't be seconds"
-            line = f"time: {{from: {time.columns[0]}, unit: {unit}}}"
             fault = f"{table.place}: the stamps {time.columns[0]!r} are {usual}"
-            raise RecordingError(
-                f"{fault}; write `{line}` into the mapping (`unit: s` if they are)."
-            )
+            advice = f"write `time: {{from: {time.columns[0]}, unit: {unit}}}` into the mapping"
+            raise RecordingError(f"{fault}; {advice} (`unit: s` if they are).")
         t, order, note = stamping.in_order(t * UNITS[time.unit or "s"].factor, name)
         self.say(note)
         return Stamped(t, known[order], "", len(raw))
@@ -167,23 +164,22 @@ class MappedReader:
         table, which = self.place(value.from_, stream.in_)
         column, time = numbers_of(table, which), value.time or stream.time
         at = self.stamped(table, column, time)
-        clock = value.clock or stream.clock or at.clock or self.mapping.clock
+        clock = value.clock or stream.clock or self.mapping.clock or at.clock or ROBOT_CLOCK
         raw = column[at.rows]
         for k in np.flatnonzero(np.isinf(raw))[:1]:
             where = f"{table.place}: {table.row(int(at.rows[k]))}"
             raise RecordingError(f"{where}: {which!r} is infinite; mend or remove the row.")
         known = np.isfinite(raw)
         if not known.any():
-            raise RecordingError(
-                f"{table.place}: {which!r} holds no number; choose another column."
-            )
+            fault = f"{table.place}: {which!r} holds no number"
+            raise RecordingError(f"{fault}; choose another column.")
         if not known.all():
             missing = f"{int((~known).sum())} of {len(raw)} rows have no value"
             self.say(f"{name}: {missing}, and were left out.")
         made = Series(at.t[known], raw[known], clock)
-        plain = unit_of(value).si in ("", "rad/s", "m/s") and value.wrap is None
-        if plain and not value.counts and (size := stamping.counter(made.values)):
-            fault = f"{table.place}: {which!r} is a counter that overflows at {size:.10g}"
+        plain = unit_of(value).si in ("", "rad/s", "m/s", "ticks/s") and value.wrap is None
+        if plain and not value.counts and (does := stamping.counter(made.values)):
+            fault = f"{table.place}: {which!r} is a counter that {does}"
             advice = f"write `{{from: {which}, unit: ticks, ticks_per_turn: ...}}`"
             raise RecordingError(f"{fault}, no speed: {advice} for {name}.")
         made = self._in_si(name, value, made, held)
@@ -194,6 +190,10 @@ class MappedReader:
         factor *= 1.0 if value.maximum is None else value.maximum
         if value.wrap is not None or value.counts:
             raw = self._continued(name, value, raw)
+        if value.counts and stamping.comes_back(raw.values):
+            fault = f"{self.source.place}: {value.from_!r} goes up and down like a speed"
+            advice = f"write `unit: {value.unit or 'ticks'}/s` for {name}"
+            raise RecordingError(f"{fault}, and is no counter: {advice}.")
         if value.counts:
             raw = _rate(raw, held)
         return raw._replace(values=raw.values * factor + value.offset)
@@ -227,10 +227,8 @@ class MappedReader:
             on &= _equals(column, wanted)[at.rows][np.clip(row, 0, None)] & (row >= 0)
         if not on.any():
             wanted = " and ".join(f"{name} is {each!r}" for name, each in value.when.items())
-            fault = (
-                f"{table.place}: {value.from_!r} never counts: there is no row in which {wanted}"
-            )
-            raise RecordingError(f"{fault}; check `when:`.")
+            fault = f"{table.place}: {value.from_!r} never counts: there is no row in which"
+            raise RecordingError(f"{fault} {wanted}; check `when:`.")
         return made._replace(values=np.where(on, made.values, value.otherwise))
 
 
@@ -297,7 +295,7 @@ def together(name: str, parts: Sequence[Series], held: bool) -> Stream:
     if len(clocks) > 1:
         fault = f"{name}: its values are of the clocks {' and '.join(clocks)}"
         raise ConfigError(f"{fault}; a stream needs one clock.")
-    t = parts[0].t
+    t, columns = parts[0].t, [part.values for part in parts]
     if not all(np.array_equal(t, part.t) for part in parts):
         start, stop = max(part.t[0] for part in parts), min(part.t[-1] for part in parts)
         if held:
@@ -307,13 +305,8 @@ def together(name: str, parts: Sequence[Series], held: bool) -> Stream:
             t = t[(t >= start) & (t <= stop)]
         if not len(t):
             raise RecordingError(f"{name}: its values are of times that do not overlap.")
-    columns = [_at(part, t, held) for part in parts]
+        columns = [
+            p.values[np.searchsorted(p.t, t, side="right") - 1] if held else np.interp(t, *p[:2])
+            for p in parts
+        ]
     return Stream(t, np.stack(columns, axis=1), clocks[0])
-
-
-def _at(part: Series, t: Array, held: bool) -> Array:
-    if np.array_equal(t, part.t):
-        return part.values
-    if held:
-        return part.values[np.searchsorted(part.t, t, side="right") - 1]
-    return np.asarray(np.interp(t, part.t, part.values))

@@ -37,7 +37,7 @@ LEAST_RATE = 1e-6
 BURSTS_SHOWN = 12
 MOST_POINTS = 3000
 BINS = 60
-CURVE_POINTS, TITLE = 400, 44  # of an input curve; letters in a line above it
+CURVE_POINTS, TITLE = 400, 44  # of an input curve; letters in a line above a picture
 REACH = 5.0  # histograms end at this many standard deviations
 REACH_S, TRIALS = 0.5, 81  # largest shift in time of a curve, and number of its points
 CAPTIONS = {
@@ -312,7 +312,7 @@ def inputs(spec: RobotSpec, identified: Identified) -> bytes | None:
         rug: dict[str, Any] = {"transform": axes.get_xaxis_transform(), "alpha": 0.05}
         axes.plot(sent, np.full(len(sent), 0.03), "|", color=MEASURED, markersize=9, **rug)
         axes.set(xlabel=f"{curve.command} [{unit}]", ylabel=f"{curve.command}' [{unit}]")
-        _finish(axes, fill(curve.equation.replace("-+", "∓"), TITLE))
+        _finish(axes, curve.equation.replace("-+", "∓"))
     return png(figure)
 
 
@@ -331,11 +331,12 @@ def _restraint(axes: Axes, identified: Identified, dof: str) -> None:
             axes.axhspan(edge - 2.0 * sigma, edge + 2.0 * sigma, color=MODEL, alpha=0.25)
     unit = model.dof_units[d]
     axes.set(xlabel=f"{dof} by its terms [{unit}]", ylabel=f"{dof} [{unit}]")
-    _finish(axes, fill(dof + model.restraint(dof), TITLE))
+    _finish(axes, dof + model.restraint(dof))
 
 
 def _finish(axes: Axes, title: str) -> None:
-    axes.set_title(title.replace("+-", "±"), fontsize=10, color=DARK)
+    lines = [fill(line, TITLE) for line in title.replace("+-", "±").splitlines()]
+    axes.set_title("\n".join(lines), fontsize=10, color=DARK)
     axes.grid(alpha=0.3)
     axes.legend(frameon=False, fontsize=9)
 

@@ -16,8 +16,9 @@ from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.fit import fit
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.repair import check_commands, check_units, repaired
+from nics_drl_bridge.recording.mapping import load_mapping
 from nics_drl_bridge.recording.readers import robot_and_drive
-from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
+from nics_drl_bridge.recording.recording import Recording, Samples, Stream, samples_on_one_clock
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot, robot_from
 
@@ -106,6 +107,44 @@ def test_a_swapped_speed_and_turn_is_refused_by_what_they_move(name, ahead):
     command = replace(plain.command, values=plain.command.values[:, ::-1])
     with pytest.raises(RecordingError, match="_command are swapped: each moves the robot as"):
         check_commands(Drive(replace(plain, command=command), spec))
+
+
+def test_two_commands_a_quarter_of_a_period_apart_are_not_swapped(differential):
+    """Late by as much, each goes as the other does."""
+    t, turn = np.arange(0.0, 60.0, 0.02), 2.0 * np.pi / 3.8
+    asked, moved = (
+        np.stack([0.5 * np.sin(turn * since), np.cos(turn * since)], axis=1)
+        for since in (t, t - 0.05)
+    )
+    heading = np.cumsum(moved[:, 1]) * 0.02
+    ahead = np.stack([np.cos(heading), np.sin(heading)], axis=1) * moved[:, :1] * 0.02
+    pose = Stream(t, np.column_stack([np.cumsum(ahead, axis=0), heading]), "robot")
+    made = Recording(Stream(t, asked, "robot"), pose, source="drive")
+    assert check_commands(Drive(made, differential)) == ()
+
+
+@pytest.mark.skipif(not JUMPING.exists(), reason=f"no recording of others at {JUMPING}")
+@pytest.mark.parametrize("name", ["DS1", "DS3", "DS4"])
+def test_the_speed_and_steering_of_a_real_car_are_refused_if_they_are_swapped(name):
+    mapping = load_mapping(ROOT / "examples" / "recordings" / "f110_folder.yaml")
+    spec, plain = robot_and_drive(JUMPING.parent / name, None, TopicRoles(), mapping)
+    assert check_commands(Drive(plain, spec)) == ()
+    columns = dict(zip(mapping.command, reversed(mapping.command.values()), strict=True))
+    swapped = mapping.model_copy(update={"command": columns})
+    spec, drive = robot_and_drive(JUMPING.parent / name, None, TopicRoles(), swapped)
+    with pytest.raises(RecordingError, match="the column of `steering_command:` behind `speed_"):
+        identify(drive, spec)
+
+
+def test_a_throttle_and_a_steering_that_are_swapped_are_refused_beyond_their_limits():
+    limits = {"throttle": (-1.0, 1.0), "steering": (-1.0, 1.0)}
+    kind = {"kind": "ackermann_throttle", "footprint_radius": 0.2}
+    spec = robot_from(kind, limits)
+    plain = drive(load_robot("ackermann"), measured_state=False)
+    assert check_commands(Drive(plain, spec)) == ()
+    swapped = replace(plain.command, values=100.0 * plain.command.values[:, ::-1])
+    with pytest.raises(RecordingError, match="throttle and steering are swapped"):
+        identify(replace(plain, command=swapped), spec)
 
 
 @pytest.mark.parametrize(("column", "unit", "times"), [(0, "km/h", 3.6), (1, "deg/s", 57.3)])

@@ -156,6 +156,21 @@ def test_a_clock_that_the_mapping_names_decides(tmp_path, offset):
     assert (same.pose.clock, same.command.clock) == ("robot", "robot")
 
 
+@pytest.mark.parametrize("offset", [0.0, 5.0])
+def test_a_pose_by_header_goes_with_commands_that_have_none(tmp_path, offset):
+    bag = bags.write(tmp_path / "bag", {"/pose": bags.poses(offset=offset), "/v": bags.commands()})
+    given = {"command": {"v": "/v:linear.x"}, "pose": {"in": "/pose", "time": "header"}}
+    found = read(bag, **given)
+    assert (found.pose.clock == found.command.clock) == (offset == 0.0)
+    same = read(bag, **given, clock="robot")
+    assert same.pose.clock == same.command.clock == "robot"
+    assert np.allclose(np.diff(found.pose.t), bags.STEP_S)
+    if offset == 0.0:
+        assert found.command.t[0] - found.pose.t[0] == pytest.approx(0.002)
+    with pytest.raises(RecordingError, match="topic '/v': its messages have no header stamps"):
+        read(bag, **given, time="header")
+
+
 def test_the_covariance_of_a_message_gives_deviations(tmp_path):
     rows = [(t, bags.pose_with_covariance(t, *bags.place_at(t))) for t in bags.times()]
     topics = {"/pose": rows, "/v": bags.commands()}

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.recording.mapping import Value, load_mapping
 from nics_drl_bridge.recording.readers import read_recording, robot_and_drive
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 
@@ -52,6 +54,16 @@ def test_the_mapped_folder_is_what_the_reader_of_such_folders_reads(shared_recor
         assert np.array_equal(one.streams[name].t, other.streams[name].t)
         assert np.allclose(one.streams[name].values, other.streams[name].values)
         assert one.streams[name].clock == other.streams[name].clock
+
+
+@pytest.mark.parametrize("drive", ["constant_drive_51s", "random_drive_45s"])
+def test_the_wheel_speeds_of_a_real_car_are_no_counters(shared_recordings, drive):
+    mapping = load_mapping(EXAMPLES / "xtark_folder.yaml")
+    counted = Value.model_validate({"from": "L_wheel.csv:0", "unit": "ticks"})
+    wheels = mapping.wheels.model_copy(update={"left": counted})
+    counting = mapping.model_copy(update={"wheels": wheels})
+    with pytest.raises(RecordingError, match=r"'L_wheel.csv:0' goes up and down like a speed"):
+        read_recording(shared_recordings / "xtark_ackermann" / drive, mapping=counting)
 
 
 def test_the_throttle_is_zero_while_the_switch_is_off(shared_recordings):

@@ -131,6 +131,15 @@ def test_an_absolute_encoder_is_an_angle_about_zero(tmp_path, columns):
     assert np.allclose(found.command.values[:, 0], angle, atol=1e-3)
 
 
+@pytest.mark.parametrize(("reach", "period"), [(50.0, 0.5), (1000.0, 100.0), (0.0, 1.0)])
+def test_a_wheel_that_goes_to_and_fro_or_trembles_is_counted(tmp_path, columns, reach, period):
+    turned = reach * np.sin(columns["t"] * 2.0 * np.pi / period)
+    ticks = np.round(turned) + np.round(np.sin(columns["t"] * 100.0))
+    path = write(tmp_path / "log.csv", columns | {"n": ticks})
+    found = read(path, command={"left": {"from": "n", "unit": "ticks"}})
+    assert len(found.command.values) == len(ticks) - 1
+
+
 def test_a_folder_has_its_values_in_several_files(tmp_path, columns):
     pick = ("t", "x", "y", "yaw")
     write(tmp_path / "pose.csv", {name: columns[name] for name in pick})
@@ -298,6 +307,18 @@ MAPPED = {"robot": "ackermann", "pose": {"x": 0, "y": 1, "heading": 2}, "command
             {"v": lambda d: np.arange(200) * 2017 % 2**16},
             "'v' is a counter that overflows at 65536, no speed: write `{from: v, unit: ticks, ",
         ),
+        *(
+            (
+                {"command": {"v": {"from": "v", **unit}}}, {"v": lambda d: -40 * np.arange(200)},
+                "'v' is a counter that went on by 7960, no speed: write `{from: v, unit: ticks, ",
+            )
+            for unit in ({}, *({"unit": unit} for unit in ("rad/s", "rpm", "m/s", "ticks/s")))
+        ),
+        (
+            {"command": {"v": {"from": "v", "unit": "ticks"}}},
+            {"v": lambda d: 30.0 + np.round(10.0 * np.sin(200.0 * d["t"]))},
+            "'v' goes up and down like a speed, and is no counter: write `unit: ticks/s` for comm",
+        ),
         (
             {"time": "sec"}, {"sec": lambda d: d["t"] // 1, "nanosec": lambda d: d["t"] % 1 * 1e9},
             "whole seconds, of 50 rows each; write `time: [sec, nanosec]` into the mapping",
@@ -316,7 +337,10 @@ def test_what_only_a_wrong_mapping_explains_is_refused_with_the_line_to_write(
     assert sentence in str(refused.value)
 
 
-@pytest.mark.parametrize("pwm", [np.where(np.arange(400) % 100 < 50, -127, 127), np.zeros(400)])
+@pytest.mark.parametrize(
+    "pwm",
+    [np.where(np.arange(400) % 100 < 50, -127, 127), np.zeros(400), 5 * np.arange(400)],
+)
 def test_commands_in_whole_numbers_are_no_counters(tmp_path, pwm):
     columns = drive(400) | {"v": pwm + np.arange(400) % 2}
     found = read(write(tmp_path / "log.csv", columns))

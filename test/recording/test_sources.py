@@ -1,11 +1,10 @@
 from __future__ import annotations
 
-from importlib.util import find_spec
-
 import numpy as np
 import pytest
 
 from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.recording import table_files
 from nics_drl_bridge.recording.readers import open_source
 
 from .tables import drive, read
@@ -48,8 +47,8 @@ def test_objects_and_damage_are_refused(tmp_path):
             read(tmp_path / name)
 
 
-@pytest.mark.skipif(find_spec("pyarrow") is not None, reason="pyarrow is installed")
-def test_parquet_without_its_library_is_one_sentence(tmp_path):
+def test_parquet_without_its_library_is_one_sentence(tmp_path, monkeypatch):
+    monkeypatch.setattr(table_files, "find_spec", lambda _: None)
     (tmp_path / "log.parquet").write_bytes(b"PAR1")
     with pytest.raises(RecordingError, match="Parquet needs the library pyarrow"):
         read(tmp_path / "log.parquet")

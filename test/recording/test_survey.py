@@ -157,11 +157,25 @@ def test_a_source_without_a_readable_table_is_refused(tmp_path):
     assert "is not text" in tables[1].findings[0]
 
 
-def test_columns_of_numbers_that_a_mapping_does_not_use_are_named(tmp_path):
+def test_columns_that_a_mapping_does_not_use_are_named_with_a_word_why(tmp_path):
     columns = {NAMES.get(name, name): column for name, column in drive().items()}
     more = {"brake_pct": columns["t"], "spare": 0.0 * columns["t"], "seq": np.arange(200)}
+    more |= {"blorp": columns["t"] ** 2, "mode": np.where(columns["t"] < 1.0, "AUTO", "HAND")}
     _, text = written(write(tmp_path / "log.csv", columns | more))
-    assert text.splitlines()[-1] == "# not used: brake_pct"
+    rest = "brake_pct, spare (constant), blorp, mode (no numbers)"
+    assert text.splitlines()[-1] == f"# not used: {rest}"
+
+
+def test_columns_that_a_mapping_does_not_use_are_named_by_table(tmp_path):
+    columns = drive()
+    write(tmp_path / "a.csv", {name: columns[name] for name in ("t", "x", "y", "yaw")})
+    more = {f"pump{k}": np.full(200, k) for k in range(22)}
+    write(tmp_path / "b.csv", {"t": columns["t"], "throttle": columns["v"]} | more)
+    write(tmp_path / "c.csv", {"t": columns["t"], "steering": columns["w"], "rest": columns["t"]})
+    first, last = written(tmp_path)[1].splitlines()[-2:]
+    assert first.startswith("# not used: b.csv: pump0 (constant), pump1 (constant), ")
+    assert first.endswith("pump19 (constant) and 2 more")
+    assert last == "# not used: c.csv: rest"
 
 
 def test_a_command_that_was_zero_throughout_stays_one(tmp_path):
@@ -189,6 +203,26 @@ def test_a_pose_that_shares_no_time_with_the_commands_has_a_clock_of_its_own(tmp
     assert guess["pose"]["clock"] == "tracker"
     found = read_recording(tmp_path, mapping=Mapping.model_validate(guess))
     assert found.pose.t[0] == found.command.t[0] == pytest.approx(0.0)
+
+
+@pytest.mark.parametrize(
+    ("unit", "since", "own"), [(1e9, 0.0, True), (1.0, 0.0, False), (1e9, 5.0, False)]
+)
+def test_a_pose_that_counts_from_its_first_row_in_another_unit_has_a_clock(
+    tmp_path, unit, since, own
+):
+    columns = drive()
+    pose = {name: columns[name] for name in ("t", "x", "y", "yaw")}
+    write(tmp_path / "pose.csv", pose | {"t": unit * (since + columns["t"])})
+    later = {"t": since + 0.13 + columns["t"], "throttle": columns["v"], "steering": columns["w"]}
+    write(tmp_path / "cmd.csv", later)
+    assert ("clock" in surveyed(tmp_path)[1]["pose"]) == own
+
+
+def test_the_motion_capture_of_a_real_car_is_guessed_to_have_a_clock(shared_recordings):
+    _, guess = surveyed(shared_recordings / "xtark_ackermann" / "random_drive_45s")
+    assert guess["pose"]["time"] == {"from": 7, "unit": "ns"}
+    assert guess["pose"]["clock"] == "tracker"
 
 
 @pytest.mark.parametrize("name", ["left_rpm", "rpm_left", "motor_rpm_left_cmd"])

@@ -10,11 +10,9 @@ from nics_drl_bridge.identify.identify import Identified, identify
 from nics_drl_bridge.identify.mounting import Mounting
 from nics_drl_bridge.identify.report import estimates, fit_report
 from nics_drl_bridge.recording.textbook import record
-from nics_drl_bridge.report.fit_pictures import (
-    CAPTIONS,
-    calibration_pictures,
-    timing_curves,
-)
+from nics_drl_bridge.report import fit_pictures
+from nics_drl_bridge.report.fit_pictures import CAPTIONS, calibration_pictures, timing_curves
+from nics_drl_bridge.report.pictures import png
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
@@ -100,13 +98,35 @@ def test_what_was_not_possible_has_no_picture_and_the_report_says_why(exact):
         assert part in text
 
 
-def test_the_table_gives_the_reason_that_the_sentence_gives(exact):
-    _, identified = exact
+def with_half_a_lever(identified: Identified) -> tuple[Identified, Mounting]:
+    """The lever arm along y is not known."""
     mounting = Mounting(0.0, np.zeros(2), 0.001, np.array([0.001, np.nan]), 2)
     known = replace(identified, findings=replace(identified.findings, mounting=mounting))
-    known = replace(known, calibration=replace(known.calibration, uncertainty={}))
+    sigma = {"rotation_rad": 0.001, "lever_arm_x_m": 0.001}
+    return replace(known, calibration=replace(known.calibration, uncertainty=sigma)), mounting
+
+
+def test_the_table_gives_the_reason_that_the_sentence_gives(exact):
+    known, mounting = with_half_a_lever(exact[1])
     (_, y), found = mounting.hidden, estimates(known)
     assert found["lever_arm_y_m"].text == f"lever arm y: not estimated, {y}"
+
+
+def test_titles_stay_within_their_pictures(exact, disturbed, monkeypatch):
+    figures = []
+
+    def drawn(figure, *rest):
+        figures.append(figure)
+        return png(figure, *rest)
+
+    monkeypatch.setattr(fit_pictures, "png", drawn)
+    for spec, identified in (disturbed, (exact[0], with_half_a_lever(exact[1])[0])):
+        calibration_pictures(spec, identified)
+    axes = [each for figure in figures for each in figure.axes]
+    assert any("lever arm y: not estimated" in each.get_title() for each in axes)
+    for each in axes:
+        title = each.title.get_window_extent()
+        assert 0.0 <= title.x0 < title.x1 <= each.figure.bbox.x1 or not each.get_title()
 
 
 def test_the_text_has_value_uncertainty_and_unit(disturbed):
