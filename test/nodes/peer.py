@@ -43,6 +43,13 @@ class Peer:
             self._executor.spin_once(timeout_sec=0.05)
         return time.monotonic() - began
 
+    def within(self, seconds: float, condition: Callable[[], Any]) -> bool:
+        """Spins until a condition holds, or the time is over; returns whether it holds."""
+        deadline = time.monotonic() + seconds
+        while not condition() and time.monotonic() < deadline:
+            self._executor.spin_once(timeout_sec=0.05)
+        return bool(condition())
+
     def another(self, messages: list[Any], what: str) -> Any:
         """The next message in a list that `listen` gave."""
         known = len(messages)
@@ -55,9 +62,9 @@ class Peer:
         self.node.create_subscription(kind, topic, received.append, quality)
         return received
 
-    def speak(self, kind: Any, topic: str, subscribers: int = 1) -> Any:
+    def speak(self, kind: Any, topic: str, subscribers: int = 1, quality: Any = qos.COMMAND) -> Any:
         """A publisher that the given number of subscribers have found."""
-        publisher = self.node.create_publisher(kind, topic, qos.COMMAND)
+        publisher = self.node.create_publisher(kind, topic, quality)
         self.until(
             lambda: publisher.get_subscription_count() >= subscribers, f"a subscriber of {topic}"
         )

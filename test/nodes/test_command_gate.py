@@ -40,6 +40,8 @@ SOON_S = 0.5  # what the gate is made for, on a machine with time
 LATE_S = 5.0
 PERIOD_S, START_NS, MOST_S = 0.1, 10**18, 1.0
 MOST_ARMINGS = 3
+CORRIDOR_M = 1.5  # from the middle of it, on which the robot drives, to either wall
+WRITTEN_S = 5.0
 PATIENT = {
     "scan_age": 1.0, "odom_age": 0.6, "command_age": 1.0, "rate_tolerance": 0.6,
     "e_stop_silence": 1.0,
@@ -53,14 +55,17 @@ class Robot:
     def __init__(self, peer, lidar):
         self.peer, self.lidar, self.stamp_ns, self.x = peer, lidar, START_NS, 0.0
         self.silent, self.wish, self.stamped = set(), (0.5, 0.0, 0.0), None
-        self.distance = 1.0
+        # Along a corridor without an end nothing moves, however late a pose or a scan may be.
+        bearings = lidar.angles + lidar.mount[2]
+        self.walls = CORRIDOR_M / np.maximum(np.abs(np.sin(bearings)), 1e-9)
+        self.distance = math.inf  # of an obstacle all around it
         self.passed = peer.listen(Twist, "cmd_vel", qos.COMMAND)
         self.topics = {
             "scan": peer.speak(LaserScan, "scan"),
             "odom": peer.speak(Odometry, "odom"),
             "filtered": peer.speak(Odometry, "odometry/filtered"),
             "cmd_vel_raw": peer.speak(TwistStamped, "cmd_vel_raw"),
-            "e_stop": peer.speak(Bool, "e_stop"),
+            "e_stop": peer.speak(Bool, "e_stop", quality=qos.EVERY_COMMAND),
         }
         peer.node.create_timer(PERIOD_S, self.sends)
 
@@ -73,9 +78,9 @@ class Robot:
         odometry = conversions.odometry_to_ros(
             [self.x, 0.0, 0.0], [speed, 0.0, 0.0], self.stamp_ns, ("odom", "base_link"), (1e-4,) * 4
         )
-        ranges = np.full(
-            self.lidar.beams, self.distance + self.stamp_ns % 7_000_000_000 * 1e-10, np.float32
-        )
+        # No two scans are the same; this is less than what counts as a motion.
+        noise = self.stamp_ns % 7_000_000_000 * 1e-12
+        ranges = (np.minimum(self.walls, self.distance) + noise).astype(np.float32)
         said = {
             "odom": odometry,
             "filtered": odometry,
@@ -134,6 +139,10 @@ class Robot:
             self.call("reset")
             answer = self.call("arm")
             assert answer.success or time.monotonic() < deadline, answer.message
+
+    def says(self, cause):
+        """Waits until the gate names what stops it; a busy machine may stop it before."""
+        self.peer.until(lambda: self.diagnosed()[""].startswith(cause), cause)
 
     def diagnosed(self):
         """What the gate says next about itself."""
@@ -337,8 +346,8 @@ def test_another_publisher_of_commands_is_told_of_as_long_as_it_is_there(robot):
 def test_an_e_stop_that_falls_silent_stops_the_robot_by_default_and_stays(robot):
     robot.drives()
     robot.silent = {"e_stop"}
+    robot.says("e_stop_silent: topic=e_stop")
     robot.stops()
-    assert robot.diagnosed()[""].startswith("e_stop_silent: topic=e_stop")
     assert robot.call("reset").success
     assert "e_stop_silent" in robot.call("arm").message
     robot.drives()
@@ -367,11 +376,15 @@ def test_the_e_stop_by_service_stops_and_its_cause_is_diagnosed(robot):
 
 
 def test_every_stop_is_in_the_black_box_and_replays(robot, black_box):
-    robot.drives()
-    robot.silent, robot.stamped = {"scan"}, robot.stamp_ns
-    robot.stops()
-    robot.peer.until(lambda: list(black_box.glob("*scan_silent.jsonl")), "a file")
-    again = replay(sorted(black_box.glob("*scan_silent.jsonl"))[-1])
+    deadline = time.monotonic() + DEADLINE_S
+    while not (files := sorted(black_box.glob("*scan_silent.jsonl"))):
+        # A busy machine may freeze the gate; then that is the stop which is written.
+        assert time.monotonic() < deadline, "no file"
+        robot.drives()
+        robot.silent, robot.stamped = {"scan"}, robot.stamp_ns
+        robot.stops()
+        robot.peer.within(WRITTEN_S, lambda: list(black_box.glob("*scan_silent.jsonl")))
+    again = replay(files[-1])
     assert again.differing == ()
     assert again.entries[-1].decision.cause.rule == "scan_silent"
 
@@ -411,13 +424,14 @@ def test_as_shipped_it_stops_before_an_obstacle_and_counts_it(
 ):
     gate = launch("command_gate", domain_id, limits="ackermann", black_box=str(tmp_path), **PATIENT)
     robot = Robot(meet(domain_id), model.lidar)
-    robot.distance = 3.0
     robot.drives(0.2, 0.0, 0.0)
+    cut = int(robot.diagnosed().get("cut by the shield", 0))
     robot.distance = 0.19
+    robot.peer.until(
+        lambda: int(robot.diagnosed().get("cut by the shield", 0)) > cut, "the shield cuts"
+    )
+    robot.says("commands pass")
     robot.stops()
-    facts = robot.diagnosed()
-    assert facts[""] == "commands pass"
-    assert int(facts["cut by the shield"]) > 0
     said = gate.log.read_text(encoding="utf-8")
     assert "the shield is on: latency 0.2, deceleration 2, margin 0.05, obstacle_speed 1" in said
     assert "config/limits/ackermann.yaml" in said
