@@ -39,6 +39,7 @@ class ForeignRobot:
     robot: dict[str, Any]  # what a user would say of it in a mapping
     latency_s: float = 0.06  # from a command's stamp to its effect
     delays_s: tuple[float, ...] = ()  # of the commands after that; none if empty
+    slew: tuple[float, ...] = ()  # greatest rates of the commands, by the robot's own driver
     mounting: tuple[float, float, float] = (0.0, 0.0, 0.0)  # pose of the tracked body
     pose_s: float = 0.01  # between poses
     arm_known: bool = True  # the tracked point's x is defined, as no other point moves alike
@@ -152,6 +153,8 @@ def foreign_drive(robot: ForeignRobot, seed: int, duration_s: float = 90.0) -> F
     acting = np.searchsorted(stamp, sent, "right") - 1
     states = np.zeros((fine + 1, physics.STATES))
     command = np.where(acting < 0, 0.0, np.take_along_axis(values, np.maximum(acting, 0), axis=0))
+    if robot.slew:
+        command = _slewed(command, np.array(robot.slew) * STEP_S)
     parameters = np.append(robot.values, np.zeros(12 - len(robot.values)))
     physics.integrate(states, command, robot.physics, parameters, STEP_S)
     seen = states[::stride]
@@ -163,6 +166,14 @@ def foreign_drive(robot: ForeignRobot, seed: int, duration_s: float = 90.0) -> F
         counts = np.floor(seen[:, 5:7] * robot.ticks_per_turn / (2.0 * np.pi))
         commands = Stream(t, counts)
     return ForeignDrive(robot, Stream(t, pose), commands)
+
+
+def _slewed(command: Array, most: Array) -> Array:
+    """Returns commands (T, C) that follow others by at most so much (C,) per step."""
+    slewed = np.zeros_like(command)
+    for k in range(1, len(command)):
+        slewed[k] = slewed[k - 1] + np.clip(command[k] - slewed[k - 1], -most, most)
+    return slewed
 
 
 def _varied(rng: np.random.Generator, t: Array, low: float, high: float) -> Array:

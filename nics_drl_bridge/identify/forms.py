@@ -178,24 +178,7 @@ def problem_of(
 
 def inputs_of(drive: Drive, latency: float, samples: Samples, form: Form) -> shooting.Inputs:
     """Returns the values that are sought besides coefficients: latency, and those of a form."""
-    one_clock = drive.recording.pose.clock == drive.recording.command.clock
-    least = min(latency, 0.0) if one_clock else latency - LONGEST_S
-    bounds = least, latency + LONGEST_S
-    rows = {
-        "latency": (latency, DELAY_SCALE_S, *(bounds if not form.delays else (latency, latency)))
-    }
-    rows |= {f"{name}.delay": (at, DELAY_SCALE_S, *bounds) for name, at in form.delays}
-    for curve in form.curves:
-        name, size = curve.command, max(abs(curve.least), abs(curve.most))
-        if np.isfinite(size):
-            step = CURVE_SCALE * size
-            rows |= {
-                f"{name}.dead": (curve.dead, step, 0.0, 0.5 * size if curve.dead else 0.0),
-                f"{name}.least": (curve.least, step, 1.5 * curve.least, 0.5 * curve.least),
-                f"{name}.most": (curve.most, step, 0.5 * curve.most, 1.5 * curve.most),
-            }
-        if name in form.back:
-            rows[f"{name}.back"] = (curve.back, BACK_SCALE, *BACK_RANGE)
+    rows = _rows_of_commands(drive, latency, form)
     rates = {v.name: samples.dq[:, 3 + i] for i, v in enumerate(drive.spec.state)}
     for name in form.friction:
         size = float(np.percentile(np.abs(rates[name]), STRONG))
@@ -220,6 +203,29 @@ def inputs_of(drive: Drive, latency: float, samples: Samples, form: Form) -> sho
         rows["y"] = (0.0, LEVER_SCALE_M, -aside, aside)
         rows["heading"] = (0.0, TURN_SCALE, -np.pi, np.pi)
     return shooting.Inputs(tuple(rows), *np.array(list(rows.values())).T)
+
+
+def _rows_of_commands(
+    drive: Drive, latency: float, form: Form
+) -> dict[str, tuple[float, float, float, float]]:
+    """Returns start, scale and bounds of latency and delays [s], and of curves, by name."""
+    one_clock = drive.recording.pose.clock == drive.recording.command.clock
+    bounds = min(latency, 0.0) if one_clock else latency - LONGEST_S, latency + LONGEST_S
+    shared = (latency, latency) if form.delays else bounds
+    rows = {"latency": (latency, DELAY_SCALE_S, *shared)}
+    rows |= {f"{name}.delay": (at, DELAY_SCALE_S, *bounds) for name, at in form.delays}
+    for curve in form.curves:
+        name, size = curve.command, max(abs(curve.least), abs(curve.most))
+        if np.isfinite(size):
+            step = CURVE_SCALE * size
+            rows |= {
+                f"{name}.dead": (curve.dead, step, 0.0, 0.5 * size if curve.dead else 0.0),
+                f"{name}.least": (curve.least, step, 1.5 * curve.least, 0.5 * curve.least),
+                f"{name}.most": (curve.most, step, 0.5 * curve.most, 1.5 * curve.most),
+            }
+        if name in form.back:
+            rows[f"{name}.back"] = (curve.back, BACK_SCALE, *BACK_RANGE)
+    return rows
 
 
 def two_way(drive: Drive, samples: Samples) -> tuple[InputCurve, ...]:

@@ -215,6 +215,8 @@ def changes(
     if speeds:
         yield lambda form: with_dead(form, drive, samples), WORTH
         yield lambda form: replace(form, limits=speeds), WORTH
+        if others := tuple(v.name for v in drive.spec.state if v.twist and not drive.spec.steers):
+            yield lambda form: replace(form, limits=others), WORTH
         if backwards := two_way(drive, samples):
             yield lambda form: with_back(form, backwards), WORTH
 

@@ -278,7 +278,7 @@ def prune(drive: Drive, findings: Findings) -> Findings:
         return findings
     linear = pruned(regression, drive.spec, drive.settings.alpha)
     model = replace(linear.model, inputs=findings.calibration.inputs)
-    return replace(findings, linear=linear, model=model)
+    return replace(findings, linear=replace(linear, model=model), model=model)
 
 
 def refine(drive: Drive, findings: Findings) -> Findings:
