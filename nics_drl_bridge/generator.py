@@ -31,6 +31,7 @@ MODEL_FILE, TABLE_FOLDER, REPORT_FILE = "model.yaml", "lidar_table", "report.txt
 _OF_TABLE = (f"{TABLE_FOLDER}/{name}" for name in (files.SUMS, *TABLE_FILES))
 MODEL_FILES = (MODEL_FILE, REPORT_FILE, *_OF_TABLE)  # and a manifest
 CONTROL_PERIOD_S = 0.1
+MOTORS = "inputs", "limits"  # of a calibration
 DEFAULT_LIDAR = "paper"
 BUILTIN_SEED = 0
 
@@ -72,8 +73,8 @@ class SimulatorModel:
     @cached_property
     def text(self) -> str:
         """The content of `model.yaml`."""
-        # The kinematics hold the input curves, of which an identification's calibration has a copy.
-        calibration = {k: v for k, v in asdict(self.calibration).items() if k != "inputs"}
+        # The kinematics hold what motors do, of which an identification's calibration has a copy.
+        calibration = {k: v for k, v in asdict(self.calibration).items() if k not in MOTORS}
         data = {
             "format": FORMAT, "control_period": self.control_period,
             "robot": self.robot.model_dump(mode="json"),
@@ -125,7 +126,7 @@ def generate(
     if (reason := why_useless(identified, robot)) and not anyway:
         raise FitError(reason)
     model = SimulatorModel(
-        robot, identified.model, replace(identified.calibration, inputs=()), lidar,
+        robot, identified.model, replace(identified.calibration, inputs=(), limits={}), lidar,
         bake(lidar, (*shapes, footprint_shape(robot))), identified.noise,
         report=fit_report(recording.source, robot, identified), latency=recording.latency,
         sensors=tuple(sensors),
@@ -192,7 +193,7 @@ def load_model(folder: str | Path) -> SimulatorModel:
         data["robot"].setdefault("angular_is", "steering")
     file = validate(data, _File, str(path))
     for key in fields(Calibration):  # its defaults are those of a robot that needs none
-        if key.name not in (*data["calibration"], "inputs"):
+        if key.name not in (*data["calibration"], *MOTORS):
             raise ConfigError(f"{path}: the key 'calibration.{key.name}' is missing; add it.")
     table = LidarTable.load(folder / TABLE_FOLDER, checked=True)
     report = read_text(folder / REPORT_FILE)

@@ -7,7 +7,7 @@ tracked body sits somewhere on the robot, or encoders that overflow. Everything 
 from __future__ import annotations
 
 import csv
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -53,7 +53,7 @@ class ForeignRobot:
         x, y, heading = self.mounting
         mounting = {"rotation_rad": -heading, "lever_arm_y_m": y}
         return Truth(
-            None if self.ticks_per_turn else self.latency_s,
+            None if self.ticks_per_turn or self.slew else self.latency_s,
             mounting | ({"lever_arm_x_m": x} if self.arm_known else {}), self.dead_zone,
             {name: (size, size) for name, size in self.wheels.items()},
         )  # fmt: skip
@@ -99,6 +99,7 @@ ROBOTS: dict[str, ForeignRobot] = {
         wheels={"left_m": 0.0975, "right_m": 0.0985, "base_m": 0.34},
     ),
 }  # fmt: skip
+ROBOTS["slewed_tricycle"] = replace(ROBOTS["tricycle"], slew=(0.6, 1.0), delays_s=())
 
 
 @dataclass(frozen=True)

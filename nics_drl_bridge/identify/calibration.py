@@ -11,7 +11,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import MAX_GAP_S, MIN_STAMPS, Drive
-from nics_drl_bridge.identify.signals import inferred_states, resample, taken, unwrapped
+from nics_drl_bridge.identify.signals import Motors, inferred_states, resample, taken, unwrapped
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
 from nics_drl_bridge.robot.curve import InputCurve, delays
 
@@ -46,6 +46,9 @@ class Calibration:
     lever_arm_m: tuple[float, float] = (0.0, 0.0)  # (x, y) of the tracked point in `base_link`
     responses: tuple[Response, ...] = ()  # of the state variables; empty if the state was measured
     inputs: tuple[InputCurve, ...] = ()  # of the commands that do not act as they are, or at once
+    limits: dict[str, tuple[float, float]] = field(
+        default_factory=dict
+    )  # of inferred states' rates
     burst_period_s: NonNegativeFloat = 0.0  # between bursts of poses; 0 without bursts
     position_noise_m: NonNegativeFloat = 0.0  # standard deviation of x and y of the pose
     heading_noise_rad: NonNegativeFloat = 0.0
@@ -64,6 +67,7 @@ class Calibration:
             and self.lever_arm_m == (0.0, 0.0)
             and not self.responses
             and not self.inputs
+            and not self.limits
             and self.burst_period_s == 0.0
         )
 
@@ -71,6 +75,15 @@ class Calibration:
     def is_exact(self) -> bool:
         """True if there is nothing to correct, not even noise: a textbook recording."""
         return self.is_identity and self.position_noise_m == self.heading_noise_rad == 0.0
+
+    @property
+    def motors(self) -> Motors:
+        """What holds back the states that follow commands, beside delays and lags."""
+        limits = [self.limits.get(r.state, (-np.inf, np.inf)) for r in self.responses]
+        fall, rise = np.array(limits).reshape(-1, 2).T
+        dead = {curve.command: curve.dead for curve in self.inputs}
+        zones = [dead.get(r.command, 0.0) for r in self.responses]
+        return Motors(fall, rise, np.array(zones))
 
     @property
     def mounting(self) -> Array:
@@ -132,8 +145,9 @@ def states_at(drive: Drive, calibration: Calibration, grid: Array) -> Array:
     lead = int(np.ceil(max(0.0, grid[0] - recording.command.t[0]) / step)) + 1
     longer = np.concatenate([grid[0] + step * np.arange(-lead, 0), grid])
     late = delays([r.command for r in calibration.responses], calibration.inputs)
-    latency = calibration.command_latency_s + late
-    return gains * inferred_states(recording.command, drive.spec, lags, latency, longer)[lead:]
+    latency, motors = calibration.command_latency_s + late, calibration.motors
+    inferred = inferred_states(recording.command, drive.spec, lags, latency, longer, motors)
+    return np.asarray(gains * inferred[lead:])
 
 
 def _shared_stamps(recording: Recording, period: float) -> tuple[Array, Array, Array, Array] | None:

@@ -1,6 +1,6 @@
 """Clocks: a drive's offset, latency and lags, each the shift that best explains it by commands."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,9 +12,8 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import signals
 from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.drive import MIN_STAMPS, Drive, TwistIntervals
-from nics_drl_bridge.identify.excitation import moving_dofs
+from nics_drl_bridge.identify.signals import Motors
 from nics_drl_bridge.identify.statistics import (
-    clustered_errors,
     minimise,
     standard_errors,
     uncertainty,
@@ -22,12 +21,11 @@ from nics_drl_bridge.identify.statistics import (
 )
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot import taylor
-from nics_drl_bridge.robot.curve import InputCurve
-from nics_drl_bridge.robot.kernels import GREATEST_ORDER
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Target = tuple[Array, Array, Array]  # start (n,), end (n,) of intervals, a signal's means (n, K)
 Residual = Callable[[Array], Array]  # of a trial delay [s] and maybe the logarithms of lags
+Left = Callable[..., Array]  # residual by lags (S,), delays () or (S,) [s], and maybe motors
 
 STEP_S = 0.01
 LEAD_S = 2.0  # for the states to forget their initial values
@@ -80,20 +78,19 @@ def delay_of_response(
     return replace(found, lags=tau, lag_sigma=sigma)
 
 
-def response_residual(
-    command: Stream, spec: RobotSpec, target: Target, order: int = 2
-) -> Callable[[Array, Array | float], Array]:
+def response_residual(command: Stream, spec: RobotSpec, target: Target, order: int = 2) -> Left:
     """Returns the residual of a signal explained by commands, given lags and delays (S,) [s]."""
     (start, end, signal), moved = target, signals.moved_inputs(command, spec)
     powers = taylor.exponents(len(moved), order)
     powers = powers[(powers[:, ~moved] == 0).all(axis=1)]
     grid = np.arange(start.min() - LEAD_S, end.max() + STEP_S, STEP_S)
 
-    def residual(lags: Array, delay: Array | float) -> Array:
+    def residual(lags: Array, delay: Array | float, motors: Motors | None = None) -> Array:
         if not spec.state:
             means = signals.held(command, spec, start - delay, end - delay, powers)
             return unexplained(means, signal)
-        chi = taylor.evaluate(signals.inferred_states(command, spec, lags, delay, grid), powers)
+        states = signals.inferred_states(command, spec, lags, delay, grid, motors)
+        chi = taylor.evaluate(states, powers)
         return unexplained(signals.interval_means(grid, chi, start, end), signal)
 
     return residual
@@ -103,7 +100,7 @@ def state_residual(command: Stream, state: Stream, spec: RobotSpec) -> Residual:
     """Returns the residual of a measured state's rates, given a delay (1,) of the commands [s]."""
     span = np.diff(state.t)
     keep = np.flatnonzero((span > 0.0) & (span < LONG_STEP * np.median(span)))
-    keep = keep[_some(len(keep), MAX_ROWS)]
+    keep = keep[some_of(len(keep), MAX_ROWS)]
     start, end = state.t[keep], state.t[keep + 1]
     rates = (state.values[keep + 1] - state.values[keep]) / (end - start)[:, None]
     middle = (state.values[keep + 1] + state.values[keep]) / 2.0
@@ -115,7 +112,7 @@ def state_residual(command: Stream, state: Stream, spec: RobotSpec) -> Residual:
     return residual
 
 
-def _some(count: int, most: int) -> NDArray[np.intp]:
+def some_of(count: int, most: int) -> NDArray[np.intp]:
     """Returns at most so many of the indices of `count` rows, in order."""
     if count <= most:
         return np.arange(count)
@@ -170,12 +167,8 @@ class TimingEstimate:
     separated: bool  # True if offset and latency could be separated
     early: float = 0.0  # by which motion on the commands' clock precedes them: no clock of it [s]
     # (S,) by which inferred states follow their commands after the latency, beside lags [s]
-    delays: Array = field(default_factory=lambda: np.zeros(0))
-
-    @property
-    def late(self) -> Array:
-        """Latency of all commands (), or (S,) of those that inferred states follow [s]."""
-        return self.latency + (self.delays if self.delays.size else np.zeros(()))
+    delays: Array = field(default_factory=lambda: np.zeros(1))
+    motors: Motors | None = None  # of inferred states; None if nothing holds them back
 
 
 def timing_of(drive: Drive) -> TimingEstimate:
@@ -206,89 +199,6 @@ def timing_of(drive: Drive) -> TimingEstimate:
     sigma = {"command_latency_s": delay.sigma}
     early = if_certain(max(-delay.value, 0.0), delay.sigma, MIN_EARLY_S)
     return TimingEstimate(0.0, latency, sigma, delay.lags, delay.lag_sigma, True, early)
-
-
-def apart(drive: Drive, timing: TimingEstimate) -> TimingEstimate:
-    """Sharpens a timing by a delay and a lag of each command of its own.
-
-    What stands between command and motion beside one lag, as a servo of higher order, adds to a
-    command's delay: the latency is the least delay.
-    """
-    if drive.recording.state is not None or not drive.spec.state or len(timing.sigma) != 1:
-        return timing
-    moved = np.flatnonzero(signals.moved_inputs(drive.recording.command, drive.spec))
-    delay, sums, sigma = _delays(drive, timing, moved)
-    if not np.isfinite(sigma).all():
-        return timing
-    first = int(np.argmin(delay + CERTAIN * sigma[0]))
-    alike = np.abs(delay - delay[first]) <= CERTAIN * np.hypot(sigma[0], sigma[0, first])
-    least = float(np.average(delay[alike], weights=sigma[0, alike] ** -2.0))
-    sigma = np.hypot(sigma, WITHIN_TICK * STEP_S)
-    (name,) = timing.sigma  # of the latency, or of the offset between clocks that contains it
-    errors = {name: float(sigma[0, first])}
-    if timing.separated:
-        least = if_certain(max(least, 0.0), errors[name], MIN_TIME_S)
-        if errors[name] > TOLD_S:
-            names = (_of_sum(drive.spec.state[i].name) for i in moved)
-            errors |= zip(names, map(float, sigma[1]), strict=True)
-    lags, lag_sigma, further = timing.lags.copy(), timing.lag_sigma.copy(), 0.0 * timing.lags
-    further[moved] = np.where(alike, 0.0, delay - least)
-    for i, own in zip(moved[~alike], sigma[0, ~alike].tolist(), strict=True):
-        errors[f"{drive.spec.state[i].follows}.delay"] = own
-    lags[moved], lag_sigma[moved] = np.maximum(sums - least - further[moved], 0.0), np.hypot(*sigma)
-    latency = least if timing.separated else 0.0
-    return replace(
-        timing, offset=latency - least, latency=latency, sigma=errors, lags=lags,
-        lag_sigma=lag_sigma, delays=further,
-    )  # fmt: skip
-
-
-def late_inputs(spec: RobotSpec, timing: TimingEstimate) -> tuple[InputCurve, ...]:
-    """Returns the commands that act later than the latency of all, as their states follow them."""
-    later = {v.follows: d for v, d in zip(spec.state, timing.delays, strict=False) if d > 0.0}
-    return tuple(InputCurve(command=str(name), delay=d) for name, d in later.items())
-
-
-def _delays(
-    drive: Drive, timing: TimingEstimate, moved: NDArray[np.intp]
-) -> tuple[Array, Array, Array]:
-    """Returns delays (m,) of moved states, their sums (m,) with the lags, errors (2, m) of both."""
-    twists, command = drive.twists, drive.recording.command
-    rows, moving = _some(len(twists.start), FEW_ROWS), list(moving_dofs(twists.twist))
-    begin = twists.start[rows]
-    target = (begin, twists.end[rows], twists.twist[rows][:, moving])
-    left_over = response_residual(command, drive.spec, target, GREATEST_ORDER)
-    shift, count = timing.latency - timing.offset, len(moved)
-    lags, delays = timing.lags.copy(), np.full(len(timing.lags), shift)
-
-    def residual(theta: Array) -> Array:
-        delays[moved], lags[moved] = theta[:count], np.exp(theta[count:])
-        return left_over(lags, delays)
-
-    low, high = (np.repeat([shift + delay, log_lag], count) for delay, log_lag in BOUNDS)
-    start = np.clip(np.append(delays[moved], np.log(lags[moved])), low, high)
-    found, jacobian, rest = minimise(residual, start, np.full(2 * count, 0.1), (low, high))
-    lag = np.exp(found[count:])
-    by_lag = jacobian[:, count:] / lag
-    by_sum = np.concatenate([jacobian[:, :count] - by_lag, by_lag], axis=1)
-    cluster = np.repeat(((begin - begin[0]) / CLUSTER_S).astype(np.intp), len(moving))
-    sigma = np.maximum(clustered_errors(by_sum, rest, cluster), EXACT)
-    return found[:count], found[:count] + lag, sigma.reshape(2, count)
-
-
-def _of_sum(state: str) -> str:
-    """Returns the name of the uncertainty of a latency and a lag together."""
-    return f"command_latency_and_{state}_lag_s"
-
-
-def about_sums(calibration: Calibration) -> Iterator[str]:
-    """Tells of latency and lags that could not be told apart."""
-    for response in calibration.responses:
-        sigma = calibration.uncertainty.get(_of_sum(response.state))
-        if sigma is not None:
-            both = calibration.command_latency_s + response.lag_s
-            finding = f"Latency and the lag of {response.state} can hardly be told apart"
-            yield f"{finding}: trust their sum, {both:.4f} s (+- {sigma:.4f} s)."
 
 
 def nominal_timing(drive: Drive, offset: float = 0.0) -> TimingEstimate:
@@ -357,7 +267,8 @@ def expected_states(drive: Drive, twists: TwistIntervals, timing: TimingEstimate
     if state is not None:
         return signals.interval_means(state.t, state.values, start, end)
     grid = np.arange(min(start[0], command.t[0]) - 1.0, end[-1] + 0.01, 0.01)
-    states = signals.inferred_states(command, drive.spec, timing.lags, timing.late, grid)
+    late = timing.latency + timing.delays
+    states = signals.inferred_states(command, drive.spec, timing.lags, late, grid, timing.motors)
     return signals.interval_means(grid, states, start, end)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import clocks as timings
-from nics_drl_bridge.identify import hypotheses, shooting, verdict
+from nics_drl_bridge.identify import followers, hypotheses, shooting, verdict
 from nics_drl_bridge.identify import motion as motions
 from nics_drl_bridge.identify.assume import assume_textbook
 from nics_drl_bridge.identify.calibration import Calibration, Response, align
@@ -119,7 +119,7 @@ def clocks(drive: Drive, findings: Findings) -> Findings:
     followed = replace(training, spec=motions.surrogate(spec)) if derived else training
     found = timings.timing_of(followed)
     if not derived:
-        found = timings.apart(training, found)
+        found = followers.apart(training, found)
     names = [c.name for c in spec.command]
     responses = (
         Response(v.name, v.follows, float(found.lags[names.index(v.follows)]))
@@ -129,7 +129,8 @@ def clocks(drive: Drive, findings: Findings) -> Findings:
     calibration = replace(
         findings.calibration,
         responses=tuple(responses),
-        inputs=timings.late_inputs(drive.spec, found),
+        inputs=followers.late_inputs(drive.spec, found),
+        limits=followers.limits_of(drive.spec, found),
         clock_offset_s=found.offset,
         command_latency_s=found.latency,
         burst_period_s=training.bursts.period_s if training.bursts else 0.0,
@@ -241,6 +242,7 @@ def fit(drive: Drive, findings: Findings) -> Findings:
     if spec.state and drive.recording.state is None:
         known(calibration.responses or None, "the response of each state", "responses")
     samples, trials = align(findings.training, calibration), findings.trials
+    samples = followers.unlimited(samples, calibration, spec)
     inferred = drive.recording.state is None and not calibration.is_exact
     if settings.order == "auto" and inferred and not trials:  # a refit knows them
         trials = _trials_of_orders(drive, findings)
@@ -277,7 +279,8 @@ def prune(drive: Drive, findings: Findings) -> Findings:
     if findings.width is not None:  # what a mirror allows is kept: the predictions weigh it
         return findings
     linear = pruned(regression, drive.spec, drive.settings.alpha)
-    model = replace(linear.model, inputs=findings.calibration.inputs)
+    limits = followers.scaled_limits(findings.calibration, drive.spec)
+    model = replace(linear.model, inputs=findings.calibration.inputs, limits=limits)
     return replace(findings, linear=replace(linear, model=model), model=model)
 
 
@@ -463,7 +466,7 @@ def _sentences(found: Findings) -> tuple[str, ...]:
     return (
         *verdict.about_stamps(drive),
         *verdict.about_clocks(drive, calibration, found.timing),
-        *timings.about_sums(calibration),
+        *followers.about_sums(calibration),
         *verdict.about_mounting(drive, calibration, found.mounting),
         *verdict.about_responses(drive, calibration, found.timing),
     )

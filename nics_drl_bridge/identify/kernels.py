@@ -255,3 +255,11 @@ def _follow_state(terms, free, scratch, dt):  # type: ignore[no-untyped-def]
 def _is_limited(terms, i, scratch):  # type: ignore[no-untyped-def]
     rate = scratch.rate[3 + i]
     return not terms.fall[i] <= rate <= terms.rise[i]
+
+
+@kernel
+def limp(states, targets, share, fall, rise):  # type: ignore[no-untyped-def]
+    """Follows targets (T,) from the first state (T,) by a share of what is left, within limits."""
+    for k in range(1, states.shape[0]):
+        change = share * (targets[k - 1] - states[k - 1])
+        states[k] = states[k - 1] + min(max(change, fall), rise)

@@ -77,7 +77,7 @@ def by_definition(
     model: TaylorModel, calibration: Calibration, spec: RobotSpec
 ) -> tuple[TaylorModel, Calibration]:
     """Scales an inferred speed to vx = 1 speed; lateral motion is noise unless commanded."""
-    coefficients = model.coefficients.copy()
+    coefficients, limits = model.coefficients.copy(), model.limits.copy()
     if not spec.moves_sideways:
         coefficients[1] = 0.0
     responses, i = list(calibration.responses), speed_index(spec)
@@ -87,9 +87,10 @@ def by_definition(
         if scale > 0.0:
             coefficients = coefficients / scale ** model.powers[:, i]
             coefficients[3 + i] *= scale
+            limits[i] *= scale
             responses[i] = replace(responses[i], gain=responses[i].gain * scale)
             coefficients[0, alone] = 1.0
-    model = replace(model, coefficients=coefficients)
+    model = replace(model, coefficients=coefficients, limits=limits)
     return model, replace(calibration, responses=tuple(responses))
 
 

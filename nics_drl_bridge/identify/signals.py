@@ -1,6 +1,7 @@
 """Signals in time: held commands, the states that follow them, means, resampled poses, noise."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +9,7 @@ from scipy.interpolate import make_interp_spline
 from scipy.signal import lfilter
 
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify.kernels import limp
 from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.curve import InputCurve, bent, delays
@@ -90,11 +92,31 @@ def nominal_lags(spec: RobotSpec) -> Array:
     return np.array([spec.parameters.get(f"{v.name}_lag", DEFAULT_LAG_S) for v in spec.state])
 
 
+class Motors(NamedTuple):
+    """What holds states back that follow commands with a gain of one, beside delays and lags."""
+
+    fall: Array  # (S,) least and greatest rates [unit of the command / s]
+    rise: Array
+    dead: Array  # (S,) a smaller command moves nothing [its unit]
+
+
+def free_motors(states: int) -> Motors:
+    """Returns motors that hold nothing back."""
+    return Motors(np.full(states, -np.inf), np.full(states, np.inf), np.zeros(states))
+
+
 def inferred_states(
-    command: Stream, spec: RobotSpec, lags: Array, latency: Array | float, grid: Array
-) -> Array:
+    command: Stream, spec: RobotSpec, lags: Array, latency: Array | float, grid: Array,
+    motors: Motors | None = None,
+) -> Array:  # fmt: skip
     """Infers states (T, S) at uniform times (T,) by lags and latencies (S,) [s], with gain one."""
     dt, follows = float(grid[1] - grid[0]), followed(spec)
+    fall, rise, dead = motors or free_motors(len(follows))
+    if dead.any():
+        least = np.zeros(command.values.shape[1])
+        least[follows] = dead
+        size = np.maximum(np.abs(command.values) - least, 0.0)
+        command = replace(command, values=np.sign(command.values) * size)
     late = np.broadcast_to(latency, len(follows)).tolist()
     means = {one: held(command, spec, grid - one, grid + dt - one) for one in set(late)}
     target = np.empty((len(grid), len(follows)))
@@ -104,7 +126,11 @@ def inferred_states(
     initial = held(command, spec, long_ago, long_ago + 1.0)[0, follows]
     states = np.empty((len(grid), len(follows)))
     for i, a in enumerate(np.exp(-dt / np.maximum(lags, 1e-6))):
-        states[:, i] = lfilter([0.0, 1.0 - a], [1.0, -a], target[:, i], zi=[initial[i]])[0]
+        if np.isinf([fall[i], rise[i]]).all():
+            states[:, i] = lfilter([0.0, 1.0 - a], [1.0, -a], target[:, i], zi=[initial[i]])[0]
+        else:
+            states[0, i] = initial[i]
+            limp(states[:, i], target[:, i], 1.0 - a, dt * fall[i], dt * rise[i])
     return states
 
 

@@ -78,6 +78,7 @@ def servoed(
     twist=front_driven, seed: int = 0, latency: float = 0.1, duration: float = 60.0,
     mounting: tuple[float, float, float] = (0.25, 0.12, 0.5), steering: float = 1.1,
     noise: float = 5e-4, steering_servo=SERVO, dead: float = 0.0, later: float = 0.0,
+    slew: float = np.inf,
 ) -> Recording:  # fmt: skip
     """A drive of a robot with a motor and a servo, of which commands and poses were recorded.
 
@@ -92,6 +93,7 @@ def servoed(
         steering_servo: transfer function.
         dead: speed that is told and does not come [m/s].
         later: by which the steering acts after the speed [s].
+        slew: greatest acceleration that the robot's driver asks of its motor [m/s^2].
     """
     rng, count = np.random.default_rng(seed), round(duration / FINE_S)
     per_hold, late = round(0.5 / FINE_S), round(latency / FINE_S)
@@ -101,6 +103,9 @@ def servoed(
     if later:
         acting[:, 1] = np.append(np.zeros(round(later / FINE_S)), acting[:, 1])[:count]
     acting[:, 0] = np.sign(acting[:, 0]) * np.maximum(np.abs(acting[:, 0]) - dead, 0.0)
+    for k in range(1, count if np.isfinite(slew) else 1):
+        change = np.clip(acting[k, 0] - acting[k - 1, 0], -slew * FINE_S, slew * FINE_S)
+        acting[k, 0] = acting[k - 1, 0] + change
     columns = []
     for each, system in zip(acting.T, (MOTOR, steering_servo), strict=True):
         b, a, _ = cont2discrete(system, FINE_S)

@@ -1,0 +1,245 @@
+"""Followers: delay, lag, dead zone and limits of each state that follows a command, unmeasured."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.identify import signals
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.clocks import (
+    BOUNDS,
+    CERTAIN,
+    CLUSTER_S,
+    EXACT,
+    FEW_ROWS,
+    MIN_TIME_S,
+    STEP_S,
+    TOLD_S,
+    WITHIN_TICK,
+    Left,
+    TimingEstimate,
+    if_certain,
+    response_residual,
+    some_of,
+)
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.excitation import moving_dofs
+from nics_drl_bridge.identify.signals import Motors
+from nics_drl_bridge.identify.statistics import clustered_errors, minimise
+from nics_drl_bridge.recording.recording import Samples
+from nics_drl_bridge.robot.curve import InputCurve
+from nics_drl_bridge.robot.kernels import GREATEST_ORDER
+from nics_drl_bridge.robot.spec import RobotSpec
+
+LAGS_S, DELAYS_S = (0.05, 0.15, 0.4), (0.0, 0.05, 0.1, 0.2)  # tried with limits
+RATES = (0.25, 0.5, 1.0, 2.0, 4.0)  # limits that are tried, in the command's range per second
+DEAD = (0.03, 0.07, 0.15, 0.3)  # dead zones that are tried, as shares of the command's reach
+HELPS = 0.95  # what is tried must take the sum of squares to this share,
+WORTH = 0.8  # and to this one once all is adjusted to it
+UNIFORM = 12.0**-0.5  # standard deviation of a uniform distribution, as a share of its width
+WIDER = 5.0  # times by which a limit may change while it is adjusted
+
+
+@dataclass(frozen=True)
+class _Following:
+    """How states follow their commands; (S,) each."""
+
+    lags: Array  # [s]
+    delays: Array  # from the pose's clock [s]
+    motors: Motors
+
+
+@dataclass(frozen=True)
+class _Adjusted:
+    """The best way to follow, and its errors."""
+
+    best: _Following
+    cost: float  # sum of squares that it leaves
+    sigma: Array  # (2, m) of delays, and of their sums with lags, of the states that moved [s]
+    motor_sigma: Array  # (S, 3) of fall, rise and dead zone
+
+
+def apart(drive: Drive, timing: TimingEstimate) -> TimingEstimate:
+    """Sharpens a timing by a delay and a lag of each command of its own, and what motors do.
+
+    What stands between command and motion beside one lag, as a servo of higher order, adds to a
+    command's delay: the latency is the least delay.
+    """
+    if drive.recording.state is not None or not drive.spec.state or len(timing.sigma) != 1:
+        return timing
+    moved = np.flatnonzero(signals.moved_inputs(drive.recording.command, drive.spec))
+    found = _found(drive, timing, moved)
+    delay, sigma = found.best.delays[moved], found.sigma
+    if not np.isfinite(sigma).all():
+        return timing
+    first = int(np.argmin(delay + CERTAIN * sigma[0]))
+    alike = np.abs(delay - delay[first]) <= CERTAIN * np.hypot(sigma[0], sigma[0, first])
+    least = float(np.average(delay[alike], weights=sigma[0, alike] ** -2.0))
+    sigma = np.hypot(sigma, WITHIN_TICK * STEP_S)
+    (name,) = timing.sigma  # of the latency, or of the offset between clocks that contains it
+    errors = {name: float(sigma[0, first])}
+    if np.isfinite(found.best.motors.rise).any():  # a lag before a limit looks like a delay
+        errors[name] = float(np.hypot(errors[name], least * UNIFORM))
+    if timing.separated:
+        least = if_certain(max(least, 0.0), errors[name], MIN_TIME_S)
+        if errors[name] > TOLD_S:
+            names = (_of_sum(drive.spec.state[i].name) for i in moved)
+            errors |= zip(names, map(float, sigma[1]), strict=True)
+    lags, lag_sigma, further = timing.lags.copy(), timing.lag_sigma.copy(), 0.0 * timing.lags
+    further[moved] = np.where(alike, 0.0, delay - least)
+    sums = delay + found.best.lags[moved]
+    lags[moved], lag_sigma[moved] = np.maximum(sums - least - further[moved], 0.0), np.hypot(*sigma)
+    for i, own in zip(moved[~alike], sigma[0, ~alike].tolist(), strict=True):
+        errors[f"{drive.spec.state[i].follows}.delay"] = own
+    for v, row in zip(drive.spec.state, found.motor_sigma.tolist(), strict=True):
+        keys = f"{v.name}.fall", f"{v.name}.rise", f"{v.follows}.dead"
+        errors |= {key: own for key, own in zip(keys, row, strict=True) if own > 0.0}
+    latency = least if timing.separated else 0.0
+    return replace(
+        timing, offset=latency - least, latency=latency, sigma=errors, lags=lags,
+        lag_sigma=lag_sigma, delays=further, motors=found.best.motors,
+    )  # fmt: skip
+
+
+def late_inputs(spec: RobotSpec, timing: TimingEstimate) -> tuple[InputCurve, ...]:
+    """Returns the curves of commands that have a dead zone, or act later than others."""
+    dead = timing.motors.dead if timing.motors else np.zeros(len(timing.delays))
+    rows = zip(spec.state, timing.delays.tolist(), dead.tolist(), strict=False)
+    each = {v.follows: (d, zone) for v, d, zone in rows if d > 0.0 or zone > 0.0}
+    return tuple(InputCurve(command=str(n), dead=zone, delay=d) for n, (d, zone) in each.items())
+
+
+def limits_of(spec: RobotSpec, timing: TimingEstimate) -> dict[str, tuple[float, float]]:
+    """Returns the greatest fall and rise of states that have them, at a gain of one."""
+    if timing.motors is None:
+        return {}
+    rows = zip(spec.state, timing.motors.fall.tolist(), timing.motors.rise.tolist(), strict=True)
+    return {v.name: (fall, rise) for v, fall, rise in rows if np.isfinite([fall, rise]).any()}
+
+
+def scaled_limits(calibration: Calibration, spec: RobotSpec) -> Array:
+    """Returns the greatest fall and rise (S, 2) of the states, at the gains of their responses."""
+    limits, gains = np.tile([-np.inf, np.inf], (len(spec.state), 1)), calibration.responses
+    for i, v in enumerate(spec.state):
+        limits[i] = calibration.limits.get(v.name, limits[i])
+    return np.asarray(limits * np.array([r.gain for r in gains] or [1.0])[:, None])
+
+
+def unlimited(samples: Samples, calibration: Calibration, spec: RobotSpec) -> Samples:
+    """Returns samples with the rates that states with limits would have without."""
+    rates, names = samples.dq.copy(), [c.name for c in spec.command]
+    for i, response in enumerate(calibration.responses):
+        if response.state in calibration.limits:
+            target = response.gain * samples.x[:, len(spec.state) + names.index(response.command)]
+            share = -np.expm1(-samples.dt / response.lag_s)
+            rates[:, 3 + i] = share * (target - samples.x[:, i]) / samples.dt
+    return replace(samples, dq=rates)
+
+
+def _found(drive: Drive, timing: TimingEstimate, moved: NDArray[np.intp]) -> _Adjusted:
+    """Returns how moved states follow, with limits and dead zones if they clearly explain more."""
+    twists, command, spec = drive.twists, drive.recording.command, drive.spec
+    rows, moving = some_of(len(twists.start), FEW_ROWS), list(moving_dofs(twists.twist))
+    begin = twists.start[rows]
+    target = (begin, twists.end[rows], twists.twist[rows][:, moving])
+    left = response_residual(command, spec, target, GREATEST_ORDER)
+    cluster = np.repeat(((begin - begin[0]) / CLUSTER_S).astype(np.intp), len(moving))
+    shift, size = timing.latency - timing.offset, len(timing.lags)
+    start = _Following(timing.lags, np.full(size, shift), signals.free_motors(size))
+    best = _adjusted(left, start, moved, shift, cluster)
+    for tries in (_with_limits, _with_dead_zones):
+        tried = best.best
+        for _ in range(2):  # what one state does hides what another does
+            for i in moved:
+                reach = command.values[:, signals.followed(spec)[i]]
+                options = [(_cost(left, each), each) for each in tries(tried, i, reach, shift)]
+                cost, option = min(options, key=lambda each: each[0])
+                tried = option if cost < HELPS * _cost(left, tried) else tried
+        if tried is not best.best:
+            other = _adjusted(left, tried, moved, shift, cluster)
+            best = other if other.cost < WORTH * best.cost else best
+    return best
+
+
+def _cost(left: Left, each: _Following) -> float:
+    return float((left(each.lags, each.delays, each.motors) ** 2).sum())
+
+
+def _with_limits(now: _Following, i: int, reach: Array, shift: float) -> Iterator[_Following]:
+    """Yields ways to follow in which state i has limits, and less of a lag and a delay."""
+    for rate, lag, delay in product(RATES, LAGS_S, {*(shift + d for d in DELAYS_S), *now.delays}):
+        size = rate * float(np.ptp(reach))
+        fall, rise = _put(now.motors.fall, i, -size), _put(now.motors.rise, i, size)
+        motors = now.motors._replace(fall=fall, rise=rise)
+        yield _Following(_put(now.lags, i, lag), _put(now.delays, i, delay), motors)
+
+
+def _with_dead_zones(now: _Following, i: int, reach: Array, _: float) -> Iterator[_Following]:
+    for share in DEAD:
+        dead = _put(now.motors.dead, i, share * float(np.abs(reach).max()))
+        yield replace(now, motors=now.motors._replace(dead=dead))
+
+
+def _put(values: Array, i: int, value: float) -> Array:
+    changed = values.copy()
+    changed[i] = value
+    return changed
+
+
+def _adjusted(
+    left: Left, start: _Following, moved: NDArray[np.intp], shift: float, cluster: NDArray[np.intp]
+) -> _Adjusted:
+    """Adjusts delays and lags of moved states, and limits and dead zones where there are any."""
+    count = len(moved)
+    given = np.stack(start.motors, axis=1)  # (S, 3)
+    held = np.nonzero(np.isfinite(given) & (given != 0.0))
+    size = np.abs(given[held])
+
+    def at(theta: Array) -> _Following:
+        lags, delays, motors = start.lags.copy(), start.delays.copy(), given.copy()
+        delays[moved], lags[moved] = theta[:count], np.exp(theta[count : 2 * count])
+        motors[held] = given[held] * np.exp(theta[2 * count :])
+        return _Following(lags, delays, Motors(*motors.T))
+
+    def residual(theta: Array) -> Array:
+        each = at(theta)
+        return left(each.lags, each.delays, each.motors)
+
+    reach = np.full(len(size), np.log(WIDER))
+    low, high = (np.repeat([shift + delay, log_lag], count) for delay, log_lag in BOUNDS)
+    begun = np.clip(np.append(start.delays[moved], np.log(start.lags[moved])), low, high)
+    found, jacobian, rest = minimise(
+        residual, np.append(begun, 0.0 * reach), np.full(len(begun) + len(reach), 0.1),
+        (np.append(low, -reach), np.append(high, reach)),
+    )  # fmt: skip
+    best = at(found)
+    by_lag = jacobian[:, count : 2 * count] / best.lags[moved]
+    by_size = jacobian[:, 2 * count :] / np.abs(np.stack(best.motors, axis=1)[held])
+    by_sum = np.concatenate([jacobian[:, :count] - by_lag, by_lag, by_size], axis=1)
+    sigma = np.maximum(clustered_errors(by_sum, rest, cluster), EXACT)
+    motor_sigma = np.zeros(given.shape)
+    motor_sigma[held] = sigma[2 * count :]
+    return _Adjusted(
+        best, float((rest**2).sum()), sigma[: 2 * count].reshape(2, count), motor_sigma
+    )  # fmt: skip
+
+
+def _of_sum(state: str) -> str:
+    """Returns the name of the uncertainty of a latency and a lag together."""
+    return f"command_latency_and_{state}_lag_s"
+
+
+def about_sums(calibration: Calibration) -> Iterator[str]:
+    """Tells of latency and lags that could not be told apart."""
+    for response in calibration.responses:
+        sigma = calibration.uncertainty.get(_of_sum(response.state))
+        if sigma is not None:
+            both = calibration.command_latency_s + response.lag_s
+            finding = f"Latency and the lag of {response.state} can hardly be told apart"
+            yield f"{finding}: trust their sum, {both:.4f} s (+- {sigma:.4f} s)."

@@ -1,0 +1,74 @@
+"""Delay, lag, dead zone and limits of states that follow commands and were not measured."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from identify.drives import MOTOR, servoed, tricycle
+from nics_drl_bridge.identify.identify import Identified, identify
+from nics_drl_bridge.robot.curve import InputCurve
+
+SPEED = "speed_command"
+
+
+@cache
+def found(**given: float) -> Identified:
+    return identify(servoed(steering_servo=MOTOR, steering=0.5, **given), tricycle())
+
+
+def ends(identified: Identified) -> tuple[float, float]:
+    """Mean error after 5 s of the model, and of the fitted textbook."""
+    (five,) = (each for each in identified.judgement if each.horizon_s == 5.0)
+    return five.model.position_m, five.textbook.position_m
+
+
+@pytest.mark.slow
+def test_a_robot_whose_motors_follow_freely_has_no_limits_and_no_dead_zone():
+    model = found().model
+    assert not np.isfinite(model.limits).any()
+    assert not any(curve.bends for curve in model.inputs)
+
+
+@pytest.mark.slow
+def test_a_dead_zone_of_the_speed_is_found_and_predicted():
+    identified = found(dead=0.1)
+    (curve,) = (each for each in identified.model.inputs if each.bends)
+    assert (curve.command, curve.least, curve.most) == (SPEED, -np.inf, np.inf)
+    assert curve.dead == pytest.approx(0.1, rel=0.1)
+    assert abs(curve.dead - 0.1) < 3.0 * identified.calibration.uncertainty[f"{SPEED}.dead"]
+    assert identified.dead_zone == curve.dead
+    error, textbook = ends(identified)
+    assert error < 0.8 * textbook
+
+
+@pytest.mark.slow
+def test_limits_of_acceleration_are_found_and_predicted():
+    identified = found(slew=0.7)
+    speed, steering = identified.model.limits
+    assert speed == pytest.approx([-0.7, 0.7], rel=0.1)
+    assert not np.isfinite(steering).any()
+    assert {"speed.fall", "speed.rise"} <= set(identified.calibration.uncertainty)
+    error, textbook = ends(identified)
+    assert error < 0.5 * textbook  # that has none
+    assert "at least -0.6" in identified.model.equations()[-2]
+
+
+@pytest.mark.slow
+def test_a_lag_before_a_limit_makes_the_latency_uncertain():
+    calibration = found(slew=0.7).calibration
+    off = abs(calibration.command_latency_s - 0.1)
+    assert off < 3.0 * calibration.uncertainty["command_latency_s"]
+    assert any("trust their sum" in note for note in calibration.notes)
+
+
+@pytest.mark.slow
+def test_what_holds_a_state_back_is_written_at_the_gain_of_the_state():
+    identified = found(slew=0.7)
+    (response, _), limits = identified.calibration.responses, identified.calibration.limits
+    assert identified.model.limits[0] == pytest.approx(
+        np.multiply(limits["speed"], response.gain), rel=0.05
+    )
+    assert InputCurve(command=SPEED) not in identified.model.inputs
