@@ -8,12 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nics_drl_bridge.config import no_device
+from nics_drl_bridge.config import find_config, no_device
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.recording.bag_file import is_bag, opened
 from nics_drl_bridge.recording.bag_reader import load_bag
 from nics_drl_bridge.recording.bag_table import Bag
-from nics_drl_bridge.recording.csv_folder import load_csv_folder
 from nics_drl_bridge.recording.mapped import read_mapped
 from nics_drl_bridge.recording.mapping import Mapping, load_mapping
 from nics_drl_bridge.recording.recording import (
@@ -30,6 +29,8 @@ from nics_drl_bridge.recording.values import unit_of
 from nics_drl_bridge.robot.spec import RobotSpec, definition, load_robot, robot_from
 
 DEFAULT_ROBOT = "ackermann"
+FOLDER = "xtark_folder"  # the mapping of a folder that is read without one,
+FILES, WHEELS = ("cmd.csv", "vrpn.csv"), ("L_wheel.csv", "R_wheel.csv")  # what it has, may have
 
 
 class Format(NamedTuple):
@@ -41,9 +42,27 @@ class Format(NamedTuple):
     has_topics: bool = False
 
 
+def _holds(path: Path, files: tuple[str, ...]) -> bool:
+    return all((path / name).is_file() for name in files)
+
+
+def _load_folder(path: Path, *_: object) -> Recording:
+    """Reads a folder by its shipped mapping: wheels may be missing, its robot may be any."""
+    file = find_config(FOLDER, "recordings")
+    mapping = load_mapping(file)
+    if not _holds(path, WHEELS):
+        mapping = mapping.model_copy(update={"wheels": None})
+    try:
+        with open_source(path) as source:
+            return replace(read_mapped(source, mapping), variables=())
+    except RecordingError as error:
+        fault = str(error).removesuffix(".")
+        raise RecordingError(f"{fault}; the mapping is {file}, --map gives another.") from None
+
+
 FORMATS = (
     Format("a bag", lambda p: p.exists() and is_bag(p), load_bag, has_topics=True),
-    Format("a folder of CSV files", Path.is_dir, lambda path, *_: load_csv_folder(path)),
+    Format(f"a folder with {' and '.join(FILES)}", lambda p: _holds(p, FILES), _load_folder),
     Format("an .npz file", lambda p: p.suffix == ".npz", lambda path, *_: load_recording(path)),
 )
 """The first that recognises a path reads it."""

@@ -100,7 +100,7 @@ def numbers_of(table: Table, which: str | int) -> Array:
         try:
             float(text or "nan")
         except ValueError:
-            fault = f"{which!r} is {str(text)[:40]!r}, which is no number"
+            fault = f"column {which!r} is {str(text)[:40]!r}, which is no number"
             advice = "mend or remove the row, or choose another column"
             raise RecordingError(f"{table.place}: {table.row(k)}: {fault}; {advice}.") from None
     return np.array([float(text or "nan") for text in column])

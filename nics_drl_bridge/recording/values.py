@@ -168,7 +168,7 @@ class MappedReader:
         raw = column[at.rows]
         for k in np.flatnonzero(np.isinf(raw))[:1]:
             where = f"{table.place}: {table.row(int(at.rows[k]))}"
-            raise RecordingError(f"{where}: {which!r} is infinite; mend or remove the row.")
+            raise RecordingError(f"{where}: column {which!r} is infinite; mend or remove the row.")
         known = np.isfinite(raw)
         if not known.any():
             fault = f"{table.place}: {which!r} holds no number"
