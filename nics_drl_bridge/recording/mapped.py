@@ -56,8 +56,7 @@ def read_mapped(source: Source, mapping: Mapping) -> Recording:
     made = Recording(**streams, source=source.place, variables=names, latency=source.latency)
     check_streams(made, {"command": len(mapping.command), "state": len(mapping.state), "wheels": 2})
     shifted: Any = _from_zero(found, mapping.clock or ROBOT_CLOCK, reader)
-    made = replace(made, **shifted, repairs=tuple(reader.notes))
-    return made
+    return replace(made, **shifted, repairs=tuple(reader.notes))
 
 
 def _check_units(reader: MappedReader, pose: Stream) -> None:

@@ -17,7 +17,6 @@ from nics_drl_bridge.recording.mapped import read_mapped
 from nics_drl_bridge.recording.mapping import Mapping, load_mapping
 from nics_drl_bridge.recording.recording import (
     Recording,
-    Stream,
     check,
     is_recording,
     load_recording,
@@ -172,20 +171,16 @@ def arranged(recording: Recording, spec: RobotSpec) -> Recording:
         return check(recording, spec)
     count = recording.command.values.shape[1]
     made: dict[str, Any] = {}
-    known = {"command": recording.variables[-count:], "state": recording.variables[:-count]}
-    wanted = {
-        "command": tuple(v.name for v in spec.command),
-        "state": tuple(v.name for v in spec.state),
-    }
-    for part, names in wanted.items():
-        stream: Stream | None = getattr(recording, part)
-        if stream is None:
+    parts = {"command": (slice(-count, None), spec.command), "state": (slice(-count), spec.state)}
+    for part, (place, variables) in parts.items():
+        known, names = recording.variables[place], [v.name for v in variables]
+        if (stream := recording.streams.get(part)) is None:
             continue
-        if set(known[part]) != set(names):
-            fault = f"{recording.source}: the {part} is {', '.join(known[part])}"
+        if set(known) != set(names):
+            fault = f"{recording.source}: the {part} is {', '.join(known)}"
             other = f"that of the robot {spec.name!r} {', '.join(names)}"
             raise ConfigError(f"{fault}, {other}; use the robot's names in the mapping.")
-        order = [known[part].index(name) for name in names]
+        order = [known.index(name) for name in names]
         made[part] = replace(stream, values=stream.values[:, order])
     return check(replace(recording, **made, variables=spec.variable_names), spec)
 

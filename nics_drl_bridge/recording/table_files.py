@@ -97,17 +97,13 @@ def _split(line: str, separator: str | None) -> list[str]:
     return list(map(str.strip, fields))
 
 
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
 def _is_value(text: str) -> bool:
     """True for numbers, with decimal commas too, flags and dates."""
-    return _is_number(text.replace(",", ".")) or text.lower() in WORDS or bool(DATE.match(text))
+    try:
+        float(text.replace(",", "."))
+    except ValueError:
+        return text.lower() in WORDS or bool(DATE.match(text))
+    return True
 
 
 def _separator(lines: Sequence[str]) -> str | None:
