@@ -30,6 +30,7 @@ from nics_drl_bridge.robot.spec import RobotSpec, definition, load_robot, robot_
 DEFAULT_ROBOT = "ackermann"
 FOLDER = "xtark_folder"  # the mapping of a folder that is read without one,
 FILES, WHEELS = ("cmd.csv", "vrpn.csv"), ("L_wheel.csv", "R_wheel.csv")  # what it has, may have
+MOST_BYTES = 64 * 2**20  # of each of these; by --map tables may be larger
 
 
 class Format(NamedTuple):
@@ -49,8 +50,12 @@ def _load_folder(path: Path, *_: object) -> Recording:
     """Reads a folder by its shipped mapping: wheels may be missing, its robot may be any."""
     file = find_config(FOLDER, "recordings")
     mapping = load_mapping(file)
-    if not _holds(path, WHEELS):
+    if not (wheels := _holds(path, WHEELS)):
         mapping = mapping.model_copy(update={"wheels": None})
+    for each in (path / name for name in FILES + WHEELS * wheels):
+        if each.stat().st_size > MOST_BYTES:
+            fault = f"{each}: is larger than {MOST_BYTES // 2**20} MB, which few drives are"
+            raise RecordingError(f"{fault}; cut it, or give --map {file}.")
     try:
         with open_source(path) as source:
             return replace(read_mapped(source, mapping), variables=())

@@ -207,9 +207,8 @@ class MappedReader:
         if not value.counts:
             values = values - size * np.round(values[0] / size)
         if count:
-            times = "once" if count == 1 else f"{count} times"
             found = "" if value.wrap else ", as it seems"
-            end = f"{times}, at {size:.10g}{found}"
+            end = f"{stamping.times(count)}, at {size:.10g}{found}"
             self.say(f"{name}: the counter overflowed {end}, and was continued.")
         return raw._replace(values=values)
 
