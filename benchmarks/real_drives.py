@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 from measuring.drive_bars import (
     DRIVES,
-    EXAMPLES,
     RECORDINGS,
     SEGMENT_S,
     SEGMENTED,
@@ -179,9 +178,9 @@ def main() -> int:
     for name in real:
         given, control = DRIVES[name], options.control
         source = options.recordings / given.source
-        result["drives"][name] = figures(source, EXAMPLES / given.mapping, given.truth, control)
+        result["drives"][name] = figures(source, given.mapping, given.truth, control)
         if name == SEGMENTED:
-            result["left_out"][name] = left_out(source, EXAMPLES / given.mapping, control)
+            result["left_out"][name] = left_out(source, given.mapping, control)
     with tempfile.TemporaryDirectory() as folder:
         for name in (n for n in options.only if n in ROBOTS):
             source = Path(folder) / name

@@ -170,10 +170,10 @@ def test_an_empty_folder_names_the_files_that_are_needed(tmp_path):
     assert names(tmp_path) == {"drive"}
 
 
-def test_a_row_with_nan_is_named(tmp_path):
-    csv_folder(tmp_path / "drive", "0.1,nan,0.0,0.0,0.0,0.0,1.0,700000000")
+def test_a_row_with_infinity_is_named(tmp_path):
+    csv_folder(tmp_path / "drive", "0.1,inf,0.0,0.0,0.0,0.0,1.0,700000000")
     sentence = refused(nics("generate", "drive", "--out", "car", cwd=tmp_path))
-    assert "vrpn.csv: row 8 holds NaN" in sentence
+    assert "vrpn.csv: line 8: column 1 is infinite" in sentence
     assert names(tmp_path) == {"drive"}
 
 

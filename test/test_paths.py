@@ -26,7 +26,6 @@ from nics_drl_bridge.middleware.playback import EstimatedDrive, write_estimate
 from nics_drl_bridge.policy.contract import shipped
 from nics_drl_bridge.policy.policy_file import load_policy
 from nics_drl_bridge.policy.training_settings import load_training
-from nics_drl_bridge.recording.csv_folder import load_csv_folder
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import load_recording, save_recording
 from nics_drl_bridge.recording.textbook import record
@@ -126,7 +125,7 @@ def test_a_policy_is_loaded_from_either(kind):
 
 @KINDS
 @pytest.mark.parametrize(
-    "load", [load_csv_folder, load_recording, load_sensor_models, load_shapes, replay, topic_roles]
+    "load", [read_recording, load_recording, load_sensor_models, load_shapes, replay, topic_roles]
 )
 def test_what_is_not_there_is_one_sentence_for_either(tmp_path, kind, load):
     with pytest.raises(BridgeError, match=r"gone: no such f"):

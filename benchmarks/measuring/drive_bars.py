@@ -9,8 +9,9 @@ from typing import Any
 
 from measuring.truths import Truth
 
-EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "recordings"
-RECORDINGS = Path(__file__).resolve().parents[3] / "shared" / "recordings"
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLES, SHIPPED = ROOT / "examples" / "recordings", ROOT / "config" / "recordings"
+RECORDINGS = ROOT.parent / "shared" / "recordings"
 MOST_LINES = 25  # of a mapping, without comments
 COVERAGE = (0.9, 0.99)  # of the 95 % band
 
@@ -30,7 +31,7 @@ class RealDrive:
     """A drive, relative to the folder of the recordings."""
 
     source: str
-    mapping: str  # in the folder of the examples
+    mapping: Path
     bars: Bars = field(default_factory=Bars)
     truth: Truth = field(default_factory=Truth)
 
@@ -43,24 +44,28 @@ def camera(number: str) -> RealDrive:
     """Returns a drive of the robot with ticks."""
     source = f"differential_ticks/Camera_Odo_Data_{number}.txt"
     bars = Bars(share=0.05, of_yardstick=None)
-    return RealDrive(source, "differential_ticks.yaml", bars, Truth(wheels=WHEELS))
+    return RealDrive(source, EXAMPLES / "differential_ticks.yaml", bars, Truth(wheels=WHEELS))
 
 
 DRIVES = {
     "xtark_random_drive_45s": RealDrive(
-        "xtark_ackermann/random_drive_45s", "xtark_folder.yaml", Bars(error_m=0.0215)
+        "xtark_ackermann/random_drive_45s", SHIPPED / "xtark_folder.yaml", Bars(error_m=0.0215)
     ),
     "jetracer_free_driving_104s": RealDrive(
-        "jetracer_dart/free_driving_104s.csv", "jetracer_csv.yaml", Bars(0.14, 0.8)
+        "jetracer_dart/free_driving_104s.csv", EXAMPLES / "jetracer_csv.yaml", Bars(0.14, 0.8)
     ),
     "jetracer_random_driving_slow_63s": RealDrive(
-        "jetracer_dart/random_driving_slow_63s.bag", "jetracer_bag.yaml", Bars(of_yardstick=0.8)
+        "jetracer_dart/random_driving_slow_63s.bag",
+        EXAMPLES / "jetracer_bag.yaml",
+        Bars(of_yardstick=0.8),
     ),
     "f110_ds1": RealDrive(
-        "f110_frictionmaps/DS1", "f110_folder.yaml", Bars(of_yardstick=None, may_refuse=True)
+        "f110_frictionmaps/DS1",
+        EXAMPLES / "f110_folder.yaml",
+        Bars(of_yardstick=None, may_refuse=True),
     ),
-    "f110_ds3": RealDrive("f110_frictionmaps/DS3", "f110_folder.yaml"),
-    "f110_ds4": RealDrive("f110_frictionmaps/DS4", "f110_folder.yaml"),
+    "f110_ds3": RealDrive("f110_frictionmaps/DS3", EXAMPLES / "f110_folder.yaml"),
+    "f110_ds4": RealDrive("f110_frictionmaps/DS4", EXAMPLES / "f110_folder.yaml"),
     "ticks_01": camera("01"),
     "ticks_02": camera("02"),
 }

@@ -18,12 +18,7 @@ from nics_drl_bridge.identify.forms import problem_of
 from nics_drl_bridge.identify.open_loop import HORIZON_S, SPACING_S, Windows, predict, windows
 from nics_drl_bridge.identify.refine import readjusted
 from nics_drl_bridge.identify.terms import defined
-from nics_drl_bridge.identify.yardstick import (
-    Yardstick,
-    fit_yardstick,
-    kept_twist,
-    twists_before,
-)  # fmt: skip
+from nics_drl_bridge.identify.yardstick import Yardstick, fit_yardstick, kept_twist, twists_before
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, TaylorModel
 

@@ -13,12 +13,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.calibration import Calibration, outside_gaps
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.signals import inferred_states, resample, taken, unwrapped
-from nics_drl_bridge.recording.recording import (
-    Recording,
-    Samples,
-    Stream,
-    samples_on_one_clock,
-)  # fmt: skip
+from nics_drl_bridge.recording.recording import Recording, Samples, Stream, samples_on_one_clock
 from nics_drl_bridge.robot.spec import POSE_RATES, CommandVariable, RobotSpec, StateVariable
 
 WIDTHS_S = (0.07, 0.1, 0.15, 0.2)  # half-widths of the parabolas that give the twist

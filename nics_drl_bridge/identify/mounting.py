@@ -224,10 +224,8 @@ def _by_commands(
 ) -> Mounting | None:
     """Estimates an omnidirectional robot's mounting; None unless it moved along x, y and turned."""
     recording, spec = drive.recording, drive.spec
-    if any(v.twist for v in spec.state) and recording.state is None:
-        begin = twists.start + timing.offset - timing.latency
-        command = held(recording.command, spec, begin, begin + twists.end - twists.start)
-    elif spec.state:
+    inferred = recording.state is None and any(v.twist for v in spec.state)
+    if spec.state and not inferred:
         expected = clocks.expected_states(drive, twists, timing)
         command = _as_commands(expected, drive, timing.latency)
     else:

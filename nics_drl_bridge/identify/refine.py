@@ -137,7 +137,7 @@ def _without_outliers(chosen: open_loop.Windows, error: Array) -> open_loop.Wind
     inside = size <= far
     if inside.all() or inside.mean() < 1.0 - MOST_OUTLIERS or inside.sum() < MIN_WINDOWS:
         return chosen
-    return open_loop.Windows(*(values[inside] for values in vars(chosen).values()))
+    return chosen.rows(inside)
 
 
 def prediction_errors(problem: Problem, model: TaylorModel, calibration: Calibration) -> Array:

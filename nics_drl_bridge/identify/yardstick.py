@@ -138,10 +138,8 @@ def _relative_ends(response: TextbookResponse, course: _Course, twist: Array) ->
         target[:, 2] += response.offset[2]
         share = 1.0 - np.exp(-STEP_S / response.lag_s[2])
         angle = lfilter([0.0, share], [1.0, share - 1.0], target[:, 2], zi=[target[0, 2]])[0]
-        actuator[:, 1], actuator[:, 2] = (
-            0.0,
-            np.interp(begin / STEP_S, np.arange(len(angle)), angle),
-        )
+        actuator[:, 1] = 0.0
+        actuator[:, 2] = np.interp(begin / STEP_S, np.arange(len(angle)), angle)
         if bicycle.front_drive:
             actuator[:, 0] /= np.maximum(np.cos(actuator[:, 2]), 0.1)
     else:

@@ -172,10 +172,8 @@ class Exploration:
 
     def _ways_back(self, factor: Array) -> Array:
         """Returns constant commands (E, T, C) for turning back: half a turn by the fastest one."""
-        low, high = (
-            np.minimum(factor * self.low, self.rest),
-            np.maximum(factor * self.high, self.rest),
-        )
+        low = np.minimum(factor * self.low, self.rest)
+        high = np.maximum(factor * self.high, self.rest)
         ends = [sorted(set(three)) for three in zip(low, self.rest, high, strict=True)]
         ways = np.array(list(product(*ends)))[:, None]
         first, last = round(WAY_S[0] / WAY_STEP_S), round(1.0 / WAY_STEP_S)

@@ -151,7 +151,7 @@ def guess_command(
         and not (pose and table is pose.table and column.name in taken)
         and column.name not in table.stamp_columns
     ]  # fmt: skip
-    own = [(kind, _words_of(kind)) for kind in kind_names()]
+    own = [(name, kind.template.words) for name in kind_names() if (kind := find_kind(name))]
     fitting = [(kind, _by_meaning(names, scored)) for kind, names in (*own, *KINDS) if names]
     # A column that was zero throughout may be a command that was not used, if all others fit.
     still = [sum(_is_still(c) for _, c in found.values()) for _, found in fitting]
@@ -189,11 +189,6 @@ def _look_alikes(kind: str) -> list[str]:
     each = {name: find_kind(name) for name in kind_names()}
     ways = {n: [{*names_of(way)} for way in k.template.commands] for n, k in each.items() if k}
     return [n for n in ways if n != kind and any(way in ways[n] for way in ways.get(kind, ()))]
-
-
-def _words_of(kind: str) -> Mapping[str, str]:
-    found = find_kind(kind)
-    return {} if found is None else found.template.words
 
 
 def _merit(table: TableSurvey, column: Survey) -> int:

@@ -56,8 +56,7 @@ def read_mapped(source: Source, mapping: Mapping) -> Recording:
     made = Recording(**streams, source=source.place, variables=names, latency=source.latency)
     check_streams(made, {"command": len(mapping.command), "state": len(mapping.state), "wheels": 2})
     shifted: Any = _from_zero(found, mapping.clock or ROBOT_CLOCK, reader)
-    made = replace(made, **shifted, repairs=tuple(reader.notes))
-    return made
+    return replace(made, **shifted, repairs=tuple(reader.notes))
 
 
 def _check_units(reader: MappedReader, pose: Stream) -> None:
@@ -218,7 +217,7 @@ def _from_zero(found: dict[str, Stream], main: str, reader: MappedReader) -> dic
         lasts, usual = np.ptp(stream.t), max(np.ptp(pose.t), 1e-9)
         if name == "pose" and lasts < SHORTEST_S:
             fault = f"{reader.source.place}: the pose lasts {lasts:.3g} s"
-            raise RecordingError(f"{fault}; give the `unit:` of its `time:`, as min or h.")
+            raise RecordingError(f"{fault}; give the `unit:` of its `time:`, as s, min or h.")
         if lasts and not 1.0 / MOST_RATIO < lasts / usual < MOST_RATIO:
             fault = f"{reader.source.place}: {name} lasts {lasts:.4g} s, the pose {usual:.4g} s"
             raise RecordingError(f"{fault}; give the `unit:` of the `time:` that is wrong.")

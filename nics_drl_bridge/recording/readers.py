@@ -8,17 +8,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nics_drl_bridge.config import no_device
+from nics_drl_bridge.config import find_config, no_device
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.recording.bag_file import is_bag, opened
 from nics_drl_bridge.recording.bag_reader import load_bag
 from nics_drl_bridge.recording.bag_table import Bag
-from nics_drl_bridge.recording.csv_folder import load_csv_folder
 from nics_drl_bridge.recording.mapped import read_mapped
 from nics_drl_bridge.recording.mapping import Mapping, load_mapping
 from nics_drl_bridge.recording.recording import (
     Recording,
-    Stream,
     check,
     is_recording,
     load_recording,
@@ -30,6 +28,9 @@ from nics_drl_bridge.recording.values import unit_of
 from nics_drl_bridge.robot.spec import RobotSpec, definition, load_robot, robot_from
 
 DEFAULT_ROBOT = "ackermann"
+FOLDER = "xtark_folder"  # the mapping of a folder that is read without one,
+FILES, WHEELS = ("cmd.csv", "vrpn.csv"), ("L_wheel.csv", "R_wheel.csv")  # what it has, may have
+MOST_BYTES = 64 * 2**20  # of each of these; by --map tables may be larger
 
 
 class Format(NamedTuple):
@@ -41,9 +42,31 @@ class Format(NamedTuple):
     has_topics: bool = False
 
 
+def _holds(path: Path, files: tuple[str, ...]) -> bool:
+    return all((path / name).is_file() for name in files)
+
+
+def _load_folder(path: Path, *_: object) -> Recording:
+    """Reads a folder by its shipped mapping: wheels may be missing, its robot may be any."""
+    file = find_config(FOLDER, "recordings")
+    mapping = load_mapping(file)
+    if not (wheels := _holds(path, WHEELS)):
+        mapping = mapping.model_copy(update={"wheels": None})
+    for each in (path / name for name in FILES + WHEELS * wheels):
+        if each.stat().st_size > MOST_BYTES:
+            fault = f"{each}: is larger than {MOST_BYTES // 2**20} MB, which few drives are"
+            raise RecordingError(f"{fault}; cut it, or give --map {file}.")
+    try:
+        with open_source(path) as source:
+            return replace(read_mapped(source, mapping), variables=())
+    except RecordingError as error:
+        fault = str(error).removesuffix(".")
+        raise RecordingError(f"{fault}; the mapping is {file}, --map gives another.") from None
+
+
 FORMATS = (
     Format("a bag", lambda p: p.exists() and is_bag(p), load_bag, has_topics=True),
-    Format("a folder of CSV files", Path.is_dir, lambda path, *_: load_csv_folder(path)),
+    Format(f"a folder with {' and '.join(FILES)}", lambda p: _holds(p, FILES), _load_folder),
     Format("an .npz file", lambda p: p.suffix == ".npz", lambda path, *_: load_recording(path)),
 )
 """The first that recognises a path reads it."""
@@ -153,20 +176,16 @@ def arranged(recording: Recording, spec: RobotSpec) -> Recording:
         return check(recording, spec)
     count = recording.command.values.shape[1]
     made: dict[str, Any] = {}
-    known = {"command": recording.variables[-count:], "state": recording.variables[:-count]}
-    wanted = {
-        "command": tuple(v.name for v in spec.command),
-        "state": tuple(v.name for v in spec.state),
-    }
-    for part, names in wanted.items():
-        stream: Stream | None = getattr(recording, part)
-        if stream is None:
+    parts = {"command": (slice(-count, None), spec.command), "state": (slice(-count), spec.state)}
+    for part, (place, variables) in parts.items():
+        known, names = recording.variables[place], [v.name for v in variables]
+        if (stream := recording.streams.get(part)) is None:
             continue
-        if set(known[part]) != set(names):
-            fault = f"{recording.source}: the {part} is {', '.join(known[part])}"
+        if set(known) != set(names):
+            fault = f"{recording.source}: the {part} is {', '.join(known)}"
             other = f"that of the robot {spec.name!r} {', '.join(names)}"
             raise ConfigError(f"{fault}, {other}; use the robot's names in the mapping.")
-        order = [known[part].index(name) for name in names]
+        order = [known.index(name) for name in names]
         made[part] = replace(stream, values=stream.values[:, order])
     return check(replace(recording, **made, variables=spec.variable_names), spec)
 

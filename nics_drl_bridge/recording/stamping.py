@@ -238,7 +238,7 @@ def without_overflow(t: Array, name: str) -> tuple[Array, str]:
     if size is None:
         return t, ""
     made, count = unwrapped(t, size)
-    return made, f"{name}: its clock overflowed at {size:.10g} {_times(count)}, and was continued."
+    return made, f"{name}: its clock overflowed at {size:.10g} {times(count)}, and was continued."
 
 
 def in_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
@@ -270,7 +270,7 @@ def in_order(t: Array, name: str) -> tuple[Array, NDArray[np.intp], str]:
         first = f"row {rows[k + 1]}, by {abs(step[k]):.3g} s"
         said = f"{name}: the clock was set {'back' if step[k] < 0.0 else 'ahead'}"
         joined = f"the parts were joined, a usual step of {usual:.3g} s apart"
-        notes.append(f"{said} {_times(int(jump.sum()))} ({first}); {joined}.")
+        notes.append(f"{said} {times(int(jump.sum()))} ({first}); {joined}.")
         t = t + np.append(0.0, np.cumsum(np.where(jump, usual - step, 0.0)))
     return t, rows, " ".join(notes)
 
@@ -286,7 +286,8 @@ def _stray(t: Array) -> NDArray[np.bool_]:
     return np.asarray(stray if stray.mean() <= MOST_STRAY else stray & False)
 
 
-def _times(count: int) -> str:
+def times(count: int) -> str:
+    """Says how often."""
     return "once" if count == 1 else f"{count} times"
 
 

@@ -81,8 +81,7 @@ class TableSurvey:
     @property
     def regularity(self) -> list[str]:
         """Sentences on rate, gaps, stamps that run backwards, repeated rows and missing values."""
-        known = self.t is not None and len(self.t) > 1
-        return list(_regularity(self.t, self.data)) if known and self.t is not None else []
+        return [] if self.t is None or len(self.t) < 2 else list(_regularity(self.t, self.data))
 
     def reference(self, column: str, alone: bool) -> str:
         """Returns how a mapping refers to a column."""

@@ -18,10 +18,6 @@ from nics_drl_bridge.robot.noise import Latency
 Column = NDArray[Any]  # (T,) numbers, or text
 
 
-def _unstamped(_: str) -> None:
-    return None
-
-
 @dataclass(frozen=True)
 class Table:
     """Columns as a mapping refers to them; those of a bag come with stamps."""
@@ -32,7 +28,7 @@ class Table:
     row: Callable[[int], str]  # names a row for errors
     notes: Sequence[str] = ()  # a sentence on each thing that reading mended
     # stamps that come with the rows, and in `values` (T, 1) these rows, if any
-    stamps: Callable[[str], Stream | None] = _unstamped
+    stamps: Callable[[str], Stream | None] = lambda _: None
 
 
 def table_of(
@@ -100,7 +96,7 @@ def numbers_of(table: Table, which: str | int) -> Array:
         try:
             float(text or "nan")
         except ValueError:
-            fault = f"{which!r} is {str(text)[:40]!r}, which is no number"
+            fault = f"column {which!r} is {str(text)[:40]!r}, which is no number"
             advice = "mend or remove the row, or choose another column"
             raise RecordingError(f"{table.place}: {table.row(k)}: {fault}; {advice}.") from None
     return np.array([float(text or "nan") for text in column])

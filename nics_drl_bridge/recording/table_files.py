@@ -12,6 +12,7 @@ from itertools import chain
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import RecordingError
@@ -24,6 +25,7 @@ NO_SEPARATOR = re.compile(r"[\w\s.,;|+\"'#-]")
 MOST_BYTES = 256 * 2**20
 MOST_ROWS, LONGEST_ROW = 2_000_000, 20_000  # longest in characters
 TRIED = 400  # lines from which separator and header are found
+MOST_SAMPLED = 50_000  # rows from which their usual width is found
 MOST_BROKEN = 0.01  # share of rows with another number of fields that are left out
 COMMENTS = ("#", "//", "%")
 UTF_16 = (b"\xff\xfe", b"\xfe\xff")
@@ -33,19 +35,17 @@ DATE = re.compile(r"(\d{4}[-/]\d\d[-/]\d\d|\d\d:\d\d:\d\d)")
 MISSING = ("", "na", "n/a", "null", "none", "-", "--", "#n/a")
 WORDS = {"true": "1", "false": "0", **dict.fromkeys(MISSING, "nan")}
 
-Row = tuple[int, list[str]]
-"""Line of the file, from 1, and fields."""
-
 
 def read_text_table(path: Path) -> Table:
     """Reads a table; RecordingError names the file, the line and the fix."""
     lines, comments = _lines(path)
     separator = _separator([text for _, text in lines[:TRIED]])
-    rows = [(line, _split(text, separator)) for line, text in lines]
+    at = np.array([line for line, _ in lines], dtype=np.intp)
+    rows = [_split(text, separator) for _, text in lines]
     first, width = _first_row(path, rows)
-    above = [row for _, row in rows[:first]]
-    rows, notes = _of_one_width(path, rows[first:], above, width)
-    columns = [list(column) for column in zip(*(row for _, row in rows), strict=True)]
+    above = rows[:first]
+    rows, at, notes = _of_one_width(path, rows[first:], at[first:], above, width)
+    columns = [list(column) for column in zip(*rows, strict=True)]
     # The last title that has most names: one of units, below it, repeats some.
     titles = [row for row in above if len(row) > 1 or width == 1]
     head = max(reversed(titles), key=lambda row: len(set(row)), default=None)
@@ -57,7 +57,6 @@ def read_text_table(path: Path) -> Table:
         columns, head = named
     columns = [_with_points(column) for column in columns]
     names = tuple([*(head or ()), *[""] * len(columns)][: len(columns)])
-    at = np.array([line for line, _ in rows], dtype=np.intp)
     return table_of(str(path), names, tuple(map(_typed, columns)), at, tuple(notes))
 
 
@@ -77,9 +76,10 @@ def _lines(path: Path) -> tuple[list[tuple[int, str]], list[str]]:
         text = data.decode("latin-1")  # as written by old tools: a degree sign in a header
     if "\0" in text:
         raise RecordingError(f"{path}: is not text; save it as CSV in UTF-8.")
-    lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip()]
-    if len(lines) > MOST_ROWS:
-        raise RecordingError(f"{path}: has {len(lines)} rows; cut it to at most {MOST_ROWS}.")
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
+    if (count := text.count("\n")) > MOST_ROWS:
+        raise RecordingError(f"{path}: has {count} rows; cut it to at most {MOST_ROWS}.")
+    lines = [(k, line) for k, line in enumerate(text.split("\n"), 1) if line.strip()]
     for k, line in lines:
         if len(line) > LONGEST_ROW:
             fault = f"line {k} has {len(line)} characters, which no row has"
@@ -94,20 +94,16 @@ def _split(line: str, separator: str | None) -> list[str]:
     fields = line.split(separator)
     if '"' in line:
         fields = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
-    return [field.strip() for field in fields]
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
+    return list(map(str.strip, fields))
 
 
 def _is_value(text: str) -> bool:
     """True for numbers, with decimal commas too, flags and dates."""
-    return _is_number(text.replace(",", ".")) or text.lower() in WORDS or bool(DATE.match(text))
+    try:
+        float(text.replace(",", "."))
+    except ValueError:
+        return text.lower() in WORDS or bool(DATE.match(text))
+    return True
 
 
 def _separator(lines: Sequence[str]) -> str | None:
@@ -122,43 +118,46 @@ def _separator(lines: Sequence[str]) -> str | None:
     return best if score(best) > 0 or not others else max(others, key=score)
 
 
-def _first_row(path: Path, rows: Sequence[Row]) -> tuple[int, int]:
+def _first_row(path: Path, rows: list[list[str]]) -> tuple[int, int]:
     """Returns the first row of numbers, and how many fields the rows from there on have."""
 
     def numeric(row: Sequence[str]) -> bool:
         full = [field for field in row if field]
         return 2 * sum(map(_is_value, full)) > len(full)
 
-    widths = Counter(len(row) for _, row in rows if numeric(row))
+    some = rows[:: 1 + len(rows) // MOST_SAMPLED]
+    widths = Counter(len(row) for row in some if numeric(row))
     if not widths:
         advice = "give a table of numbers, a column each, with or without a header"
         raise RecordingError(f"{path}: holds no row of numbers; {advice}.")
     width = widths.most_common(1)[0][0]
-    first = next(k for k, (_, row) in enumerate(rows) if numeric(row) and len(row) == width)
+    first = next(k for k, row in enumerate(rows) if len(row) == width and numeric(row))
     return first, width
 
 
 def _of_one_width(
-    path: Path, rows: Sequence[Row], above: Sequence[list[str]], width: int
-) -> tuple[list[Row], list[str]]:
+    path: Path, rows: list[list[str]], at: NDArray[np.intp], above: list[list[str]], width: int
+) -> tuple[list[list[str]], NDArray[np.intp], list[str]]:
     """Leaves out headers that are repeated, and the few rows that were cut short."""
     file, notes = path.name, []
-    full = [row for row in rows if row[1] not in above]
-    if again := len(rows) - len(full):
-        notes.append(f"{file}: {again} lines repeat the header, and were left out.")
-    whole = [row for row in full if len(row[1]) == width]
-    broken = [row for row in full if len(row[1]) != width]
-    if len(broken) > max(1.0, MOST_BROKEN * len(full)):
-        line, row = broken[0]
-        fault = f"line {line} has {len(row)} fields where most lines have {width}"
-        raise RecordingError(f"{path}: {fault}; mend or remove it and those like it.")
-    if broken:
-        where = ", ".join(str(line) for line, _ in broken[:5])
+    new = np.array([row not in above for row in rows], dtype=np.bool_)
+    if not new.all():
+        notes.append(f"{file}: {(~new).sum()} lines repeat the header, and were left out.")
+    fits = np.array([len(row) == width for row in rows], dtype=np.bool_)
+    broken = np.flatnonzero(new & ~fits)
+    if len(broken) > max(1.0, MOST_BROKEN * new.sum()):
+        fault = f"line {at[broken[0]]} has {len(rows[broken[0]])} fields"
+        advice = f"where most lines have {width}; mend or remove it and those like it"
+        raise RecordingError(f"{path}: {fault} {advice}.")
+    if len(broken):
+        where = ", ".join(map(str, at[broken[:5]]))
         notes.append(f"{file}: {len(broken)} lines of another length (line {where}) were left out.")
-    while width > 1 and not any(row[width - 1] for _, row in whole):
+    kept = np.flatnonzero(new & fits)
+    whole = [rows[k] for k in kept]
+    while width > 1 and not any(row[width - 1] for row in whole):
         width -= 1  # after a separator at the end of each line
-        whole = [(line, row[:width]) for line, row in whole]
-    return whole, notes
+        whole = [row[:width] for row in whole]
+    return whole, at[kept], notes
 
 
 def _is_tum(columns: Sequence[Sequence[str]]) -> bool:

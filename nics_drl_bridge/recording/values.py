@@ -142,9 +142,9 @@ class MappedReader:
 
     def _raw_stamps(self, table: Table, time: schema.Time) -> Array:
         first, *others = time.columns
-        which = self._same(table, first)
+        which = self._beside(table, first)[1]
         if others:
-            nanoseconds = numbers_of(table, self._same(table, others[0]))
+            nanoseconds = numbers_of(table, self._beside(table, others[0])[1])
             return stamping.joined(numbers_of(table, which), nanoseconds)
         column = table.column(which)
         if column.dtype.kind in "US":
@@ -152,11 +152,11 @@ class MappedReader:
             return numbers_of(table, which) if dates is None else dates
         return column.astype(np.float64)
 
-    def _same(self, table: Table, reference: Reference) -> Reference:
-        """Returns the column of a reference that may repeat the table of the values."""
+    def _beside(self, table: Table, reference: Reference) -> tuple[Table, Reference]:
+        """Returns table and column of a reference that, without a table, is of the values'."""
         if isinstance(reference, str) and ":" in reference and reference not in table.names:
-            return self.place(reference)[1]
-        return reference
+            return self.place(reference)
+        return table, reference
 
     def series(self, name: str, value: Value, stream: Measured | None, held: bool) -> Series:
         """Returns a value in SI; of a counter its rate, `held` from stamp to stamp or between."""
@@ -168,7 +168,7 @@ class MappedReader:
         raw = column[at.rows]
         for k in np.flatnonzero(np.isinf(raw))[:1]:
             where = f"{table.place}: {table.row(int(at.rows[k]))}"
-            raise RecordingError(f"{where}: {which!r} is infinite; mend or remove the row.")
+            raise RecordingError(f"{where}: column {which!r} is infinite; mend or remove the row.")
         known = np.isfinite(raw)
         if not known.any():
             fault = f"{table.place}: {which!r} holds no number"
@@ -207,9 +207,8 @@ class MappedReader:
         if not value.counts:
             values = values - size * np.round(values[0] / size)
         if count:
-            times = "once" if count == 1 else f"{count} times"
             found = "" if value.wrap else ", as it seems"
-            end = f"{times}, at {size:.10g}{found}"
+            end = f"{stamping.times(count)}, at {size:.10g}{found}"
             self.say(f"{name}: the counter overflowed {end}, and was continued.")
         return raw._replace(values=values)
 
@@ -217,10 +216,7 @@ class MappedReader:
         """Puts `otherwise` where a flag is not as it must be."""
         on = np.ones(len(made.t), dtype=np.bool_)
         for reference, wanted in value.when.items():
-            other, which = table, reference
-            if ":" in reference and reference not in table.names:
-                other, found = self.place(reference)
-                which = str(found)
+            other, which = self._beside(table, reference)
             column = other.column(which)
             at = self.stamped(other, column, time if other is table else None)
             row = np.searchsorted(at.t, made.t, side="right") - 1

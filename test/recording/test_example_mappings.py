@@ -8,18 +8,19 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.config import share_folder
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.recording.mapping import Value, load_mapping
 from nics_drl_bridge.recording.readers import read_recording, robot_and_drive
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples" / "recordings"
+SHIPPED = share_folder() / "config" / "recordings" / "xtark_folder.yaml"
 SOURCES = {
     "jetracer_csv": ("jetracer_dart/free_driving_104s.csv",),
     "jetracer_bag": ("jetracer_dart/random_driving_slow_63s.bag",),
     "f110_folder": tuple(f"f110_frictionmaps/DS{k}" for k in (1, 3, 4)),
     "differential_ticks": tuple(f"differential_ticks/Camera_Odo_Data_0{k}.txt" for k in (1, 2)),
-    "xtark_folder": ("xtark_ackermann/random_drive_45s",),
 }
 
 
@@ -47,18 +48,29 @@ def test_each_example_reads_its_drives(shared_recordings, name, k):
         assert drive.command.values[:, c].max() <= variable.max
 
 
-def test_the_mapped_folder_is_what_the_reader_of_such_folders_reads(shared_recordings):
-    path = shared_recordings / SOURCES["xtark_folder"][0]
-    one, other = read_recording(path), read_recording(path, mapping=EXAMPLES / "xtark_folder.yaml")
-    for name in ("command", "pose"):
-        assert np.array_equal(one.streams[name].t, other.streams[name].t)
-        assert np.allclose(one.streams[name].values, other.streams[name].values)
-        assert one.streams[name].clock == other.streams[name].clock
+@pytest.mark.parametrize("drive", ["constant_drive_51s", "random_drive_45s"])
+def test_a_folder_of_the_shipped_form_needs_no_mapping_and_is_as_its_files_say(
+    shared_recordings, drive
+):
+    path = shared_recordings / "xtark_ackermann" / drive
+    tables = {file.stem: np.loadtxt(file, delimiter=",") for file in path.glob("*.csv")}
+    found, mapped = read_recording(path), read_recording(path, mapping=SHIPPED)
+    assert (found.variables, found.robot, found.repairs) == ((), None, ())
+    assert np.array_equal(found.command.values, tables["cmd"][:, :2])
+    assert np.array_equal(found.command.t, tables["cmd"][:, 2])
+    assert np.array_equal(found.pose.values[:, :2], tables["vrpn"][:, :2])
+    assert np.array_equal(found.pose.t, tables["vrpn"][:, 7] * 1e-9)
+    rows = len(found.wheels.t)  # where both sides are known
+    assert len(tables["L_wheel"]) - rows <= 1
+    assert np.array_equal(found.wheels.values[:, 0], tables["L_wheel"][:rows, 0])
+    for name, stream in found.streams.items():
+        assert np.array_equal(stream.values, mapped.streams[name].values)
+        assert np.array_equal(stream.t, mapped.streams[name].t)
 
 
 @pytest.mark.parametrize("drive", ["constant_drive_51s", "random_drive_45s"])
 def test_the_wheel_speeds_of_a_real_car_are_no_counters(shared_recordings, drive):
-    mapping = load_mapping(EXAMPLES / "xtark_folder.yaml")
+    mapping = load_mapping(SHIPPED)
     counted = Value.model_validate({"from": "L_wheel.csv:0", "unit": "ticks"})
     wheels = mapping.wheels.model_copy(update={"left": counted})
     counting = mapping.model_copy(update={"wheels": wheels})
