@@ -24,9 +24,10 @@ CONTROLS = {
 PACKAGE = Path(__file__).resolve().parents[1] / "nics_drl_bridge"
 BARS = {
     # 180 and 33,000 until it read any recording, knew ten kinds of robots instead of six, and what
-    # motors do, judged itself by yardsticks, and named units and clocks that can't be.
+    # motors do to every command, judged itself by yardsticks, and named units and clocks that
+    # can't be.
     "modules": 194,
-    "lines": 39_650,
+    "lines": 39_900,
     "single_importers": 50,
     "circles": 0,
     "max_arguments": 10,

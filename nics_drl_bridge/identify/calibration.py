@@ -78,7 +78,7 @@ class Calibration:
 
     @property
     def motors(self) -> Motors:
-        """What holds back the states that follow commands, beside delays and lags."""
+        """Motors, which hold back states that follow commands, beside delays and lags."""
         limits = [self.limits.get(r.state, (-np.inf, np.inf)) for r in self.responses]
         fall, rise = np.array(limits).reshape(-1, 2).T
         dead = {curve.command: curve.dead for curve in self.inputs}
@@ -111,7 +111,9 @@ def align(drive: Drive, calibration: Calibration) -> Samples:
     if not half_width and (calibration.position_noise_m or calibration.heading_noise_rad):
         half_width = SMOOTHING_S
     t = drive.sample_t + calibration.clock_offset_s
-    tracked = resample(t, unwrapped(recording.pose.values), grid, half_width)
+    tracked = resample(
+        t, unwrapped(recording.pose.values), grid, half_width, recording.pose.weights
+    )
     begin = grid - calibration.command_latency_s
     samples = samples_on_one_clock(
         grid,

@@ -78,6 +78,15 @@ class Drive:
         """Poses with the best known time: the newest of each burst, or all."""
         return self.recording.pose.rows(slice(None) if self.bursts is None else self.bursts.newest)
 
+    def trust(self, start: Array, end: Array) -> Array:
+        """Returns weights (..., 3) of motions from start to end on the pose's clock, usually 1."""
+        variance = 1.0 / self.recording.pose.weights
+        columns = [
+            (np.interp(start, self.sample_t, each) + np.interp(end, self.sample_t, each)) / 2.0
+            for each in variance.T
+        ]
+        return np.asarray(1.0 / np.stack(columns, axis=-1))
+
     @cached_property
     def pose_noise(self) -> tuple[float, float] | None:
         """Standard deviations of position [m] and heading [rad]; None if they do not show."""

@@ -48,7 +48,7 @@ WIDER = 5.0  # times by which a limit may change while it is adjusted
 
 @dataclass(frozen=True)
 class _Following:
-    """How states follow their commands; (S,) each."""
+    """A way in which states follow their commands; (S,) each."""
 
     lags: Array  # [s]
     delays: Array  # from the pose's clock [s]

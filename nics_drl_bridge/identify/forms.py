@@ -160,7 +160,7 @@ class Form:
 
 
 def problem_of(
-    drive: Drive, samples: Samples, form: Form, inputs: shooting.Inputs
+    drive: Drive, calibration: Calibration, samples: Samples, form: Form, inputs: shooting.Inputs
 ) -> shooting.Shooting:
     """Returns the prediction problem of a drive on one time axis."""
     command, spec, t, dt = drive.recording.command, drive.spec, samples.t, samples.dt
@@ -172,8 +172,11 @@ def problem_of(
     def shaped(model: TaylorModel, values: Array) -> TaylorModel:
         return form.actuated(model, inputs, values)
 
+    def trust(start: Array, end: Array) -> Array:
+        return drive.trust(*(each - calibration.clock_offset_s for each in (start, end)))
+
     noise, _ = drive.pose_noise or (0.0, 0.0)
-    return shooting.Shooting(samples, commands, shaped, not spec.state, noise)
+    return shooting.Shooting(samples, commands, shaped, trust, not spec.state, noise)
 
 
 def inputs_of(drive: Drive, latency: float, samples: Samples, form: Form) -> shooting.Inputs:
@@ -319,7 +322,7 @@ def _delayed(drive: Drive, calibration: Calibration, samples: Samples) -> tuple[
     """Returns delays (N,) that may be [s], and the commands in effect (N, T, C) by each."""
     form, now = Form(calibration.inputs), calibration.command_latency_s
     inputs = inputs_of(drive, now, samples, form)
-    problem = problem_of(drive, samples, form, inputs)
+    problem = problem_of(drive, calibration, samples, form, inputs)
     one_clock = drive.recording.pose.clock == drive.recording.command.clock
     tries = np.arange(0.0, LONGEST_S, DELAY_STEP_S) - (0.0 if one_clock else LONGEST_S / 2.0)
     late = [problem.commands(np.append(delay, inputs.start[1:])) for delay in tries]

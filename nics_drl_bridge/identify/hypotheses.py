@@ -172,7 +172,7 @@ def base_of(
     def fitted(form: Form, before: Base | None = None) -> Base:
         inputs = inputs_of(drive, calibration.command_latency_s, samples, form)
         inputs = inputs.begun_at(before.draft.inputs) if before else inputs
-        problem = problem_of(drive, samples, form, inputs)
+        problem = problem_of(drive, calibration, samples, form, inputs)
         draft = Draft(drive.spec, form, inputs, replace(problem, spacing_s=SPACING_S))
         found = draft.base(other=before.found.model if before else None)
         inputs = replace(inputs, start=found.values)

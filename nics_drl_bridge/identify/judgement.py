@@ -121,7 +121,7 @@ def _with_motion(
 ) -> tuple[TaylorModel, Calibration]:  # fmt: skip
     """Adjusts a model with a motion as state, and its inputs, to the rows that are kept (T,)."""
     draft = base.draft
-    problem = problem_of(training, samples, draft.form, draft.inputs)
+    problem = problem_of(training, calibration, samples, draft.form, draft.inputs)
     problem = replace(problem, spacing_s=hypotheses.SPACING_S)
     free = (model.coefficients != 0.0) & ~defined(training.spec)[:, None]
     found = shooting.fitted(

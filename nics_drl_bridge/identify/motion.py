@@ -52,7 +52,9 @@ def with_motion(drive: Drive, calibration: Calibration, grid: Array, width: floa
     """
     recording, spec, step = drive.recording, drive.spec, float(grid[1] - grid[0])
     t = drive.sample_t + calibration.clock_offset_s
-    tracked = resample(t, unwrapped(recording.pose.values), grid, 0.5 * width)
+    tracked = resample(
+        t, unwrapped(recording.pose.values), grid, 0.5 * width, recording.pose.weights
+    )
     pose = unwrapped(calibration.to_base(tracked))
     rows = 2 * max(2, round(width / step)) + 1
     rates = savgol_filter(pose, rows, 2, deriv=1, delta=step, axis=0)
@@ -81,7 +83,9 @@ def samples_of(drive: Drive, calibration: Calibration, width: float) -> Samples:
     grid = state.t
     step = round(float(grid[-1] - grid[0]) / (len(grid) - 1), 9)
     t = drive.sample_t + calibration.clock_offset_s
-    tracked = resample(t, unwrapped(drive.recording.pose.values), grid, 0.5 * width)
+    tracked = resample(
+        t, unwrapped(drive.recording.pose.values), grid, 0.5 * width, drive.recording.pose.weights
+    )
     begin = grid - calibration.command_latency_s
     command = taken(drive.recording.command, spec, calibration.inputs, begin, begin + step)
     samples = samples_on_one_clock(grid, calibration.to_base(tracked), state.values, command)

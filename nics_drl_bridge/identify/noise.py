@@ -37,6 +37,9 @@ def sensor_noise(drive: Drive) -> Noise:
     parts = [pose_noise(block, find_bursts(block.t)) for block in blocks]
     known = np.array([part for part in parts if part is not None])
     spread = known.std(axis=0, ddof=1) / np.sqrt(len(known)) if len(known) > 1 else [None, None]
+    if pose.sigma is not None:  # differences do not show an error that stays for a while
+        claimed = np.median(pose.sigma, axis=0)
+        whole = max(whole[0], float(claimed[:2].mean())), max(whole[1], float(claimed[2]))
     position, heading = (
         _measured(std, unit, None if u is None else float(u))
         for std, unit, u in zip(whole, ("m", "rad"), spread, strict=True)

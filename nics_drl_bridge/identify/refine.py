@@ -152,7 +152,13 @@ def prediction_errors(problem: Problem, model: TaylorModel, calibration: Calibra
             predicted = open_loop.predict(model, calibration, problem.drive, chosen)
         error = predicted - chosen.end
         error[:, 2] = HEADING_ARM_M * geometry.wrap_angle(error[:, 2])
+        error *= _scale(problem, chosen)
     return np.asarray(np.clip(np.nan_to_num(error.ravel(), nan=DIVERGED), -DIVERGED, DIVERGED))
+
+
+def _scale(problem: Problem, chosen: open_loop.Windows) -> Array:
+    """Returns factors (W, 3) of errors, by the variances of the poses at both ends."""
+    return np.asarray(np.sqrt(problem.drive.trust(chosen.start_t, chosen.end_t)))
 
 
 def prediction_slopes(
@@ -171,6 +177,7 @@ def prediction_slopes(
             aside[:, 2] = geometry.wrap_angle(aside[:, 2])
             slope = np.concatenate([slope, aside / (2.0 * TURN_RAD)], axis=2)
         slope[:, 2] *= HEADING_ARM_M
+        slope *= _scale(problem, course.chosen)[..., None]
         parts.append(slope.reshape(-1, slope.shape[2]))
     slopes = np.nan_to_num(np.concatenate(parts), nan=0.0)
     return np.clip(slopes, -STEEPEST, STEEPEST)

@@ -27,6 +27,8 @@ Rows = NDArray[np.intp]
 Commands = Callable[[Array], Array]  # those in effect (T, C) during each step, by values (I,)
 Shape = Callable[[TaylorModel, Array], TaylorModel]  # a model with friction and limits by values
 
+Trust = Callable[[Array, Array], Array]  # weights of motions from start to end, usually 1
+
 HORIZONS_S = (0.3, 1.0, 2.5, 5.0)  # the shortest tells a latency from a lag
 SPACING_S = 0.25
 HEADING_ARM_M = 0.3  # a heading error counts as a position error at this distance
@@ -71,6 +73,7 @@ class Shooting:
     samples: Samples
     commands: Commands
     shaped: Shape
+    trust: Trust
     mounted: bool = False  # True if the last three values are the pose of what `q` is, in the base
     noise_m: float = 0.0  # standard deviation of measured positions
     fixed: Array | None = None  # values (I,) that are used instead of those given
@@ -202,7 +205,9 @@ class _Search:
         self.wanted = self.steps > 0
         weight = np.array([1.0, 1.0, HEADING_ARM_M])
         usual = np.array(problem.horizons) + problem.noise_m / DRIFT_M_S
-        self.weight = (weight / usual[:, None])[None, :, :]
+        t = problem.samples.t
+        trust = problem.trust(t[self.first][:, None], t[self.first[:, None] + self.steps])
+        self.weight = weight / usual[:, None] * np.sqrt(trust)
         self.measured = problem.moved(self.first, self.steps)
         self.sought = inputs.sought
         self.count = len(self.sought)

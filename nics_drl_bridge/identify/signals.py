@@ -93,7 +93,7 @@ def nominal_lags(spec: RobotSpec) -> Array:
 
 
 class Motors(NamedTuple):
-    """What holds states back that follow commands with a gain of one, beside delays and lags."""
+    """Motors, which hold back states that follow commands with a gain of one, beside their lags."""
 
     fall: Array  # (S,) least and greatest rates [unit of the command / s]
     rise: Array
@@ -147,20 +147,24 @@ def unwrapped(pose: Array) -> Array:
     return np.concatenate([pose[:, :2], np.unwrap(pose[:, 2])[:, None]], axis=1)
 
 
-def resample(t: Array, pose: Array, at: Array, half_width: float) -> Array:
+def resample(
+    t: Array, pose: Array, at: Array, half_width: float, weights: Array | None = None
+) -> Array:
     """Resamples unwrapped poses (T, 3) at (n,), by parabolas over `half_width` [s] unless 0."""
     distinct = np.concatenate([[True], np.diff(t) > 0.0])
-    t, pose = t[distinct], pose[distinct]
+    weights = np.ones_like(pose) if weights is None else weights
+    t, pose, weights = t[distinct], pose[distinct], weights[distinct]
     if half_width == 0.0:
         return np.asarray(make_interp_spline(t, pose, k=3)(at))
     low = np.searchsorted(t, at - half_width)
     low = np.clip(np.minimum(low, np.searchsorted(t, at) - 2), 0, max(len(t) - 4, 0))
     high = np.maximum(np.searchsorted(t, at + half_width), low + 4)
     index = low[:, None] + np.arange(min(SMOOTHING_BATCH, int((high - low).max())))
-    weight = (index < high[:, None]) & (index < len(t))
+    inside = (index < high[:, None]) & (index < len(t))
     index = np.minimum(index, len(t) - 1)
+    weight = inside[..., None] * weights[index]
     tau = (t[index] - at[:, None]) / half_width
     basis = tau[..., None] ** np.arange(3)
-    normal = np.einsum("nki,nk,nkj->nij", basis, weight, basis) + 1e-9 * np.eye(3)
-    right = np.einsum("nki,nk,nkd->nid", basis, weight, pose[index] - pose[low][:, None])
-    return np.asarray(np.linalg.solve(normal, right)[:, 0] + pose[low])
+    normal = np.einsum("nki,nkd,nkj->ndij", basis, weight, basis) + 1e-9 * np.eye(3)
+    right = np.einsum("nki,nkd,nkd->ndi", basis, weight, pose[index] - pose[low][:, None])
+    return np.asarray(np.linalg.solve(normal, right[..., None])[:, :, 0, 0] + pose[low])

@@ -44,6 +44,7 @@ ALONG, LESS_ALONG, ALONG_BY_CHANCE = 0.9, 0.2, 0.05
 MIN_DIRECTIONS = 30  # a reversed axis shows in a path of more pieces than this,
 MIN_TURN = 1.0  # that turns by this [rad],
 MIRRORED, BETTER = 0.9, 0.15  # and leads along mirrored headings, by so much more than as given
+WEIGHTS = 0.01, 100.0  # bounds of what variances may weigh
 UNITS_OF_STEP = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 
 
@@ -55,6 +56,17 @@ class Stream:
     values: Array  # (T, D)
     clock: str = "robot"
     sigma: Array | None = None  # (T, D) standard deviations of the values, where they are known
+
+    @property
+    def weights(self) -> Array:
+        """Weights (T, D) by the variances, 1 for a usual one or where none is known."""
+        if self.sigma is None:
+            return np.ones_like(self.values)
+        usual = np.median(self.sigma, axis=0)
+        share = np.where(usual > 0.0, self.sigma / np.where(usual > 0.0, usual, 1.0), 1.0)
+        return np.asarray(
+            np.clip(np.maximum(np.nan_to_num(share, nan=1.0), 1e-9) ** -2.0, *WEIGHTS)
+        )
 
     def rows(self, keep: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Stream:
         """Returns the rows selected by a mask (T,), indices or a slice."""

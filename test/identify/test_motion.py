@@ -74,3 +74,18 @@ def test_samples_have_the_commands_in_effect_after_their_latency(drive):
 def test_a_surrogate_has_a_state_for_each_command(drive):
     names = [(v.name, v.follows) for v in surrogate(drive.spec).state]
     assert names == [("throttle_state", "throttle"), ("steering_state", "steering")]
+
+
+def test_poses_that_are_known_to_be_doubtful_do_not_bend_the_motion(drive):
+    pose, rng = drive.recording.pose, np.random.default_rng(3)
+    lost = rng.random(len(pose.t)) < 0.2
+    values = pose.values + np.where(lost[:, None], rng.normal(0.0, 0.05, pose.values.shape), 0.0)
+    sigma = np.where(lost, 0.05, 0.0005)[:, None] * np.ones(3)
+    grid, off = grid_of(drive, MOUNTED, 0.1), []
+    truth = known_state(with_motion(drive, MOUNTED, grid, 0.07)).values
+    for known in (None, sigma):
+        stream = replace(pose, values=values, sigma=known)
+        seen = Drive(replace(drive.recording, pose=stream), drive.spec)
+        found = known_state(with_motion(seen, MOUNTED, grid, 0.07)).values
+        off.append(np.abs(found - truth).mean())
+    assert off[1] < 0.1 * off[0]

@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 from robots import field
 
-from identify.drives import drive
+from identify.drives import drive, slipping_car
 from nics_drl_bridge import geometry
 from nics_drl_bridge.config import dump_yaml, parse_yaml
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import SUMS
 from nics_drl_bridge.generator import builtin_model, load_model, save_model
+from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.noise import motion_noise
+from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.noise import MEASURED, Level, Noise
@@ -159,3 +160,15 @@ def test_a_level_in_another_unit_is_refused(tmp_path):
     sums.write_text("".join(line for line in lines if "model.yaml" not in line))
     with pytest.raises(ConfigError, match="odom_angular must be in rad/s"):
         load_model(tmp_path / "model")
+
+
+def test_the_noise_of_a_pose_is_no_less_than_its_covariances_say():
+    spec, recording = slipping_car(duration=10.0)
+    pose = recording.pose
+    shown = sensor_noise(Drive(recording, spec))
+    assert shown.pose_position.std < 0.001
+    sigma = np.tile([0.02, 0.03, 0.05], (len(pose.t), 1))
+    claimed = sensor_noise(Drive(replace(recording, pose=replace(pose, sigma=sigma)), spec))
+    assert claimed.pose == pytest.approx((0.025, 0.025, 0.05))
+    small = replace(pose, sigma=1e-9 * sigma)
+    assert sensor_noise(Drive(replace(recording, pose=small), spec)) == shown

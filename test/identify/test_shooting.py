@@ -32,6 +32,10 @@ def car() -> TaylorModel:
     )  # fmt: skip
 
 
+def equally(start, end):
+    return np.ones((*np.broadcast_shapes(start.shape, end.shape), 3))
+
+
 @pytest.fixture(scope="module")
 def problem(car) -> Shooting:
     """A drive of it, whose commands act after a delay."""
@@ -48,7 +52,7 @@ def problem(car) -> Shooting:
         at = np.arange(STEPS + 1) - values[0] / DT
         return np.stack([np.interp(at, np.arange(STEPS), column) for column in command.T], axis=1)
 
-    return Shooting(samples, commands, lambda model, values: model)
+    return Shooting(samples, commands, lambda model, values: model, equally)
 
 
 DELAYS = Inputs(("latency",), *(np.array([value]) for value in (0.05, 0.05, 0.0, 0.4)))
@@ -93,6 +97,25 @@ def test_predictions_are_seen_from_where_the_tracked_body_is(car, problem):
     mounting = values[1:]
     expected = geometry.between(mounting, geometry.compose(base, mounting))
     assert seen[..., :2] == pytest.approx(expected[..., :2])
+
+
+def test_windows_between_doubtful_poses_bend_nothing(car, problem):
+    samples = problem.samples
+    lost = samples.t > 0.5 * samples.t[-1]
+    wrong = samples.q.copy()
+    wrong[lost, :2] *= 1.5
+    free = np.zeros(car.coefficients.shape, dtype=np.bool_)
+    free[0] = car.coefficients[0] != 0.0
+
+    def doubtful(start, end):
+        return np.where((end > 0.5 * samples.t[-1])[..., None], 1e-6, equally(start, end))
+
+    known = replace(problem, samples=replace(samples, q=wrong), fixed=np.array([DELAY]))
+    off = [
+        np.abs(fitted(each, car, free, NOTHING_FREE).model.coefficients - car.coefficients).max()
+        for each in (known, replace(known, trust=doubtful))
+    ]
+    assert off[1] < 0.05 * off[0]
 
 
 def test_nothing_free_leaves_the_model(car, problem):
