@@ -9,6 +9,7 @@ import pytest
 from scipy.signal import lfilter
 
 from identify.drives import slipping_car
+from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.forms import (
     Form,
@@ -97,9 +98,11 @@ def test_the_least_delay_of_the_commands_is_their_latency(found, samples):
     assert form.latency_at(sought, sought.start) == 0.02
     (curve,) = form.curves_at(sought, sought.start)
     assert (curve.command, curve.delay) == ("throttle", pytest.approx(0.06))
-    delayed = problem_of(found.training, samples, form, sought).commands(sought.start)
+    delayed = problem_of(found.training, Calibration(), samples, form, sought).commands(
+        sought.start
+    )
     shared = replace(sought, start=np.where(np.arange(len(sought.start)) == 1, 0.02, sought.start))
-    alike = problem_of(found.training, samples, form, shared).commands(shared.start)
+    alike = problem_of(found.training, Calibration(), samples, form, shared).commands(shared.start)
     step = round(0.06 / samples.dt)
     assert delayed[step:, 0] == pytest.approx(alike[:-step, 0])
     assert np.array_equal(delayed[:, 1], alike[:, 1])
