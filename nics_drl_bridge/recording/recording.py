@@ -62,11 +62,11 @@ class Stream:
         """Weights (T, D) by the variances, 1 for a usual one or where none is known."""
         if self.sigma is None:
             return np.ones_like(self.values)
-        usual = np.median(self.sigma, axis=0)
-        share = np.where(usual > 0.0, self.sigma / np.where(usual > 0.0, usual, 1.0), 1.0)
-        return np.asarray(
-            np.clip(np.maximum(np.nan_to_num(share, nan=1.0), 1e-9) ** -2.0, *WEIGHTS)
-        )
+        known = np.isfinite(self.sigma) & (self.sigma > 0.0)
+        columns = zip(self.sigma.T, known.T, strict=True)
+        usual = [np.median(column[own]) if own.any() else 1.0 for column, own in columns]
+        share = np.where(known, self.sigma, usual) / usual
+        return np.asarray(np.clip(share**-2.0, *WEIGHTS))
 
     def rows(self, keep: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Stream:
         """Returns the rows selected by a mask (T,), indices or a slice."""

@@ -266,3 +266,15 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path):
         file.truncate(MOST_BYTES + 1)
     with pytest.raises(RecordingError, match="larger than 256 MB"):
         load_recording(path)
+
+
+@pytest.mark.parametrize("unknown", [0.0, np.nan, np.inf])
+def test_a_row_weighs_by_its_variance_and_as_usual_where_that_is_unknown(unknown):
+    sigma = np.full((6, 3), 0.02)
+    sigma[1], sigma[2], sigma[3:, 2] = 0.04, unknown, unknown
+    stream = Stream(np.arange(6.0), np.zeros((6, 3)), sigma=sigma)
+    expected = np.ones((6, 3))
+    expected[1] = 0.25, 0.25, (0.03 / 0.04) ** 2  # of the heading two rows are known
+    expected[0, 2] = (0.03 / 0.02) ** 2
+    assert stream.weights == pytest.approx(expected)
+    assert (replace(stream, sigma=None).weights == 1.0).all()
