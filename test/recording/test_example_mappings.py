@@ -21,6 +21,7 @@ SOURCES = {
     "jetracer_bag": ("jetracer_dart/random_driving_slow_63s.bag",),
     "f110_folder": tuple(f"f110_frictionmaps/DS{k}" for k in (1, 3, 4)),
     "differential_ticks": tuple(f"differential_ticks/Camera_Odo_Data_0{k}.txt" for k in (1, 2)),
+    "xtark_folder": ("xtark_ackermann/random_drive_45s",),
 }
 
 
