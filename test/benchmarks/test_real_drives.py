@@ -111,7 +111,8 @@ def test_a_bar_that_is_missed_is_told(module, change, told):
 def test_every_drive_has_its_mapping(module):
     bars = module("measuring.drive_bars")
     mappings = {drive.mapping for drive in bars.DRIVES.values()}
-    assert mappings == {*bars.EXAMPLES.glob("*.yaml"), *bars.SHIPPED.glob("*.yaml")}
+    found = [*bars.EXAMPLES.glob("*.yaml"), *bars.SHIPPED.glob("*.yaml")]
+    assert mappings == {path.resolve() for path in found}  # one is a link to a shipped one
 
 
 def test_wheels_are_found_in_a_model_that_moves_by_them(module):
