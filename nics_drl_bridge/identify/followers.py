@@ -137,7 +137,7 @@ def unlimited(samples: Samples, calibration: Calibration, spec: RobotSpec) -> Sa
     for i, response in enumerate(calibration.responses):
         if response.state in calibration.limits:
             target = response.gain * samples.x[:, len(spec.state) + names.index(response.command)]
-            share = -np.expm1(-samples.dt / response.lag_s)
+            share = -np.expm1(-samples.dt / max(response.lag_s, MIN_TIME_S))
             rates[:, 3 + i] = share * (target - samples.x[:, i]) / samples.dt
     return replace(samples, dq=rates)
 

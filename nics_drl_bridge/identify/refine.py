@@ -37,6 +37,7 @@ LEAST_SCALE = 0.05
 # A model uses the values at the start of a step: a time is uncertain by the standard deviation of
 # a uniform distribution over the step.
 WITHIN = 12.0**-0.5
+FASTEST = 0.99  # share of its distance by which a state nears its command in one step, at most
 WORTH = 0.1  # terms are removed while the error rises by less than this share in total
 
 
@@ -221,6 +222,16 @@ class _Free:
         model = replace(self.model, coefficients=coefficients)
         return model, replace(self.calibration, **values)
 
+    def bounds(self) -> tuple[Array, Array]:
+        """Returns bounds (P,) by which no state that follows a command overshoots it in a step."""
+        low = np.full(self.model.coefficients.shape, -np.inf)
+        high, rest = -low, np.full(len(self.names), np.inf)
+        for i, response in enumerate(self.calibration.responses):
+            own, _ = linear_terms(self.model, response.state, response.command)
+            if own is not None:
+                low[3 + i, own], high[3 + i, own] = -FASTEST / self.model.dt, 0.0
+        return np.append(low[self.coefficients], -rest), np.append(high[self.coefficients], rest)
+
 
 def free_coefficients(model: TaylorModel, calibration: Calibration) -> Mask:
     """Selects the free coefficients (D, K): kept, and not fixed by the definition of a state."""
@@ -277,8 +288,9 @@ def refine(problem: Problem, model: TaylorModel, calibration: Calibration) -> Re
     def jacobian(value: Array) -> Array:
         return prediction_slopes(problem, *free.at(value), free)
 
-    given = jacobian if problem.courses else None
-    theta, slope, rest = minimise(residual, theta, scale, jacobian=given)
+    given, (low, high) = jacobian if problem.courses else None, free.bounds()
+    begun = np.clip(theta, low, high)
+    theta, slope, rest = minimise(residual, begun, scale, (low, high), jacobian=given)
     model, calibration = free.at(theta)
     sigma = uncertainty(slope, rest)[len(first) :]
     calibration = _with_uncertainty(free, model, calibration, sigma)
@@ -311,6 +323,8 @@ def _with_uncertainty(
     spread = dict(zip(free.names, map(float, sigma), strict=True))
     if free.time:
         spread[free.time] = float(np.hypot(spread[free.time], WITHIN * model.dt))
+        if calibration.limits:  # a lag before a limit looks like a delay
+            spread[free.time] = max(spread[free.time], known[free.time])
     if lag_is_measured(calibration) and "clock_offset_s" in spread:
         both = np.hypot(spread["clock_offset_s"], known["command_latency_s"])
         spread["clock_offset_s"] = float(both)

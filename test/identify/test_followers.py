@@ -57,8 +57,17 @@ def test_limits_of_acceleration_are_found_and_predicted():
 
 
 @pytest.mark.slow
-def test_a_lag_before_a_limit_makes_the_latency_uncertain():
-    calibration = found(slew=0.7).calibration
+def test_no_state_overshoots_its_command_in_a_step():
+    recording = servoed(steering_servo=MOTOR, steering=0.5, slew=0.7, later=0.15, dead=0.1)
+    model = identify(recording, tricycle(), order="auto", alpha="auto").model
+    (alone,) = (k for k, term in enumerate(model.term_names) if term == "speed")
+    assert 0.0 <= 1.0 + model.dt * model.coefficients[3, alone] < 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("slew", [0.4, 0.7])
+def test_a_lag_before_a_limit_makes_the_latency_uncertain(slew):
+    calibration = found(slew=slew).calibration
     off = abs(calibration.command_latency_s - 0.1)
     assert off < 3.0 * calibration.uncertainty["command_latency_s"]
     assert any("trust their sum" in note for note in calibration.notes)
