@@ -127,15 +127,11 @@ def clocks(drive: Drive, findings: Findings) -> Findings:
         if derived and v.follows and v.twist is None
     )
     calibration = replace(
-        findings.calibration,
-        responses=tuple(responses),
-        inputs=followers.late_inputs(drive.spec, found),
-        limits=followers.limits_of(drive.spec, found),
-        clock_offset_s=found.offset,
-        command_latency_s=found.latency,
+        findings.calibration, responses=tuple(responses), uncertainty=found.sigma,
+        inputs=followers.late_inputs(spec, found), limits=followers.limits_of(spec, found),
+        clock_offset_s=found.offset, command_latency_s=found.latency,
         burst_period_s=training.bursts.period_s if training.bursts else 0.0,
-        uncertainty=found.sigma,
-    )
+    )  # fmt: skip
     return replace(findings, timing=found, calibration=calibration)
 
 
@@ -163,10 +159,8 @@ def responses(drive: Drive, findings: Findings) -> Findings:
 def noise(drive: Drive, findings: Findings) -> Findings:
     """Measures the noise of the pose: without it, a drive without corrections is an exact one."""
     position, heading = findings.training.pose_noise or (0.0, 0.0)
-    calibration = replace(
-        findings.calibration, position_noise_m=position, heading_noise_rad=heading
-    )
-    return replace(findings, calibration=calibration, noise=sensor_noise(findings.whole))
+    noisy = replace(findings.calibration, position_noise_m=position, heading_noise_rad=heading)
+    return replace(findings, calibration=noisy, noise=sensor_noise(findings.whole))
 
 
 def motion(drive: Drive, findings: Findings) -> Findings:
@@ -222,8 +216,7 @@ def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:
         raise FitError(f"{drive.recording.source}: {error}") from None
     best = hypotheses.chosen(trials).order
     curves = base.draft.form.curves_at(base.draft.inputs, base.found.values)
-    calibration = replace(findings.calibration, inputs=curves)
-    findings = replace(findings, calibration=calibration)
+    findings = replace(findings, calibration=replace(findings.calibration, inputs=curves))
     samples = aligned(training, findings)
     linear = linear_fit(samples, spec, best or hypotheses.BASE_ORDER)
     if drive.settings.strict:
@@ -360,16 +353,12 @@ def judge(drive: Drive, findings: Findings) -> Findings:
     judgement = judged(model, calibration, whole, bands)
     rated = verdict.with_quality(model, linear, unseen, held_out, judgement, spec)
     findings = replace(
-        findings,
+        findings, model=rated, unseen=unseen, held_out=held_out, judgement=judgement,
         calibration=replace(calibration, notes=_sentences(findings)),
         noise=motion_noise(findings.noise, whole, calibration, model, samples),
         linear=replace(linear, model=rated) if model is linear.model else linear,
-        model=rated,
-        unseen=unseen,
-        held_out=held_out,
         structure=structure(findings),
-        judgement=judgement,
-    )
+    )  # fmt: skip
     return replace(findings, notes=_notes(drive, findings))
 
 
@@ -453,11 +442,10 @@ def refit(drive: Drive, findings: Findings) -> Findings:
         findings = replace(findings, refinement=(*findings.refinement, sentence))
         return replace(findings, notes=_notes(drive, findings))
     final = replace(
-        final,
+        final, refinement=(*final.refinement, sentence),
         calibration=replace(final.calibration, notes=_sentences(final)),
         model=replace(_fitted(final)[1], quality=_fitted(findings)[1].quality),
-        refinement=(*final.refinement, sentence),
-    )
+    )  # fmt: skip
     return replace(findings, refit=replace(final, notes=_notes(drive, final)))
 
 
