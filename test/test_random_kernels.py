@@ -56,3 +56,52 @@ def test_large_and_negative_seeds_give_draws_of_their_own():
     seeds = np.array([0, 1, -1, 2**31 - 1, 2**62, -(2**62)])
     sample = draws(random.uniform, seeds, np.arange(1), np.arange(1)).ravel()
     assert len(np.unique(sample)) == len(seeds)
+
+
+@njit
+def pairs(seeds, counters, count):
+    out = np.empty((seeds, counters, 2, count), np.float32)
+    for i in range(seeds):
+        for j in range(counters):
+            by = random.key(i, 3, j)
+            for k in range(count):
+                out[i, j, 0, k], out[i, j, 1, k] = random.two_normals(by, k)
+    return out
+
+
+@pytest.mark.slow
+def test_normals_by_the_thousand_are_standard_normal_far_out_too():
+    sample = pairs(30, 60, 540).ravel().astype(np.float64)
+    assert stats.kstest(sample, "norm").pvalue > 1e-3
+    assert stats.kurtosis(sample) == pytest.approx(0.0, abs=4.0 * np.sqrt(24.0 / sample.size))
+    for share in (1e-3, 1e-4):
+        far = stats.norm.isf(share)
+        expected = share * sample.size
+        for tail in (sample > far, sample < -far):
+            assert tail.sum() == pytest.approx(expected, abs=4.0 * np.sqrt(expected))
+
+
+@pytest.mark.slow
+def test_normals_of_a_pair_and_of_neighbours_are_not_correlated():
+    sample = pairs(30, 60, 540).astype(np.float64)
+    for values in (sample, np.abs(sample) - np.sqrt(2.0 / np.pi)):
+        limit = 4.5 * values.var() / np.sqrt(sample.size / 2)
+        for axis in range(4):
+            ahead = np.take(values, np.arange(1, sample.shape[axis]), axis=axis)
+            behind = np.take(values, np.arange(sample.shape[axis] - 1), axis=axis)
+            assert abs((ahead * behind).mean()) < limit
+
+
+@pytest.mark.slow
+def test_bits_of_a_key_are_uniform_and_hardly_repeat():
+    @njit
+    def drawn(count):
+        out = np.empty(count, np.float64)
+        for k in range(count):
+            out[k] = random.share_of(random.bits(random.key(5, 2, 7), k))
+        return out
+
+    sample = drawn(50_000)
+    assert stats.kstest(sample, "uniform").pvalue > 1e-3
+    assert (sample > 0.0).all()
+    assert len(np.unique(sample)) > 0.98 * sample.size

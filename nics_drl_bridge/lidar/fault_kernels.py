@@ -6,6 +6,7 @@ are a row (P,) of numbers; one whose numbers are 0 takes no time and draws nothi
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,68 +21,115 @@ CLOCKWISE, AT_ONCE, COUNTER_CLOCKWISE = -1, 0, 1  # values of SKEW
 ROUNDING = 1e-9  # rounding error of a multiple of the quantisation step [m]
 
 
+class Device(NamedTuple):
+    """What a device does to a return, float32; so as to change nothing where it has no fault."""
+
+    least: float  # [m]
+    most: float
+    close: float  # value for what is too close
+    std: float  # [m]
+    grows: float  # [1]
+    per_step: float  # 1 / step of the quantisation [1/m]
+    step: float  # [m]
+    rest: float  # of the step, beyond float32
+    first: float  # least multiple of the step within the limits
+    last: float
+
+
 @kernel(allocates=True)
 def distort(ranges, limits, faults, seed, counter):  # type: ignore[no-untyped-def]
     """Applies faults (P,) of the device to one exact scan (B,) float32, REP-117, in place [m].
 
     A return stays within the limits, range_min and range_max [m]; `counter` is that of the scan.
     """
-    if faults[TOO_CLOSE] != AS_MINUS_INF:
-        _too_close(ranges, limits, faults[TOO_CLOSE], seed, counter)
-    if faults[NOISE_STD] > 0.0 or faults[NOISE_PROPORTIONAL] > 0.0:
-        _noise(ranges, limits, faults[NOISE_STD], faults[NOISE_PROPORTIONAL], seed, counter)
-    if faults[QUANTISATION] > 0.0:
-        _quantise(ranges, limits, faults[QUANTISATION])
+    device = _device(limits, faults)
+    noisy, coarse = device.std > 0.0 or device.grows > 0.0, device.step > 0.0
+    if faults[TOO_CLOSE] == AS_GHOST:
+        _ghosts(ranges, device, random.key(seed, random.GHOST_STREAM, counter))
+    if noisy and coarse:
+        _noise(ranges, device, random.key(seed, random.RANGE_STREAM, counter), True)
+    elif noisy:
+        _noise(ranges, device, random.key(seed, random.RANGE_STREAM, counter), False)
+    elif coarse or faults[TOO_CLOSE] != AS_MINUS_INF:
+        for i in range(ranges.shape[0]):
+            value = _closed(ranges[i], device)
+            ranges[i] = _quantised(value, device) if coarse else value
     if faults[DROPOUT] > 0.0 or faults[DROPOUT_FAR] > 0.0:
-        _drop(ranges, limits, faults[DROPOUT], faults[DROPOUT_FAR], seed, counter)
+        by = random.key(seed, random.DROPOUT_STREAM, counter)
+        _drop(ranges, faults[DROPOUT], faults[DROPOUT_FAR] / (limits[1] * limits[1]), by)
+
+
+@kernel(inline=True)
+def _device(limits, faults):  # type: ignore[no-untyped-def]
+    single, step, close = np.float32, faults[QUANTISATION], np.inf
+    if faults[TOO_CLOSE] == AS_RANGE_MIN:
+        close = limits[0]
+    elif faults[TOO_CLOSE] == AS_MINUS_INF:
+        close = -np.inf
+    per_step = 1.0 / step if step > 0.0 else 0.0
+    return Device(
+        single(limits[0]), single(limits[1]), single(close), single(faults[NOISE_STD]),
+        single(faults[NOISE_PROPORTIONAL]), single(per_step), single(step),
+        single(step - single(step)), single(math.ceil((limits[0] - ROUNDING) * per_step)),
+        single(math.floor((limits[1] + ROUNDING) * per_step)),
+    )  # fmt: skip
 
 
 @kernel(allocates=True)
-def _too_close(ranges, limits, behaviour, seed, counter):  # type: ignore[no-untyped-def]
-    count = ranges.shape[0]
-    for i in range(count):
-        if ranges[i] != -np.inf:
-            continue
-        if behaviour == AS_RANGE_MIN:
-            ranges[i] = limits[0]
-        elif behaviour == AS_NO_RETURN:
-            ranges[i] = np.inf
-        else:
-            draw = random.uniform(seed, random.GHOST_STREAM, counter * count + i)
-            ranges[i] = limits[0] + draw * (limits[1] - limits[0])
-
-
-@kernel(allocates=True)
-def _noise(ranges, limits, std, proportional, seed, counter):  # type: ignore[no-untyped-def]
-    count = ranges.shape[0]
-    for i in range(count):
-        if np.isfinite(ranges[i]):
-            draw = random.normal(seed, random.RANGE_STREAM, counter * count + i)
-            noisy = ranges[i] + (std + proportional * ranges[i]) * draw
-            ranges[i] = min(max(noisy, limits[0]), limits[1])
-
-
-@kernel(allocates=True)
-def _quantise(ranges, limits, step):  # type: ignore[no-untyped-def]
+def _ghosts(ranges, device, by):  # type: ignore[no-untyped-def]
     for i in range(ranges.shape[0]):
-        if np.isfinite(ranges[i]):
-            value = math.floor(ranges[i] / step + 0.5) * step
-            if value > limits[1] + ROUNDING:
-                value -= step
-            elif value < limits[0] - ROUNDING:
-                value += step
-            ranges[i] = value
+        ghost = device.least + random.share_of(random.bits(by, i)) * (device.most - device.least)
+        ranges[i] = ghost if ranges[i] == -np.inf else ranges[i]
+
+
+@kernel(allocates=True, inline=True)
+def _noise(ranges, device, by, coarse):  # type: ignore[no-untyped-def]
+    half = ranges.shape[0] // 2
+    one, two = ranges[:half], ranges[half : 2 * half]  # no two draws of a pair side by side
+    for i in range(half):
+        first, second = random.two_normals(by, i)
+        first, second = _noisy(one[i], first, device), _noisy(two[i], second, device)
+        one[i] = _quantised(first, device) if coarse else first
+        two[i] = _quantised(second, device) if coarse else second
+    for i in range(2 * half, ranges.shape[0]):
+        first, _ = random.two_normals(by, half)
+        first = _noisy(ranges[i], first, device)
+        ranges[i] = _quantised(first, device) if coarse else first
+
+
+@kernel(inline=True)
+def _closed(value, device):  # type: ignore[no-untyped-def]
+    return device.close if value == np.float32(-np.inf) else value
+
+
+@kernel(contracts=True, inline=True)
+def _noisy(value, draw, device):  # type: ignore[no-untyped-def]
+    value = _closed(value, device)
+    noisy = value + (device.std + device.grows * value) * draw
+    noisy = device.least if noisy < device.least else noisy
+    noisy = device.most if noisy > device.most else noisy
+    return noisy if abs(value) < np.float32(np.inf) else value
+
+
+@kernel(contracts=True, inline=True)
+def _quantised(value, device):  # type: ignore[no-untyped-def]
+    """Returns the nearest multiple of the step within the limits."""
+    count = np.floor(value * device.per_step + np.float32(0.5))
+    count = device.first if count < device.first else count
+    count = device.last if count > device.last else count
+    coarse = count * device.step + count * device.rest  # rounded once
+    coarse = device.least if coarse < device.least else coarse
+    coarse = device.most if coarse > device.most else coarse
+    return coarse if abs(value) < np.float32(np.inf) else value
 
 
 @kernel(allocates=True)
-def _drop(ranges, limits, share, far, seed, counter):  # type: ignore[no-untyped-def]
-    count = ranges.shape[0]
-    for i in range(count):
-        if ranges[i] < np.inf:
-            reach = max(ranges[i], 0.0) / limits[1]
-            draw = random.uniform(seed, random.DROPOUT_STREAM, counter * count + i)
-            if draw < share + far * reach * reach:
-                ranges[i] = np.inf
+def _drop(ranges, share, far, by):  # type: ignore[no-untyped-def]
+    share, far = np.float32(share), np.float32(far)
+    for i in range(ranges.shape[0]):
+        reach = ranges[i] if ranges[i] > np.float32(0.0) else np.float32(0.0)
+        lost = random.share_of(random.bits(by, i)) < share + far * reach * reach
+        ranges[i] = np.float32(np.inf) if lost & (ranges[i] < np.inf) else ranges[i]
 
 
 @kernel(allocates=True)

@@ -127,6 +127,21 @@ def test_a_ghost_may_be_anywhere_within_the_limits():
     assert seen.mean() == pytest.approx(np.mean(LIMITS), abs=4.0 * 2.95 / np.sqrt(12 * BEAMS))
 
 
+@pytest.mark.parametrize("beams", [1, 2, 7, 1081])
+def test_a_scan_of_any_length_has_the_noise_of_each_of_its_beams(beams):
+    ranges = scan_at(1.0, beams)
+    errors = np.array([reported(ranges, noise_std=0.1, counter=k) - 1.0 for k in range(200)])
+    assert errors.std(axis=0) == pytest.approx(np.full(beams, 0.1), rel=0.3)
+    assert abs(np.mean(errors)) < 0.4 / np.sqrt(errors.size)
+
+
+def test_a_quantised_range_is_the_single_number_nearest_to_its_multiple():
+    ranges = np.linspace(0.06, 2.99, BEAMS).astype(np.float32)
+    coarse = reported(ranges, quantisation=0.00025)
+    exact = (np.round(ranges.astype(np.float64) / 0.00025) * 0.00025).astype(np.float32)
+    assert (coarse == exact).mean() > 0.99  # but for what lies between two multiples
+
+
 def test_faults_act_in_the_order_of_the_device():
     close = reported(
         scan_at(-np.inf),
