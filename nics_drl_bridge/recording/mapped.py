@@ -190,14 +190,16 @@ def _deviations(
     columns = []
     for k in COVARIANCES[len(given)]:
         value = Value.model_validate({"from": given[k]})
-        part = reader.series("pose.covariance", value, pose, held=False)
+        part = reader.series("pose.covariance", value, pose, held=False, infinite=True)
         columns.append(np.interp(t, part.t, part.values))
     variance = np.stack(columns, axis=1)
-    if (variance > 0.0).all():
-        return np.asarray(np.sqrt(variance))
-    if variance.any():
-        reader.say("pose: its covariance is not positive throughout, and was not used.")
-    return None
+    known = variance > 0.0
+    if not known.any():
+        return None
+    if not known.all():
+        rows = int((~known).any(axis=1).sum())
+        reader.say(f"pose: {rows} of {len(t)} rows have a variance that is not positive: unknown.")
+    return np.asarray(np.sqrt(np.where(known, variance, np.nan)))
 
 
 def _from_zero(found: dict[str, Stream], main: str, reader: MappedReader) -> dict[str, Stream]:
