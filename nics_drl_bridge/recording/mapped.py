@@ -191,15 +191,18 @@ def _deviations(
     for k in COVARIANCES[len(given)]:
         value = Value.model_validate({"from": given[k]})
         part = reader.series("pose.covariance", value, pose, held=False, infinite=True)
-        columns.append(np.interp(t, part.t, part.values))
-    variance = np.stack(columns, axis=1)
-    known = variance > 0.0
-    if not known.any():
+        positive = part.values > 0.0
+        known = np.interp(t, part.t, positive) == 1.0
+        variance = np.interp(t, part.t, np.where(positive, part.values, 0.0))
+        columns.append(np.sqrt(np.where(known, variance, np.nan)))
+    sigma = np.stack(columns, axis=1)
+    unknown = np.isnan(sigma)
+    if unknown.all():
         return None
-    if not known.all():
-        rows = int((~known).any(axis=1).sum())
+    if unknown.any():
+        rows = int(unknown.any(axis=1).sum())
         reader.say(f"pose: {rows} of {len(t)} rows have a variance that is not positive: unknown.")
-    return np.asarray(np.sqrt(np.where(known, variance, np.nan)))
+    return sigma
 
 
 def _from_zero(found: dict[str, Stream], main: str, reader: MappedReader) -> dict[str, Stream]:

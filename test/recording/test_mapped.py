@@ -104,9 +104,9 @@ def test_a_variance_that_is_no_positive_number_is_unknown(tmp_path, columns):
     pose = {"x": "x", "y": "y", "heading": "yaw", "covariance": ["c", "c", "c"]}
     found = read(path, pose=pose)
     known = np.isfinite(found.pose.sigma).all(axis=1)
-    assert np.flatnonzero(~known).tolist() == [3, 4]
-    assert (found.pose.sigma[known] == 2.0).all()  # an infinite one is that of its neighbours
-    assert any("2 of " in told and "variance" in told for told in found.repairs)
+    assert np.flatnonzero(~known).tolist() == [3, 4, 5]
+    assert (found.pose.sigma[known] == 2.0).all()
+    assert any("3 of " in told and "variance" in told for told in found.repairs)
 
 
 def test_counts_that_come_at_once_are_of_the_time_since_the_burst_before(tmp_path, columns):
