@@ -27,7 +27,7 @@ BARS = {
     # motors do to every command, judged itself by yardsticks, and named units and clocks that
     # can't be.
     "modules": 194,
-    "lines": 39_900,
+    "lines": 40_000,
     "single_importers": 50,
     "circles": 0,
     "max_arguments": 10,

@@ -251,6 +251,7 @@ REAL_DRIVES = Table(
             ("simulated skid-steer", "own_robots.skid_steer"),
             ("simulated car by throttle", "own_robots.throttle_car"),
             ("simulated tricycle", "own_robots.tricycle"),
+            ("simulated tricycle, slewed commands", "own_robots.slewed_tricycle"),
             ("simulated omnidirectional", "own_robots.omni"),
             ("simulated differential, ticks", "own_robots.ticks"),
         )

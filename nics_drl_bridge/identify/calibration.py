@@ -5,7 +5,7 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import AllowInfNan, NonNegativeFloat
+from pydantic import AllowInfNan, Field, NonNegativeFloat
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
@@ -13,7 +13,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import MAX_GAP_S, MIN_STAMPS, Drive
 from nics_drl_bridge.identify.signals import Motors, inferred_states, resample, taken, unwrapped
 from nics_drl_bridge.recording.recording import Recording, Samples, samples_on_one_clock
-from nics_drl_bridge.robot.curve import InputCurve, delays
+from nics_drl_bridge.robot.curve import LONGEST_DELAY_S, InputCurve, delays
 
 STEP_S = 0.01  # step of the samples where the pose's own step is not usable
 STEP_RANGE_S = (0.002, 0.02)
@@ -41,7 +41,8 @@ class Calibration:
     """Estimates of a recording's clocks, mounting and noise."""
 
     clock_offset_s: float = 0.0  # added to the pose's stamps, gives the commands' clock
-    command_latency_s: float = 0.0  # from a command's stamp to its effect
+    # from a command's stamp to its effect
+    command_latency_s: Annotated[float, Field(le=LONGEST_DELAY_S)] = 0.0
     rotation_rad: float = 0.0  # heading of `base_link` minus the heading of the tracked body
     lever_arm_m: tuple[float, float] = (0.0, 0.0)  # (x, y) of the tracked point in `base_link`
     responses: tuple[Response, ...] = ()  # of the state variables; empty if the state was measured

@@ -33,16 +33,21 @@ from nics_drl_bridge.identify.excitation import moving_dofs
 from nics_drl_bridge.identify.signals import Motors
 from nics_drl_bridge.identify.statistics import clustered_errors, minimise
 from nics_drl_bridge.recording.recording import Samples
-from nics_drl_bridge.robot.curve import InputCurve
+from nics_drl_bridge.robot.curve import InputCurve, delays
 from nics_drl_bridge.robot.kernels import GREATEST_ORDER
 from nics_drl_bridge.robot.spec import RobotSpec
 
+FREE = -np.inf, np.inf, 0.0  # fall, rise and dead zone of a motor that holds nothing back
 LAGS_S, DELAYS_S = (0.05, 0.15, 0.4), (0.0, 0.05, 0.1, 0.2)  # tried with limits
 RATES = (0.25, 0.5, 1.0, 2.0, 4.0)  # limits that are tried, in the command's range per second
 DEAD = (0.03, 0.07, 0.15, 0.3)  # dead zones that are tried, as shares of the command's reach
 HELPS = 0.95  # what is tried must take the sum of squares to this share,
 WORTH = 0.8  # and to this one once all is adjusted to it
-UNIFORM = 12.0**-0.5  # standard deviation of a uniform distribution, as a share of its width
+# Standard deviation of a uniform distribution about one of its ends, as a share of its width: a
+# lag before a limit looks like a delay, which may be none.
+END = 3.0**-0.5
+EXPLAINED = 0.5  # a component of the twist counts if commands leave less than this share of it
+NO_EFFECT = 1e-6  # a limit or dead zone is not determined by less than this share of the residual
 WIDER = 5.0  # times by which a limit may change while it is adjusted
 
 
@@ -71,7 +76,7 @@ def apart(drive: Drive, timing: TimingEstimate) -> TimingEstimate:
     What stands between command and motion beside one lag, as a servo of higher order, adds to a
     command's delay: the latency is the least delay.
     """
-    if drive.recording.state is not None or not drive.spec.state or len(timing.sigma) != 1:
+    if drive.recording.state is not None or not drive.spec.state or not timing.sigma:
         return timing
     moved = np.flatnonzero(signals.moved_inputs(drive.recording.command, drive.spec))
     found = _found(drive, timing, moved)
@@ -80,30 +85,35 @@ def apart(drive: Drive, timing: TimingEstimate) -> TimingEstimate:
         return timing
     first = int(np.argmin(delay + CERTAIN * sigma[0]))
     alike = np.abs(delay - delay[first]) <= CERTAIN * np.hypot(sigma[0], sigma[0, first])
+    told, motors = len(timing.sigma) > 1, found.best.motors  # True if wheels told the latency
+    held = motors.limited
+    if told and alike.all() and not (held.any() or motors.dead.any()):
+        return timing
     least = float(np.average(delay[alike], weights=sigma[0, alike] ** -2.0))
     sigma = np.hypot(sigma, WITHIN_TICK * STEP_S)
-    (name,) = timing.sigma  # of the latency, or of the offset between clocks that contains it
-    errors = {name: float(sigma[0, first])}
-    if np.isfinite(found.best.motors.rise).any():  # a lag before a limit looks like a delay
-        errors[name] = float(np.hypot(errors[name], least * UNIFORM))
-    if timing.separated:
-        least = if_certain(max(least, 0.0), errors[name], MIN_TIME_S)
-        if errors[name] > TOLD_S:
-            names = (_of_sum(drive.spec.state[i].name) for i in moved)
-            errors |= zip(names, map(float, sigma[1]), strict=True)
+    own = np.hypot(sigma[0], END * np.where(held[moved], delay - least, 0.0))
+    unsure = END * (least if timing.separated and not told else max(DELAYS_S)) * held.any()
+    errors = {n: float(np.hypot(sigma[0, first] if len(timing.sigma) == 1 else e, unsure))
+              for n, e in timing.sigma.items()}  # fmt: skip
+    if timing.separated and not told:
+        least = if_certain(max(least, 0.0), float(sigma[0, first]), MIN_TIME_S)
+    if timing.separated and errors["command_latency_s"] > TOLD_S:
+        names = (_of_sum(drive.spec.state[i].name) for i in moved)
+        errors |= zip(names, map(float, sigma[1]), strict=True)
     lags, lag_sigma, further = timing.lags.copy(), timing.lag_sigma.copy(), 0.0 * timing.lags
-    further[moved] = np.where(alike, 0.0, delay - least)
+    further[moved] = np.where(alike, 0.0, np.maximum(delay - least, 0.0))
     sums = delay + found.best.lags[moved]
     lags[moved], lag_sigma[moved] = np.maximum(sums - least - further[moved], 0.0), np.hypot(*sigma)
-    for i, own in zip(moved[~alike], sigma[0, ~alike].tolist(), strict=True):
-        errors[f"{drive.spec.state[i].follows}.delay"] = own
+    for i, error in zip(moved, own.tolist(), strict=True):
+        if further[i] > 0.0:
+            errors[f"{drive.spec.state[i].follows}.delay"] = error
     for v, row in zip(drive.spec.state, found.motor_sigma.tolist(), strict=True):
         keys = f"{v.name}.fall", f"{v.name}.rise", f"{v.follows}.dead"
         errors |= {key: own for key, own in zip(keys, row, strict=True) if own > 0.0}
-    latency = least if timing.separated else 0.0
+    latency = timing.latency if told else least if timing.separated else 0.0
     return replace(
         timing, offset=latency - least, latency=latency, sigma=errors, lags=lags,
-        lag_sigma=lag_sigma, delays=further, motors=found.best.motors,
+        lag_sigma=lag_sigma, delays=further, motors=motors,
     )  # fmt: skip
 
 
@@ -146,24 +156,25 @@ def _found(drive: Drive, timing: TimingEstimate, moved: NDArray[np.intp]) -> _Ad
     """Returns how moved states follow, with limits and dead zones if they clearly explain more."""
     twists, command, spec = drive.twists, drive.recording.command, drive.spec
     rows, moving = some_of(len(twists.start), FEW_ROWS), list(moving_dofs(twists.twist))
-    begin = twists.start[rows]
-    target = (begin, twists.end[rows], twists.twist[rows][:, moving])
-    left = response_residual(command, spec, target, GREATEST_ORDER)
-    cluster = np.repeat(((begin - begin[0]) / CLUSTER_S).astype(np.intp), len(moving))
-    shift, size = timing.latency - timing.offset, len(timing.lags)
+    begin, shift, size = twists.start[rows], timing.latency - timing.offset, len(timing.lags)
     start = _Following(timing.lags, np.full(size, shift), signals.free_motors(size))
+    for _ in range(2):  # what commands do not explain hides what motors do
+        target = (begin, twists.end[rows], twists.twist[rows][:, moving])
+        left = response_residual(command, spec, target, GREATEST_ORDER)
+        unexplained = np.mean(left(*vars(start).values()).reshape(len(rows), -1) ** 2, axis=0)
+        if (unexplained < EXPLAINED).all() or not (unexplained < EXPLAINED).any():
+            break
+        moving = [dof for dof, rest in zip(moving, unexplained, strict=True) if rest < EXPLAINED]
+    cluster = np.repeat(((begin - begin[0]) / CLUSTER_S).astype(np.intp), len(moving))
     best = _adjusted(left, start, moved, shift, cluster)
-    for tries in (_with_limits, _with_dead_zones):
-        tried = best.best
-        for _ in range(2):  # what one state does hides what another does
-            for i in moved:
-                reach = command.values[:, signals.followed(spec)[i]]
-                options = [(_cost(left, each), each) for each in tries(tried, i, reach, shift)]
-                cost, option = min(options, key=lambda each: each[0])
-                tried = option if cost < HELPS * _cost(left, tried) else tried
-        if tried is not best.best:
-            other = _adjusted(left, tried, moved, shift, cluster)
-            best = other if other.cost < WORTH * best.cost else best
+    for tries in (_with_limits, _with_dead_zones, _with_limits):  # what one does hides another
+        for i in moved:
+            reach = command.values[:, signals.followed(spec)[i]]
+            options = [(_cost(left, each), each) for each in tries(best.best, i, reach, shift)]
+            cost, option = min(options, key=lambda each: each[0])
+            if cost < HELPS * best.cost:
+                other = _adjusted(left, option, moved, shift, cluster)
+                best = other if other.cost < WORTH * best.cost else best
     return best
 
 
@@ -224,9 +235,13 @@ def _adjusted(
     by_sum = np.concatenate([jacobian[:, :count] - by_lag, by_lag, by_size], axis=1)
     sigma = np.maximum(clustered_errors(by_sum, rest, cluster), EXACT)
     motor_sigma = np.zeros(given.shape)
-    motor_sigma[held] = sigma[2 * count :]
+    effect = np.linalg.norm(by_size, axis=0) * size
+    sure = (effect > NO_EFFECT * np.linalg.norm(rest)) & (sigma[2 * count :] < size)
+    motor_sigma[held] = np.where(sure, sigma[2 * count :], 0.0)
+    motors = np.where(motor_sigma > 0.0, np.stack(best.motors, axis=1), FREE)
     return _Adjusted(
-        best, float((rest**2).sum()), sigma[: 2 * count].reshape(2, count), motor_sigma
+        replace(best, motors=Motors(*motors.T)), float((rest**2).sum()),
+        sigma[: 2 * count].reshape(2, count), motor_sigma,
     )  # fmt: skip
 
 
@@ -237,9 +252,10 @@ def _of_sum(state: str) -> str:
 
 def about_sums(calibration: Calibration) -> Iterator[str]:
     """Tells of latency and lags that could not be told apart."""
-    for response in calibration.responses:
+    own = delays([r.command for r in calibration.responses], calibration.inputs).tolist()
+    for response, delay in zip(calibration.responses, own, strict=True):
         sigma = calibration.uncertainty.get(_of_sum(response.state))
         if sigma is not None:
-            both = calibration.command_latency_s + response.lag_s
+            both = calibration.command_latency_s + delay + response.lag_s
             finding = f"Latency and the lag of {response.state} can hardly be told apart"
             yield f"{finding}: trust their sum, {both:.4f} s (+- {sigma:.4f} s)."

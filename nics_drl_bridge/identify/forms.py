@@ -5,6 +5,7 @@ Input curves are those of Hammerstein models: a dead zone, saturation, a gain of
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -36,6 +37,7 @@ BACK_SCALE, BACK_RANGE = 0.2, (0.2, 5.0)  # of a gain backwards
 SMALL_DEAD = 0.05  # share of a command's reach at which the search for a dead zone begins
 TWO_WAY = 0.05  # share of the rows in which a command drives backwards, to tell its gain
 NEAR_END = 0.01  # share of a command's reach by which it must exceed the end of its curve
+SELDOM = 1.0  # percentage of a drive that is to exceed a limit of a rate
 STRONG = 95.0  # percentile of the rates at which limits are first sought
 LEVER_SCALE_M, TURN_SCALE = 0.05, 0.1
 
@@ -268,10 +270,13 @@ def with_back(form: Form, curves: tuple[InputCurve, ...]) -> Form:
     return replace(form, curves=form.curves + more, back=tuple(c.command for c in curves))
 
 
-def reached(model: TaylorModel, drive: Drive, samples: Samples) -> TaylorModel:
-    """Returns a model without the ends of curves, and limits of rates, that a drive never reached.
+def reached(
+    model: TaylorModel, drive: Drive, samples: Samples, errors: Mapping[str, float]
+) -> TaylorModel:
+    """Returns a model without ends of curves that were never reached, and limits that hardly were.
 
-    Its range of a command in effect is that of what was sent.
+    Nor does it have limits that are less than their errors, by name. Its range of a command in
+    effect is that of what was sent.
     """
     names, sent = [c.name for c in drive.spec.command], drive.recording.command.values
     low, high, curves, limits = model.low.copy(), model.high.copy(), [], model.limits.copy()
@@ -289,8 +294,12 @@ def reached(model: TaylorModel, drive: Drive, samples: Samples) -> TaylorModel:
             curves.append(curve)
     free = replace(model, limits=np.zeros((0, 2)), drag=np.zeros(0), friction=np.zeros(0))
     asked = free.rates(samples.x)[:, 3:]
-    limits[:, 0] = np.where(asked.min(axis=0) < limits[:, 0], limits[:, 0], -np.inf)
-    limits[:, 1] = np.where(asked.max(axis=0) > limits[:, 1], limits[:, 1], np.inf)
+    for i, name in enumerate(model.variables[: model.state_size]):
+        fall, rise = (errors.get(f"{name}.{word}", 0.0) for word in ("fall", "rise"))
+        if not np.percentile(asked[:, i], SELDOM) < limits[i, 0] < -fall:
+            limits[i, 0] = -np.inf
+        if not np.percentile(asked[:, i], 100.0 - SELDOM) > limits[i, 1] > rise:
+            limits[i, 1] = np.inf
     return replace(model, inputs=tuple(curves), low=low, high=high, limits=limits)
 
 

@@ -204,14 +204,17 @@ def changes(
     """Yields changes of the form of a robot's motion, and to which share each takes the error."""
     # Drag and friction are hard to tell apart: both are tried, then each without the other.
     speeds = tuple(v.name for v in drive.spec.state if v.twist == "vx")
+    late = likely_delays(drive, calibration, samples)
+    if late:  # a wrong time hides what else there is, and is hidden by it
+        yield lambda form: replace(form, delays=late), WORTH
     if tyres_slip(drive.spec):
         yield lambda form: replace(form, tyres=True), WORTH
     if speeds:
         yield lambda form: replace(form, drag=speeds, friction=speeds), WORTH
         yield lambda form: replace(form, drag=()), 1.0 / WORTH
         yield lambda form: replace(form, friction=()), 1.0 / WORTH
-    if delays := likely_delays(drive, calibration, samples):
-        yield lambda form: replace(form, delays=delays), WORTH
+    if late:
+        yield lambda form: replace(form, delays=late), WORTH
     if speeds:
         yield lambda form: with_dead(form, drive, samples), WORTH
         yield lambda form: replace(form, limits=speeds), WORTH

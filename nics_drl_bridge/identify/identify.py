@@ -568,7 +568,7 @@ def _result(trial: Findings, final: Findings) -> Identified:
     linear, model = _fitted(final)
     samples = known(final.samples, "the training part", "fit")
     if final.width is not None:
-        model = reached(model, final.whole, samples)
+        model = reached(model, final.whole, samples, final.calibration.uncertainty)
     return Identified(
         final.whole, model, final.calibration, linear, samples, trial.unseen, trial.held_out,
         trial.noise, trial, final.notes,

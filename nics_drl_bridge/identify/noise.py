@@ -37,9 +37,6 @@ def sensor_noise(drive: Drive) -> Noise:
     parts = [pose_noise(block, find_bursts(block.t)) for block in blocks]
     known = np.array([part for part in parts if part is not None])
     spread = known.std(axis=0, ddof=1) / np.sqrt(len(known)) if len(known) > 1 else [None, None]
-    if pose.sigma is not None:  # differences do not show an error that stays for a while
-        claimed = np.median(pose.sigma, axis=0)
-        whole = max(whole[0], float(claimed[:2].mean())), max(whole[1], float(claimed[2]))
     position, heading = (
         _measured(std, unit, None if u is None else float(u))
         for std, unit, u in zip(whole, ("m", "rad"), spread, strict=True)
@@ -58,7 +55,23 @@ def motion_noise(
         measured["odom_linear"] = max(linear, key=lambda found: found.std)
         measured["odom_angular"] = _level(rest[:, 2], "rad/s")
     measured |= _pose_drift(sensor, drive, calibration, model)
+    measured |= claimed(sensor, drive.recording.pose.sigma)
     return sensor.model_copy(update=measured)
+
+
+def claimed(sensor: Noise, sigma: Array | None) -> dict[str, Level]:
+    """Returns the pose's deviations by its covariances, where they are the greater ones."""
+    # Differences do not show an error that stays for a while; nor does a drift contain it.
+    if sigma is None:
+        return {}
+    usual = []
+    for column in sigma.T:
+        known = column[np.isfinite(column) & (column > 0.0)]
+        usual.append(float(np.median(known)) if len(known) else np.nan)
+    across = [std for std in usual[:2] if std > 0.0]
+    claims = {"pose_position": float(np.mean(across)) if across else 0.0, "pose_heading": usual[2]}
+    found = {name: (getattr(sensor, name), std) for name, std in claims.items()}
+    return {name: assumed(std, at.unit) for name, (at, std) in found.items() if std > at.std}
 
 
 def _measured(std: float, unit: str, uncertainty: float | None) -> Level:

@@ -99,6 +99,11 @@ class Motors(NamedTuple):
     rise: Array
     dead: Array  # (S,) a smaller command moves nothing [its unit]
 
+    @property
+    def limited(self) -> NDArray[np.bool_]:
+        """(S,) True where rates have limits."""
+        return np.isfinite(self.fall) | np.isfinite(self.rise)
+
 
 def free_motors(states: int) -> Motors:
     """Returns motors that hold nothing back."""

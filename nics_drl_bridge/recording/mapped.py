@@ -190,14 +190,19 @@ def _deviations(
     columns = []
     for k in COVARIANCES[len(given)]:
         value = Value.model_validate({"from": given[k]})
-        part = reader.series("pose.covariance", value, pose, held=False)
-        columns.append(np.interp(t, part.t, part.values))
-    variance = np.stack(columns, axis=1)
-    if (variance > 0.0).all():
-        return np.asarray(np.sqrt(variance))
-    if variance.any():
-        reader.say("pose: its covariance is not positive throughout, and was not used.")
-    return None
+        part = reader.series("pose.covariance", value, pose, held=False, infinite=True)
+        positive = part.values > 0.0
+        known = np.interp(t, part.t, positive) == 1.0
+        variance = np.interp(t, part.t, np.where(positive, part.values, 0.0))
+        columns.append(np.sqrt(np.where(known, variance, np.nan)))
+    sigma = np.stack(columns, axis=1)
+    unknown = np.isnan(sigma)
+    if unknown.all():
+        return None
+    if unknown.any():
+        rows = int(unknown.any(axis=1).sum())
+        reader.say(f"pose: {rows} of {len(t)} rows have a variance that is not positive: unknown.")
+    return sigma
 
 
 def _from_zero(found: dict[str, Stream], main: str, reader: MappedReader) -> dict[str, Stream]:

@@ -158,15 +158,20 @@ class MappedReader:
             return self.place(reference)
         return table, reference
 
-    def series(self, name: str, value: Value, stream: Measured | None, held: bool) -> Series:
-        """Returns a value in SI; of a counter its rate, `held` from stamp to stamp or between."""
+    def series(
+        self, name: str, value: Value, stream: Measured | None, held: bool, infinite: bool = False
+    ) -> Series:
+        """Returns a value in SI; of a counter its rate, `held` from stamp to stamp or between.
+
+        What is `infinite` is refused, or else unknown.
+        """
         stream = stream or Measured()
         table, which = self.place(value.from_, stream.in_)
         column, time = numbers_of(table, which), value.time or stream.time
         at = self.stamped(table, column, time)
         clock = value.clock or stream.clock or self.mapping.clock or at.clock or ROBOT_CLOCK
         raw = column[at.rows]
-        for k in np.flatnonzero(np.isinf(raw))[:1]:
+        for k in np.flatnonzero(np.isinf(raw) & (not infinite))[:1]:
             where = f"{table.place}: {table.row(int(at.rows[k]))}"
             raise RecordingError(f"{where}: column {which!r} is infinite; mend or remove the row.")
         known = np.isfinite(raw)

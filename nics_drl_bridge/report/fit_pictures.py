@@ -25,6 +25,7 @@ from nics_drl_bridge.identify.signals import DIFFERENCE, held, moved_commands, n
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.report.pictures import DARK, MEASURED, MODEL, OTHER, panels, png
 from nics_drl_bridge.robot import taylor
+from nics_drl_bridge.robot.curve import delays as delays_of
 from nics_drl_bridge.robot.noise import Level
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.threads import one_blas_thread
@@ -151,7 +152,8 @@ def alignment(spec: RobotSpec, identified: Identified) -> bytes:
     for axes, c in zip(grid, moved, strict=True):
         name, unit = spec.command[c].name, spec.command[c].unit
         latency = calibration.command_latency_s
-        for late, style, label in ((0.0, ":", "as stamped"), (latency, "-", "as it takes effect")):
+        acts = latency + float(delays_of([name], calibration.inputs)[0])
+        for late, style, label in ((0.0, ":", "as stamped"), (acts, "-", "as it takes effect")):
             value = held(command, spec, t - late, t - late + samples.dt)[:, c]
             axes.plot(t - begin, value, style, color=MODEL, linewidth=1.4, label=label)
         axes.set_ylabel(f"{name} [{unit}]", fontsize=9, color=MODEL)
@@ -433,5 +435,6 @@ def _curve(drive: Drive, calibration: Calibration, name: str) -> ShiftCurve | No
             return None
         left = clocks.response_residual(command, spec, signal)
         delays = calibration.command_latency_s - value if of_clock else value
-        rest = [left(lags, d) for d in delays]
+        own = delays_of([r.command for r in calibration.responses], calibration.inputs)
+        rest = [left(lags, own + d, calibration.motors) for d in delays]
     return ShiftCurve(name, value, np.array([np.sqrt(np.mean(r**2)) for r in rest]))

@@ -12,6 +12,7 @@ from pydantic import AllowInfNan, Field
 from nics_drl_bridge.config import Schema
 
 Array = NDArray[np.float64]
+LONGEST_DELAY_S = 60.0  # simulators and estimators keep all commands of such a time
 End = Annotated[float, AllowInfNan(), Field(ge=-np.inf)]  # infinite maybe, but not NaN
 
 
@@ -24,7 +25,8 @@ class InputCurve(Schema):
     least: End = -np.inf
     most: End = np.inf
     back: float = Field(default=1.0, ge=0.0)  # gain of negative commands; that of positive ones: 1
-    delay: float = Field(default=0.0, ge=0.0)  # after the latency of all commands [s]
+    # after the latency of all commands [s]
+    delay: float = Field(default=0.0, ge=0.0, le=LONGEST_DELAY_S)
 
     @property
     def bends(self) -> bool:

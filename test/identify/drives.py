@@ -78,7 +78,7 @@ def servoed(
     twist=front_driven, seed: int = 0, latency: float = 0.1, duration: float = 60.0,
     mounting: tuple[float, float, float] = (0.25, 0.12, 0.5), steering: float = 1.1,
     noise: float = 5e-4, steering_servo=SERVO, dead: float = 0.0, later: float = 0.0,
-    slew: float = np.inf,
+    slew: float = np.inf, motor=MOTOR,
 ) -> Recording:  # fmt: skip
     """A drive of a robot with a motor and a servo, of which commands and poses were recorded.
 
@@ -94,6 +94,7 @@ def servoed(
         dead: speed that is told and does not come [m/s].
         later: by which the steering acts after the speed [s].
         slew: greatest acceleration that the robot's driver asks of its motor [m/s^2].
+        motor: transfer function.
     """
     rng, count = np.random.default_rng(seed), round(duration / FINE_S)
     per_hold, late = round(0.5 / FINE_S), round(latency / FINE_S)
@@ -107,7 +108,7 @@ def servoed(
         change = np.clip(acting[k, 0] - acting[k - 1, 0], -slew * FINE_S, slew * FINE_S)
         acting[k, 0] = acting[k - 1, 0] + change
     columns = []
-    for each, system in zip(acting.T, (MOTOR, steering_servo), strict=True):
+    for each, system in zip(acting.T, (motor, steering_servo), strict=True):
         b, a, _ = cont2discrete(system, FINE_S)
         columns.append(lfilter(b.ravel(), a, each))
     moved = geometry.exp(twist(np.stack(columns, axis=1)) * FINE_S)

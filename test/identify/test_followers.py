@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import pytest
 
 from identify.drives import MOTOR, servoed, tricycle
+from nics_drl_bridge import geometry
 from nics_drl_bridge.identify.identify import Identified, identify
+from nics_drl_bridge.recording.recording import Stream
 from nics_drl_bridge.robot.curve import InputCurve
 
 SPEED = "speed_command"
+QUICK = [1.0], [0.003, 1.0]
 
 
 @cache
@@ -33,8 +37,9 @@ def test_a_robot_whose_motors_follow_freely_has_no_limits_and_no_dead_zone():
 
 
 @pytest.mark.slow
-def test_a_dead_zone_of_the_speed_is_found_and_predicted():
-    identified = found(dead=0.1)
+@pytest.mark.parametrize("mounting", [(0.25, 0.12, 0.5), (0.0, 0.0, 0.0)])
+def test_a_dead_zone_of_the_speed_is_found_and_predicted(mounting):
+    identified = found(dead=0.1, mounting=mounting)
     (curve,) = (each for each in identified.model.inputs if each.bends)
     assert (curve.command, curve.least, curve.most) == (SPEED, -np.inf, np.inf)
     assert curve.dead == pytest.approx(0.1, rel=0.1)
@@ -71,6 +76,35 @@ def test_a_lag_before_a_limit_makes_the_latency_uncertain(slew):
     off = abs(calibration.command_latency_s - 0.1)
     assert off < 3.0 * calibration.uncertainty["command_latency_s"]
     assert any("trust their sum" in note for note in calibration.notes)
+
+
+@pytest.mark.slow
+def test_a_limit_of_the_speed_makes_no_limit_of_the_steering():
+    recording = servoed(steering_servo=([1.0], [0.15, 1.0]), slew=0.7, steering=0.5, motor=QUICK)
+    limits = identify(recording, tricycle()).model.limits
+    assert limits[0] == pytest.approx([-0.7, 0.7], rel=0.1)
+    assert not np.isfinite(limits[1]).any()
+
+
+@pytest.mark.slow
+def test_a_motor_without_a_lag_may_have_limits():
+    recording = servoed(steering_servo=QUICK, slew=2.0, steering=0.5, latency=0.0, motor=QUICK)
+    early = replace(recording, pose=replace(recording.pose, t=recording.pose.t - 0.04))
+    assert identify(early, tricycle()).model.limits[0] == pytest.approx([-2.0, 2.0], rel=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("given", [{"slew": 0.7}, {"later": 0.12}, {"dead": 0.1}])
+def test_motors_are_found_where_the_wheels_tell_the_latency_of_a_pose_on_another_clock(given):
+    recording = servoed(steering_servo=MOTOR, steering=0.5, mounting=(0.0, 0.0, 0.0), **given)
+    pose = recording.pose
+    moved = geometry.log(geometry.between(pose.values[:-5], pose.values[5:]))
+    twist = moved / (pose.t[5:] - pose.t[:-5])[:, None]
+    both = np.stack([twist[:, 0] - 0.2 * twist[:, 2], twist[:, 0] + 0.2 * twist[:, 2]], axis=1)
+    wheels = Stream(pose.t[5::2], both[::2], "robot")
+    tracked = replace(pose, t=pose.t + 3.0, clock="mocap")
+    error, textbook = ends(identify(replace(recording, wheels=wheels, pose=tracked), tricycle()))
+    assert error < 0.6 * textbook
 
 
 @pytest.mark.slow

@@ -162,7 +162,7 @@ def test_ends_and_limits_that_the_drive_never_reached_are_left_out(found, sample
             spec.variable_names, spec.dof_names, spec.dof_units, powers, gains, 0.01,
             np.zeros(size), np.zeros(size), inputs=(curve,), limits=limits,
         )  # fmt: skip
-        return reached(model, found.training, samples)
+        return reached(model, found.training, samples, {})
 
     beyond = written(1.1 * sent.max(), 2.0 * asked.max())
     assert beyond.inputs == (InputCurve(command="throttle", dead=0.1),)

@@ -14,7 +14,7 @@ from nics_drl_bridge.files import SUMS
 from nics_drl_bridge.generator import builtin_model, load_model, save_model
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
+from nics_drl_bridge.identify.noise import claimed, motion_noise, sensor_noise
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.noise import MEASURED, Level, Noise
@@ -168,7 +168,22 @@ def test_the_noise_of_a_pose_is_no_less_than_its_covariances_say():
     shown = sensor_noise(Drive(recording, spec))
     assert shown.pose_position.std < 0.001
     sigma = np.tile([0.02, 0.03, 0.05], (len(pose.t), 1))
-    claimed = sensor_noise(Drive(replace(recording, pose=replace(pose, sigma=sigma)), spec))
-    assert claimed.pose == pytest.approx((0.025, 0.025, 0.05))
-    small = replace(pose, sigma=1e-9 * sigma)
-    assert sensor_noise(Drive(replace(recording, pose=small), spec)) == shown
+    sigma[::2], sigma[1, 0], sigma[:, 1] = np.nan, np.inf, 0.0  # unknown
+    sigma[1::2, 1] = 0.03
+    told = shown.model_copy(update=claimed(shown, sigma))
+    assert told.pose == pytest.approx((0.025, 0.025, 0.05))
+    assert not told.pose_position.measured
+    for none in (None, 1e-9 * sigma, np.nan * sigma):
+        assert claimed(shown, none) == {}
+
+
+def test_covariances_leave_the_drift_that_was_measured():
+    spec, recording = slipping_car()
+    pose = recording.pose
+    told = replace(pose, sigma=np.tile([0.5, 0.5, 0.26], (len(pose.t), 1)))
+    plain, with_claims = (
+        identify(each, spec).noise for each in (recording, replace(recording, pose=told))
+    )
+    assert with_claims.pose == (0.5, 0.5, 0.26)
+    assert plain.position_drift.std > 0.0
+    assert with_claims.position_drift == plain.position_drift

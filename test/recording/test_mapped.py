@@ -97,6 +97,18 @@ def test_quaternions_are_headings_and_variances_deviations(tmp_path, columns):
     assert read(path, pose=pose | {"covariance": ["q"] * 3}).pose.sigma is None
 
 
+def test_a_variance_that_is_no_positive_number_is_unknown(tmp_path, columns):
+    variance = np.full_like(columns["x"], 4.0)
+    variance[3:6] = 0.0, -1.0, np.inf
+    path = write(tmp_path / "log.csv", columns | {"c": variance})
+    pose = {"x": "x", "y": "y", "heading": "yaw", "covariance": ["c", "c", "c"]}
+    found = read(path, pose=pose)
+    known = np.isfinite(found.pose.sigma).all(axis=1)
+    assert np.flatnonzero(~known).tolist() == [3, 4, 5]
+    assert (found.pose.sigma[known] == 2.0).all()
+    assert any("3 of " in told and "variance" in told for told in found.repairs)
+
+
 def test_counts_that_come_at_once_are_of_the_time_since_the_burst_before(tmp_path, columns):
     t = np.repeat(columns["t"][::2], 2)
     t[1::2] += 0.001

@@ -43,7 +43,9 @@ def test_a_command_of_zero_never_does_anything():
     assert InputCurve(command="throttle", least=0.2, most=1.0).of([-0.5, 0.0]).tolist() == [0.0] * 2
 
 
-@pytest.mark.parametrize("wrong", [{"dead": -0.1}, {"back": -1.0}, {"most": np.nan}])
-def test_a_curve_that_falls_is_refused(wrong):
+@pytest.mark.parametrize(
+    "wrong", [{"dead": -0.1}, {"back": -1.0}, {"most": np.nan}, {"delay": 61.0}]
+)
+def test_a_curve_that_falls_or_is_late_for_ever_is_refused(wrong):
     with pytest.raises(ValidationError):
         InputCurve(command="throttle", **wrong)
