@@ -44,21 +44,23 @@ _ALIAS = re.compile(r"\bas\s+\w+")
 
 def kernel(
     function: Callable[..., Any] | None = None, *, allocates: bool = False, contracts: bool = False,
-    inline: bool = False,
+    inline: bool = False, view: bool = False,
 ) -> Callable[..., Any]:  # fmt: skip
     """Compiles a function with numba when it is first called, or loads what was compiled before.
 
     It runs without the interpreter's lock; a division by zero gives inf or NaN. It `allocates` if
     it makes arrays or other objects, or calls what does; `contracts` lets products and sums be
-    fused, with one rounding; `inline` compiles it into all callers, where that was measured to pay.
+    fused, with one rounding; `inline` compiles it into all callers, where that was measured to pay. A `view` returns parts of
+    its arguments' arrays, which only a function that is written into its callers can.
     """
     if function is None:
-        return partial(kernel, allocates=allocates, contracts=contracts, inline=inline)
+        return partial(kernel, allocates=allocates, contracts=contracts, inline=inline, view=view)
     options: dict[str, Any] = {"nopython": True, "nogil": True, "error_model": "numpy"}
     options |= {"boundscheck": None, "no_cfunc_wrapper": True}
     options |= {} if allocates else {"_nrt": False}
     options |= {"fastmath": {"contract"}} if contracts else {}
     options |= {"forceinline": True} if inline else {}
+    options |= {"inline": "always"} if view else {}
     compiled: Callable[..., Any] = _Kernel(function, targetoptions=options)
     KERNELS.append(compiled)
     return compiled

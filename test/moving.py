@@ -78,7 +78,8 @@ def state_of(bodies, marks, velocity, seeds):
     return State(
         pose=none, state=none, history=empty, bodies=bodies, odom=none, twist=none,
         ranges=none.astype(np.float32), collided=ints.astype(np.uint8),
-        steps=np.zeros(worlds, np.int64), seeds=np.array(seeds, np.int64), faults=none,
+        steps=np.zeros(worlds, np.int64), seeds=np.array(seeds, np.int64),
+        member=np.zeros(worlds, np.int64), faults=none,
         coefficient=none, delay=ints, age=ints, noise=none, velocity=velocity, past=empty,
         marks=marks,
     )  # fmt: skip

@@ -25,7 +25,7 @@ from nics_drl_bridge.report.doctor_facts import expected_of
 from nics_drl_bridge.report.pictures import trajectories
 from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim.scenes import Scene, sample_scene
-from nics_drl_bridge.sim.world import World, load_world
+from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 FAST, DDS, MUJOCO, VEHICLE = "fast", "dds", "mujoco_dds", "vehicle"
 NODES = {DDS: "simulator_node", MUJOCO: "mujoco_node"}
@@ -135,7 +135,7 @@ class Evaluated:
 def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
     """Drives all policies through the same episodes everywhere; writes results, pictures."""
     name, seeds, logs = _model_name(order), order.seeds, order.out / "logs"
-    model, world = open_model(name), load_world(order.world)
+    model, world = open_model(name), load_worlds(order.world)
     places, evaluated = _places(order, model, say), []
     for policy in order.policies:
         runs = {}
@@ -169,7 +169,7 @@ def _places(order: EvaluationOrder, model: SimulatorModel, say: Say) -> Sequence
 
 
 def judged(
-    policy: str, runs: Mapping[str, Sequence[Episode]], model: SimulatorModel, world: World,
+    policy: str, runs: Mapping[str, Sequence[Episode]], model: SimulatorModel, world: AnyWorld,
     out: Path, panels: int | None = None,
 ) -> Evaluated:  # fmt: skip
     """Judges the runs of a policy by place, and draws their first episodes into a folder."""
@@ -245,7 +245,7 @@ def drive_vehicle(
     """
     policy = order.policies[0]
     name, namespace = order.model or robot_of(policy), options.get("namespace", "")
-    model, world = open_model(name), load_world(order.world)
+    model, world = open_model(name), load_worlds(order.world)
     open_policy(policy, model)  # a misfit is an error before anything moves
     from nics_drl_bridge.nodes.listen import listen
 

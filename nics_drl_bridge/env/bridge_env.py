@@ -20,7 +20,7 @@ from nics_drl_bridge.lidar.sensor import unread
 from nics_drl_bridge.random_kernels import episode_seed
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.scenes import Scene, sample_scene
-from nics_drl_bridge.sim.world import World, load_world
+from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 Array = NDArray[np.float64]
 RENDER_FPS = 10
@@ -95,7 +95,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
 
     def __init__(
         self, backend: str | Backend = "sim", model: str | SimulatorModel = "ackermann",
-        world: str | World = "arena", task: str | type[Task] | Task = "navigation",
+        world: str | AnyWorld = "arena", task: str | type[Task] | Task = "navigation",
         task_options: dict[str, Any] | None = None, estimator: bool | None = None,
         backend_options: dict[str, Any] | None = None,
         randomisation: str | Randomisation | None = None, render_mode: str | None = None,
@@ -103,7 +103,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         check_render_mode(render_mode, self.metadata)
         self.render_mode = render_mode
         self.model = open_model(model) if isinstance(model, str) else model
-        self.world = load_world(world) if isinstance(world, str) else world
+        self.world = load_worlds(world) if isinstance(world, str) else world
         self.task = make_task(task, self.model, task_options)
         self.robots = self.task.robots
         self.observation_space = team_space(self.task.observation_space, self.robots)
@@ -256,7 +256,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         facts = self._backend.facts()
         poses = np.reshape(facts.get("true_pose", self._view.pose), (self.robots, 3))
         bodies = facts.get("bodies", self.scene.bodies)
-        return self._picture.draw(poses, self._view.ranges[0], bodies, self.memory)
+        shown = poses, self._view.ranges[0], bodies, self.memory
+        return self._picture.draw(*shown, int(np.asarray(self.scene.member)))
 
     @halts_on_error
     def close(self) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE
-from nics_drl_bridge.sim.world import World
+from nics_drl_bridge.sim.world_set import AnyWorld
 
 Array = NDArray[np.float64]
 SIZE_IN, DPI, MARGIN = 5.0, 100, 0.05
@@ -25,7 +25,7 @@ ROBOTS = ("#1f6fb2", "#2f855a", "#7a4fa3", "#b7791f", "#0f766e", "#9d174d")
 class WorldPicture:
     """Picture of a world, redrawn at every step: `rgb_array`, or `human` in a window."""
 
-    def __init__(self, model: SimulatorModel, world: World, mode: str, fps: int) -> None:
+    def __init__(self, model: SimulatorModel, world: AnyWorld, mode: str, fps: int) -> None:
         self._model, self._world = model, world
         self._human, self._pause_s = mode == "human", 1.0 / fps
         low, high = np.array(world.extent).reshape(2, 2)
@@ -41,16 +41,24 @@ class WorldPicture:
         self._axes = self._figure.add_axes((0.0, 0.0, 1.0, 1.0))
 
     def draw(
-        self, poses: Array, ranges: NDArray[Any], bodies: Array, memory: dict[str, NDArray[Any]]
+        self,
+        poses: Array,
+        ranges: NDArray[Any],
+        bodies: Array,
+        memory: dict[str, NDArray[Any]],
+        member: int = 0,
     ) -> NDArray[np.uint8] | None:
-        """Draws robots (M, 3), scans (M, B), bodies (K, 7), goals; pixels unless `human`."""
+        """Draws robots (M, 3), scans (M, B), bodies (K, 7), goals; pixels unless `human`.
+
+        All in the world `member` of a set.
+        """
         axes = self._axes
         axes.clear()
         axes.set_axis_off()
         axes.set_aspect("equal")
         axes.set_xlim(self._low[0], self._high[0])
         axes.set_ylim(self._low[1], self._high[1])
-        draw_world(axes, self._world, bodies)
+        draw_world(axes, self._world, bodies, member)
         for goal in np.reshape(memory.get("goal", np.zeros((0, 2))), (-1, 2)):
             axes.plot(*goal, marker="*", color=GOAL, markersize=16, markeredgecolor=WALL)
         for m, (pose, scan) in enumerate(zip(poses, ranges, strict=True)):
@@ -95,21 +103,22 @@ class WorldPicture:
             plt.close(self._figure)
 
 
-def draw_world(axes: Axes, world: World, bodies: NDArray[np.float64]) -> None:
+def draw_world(axes: Axes, world: AnyWorld, bodies: NDArray[np.float64], member: int = 0) -> None:
     """Draws map, walls and obstacles (K, 7), see `sim.scenes.Scene`; x and y in `map` [m]."""
-    if (grid := world.grid) is not None:
+    place = world.members[member]
+    if (grid := place.grid) is not None:
         edges = np.indices((grid.cells.shape[0] + 1, grid.cells.shape[1] + 1)) - 0.5
         x, y = np.moveaxis(grid.cell_to_world(np.moveaxis(edges, 0, -1)), -1, 0)
         shade = np.where(grid.free, 1.0, np.where(grid.blocked, 0.2, 0.8))
         axes.pcolormesh(x, y, shade, cmap="gray", vmin=0.0, vmax=1.0, rasterized=True)
-    for x1, y1, x2, y2 in world.all_walls():
+    for x1, y1, x2, y2 in place.all_walls():
         axes.plot([x1, x2], [y1, y2], color=WALL, linewidth=2)
     for body in bodies:
         if body[RADIUS] > 0.0:
             axes.add_patch(_patch(world, body))
 
 
-def _patch(world: World, body: NDArray[np.float64]) -> Patch:
+def _patch(world: AnyWorld, body: NDArray[np.float64]) -> Patch:
     shape = world.shapes[int(body[SHAPE]) % len(world.shapes)]
     if not len(shape.outline):
         return Disc((body[0], body[1]), body[RADIUS], color=STANDING)

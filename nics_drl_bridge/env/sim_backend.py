@@ -13,7 +13,7 @@ from nics_drl_bridge.interface import NS_PER_S, Backend, BackendFacts, RobotView
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.sim.simulator import FastSimulator
-from nics_drl_bridge.sim.world import World
+from nics_drl_bridge.sim.world_set import AnyWorld
 
 Array = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ class SimBackend:
     """
 
     def __init__(
-        self, model: SimulatorModel, world: World, renderer: Renderer = "baked",
+        self, model: SimulatorModel, world: AnyWorld, renderer: Renderer = "baked",
         estimator: bool = False, robots: int = 1, **simulation: Any,
     ) -> None:  # fmt: skip
         self._robot = model.robot
@@ -153,7 +153,7 @@ def completed(backend: Any, still: Array) -> Backend:
     return CompletedBackend(backend, still)
 
 
-def make_backend(name: str, model: SimulatorModel, world: World, **options: Any) -> Any:
+def make_backend(name: str, model: SimulatorModel, world: AnyWorld, **options: Any) -> Any:
     """Makes a backend by the name under which it is registered, see `extensions`."""
     make = extensions.load("backends", name)
     try:

@@ -19,7 +19,7 @@ from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import NS_PER_S, RobotView
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.sim.simulator import FastSimulator
-from nics_drl_bridge.sim.world import World, load_world
+from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 Array = NDArray[np.float64]
 Observation = NDArray[np.float32]
@@ -64,7 +64,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
 
     def __init__(
         self, num_envs: int = 1, model: str | SimulatorModel = "ackermann",
-        world: str | World = "arena", task: str | type[Task] | Task = "navigation",
+        world: str | AnyWorld = "arena", task: str | type[Task] | Task = "navigation",
         task_options: dict[str, Any] | None = None, max_episode_steps: int = 300,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP, copy: bool = True, *,
         render_mode: str | None = None, **simulation: Any,
@@ -79,7 +79,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self._mode = MODES[mode]
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
         self.model = open_model(model) if isinstance(model, str) else model
-        self.world = load_world(world) if isinstance(world, str) else world
+        self.world = load_worlds(world) if isinstance(world, str) else world
         self.task = make_task(task, self.model, task_options)
         self.robots = self.task.robots
         self.single_observation_space = team_space(self.task.observation_space, self.robots)
@@ -274,7 +274,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         drawn, data, bodies = [], self.simulator.data, self.simulator.obstacles
         for n, picture in enumerate(self._pictures):
             memory = {name: rows[n : n + 1] for name, rows in self.memory.items()}
-            drawn.append(picture.draw(data.pose[n], data.ranges[n], bodies[n], memory))
+            shown = data.pose[n], data.ranges[n], bodies[n], memory, int(data.member[n])
+            drawn.append(picture.draw(*shown))
         return tuple(drawn)
 
     def close_extras(self, **kwargs: Any) -> None:

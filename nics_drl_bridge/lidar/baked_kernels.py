@@ -26,7 +26,6 @@ from nics_drl_bridge.lidar.exact_kernels import (
     X,
     Y,
 )  # fmt: skip
-from nics_drl_bridge.lidar.map_kernels import GridArrays
 
 ABOVE_ZERO = 2.0**24  # Added before truncation to an integer: numbers are rounded down
 PER_TURN = 0.5 / math.pi
@@ -61,7 +60,7 @@ class TableArrays(NamedTuple):
 
 
 class LidarArrays(NamedTuple):
-    """A lidar with its table, and the static map that it sees, for the kernels."""
+    """A lidar with its table, for the kernels."""
 
     mount: NDArray[np.float64]  # (3,) pose on the robot
     beams: Beams
@@ -71,8 +70,7 @@ class LidarArrays(NamedTuple):
     between: NDArray[np.float64]  # (H, 2) squares of the distances of a look-up [m^2]
     outlines: OutlineArrays  # `outlines`, `table`: of the shapes
     table: TableArrays
-    grid: GridArrays
-    exact: bool  # True if the map is scanned exactly, from cell to cell
+    exact: bool  # True if maps are scanned exactly, from cell to cell
 
 
 @kernel(inline=True)

@@ -40,7 +40,7 @@ class FurtherLidar(Sensor):
 
     def renderer(self, around: SensedWorlds) -> Render:
         """Scans bodies, walls and map like the first lidar, with this one's faults."""
-        scanner = make_scanner(self.lidar, around.shapes, around.renderer, around.grid)
+        scanner = make_scanner(self.lidar, around.shapes, around.renderer)
         state, lidar, salt = around.state, scanner.arguments, crc32(self.name.encode())
         limits = self.lidar.range_min, self.lidar.range_max
         faults = self.lidar.fault_parameters
@@ -48,7 +48,7 @@ class FurtherLidar(Sensor):
         def render(out: Readings, worlds: NDArray[np.int64]) -> None:
             lanes = scan_kernels.scan_lanes()
             scan_kernels.scan_worlds(
-                out, state.pose, worlds, state.bodies, around.first, around.walls, lidar, lanes
+                out, state.pose, worlds, state.bodies, around.first, around.standing, lidar, lanes
             )
             fault_kernels.distort_worlds(
                 out, worlds, limits, faults, state.seeds ^ salt, state.steps

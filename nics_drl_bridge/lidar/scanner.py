@@ -15,9 +15,10 @@ from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.exact_kernels import SHAPE, Beams
 from nics_drl_bridge.lidar.lookup_error import lookup_distances
-from nics_drl_bridge.lidar.maps import NO_MAP, GridMap
+from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import BODY, Shape, place
 from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.lidar.standing import standing
 from nics_drl_bridge.lidar.table import LidarTable
 
 Renderer = Literal["auto", "baked", "exact"]
@@ -43,7 +44,7 @@ class Scanner:
     spec: LidarSpec
     table: LidarTable  # of the shapes that may occur
     renderer: Renderer = "auto"
-    grid: GridMap | None = None  # a static map of every world
+    grid: GridMap | None = None  # a static map of every world that `scan` sees
 
     def __post_init__(self) -> None:
         """Raises ConfigError for an unknown renderer, ModelError for another lidar's table."""
@@ -73,8 +74,7 @@ class Scanner:
             np.array(spec.mount),
             Beams(spec.directions, spec.angle_min, spec.angle_increment, spec.full_circle),
             spec.range_min, spec.range_max, spec.sweep_time, self._looked_up(),
-            table.outlines.arguments, table.arrays,
-            NO_MAP if self.grid is None else self.grid.arrays, self.renderer == "exact",
+            table.outlines.arguments, table.arrays, self.renderer == "exact",
         )  # fmt: skip
 
     def _looked_up(self) -> Array:
@@ -118,8 +118,9 @@ class Scanner:
             out[:] = self.scan(poses, bodies, walls)
             return out
         worlds, lanes = np.arange(len(poses)), scan_kernels.scan_lanes()
+        around = standing([walls], [self.grid], np.zeros(len(poses), np.int64))
         scan_kernels.scan_worlds(
-            out[:, None], poses[:, None], worlds, bodies, -1, walls, self.arguments, lanes
+            out[:, None], poses[:, None], worlds, bodies, -1, around, self.arguments, lanes
         )
         return out
 

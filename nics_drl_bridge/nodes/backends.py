@@ -26,7 +26,7 @@ from nics_drl_bridge.nodes.executor import HANDED_OVER
 from nics_drl_bridge.nodes.link import EpisodeServices, Link
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.nodes.robot_topics import data_facts
-from nics_drl_bridge.sim.world import World
+from nics_drl_bridge.sim.world_set import AnyWorld
 
 T = TypeVar("T")
 SCAN, ODOM, TRUTH = "scan", "odom", "ground_truth"
@@ -109,7 +109,7 @@ class DdsBackend:
     """
 
     def __init__(
-        self, model: SimulatorModel, world: World, namespace: str = "",
+        self, model: SimulatorModel, world: AnyWorld, namespace: str = "",
         simulator: str = "simulator_node", timeout_s: float = 30.0, truth: bool = False,
         domain_id: int | None = None,
     ) -> None:  # fmt: skip
@@ -239,7 +239,7 @@ class FleetBackend:
     """M robots (M, ...) in lock-step with one simulator node; BackendError if one is missing."""
 
     def __init__(
-        self, model: SimulatorModel, world: World, namespaces: Sequence[str],
+        self, model: SimulatorModel, world: AnyWorld, namespaces: Sequence[str],
         simulator: str = "/simulator_node", **options: Any,
     ) -> None:  # fmt: skip
         if len(set(namespaces)) < max(2, len(namespaces)):
@@ -298,7 +298,7 @@ MODES = {"lockstep": DdsBackend, "realtime": RealtimeBackend}
 
 
 def dds_backend(
-    model: SimulatorModel, world: World, mode: str = "lockstep", robots: int = 1,
+    model: SimulatorModel, world: AnyWorld, mode: str = "lockstep", robots: int = 1,
     estimator: bool = True, randomisation: None = None, **options: Any,
 ) -> interface.Backend:  # fmt: skip
     """Returns the backend for the options; ConfigError if they do not go together, BackendError."""

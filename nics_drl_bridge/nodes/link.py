@@ -33,7 +33,7 @@ from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.runner import holds, last_word, open_context
 from nics_drl_bridge.nodes.wire import twist_to_bytes
-from nics_drl_bridge.sim.world import World
+from nics_drl_bridge.sim.world_set import AnyWorld
 
 SPIN_S, POLL_S = 0.2, 0.002
 LOST_S = 1.0  # a request to repeat data that stays unanswered for longer was itself lost [s]
@@ -199,7 +199,7 @@ class CommandTimeout:
 class EpisodeServices:
     """The services of a simulator node that begin an episode of a model in a world."""
 
-    def __init__(self, link: Link, simulator: str, model: SimulatorModel, world: World) -> None:
+    def __init__(self, link: Link, simulator: str, model: SimulatorModel, world: AnyWorld) -> None:
         self._link = link
         self._identity = {"model": model.fingerprint, "world": world.fingerprint}
         client, setting = link.node.create_client, f"{simulator}/set_parameters_atomically"

@@ -18,7 +18,7 @@ from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes.link import EpisodeServices, Link
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, data_facts, declare_sensors
 from nics_drl_bridge.nodes.runner import holds
-from nics_drl_bridge.sim.world import World
+from nics_drl_bridge.sim.world_set import AnyWorld
 
 RAW = "cmd_vel_raw"
 POLL_S, SAY_EVERY_S = 0.01, 2.0
@@ -67,7 +67,7 @@ class RealtimeBackend:
     ModelError for another model or world; StaleDataError for data older than `stale_after_s`.
     """
 
-    def __init__(self, model: SimulatorModel, world: World, **options: Any) -> None:
+    def __init__(self, model: SimulatorModel, world: AnyWorld, **options: Any) -> None:
         chosen = validate(options, RealtimeOptions, "backend_options")
         self._options, self._robot = chosen, model.robot
         self._period_ns = round((chosen.period_s or model.control_period) * NS_PER_S)

@@ -34,7 +34,7 @@ from nics_drl_bridge.nodes.conversions import sensor_to_ros, sensor_type
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, variances
 from nics_drl_bridge.sim.simulator import FastSimulator
-from nics_drl_bridge.sim.world import World, load_world
+from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 CLOCK = "/clock"
 WATCH_S, QUIET_S = 2.0, 5.0
@@ -42,7 +42,7 @@ LONGEST_TICK_S = 0.005  # longest time between two checks for delayed data that 
 
 # Makes the simulator of some robots; may declare its own parameters at the node. Its control
 # period is that of the given model.
-MakeSimulator = Callable[[Node, SimulatorModel, World, int], FastSimulator]
+MakeSimulator = Callable[[Node, SimulatorModel, AnyWorld, int], FastSimulator]
 TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 # The setting that selects the other type.
 SWITCH = {STAMPED: "enable_stamped_cmd_vel:=false", TWIST: "enable_stamped_cmd_vel:=true"}
@@ -243,7 +243,7 @@ class DeviceNode(qos.QosWatch):
         device_parameters.declare_device(self, model.lidar.frame)
         self._time = device_parameters.timing(self, model)
         self._names = device_parameters.namespaces(self)
-        world = load_world(str(self.get_parameter("world").value))
+        world = load_worlds(str(self.get_parameter("world").value))
         self._identity = {"model": model.fingerprint, "world": world.fingerprint}
         model = device_parameters.timed_model(self, model, self._time)
         simulator = make(self, model, world, len(self._names))
@@ -436,7 +436,9 @@ def declare_renderer(node: Node, default: Renderer) -> Renderer:
     return cast(Renderer, device_parameters.choice(node, "renderer", RENDERERS))
 
 
-def fast_simulator(node: Node, model: SimulatorModel, world: World, robots: int) -> FastSimulator:
+def fast_simulator(
+    node: Node, model: SimulatorModel, world: AnyWorld, robots: int
+) -> FastSimulator:
     """Makes the fast simulator, with the lidar that the parameter `renderer` names."""
     renderer, tell = declare_renderer(node, "baked"), node.get_logger().warning
     return FastSimulator(model, world, robots=robots, renderer=renderer, tell=tell)

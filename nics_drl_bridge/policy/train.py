@@ -26,7 +26,7 @@ from nics_drl_bridge.policy.train_export import export_policy
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 from nics_drl_bridge.seeds import checked_seeds
-from nics_drl_bridge.sim.world import World
+from nics_drl_bridge.sim.world_set import AnyWorld
 
 CHECKPOINT, SETTINGS = "checkpoint.pt", "settings.yaml"
 EVALUATION, POLICY = "evaluation.json", "policy.onnx"
@@ -78,7 +78,7 @@ def train(
 
 def make_train_env(
     settings: TrainingSettings, model: SimulatorModel | None = None,
-    scenes: Mapping[str, World] | None = None,
+    scenes: Mapping[str, AnyWorld] | None = None,
 ) -> TrainVecEnv:  # fmt: skip
     """Makes the worlds of the settings in one env; model and worlds may already be open."""
     model = model or open_model(settings.robot)

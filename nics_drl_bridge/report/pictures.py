@@ -16,7 +16,8 @@ from nics_drl_bridge.policy.evaluation import Episode
 from nics_drl_bridge.policy.shadow import Shadow
 from nics_drl_bridge.recording.excite import Pattern
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.sim.world import World
+from nics_drl_bridge.sim.scenes import member_of
+from nics_drl_bridge.sim.world_set import AnyWorld
 
 MEASURED, MODEL, OTHER, DARK = "#1f6fb2", "#d1495b", "#8d99ae", "#333333"
 STYLE = """
@@ -100,7 +101,7 @@ def png(figure: Figure, legend: Axes | None = None) -> bytes:
     return buffer.getvalue()
 
 
-def trajectories(runs: Mapping[str, Sequence[Episode]], world: World, footprint: float) -> bytes:
+def trajectories(runs: Mapping[str, Sequence[Episode]], world: AnyWorld, footprint: float) -> bytes:
     """Draws a panel per episode with its path in each run, of equal seeds (the paper's Fig. 7)."""
     count = max(len(episodes) for episodes in runs.values())
     columns, rows = min(count, 3), -(-count // 3)
@@ -111,9 +112,9 @@ def trajectories(runs: Mapping[str, Sequence[Episode]], world: World, footprint:
     return png(figure, grid[0])
 
 
-def _panel(axes: Axes, episodes: Mapping[str, Episode], world: World, footprint: float) -> None:
+def _panel(axes: Axes, episodes: Mapping[str, Episode], world: AnyWorld, footprint: float) -> None:
     first = next(iter(episodes.values()))
-    draw_world(axes, world, first.bodies)
+    draw_world(axes, world, first.bodies, member_of(world, first.seed))
     axes.add_patch(Circle(tuple(first.goal), 0.3, color="#f2c14e", alpha=0.7, label="goal"))
     start = Circle(tuple(first.path[0, :2]), footprint, fill=False, color=DARK, label="start")
     axes.add_patch(start)

@@ -1,24 +1,20 @@
 """Allocation of worlds, as the kernels take them: state, surroundings, and scratch memory."""
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar import scan_kernels
-from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.robot.kernels import SERIES, scratch, term_arrays
 from nics_drl_bridge.sim import state as arrays
 from nics_drl_bridge.sim.contact_kernels import FRAME, SEVERAL
 from nics_drl_bridge.sim.impact_kernels import EVENT, FLIGHT
-from nics_drl_bridge.sim.obstacles import Motion, plan_arrays
 from nics_drl_bridge.sim.sensing_kernels import PAST
 from nics_drl_bridge.sim.separation_kernels import MARK
-from nics_drl_bridge.sim.world import World
 
 SLICES = 16  # Number of groups of beams in which a skewed scan is rendered
 LANES = 256  # Number of robots moved side by side: their arrays stay in the L1 cache
@@ -65,7 +61,7 @@ def allocate(model: SimulatorModel, sizes: Sizes) -> arrays.State:
         twist=np.zeros((*shape, 3)),
         ranges=np.full((*shape, model.lidar.beams), np.inf, np.float32),
         collided=np.zeros(shape, np.uint8), steps=np.zeros(sizes.worlds, np.int64),
-        seeds=np.zeros(sizes.worlds, np.int64),
+        seeds=np.zeros(sizes.worlds, np.int64), member=np.zeros(sizes.worlds, np.int64),
         faults=np.tile(model.lidar.fault_parameters, (*shape, 1)),
         coefficient=np.tile(terms.coefficient, (*shape, 1)),
         delay=np.full(shape, delay, np.int64), age=np.zeros(shape, np.int64),
@@ -80,36 +76,15 @@ def split(worlds: int, threads: int) -> tuple[slice, ...]:
     return tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(edges))
 
 
-def map_field(grid: GridMap | None) -> arrays.MapField:
-    """Returns a static map as the kernels take it."""
-    if grid is None:
-        return arrays.NO_FIELD
-    return arrays.MapField(np.ascontiguousarray(grid.distance_field), *grid.arrays.frame.tolist())
-
-
-def surroundings(
-    world: World, motions: Sequence[Motion | None], scanner: Scanner, sizes: Sizes
-) -> arrays.Surroundings:
-    """Returns all that stands in every world, with obstacles that move by `motions` (K,)."""
-    low_x, low_y, high_x, high_y = world.extent
-    half = np.array([max(-low_x, high_x), max(-low_y, high_y)])
-    moves = any(motion is not None for motion in motions)
-    outlines = scanner.table.outlines.arguments
-    return arrays.Surroundings(
-        world.all_walls(), map_field(scanner.grid), outlines, sizes.crowded, sizes.scattered,
-        arrays.Movers(moves, *plan_arrays(motions), half),
-    )  # fmt: skip
-
-
 def part_of(
-    state: arrays.State, scene: arrays.Surroundings, model: SimulatorModel, scanner: Scanner,
+    state: arrays.State, members: arrays.Members, model: SimulatorModel, scanner: Scanner,
     sizes: Sizes, part: slice,
 ) -> arrays.Part:  # fmt: skip
     """Returns the arguments of the kernels for one part of the worlds, with scratch of its own."""
     dt, substeps, _ = model.timing
     motion = arrays.Dynamics(term_arrays(model.kinematics), SERIES, float(dt), int(substeps))
     own = _scratch(model, scanner, sizes, part.stop - part.start)
-    return arrays.Part(state, scene, scanner.arguments, motion, own)
+    return arrays.Part(state, members, scanner.arguments, motion, own)
 
 
 def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int) -> arrays.Scratch:

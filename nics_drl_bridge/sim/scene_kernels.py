@@ -383,6 +383,14 @@ def _place_robots(seed, counter, plan, bodies, starts, goals, scratch):  # type:
 
 
 @kernel
+def choose_members(seeds, members, out):  # type: ignore[no-untyped-def]
+    """Writes the index of the world of each seed (n,) among the members of a set."""
+    for n in range(seeds.shape[0]):
+        share = random.uniform(seeds[n], random.MEMBER_STREAM, 0)
+        out[n] = min(int(share * members), members - 1)
+
+
+@kernel
 def draw_scenes(seeds, wanted, sizes, plan, bodies, starts, goals, scratch):  # type: ignore[no-untyped-def]
     """Draws the scenes of some seeds (n,) to bodies (n, K, 7), starts (n, M, 3), goals (n, M, 2).
 

@@ -11,6 +11,7 @@ from pydantic import ValidationError
 from scipy import ndimage
 
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.lidar.exact_kernels import SHAPE
 from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
 from nics_drl_bridge.lidar.shapes import BODY, LARGEST, SMALLEST, Circle, Outlines, Shape, describe
 from nics_drl_bridge.seeds import checked_seeds
@@ -19,8 +20,9 @@ from nics_drl_bridge.sim.obstacles import Motion
 from nics_drl_bridge.sim.scene_kernels import FreeSpace, ScenePlan, SceneScratch
 from nics_drl_bridge.sim.state import NO_FIELD, MapField
 from nics_drl_bridge.sim.world import Goals, Starts, World, check_places
+from nics_drl_bridge.sim.world_set import AnyWorld
 
-__all__ = ["Scene", "SceneSampler", "Scenes", "sample_scene", "scaled"]
+__all__ = ["Scene", "SceneSampler", "Scenes", "SetSampler", "sample_scene", "scaled"]
 Array = NDArray[np.float64]
 CELL = 0.1  # Side of cells without a map [m]; larger in large fields, smaller in small ones
 FEWEST_CELLS = 20
@@ -29,21 +31,24 @@ MOST_CELLS = 4_000_000
 
 @dataclass(frozen=True)
 class Scene:
-    """Scene of one seed in a world."""
+    """Scene of one seed in a world, or in one of a set."""
 
-    bodies: Array  # (K, 7) obstacles, see `shapes.place`; shapes are of `SceneSampler.shapes`
+    bodies: Array  # (K, 7) obstacles, see `shapes.place`; shapes are of the sampler's `shapes`
     starts: Array  # (M, 3) pose of each robot
     goals: Array  # (M, 2) position of each goal [m]
+    member: ArrayLike = 0  # index of its world in the set
 
 
 class Scenes(Scene):
-    """Scenes of n seeds in a world, arrays (n, ...) as in `Scene`; `scenes[i]` is that of one."""
+    """Scenes of n seeds, arrays (n, ...) as in `Scene`; `scenes[i]` is that of one."""
+
+    member: NDArray[np.int64]
 
     def __len__(self) -> int:
         return len(self.bodies)
 
     def __getitem__(self, row: int) -> Scene:
-        return Scene(self.bodies[row], self.starts[row], self.goals[row])
+        return Scene(self.bodies[row], self.starts[row], self.goals[row], int(self.member[row]))
 
     def __iter__(self) -> Iterator[Scene]:
         return (self[row] for row in range(len(self)))
@@ -89,7 +94,7 @@ class SceneSampler:
         if n and not 0 <= sizes.min() <= sizes.max() < self._sizes:
             raise ConfigError(f"size must be from 0 to {self._sizes - 1}.")
         bodies, starts = np.zeros((n, self.count, BODY)), np.zeros((n, self.robots, 3))
-        scenes = Scenes(bodies, starts, np.zeros((n, self.robots, 2)))
+        scenes = Scenes(bodies, starts, np.zeros((n, self.robots, 2)), np.zeros(n, np.int64))
         try:
             scratch = self._scratches.pop()  # threads may draw at the same time
         except IndexError:
@@ -118,12 +123,59 @@ class SceneSampler:
         )
 
 
-def sample_scene(world: World, footprint: float, seed: int, robots: int = 1) -> Scene:
+class SetSampler:
+    """Draws scenes of a world, or of the worlds of a set: a seed has its world, and a scene there.
+
+    Arguments and errors are those of `SceneSampler`; so are the scenes of each member.
+    """
+
+    def __init__(
+        self, world: AnyWorld, footprint_radius: float, robots: int = 1,
+        sizes: Sequence[float] = (1.0,), most: int | None = None,
+    ) -> None:  # fmt: skip
+        given = footprint_radius, robots, sizes, most
+        self.samplers = [SceneSampler(member, *given) for member in world.members]
+        self.robots, self.count = robots, max(each.count for each in self.samplers)
+        self.shapes = tuple(scaled(shape, size) for size in sizes for shape in world.shapes)
+        first = np.arange(len(sizes))[:, None] * len(world.shapes)
+        own = ([world.shapes.index(one) for one in each.shapes] for each in world.members)
+        self._index = [(first + np.array(each, np.int64)).ravel() for each in own]
+
+    def draw(
+        self, seeds: ArrayLike, count: ArrayLike | None = None, size: ArrayLike | None = None
+    ) -> Scenes:
+        """Draws the scenes of seeds (n,), see `SceneSampler.draw`; K is the most of all members."""
+        if len(self.samplers) == 1:
+            return self.samplers[0].draw(seeds, count, size)
+        numbers = checked_seeds(seeds)
+        n = len(numbers)
+        bodies, starts = np.zeros((n, self.count, BODY)), np.zeros((n, self.robots, 3))
+        scenes = Scenes(bodies, starts, np.zeros((n, self.robots, 2)), np.zeros(n, np.int64))
+        kernels.choose_members(numbers, len(self.samplers), scenes.member)
+        each = [None if one is None else np.asarray(one) for one in (count, size)]
+        for p in np.unique(scenes.member).tolist():
+            rows = np.flatnonzero(scenes.member == p)
+            some = (None if one is None else one[rows] for one in each)
+            drawn = self.samplers[p].draw(numbers[rows], *some)
+            drawn.bodies[..., SHAPE] = self._index[p][drawn.bodies[..., SHAPE].astype(np.int64)]
+            bodies[rows, : drawn.bodies.shape[1]] = drawn.bodies
+            starts[rows], scenes.goals[rows] = drawn.starts, drawn.goals
+        return scenes
+
+
+def member_of(world: AnyWorld, seed: int) -> int:
+    """Returns the index of the world of a set in which the scene of a seed is."""
+    chosen = np.zeros(1, np.int64)
+    kernels.choose_members(checked_seeds(seed), len(world.members), chosen)
+    return int(chosen[0])
+
+
+def sample_scene(world: AnyWorld, footprint: float, seed: int, robots: int = 1) -> Scene:
     """Draws the scene of a seed for M robots of a radius [m]; identical in every process."""
     return _sampler(world, footprint, robots).draw([seed])[0]
 
 
-_sampler = lru_cache(maxsize=16)(SceneSampler)
+_sampler = lru_cache(maxsize=16)(SetSampler)
 
 
 def scaled(shape: Shape, factor: float) -> Shape:

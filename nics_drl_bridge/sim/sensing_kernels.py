@@ -11,9 +11,10 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import fault_kernels, scan_kernels
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, X, Y
+from nics_drl_bridge.lidar.standing import standing_around
 from nics_drl_bridge.robot.kernels import move, wrap
 from nics_drl_bridge.sim import contact_kernels as contacts
-from nics_drl_bridge.sim.state import Array, Dynamics, Scratch, State, Surroundings
+from nics_drl_bridge.sim.state import Array, Dynamics, Members, Scratch, State
 
 POSE, TWIST, ODOM, MEASURED, PAST = 0, 3, 6, 9, 12  # Columns of `past`
 
@@ -124,16 +125,16 @@ def drift_of(n: int, m: int, state: State, period: float) -> tuple[float, float,
 
 @kernel(inline=True)
 def scan_or_wait(
-    n: int, waiting: int, state: State, scene: Surroundings, lidar: LidarArrays, motion: Dynamics,
+    n: int, waiting: int, state: State, members: Members, lidar: LidarArrays, motion: Dynamics,
     scratch: Scratch,
 ) -> int:  # fmt: skip
     """Scans world n, unless `scan_together` can; returns how many worlds now wait for it."""
-    alone = scene.scattered
+    alone = members.scattered
     for m in range(state.age.shape[1]):  # a scan that is not of a robot's present pose
         alone = alone or state.age[n, m] > 0 or state.faults[n, m, fault_kernels.SKEW] != 0.0
     if alone:
         for m in range(state.pose.shape[1]):
-            _scan_alone(n, m, state, scene, lidar, motion, scratch)
+            _scan_alone(n, m, state, members, lidar, motion, scratch)
         return waiting
     scratch.scans.waiting[waiting] = n
     return waiting + 1
@@ -141,13 +142,13 @@ def scan_or_wait(
 
 @kernel
 def scan_together(
-    waiting: int, state: State, scene: Surroundings, lidar: LidarArrays, scratch: Scratch
+    waiting: int, state: State, members: Members, lidar: LidarArrays, scratch: Scratch
 ) -> None:
     """Scans the first `waiting` worlds of the list in the scratch memory, as they stand."""
     scans = scratch.scans
     chosen, first = scans.waiting[:waiting], state.velocity.shape[1]
     scan_kernels.scan_worlds(
-        state.ranges, state.pose, chosen, state.bodies, first, scene.walls, lidar, scans.lookup
+        state.ranges, state.pose, chosen, state.bodies, first, members.standing, lidar, scans.lookup
     )
 
 
@@ -165,7 +166,7 @@ def distort(low: int, high: int, state: State, lidar: LidarArrays) -> None:
 
 @kernel
 def _scan_alone(
-    n: int, m: int, state: State, scene: Surroundings, lidar: LidarArrays, motion: Dynamics,
+    n: int, m: int, state: State, members: Members, lidar: LidarArrays, motion: Dynamics,
     scratch: Scratch,
 ) -> None:  # fmt: skip
     scans, beams = scratch.scans, state.ranges.shape[2]
@@ -177,10 +178,11 @@ def _scan_alone(
     reach = lidar.range_max + math.hypot(lidar.mount[0], lidar.mount[1])
     if skew != 0.0:
         reach += math.hypot(drive[0], drive[1]) * lidar.sweep_time
-    count = _gather(n, m, lag, reach, state, scene, motion, scratch)
+    count = _gather(n, m, lag, reach, state, members, motion, scratch)
     seen = scans.seen[:count].reshape((1, count, 7))
     begin = (n * state.ranges.shape[1] + m) * beams
     scan = state.ranges.reshape(-1)[begin : begin + beams].reshape((1, 1, beams))
+    around = standing_around(n, members.standing)
     groups = 1 if skew == 0.0 else scans.slices.shape[0]
     if groups > 1:
         fault_kernels.slice_poses(scans.slices, spot[0, 0], drive, lidar.sweep_time, skew)
@@ -188,21 +190,21 @@ def _scan_alone(
         out = scan if groups == 1 else scans.part
         for i in range(3 if groups > 1 else 0):
             spot[0, 0, i] = scans.slices[g, i]
-        scan_kernels.scan_worlds(out, spot, scans.none, seen, -1, scene.walls, lidar, scans.lookup)
+        scan_kernels.scan_worlds(out, spot, scans.none, seen, -1, around, lidar, scans.lookup)
         for i in range(g * beams // groups, (g + 1) * beams // groups if groups > 1 else 0):
             scan[0, 0, i] = scans.part[0, 0, i]
 
 
 @kernel
 def _gather(
-    n: int, m: int, lag: int, reach: float, state: State, scene: Surroundings, motion: Dynamics,
+    n: int, m: int, lag: int, reach: float, state: State, members: Members, motion: Dynamics,
     scratch: Scratch,
 ) -> int:  # fmt: skip
     """Copies the bodies around `spot`, as they were `lag` substeps ago; returns their number."""
     scans, cells, bodies, velocity = scratch.scans, scratch.cells, state.bodies, state.velocity
     spot = scans.spot[0, 0]
     first, several = velocity.shape[1], bodies.shape[1]
-    in_cells = scene.scattered and lag == 0  # the cells are of this period
+    in_cells = members.scattered and lag == 0  # the cells are of this period
     if in_cells:
         several = contacts.bodies_around(spot[0], spot[1], reach, cells)
     count, ago = 0, lag * motion.dt

@@ -19,10 +19,12 @@ from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.sim import step_kernels
-from nics_drl_bridge.sim.allocation import Sizes, allocate, part_of, split, surroundings
+from nics_drl_bridge.sim.allocation import Sizes, allocate, part_of, split
+from nics_drl_bridge.sim.members import members_of
 from nics_drl_bridge.sim.randomisation import Draws, Randomisation, Sampler, load_randomisation
-from nics_drl_bridge.sim.scenes import Scenes, SceneSampler
-from nics_drl_bridge.sim.world import World
+from nics_drl_bridge.sim.scenes import Scenes, SetSampler
+from nics_drl_bridge.sim.state import Members
+from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.threads import run_parts
 
 Array = NDArray[np.float64]
@@ -84,7 +86,7 @@ class CommandBox:
             self._tell(f"{found}: its motion there is extrapolated; record a drive that covers it.")
 
 
-def _check_speed(model: TaylorModel, robot: RobotSpec, world: World) -> None:
+def _check_speed(model: TaylorModel, robot: RobotSpec, world: AnyWorld) -> None:
     """Raises ConfigError if a robot could cross a whole world in one step of its kinematics."""
     first = len(robot.state)
     most = np.maximum(np.abs(model.low), np.abs(model.high))
@@ -93,16 +95,17 @@ def _check_speed(model: TaylorModel, robot: RobotSpec, world: World) -> None:
     most[first:] = np.maximum(most[first:], limits)
     products = np.prod(most**model.powers, axis=1)
     step = float((np.abs(model.coefficients[:2]) @ products).max() * model.dt)
-    x1, y1, x2, y2 = world.extent
-    if not step < (least := min(x2 - x1, y2 - y1)):
+    sides = np.array([member.extent for member in world.members]).reshape(-1, 2, 2)
+    if not step < (least := float(np.diff(sides, axis=1).min())):
         drives = f"could drive {step:.3g} m in a step of {model.dt:g} s, across {least:.3g} m"
         fix = "lower the limits of its commands, or generate its model with a shorter step."
         raise ConfigError(f"the robot {robot.name!r} {drives} of world; {fix}")
 
 
-def _check_memory(model: SimulatorModel, world: World, worlds: int, robots: int) -> None:
+def _check_memory(model: SimulatorModel, world: AnyWorld, worlds: int, robots: int) -> None:
     """Raises ConfigError for more copies of a world than fit in memory, before any allocation."""
-    obstacles = sum(group.counts[1] for group in world.obstacles)
+    counts = (sum(group.counts[1] for group in one.obstacles) for one in world.members)
+    obstacles = max(counts)
     each = robots * (model.lidar.beams + PER_BODY) + obstacles * PER_BODY
     if robots > MOST_ROBOTS or worlds * each > MOST_NUMBERS:
         raise ConfigError(
@@ -112,7 +115,7 @@ def _check_memory(model: SimulatorModel, world: World, worlds: int, robots: int)
 
 
 class FastSimulator:
-    """The simulator that a SimulatorModel describes, in a world.
+    """The simulator that a SimulatorModel describes, in a world, or in those of a set.
 
     A world is bit-identical in any batch and any number of threads. Its M robots scan and hit each
     other. The renderer is `auto`, `baked` or `exact`, see `lidar.scanner.Scanner`; `threads` parts
@@ -124,7 +127,7 @@ class FastSimulator:
     """
 
     def __init__(
-        self, model: SimulatorModel, world: World, worlds: int = 1, robots: int = 1,
+        self, model: SimulatorModel, world: AnyWorld, worlds: int = 1, robots: int = 1,
         renderer: Renderer = "auto", threads: int = 1,
         randomisation: str | Randomisation | None = None, longest_delay: int | None = None,
         longest_age: int = 0, tell: Callable[[str], None] = warn,
@@ -152,11 +155,11 @@ class FastSimulator:
         sizes = (1.0,) if randomisation is None else randomisation.sizes
         counts = None if randomisation is None else randomisation.obstacles.count
         most = None if counts is None else counts[1]
-        self.sampler = SceneSampler(world, self._footprint.radius, robots, sizes, most)
+        self.sampler = SetSampler(world, self._footprint.radius, robots, sizes, most)
         shapes = (*self.sampler.shapes, self._footprint)
         table = with_shapes(model.lidar, model.table, shapes)
         self._in_table = np.array([table.outlines.index_of(shape) for shape in shapes])
-        self._scanner = Scanner(model.lidar, table, renderer, world.grid)
+        self._scanner = Scanner(model.lidar, table, renderer)
         self._sizes = Sizes(worlds, robots, self.sampler.count, delay, longest_age)
         self.data = allocate(model, self._sizes)
         # Name of a further sensor -> (N, M, S) its readings, see `lidar.sensor`.
@@ -166,21 +169,27 @@ class FastSimulator:
         self._boxes = {part.start: CommandBox(*known) for part in self.parts}
 
     @cached_property
+    def _members(self) -> Members:
+        motions = [each.motions for each in self.sampler.samplers]
+        outlines = self._scanner.table.outlines.arguments
+        crowds = self._sizes.crowded, self._sizes.scattered
+        return members_of(self.world.members, motions, outlines, crowds, self.data.member)
+
+    @cached_property
     def packed(self) -> dict[int, Any]:
         """Packed arguments of the kernels, by the first world of each part."""
-        scene = surroundings(self.world, self.sampler.motions, self._scanner, self._sizes)
-        of = (self.data, scene, self.model, self._scanner, self._sizes)
+        of = (self.data, self._members, self.model, self._scanner, self._sizes)
         return {part.start: step_kernels.pack(part_of(*of, part)) for part in self.parts}
 
     def __getstate__(self) -> dict[str, Any]:  # a copy rebuilds the rest
-        rebuilt = ("packed", "_renders")
+        rebuilt = ("_members", "packed", "_renders")
         return {name: value for name, value in vars(self).items() if name not in rebuilt}
 
     @cached_property
     def _renders(self) -> dict[str, Render]:
         around = SensedWorlds(
-            self.data, self._scanner.table.shapes, self.sampler.count, self.world.all_walls(),
-            self.world.grid, self._scanner.renderer,
+            self.data, self._scanner.table.shapes, self.sampler.count, self._members.standing,
+            self._scanner.renderer,
         )  # fmt: skip
         return {sensor.name: sensor.renderer(around) for sensor in self.model.sensors}
 
@@ -238,7 +247,7 @@ class FastSimulator:
         data.pose[chosen], data.odom[chosen] = starts, starts
         for name in ("state", "history", "twist", "collided", "steps", "velocity"):
             getattr(data, name)[chosen] = 0
-        data.seeds[chosen] = seeds
+        data.seeds[chosen], data.member[chosen] = seeds, scenes.member
         bodies = scenes.bodies.copy()
         bodies[..., SHAPE] = self._in_table[bodies[..., SHAPE].astype(np.int64)]
         footprints = place(starts, self._footprint.radius, self._in_table[-1])

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.lidar.scan_kernels import ScanLanes
+from nics_drl_bridge.lidar.standing import Standing
 from nics_drl_bridge.robot.kernels import Terms
 
 Array = NDArray[np.float64]
@@ -31,6 +32,7 @@ class State(NamedTuple):
     collided: NDArray[np.uint8]  # (N, M) 1 once a robot has touched something
     steps: Integers  # (N,) control periods since the reset
     seeds: Integers  # (N,) of the episode
+    member: Integers  # (N,) world of a set in which the episode is
     faults: Array  # (N, M, P) of each robot's lidar, columns as in `lidar.fault_kernels`
     coefficient: Array  # (N, M, T), in the order of `robot.kernels.term_arrays`
     delay: Integers  # (N, M) common latency of the commands [substeps], at most `longest_delay`
@@ -66,7 +68,7 @@ class Movers(NamedTuple):
 
 
 class Surroundings(NamedTuple):
-    """Everything that stands in every world, and how its bodies are searched."""
+    """Everything that stands in one world, and how its bodies are searched."""
 
     walls: Array  # (W, 4) x1, y1, x2, y2 [m]
     grid: MapField
@@ -74,6 +76,21 @@ class Surroundings(NamedTuple):
     crowded: bool  # True if the bodies of a world are sorted into cells
     scattered: bool  # True if scans use the cells too
     movers: Movers
+
+
+class Members(NamedTuple):
+    """The surroundings of P worlds, one after the other; see `members.surroundings_of`."""
+
+    standing: Standing
+    distances: NDArray[np.float32]  # of all maps, see `MapField`
+    fields: Integers  # (P, 3) first distance, rows and columns of each map
+    outlines: OutlineArrays
+    crowded: bool  # `crowded`, `scattered`, `moves`: as in `Surroundings` and `Movers`
+    scattered: bool
+    moves: bool
+    plans: Array  # (P, K, L)
+    waypoints: Array  # (Q, 2) of all patrols in all worlds [m]
+    half: Array  # (P, 2)
 
 
 class Dynamics(NamedTuple):
@@ -156,7 +173,7 @@ class Part(NamedTuple):
     """Everything that the kernels need to step the worlds of one part."""
 
     state: State
-    scene: Surroundings
+    members: Members
     lidar: LidarArrays
     motion: Dynamics
     scratch: Scratch

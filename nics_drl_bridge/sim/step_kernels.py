@@ -18,11 +18,13 @@ from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import obstacle_kernels as obstacles
 from nics_drl_bridge.sim import sensing_kernels as sensing
 from nics_drl_bridge.sim.careful_kernels import drift_carefully, move_carefully, rates_at
+from nics_drl_bridge.sim.members import surroundings_of
 from nics_drl_bridge.sim.state import (
     Array,
     Dynamics,
     Integers,
     Lanes,
+    Members,
     Part,
     Scratch,
     State,
@@ -136,12 +138,12 @@ def _move_world(
 def step_worlds(packed: Any, commands: Array, begin: int) -> None:
     """Steps the worlds of a part, from `begin` on, under commands (n, M, C) for a period."""
     part = packed.part
-    _step(part.state, part.scene, part.lidar, part.motion, part.scratch, commands, begin)
+    _step(part.state, part.members, part.lidar, part.motion, part.scratch, commands, begin)
 
 
 @kernel
 def _step(
-    state: State, scene: Surroundings, lidar: LidarArrays, motion: Dynamics, scratch: Scratch,
+    state: State, members: Members, lidar: LidarArrays, motion: Dynamics, scratch: Scratch,
     commands: Array, begin: int,
 ) -> None:  # fmt: skip
     """See `step_worlds`; without reference counts, which took longer than the step."""
@@ -150,22 +152,22 @@ def _step(
     block = scratch.lanes.pose.shape[1] // many
     for low in range(begin, end, block):
         high = min(low + block, end)
-        _begin_period(low, high, state, scene, motion, scratch)
+        _begin_period(low, high, state, members, motion, scratch)
         move_freely(low, high, state, motion, scratch.lanes)
         waiting = np.int64(0)
         for n in range(low, high):
             state.steps[n] += 1
-            skip = (n - low) * many
+            skip, scene = (n - low) * many, surroundings_of(n, members)
             _move_world(n, skip, state, scene, motion, scratch)
             _measure(n, skip, state, motion, scratch)
-            waiting = sensing.scan_or_wait(n, waiting, state, scene, lidar, motion, scratch)
-        sensing.scan_together(waiting, state, scene, lidar, scratch)
+            waiting = sensing.scan_or_wait(n, waiting, state, members, lidar, motion, scratch)
+        sensing.scan_together(waiting, state, members, lidar, scratch)
         sensing.distort(low, high, state, lidar)
 
 
 @kernel(inline=True)
 def _begin_period(
-    low: int, high: int, state: State, scene: Surroundings, motion: Dynamics, scratch: Scratch
+    low: int, high: int, state: State, members: Members, motion: Dynamics, scratch: Scratch
 ) -> None:
     pose, before, speeds = state.pose, scratch.scans.before, scratch.nearby.speeds
     for n in range(low, high):
@@ -174,12 +176,13 @@ def _begin_period(
             before[i, 0], before[i, 1], before[i, 2] = pose[n, m, 0], pose[n, m, 1], pose[n, m, 2]
             if state.steps[n] == 0:
                 sensing.begin(n, m, state)
-            if scene.movers.moves:
+            if members.moves:
                 twist = state.past[n, m, row, sensing.TWIST : sensing.TWIST + 2]
                 c, s = math.cos(pose[n, m, 2]), math.sin(pose[n, m, 2])
                 speeds[m, 0] = c * twist[0] - s * twist[1]
                 speeds[m, 1] = s * twist[0] + c * twist[1]
-        if scene.movers.moves:
+        if members.moves:
+            scene = surroundings_of(n, members)
             obstacles.steer(n, state, scene, motion.dt * motion.substeps, speeds)
 
 
@@ -203,9 +206,10 @@ def begin(packed: Any, chosen: Integers) -> None:
     state, waiting = part.state, part.scratch.scans.waiting
     for i in range(chosen.shape[0]):
         waiting[i] = chosen[i]
-        if part.scene.movers.moves:
-            obstacles.begin(chosen[i], state, part.scene.movers.plans)
-    sensing.scan_together(chosen.shape[0], state, part.scene, part.lidar, part.scratch)
+        if part.members.moves:
+            plans = surroundings_of(chosen[i], part.members).movers.plans
+            obstacles.begin(chosen[i], state, plans)
+    sensing.scan_together(chosen.shape[0], state, part.members, part.lidar, part.scratch)
     for n in chosen:
         sensing.distort(n, n + 1, state, part.lidar)
 
@@ -214,7 +218,8 @@ def begin(packed: Any, chosen: Integers) -> None:
 def begin_period(packed: Any) -> None:
     """Begins a period of worlds whose robots are moved from outside, from where they stand."""
     part = packed.part
-    _begin_period(0, part.state.pose.shape[0], part.state, part.scene, part.motion, part.scratch)
+    count = part.state.pose.shape[0]
+    _begin_period(0, count, part.state, part.members, part.motion, part.scratch)
 
 
 @kernel(allocates=True)
@@ -225,7 +230,7 @@ def end_period(packed: Any, true: Array, before: Array, wheels: Array, counted: 
     the end, the pose by the wheels alone before and after, and the twist by the wheels at the end.
     """
     part = packed.part
-    state, scene, motion, scratch = part.state, part.scene, part.motion, part.scratch
+    state, members, motion, scratch = part.state, part.members, part.motion, part.scratch
     first, waiting = state.velocity.shape[1], 0
     for n in range(state.pose.shape[0]):
         state.steps[n] += 1
@@ -236,10 +241,10 @@ def end_period(packed: Any, true: Array, before: Array, wheels: Array, counted: 
             for i in range(3):  # the pose by the wheels is not where the lidar is
                 row[m, sensing.POSE + i] = state.pose[n, m, i]
                 row[m, sensing.TWIST + i] = true[n, m, i]
-        if scene.crowded:
+        if members.crowded:
             contacts.sort_bodies(state.bodies, n, scratch.cells)
-        waiting = sensing.scan_or_wait(n, waiting, state, scene, part.lidar, motion, scratch)
-    sensing.scan_together(waiting, state, scene, part.lidar, scratch)
+        waiting = sensing.scan_or_wait(n, waiting, state, members, part.lidar, motion, scratch)
+    sensing.scan_together(waiting, state, members, part.lidar, scratch)
     sensing.distort(0, state.pose.shape[0], state, part.lidar)
 
 

@@ -115,6 +115,11 @@ class World(Schema):
         return self
 
     @property
+    def members(self) -> tuple[World, ...]:
+        """The world itself, as the only one of its set."""
+        return (self,)
+
+    @property
     def source(self) -> str:
         """Name of the world in error messages: its file, or its name."""
         return self._file or f"world {self.name!r}"

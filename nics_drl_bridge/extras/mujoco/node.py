@@ -11,11 +11,11 @@ from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.nodes.runner import declare, run_node
 from nics_drl_bridge.nodes.simulator_node import DeviceNode, declare_renderer
-from nics_drl_bridge.sim.world import World
+from nics_drl_bridge.sim.world_set import AnyWorld
 
 
 def mujoco_simulator(
-    node: Node, model: SimulatorModel, world: World, robots: int
+    node: Node, model: SimulatorModel, world: AnyWorld, robots: int
 ) -> MujocoSimulator:
     """Makes robots in MuJoCo, with the lidar and the floor that the parameters name."""
     renderer = declare_renderer(node, "exact")

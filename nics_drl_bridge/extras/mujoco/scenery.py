@@ -11,7 +11,7 @@ from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import Circle, Rectangle, Segment, Shape, convex_hull
-from nics_drl_bridge.sim.scenes import SceneSampler
+from nics_drl_bridge.sim.obstacles import Motion
 from nics_drl_bridge.sim.world import World
 
 HEIGHT = 0.5  # height of walls and obstacles [m]
@@ -29,9 +29,9 @@ def prefix_of(robot: int) -> str:
 
 def compile_scene(
     mujoco: Any, machine: Machine, physics: Physics, footprint: Shape, robots: int, world: World,
-    sampler: SceneSampler, bodies: Array,
+    motions: Sequence[Motion | None], shapes: Sequence[Shape], bodies: Array,
 ) -> Any:  # fmt: skip
-    """Compiles robots of one kind in a world; bodies (K, 7) that move have prescribed poses."""
+    """Compiles robots of one kind in a world; those of its bodies (K, 7) that move are mocaps."""
     spec = mujoco.MjSpec.from_string(machine.xml)
     maker = _Maker(mujoco, spec, physics)
     maker.bumper(spec.body("base_link"), footprint)
@@ -46,8 +46,8 @@ def compile_scene(
         maker.map(world.grid)
     for k, body in enumerate(bodies):
         if body[RADIUS] > 0.0:
-            moves = sampler.motions[k] is not None
-            maker.obstacle(k, sampler.shapes[int(body[SHAPE])], body[:3], moves)
+            moves = motions[k] is not None
+            maker.obstacle(k, shapes[int(body[SHAPE])], body[:3], moves)
     return spec.compile()
 
 

@@ -20,7 +20,7 @@ from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import DrivenSimulator
 from nics_drl_bridge.sim.scenes import Scenes
-from nics_drl_bridge.sim.world import World
+from nics_drl_bridge.sim.world_set import AnyWorld
 
 ENCODER_PERIOD_S = 0.01  # approximate period of encoder readings and of updates of moving obstacles
 LARGEST_TILT_RAD = 0.5
@@ -141,7 +141,7 @@ class MujocoSimulator(DrivenSimulator):
     """
 
     def __init__(
-        self, model: SimulatorModel, world: World, robots: int = 1, renderer: Renderer = "auto",
+        self, model: SimulatorModel, world: AnyWorld, robots: int = 1, renderer: Renderer = "auto",
         physics: Physics | None = None,
     ) -> None:  # fmt: skip
         self._mujoco = load_mujoco()
@@ -160,9 +160,11 @@ class MujocoSimulator(DrivenSimulator):
         """Begins the episode of a seed (1,), at poses (1, M, 3); see `FastSimulator.reset`."""
         scenes = super().reset(seeds, worlds, starts)
         spec, robots, bodies = self.model.robot, self.data.pose.shape[1], scenes.bodies[0]
+        member = int(self.data.member[0])
         compiled = self._simulation = scenery.compile_scene(
-            self._mujoco, self._machine, self._physics, footprint_shape(spec), robots, self.world,
-            self.sampler, bodies,
+            self._mujoco, self._machine, self._physics, footprint_shape(spec), robots,
+            self.world.members[member], self.sampler.samplers[member].motions,
+            self.sampler.shapes, bodies,
         )  # fmt: skip
         self._data = self._mujoco.MjData(compiled)
         self._rigs = [Rig(spec, self._machine, compiled, m) for m in range(robots)]

@@ -38,7 +38,7 @@ from nics_drl_bridge.policy import train, train_algorithms
 from nics_drl_bridge.policy.train_checkpoint import Progress, read_checkpoint, write_content
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
-from nics_drl_bridge.sim.world import World, load_world
+from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 FORMAT = "nics_drl_bridge/ray_checkpoint/1"
 VALUE_WEIGHT, GRADIENT_LIMIT = 0.5, 0.5  # parameters of the loss, as in Stable-Baselines3
@@ -336,7 +336,7 @@ class Learning:
 def _algorithm(settings: TrainingSettings, seed: int, done: int, runners: int) -> PPO:
     torch.set_num_threads(settings.threads)
     model = open_model(settings.robot)
-    scenes = {name: load_world(name) for name in settings.worlds}
+    scenes = {name: load_worlds(name) for name in settings.worlds}
     rng = np.random.default_rng(seed)
     env = train.make_train_env(settings, model, scenes)
     train_algorithms.check_serves(settings, env)
@@ -357,7 +357,7 @@ def _algorithm(settings: TrainingSettings, seed: int, done: int, runners: int) -
 
 
 def share_of_worlds(
-    settings: TrainingSettings, model: SimulatorModel, scenes: Mapping[str, World], runner: int,
+    settings: TrainingSettings, model: SimulatorModel, scenes: Mapping[str, AnyWorld], runner: int,
     runners: int,
 ) -> TrainVecEnv:  # fmt: skip
     """The worlds of env runner number `runner`: every `runners`-th."""

@@ -1,0 +1,119 @@
+"""World sets: many worlds under one name, of which every episode draws one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from glob import glob
+from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+from pydantic import Field
+
+from nics_drl_bridge.config import Schema, parse_yaml, read_text, share_folder, validate
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.files import sha256
+from nics_drl_bridge.lidar.shapes import Shape
+from nics_drl_bridge.sim.world import Region, World, load_world
+
+MOST_MEMBERS = 10_000
+YAML = (".yaml", ".yml")
+SPECIAL = "*?["
+
+
+class SetFile(Schema):
+    """The keys of a world set's YAML file."""
+
+    name: str
+    # names, files, folders and globs; paths count from the folder of this file
+    worlds: tuple[str, ...] = Field(min_length=1, max_length=MOST_MEMBERS)
+    without: tuple[str, ...] = ()  # of those, the ones to leave out
+
+
+@dataclass(frozen=True, eq=False)
+class WorldSet:
+    """Worlds of which every episode draws one by its seed, all with the same chance."""
+
+    name: str
+    members: tuple[World, ...]
+
+    @property
+    def source(self) -> str:
+        """Name in error messages."""
+        return f"world set {self.name!r}"
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """The name, and 8 digits of a SHA-256 over the content of all members."""
+        content = "\n".join(world.fingerprint for world in self.members)
+        return f"{self.name}-{sha256(content.encode())[:8]}"
+
+    @cached_property
+    def shapes(self) -> tuple[Shape, ...]:
+        """The distinct shapes of all obstacles."""
+        return tuple(dict.fromkeys(shape for world in self.members for shape in world.shapes))
+
+    @cached_property
+    def extent(self) -> Region:
+        """Least x, least y, greatest x, greatest y of all members [m]."""
+        extents = np.array([world.extent for world in self.members])
+        low, high = extents[:, :2].min(axis=0).tolist(), extents[:, 2:].max(axis=0).tolist()
+        return low[0], low[1], high[0], high[1]
+
+
+AnyWorld: TypeAlias = World | WorldSet
+
+
+def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
+    """Loads a world or a world set.
+
+    A world is a shipped one by name (`arena`), or any other by the path of its YAML file. A set is
+    a list of worlds, a folder of files, a glob (`worlds/*.yaml`), or a YAML file with the key
+    `worlds`. Raises ConfigError for a missing or wrong file; of a member it names which.
+    """
+    if not isinstance(name, str | Path):
+        return _set_of("worlds", _members([str(one) for one in name], Path()))
+    text, path = str(name), Path(name)
+    if text.endswith(YAML) and path.is_file():
+        content = parse_yaml(read_text(path), text)
+        if isinstance(content, dict) and "worlds" in content:
+            return _read_set(path, validate(content, SetFile, text))
+    if path.is_dir() or any(sign in text for sign in SPECIAL):
+        return _set_of(path.name if path.is_dir() else text, _members([text], Path()))
+    shipped = share_folder() / "config" / "worlds" / text
+    if text and shipped.is_dir():
+        return _set_of(text, _members([str(shipped)], Path()))
+    return load_world(name)
+
+
+def _read_set(path: Path, file: SetFile) -> WorldSet:
+    without = {world.source for world in _members(file.without, path.parent)}
+    chosen = [one for one in _members(file.worlds, path.parent) if one.source not in without]
+    return _set_of(file.name, chosen, str(path))
+
+
+def _set_of(name: str, members: Sequence[World], source: str = "") -> WorldSet:
+    source = source or f"world set {name!r}"
+    if not members:
+        raise ConfigError(f"{source}: holds no world; name at least one.")
+    if len(members) > MOST_MEMBERS:
+        raise ConfigError(f"{source}: holds {len(members)} worlds; {MOST_MEMBERS} are the most.")
+    return WorldSet(name, tuple(members))
+
+
+def _members(names: Sequence[str], base: Path) -> list[World]:
+    found: list[World] = []
+    for name in names:
+        special, path = any(sign in name for sign in SPECIAL), base / name
+        if special or path.is_dir():
+            pattern = str(path) if special else f"{path}/*"
+            files = sorted(one for one in glob(pattern) if one.endswith(YAML))
+            if not files:
+                raise ConfigError(f"{pattern}: no world file (.yaml) there; check the path.")
+            found += [load_world(file) for file in files]
+        else:
+            loaded = load_worlds(path if name.endswith(YAML) else name)
+            found += loaded.members
+    return found
