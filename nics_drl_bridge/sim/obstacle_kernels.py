@@ -19,6 +19,7 @@ from nics_drl_bridge.sim.collision_kernels import on_wall
 from nics_drl_bridge.sim.state import Array, State, Surroundings
 
 DRAWS = 64  # Greatest number of draws per obstacle and period
+MOST = 10_000  # Obstacles of a world at most: draws do not depend on how many there are
 TURN = 2.0  # Greatest turn rate of an obstacle [rad/s]
 LOOK = 1.0  # A wandering obstacle looks ahead by the distance of this time [s], plus its radius
 MARGIN = 0.1  # Free space that it keeps at its sides [m]
@@ -65,7 +66,7 @@ def steer(n: int, state: State, scene: Surroundings, period: float, speeds: Arra
     velocity, seed, step, movers = state.velocity[n], state.seeds[n], state.steps[n], scene.movers
     count, plans, bodies = velocity.shape[0], movers.plans, state.bodies[n]
     traffic = at.Traffic(bodies, count, speeds, plans, scene.walls, movers.half, scene.grid, period)
-    draws = (step + 1) * count
+    draws = (step + 1) * MOST
     for k in range(count):  # walkers first: they react to the velocities of the last period
         velocity[k, :] = 0.0
         if plans[k, at.KIND] == at.PEDESTRIAN and bodies[k, RADIUS] > 0.0:

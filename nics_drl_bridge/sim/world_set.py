@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from glob import glob
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from pydantic import Field
@@ -76,16 +76,22 @@ def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
     if not isinstance(name, str | Path):
         return _set_of("worlds", _members([str(one) for one in name], Path()))
     text, path = str(name), Path(name)
-    if text.endswith(YAML) and path.is_file():
-        content = parse_yaml(read_text(path), text)
-        if isinstance(content, dict) and "worlds" in content:
-            return _read_set(path, validate(content, SetFile, text))
+    if (content := _set_in(path)) is not None:
+        return _read_set(path, validate(content, SetFile, text))
     if path.is_dir() or any(sign in text for sign in SPECIAL):
         return _set_of(path.name if path.is_dir() else text, _members([text], Path()))
     shipped = share_folder() / "config" / "worlds" / text
     if text and shipped.is_dir():
         return _set_of(text, _members([str(shipped)], Path()))
     return load_world(name)
+
+
+def _set_in(path: Path) -> dict[str, Any] | None:
+    """Content of a world set's YAML file; None for any other."""
+    if path.suffix not in YAML or not path.is_file() or "worlds" not in (text := read_text(path)):
+        return None
+    content = parse_yaml(text, str(path))
+    return content if isinstance(content, dict) and "worlds" in content else None
 
 
 def _read_set(path: Path, file: SetFile) -> WorldSet:
@@ -109,11 +115,18 @@ def _members(names: Sequence[str], base: Path) -> list[World]:
         special, path = any(sign in name for sign in SPECIAL), base / name
         if special or path.is_dir():
             pattern = str(path) if special else f"{path}/*"
-            files = sorted(one for one in glob(pattern) if one.endswith(YAML))
+            files = [Path(one) for one in sorted(glob(pattern)) if one.endswith(YAML)]
             if not files:
                 raise ConfigError(f"{pattern}: no world file (.yaml) there; check the path.")
-            found += [load_world(file) for file in files]
+            found += map(_member, files)
+        elif name.endswith(YAML):
+            found.append(_member(path))
         else:
-            loaded = load_worlds(path if name.endswith(YAML) else name)
-            found += loaded.members
+            found += load_worlds(name).members
     return found
+
+
+def _member(path: Path) -> World:
+    if _set_in(path) is not None:
+        raise ConfigError(f"{path}: is a world set, and a set holds worlds; name its worlds.")
+    return load_world(path)

@@ -1,0 +1,184 @@
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+import yaml
+from robots import circles, direct_model, field, lidar
+
+from nics_drl_bridge.config import dump_yaml, share_folder
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.sim.scenes import SetSampler, member_of, sample_scene
+from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.world import load_world
+from nics_drl_bridge.sim.world_set import WorldSet, load_worlds
+
+MODEL = direct_model(odometry=(0.05, 0.03), sensor=lidar(noise_std=0.01))
+MIXED = WorldSet("mixed", tuple(load_world(n) for n in ("crowd", "room", "doorway", "circles")))
+STEPS, PERIOD = 12, 0.1
+
+
+def commands(worlds, robots=1):
+    low, high = MODEL.robot.command_low, MODEL.robot.command_high
+    shape = STEPS, worlds, robots, len(low)
+    return np.random.default_rng(0).uniform(low, high, shape)
+
+
+def drive(world, seeds, given, **options):
+    """Scans, poses and contacts of a drive (T, N, ...)."""
+    simulator = FastSimulator(MODEL, world, len(seeds), given.shape[2], **options)
+    simulator.reset(seeds)
+    seen = []
+    for each in given:
+        simulator.step(each)
+        data = simulator.data
+        seen.append([data.ranges.copy(), data.pose.copy(), data.odom.copy(), data.collided.copy()])
+    return [np.array(one) for one in zip(*seen, strict=True)]
+
+
+@pytest.mark.parametrize("robots", [1, 2])
+@pytest.mark.parametrize("renderer", ["baked", "exact"])
+def test_an_episode_in_a_set_is_that_of_its_member_alone_to_the_bit(renderer, robots):
+    seeds = np.arange(24)
+    given = commands(len(seeds), robots)
+    together = drive(MIXED, seeds, given, renderer=renderer, threads=2)
+    chosen = np.array([member_of(MIXED, seed) for seed in seeds.tolist()])
+    for p, member in enumerate(MIXED.members):
+        rows = chosen == p
+        assert rows.any()
+        alone = drive(member, seeds[rows], given[:, rows], renderer=renderer)
+        for one, other in zip(together, alone, strict=True):
+            assert np.array_equal(one[:, rows], other)
+
+
+def test_a_world_goes_from_member_to_member_as_its_episodes_begin():
+    simulator = FastSimulator(MODEL, MIXED, 2)
+    begun = set()
+    for seed in range(30):
+        simulator.reset([seed], worlds=[1])
+        begun.add(int(simulator.data.member[1]))
+        alone = FastSimulator(MODEL, MIXED.members[simulator.data.member[1]])
+        alone.reset([seed])
+        assert np.array_equal(simulator.data.ranges[1], alone.data.ranges[0])
+    assert begun == {0, 1, 2, 3}
+
+
+def test_a_copy_of_a_simulator_goes_on_in_the_same_members():
+    simulator = FastSimulator(MODEL, MIXED, 4)
+    simulator.reset(range(4))
+    other = copy.deepcopy(simulator)
+    for each in commands(4):
+        simulator.step(each)
+        other.step(each)
+    assert np.array_equal(simulator.data.ranges, other.data.ranges)
+
+
+def test_every_member_has_the_same_chance_and_its_own_scenes():
+    sampler = SetSampler(MIXED, 0.2)
+    scenes = sampler.draw(range(4000))
+    counts = np.bincount(scenes.member, minlength=4)
+    assert (np.abs(counts - 1000) < 5.0 * np.sqrt(750.0)).all()
+    for seed in range(40):
+        alone = sample_scene(MIXED.members[scenes.member[seed]], 0.2, seed)
+        there = scenes[seed].bodies[:, 5] > 0.0
+        assert np.array_equal(
+            scenes[seed].bodies[there][:, :6], alone.bodies[alone.bodies[:, 5] > 0][:, :6]
+        )
+        assert np.array_equal(scenes[seed].starts, alone.starts)
+        shapes = [sampler.shapes[int(body[6])] for body in scenes[seed].bodies[there]]
+        member = MIXED.members[member_of(MIXED, seed)]
+        assert set(shapes) <= set(member.shapes)
+
+
+def test_sizes_and_numbers_of_a_randomisation_hold_in_every_member():
+    worlds = WorldSet("two", (field(8.0, obstacles=[circles(3, (0.1, 0.3), 0.1)]),
+                              field(9.0, obstacles=[circles(6, (0.2,), 0.1)])))  # fmt: skip
+    sampler = SetSampler(worlds, 0.1, sizes=(1.0, 0.5))
+    scenes = sampler.draw(range(50), count=np.full(50, 2), size=np.arange(50) % 2)
+    for seed, scene in enumerate(scenes):
+        radii = scene.bodies[scene.bodies[:, 5] > 0.0][:, 5]
+        assert len(radii) == 2
+        there = scene.bodies[:, 5] > 0.0
+        named = [sampler.shapes[int(body[6])].radius for body in scene.bodies[there]]
+        assert radii.tolist() == pytest.approx(named)
+        own = {shape.radius * (0.5 if seed % 2 else 1.0)
+               for shape in worlds.members[scene.member].shapes}  # fmt: skip
+        assert set(np.round(radii, 9)) <= set(np.round(list(own), 9))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for name in ("b", "a", "c"):
+        world = field(5.0, count=ord(name) - ord("a")).model_copy(update={"name": name})
+        (tmp_path / f"{name}.yaml").write_text(dump_yaml(world.model_dump(mode="json")))
+    return tmp_path
+
+
+def names(worlds):
+    return [world.name for world in worlds.members]
+
+
+def test_a_set_is_a_folder_a_glob_a_list_or_a_file(folder):
+    file = folder / "sets" / "some.yaml"
+    file.parent.mkdir()
+    file.write_text("name: some\nworlds: [../*.yaml, circles]\nwithout: [../b.yaml]\n")
+    assert (
+        names(load_worlds(str(folder))) == names(load_worlds(f"{folder}/*.yaml")) == ["a", "b", "c"]
+    )
+    assert load_worlds(folder).name == folder.name
+    assert names(load_worlds(f"{folder}/[ac].yaml")) == ["a", "c"]
+    assert names(load_worlds(["room", folder / "a.yaml"])) == ["room", "a"]
+    assert names(load_worlds(file)) == ["a", "c", "circles"]
+    assert load_worlds(file).name == "some"
+    assert names(load_worlds("circles")) == ["circles"]
+
+
+def test_sets_of_equal_worlds_share_a_fingerprint_and_others_do_not(folder):
+    once, again = load_worlds(str(folder)), load_worlds(str(folder))
+    assert once.fingerprint == again.fingerprint
+    (folder / "d.yaml").write_text((folder / "a.yaml").read_text())
+    assert load_worlds(str(folder)).fingerprint != once.fingerprint
+
+
+def test_a_broken_member_is_named(folder):
+    broken = yaml.safe_load((folder / "b.yaml").read_text()) | {"size": [5.0, -1.0]}
+    (folder / "b.yaml").write_text(yaml.safe_dump(broken))
+    with pytest.raises(ConfigError, match=r"b\.yaml: key 'size\.1'"):
+        load_worlds(str(folder))
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("name: s\nworlds: []\n", "key 'worlds'"),
+        ("name: s\nworlds: [nowhere]\n", "unknown world 'nowhere'"),
+        ("name: s\nworlds: [none/*.yaml]\n", "no world file"),
+        ("name: s\nworlds: [gone.yaml]\n", "no such file"),
+        ("name: s\nworlds: [circles]\nwithout: [circles]\n", "holds no world"),
+        ("name: s\nworlds: [circles]\nwithin: [1]\n", "unknown key 'within'"),
+    ],
+)
+def test_a_wrong_set_is_refused_in_one_sentence(tmp_path, text, reason):
+    file = tmp_path / "set.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=reason) as refused:
+        load_worlds(file)
+    assert str(refused.value).count("\n") == 0
+
+
+def test_a_set_of_sets_is_refused(tmp_path):
+    file = tmp_path / "set.yaml"
+    file.write_text("name: s\nworlds: [set.yaml]\n")
+    with pytest.raises(ConfigError, match="is a world set, and a set holds worlds"):
+        load_worlds(file)
+
+
+def test_an_empty_folder_is_no_set(tmp_path):
+    with pytest.raises(ConfigError, match="no world file"):
+        load_worlds(str(tmp_path))
+
+
+def test_shipped_worlds_can_be_one_set():
+    shipped = load_worlds(str(share_folder() / "config" / "worlds"))
+    assert {"circles", "room", "corridor"} <= set(names(shipped))
