@@ -50,8 +50,8 @@ def kernel(
 
     It runs without the interpreter's lock; a division by zero gives inf or NaN. It `allocates` if
     it makes arrays or other objects, or calls what does; `contracts` lets products and sums be
-    fused, with one rounding; `inline` compiles it into all callers, where that was measured to pay. A `view` returns parts of
-    its arguments' arrays, which only a function that is written into its callers can.
+    fused, with one rounding; `inline` compiles it into all callers, where that was measured to pay.
+    A `view` returns parts of its arguments' arrays, for which it is written into its callers.
     """
     if function is None:
         return partial(kernel, allocates=allocates, contracts=contracts, inline=inline, view=view)

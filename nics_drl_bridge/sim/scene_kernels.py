@@ -37,8 +37,10 @@ class FreeSpace(NamedTuple):
     bounds: Array  # (4,) least x, y and greatest x, y of the field [m]
     walls: Array  # (W, 4)
     grid: MapField  # the static map
-    for_robots: Integers  # (C,) row-major indices of the cells where a robot may start
-    for_anything: Integers  # (C,) row-major indices of the cells with any free space
+    # (C,) row-major indices of the cells where a robot may start, and of those with any free space;
+    # none where nothing is drawn there
+    for_robots: NDArray[np.int32]
+    for_anything: NDArray[np.int32]
     room: float  # free space that a robot on its path needs around the centre of a cell [m]
 
 

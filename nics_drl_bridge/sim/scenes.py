@@ -24,6 +24,7 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 
 __all__ = ["Scene", "SceneSampler", "Scenes", "SetSampler", "sample_scene", "scaled"]
 Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
 CELL = 0.1  # Side of cells without a map [m]; larger in large fields, smaller in small ones
 FEWEST_CELLS = 20
 MOST_CELLS = 4_000_000
@@ -75,7 +76,9 @@ class SceneSampler:
         self.count = len(slots)  # K, the greatest number of obstacles
         self.motions: tuple[Motion | None, ...] = tuple(world.obstacles[g].motion for g in slots)
         self._plan = _plan(world, footprint_radius, slots, self.shapes, len(sizes))
-        self._scratches: list[SceneScratch] = []
+        # Greatest number of cells, obstacles and corners; threads draw with a scratch memory each.
+        self.room = _room_for(self._plan)
+        self.scratches: list[SceneScratch] = []
 
     def draw(
         self, seeds: ArrayLike, count: ArrayLike | None = None, size: ArrayLike | None = None
@@ -85,27 +88,37 @@ class SceneSampler:
         The `count` (n,) of random obstacles is at most, and by default, that of the world; `size`
         (n,) is the index of their size. Raises ConfigError if the world has no room for a scene.
         """
+        return self.drawn(*self.checked(seeds, count, size))
+
+    def checked(
+        self, seeds: ArrayLike, count: ArrayLike | None, size: ArrayLike | None
+    ) -> tuple[Integers, Integers, Integers]:
+        """Returns seeds, numbers of obstacles and sizes as `drawn` takes them; see `draw`."""
         numbers = checked_seeds(seeds)
         n = len(numbers)
-        wanted = np.full(n, -1) if count is None else np.maximum(np.asarray(count), 0)
+        wanted = np.full(n, -1) if count is None else np.maximum(np.asarray(count, np.int64), 0)
         sizes = np.zeros(n, np.int64) if size is None else np.asarray(size, dtype=np.int64)
         if wanted.shape != (n,) or sizes.shape != (n,):
             raise ConfigError(f"count {wanted.shape} and size {sizes.shape} must be ({n},).")
         if n and not 0 <= sizes.min() <= sizes.max() < self._sizes:
             raise ConfigError(f"size must be from 0 to {self._sizes - 1}.")
+        return numbers, wanted, sizes
+
+    def drawn(self, seeds: Integers, wanted: Integers, sizes: Integers) -> Scenes:
+        """Draws like `draw`, without checks; -1 of the `wanted` obstacles are the world's own."""
+        n = len(seeds)
         bodies, starts = np.zeros((n, self.count, BODY)), np.zeros((n, self.robots, 3))
         scenes = Scenes(bodies, starts, np.zeros((n, self.robots, 2)), np.zeros(n, np.int64))
         try:
-            scratch = self._scratches.pop()  # threads may draw at the same time
+            scratch = self.scratches.pop()
         except IndexError:
-            scratch = _scratch(self._plan)
+            scratch = _scratch(*self.room)
         row, why = kernels.draw_scenes(
-            numbers, wanted.astype(np.int64), sizes, self._plan, bodies, starts, scenes.goals,
-            scratch,
-        )  # fmt: skip
-        self._scratches.append(scratch)
+            seeds, wanted, sizes, self._plan, bodies, starts, scenes.goals, scratch
+        )
+        self.scratches.append(scratch)
         if row < n:
-            raise self._no_room(int(numbers[row]), why)
+            raise self._no_room(int(seeds[row]), why)
         return scenes
 
     def _no_room(self, seed: int, why: int) -> ConfigError:
@@ -135,6 +148,10 @@ class SetSampler:
     ) -> None:  # fmt: skip
         given = footprint_radius, robots, sizes, most
         self.samplers = [SceneSampler(member, *given) for member in world.members]
+        scratches, rooms = self.samplers[0].scratches, [each.room for each in self.samplers]
+        room = tuple(max(each) for each in zip(*rooms, strict=True))
+        for each in self.samplers:
+            each.room, each.scratches = room, scratches
         self.robots, self.count = robots, max(each.count for each in self.samplers)
         self.shapes = tuple(scaled(shape, size) for size in sizes for shape in world.shapes)
         first = np.arange(len(sizes))[:, None] * len(world.shapes)
@@ -147,19 +164,18 @@ class SetSampler:
         """Draws the scenes of seeds (n,), see `SceneSampler.draw`; K is the most of all members."""
         if len(self.samplers) == 1:
             return self.samplers[0].draw(seeds, count, size)
-        numbers = checked_seeds(seeds)
+        numbers, wanted, sizes = self.samplers[0].checked(seeds, count, size)
         n = len(numbers)
         bodies, starts = np.zeros((n, self.count, BODY)), np.zeros((n, self.robots, 3))
         scenes = Scenes(bodies, starts, np.zeros((n, self.robots, 2)), np.zeros(n, np.int64))
         kernels.choose_members(numbers, len(self.samplers), scenes.member)
-        each = [None if one is None else np.asarray(one) for one in (count, size)]
-        for p in np.unique(scenes.member).tolist():
-            rows = np.flatnonzero(scenes.member == p)
-            some = (None if one is None else one[rows] for one in each)
-            drawn = self.samplers[p].draw(numbers[rows], *some)
-            drawn.bodies[..., SHAPE] = self._index[p][drawn.bodies[..., SHAPE].astype(np.int64)]
-            bodies[rows, : drawn.bodies.shape[1]] = drawn.bodies
-            starts[rows], scenes.goals[rows] = drawn.starts, drawn.goals
+        for i in range(n):
+            p, row = scenes.member[i], slice(i, i + 1)
+            drawn = self.samplers[p].drawn(numbers[row], wanted[row], sizes[row])
+            own = drawn.bodies[0]
+            own[:, SHAPE] = self._index[p][own[:, SHAPE].astype(np.int64)]
+            bodies[i, : len(own)] = own
+            starts[i], scenes.goals[i] = drawn.starts[0], drawn.goals[0]
         return scenes
 
 
@@ -250,9 +266,11 @@ def _places(places: Starts | Goals | None) -> Array:
     return rows
 
 
-def _scratch(plan: ScenePlan) -> SceneScratch:
-    cells, count = plan.space.area.size, len(plan.group)
-    corners = max(int(np.diff(plan.outlines.first).max()), 4)
+def _room_for(plan: ScenePlan) -> tuple[int, ...]:
+    return plan.space.area.size, len(plan.group), max(int(np.diff(plan.outlines.first).max()), 4)
+
+
+def _scratch(cells: int, count: int, corners: int) -> SceneScratch:
     return SceneScratch(
         np.zeros(cells, np.int64), np.zeros((2, cells), np.int64), np.zeros(1, np.int64),
         np.zeros(count, np.bool_), np.zeros(count), np.zeros(BODY), np.zeros(BODY),
@@ -286,8 +304,11 @@ def _free_space(world: World, footprint: float) -> FreeSpace:
         raise ConfigError(f"{world.source}: {fault}, or enlarge the world.")
     for key, places in (("starts", world.starts), ("goals", world.goals)):
         _check(world, key, places, area, cells)
-    free = np.flatnonzero(area), np.flatnonzero(cells.distances > 0.0)
-    return FreeSpace(cells, area, bounds, walls, grid, *free, room)
+    nothing, drawn = np.zeros(0, np.int32), any(group.count for group in world.obstacles)
+    given = world.starts is not None and world.goals is not None
+    for_robots = nothing if given else np.flatnonzero(area).astype(np.int32)
+    anywhere = np.flatnonzero(cells.distances > 0.0).astype(np.int32) if drawn else nothing
+    return FreeSpace(cells, area, bounds, walls, grid, for_robots, anywhere, room)
 
 
 def _closed(grid: GridMap) -> MapField:
