@@ -10,6 +10,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numba import types
+from numba.experimental import structref
 from numpy.typing import NDArray
 
 from nics_drl_bridge import random_kernels as random
@@ -392,24 +394,49 @@ def choose_members(seeds, members, out):  # type: ignore[no-untyped-def]
         out[n] = min(int(share * members), members - 1)
 
 
-@kernel
-def draw_scenes(seeds, wanted, sizes, plan, bodies, starts, goals, scratch):  # type: ignore[no-untyped-def]
+@structref.register
+class PackedType(types.StructRef):  # type: ignore[misc]
+    """The type of `Packed`."""
+
+
+class Packed(structref.StructRefProxy):  # type: ignore[misc]
+    """A `ScenePlan` as one argument: passing its arrays takes as long as drawing a scene."""
+
+
+structref.define_proxy(Packed, PackedType, ["plan"])
+
+
+@kernel(allocates=True)
+def pack(plan):  # type: ignore[no-untyped-def]
+    """Makes one argument of a plan."""
+    return Packed(plan)
+
+
+@kernel(allocates=True)
+def draw_scenes(packed, seeds, wanted, sizes, bodies, starts, goals, scratch):  # type: ignore[no-untyped-def]
     """Draws the scenes of some seeds (n,) to bodies (n, K, 7), starts (n, M, 3), goals (n, M, 2).
 
-    `wanted` (n,) are numbers of random obstacles, -1 for the world's own, and `sizes` (n,) rows of
-    `plan.variants`. Returns the first row that could not be drawn, or n, and the reason.
+    K may be more than the world has: the others are absent. `wanted` (n,) are numbers of random
+    obstacles, -1 for the world's own, and `sizes` (n,) rows of `plan.variants`. Returns the first
+    row that could not be drawn, or n, and the reason.
     """
+    return _draw(packed.plan, seeds, wanted, sizes, bodies, starts, goals, scratch)
+
+
+@kernel
+def _draw(plan, seeds, wanted, sizes, bodies, starts, goals, scratch):  # type: ignore[no-untyped-def]
     _put(scratch.disc, 0.0, 0.0, 0.0, plan.radii.shape[0] - 1, plan)
     scratch.disc[RADIUS] = plan.footprint
+    count = plan.group.shape[0]
     for n in range(seeds.shape[0]):
         state = NO_OBSTACLES
-        counter = _choose(seeds[n], wanted[n], sizes[n], plan, bodies[n], scratch.active)
+        counter = _choose(seeds[n], wanted[n], sizes[n], plan, bodies[n, :count], scratch.active)
         for _ in range(RESTARTS):
-            counter, placed = _place_obstacles(seeds[n], counter, plan, bodies[n], scratch)
+            counter, placed = _place_obstacles(seeds[n], counter, plan, bodies[n, :count], scratch)
             if placed:
                 state = NO_ROBOTS
                 counter, placed = _place_robots(
-                    seeds[n], counter, plan, bodies[n], starts[n], goals[n], scratch
+                    seeds[n], counter, plan, bodies[n, :count], starts[n], goals[n], scratch
                 )
             if placed:
                 state = DRAWN

@@ -1,9 +1,12 @@
 """Scenes drawn from worlds: obstacles, starts and goals of each seed, in connected free space."""
 
+from __future__ import annotations
+
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,7 +14,6 @@ from pydantic import ValidationError
 from scipy import ndimage
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.lidar.exact_kernels import SHAPE
 from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
 from nics_drl_bridge.lidar.shapes import BODY, LARGEST, SMALLEST, Circle, Outlines, Shape, describe
 from nics_drl_bridge.seeds import checked_seeds
@@ -45,6 +47,12 @@ class Scenes(Scene):
 
     member: NDArray[np.int64]
 
+    @classmethod
+    def of(cls, n: int, obstacles: int, robots: int) -> Scenes:
+        """Allocates n scenes, without anything in them."""
+        starts, goals = np.zeros((n, robots, 3)), np.zeros((n, robots, 2))
+        return cls(np.zeros((n, obstacles, BODY)), starts, goals, np.zeros(n, np.int64))
+
     def __len__(self) -> int:
         return len(self.bodies)
 
@@ -53,6 +61,22 @@ class Scenes(Scene):
 
     def __iter__(self) -> Iterator[Scene]:
         return (self[row] for row in range(len(self)))
+
+
+@dataclass(frozen=True)
+class Catalogue:
+    """Every shape that can occur in a world or set: all in the first size, then in the next."""
+
+    shapes: tuple[Shape, ...]
+    place: Mapping[Shape, int]  # of each shape in the first size
+    outlines: Outlines  # of the shapes, and of a disc
+
+    @classmethod
+    def of(cls, world: AnyWorld, sizes: Sequence[float]) -> Catalogue:
+        """Lists the shapes of a world or set, scaled."""
+        shapes = tuple(scaled(shape, size) for size in sizes for shape in world.shapes)
+        place = {shape: i for i, shape in enumerate(world.shapes)}
+        return cls(shapes, place, Outlines.of((*shapes, Circle(radius=1.0))))
 
 
 class SceneSampler:
@@ -66,19 +90,26 @@ class SceneSampler:
 
     def __init__(
         self, world: World, footprint_radius: float, robots: int = 1,
-        sizes: Sequence[float] = (1.0,), most: int | None = None,
+        sizes: Sequence[float] = (1.0,), most: int | None = None, known: Catalogue | None = None,
     ) -> None:  # fmt: skip
         self.world = world = world if most is None else _with_room(world, most)
         self.robots, self._sizes = robots, len(sizes)
-        # Every shape that can occur: those of the world in the first size, then in the next.
-        self.shapes = tuple(scaled(shape, size) for size in sizes for shape in world.shapes)
+        known = known or Catalogue.of(world, sizes)
+        self.shapes = known.shapes
         slots = [g for g, group in enumerate(world.obstacles) for _ in range(group.counts[1])]
         self.count = len(slots)  # K, the greatest number of obstacles
         self.motions: tuple[Motion | None, ...] = tuple(world.obstacles[g].motion for g in slots)
-        self._plan = _plan(world, footprint_radius, slots, self.shapes, len(sizes))
+        self._plan = _plan(world, footprint_radius, slots, known)
         # Greatest number of cells, obstacles and corners; threads draw with a scratch memory each.
         self.room = _room_for(self._plan)
         self.scratches: list[SceneScratch] = []
+
+    @cached_property
+    def _packed(self) -> Any:
+        return kernels.pack(self._plan)
+
+    def __getstate__(self) -> dict[str, Any]:  # a copy packs its plan anew
+        return {name: value for name, value in vars(self).items() if name != "_packed"}
 
     def draw(
         self, seeds: ArrayLike, count: ArrayLike | None = None, size: ArrayLike | None = None
@@ -88,12 +119,15 @@ class SceneSampler:
         The `count` (n,) of random obstacles is at most, and by default, that of the world; `size`
         (n,) is the index of their size. Raises ConfigError if the world has no room for a scene.
         """
-        return self.drawn(*self.checked(seeds, count, size))
+        draws = self.draws(seeds, count, size)
+        scenes = Scenes.of(len(draws[0]), self.count, self.robots)
+        self.draw_into(scenes, draws, slice(0, len(scenes)))
+        return scenes
 
-    def checked(
+    def draws(
         self, seeds: ArrayLike, count: ArrayLike | None, size: ArrayLike | None
     ) -> tuple[Integers, Integers, Integers]:
-        """Returns seeds, numbers of obstacles and sizes as `drawn` takes them; see `draw`."""
+        """Returns seeds, numbers of obstacles (-1 for the world's own) and sizes; see `draw`."""
         numbers = checked_seeds(seeds)
         n = len(numbers)
         wanted = np.full(n, -1) if count is None else np.maximum(np.asarray(count, np.int64), 0)
@@ -104,22 +138,20 @@ class SceneSampler:
             raise ConfigError(f"size must be from 0 to {self._sizes - 1}.")
         return numbers, wanted, sizes
 
-    def drawn(self, seeds: Integers, wanted: Integers, sizes: Integers) -> Scenes:
-        """Draws like `draw`, without checks; -1 of the `wanted` obstacles are the world's own."""
-        n = len(seeds)
-        bodies, starts = np.zeros((n, self.count, BODY)), np.zeros((n, self.robots, 3))
-        scenes = Scenes(bodies, starts, np.zeros((n, self.robots, 2)), np.zeros(n, np.int64))
+    def draw_into(
+        self, scenes: Scenes, draws: tuple[Integers, Integers, Integers], rows: slice
+    ) -> None:
+        """Draws some rows of scenes of at least K obstacles; `draws` are those of all rows."""
         try:
             scratch = self.scratches.pop()
         except IndexError:
             scratch = _scratch(*self.room)
-        row, why = kernels.draw_scenes(
-            seeds, wanted, sizes, self._plan, bodies, starts, scenes.goals, scratch
-        )
+        numbers, wanted, sizes = (each[rows] for each in draws)
+        into = scenes.bodies[rows], scenes.starts[rows], scenes.goals[rows]
+        drawn, why = kernels.draw_scenes(self._packed, numbers, wanted, sizes, *into, scratch)
         self.scratches.append(scratch)
-        if row < n:
-            raise self._no_room(int(seeds[row]), why)
-        return scenes
+        if drawn < len(numbers):
+            raise self._no_room(int(numbers[drawn]), why)
 
     def _no_room(self, seed: int, why: int) -> ConfigError:
         where, scene = self.world.source, f"in the scene of seed {seed}"
@@ -146,36 +178,28 @@ class SetSampler:
         self, world: AnyWorld, footprint_radius: float, robots: int = 1,
         sizes: Sequence[float] = (1.0,), most: int | None = None,
     ) -> None:  # fmt: skip
-        given = footprint_radius, robots, sizes, most
+        known = Catalogue.of(world, sizes)
+        given = footprint_radius, robots, sizes, most, known
         self.samplers = [SceneSampler(member, *given) for member in world.members]
         scratches, rooms = self.samplers[0].scratches, [each.room for each in self.samplers]
         room = tuple(max(each) for each in zip(*rooms, strict=True))
         for each in self.samplers:
             each.room, each.scratches = room, scratches
         self.robots, self.count = robots, max(each.count for each in self.samplers)
-        self.shapes = tuple(scaled(shape, size) for size in sizes for shape in world.shapes)
-        first = np.arange(len(sizes))[:, None] * len(world.shapes)
-        own = ([world.shapes.index(one) for one in each.shapes] for each in world.members)
-        self._index = [(first + np.array(each, np.int64)).ravel() for each in own]
+        self.shapes = known.shapes
 
     def draw(
         self, seeds: ArrayLike, count: ArrayLike | None = None, size: ArrayLike | None = None
     ) -> Scenes:
         """Draws the scenes of seeds (n,), see `SceneSampler.draw`; K is the most of all members."""
+        draws = self.samplers[0].draws(seeds, count, size)
+        scenes = Scenes.of(len(draws[0]), self.count, self.robots)
         if len(self.samplers) == 1:
-            return self.samplers[0].draw(seeds, count, size)
-        numbers, wanted, sizes = self.samplers[0].checked(seeds, count, size)
-        n = len(numbers)
-        bodies, starts = np.zeros((n, self.count, BODY)), np.zeros((n, self.robots, 3))
-        scenes = Scenes(bodies, starts, np.zeros((n, self.robots, 2)), np.zeros(n, np.int64))
-        kernels.choose_members(numbers, len(self.samplers), scenes.member)
-        for i in range(n):
-            p, row = scenes.member[i], slice(i, i + 1)
-            drawn = self.samplers[p].drawn(numbers[row], wanted[row], sizes[row])
-            own = drawn.bodies[0]
-            own[:, SHAPE] = self._index[p][own[:, SHAPE].astype(np.int64)]
-            bodies[i, : len(own)] = own
-            starts[i], scenes.goals[i] = drawn.starts[0], drawn.goals[0]
+            self.samplers[0].draw_into(scenes, draws, slice(0, len(scenes)))
+            return scenes
+        kernels.choose_members(draws[0], len(self.samplers), scenes.member)
+        for row, p in enumerate(scenes.member.tolist()):
+            self.samplers[p].draw_into(scenes, draws, slice(row, row + 1))
         return scenes
 
 
@@ -227,18 +251,15 @@ def _with_room(world: World, most: int) -> World:
     return world.model_copy(update={"obstacles": tuple(groups)})
 
 
-def _plan(
-    world: World, footprint: float, slots: Sequence[int], shapes: Sequence[Shape], sizes: int
-) -> ScenePlan:
-    space = _free_space(world, footprint)
-    outlines = Outlines.of((*shapes, Circle(radius=1.0)))
+def _plan(world: World, footprint: float, slots: Sequence[int], known: Catalogue) -> ScenePlan:
+    space, outlines = _free_space(world, footprint), known.outlines
     groups = np.zeros((len(world.obstacles), kernels.GROUP))
     choices: list[int] = []
     poses = np.zeros((len(slots), 3))
     for g, group in enumerate(world.obstacles):
         fixed, moving = float(bool(group.at)), float(group.motion is not None)
         groups[g] = *group.counts, group.gap, len(choices), len(group.shapes), fixed, moving
-        choices += [world.shapes.index(shape) for shape in group.shapes]
+        choices += [known.place[shape] for shape in group.shapes]
         if group.at:
             poses[np.flatnonzero(np.equal(slots, g))] = group.at
     least, greatest = world.goal_distance
@@ -247,8 +268,8 @@ def _plan(
     return ScenePlan(
         space, outlines.arguments, outlines.radii, groups, np.array(slots, dtype=np.int64),
         np.array(choices, dtype=np.int64),
-        np.arange(sizes * len(world.shapes)).reshape(sizes, -1), poses, _places(world.starts),
-        _places(world.goals), float(footprint), world.clearance, least, greatest, around,
+        np.arange(len(known.shapes)).reshape(-1, max(len(known.place), 1)), poses,
+        _places(world.starts), _places(world.goals), float(footprint), world.clearance, least, greatest, around,
     )  # fmt: skip
 
 
