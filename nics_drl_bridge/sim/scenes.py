@@ -269,7 +269,8 @@ def _plan(world: World, footprint: float, slots: Sequence[int], known: Catalogue
         space, outlines.arguments, outlines.radii, groups, np.array(slots, dtype=np.int64),
         np.array(choices, dtype=np.int64),
         np.arange(len(known.shapes)).reshape(-1, max(len(known.place), 1)), poses,
-        _places(world.starts), _places(world.goals), float(footprint), world.clearance, least, greatest, around,
+        _places(world.starts), _places(world.goals), float(footprint), world.clearance, least,
+        greatest, around,
     )  # fmt: skip
 
 
