@@ -68,7 +68,7 @@ def read_sdf(
         fix = "leave it out by --skip-unknown or --without MODEL, or put a box in its place"
         raise ConfigError(f"{path}: {left_out[0]}{more}, which is no shape of a world; {fix}.")
     if not placed:
-        reason = f"nothing of its {seen} collision geometries stands at a height of {height:g} m"
+        reason = f"none of its {seen} collision geometries stands at a height of {height:g} m"
         raise ConfigError(f"{path}: {reason}; choose another --height.")
     return Standing(tuple(placed), left_out)
 
@@ -172,19 +172,22 @@ class _Scope:
         bases = {"joint": _text(element, "child"), "frame": element.get("attached_to", "")}
         return self.posed(element.find("pose"), bases.get(element.tag, ""))
 
-    def posed(self, pose: Element | None, base: str = "", start: Array | None = None) -> Array:
+    def posed(
+        self, pose: Element | None, base: str = "", start: Array | None = None, where: str = ""
+    ) -> Array:
         """(4, 4) of a `<pose>` in this scope; by default from `start`, or from the frame `base`."""
         given = "" if pose is None else pose.get("relative_to") or pose.get("frame") or ""
         if start is None or given:
             start = self.frame(given or base)
-        return start @ _matrix(pose, self.where)
+        return start @ _matrix(pose, where or self.where)
 
     def of_model(self, model: "_Scope") -> Array:
         """(4, 4) pose of a model in this scope."""
         state = self._state.get(model.name)
         if state is not None:
-            return _matrix(state, self.where)
-        return self.posed(model.pose) @ np.linalg.inv(model.frame(model.placement))
+            return _matrix(state, model.where)
+        placed = self.posed(model.pose, where=model.where)
+        return placed @ np.linalg.inv(model.frame(model.placement))
 
 
 class _Body(NamedTuple):
@@ -213,10 +216,9 @@ class _Body(NamedTuple):
             return kind(*self._lengths(shape, "radius"), *self._lengths(shape, "length"))
         if shape.tag == "polyline" and len(self.geometry.findall("polyline")) == 1:
             return self._prism(shape)
-        uri = _text(shape, "uri")
-        raise ShapelessError(
-            f"a {shape.tag}{' with holes' * (shape.tag == 'polyline')} {uri}".rstrip()
-        )
+        what = "polyline with holes" if shape.tag == "polyline" else shape.tag
+        article = "an" if what[0] in "aeiou" else "a"
+        raise ShapelessError(f"{article} {what} {_text(shape, 'uri')}".rstrip())
 
     def _ground(self, plane: Element) -> None:
         normal = self.pose[:3, :3] @ _floats(plane.findtext("normal", "0 0 1"), 3, self.where)
@@ -306,7 +308,8 @@ def _text(element: Element, tag: str) -> str:
 def _found(uri: str, file: Path) -> Path | None:
     """The file of an included model, beside a file or on the paths of Gazebo; None for none."""
     kind, _, name = uri.rpartition("://")
-    near = [file.parent, file.parent / "models", *(file.parents[1] / at for at in (".", "models"))]
+    here = file.resolve().parent
+    near = [here, here / "models", here.parent, here.parent / "models"]
     listed = [
         Path(one) for key in PATHS for one in os.environ.get(key, "").split(os.pathsep) if one
     ]
