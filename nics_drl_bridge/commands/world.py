@@ -113,8 +113,7 @@ def _standing(file: Path, place: Path, standing: "Standing", keys: Keys, height:
     head += [f"Left out: {each}." for each in standing.left_out]
     known = {"name": file.stem, "bounds": field, "obstacles": groups}
     text = _text(place, head, known | keys, (x2 - x1, y2 - y1))
-    line = f"{len(standing.placed)} obstacles of {len(groups)} shapes in a field of "
-    line += f"{x2 - x1:.4g} m x {y2 - y1:.4g} m"
+    line = f"obstacles: {len(standing.placed)}, field: {x2 - x1:.4g} m x {y2 - y1:.4g} m"
     return Written(place, text, "\n  left out: ".join([line, *standing.left_out]))
 
 
@@ -142,7 +141,7 @@ def _mapped(file: Path, place: Path, keys: Keys, resolution: float | None) -> li
     x, y = columns * resolution, rows * resolution
     known = {"name": file.stem, "map": _seen_from(place, map_file)}
     text = _text(place, [f"The map {map_file.name}."], known | keys, (x, y))
-    return [*made, Written(place, text, f"a map of {x:.4g} m x {y:.4g} m")]
+    return [*made, Written(place, text, f"map: {x:.4g} m x {y:.4g} m")]
 
 
 def _seen_from(place: Path, file: Path) -> str:
