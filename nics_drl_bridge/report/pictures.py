@@ -235,7 +235,7 @@ def world_picture(
 def _regions(axes: Axes, places: Places | None, colour: str, kind: str) -> None:
     for number, (x1, y1, x2, y2) in enumerate(places.regions if places else ()):
         look: dict[str, Any] = {"facecolor": (colour, 0.12), "edgecolor": colour, "linestyle": "--"}
-        look["label"] = f"region of {kind}" if number == 0 else None
+        look["label"] = None if number else f"region of {kind}"
         axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, zorder=0.5, **look))
 
 
@@ -245,11 +245,12 @@ def _movers(axes: Axes, motions: Sequence[Motion | None], scene: Scene) -> None:
     ring: dict[str, Any] = {"fill": False, "edgecolor": MODEL, "linewidth": 2.0}
     for number, k in enumerate(moving):
         x, y, radius = scene.bodies[k, [X, Y, RADIUS]]
-        axes.add_patch(Circle((x, y), radius, label="moves" if number == 0 else None, **ring))
-    for motion in dict.fromkeys(motions):
-        if isinstance(motion, Patrol):
-            way = np.array([*motion.waypoints, *motion.waypoints[: int(motion.loop)]])
-            axes.plot(*way.T, color=MODEL, linewidth=1.2, linestyle=":", label="its way")
+        axes.add_patch(Circle((x, y), radius, label=None if number else "moves", **ring))
+    patrols = [motion for motion in dict.fromkeys(motions) if isinstance(motion, Patrol)]
+    for number, patrol in enumerate(patrols):
+        way = np.array([*patrol.waypoints, *patrol.waypoints[: int(patrol.loop)]])
+        label = None if number else "its way"
+        axes.plot(*way.T, color=MODEL, linewidth=1.2, linestyle=":", label=label)
 
 
 def _start(

@@ -53,6 +53,7 @@ def test_a_world_of_gazebo_becomes_a_world_file_that_an_env_drives_in(tmp_path):
     world = load_world(tmp_path / "own.yaml")
     assert (world.name, world.clearance) == ("own", 0.15)
     assert world.bounds == (-3.0, -3.5, 4.0, 0.25)
+    assert world.goal_distance[0] == 0.0  # start and goal are given, however near
     assert world.shapes == (Circle(radius=0.25),)
     assert world.obstacles[0].at == ((0.0, 0.0, 0.0), (2.0, 0.0, 0.0))
     env = BridgeEnv(model=direct_model(), world=str(tmp_path / "own.yaml"))

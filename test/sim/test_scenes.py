@@ -282,7 +282,7 @@ def test_in_an_open_field_all_is_within_its_bounds_wherever_they_lie():
     world = World.model_validate(
         {
             "name": "open",
-            "bounds": [10.0, -2.0, 14.0, 3.0],
+            "bounds": [10.0, -2.0, 14.01, 3.01],
             "obstacles": [circles(4)],
             "goal_distance": [1.0, 3.0],
         }
@@ -291,7 +291,7 @@ def test_in_an_open_field_all_is_within_its_bounds_wherever_they_lie():
     for points in (scenes.bodies[..., :2], scenes.starts[..., :2], scenes.goals):
         assert points.min(axis=(0, 1)) == pytest.approx((10.0, -2.0), abs=0.5)
         assert points.max(axis=(0, 1)) == pytest.approx((14.0, 3.0), abs=0.5)
-        assert ((points >= (10.0, -2.0)) & (points <= (14.0, 3.0))).all()
+        assert ((points >= (10.0, -2.0)) & (points <= (14.01, 3.01))).all()
 
 
 def test_a_world_that_is_too_full_is_refused_with_what_to_change():
