@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from nics_drl_bridge.recording.readers import read_recording
     from nics_drl_bridge.recording.recording import load_recording, save_recording
     from nics_drl_bridge.robot.spec import load_robot
+    from nics_drl_bridge.sim.sdf import read_sdf
     from nics_drl_bridge.sim.simulator import FastSimulator
     from nics_drl_bridge.sim.world import load_world
 
@@ -31,8 +32,8 @@ except PackageNotFoundError:  # a source tree that was never installed
 
 __all__ = [
     "FastSimulator", "__version__", "generate", "load_model", "load_policy", "load_recording",
-    "load_robot", "load_world", "make", "make_vec", "open_model", "read_recording", "save_model",
-    "save_recording",
+    "load_robot", "load_world", "make", "make_vec", "open_model", "read_recording", "read_sdf",
+    "save_model", "save_recording",
 ]  # fmt: skip
 
 _NAMES = {
@@ -42,6 +43,7 @@ _NAMES = {
     "recording.readers": ("read_recording",),
     "recording.recording": ("load_recording", "save_recording"),
     "robot.spec": ("load_robot",),
+    "sim.sdf": ("read_sdf",),
     "sim.simulator": ("FastSimulator",),
     "sim.world": ("load_world",),
 }

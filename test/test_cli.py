@@ -63,6 +63,7 @@ def csv_folder(path: Path, bad_row: str = "") -> Path:
 
 COMMANDS = {
     "generate", "record", "replay", "doctor", "urdf", "train", "evaluate", "demo", "policy", "bag",
+    "world",
 }  # fmt: skip
 
 

@@ -15,6 +15,7 @@ from nics_drl_bridge.commands.evaluate import evaluate
 from nics_drl_bridge.commands.model import generate, import_, inspect, record, urdf
 from nics_drl_bridge.commands.train import policy, train
 from nics_drl_bridge.commands.warmup import warmup
+from nics_drl_bridge.commands.world import world
 from nics_drl_bridge.errors import LONGEST, shortened
 
 app = typer.Typer(
@@ -55,6 +56,7 @@ for command in (
 ):
     app.command(command.__name__.rstrip("_"))(command)
 app.add_typer(policy, name="policy")
+app.add_typer(world, name="world")
 for name, extension in extensions.known("commands").items():
     app.add_typer(extension.load(), name=name)
 

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle as Disc
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, Rectangle
 from matplotlib.patches import Polygon as Outline
 from numpy.typing import NDArray
 
@@ -19,6 +19,7 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 Array = NDArray[np.float64]
 SIZE_IN, DPI, MARGIN = 5.0, 100, 0.05
 WALL, STANDING, GOAL, SCAN = "#333333", "#8d99ae", "#f2c14e", "#d1495b"
+EDGE = "#c5cbd3"  # of a field without walls
 ROBOTS = ("#1f6fb2", "#2f855a", "#7a4fa3", "#b7791f", "#0f766e", "#9d174d")
 
 
@@ -111,6 +112,9 @@ def draw_world(axes: Axes, world: AnyWorld, bodies: NDArray[np.float64], member:
         x, y = np.moveaxis(grid.cell_to_world(np.moveaxis(edges, 0, -1)), -1, 0)
         shade = np.where(grid.free, 1.0, np.where(grid.blocked, 0.2, 0.8))
         axes.pcolormesh(x, y, shade, cmap="gray", vmin=0.0, vmax=1.0, rasterized=True)
+    if place.bounds is not None:
+        low, high = np.array(place.bounds).reshape(2, 2)
+        axes.add_patch(Rectangle(tuple(low), *(high - low), fill=False, color=EDGE, ls="--"))
     for x1, y1, x2, y2 in place.all_walls():
         axes.plot([x1, x2], [y1, y2], color=WALL, linewidth=2)
     for body in bodies:

@@ -9,16 +9,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Polygon, Rectangle
+from numpy.typing import NDArray
 
+from nics_drl_bridge import geometry
 from nics_drl_bridge.env.rendering import draw_world
+from nics_drl_bridge.lidar.exact_kernels import RADIUS, X, Y
 from nics_drl_bridge.policy.evaluation import Episode
 from nics_drl_bridge.policy.shadow import Shadow
 from nics_drl_bridge.recording.excite import Pattern
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.sim.scenes import member_of
+from nics_drl_bridge.sim.obstacles import Motion, Patrol
+from nics_drl_bridge.sim.scenes import Scene, SceneSampler, member_of
+from nics_drl_bridge.sim.world import Places, World
 from nics_drl_bridge.sim.world_set import AnyWorld
 
+Array = NDArray[np.float64]
 MEASURED, MODEL, OTHER, DARK = "#1f6fb2", "#d1495b", "#8d99ae", "#333333"
 STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 64rem;
@@ -38,6 +44,8 @@ LINES: tuple[dict[str, Any], ...] = (
     {"color": GREEN, "linewidth": 1.4, "linestyle": ":"},
 )
 LEAST_WIDTH = 5.5
+GOAL = "#f2c14e"
+WORLD_SIDE = 7.5  # the longer side of a world's picture [inch]
 
 
 def page(title: str, lead: str, sections: Sequence[tuple[str, Sequence[str]]]) -> str:
@@ -115,7 +123,7 @@ def trajectories(runs: Mapping[str, Sequence[Episode]], world: AnyWorld, footpri
 def _panel(axes: Axes, episodes: Mapping[str, Episode], world: AnyWorld, footprint: float) -> None:
     first = next(iter(episodes.values()))
     draw_world(axes, world, first.bodies, member_of(world, first.seed))
-    axes.add_patch(Circle(tuple(first.goal), 0.3, color="#f2c14e", alpha=0.7, label="goal"))
+    axes.add_patch(Circle(tuple(first.goal), 0.3, color=GOAL, alpha=0.7, label="goal"))
     start = Circle(tuple(first.path[0, :2]), footprint, fill=False, color=DARK, label="start")
     axes.add_patch(start)
     for line, (name, episode) in zip(LINES, episodes.items(), strict=False):
@@ -184,3 +192,81 @@ def shadow_picture(shadow: Shadow) -> bytes:
         narrow.set_xlabel(f"policy less driven [{shadow.units[c]}]")
     grid[-2].set_xlabel("time [s]")
     return png(figure, grid[0])
+
+
+def world_picture(
+    world: World, footprint: float, seed: int, outline: Sequence[tuple[float, float]] | None = None
+) -> bytes:
+    """Draws a world as the episode of a seed finds it.
+
+    Args:
+        world: the world.
+        footprint: radius of the robot [m].
+        seed: of the scene.
+        outline: corners (V, 2) of the robot [m], if it is not round.
+
+    Raises:
+        ConfigError: the world has no room for the robot, or for the scene.
+    """
+    sampler = SceneSampler(world, footprint)
+    scene = sampler.draw([seed])[0]
+    low, high = np.array(world.extent).reshape(2, 2)
+    size = high - low
+    width, depth = WORLD_SIDE * size / size.max()
+    figure, (axes,) = panels(1, 1, (max(width, LEAST_WIDTH) + 0.8, max(depth, 1.6) + 1.3))
+    axes.set_axisbelow(True)
+    axes.grid(alpha=0.25, linewidth=0.6)
+    axes.spines[:].set_color("#cccccc")
+    draw_world(axes, world, scene.bodies)
+    for kind, places, colour in (("starts", world.starts, GREEN), ("goals", world.goals, GOAL)):
+        _regions(axes, places, colour, kind)
+    _movers(axes, sampler.motions, scene)
+    _start(axes, scene.starts[0], footprint, outline)
+    goal: dict[str, Any] = {"marker": "*", "markersize": 18, "color": GOAL, "markeredgecolor": DARK}
+    axes.plot(*scene.goals[0], linestyle="none", zorder=5, label="goal", **goal)
+    margin = 0.03 * size.max()
+    axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
+    count = np.count_nonzero(scene.bodies[:, RADIUS])
+    about = f"{size[0]:.3g} m x {size[1]:.3g} m, {count} obstacles, seed {seed}"
+    axes.set_title(f"{world.name}: {about}", fontsize=10)
+    return png(figure, axes)
+
+
+def _regions(axes: Axes, places: Places | None, colour: str, kind: str) -> None:
+    for number, (x1, y1, x2, y2) in enumerate(places.regions if places else ()):
+        look: dict[str, Any] = {"facecolor": (colour, 0.12), "edgecolor": colour, "linestyle": "--"}
+        look["label"] = None if number else f"region of {kind}"
+        axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, zorder=0.5, **look))
+
+
+def _movers(axes: Axes, motions: Sequence[Motion | None], scene: Scene) -> None:
+    """Draws rings around obstacles that move, and the ways of those that patrol."""
+    moving = [k for k, motion in enumerate(motions) if motion and scene.bodies[k, RADIUS] > 0.0]
+    ring: dict[str, Any] = {"fill": False, "edgecolor": MODEL, "linewidth": 2.0}
+    for number, k in enumerate(moving):
+        x, y, radius = scene.bodies[k, [X, Y, RADIUS]]
+        axes.add_patch(Circle((x, y), radius, label=None if number else "moves", **ring))
+    patrols = [motion for motion in dict.fromkeys(motions) if isinstance(motion, Patrol)]
+    for number, patrol in enumerate(patrols):
+        way = np.array([*patrol.waypoints, *patrol.waypoints[: int(patrol.loop)]])
+        label = None if number else "its way"
+        axes.plot(*way.T, color=MODEL, linewidth=1.2, linestyle=":", label=label)
+
+
+def _start(
+    axes: Axes, pose: Array, footprint: float, outline: Sequence[tuple[float, float]] | None
+) -> None:
+    look: dict[str, Any] = {
+        "facecolor": MEASURED,
+        "edgecolor": DARK,
+        "zorder": 4,
+        "label": "robot at its start",
+    }
+    front = footprint if outline is None else np.max(outline, axis=0)[0]
+    if outline is None:
+        axes.add_patch(Circle((pose[0], pose[1]), footprint, **look))
+    else:
+        axes.add_patch(Polygon(geometry.rotate(outline, pose[2]) + pose[:2], **look))
+    nose = pose[:2] + front * np.array([np.cos(pose[2]), np.sin(pose[2])])
+    axes.plot([pose[0], nose[0]], [pose[1], nose[1]], color="white", linewidth=2.0, zorder=4.5)

@@ -157,14 +157,14 @@ class SceneSampler:
         where, scene = self.world.source, f"in the scene of seed {seed}"
         if why == kernels.NO_OBSTACLES:
             reason = f"no free place for {self.count} obstacles {scene}"
-            fix = "lower `count` or `gap`, or enlarge `size`."
+            fix = "lower `count` or `gap`, or enlarge the field."
             return ConfigError(f"{where}: key 'obstacles': {reason}; {fix}")
         least, greatest = self.world.goal_distance
         return ConfigError(
             f"{where}: key 'goal_distance': no free places for {self.robots} start(s) and goal(s) "
             f"of robots of radius {self._plan.footprint:g} m, {least:g} to {greatest:g} m apart "
             f"with a way between among {self.count} obstacles, {scene}; change `goal_distance`, "
-            "lower `clearance` or `obstacles`, or enlarge `size`."
+            "lower `clearance` or `obstacles`, or enlarge the field."
         )
 
 
@@ -307,7 +307,7 @@ def _free_space(world: World, footprint: float) -> FreeSpace:
     cells = cells._replace(distances=np.array(cells.distances, order="C"))
     walls, bounds = world.all_walls(), np.array([-np.inf, -np.inf, np.inf, np.inf])
     kernels.wall_distances(cells, walls)
-    if world.size is not None:
+    if world.size is not None or world.bounds is not None:
         bounds = np.array(world.extent)
         x, y = _centres(cells)
         inside = (x > bounds[0]) & (x < bounds[2]) & (y > bounds[1]) & (y < bounds[3])

@@ -93,9 +93,10 @@ class World(Schema):
 
     name: str  # the name users refer to it by
     size: tuple[Side, Side] | None = None  # along x, y of a walled field around the origin [m]
+    bounds: Region | None = None  # instead, x1, y1, x2, y2 of a field without walls [m]
     # further straight walls, x1, y1, x2, y2 [m]
     walls: tuple[Region, ...] = Field(default=(), max_length=MOST_WALLS)
-    # a static map beside or instead of a `size`: a shipped one, or Nav2's YAML, from this folder
+    # a static map beside or instead of a field: a shipped one, or Nav2's YAML, from this folder
     map: str | None = None
     obstacles: tuple[Obstacles, ...] = ()  # groups of obstacles, see `Obstacles`
     clearance: Distance = 0.3  # around the footprint at start, goal, and on a path between [m]
@@ -106,8 +107,13 @@ class World(Schema):
 
     @model_validator(mode="after")
     def _consistent(self) -> World:
-        if self.size is None and self.map is None:
-            raise ValueError("a world needs a `size`, a `map`, or both")
+        if self.size is None and self.bounds is None and self.map is None:
+            raise ValueError("a world needs a `size`, `bounds`, or a `map`")
+        if self.size is not None and self.bounds is not None:
+            raise ValueError("a field has either a `size` and walls, or `bounds` and none")
+        x1, y1, x2, y2 = self.bounds or (0.0, 0.0, 1.0, 1.0)
+        if not all(SMALLEST_FIELD <= side <= LARGEST for side in (x2 - x1, y2 - y1)):
+            raise ValueError("bounds must be [least x, least y, greatest x, greatest y] in metres")
         if not 0.0 <= self.goal_distance[0] < self.goal_distance[1]:
             raise ValueError("goal_distance must be [least, greatest] in metres")
         if sum(group.counts[1] for group in self.obstacles) > MOST_OBSTACLES:
@@ -132,7 +138,8 @@ class World(Schema):
     @property
     def fingerprint(self) -> str:
         """The name, and 8 digits of a SHA-256 over the content; of a map, not its path."""
-        content = self.model_dump_json(exclude={"map"}).encode()
+        absent = {"bounds"} if self.bounds is None else set()
+        content = self.model_dump_json(exclude={"map", *absent}).encode()
         if self.grid is not None:
             about = repr((self.grid.cells.shape, self.grid.resolution, self.grid.origin))
             content += about.encode() + self.grid.cells.tobytes()
@@ -149,8 +156,10 @@ class World(Schema):
         if self.size is not None:
             x, y = self.size[0] / 2.0, self.size[1] / 2.0
             return -x, -y, x, y
+        if self.bounds is not None:
+            return self.bounds
         if self.grid is None:
-            raise ValueError("a world needs a `size`, a `map`, or both")
+            raise ValueError("a world needs a `size`, `bounds`, or a `map`")
         rows, columns = self.grid.cells.shape
         corners = [(i - 0.5, j - 0.5) for i in (0, rows) for j in (0, columns)]
         points = self.grid.cell_to_world(corners)

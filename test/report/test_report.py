@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from PIL import Image
+from robots import circles, field
 
 from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.policy.evaluation import Episode
@@ -25,6 +26,7 @@ from nics_drl_bridge.report.pictures import (
     table,
     training_curve,
     trajectories,
+    world_picture,
 )
 from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.world import World, load_world
@@ -142,6 +144,50 @@ def test_a_run_that_ended_early_is_drawn_as_far_as_it_went():
     drawn_short = decoded(trajectories(runs, WORLD, 0.2))
     whole = {"all": runs["all"], "short": runs["all"]}
     assert not np.array_equal(drawn_short, decoded(trajectories(whole, WORLD, 0.2)))
+
+
+def pixels_of(image, colour, off=8):
+    """Rows and columns of the pixels of a colour."""
+    return np.argwhere((np.abs(image.astype(int) - colour) < off).all(axis=-1))
+
+
+@pytest.mark.slow
+def test_the_picture_of_a_world_shows_the_episode_of_its_seed():
+    first, again, other = (decoded(world_picture(WORLD, 0.2, seed)) for seed in (0, 0, 1))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
+
+
+def test_a_robot_with_an_outline_is_drawn_with_it():
+    outline = ((0.4, 0.2), (-0.4, 0.2), (-0.4, -0.2), (0.4, -0.2))
+    disc, box = (
+        pixels_of(decoded(world_picture(WORLD, 0.45, 0, given)), [0x1F, 0x6F, 0xB2], off=60)
+        for given in (None, outline)
+    )
+    disc, box = (np.count_nonzero(one[:, 0] > 60) for one in (disc, box))
+    assert box / disc == pytest.approx(0.32 / (math.pi * 0.45**2), rel=0.1)
+
+
+def test_the_picture_of_an_open_field_is_as_wide_and_deep_as_its_bounds():
+    places = {"starts": {"at": [[9.0, 1.0, 0.0]]}, "goals": {"at": [[9.8, 7.0]]}}
+    bounds = {"name": "open", "bounds": [8.0, 0.0, 10.0, 8.0], "goal_distance": [1.0, 9.0]}
+    image = decoded(world_picture(World.model_validate(bounds | places), 0.3, 0))
+    robot, goal = (pixels_of(image, colour) for colour in ([0x1F, 0x6F, 0xB2], [0xF2, 0xC1, 0x4E]))
+    robot, goal = (one[one[:, 0] > 60].mean(axis=0) for one in (robot, goal))  # below the legend
+    up, right = robot[0] - goal[0], goal[1] - robot[1]
+    assert up / right == pytest.approx(6.0 / 0.8, rel=0.03)
+
+
+@pytest.mark.slow
+def test_obstacles_that_move_are_marked_with_the_ways_of_those_that_patrol():
+    patrol = {"kind": "patrol", "waypoints": [[-2.0, -2.0], [2.0, -2.0]], "speed": 0.5}
+    rings = []
+    for motion in (None, {"kind": "wander", "speed": [0.1, 0.2]}, patrol):
+        world = field(count=1, obstacles=[circles(1) | {"motion": motion}])
+        image = decoded(world_picture(world, 0.2, 0))
+        rings.append(len(pixels_of(image, [0xD1, 0x49, 0x5B], off=60)))
+    assert rings[0] < 20
+    assert rings[0] + 100 < rings[1] < rings[2] - 20
 
 
 def drawn(world, bodies):

@@ -278,10 +278,26 @@ def test_a_world_without_room_is_refused_before_anything_is_drawn(changes, sente
     assert "world 'field'" in str(caught.value)
 
 
+def test_in_an_open_field_all_is_within_its_bounds_wherever_they_lie():
+    world = World.model_validate(
+        {
+            "name": "open",
+            "bounds": [10.0, -2.0, 14.01, 3.01],
+            "obstacles": [circles(4)],
+            "goal_distance": [1.0, 3.0],
+        }
+    )
+    scenes = SceneSampler(world, FOOTPRINT).draw(range(50))
+    for points in (scenes.bodies[..., :2], scenes.starts[..., :2], scenes.goals):
+        assert points.min(axis=(0, 1)) == pytest.approx((10.0, -2.0), abs=0.5)
+        assert points.max(axis=(0, 1)) == pytest.approx((14.0, 3.0), abs=0.5)
+        assert ((points >= (10.0, -2.0)) & (points <= (14.01, 3.01))).all()
+
+
 def test_a_world_that_is_too_full_is_refused_with_what_to_change():
     with pytest.raises(ConfigError, match="no free place for 200 obstacles") as caught:
         sample_scene(field(2.0, count=200), FOOTPRINT, 0)
-    assert "enlarge `size`" in str(caught.value)
+    assert "enlarge the field" in str(caught.value)
     with pytest.raises(ConfigError, match="key 'goal_distance': no free places for 9 start"):
         sample_scene(field(2.0), FOOTPRINT, 0, robots=9)
 

@@ -36,6 +36,30 @@ def test_a_world_of_a_map_alone_has_no_other_walls_and_the_extent_of_the_map():
     assert np.array_equal(world.grid.cells, load_map("room").cells)
 
 
+def test_a_field_of_bounds_has_no_walls_and_lies_where_they_say():
+    world = World(name="open", bounds=(1.0, 2.0, 4.0, 9.0), goal_distance=(1.0, 2.0))
+    assert world.all_walls().shape == (0, 4)
+    assert world.extent == (1.0, 2.0, 4.0, 9.0)
+
+
+def test_the_fingerprint_of_a_world_without_bounds_is_that_of_worlds_made_before():
+    assert load_world("arena").fingerprint == "arena-00ae64c9"
+    fields = [
+        World(name="open", bounds=(0.0, 0.0, 6.0, y), goal_distance=(1.0, 2.0)) for y in (6.0, 7.0)
+    ]
+    assert fields[0].fingerprint != fields[1].fingerprint
+
+
+def test_an_obstacle_beyond_the_bounds_is_refused(tmp_path):
+    file = tmp_path / "open.yaml"
+    file.write_text(
+        "name: open\nbounds: [2.0, 2.0, 5.0, 5.0]\ngoal_distance: [1.0, 2.0]\n"
+        "obstacles: [{shapes: [{kind: circle, radius: 0.1}], at: [[1.0, 3.0, 0.0]]}]\n"
+    )
+    with pytest.raises(ConfigError, match=r"'obstacles.0.at.0': .* is outside the world"):
+        load_world(file)
+
+
 def test_wall_distance_is_that_of_plane_geometry():
     world = field(6.0, walls=[[-1.0, -1.0, 1.0, 0.5]])
     walls = world.all_walls()
@@ -101,7 +125,11 @@ def test_an_unknown_key_is_named_with_the_file_and_the_nearest_key(tmp_path):
     ("changes", "sentence"),
     [
         ({"size": [0.0, 3.0]}, "key 'size.0': input should be greater than or equal to 0.01"),
-        ({"size": None}, "needs a `size`, a `map`, or both"),
+        ({"size": None}, "needs a `size`, `bounds`, or a `map`"),
+        ({"bounds": [0.0, 0.0, 1.0, 1.0]}, "either a `size` and walls, or `bounds` and none"),
+        ({"size": None, "bounds": [1.0, 0.0, 0.0, 1.0]}, "bounds must be [least x, least y"),
+        ({"size": None, "bounds": [0.0, 0.0, 1.0, 2e4]}, "bounds must be [least x, least y"),
+        ({"size": None, "bounds": [0.0, 0.0, 1.0]}, "key 'bounds.3'"),
         ({"goal_distance": [3.0, 1.0]}, "goal_distance must be"),
         ({"obstacles": [circles(1, (0.0,))]}, "key 'obstacles.0.shapes.0.circle.radius'"),
         ({"obstacles": [circles(1, ())]}, "key 'obstacles.0.shapes'"),

@@ -1,0 +1,209 @@
+"""`nics world import` and `nics world draw`: worlds of others, and what a world looks like."""
+
+import math
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+
+import typer
+from typer import Argument, Option
+
+from nics_drl_bridge.commands.console import one_sentence
+from nics_drl_bridge.errors import ConfigError
+
+if TYPE_CHECKING:
+    from nics_drl_bridge.sim.sections import Standing
+
+world = typer.Typer(help="Imports worlds of others, and draws worlds.", no_args_is_help=True)
+
+SDF, MAPS, PICTURES = (".world", ".sdf"), (".yaml", ".yml"), (".png", ".pgm", ".bmp")
+HEIGHT = 0.2  # default of the height that counts [m]: TurtleBot3's lidar is at 0.18 m
+CLEARANCE = 0.1  # default [m]: fields of others are often narrow
+NEAREST = 2.0  # default of the least distance from start to goal [m]
+NAV2 = {"origin": [0.0, 0.0, 0.0], "negate": 0, "occupied_thresh": 0.65, "free_thresh": 0.25}
+Keys = dict[str, Any]  # of a YAML file
+
+
+class Written(NamedTuple):
+    """A file to write."""
+
+    path: Path
+    text: str
+    line: str  # what it holds
+
+
+@world.command("import")
+def import_(
+    files: Annotated[list[Path], Argument(
+        metavar="FILE...", help="Gazebo's .world or .sdf, Nav2's map .yaml, or a picture.")],
+    out: Annotated[Path | None, Option(
+        help="The .yaml to write, or a folder; by default named after the file, here.")] = None,
+    name: Annotated[str | None, Option(help="Of the world; by default that of the file.")] = None,
+    start: Annotated[tuple[float, float, float] | None, Option(
+        metavar="X Y HEADING", help="Where robots start [m, rad]; else anywhere.")] = None,
+    goal: Annotated[tuple[float, float] | None, Option(
+        metavar="X Y", help="Where the goal lies [m]; else anywhere.")] = None,
+    goal_distance: Annotated[tuple[float, float] | None, Option(
+        metavar="LEAST GREATEST", help="From start to goal [m]; else from 2 m on.")] = None,
+    clearance: Annotated[float, Option(help="Free space around the footprint [m].")] = CLEARANCE,
+    height: Annotated[float, Option(
+        help="Of SDF: what stands this far above z = 0 counts, the lidar's height [m].")] = HEIGHT,
+    bounds: Annotated[tuple[float, float, float, float] | None, Option(
+        metavar="X1 Y1 X2 Y2", help="Of SDF: the field [m]; else what holds everything.")] = None,
+    without: Annotated[list[str] | None, Option(
+        metavar="MODEL", help="Of SDF: a model to leave out, as a robot; * stands for anything. "
+        "May be given several times.")] = None,
+    skip_unknown: Annotated[bool, Option(
+        "--skip-unknown", help="Of SDF: leave out, and list, meshes and what else is no shape.")
+    ] = False,
+    resolution: Annotated[float | None, Option(help="Of a picture: side of a pixel [m].")] = None,
+) -> None:  # fmt: skip
+    """Makes worlds of Gazebo's worlds, of Nav2's maps, or of pictures."""
+    with one_sentence():
+        from nics_drl_bridge.files import write_text
+        from nics_drl_bridge.sim.sdf import read_sdf
+
+        keys = {
+            "name": name, "bounds": bounds, "clearance": clearance, "goal_distance": goal_distance,
+            "starts": start and {"at": [start]}, "goals": goal and {"at": [goal]},
+        }  # fmt: skip
+        keys = {key: value for key, value in keys.items() if value is not None}
+        made = list[Written]()
+        for file, place in _places(files, out, name).items():
+            if file.suffix in SDF:
+                standing = read_sdf(file, height, tuple(without or ()), skip_unknown)
+                made.append(_standing(file, place, standing, keys, height))
+            else:
+                made += _mapped(file, place, keys, resolution)
+        for each in made:
+            if each.path.exists():
+                fix = "remove it, or give another place as --out"
+                raise ConfigError(f"{each.path}: is there already; {fix}.")
+        for each in made:
+            write_text(each.path, each.text)
+            typer.echo(f"{each.path}: {each.line}")
+
+
+def _places(files: list[Path], out: Path | None, name: str | None) -> dict[Path, Path]:
+    """The file to write for each one to read."""
+    one = out is not None and out.suffix in MAPS
+    if len(files) > 1 and (one or name is not None):
+        given = f"--out {out}" if one else f"--name {name}"
+        raise ConfigError(
+            f"{given}: is for one file, not for {len(files)}; give a folder as --out."
+        )
+    if out is not None and one:
+        return {files[0]: out}
+    ends = [".yaml" if file.suffix in SDF else "_world.yaml" for file in files]
+    places = [(out or Path()) / f"{file.stem}{end}" for file, end in zip(files, ends, strict=True)]
+    if twice := {str(place) for place in places if places.count(place) > 1}:
+        raise ConfigError(f"{min(twice)}: two files would be written there; import them in turn.")
+    return dict(zip(files, places, strict=True))
+
+
+def _standing(file: Path, place: Path, standing: "Standing", keys: Keys, height: float) -> Written:
+    """The world of what stands in an SDF file."""
+    at = [keys[key]["at"][0] for key in ("starts", "goals") if key in keys]
+    x1, y1, x2, y2 = field = keys.get("bounds") or standing.bounds(*at)
+    groups = [
+        {"shapes": [group.shapes[0].model_dump(exclude_none=True)], "at": group.at}
+        for group in standing.obstacles
+    ]
+    head = [f"What stands in {file.name} at a height of {height:g} m."]
+    head += [f"Left out: {each}." for each in standing.left_out]
+    known = {"name": file.stem, "bounds": field, "obstacles": groups}
+    text = _text(place, head, known | keys, (x2 - x1, y2 - y1))
+    line = f"obstacles: {len(standing.placed)}, field: {x2 - x1:.4g} m x {y2 - y1:.4g} m"
+    return Written(place, text, "\n  left out: ".join([line, *standing.left_out]))
+
+
+def _mapped(file: Path, place: Path, keys: Keys, resolution: float | None) -> list[Written]:
+    """The world of a map; and of a picture without one, the map's own file before it."""
+    from nics_drl_bridge.config import dump_yaml, validate
+    from nics_drl_bridge.lidar.maps import MapFile, load_map, read_image
+
+    if file.suffix not in (*MAPS, *PICTURES):
+        kinds = ", ".join((*SDF, *MAPS, *PICTURES))
+        raise ConfigError(f"{file}: unknown kind of file; give one of {kinds}.")
+    map_file, made = file.with_suffix(".yaml") if file.suffix in PICTURES else file, []
+    if file.suffix in PICTURES and resolution is not None:
+        map_file = place.with_name(f"{place.stem}_map.yaml")
+        about = {"image": _seen_from(place, file), "resolution": resolution, **NAV2}
+        validate(about, MapFile, f"--resolution {resolution:g}")
+        rows, columns = read_image(file, str(file))[0].shape
+        made = [Written(map_file, dump_yaml(about), f"the map of {file.name}")]
+    elif map_file.is_file() or file.suffix in MAPS:
+        grid = load_map(map_file)
+        (rows, columns), resolution = grid.cells.shape, grid.resolution
+    else:
+        fix = "give the side of its pixels in metres as --resolution"
+        raise ConfigError(f"{file}: there is no {map_file.name} beside the picture; {fix}.")
+    x, y = columns * resolution, rows * resolution
+    known = {"name": file.stem, "map": _seen_from(place, map_file)}
+    text = _text(place, [f"The map {map_file.name}."], known | keys, (x, y))
+    return [*made, Written(place, text, f"map: {x:.4g} m x {y:.4g} m")]
+
+
+def _seen_from(place: Path, file: Path) -> str:
+    return os.path.relpath(file.resolve(), place.parent.resolve())
+
+
+def _text(place: Path, head: list[str], known: Keys, size: tuple[float, float]) -> str:
+    """Returns the text of a world file, which is read back to see that it is one."""
+    from nics_drl_bridge.config import dump_yaml, parse_yaml, validate
+    from nics_drl_bridge.sim.world import World, check_places
+
+    far = round(math.hypot(*size), 3)
+    least = 0.0 if {"starts", "goals"} <= set(known) else min(NEAREST, round(far / 4.0, 3))
+    known = {"goal_distance": (least, far), **known}
+    lines = [f"# {' '.join(line.split())}" for line in head]
+    for key in ("name", "map"):
+        lines += [dump_yaml({key: known[key]}).rstrip()] if key in known else []
+    lines += [f"{key}: {_flow(known[key])}" for key in ("bounds",) if key in known]
+    for g, group in enumerate(known.get("obstacles", ())):
+        lines += [] if g else ["obstacles:"]
+        lines += [f"  - shapes: {_flow(group['shapes'])}", "    at:"]
+        lines += [f"      - {_flow(pose)}" for pose in group["at"]]
+    for key in ("clearance", "goal_distance", "starts", "goals"):
+        lines += [f"{key}: {_flow(known[key])}"] if key in known else []
+    text = "\n".join(lines) + "\n"
+    found = validate(parse_yaml(text, str(place)), World, str(place))
+    if found.map is None:
+        check_places(found)
+    return text
+
+
+def _flow(value: Any) -> str:
+    """Numbers, words, lists and mappings as YAML on one line."""
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key}: {_flow(each)}" for key, each in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_flow, value)) + "]"
+    return str(value)
+
+
+@world.command()
+def draw(
+    name: Annotated[str, Argument(metavar="WORLD", help="A shipped world (arena) or a YAML file.")],
+    out: Annotated[Path | None, Option(help="The .png to write; <world>.png.")] = None,
+    seed: Annotated[int, Option(min=0, help="Of the episode.")] = 0,
+    robot: Annotated[str, Option(help="A shipped robot or a YAML file.")] = "differential",
+    footprint: Annotated[float | None, Option(help="Instead: radius of a round robot [m].")] = None,
+) -> None:
+    """Draws a world as an episode finds it: walls, map, obstacles, start and goal."""
+    with one_sentence():
+        from nics_drl_bridge.files import write_bytes
+        from nics_drl_bridge.report.pictures import world_picture
+        from nics_drl_bridge.robot.spec import load_robot
+        from nics_drl_bridge.sim.world import load_world
+
+        opened = load_world(name)
+        outline = None if footprint is not None else load_robot(robot).footprint
+        radius = load_robot(robot).footprint_radius if footprint is None else footprint
+        if not 0.0 < radius < math.inf:
+            raise ConfigError(f"--footprint {radius:g}: must be above 0 m.")
+        file = out or Path(f"{opened.name}.png")
+        if file.suffix != ".png":
+            raise ConfigError(f"--out {file}: must end in .png.")
+        write_bytes(file, world_picture(opened, radius, seed, outline))
+        typer.echo(f"{file}: the world {opened.name!r}, seed {seed}")

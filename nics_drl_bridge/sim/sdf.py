@@ -1,0 +1,384 @@
+"""Worlds of Gazebo, in SDF (http://sdformat.org): what stands there at a height above the ground.
+
+Only collision geometry counts, since that is what a robot touches. Poses are composed in space, of
+models, links, frames and includes; a plane at the height of the lidar then cuts the bodies. Where
+Gazebo classic saved a `<state>`, its poses replace those of the models, as they do in Gazebo.
+"""
+
+import math
+import os
+from collections.abc import Iterator
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any, NamedTuple
+from xml.etree.ElementTree import Element, TreeBuilder
+from xml.parsers import expat
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from nics_drl_bridge.config import no_device
+from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.lidar.shapes import FARTHEST, LARGEST, SMALLEST
+from nics_drl_bridge.sim import sections
+from nics_drl_bridge.sim.sections import Placed, ShapelessError, Solid, Standing
+
+Array = NDArray[np.float64]
+MOST_BYTES = 2**24  # of a file; the largest saved worlds have some megabytes
+MOST_MODELS = 20_000  # with all that are included
+OLDEST, NEWEST = (1, 4), (1, 12)  # versions of SDF
+PATHS = "GZ_SIM_RESOURCE_PATH", "IGN_GAZEBO_RESOURCE_PATH", "GAZEBO_MODEL_PATH"
+HARMLESS = "sun", "ground_plane"  # included by most worlds, and nothing to run into
+MOVING = {"actor": "an actor, which moves by a script", "population": "a population of models"}
+POSE = {"relative_to", "frame", "degrees", "rotation_format"}  # attributes
+NUMBERS = {"euler_rpy": 6, "quat_xyzw": 7}  # of a pose, by its rotation_format
+
+
+def read_sdf(
+    path: str | Path, height: float, without: tuple[str, ...] = (), skip_unknown: bool = False
+) -> Standing:
+    """Reads what stands in a Gazebo world at a height [m] above z = 0.
+
+    Args:
+        path: of a `.world` or `.sdf` file.
+        height: at which bodies count, that of the lidar [m].
+        without: names of models to leave out, in which `*` stands for anything.
+        skip_unknown: True to leave out what is no shape of a world: meshes, bodies that lean.
+
+    Raises:
+        ConfigError: the file is damaged or no SDF, holds what is no shape, or nothing stands there.
+    """
+    path = Path(path)
+    placed, unknown, seen = list[Placed](), dict[str, list[str]](), 0
+    try:
+        for body in _bodies(_Scope(_world(path), path, "", _Order(without)), np.eye(4)):
+            seen += 1
+            try:
+                solid = body.solid()
+                found = None if solid is None else sections.section(solid, body.pose, height)
+                placed += [] if found is None else [found]
+            except ShapelessError as error:
+                unknown.setdefault(body.model, []).append(str(error))
+    except RecursionError:
+        raise ConfigError(f"{path}: is nested too deeply; flatten its models.") from None
+    left_out = tuple(f"model {name!r} has {', '.join(what)}" for name, what in unknown.items())
+    if left_out and not skip_unknown:
+        more = f" (as {len(left_out) - 1} more models)" if len(left_out) > 1 else ""
+        fix = "leave it out by --skip-unknown or --without MODEL, or put a box in its place"
+        raise ConfigError(f"{path}: {left_out[0]}{more}, which is no shape of a world; {fix}.")
+    if not placed:
+        reason = f"none of its {seen} collision geometries stands at a height of {height:g} m"
+        raise ConfigError(f"{path}: {reason}; choose another --height.")
+    return Standing(tuple(placed), left_out)
+
+
+class _Order:
+    """Names to leave out, and which files and how many models have been opened."""
+
+    def __init__(self, without: tuple[str, ...]) -> None:
+        self._without, self._models = without, 0
+        self._roots: dict[Path, Element] = {}
+
+    def takes(self, name: str) -> bool:
+        return not any(fnmatch(name, pattern) for pattern in self._without)
+
+    def root(self, file: Path) -> Element:
+        if file not in self._roots:
+            self._roots[file] = _root(file)
+        return self._roots[file]
+
+    def count(self, file: Path) -> None:
+        self._models += 1
+        if self._models > MOST_MODELS:
+            raise ConfigError(f"{file}: holds more than {MOST_MODELS} models; split the world.")
+
+
+class _Scope:
+    """A world or a model: its frames by their names, and what is in it."""
+
+    def __init__(
+        self, element: Element, file: Path, name: str, order: _Order, include: Element | None = None
+    ) -> None:
+        self.element, self.file, self.name, self._order = element, file, name, order
+        self.pose, self.placement = element.find("pose"), element.get("placement_frame", "")
+        if include is not None and include.find("pose") is not None:
+            self.pose, self.placement = include.find("pose"), _text(include, "placement_frame")
+        self.models: list[_Scope] = []
+        self.strange: list[tuple[str, str]] = []  # name of a model, and why it can't be read
+        self._state = {
+            one.get("name", ""): one.find("pose") for one in element.iterfind("state/model")
+        }
+        self._named: dict[str, Element | _Scope] = {}
+        self._open: set[str] = set()  # frames whose poses are being looked for
+        order.count(file)
+        for child in element:
+            self._add(child)
+
+    @property
+    def where(self) -> str:
+        return f"{self.file}: model {self.name!r}" if self.name else str(self.file)
+
+    def _add(self, child: Element) -> None:
+        name = child.get("name", "") or _text(child, "name")
+        if child.tag == "link" or (child.tag in ("frame", "joint") and name not in self._named):
+            self._named[name] = child
+        elif child.tag == "model":
+            self._add_model(child, self.file, name)
+        elif child.tag in MOVING and self._order.takes(name):
+            self.strange.append((name, MOVING[child.tag]))
+        elif child.tag == "include":
+            uri = _text(child, "uri")
+            name = name or uri.rstrip("/").rpartition("/")[2]
+            file = _found(uri, self.file)
+            if file is not None:
+                model = self._order.root(file).find("model")
+                if model is not None:  # else a light
+                    self._add_model(
+                        model, file, _text(child, "name") or model.get("name", ""), child
+                    )
+            elif name not in HARMLESS and self._order.takes(name):
+                folders = f"{uri!r}, which is neither beside the file nor on {PATHS[0]}"
+                self.strange.append((name, folders))
+
+    def _add_model(
+        self, element: Element, file: Path, name: str, include: Element | None = None
+    ) -> None:
+        whole = f"{self.name}::{name}" if self.name else name
+        if self._order.takes(whole):
+            model = _Scope(element, file, whole, self._order, include)
+            self.models.append(model)
+            self._named.setdefault(name, model)
+
+    def frame(self, name: str) -> Array:
+        """(4, 4) pose of a frame of this scope, in its own frame. Raises ConfigError for none."""
+        if name in ("", "world", "__model__"):
+            return np.eye(4)
+        found, (first, _, rest) = self._named.get(name), name.partition("::")
+        if found is None and rest and isinstance(inner := self._named.get(first), _Scope):
+            return self.frame(first) @ inner.frame(rest)
+        if found is None:
+            near = nearest(name, self._named) if self._named else "there are none here."
+            raise ConfigError(f"{self.where}: there is no frame {name!r}; {near}")
+        if name in self._open:
+            reason = f"the pose of {name!r} is relative to itself; give it another frame"
+            raise ConfigError(f"{self.where}: {reason}.")
+        self._open.add(name)
+        pose = self.of_model(found) if isinstance(found, _Scope) else self._of_element(found)
+        self._open.remove(name)
+        return pose
+
+    def _of_element(self, element: Element) -> Array:
+        bases = {"joint": _text(element, "child"), "frame": element.get("attached_to", "")}
+        return self.posed(element.find("pose"), bases.get(element.tag, ""))
+
+    def posed(
+        self, pose: Element | None, base: str = "", start: Array | None = None, where: str = ""
+    ) -> Array:
+        """(4, 4) of a `<pose>` in this scope; by default from `start`, or from the frame `base`."""
+        given = "" if pose is None else pose.get("relative_to") or pose.get("frame") or ""
+        if start is None or given:
+            start = self.frame(given or base)
+        return start @ _matrix(pose, where or self.where)
+
+    def of_model(self, model: "_Scope") -> Array:
+        """(4, 4) pose of a model in this scope."""
+        state = self._state.get(model.name)
+        if state is not None:
+            return _matrix(state, model.where)
+        placed = self.posed(model.pose, where=model.where)
+        return placed @ np.linalg.inv(model.frame(model.placement))
+
+
+class _Body(NamedTuple):
+    """A collision geometry, or the reason why there is none."""
+
+    model: str
+    where: str
+    geometry: Element | str
+    pose: Array  # (4, 4) in the world
+
+    def solid(self) -> Solid | None:
+        """Returns the body; None for the ground. Raises ShapelessError, ConfigError for sizes."""
+        if isinstance(self.geometry, str):
+            raise ShapelessError(self.geometry)
+        shape = next((child for child in self.geometry if ":" not in child.tag), Element("empty"))
+        if shape.tag == "empty":
+            return None
+        if shape.tag == "plane":
+            return self._ground(shape)
+        if shape.tag == "box":
+            return sections.Box(self._lengths(shape, "size", 3))
+        if shape.tag == "sphere":
+            return sections.Sphere(*self._lengths(shape, "radius"))
+        if shape.tag in ("cylinder", "capsule"):
+            kind = sections.Cylinder if shape.tag == "cylinder" else sections.Capsule
+            return kind(*self._lengths(shape, "radius"), *self._lengths(shape, "length"))
+        if shape.tag == "polyline" and len(self.geometry.findall("polyline")) == 1:
+            return self._prism(shape)
+        what = "polyline with holes" if shape.tag == "polyline" else shape.tag
+        article = "an" if what[0] in "aeiou" else "a"
+        raise ShapelessError(f"{article} {what} {_text(shape, 'uri')}".rstrip())
+
+    def _ground(self, plane: Element) -> None:
+        normal = self.pose[:3, :3] @ _floats(plane.findtext("normal", "0 0 1"), 3, self.where)
+        if abs(normal[2]) < math.cos(sections.TILT) * np.linalg.norm(normal):
+            raise ShapelessError("a plane that is not level")
+
+    def _prism(self, polyline: Element) -> Solid:
+        texts = [point.text or "" for point in polyline.findall("point")]
+        points = [_floats(text, 2, f"{self.where}: <point>") for text in texts]
+        if len(points) > 1 and points[0] == points[-1]:
+            points.pop()
+        if len(set(points)) < 3:
+            raise ConfigError(f"{self.where}: <polyline> needs three different points; add some.")
+        return sections.Prism(tuple(points), *self._lengths(polyline, "height"))
+
+    def _lengths(self, shape: Element, key: str, count: int = 1) -> tuple[float, ...]:
+        where = f"{self.where}: <{key}> of its <{shape.tag}>"
+        text = shape.findtext(key)
+        if text is None:
+            raise ConfigError(f"{where} is missing; add it.")
+        lengths = _floats(text, count, where)
+        if not all(SMALLEST <= length <= LARGEST for length in lengths):
+            raise ConfigError(f"{where} must be above 0 and at most {LARGEST:g} m, not {text!r}.")
+        return lengths
+
+
+def _bodies(scope: _Scope, pose: Array) -> Iterator[_Body]:
+    """Yields all collision geometries of a scope that has a pose (4, 4) in the world."""
+    for name, reason in scope.strange:
+        yield _Body(name, scope.where, reason, pose)
+    for link in scope.element.iterfind("link"):
+        of_link = scope.posed(link.find("pose"))
+        for collision in link.iterfind("collision"):
+            where = f"{scope.where}, collision {collision.get('name', '')!r}"
+            own = scope.posed(collision.find("pose"), start=of_link)
+            what = collision.find("geometry")
+            if what is not None:
+                yield _Body(scope.name, where, what, pose @ own)
+    for model in scope.models:
+        yield from _bodies(model, pose @ scope.of_model(model))
+
+
+def _matrix(pose: Element | None, where: str) -> Array:
+    """(4, 4) of the numbers in a `<pose>`, with angles about the fixed axes x, y, z."""
+    matrix = np.eye(4)
+    if pose is None or not (pose.text or "").strip():
+        return matrix
+    unknown = [name for name in pose.attrib if name not in POSE and ":" not in name]
+    if unknown:
+        hint = nearest(unknown[0], POSE)
+        raise ConfigError(f"{where}: unknown attribute {unknown[0]!r} of a <pose>; {hint}")
+    form, degrees = pose.get("rotation_format", "euler_rpy"), pose.get("degrees", "false")
+    for name, given, known in (
+        ("rotation_format", form, list(NUMBERS)),
+        ("degrees", degrees, ["true", "false", "1", "0"]),
+    ):
+        if given not in known:
+            hint = nearest(given, known)
+            raise ConfigError(f"{where}: attribute {name}={given!r} of a <pose>; {hint}")
+    numbers = _floats(pose.text or "", NUMBERS[form], f"{where}: <pose>")
+    matrix[:3, 3] = numbers[:3]
+    if form == "quat_xyzw":
+        if not any(numbers[3:]):
+            raise ConfigError(f"{where}: the quaternion of a <pose> is 0; give a rotation.")
+        matrix[:3, :3] = Rotation.from_quat(numbers[3:]).as_matrix()
+    elif any(numbers[3:]):
+        turned = Rotation.from_euler("xyz", numbers[3:], degrees in ("true", "1"))
+        matrix[:3, :3] = turned.as_matrix()
+    return matrix
+
+
+def _floats(text: str, count: int, where: str) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(word) for word in text.split())
+    except ValueError:
+        numbers = ()
+    if len(numbers) != count or not all(abs(number) <= FARTHEST for number in numbers):
+        words = f"{count} numbers" if count > 1 else "a number"
+        raise ConfigError(f"{where} must be {words}, not {text.strip()!r}.")
+    return numbers
+
+
+def _text(element: Element, tag: str) -> str:
+    return element.findtext(tag, "").strip()
+
+
+def _found(uri: str, file: Path) -> Path | None:
+    """The file of an included model, beside a file or on the paths of Gazebo; None for none."""
+    kind, _, name = uri.rpartition("://")
+    here = file.resolve().parent
+    near = [here, here / "models", here.parent, here.parent / "models"]
+    listed = [
+        Path(one) for key in PATHS for one in os.environ.get(key, "").split(os.pathsep) if one
+    ]
+    for folder in () if kind.startswith("http") else (*near, *listed):
+        path = folder / name
+        if name and path.is_file():
+            return path
+        if name and path.is_dir():
+            return _model_in(path)
+    return None
+
+
+def _model_in(folder: Path) -> Path | None:
+    """The SDF of the newest version in a model's folder."""
+    config = folder / "model.config"
+    listed = list(_tree(config).iterfind("sdf")) if config.is_file() else []
+    newest = max(listed, key=lambda one: _version(one.get("version", "")), default=None)
+    file = folder / ("model.sdf" if newest is None else (newest.text or "").strip())
+    return file if file.is_file() else None
+
+
+def _version(text: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in text.split(".") if part.isdecimal())
+
+
+def _world(path: Path) -> Element:
+    """The world of a file, or its root where that holds models alone."""
+    root = _root(path)
+    worlds = root.findall("world")
+    if len(worlds) > 1 or not (worlds or root.findall("model")):
+        raise ConfigError(f"{path}: holds {len(worlds)} worlds; give a file with one.")
+    return worlds[0] if worlds else root
+
+
+def _root(path: Path) -> Element:
+    root = _tree(path)
+    if root.tag != "sdf":
+        raise ConfigError(f"{path}: is no SDF but <{root.tag}>; give a .world or .sdf file.")
+    version = root.get("version", "")
+    if not OLDEST <= _version(version) <= NEWEST:
+        known = " to ".join(".".join(map(str, one)) for one in (OLDEST, NEWEST))
+        fix = "convert it by `gz sdf -p`"
+        raise ConfigError(f"{path}: SDF version {version!r} is not read, {known} are; {fix}.")
+    return root
+
+
+def _tree(path: Path) -> Element:
+    """Reads XML. Raises ConfigError with line and column, and for declared entities, which grow."""
+    try:
+        if no_device(path).stat().st_size > MOST_BYTES:
+            reason = f"is larger than {MOST_BYTES // 2**20} MB, which no such file is"
+            raise ConfigError(f"{path}: {reason}; give another.")
+        data = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{path}: can't be read ({error.strerror}).") from None
+    parser, builder = expat.ParserCreate(), TreeBuilder()
+
+    def refuse(*_: Any) -> None:
+        reason = "declares a document type, whose entities may grow without end"
+        raise ConfigError(f"{path}, line {parser.CurrentLineNumber}: {reason}; remove <!DOCTYPE>.")
+
+    parser.StartDoctypeDeclHandler = refuse
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler = builder.end
+    parser.CharacterDataHandler = builder.data
+    try:
+        parser.Parse(data, True)
+    except (expat.ExpatError, ValueError, LookupError) as error:
+        at = f"line {parser.ErrorLineNumber}, column {parser.ErrorColumnNumber + 1}"
+        problem = expat.ErrorString(parser.ErrorCode) or str(error)
+        raise ConfigError(f"{path}, {at}: is no XML: {problem}; mend it.") from None
+    return builder.close()
