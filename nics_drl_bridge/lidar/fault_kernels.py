@@ -21,8 +21,8 @@ CLOCKWISE, AT_ONCE, COUNTER_CLOCKWISE = -1, 0, 1  # values of SKEW
 ROUNDING = 1e-9  # rounding error of a multiple of the quantisation step [m]
 
 
-class Device(NamedTuple):
-    """What a device does to a return, float32; so as to change nothing where it has no fault."""
+class Distortion(NamedTuple):
+    """Faults of a device as applied to a return; each changes nothing where there is none."""
 
     least: np.float32  # [m]
     most: np.float32
@@ -67,7 +67,7 @@ def _device(limits, faults):  # type: ignore[no-untyped-def]
     elif faults[TOO_CLOSE] == AS_MINUS_INF:
         close = -np.inf
     per_step = 1.0 / step if step > 0.0 else 0.0
-    return Device(
+    return Distortion(
         single(limits[0]), single(limits[1]), single(close), single(faults[NOISE_STD]),
         single(faults[NOISE_PROPORTIONAL]), single(per_step), single(step),
         single(step - single(step)), single(math.ceil((limits[0] - ROUNDING) * per_step)),

@@ -48,7 +48,7 @@ class FurtherLidar(Sensor):
         def render(out: Readings, worlds: NDArray[np.int64]) -> None:
             lanes = scan_kernels.scan_lanes()
             scan_kernels.scan_worlds(
-                out, state.pose, worlds, state.bodies, around.first, around.standing, lidar, lanes
+                out, state.pose, worlds, state.bodies, around.first, around.fixtures, lidar, lanes
             )
             fault_kernels.distort_worlds(
                 out, worlds, limits, faults, state.seeds ^ salt, state.steps

@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
+from nics_drl_bridge.lidar.fixtures import stack_fixtures
 from nics_drl_bridge.lidar.shapes import place
-from nics_drl_bridge.lidar.standing import standing
 
 Array = NDArray[np.float64]
 # Rings around the lidar, placements in each, bands of range; rings and bands grow geometrically.
@@ -81,7 +81,7 @@ def _scans(bodies: Array, exact: LidarArrays, baked: LidarArrays) -> tuple[Array
     robots = np.tile([-mount[0], -mount[1], 0.0], (PLACES, 1, 1))  # the lidar is at the origin
     scans = np.empty((2, PLACES, 1, len(directions)), np.float32)
     worlds, lanes = np.arange(PLACES), scan_kernels.scan_lanes()
-    nothing = standing([NO_WALLS], [None], np.zeros(PLACES, np.int64))
+    nothing = stack_fixtures([NO_WALLS], [None], np.zeros(PLACES, np.int64))
     for ranges, sensor in zip(scans, (exact, baked), strict=True):
         scan_kernels.scan_worlds(ranges, robots, worlds, bodies, -1, nothing, sensor, lanes)
     one, other = scans[:, :, 0].astype(np.float64)

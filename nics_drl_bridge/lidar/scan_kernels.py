@@ -16,7 +16,7 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import baked_kernels as baked
 from nics_drl_bridge.lidar import exact_kernels, map_kernels
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, LidarPose, X, Y
-from nics_drl_bridge.lidar.standing import grid_of, walls_of
+from nics_drl_bridge.lidar.fixtures import grid_of, walls_of
 
 BLOCK = 16  # Beams that are fused at once
 LANES = 9 * BLOCK  # Bodies looked up together: so few that their scans stay in the L1 cache
@@ -63,15 +63,15 @@ class Device(NamedTuple):
 
 
 @kernel
-def scan_worlds(ranges, poses, chosen, bodies, first, standing, lidar, lanes):  # type: ignore[no-untyped-def]
+def scan_worlds(ranges, poses, chosen, bodies, first, fixtures, lidar, lanes):  # type: ignore[no-untyped-def]
     """Scans from the robots of the worlds `chosen` (n,), at poses (N, M, 3), into ranges (N, M, B).
 
     Of the bodies (N, K, 7) that of robot 0 is `first`, the others follow; -1 if robots are none.
-    Walls and maps are `standing` there. Bodies wait in the lanes until these are full.
+    Walls and maps are the `fixtures`. Bodies wait in the lanes until these are full.
     """
     count, robots, found = bodies.shape[1], poses.shape[1], 0
     for n in chosen:
-        walls = walls_of(n, standing)
+        walls = walls_of(n, fixtures)
         for m in range(robots):
             out, me = ranges[n, m], first + m if first >= 0 else -1
             for i in range(out.shape[0]):
@@ -90,8 +90,8 @@ def scan_worlds(ranges, poses, chosen, bodies, first, standing, lidar, lanes):  
                 here = LidarPose(x, y, math.cos(heading), math.sin(heading))
                 baked.compute(out, here, bodies[n], me, computed > 0, walls, lidar)
     look_up(found, ranges, lidar, lanes)
-    if standing.squares.size > 0:
-        add_maps(ranges, poses, chosen, standing, lidar, lanes)
+    if fixtures.squares.size > 0:
+        add_maps(ranges, poses, chosen, fixtures, lidar, lanes)
 
 
 @kernel(contracts=True, inline=True)
@@ -269,10 +269,10 @@ def fuse(flat, k, lidar, lanes):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def add_maps(ranges, poses, chosen, standing, lidar, lanes):  # type: ignore[no-untyped-def]
+def add_maps(ranges, poses, chosen, fixtures, lidar, lanes):  # type: ignore[no-untyped-def]
     """Fuses static maps into the scans of some worlds, see `scan_worlds`."""
     for n in chosen:
-        grid = grid_of(n, standing)
+        grid = grid_of(n, fixtures)
         for m in range(poses.shape[1] if grid.squares.size > 0 else 0):
             x, y, heading = baked.sensor_pose(poses[n, m], lidar.mount)
             here = LidarPose(x, y, math.cos(heading), math.sin(heading))

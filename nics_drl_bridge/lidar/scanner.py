@@ -14,11 +14,11 @@ from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.exact_kernels import SHAPE, Beams
+from nics_drl_bridge.lidar.fixtures import stack_fixtures
 from nics_drl_bridge.lidar.lookup_error import lookup_distances
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import BODY, Shape, place
 from nics_drl_bridge.lidar.spec import LidarSpec
-from nics_drl_bridge.lidar.standing import standing
 from nics_drl_bridge.lidar.table import LidarTable
 
 Renderer = Literal["auto", "baked", "exact"]
@@ -118,7 +118,7 @@ class Scanner:
             out[:] = self.scan(poses, bodies, walls)
             return out
         worlds, lanes = np.arange(len(poses)), scan_kernels.scan_lanes()
-        around = standing([walls], [self.grid], np.zeros(len(poses), np.int64))
+        around = stack_fixtures([walls], [self.grid], np.zeros(len(poses), np.int64))
         scan_kernels.scan_worlds(
             out[:, None], poses[:, None], worlds, bodies, -1, around, self.arguments, lanes
         )

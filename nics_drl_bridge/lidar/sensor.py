@@ -17,9 +17,9 @@ from pydantic import Field, PlainSerializer, PlainValidator
 from nics_drl_bridge import extensions
 from nics_drl_bridge.config import Schema, parse_yaml, read_text, validate
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.lidar.fixtures import Fixtures
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.lidar.shapes import Shape
-from nics_drl_bridge.lidar.standing import Standing
 
 Array = NDArray[np.float64]
 Readings = NDArray[np.float32]
@@ -38,7 +38,7 @@ class SensedWorlds:
     state: Any
     shapes: tuple[Shape, ...]  # of the bodies, by the index in their column `SHAPE`
     first: int  # K, the body of robot 0
-    standing: Standing  # walls and static map of each world
+    fixtures: Fixtures  # walls and static map of each world
     renderer: Renderer  # of the lidar
 
 

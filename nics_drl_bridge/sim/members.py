@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
+from nics_drl_bridge.lidar.fixtures import cells_of, joined, stack_fixtures, walls_of
 from nics_drl_bridge.lidar.maps import GridMap
-from nics_drl_bridge.lidar.standing import cells_of, joined, standing, walls_of
 from nics_drl_bridge.sim.obstacles import Motion, plan_arrays
 from nics_drl_bridge.sim.separation_kernels import FIRST, PLAN
 from nics_drl_bridge.sim.state import NO_FIELD, Array, MapField, Members, Movers, Surroundings
@@ -18,13 +18,13 @@ from nics_drl_bridge.sim.world import World
 @kernel(view=True)
 def surroundings_of(n: int, members: Members) -> Surroundings:
     """Returns all that stands in world n of the simulation."""
-    p = members.standing.member[n]
-    frame = members.standing.frames[p]
+    p = members.fixtures.member[n]
+    frame = members.fixtures.frames[p]
     distances = cells_of(members.distances, members.fields[p])
     grid = MapField(distances, frame[0], frame[1], frame[2], frame[3], frame[4])
     movers = Movers(members.moves, members.plans[p], members.waypoints, members.half[p])
     return Surroundings(
-        walls_of(n, members.standing), grid, members.outlines, members.crowded,
+        walls_of(n, members.fixtures), grid, members.outlines, members.crowded,
         members.scattered, movers,
     )  # fmt: skip
 
@@ -43,7 +43,7 @@ def members_of(
     plans, waypoints = _plans(motions if moves else [() for _ in worlds])
     half = np.array([np.abs(world.extent).reshape(2, 2).max(axis=0) for world in worlds])
     return Members(
-        standing([world.all_walls() for world in worlds], grids, member), distances, places,
+        stack_fixtures([world.all_walls() for world in worlds], grids, member), distances, places,
         outlines, *crowds, moves, plans, waypoints, half,
     )  # fmt: skip
 

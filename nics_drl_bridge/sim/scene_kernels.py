@@ -10,8 +10,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import types
-from numba.experimental import structref
 from numpy.typing import NDArray
 
 from nics_drl_bridge import random_kernels as random
@@ -394,24 +392,6 @@ def choose_members(seeds, members, out):  # type: ignore[no-untyped-def]
         out[n] = min(int(share * members), members - 1)
 
 
-@structref.register
-class PackedType(types.StructRef):  # type: ignore[misc]
-    """The type of `Packed`."""
-
-
-class Packed(structref.StructRefProxy):  # type: ignore[misc]
-    """A `ScenePlan` as one argument: passing its arrays takes as long as drawing a scene."""
-
-
-structref.define_proxy(Packed, PackedType, ["plan"])
-
-
-@kernel(allocates=True)
-def pack(plan):  # type: ignore[no-untyped-def]
-    """Makes one argument of a plan."""
-    return Packed(plan)
-
-
 @kernel(allocates=True)
 def draw_scenes(packed, seeds, wanted, sizes, bodies, starts, goals, scratch):  # type: ignore[no-untyped-def]
     """Draws the scenes of some seeds (n,) to bodies (n, K, 7), starts (n, M, 3), goals (n, M, 2).
@@ -420,7 +400,7 @@ def draw_scenes(packed, seeds, wanted, sizes, bodies, starts, goals, scratch):  
     obstacles, -1 for the world's own, and `sizes` (n,) rows of `plan.variants`. Returns the first
     row that could not be drawn, or n, and the reason.
     """
-    return _draw(packed.plan, seeds, wanted, sizes, bodies, starts, goals, scratch)
+    return _draw(packed.content, seeds, wanted, sizes, bodies, starts, goals, scratch)
 
 
 @kernel

@@ -19,6 +19,7 @@ from nics_drl_bridge.lidar.shapes import BODY, LARGEST, SMALLEST, Circle, Outlin
 from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim import scene_kernels as kernels
 from nics_drl_bridge.sim.obstacles import Motion
+from nics_drl_bridge.sim.packing import pack
 from nics_drl_bridge.sim.scene_kernels import FreeSpace, ScenePlan, SceneScratch
 from nics_drl_bridge.sim.state import NO_FIELD, MapField
 from nics_drl_bridge.sim.world import Goals, Starts, World, check_places
@@ -106,7 +107,7 @@ class SceneSampler:
 
     @cached_property
     def _packed(self) -> Any:
-        return kernels.pack(self._plan)
+        return pack(self._plan)
 
     def __getstate__(self) -> dict[str, Any]:  # a copy packs its plan anew
         return {name: value for name, value in vars(self).items() if name != "_packed"}

@@ -11,7 +11,7 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import fault_kernels, scan_kernels
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, X, Y
-from nics_drl_bridge.lidar.standing import standing_around
+from nics_drl_bridge.lidar.fixtures import fixtures_around
 from nics_drl_bridge.robot.kernels import move, wrap
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim.state import Array, Dynamics, Members, Scratch, State
@@ -148,7 +148,7 @@ def scan_together(
     scans = scratch.scans
     chosen, first = scans.waiting[:waiting], state.velocity.shape[1]
     scan_kernels.scan_worlds(
-        state.ranges, state.pose, chosen, state.bodies, first, members.standing, lidar, scans.lookup
+        state.ranges, state.pose, chosen, state.bodies, first, members.fixtures, lidar, scans.lookup
     )
 
 
@@ -182,7 +182,7 @@ def _scan_alone(
     seen = scans.seen[:count].reshape((1, count, 7))
     begin = (n * state.ranges.shape[1] + m) * beams
     scan = state.ranges.reshape(-1)[begin : begin + beams].reshape((1, 1, beams))
-    around = standing_around(n, members.standing)
+    around = fixtures_around(n, members.fixtures)
     groups = 1 if skew == 0.0 else scans.slices.shape[0]
     if groups > 1:
         fault_kernels.slice_poses(scans.slices, spot[0, 0], drive, lidar.sweep_time, skew)

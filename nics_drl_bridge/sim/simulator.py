@@ -21,6 +21,7 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.sim import step_kernels
 from nics_drl_bridge.sim.allocation import Sizes, allocate, part_of, split
 from nics_drl_bridge.sim.members import members_of
+from nics_drl_bridge.sim.packing import pack
 from nics_drl_bridge.sim.randomisation import Draws, Randomisation, Sampler, load_randomisation
 from nics_drl_bridge.sim.scenes import Scenes, SetSampler
 from nics_drl_bridge.sim.state import Members
@@ -179,7 +180,7 @@ class FastSimulator:
     def packed(self) -> dict[int, Any]:
         """Packed arguments of the kernels, by the first world of each part."""
         of = (self.data, self._members, self.model, self._scanner, self._sizes)
-        return {part.start: step_kernels.pack(part_of(*of, part)) for part in self.parts}
+        return {part.start: pack(part_of(*of, part)) for part in self.parts}
 
     def __getstate__(self) -> dict[str, Any]:  # a copy rebuilds the rest
         rebuilt = ("_members", "packed", "_renders")
@@ -188,7 +189,7 @@ class FastSimulator:
     @cached_property
     def _renders(self) -> dict[str, Render]:
         around = SensedWorlds(
-            self.data, self._scanner.table.shapes, self.sampler.count, self._members.standing,
+            self.data, self._scanner.table.shapes, self.sampler.count, self._members.fixtures,
             self._scanner.renderer,
         )  # fmt: skip
         return {sensor.name: sensor.renderer(around) for sensor in self.model.sensors}

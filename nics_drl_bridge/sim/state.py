@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
+from nics_drl_bridge.lidar.fixtures import Fixtures
 from nics_drl_bridge.lidar.scan_kernels import ScanLanes
-from nics_drl_bridge.lidar.standing import Standing
 from nics_drl_bridge.robot.kernels import Terms
 
 Array = NDArray[np.float64]
@@ -81,7 +81,7 @@ class Surroundings(NamedTuple):
 class Members(NamedTuple):
     """The surroundings of P worlds, one after the other; see `members.surroundings_of`."""
 
-    standing: Standing
+    fixtures: Fixtures
     distances: NDArray[np.float32]  # of all maps, see `MapField`
     fields: Integers  # (P, 3) first distance, rows and columns of each map
     outlines: OutlineArrays

@@ -8,8 +8,6 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import types
-from numba.experimental import structref
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
@@ -25,29 +23,10 @@ from nics_drl_bridge.sim.state import (
     Integers,
     Lanes,
     Members,
-    Part,
     Scratch,
     State,
     Surroundings,
 )
-
-
-@structref.register
-class PackedType(types.StructRef):  # type: ignore[misc]
-    """The type of `Packed`."""
-
-
-class Packed(structref.StructRefProxy):  # type: ignore[misc]
-    """A `Part` as one argument: passing a hundred arrays took longer than a step."""
-
-
-structref.define_proxy(Packed, PackedType, ["part"])
-
-
-@kernel(allocates=True)
-def pack(part: Part) -> Any:
-    """Makes one argument of a part."""
-    return Packed(part)
 
 
 @kernel
@@ -137,7 +116,7 @@ def _move_world(
 @kernel(allocates=True)
 def step_worlds(packed: Any, commands: Array, begin: int) -> None:
     """Steps the worlds of a part, from `begin` on, under commands (n, M, C) for a period."""
-    part = packed.part
+    part = packed.content
     _step(part.state, part.members, part.lidar, part.motion, part.scratch, commands, begin)
 
 
@@ -202,7 +181,7 @@ def _measure(n: int, skip: int, state: State, motion: Dynamics, scratch: Scratch
 @kernel(allocates=True)
 def begin(packed: Any, chosen: Integers) -> None:
     """Begins episodes in the worlds `chosen` (n,): all is in place and stands still."""
-    part = packed.part
+    part = packed.content
     state, waiting = part.state, part.scratch.scans.waiting
     for i in range(chosen.shape[0]):
         waiting[i] = chosen[i]
@@ -217,7 +196,7 @@ def begin(packed: Any, chosen: Integers) -> None:
 @kernel(allocates=True)
 def begin_period(packed: Any) -> None:
     """Begins a period of worlds whose robots are moved from outside, from where they stand."""
-    part = packed.part
+    part = packed.content
     count = part.state.pose.shape[0]
     _begin_period(0, count, part.state, part.members, part.motion, part.scratch)
 
@@ -229,7 +208,7 @@ def end_period(packed: Any, true: Array, before: Array, wheels: Array, counted: 
     Robots and obstacles stand where the period ends. All others are (N, M, 3): the true twist at
     the end, the pose by the wheels alone before and after, and the twist by the wheels at the end.
     """
-    part = packed.part
+    part = packed.content
     state, members, motion, scratch = part.state, part.members, part.motion, part.scratch
     first, waiting = state.velocity.shape[1], 0
     for n in range(state.pose.shape[0]):

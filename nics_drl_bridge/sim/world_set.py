@@ -12,15 +12,17 @@ from typing import Any, TypeAlias
 import numpy as np
 from pydantic import Field
 
-from nics_drl_bridge.config import Schema, parse_yaml, read_text, share_folder, validate
+from nics_drl_bridge.config import Schema, parse_yaml, read_text, validate
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import sha256
 from nics_drl_bridge.lidar.shapes import Shape
+from nics_drl_bridge.sim.barn import barn_numbers, barn_world
 from nics_drl_bridge.sim.world import Region, World, load_world
 
 MOST_MEMBERS = 10_000
 YAML = (".yaml", ".yml")
 SPECIAL = "*?["
+BARN = "barn"  # the 250 worlds of a benchmark; one of them is `barn/7`
 
 
 class SetFile(Schema):
@@ -69,9 +71,10 @@ AnyWorld: TypeAlias = World | WorldSet
 def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
     """Loads a world or a world set.
 
-    A world is a shipped one by name (`arena`), or any other by the path of its YAML file. A set is
-    a list of worlds, a folder of files, a glob (`worlds/*.yaml`), or a YAML file with the key
-    `worlds`. Raises ConfigError for a missing or wrong file; of a member it names which.
+    A world is a shipped one by name (`arena`, `barn/7`), or any other by the path of its YAML file.
+    A set is `barn`, see `sim.barn`, a list of worlds, a folder of files, a glob (`worlds/*.yaml`),
+    or a YAML file with the key `worlds`. Raises ConfigError for a missing or wrong file; of a
+    member it names which.
     """
     if not isinstance(name, str | Path):
         return _set_of("worlds", _members([str(one) for one in name], Path()))
@@ -80,9 +83,10 @@ def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
         return _read_set(path, validate(content, SetFile, text))
     if path.is_dir() or any(sign in text for sign in SPECIAL):
         return _set_of(path.name if path.is_dir() else text, _members([text], Path()))
-    shipped = share_folder() / "config" / "worlds" / text
-    if text and shipped.is_dir():
-        return _set_of(text, _members([str(shipped)], Path()))
+    if text == BARN:
+        return _set_of(text, [barn_world(number) for number in barn_numbers()])
+    if (number := text.removeprefix(f"{BARN}/")).isdecimal() and number != text:
+        return barn_world(int(number))
     return load_world(name)
 
 

@@ -182,3 +182,22 @@ def test_an_empty_folder_is_no_set(tmp_path):
 def test_shipped_worlds_can_be_one_set():
     shipped = load_worlds(str(share_folder() / "config" / "worlds"))
     assert {"circles", "room", "corridor"} <= set(names(shipped))
+
+
+def test_the_worlds_of_barn_are_a_set_and_each_has_a_name(tmp_path):
+    barn = load_worlds("barn")
+    assert len(barn.members) == 250
+    assert load_worlds("barn/7") == barn.members[names(barn).index("barn_007")]
+    file = tmp_path / "fold.yaml"
+    file.write_text("name: fold\nworlds: [barn]\nwithout: [barn/1, barn/7]\n")
+    assert set(names(barn)) - set(names(load_worlds(file))) == {"barn_001", "barn_007"}
+    with pytest.raises(ConfigError, match="no BARN world 6"):
+        load_worlds("barn/6")
+
+
+def test_a_set_of_a_benchmark_is_driven_with_narrow_places_and_all():
+    barn = load_worlds(["barn/1", "barn/299"])
+    simulator = FastSimulator(MODEL, barn, 8)
+    scenes = simulator.reset(range(8))
+    assert scenes.starts[:, 0].tolist() == [[-2.25, 3.0, 1.57]] * 8
+    assert set(scenes.member.tolist()) == {0, 1}

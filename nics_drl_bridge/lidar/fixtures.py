@@ -1,4 +1,4 @@
-"""What stands still in the worlds of a set, as lidars see it: walls and static maps.
+"""Fixtures of the worlds of a set, as lidars see them: walls and static maps.
 
 P worlds lie one after the other in flat arrays; of each copy that is simulated, `member` tells
 which one it is a copy of.
@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 
-class Standing(NamedTuple):
+class Fixtures(NamedTuple):
     """Walls and maps of P worlds, for N copies."""
 
     member: Integers  # (N,) world of each copy
@@ -30,24 +30,24 @@ class Standing(NamedTuple):
 
 
 @kernel(view=True)
-def walls_of(n, standing):  # type: ignore[no-untyped-def]
+def walls_of(n, fixtures):  # type: ignore[no-untyped-def]
     """Walls (W, 4) of one copy."""
-    p = standing.member[n]
-    return standing.walls[standing.first[p] : standing.first[p + 1]]
+    p = fixtures.member[n]
+    return fixtures.walls[fixtures.first[p] : fixtures.first[p + 1]]
 
 
 @kernel(view=True)
-def grid_of(n, standing):  # type: ignore[no-untyped-def]
+def grid_of(n, fixtures):  # type: ignore[no-untyped-def]
     """Map of one copy, without squares if there is none."""
-    p = standing.member[n]
-    return GridArrays(cells_of(standing.squares, standing.maps[p]), standing.frames[p])
+    p = fixtures.member[n]
+    return GridArrays(cells_of(fixtures.squares, fixtures.maps[p]), fixtures.frames[p])
 
 
 @kernel(view=True)
-def standing_around(n, standing):  # type: ignore[no-untyped-def]
-    """What stands in one copy, as that of the only copy."""
-    s = standing
-    return Standing(s.member[n : n + 1], s.walls, s.first, s.squares, s.maps, s.frames)
+def fixtures_around(n, fixtures):  # type: ignore[no-untyped-def]
+    """Fixtures of one copy, as those of the only copy."""
+    s = fixtures
+    return Fixtures(s.member[n : n + 1], s.walls, s.first, s.squares, s.maps, s.frames)
 
 
 @kernel(view=True)
@@ -57,15 +57,17 @@ def cells_of(cells, place):  # type: ignore[no-untyped-def]
     return cells[first : first + rows * columns].reshape((rows, columns))
 
 
-def standing(walls: Sequence[Array], grids: Sequence[GridMap | None], member: Integers) -> Standing:
-    """Returns what stands in P worlds: walls (W, 4) and the map of each."""
+def stack_fixtures(
+    walls: Sequence[Array], grids: Sequence[GridMap | None], member: Integers
+) -> Fixtures:
+    """Stacks the fixtures of P worlds: walls (W, 4) and the map of each."""
     maps = [NO_MAP if grid is None else grid.arrays for grid in grids]
     squares, places = joined([each.squares for each in maps])
     frames = np.zeros((len(maps), 5))
     for frame, each in zip(frames, maps, strict=True):
         frame[: len(each.frame)] = each.frame
     first = np.cumsum([0, *map(len, walls)])
-    return Standing(member, np.concatenate(walls), first, squares, places, frames)
+    return Fixtures(member, np.concatenate(walls), first, squares, places, frames)
 
 
 def joined(cells: Sequence[NDArray[Any]]) -> tuple[NDArray[Any], Integers]:
