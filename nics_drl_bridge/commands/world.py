@@ -184,20 +184,25 @@ def _flow(value: Any) -> str:
 
 @world.command()
 def draw(
-    name: Annotated[str, Argument(metavar="WORLD", help="A shipped world (arena) or a YAML file.")],
+    name: Annotated[str, Argument(metavar="WORLD", help="A shipped one, a YAML file, or a set.")],
     out: Annotated[Path | None, Option(help="The .png to write; <world>.png.")] = None,
     seed: Annotated[int, Option(min=0, help="Of the episode.")] = 0,
     robot: Annotated[str, Option(help="A shipped robot or a YAML file.")] = "differential",
     footprint: Annotated[float | None, Option(help="Instead: radius of a round robot [m].")] = None,
 ) -> None:
-    """Draws a world as an episode finds it: walls, map, obstacles, start and goal."""
+    """Draws a world as an episode finds it: walls, map, obstacles, start and goal.
+
+    Of a set, such as barn or a folder of files, it is the world of the episode.
+    """
     with one_sentence():
         from nics_drl_bridge.files import write_bytes
         from nics_drl_bridge.report.pictures import world_picture
         from nics_drl_bridge.robot.spec import load_robot
-        from nics_drl_bridge.sim.world import load_world
+        from nics_drl_bridge.sim.scenes import member_of
+        from nics_drl_bridge.sim.world_set import load_worlds
 
-        opened = load_world(name)
+        worlds = load_worlds(name)
+        opened = worlds.members[member_of(worlds, seed)]
         outline = None if footprint is not None else load_robot(robot).footprint
         radius = load_robot(robot).footprint_radius if footprint is None else footprint
         if not 0.0 < radius < math.inf:

@@ -17,11 +17,13 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import sha256
 from nics_drl_bridge.lidar.shapes import Shape
 from nics_drl_bridge.sim.barn import barn_numbers, barn_world
+from nics_drl_bridge.sim.cellular import Cellular, grow
 from nics_drl_bridge.sim.world import Region, World, load_world
 
 MOST_MEMBERS = 10_000
 YAML = (".yaml", ".yml")
 SPECIAL = "*?["
+KEYS = ("worlds", "generate")  # one of which only a set has
 BARN = "barn"  # the 250 worlds of a benchmark; one of them is `barn/7`
 
 
@@ -30,8 +32,9 @@ class SetFile(Schema):
 
     name: str
     # names, files, folders and globs; paths count from the folder of this file
-    worlds: tuple[str, ...] = Field(min_length=1, max_length=MOST_MEMBERS)
+    worlds: tuple[str, ...] = Field(default=(), max_length=MOST_MEMBERS)
     without: tuple[str, ...] = ()  # of those, the ones to leave out
+    generate: Cellular | None = None  # beside or instead of those: worlds made here
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +76,8 @@ def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
 
     A world is a shipped one by name (`arena`, `barn/7`), or any other by the path of its YAML file.
     A set is `barn`, see `sim.barn`, a list of worlds, a folder of files, a glob (`worlds/*.yaml`),
-    or a YAML file with the key `worlds`. Raises ConfigError for a missing or wrong file; of a
-    member it names which.
+    or a YAML file with the key `worlds` or `generate`. Raises ConfigError for a missing or wrong
+    file; of a member it names which.
     """
     if not isinstance(name, str | Path):
         return _set_of("worlds", _members([str(one) for one in name], Path()))
@@ -92,15 +95,22 @@ def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
 
 def _set_in(path: Path) -> dict[str, Any] | None:
     """Content of a world set's YAML file; None for any other."""
-    if path.suffix not in YAML or not path.is_file() or "worlds" not in (text := read_text(path)):
+    if path.suffix not in YAML or not path.is_file():
         return None
-    content = parse_yaml(text, str(path))
-    return content if isinstance(content, dict) and "worlds" in content else None
+    text = read_text(path)
+    content = parse_yaml(text, str(path)) if any(f"{key}:" in text for key in KEYS) else None
+    is_set = isinstance(content, dict) and any(key in content for key in KEYS)
+    return content if is_set else None
 
 
 def _read_set(path: Path, file: SetFile) -> WorldSet:
     without = {world.source for world in _members(file.without, path.parent)}
     chosen = [one for one in _members(file.worlds, path.parent) if one.source not in without]
+    if (given := file.generate) is not None:
+        try:
+            chosen += [grow(given, number) for number in range(given.worlds)]
+        except ConfigError as error:
+            raise ConfigError(f"{path}: {error}") from None
     return _set_of(file.name, chosen, str(path))
 
 

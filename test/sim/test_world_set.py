@@ -151,7 +151,7 @@ def test_a_broken_member_is_named(folder):
 @pytest.mark.parametrize(
     ("text", "reason"),
     [
-        ("name: s\nworlds: []\n", "key 'worlds'"),
+        ("name: s\nworlds: []\n", "holds no world"),
         ("name: s\nworlds: [nowhere]\n", "unknown world 'nowhere'"),
         ("name: s\nworlds: [none/*.yaml]\n", "no world file"),
         ("name: s\nworlds: [gone.yaml]\n", "no such file"),

@@ -1,0 +1,106 @@
+"""Fields of cylinders grown by a cellular automaton, as those of BARN were: as many as wanted.
+
+Cells are filled at random; then, some times, one with many filled neighbours is filled and one with
+few is emptied, which leaves clumps with ways between (Perille, Truong, Xiao and Stone, 2020).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+from scipy import ndimage
+
+from nics_drl_bridge.config import Schema
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.lidar.shapes import Circle
+from nics_drl_bridge.sim.world import Goals, Obstacles, Starts, World
+
+MOST_CELLS = 10_000
+TRIES = 200  # fields drawn for one world, until there is a way through
+FILLED, EMPTIED = 5, 1  # at least, at most so many of a cell's 8 neighbours are filled
+FINE = 4  # points of the search for a way, along a cell
+
+
+class Cellular(Schema):
+    """Parameters of the worlds; each draws its own fill and smoothing between the two given."""
+
+    kind: Literal["cellular"] = "cellular"
+    worlds: int = Field(ge=1, le=10_000)
+    seed: int = Field(default=0, ge=0)
+    columns: int = Field(default=30, ge=4)  # of cells across the field
+    rows: int = Field(default=30, ge=4)  # along it
+    cell: float = Field(default=0.15, ge=0.01, le=10.0)  # side, and diameter of a cylinder [m]
+    fill: tuple[float, float] = (0.1, 0.35)  # share of the cells that are filled at first
+    smoothing: tuple[int, int] = (2, 4)  # passes of the automaton
+    margin: float = Field(default=4.0, ge=0.5, le=100.0)  # free space before and behind [m]
+    passage: float = Field(default=0.5, ge=0.0, le=100.0)  # width that the way through has [m]
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Cellular:
+        if self.columns * self.rows > MOST_CELLS:
+            raise ValueError(f"columns times rows may be {MOST_CELLS}")
+        if not 0.0 <= self.fill[0] <= self.fill[1] < 1.0:
+            raise ValueError("fill must be [least, greatest], from 0 to below 1")
+        if not 0 <= self.smoothing[0] <= self.smoothing[1] <= 100:
+            raise ValueError("smoothing must be [least, greatest], from 0 to 100")
+        return self
+
+
+def grow(given: Cellular, number: int) -> World:
+    """Returns one of the worlds; the same for the same parameters. ConfigError if none has a way.
+
+    The robot starts before the field, between two walls, and its goal lies beyond.
+    """
+    rng = np.random.default_rng([given.seed, number])
+    for _ in range(TRIES):
+        filled = _field(given, rng)
+        if _has_way(filled, given):
+            return _world(filled, given, number)
+    raise ConfigError(
+        f"key 'generate': none of {TRIES} fields drawn for world {number} has a way of "
+        f"{given.passage:g} m; lower `fill` or `passage`."
+    )
+
+
+def _field(given: Cellular, rng: np.random.Generator) -> NDArray[np.bool_]:
+    share = rng.uniform(*given.fill)
+    filled = rng.random((given.rows, given.columns)) < share
+    around = np.ones((3, 3), np.int64)
+    around[1, 1] = 0
+    for _ in range(rng.integers(given.smoothing[0], given.smoothing[1] + 1)):
+        neighbours = ndimage.convolve(filled.astype(np.int64), around, mode="constant")
+        filled = (neighbours >= FILLED) | (filled & (neighbours > EMPTIED))
+    return filled
+
+
+def _has_way(filled: NDArray[np.bool_], given: Cellular) -> bool:
+    """True if a disc of the passage's width gets from before the field to behind it."""
+    fine = np.repeat(np.repeat(filled, FINE, axis=0), FINE, axis=1)
+    ahead = math.ceil(given.margin / given.cell) * FINE
+    walled = np.pad(np.pad(fine, ((ahead, ahead), (0, 0))), ((0, 0), (1, 1)), constant_values=True)
+    away = ndimage.distance_transform_edt(~walled) * given.cell / FINE
+    areas, _ = ndimage.label(away > given.passage / 2.0)
+    middle = areas.shape[1] // 2
+    start, goal = areas[ahead // 2, middle], areas[-1 - ahead // 2, middle]
+    return bool(start > 0 and start == goal)
+
+
+def _world(filled: NDArray[np.bool_], given: Cellular, number: int) -> World:
+    rows, columns = np.nonzero(filled)
+    x, y = (columns + 0.5) * given.cell, given.margin + (rows + 0.5) * given.cell
+    wide, deep = given.columns * given.cell, given.rows * given.cell
+    long, middle = deep + 2.0 * given.margin, wide / 2.0
+    poses = [(px, py, 0.0) for px, py in np.round(np.stack([x, y], axis=1), 6).tolist()]
+    one = Obstacles(shapes=(Circle(radius=given.cell / 2.0),), at=tuple(poses)) if poses else None
+    start, goal = given.margin / 2.0, long - given.margin / 2.0
+    return World(
+        name=f"cellular_{given.seed}_{number}", bounds=(0.0, 0.0, wide, long), clearance=0.0,
+        walls=((0.0, 0.0, 0.0, given.margin + deep), (wide, 0.0, wide, given.margin + deep),
+               (0.0, 0.0, wide, 0.0)),
+        obstacles=(one,) if one else (), goal_distance=(0.0, 2.0 * long),
+        starts=Starts(at=((middle, start, math.pi / 2.0),)), goals=Goals(at=((middle, goal),)),
+    )  # fmt: skip
