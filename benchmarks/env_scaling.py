@@ -1,16 +1,18 @@
-"""What an env step costs with more worlds, robots, obstacles and beams.
+"""What an env step costs with more worlds, robots, obstacles, beams, and worlds in a set.
 
 Navigation on one thread: differential robots, 10 kinematic substeps, observation, reward and
 autoreset, random actions. Unless it is what grows: 256 worlds of one robot, 10 circles on
 8 x 8 m, 720 beams.
 Robots and obstacles get a field that grows with them, so that as many as before are in range;
-what then grows faster than their number is the search for them.
+what then grows faster than their number is the search for them. `members` are the worlds of a set,
+each with its own ten circles at fixed places, among which the 256 episodes are.
 """
 
 from __future__ import annotations
 
 import math
 import time
+import tracemalloc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,14 +27,19 @@ from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.lidar.bake import bake
+from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.world import World
+from nics_drl_bridge.sim.world_set import AnyWorld, WorldSet
 
 CONTROLS = {
     "quadratic": "the search for what is near: each robot looks at each other, in Python",
     "slow": "the batch: worlds are stepped one after the other, each by a call of its own",
+    "apart": "the set: each of its worlds is a vector env of its own, with one copy at least",
 }
-BARS = {"worlds": 0.5, "robots": 4.0, "obstacles": 12.0, "beams": 12.0}
+BARS = {"worlds": 0.5, "robots": 4.0, "obstacles": 12.0, "beams": 12.0, "members": 1.15}
 """How many times the first point of a curve the last one costs at most, `robots` for each robot."""
+MEMORY_BAR = 1.5
+"""Of the last set's memory, with all its copies, to that of the first one."""
 MODEL = open_model("differential")
 WORLDS, OBSTACLES, SIDE, BEAMS = 256, 10, 8.0, 720
 SWEEPS: dict[str, tuple[int, ...]] = {
@@ -40,6 +47,7 @@ SWEEPS: dict[str, tuple[int, ...]] = {
     "robots": (1, 2, 4, 8, 16, 32, 64),
     "obstacles": (1, 4, 16, 64, 256),
     "beams": (36, 90, 180, 360, 720, 1440, 2048),
+    "members": (1, 5, 25, 250),
 }
 AREA_PER_ROBOT, AREA_PER_OBSTACLE = 12.0, 4.0
 """[m^2]"""
@@ -66,7 +74,20 @@ class Crowd(Navigation):
         return self.team
 
 
-def environment(worlds: int, robots: int, world: World, beams: int) -> BridgeVectorEnv:
+def members(count: int) -> list[World]:
+    """Worlds whose circles stand where a seed each puts them in the usual field."""
+    usual = field(OBSTACLES, SIDE)
+    (group,) = usual.obstacles
+    found = []
+    for seed in range(count):
+        bodies = sample_scene(usual, MODEL.robot.footprint_radius, seed).bodies
+        at = tuple((x, y, 0.0) for x, y in bodies[:, :2].tolist())
+        stands = group.model_copy(update={"count": None, "at": at})
+        found.append(usual.model_copy(update={"name": f"field_{seed}", "obstacles": (stands,)}))
+    return found
+
+
+def environment(worlds: int, robots: int, world: AnyWorld, beams: int) -> BridgeVectorEnv:
     """Worlds of robots that have to reach goals."""
     model = MODEL
     if beams != model.lidar.beams:
@@ -91,6 +112,8 @@ def sweep(name: str, value: int) -> BridgeVectorEnv:
         return environment(
             WORLDS, 1, field(value, max(SIDE, side_of(value, AREA_PER_OBSTACLE))), BEAMS
         )
+    if name == "members":
+        return environment(WORLDS, 1, WorldSet("fields", tuple(members(value))), BEAMS)
     return environment(WORLDS, 1, world, value)
 
 
@@ -118,18 +141,44 @@ def stepper(env: BridgeVectorEnv, times: int, in_pairs: bool) -> Callable[[], No
     return step
 
 
+def apart(count: int) -> list[BridgeVectorEnv]:
+    """A vector env for each world of a set, in which together as many copies are."""
+    copies = max(1, WORLDS // count)
+    return [environment(copies, 1, world, BEAMS) for world in members(count)]
+
+
 def measure(name: str, values: Sequence[int], repeats: int, control: str | None) -> list[float]:
     """The cost of an env step at each point of a curve [us]."""
     costs = []
     for value in values:
-        alone = control == "slow" and name == "worlds"
-        env, times = sweep(name, 1 if alone else value), min(value, ALONE) if alone else 1
-        often = max(min(repeats, FEWEST), repeats // (env.num_envs * times))
-        calls = {value: stepper(env, times, control == "quadratic")}
+        alone, split = (
+            control == "slow" and name == "worlds",
+            (name, control) == ("members", "apart"),
+        )
+        times = min(value, ALONE) if alone else 1
+        envs = apart(value) if split else [sweep(name, 1 if alone else value)]
+        stepped = sum(env.num_envs for env in envs) * times
+        often = max(min(repeats, FEWEST), repeats // stepped)
+        steps = [stepper(env, times, control == "quadratic") for env in envs]
+        calls = {value: lambda steps=steps: [step() for step in steps]}
         seconds = medians(interleaved(calls, often, clock=time.process_time))
-        costs.append(1e6 * seconds[value] / (env.num_envs * times))
-        env.close()
+        costs.append(1e6 * seconds[value] / stepped)
+        for env in envs:
+            env.close()
     return costs
+
+
+def memory(control: str | None) -> float:
+    """How many times the memory of a set of one the set of most takes, with all its copies."""
+    taken = []
+    for value in (SWEEPS["members"][0], SWEEPS["members"][-1]):
+        tracemalloc.start()
+        envs = apart(value) if control == "apart" else [sweep("members", value)]
+        for env in envs:
+            env.reset(seed=0)
+        taken.append(tracemalloc.get_traced_memory()[0])
+        tracemalloc.stop()
+    return taken[1] / taken[0]
 
 
 def run(repeats: int, ends_only: bool, control: str | None) -> dict[str, Any]:
@@ -140,6 +189,7 @@ def run(repeats: int, ends_only: bool, control: str | None) -> dict[str, Any]:
         result[f"{name}_us"] = measure(name, result[name], repeats, control)
     per_robot = np.array(result["robots_us"]) / np.array(result["robots"])
     result["robots_us_per_robot"] = per_robot.tolist()
+    result["members_memory"] = memory(control)
     result["end_to_end"] = {name: end_to_end(result, name) for name in SWEEPS}
     return result
 
@@ -152,12 +202,16 @@ def end_to_end(result: dict[str, Any], name: str) -> float:
 
 def judge(result: dict[str, Any]) -> list[str]:
     """The bars that were missed."""
-    return [
+    missed = [
         f"{name}: {result[name][-1]} cost {result['end_to_end'][name]:.2f} times "
         f"{result[name][0]}, bar {bar}"
         for name, bar in BARS.items()
         if not result["end_to_end"][name] <= bar
     ]
+    if not result["members_memory"] <= MEMORY_BAR:
+        taken = f"{result['members_memory']:.2f} times the memory of one, bar {MEMORY_BAR}"
+        missed.append(f"members: {result['members'][-1]} take {taken}")
+    return missed
 
 
 def draw(result: dict[str, Any], file: Path) -> None:
@@ -182,7 +236,7 @@ def table_of(result: dict[str, Any]) -> str:
         for k, (value, cost) in enumerate(zip(result[name], result[f"{name}_us"], strict=True)):
             one = f"{result['robots_us_per_robot'][k]:>12.2f}" if name == "robots" else ""
             text += f"{name:<11}{value:>8}{cost:>17.2f}{one}\n"
-    return text
+    return text + f"memory of the most members: {result['members_memory']:.2f} times one\n"
 
 
 def main() -> None:

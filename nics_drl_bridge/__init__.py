@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from nics_drl_bridge.sim.sdf import read_sdf
     from nics_drl_bridge.sim.simulator import FastSimulator
     from nics_drl_bridge.sim.world import load_world
+    from nics_drl_bridge.sim.world_set import load_worlds
 
 try:
     __version__ = version("nics_drl_bridge")
@@ -32,8 +33,8 @@ except PackageNotFoundError:  # a source tree that was never installed
 
 __all__ = [
     "FastSimulator", "__version__", "generate", "load_model", "load_policy", "load_recording",
-    "load_robot", "load_world", "make", "make_vec", "open_model", "read_recording", "read_sdf",
-    "save_model", "save_recording",
+    "load_robot", "load_world", "load_worlds", "make", "make_vec", "open_model", "read_recording",
+    "read_sdf", "save_model", "save_recording",
 ]  # fmt: skip
 
 _NAMES = {
@@ -46,6 +47,7 @@ _NAMES = {
     "sim.sdf": ("read_sdf",),
     "sim.simulator": ("FastSimulator",),
     "sim.world": ("load_world",),
+    "sim.world_set": ("load_worlds",),
 }
 _HOMES = {name: home for home, names in _NAMES.items() for name in names}
 

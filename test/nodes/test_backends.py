@@ -26,6 +26,7 @@ from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.backends import DdsBackend, _Mailbox, dds_backend
 from nics_drl_bridge.nodes.executor import HANDED_OVER
+from nics_drl_bridge.sim.scenes import member_of
 from nics_drl_bridge.sim.world import load_world
 
 pytestmark = pytest.mark.ros
@@ -149,6 +150,24 @@ def test_moving_obstacles_and_maps_are_the_same_over_topics(launch, domain_id, m
     finally:
         there.close()
     assert np.array_equal(here.scene.bodies, there.scene.bodies)
+    *seen, truth = (np.abs(a - b).max() for a, b in zip(told_here, told_there, strict=True))
+    assert seen == [0.0] * 4
+    assert truth < 1e-12
+
+
+def test_every_episode_over_topics_is_in_its_world_of_a_set(launch, domain_id, model, tmp_path):
+    world = tmp_path / "mixed.yaml"
+    world.write_text("name: mixed\nworlds: [crowd, room, corridor]\n")
+    launch("simulator_node", domain_id, mode="lockstep", world=str(world))
+    options, seeds = {"domain_id": domain_id, "truth": True, "timeout_s": TIMEOUT_S}, (0, 1, 2, 3)
+    here = BridgeEnv("sim", model, str(world), estimator=True)
+    there = BridgeEnv("dds", model, str(world), backend_options=options)
+    assert {member_of(here.world, seed) for seed in seeds} == {0, 1, 2}
+    try:
+        told_here = episodes(here, seeds, 8, np.random.default_rng(0))
+        told_there = episodes(there, seeds, 8, np.random.default_rng(0))
+    finally:
+        there.close()
     *seen, truth = (np.abs(a - b).max() for a, b in zip(told_here, told_there, strict=True))
     assert seen == [0.0] * 4
     assert truth < 1e-12

@@ -18,6 +18,7 @@ from nics_drl_bridge.lidar.exact_kernels import X, Y
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World, load_world
+from nics_drl_bridge.sim.world_set import load_worlds
 
 NAMES = [
     "differential",
@@ -79,6 +80,23 @@ def test_what_the_lidar_sees_is_what_stands_in_mujoco(name):
             # A wall is 1 mm thicker on each side, which is more along a slanting beam.
             near += abs(away - seen) > 0.01
     assert near <= 0.01 * model.lidar.beams  # a beam past a corner may take either side
+
+
+def test_each_episode_stands_in_its_world_of_a_set():
+    model, worlds = builtin_model("differential"), load_worlds(["room", "crowd", "corridor"])
+    both = MujocoSimulator(model, worlds), FastSimulator(model, worlds)
+    seen = set()
+    for seed in range(6):
+        for simulator in both:
+            simulator.reset([seed])
+        ours, theirs = (simulator.data for simulator in both)
+        assert np.array_equal(ours.ranges, theirs.ranges)
+        assert np.array_equal(ours.member, theirs.member)
+        boxes = both[0]._simulation.ngeom
+        seen.add((int(ours.member[0]), boxes > 50))  # the map is many boxes
+        drive(both[0], forward(model, 0.2), 1)
+    assert {member for member, _ in seen} == {0, 1, 2}
+    assert all(many == (member == 0) for member, many in seen)
 
 
 @pytest.mark.parametrize("name", NAMES)
