@@ -71,8 +71,13 @@ def stack_fixtures(
 
 
 def joined(cells: Sequence[NDArray[Any]]) -> tuple[NDArray[Any], Integers]:
-    """Cells (rows, columns) one after the other, and first cell, rows, columns of each (P, 3)."""
-    starts = np.cumsum([0, *(each.size for each in cells[:-1])]).tolist()
-    shapes = [(first, *each.shape) for first, each in zip(starts, cells, strict=True)]
-    flat = [each.reshape(-1) for each in cells]  # of one alone, no copy
+    """Cells (rows, columns) one after the other, and first cell, rows, columns of each (P, 3).
+
+    An array that occurs again, as the map of several worlds, is stored once.
+    """
+    once = {id(each): each for each in cells}
+    starts = np.cumsum([0, *(each.size for each in once.values())]).tolist()
+    first = dict(zip(once, starts, strict=False))
+    shapes = [(first[id(each)], *each.shape) for each in cells]
+    flat = [each.reshape(-1) for each in once.values()]  # of one alone, no copy
     return flat[0] if len(flat) == 1 else np.concatenate(flat), np.array(shapes, np.int64)

@@ -1,10 +1,12 @@
 """The surroundings of the worlds of a set, stacked for the kernels, and of one of them."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.files import sha256
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.lidar.fixtures import cells_of, joined, stack_fixtures, walls_of
@@ -37,7 +39,7 @@ def members_of(
 
     `crowds` are `Surroundings.crowded` and `scattered`; `member` (N,) is read as the kernels run.
     """
-    grids = [world.grid for world in worlds]
+    grids = _shared([world.grid for world in worlds])
     distances, places = joined([map_field(grid).distances for grid in grids])
     moves = any(motion is not None for each in motions for motion in each)
     plans, waypoints = _plans(motions if moves else [() for _ in worlds])
@@ -46,6 +48,19 @@ def members_of(
         stack_fixtures([world.all_walls() for world in worlds], grids, member), distances, places,
         outlines, *crowds, moves, plans, waypoints, half,
     )  # fmt: skip
+
+
+def _shared(grids: Sequence[GridMap | None]) -> list[GridMap | None]:
+    """The same object for maps of the same content, which is then baked and stored once."""
+    once: dict[Any, GridMap] = {}
+    found: list[GridMap | None] = []
+    for grid in grids:
+        if grid is None:
+            found.append(None)
+        else:
+            about = grid.cells.shape, grid.resolution, grid.origin, sha256(grid.cells.tobytes())
+            found.append(once.setdefault(about, grid))
+    return found
 
 
 def map_field(grid: GridMap | None) -> MapField:

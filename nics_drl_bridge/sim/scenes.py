@@ -66,18 +66,19 @@ class Scenes(Scene):
 
 @dataclass(frozen=True)
 class Catalogue:
-    """Every shape that can occur in a world or set: all in the first size, then in the next."""
+    """What the worlds of a set share: every shape, all in the first size, then in the next."""
 
     shapes: tuple[Shape, ...]
     place: Mapping[Shape, int]  # of each shape in the first size
     outlines: Outlines  # of the shapes, and of a disc
+    spaces: dict[str, FreeSpace]  # of worlds that differ in their obstacles alone
 
     @classmethod
     def of(cls, world: AnyWorld, sizes: Sequence[float]) -> Catalogue:
         """Lists the shapes of a world or set, scaled."""
         shapes = tuple(scaled(shape, size) for size in sizes for shape in world.shapes)
         place = {shape: i for i, shape in enumerate(world.shapes)}
-        return cls(shapes, place, Outlines.of((*shapes, Circle(radius=1.0))))
+        return cls(shapes, place, Outlines.of((*shapes, Circle(radius=1.0))), {})
 
 
 class SceneSampler:
@@ -253,7 +254,12 @@ def _with_room(world: World, most: int) -> World:
 
 
 def _plan(world: World, footprint: float, slots: Sequence[int], known: Catalogue) -> ScenePlan:
-    space, outlines = _free_space(world, footprint), known.outlines
+    check_places(world)
+    drawn = any(group.count for group in world.obstacles)
+    alike = f"{drawn} {world.model_dump_json(exclude={'name', 'obstacles'})}"
+    if alike not in known.spaces:
+        known.spaces[alike] = _free_space(world, footprint, drawn)
+    space, outlines = known.spaces[alike], known.outlines
     groups = np.zeros((len(world.obstacles), kernels.GROUP))
     choices: list[int] = []
     poses = np.zeros((len(slots), 3))
@@ -301,8 +307,7 @@ def _scratch(cells: int, count: int, corners: int) -> SceneScratch:
     )  # fmt: skip
 
 
-def _free_space(world: World, footprint: float) -> FreeSpace:
-    check_places(world)
+def _free_space(world: World, footprint: float, drawn: bool) -> FreeSpace:
     grid = NO_FIELD if world.grid is None else _closed(world.grid)
     cells = _cells_of(world) if world.grid is None else grid
     cells = cells._replace(distances=np.array(cells.distances, order="C"))
@@ -327,7 +332,7 @@ def _free_space(world: World, footprint: float) -> FreeSpace:
         raise ConfigError(f"{world.source}: {fault}, or enlarge the world.")
     for key, places in (("starts", world.starts), ("goals", world.goals)):
         _check(world, key, places, area, cells)
-    nothing, drawn = np.zeros(0, np.int32), any(group.count for group in world.obstacles)
+    nothing = np.zeros(0, np.int32)
     given = world.starts is not None and world.goals is not None
     for_robots = nothing if given else np.flatnonzero(area).astype(np.int32)
     anywhere = np.flatnonzero(cells.distances > 0.0).astype(np.int32) if drawn else nothing

@@ -201,3 +201,16 @@ def test_a_set_of_a_benchmark_is_driven_with_narrow_places_and_all():
     scenes = simulator.reset(range(8))
     assert scenes.starts[:, 0].tolist() == [[-2.25, 3.0, 1.57]] * 8
     assert set(scenes.member.tolist()) == {0, 1}
+
+
+def test_what_worlds_share_is_stored_once():
+    fields = tuple(
+        field(5.0, obstacles=[circles(2, (0.1 + 0.01 * n,))]).model_copy(update={"name": f"f{n}"})
+        for n in range(5)
+    )
+    samplers = SetSampler(WorldSet("alike", fields), 0.2).samplers
+    assert all(one._plan.space is samplers[0]._plan.space for one in samplers)
+    rooms = WorldSet("rooms", (load_world("room"), load_world("room"), load_world("circles")))
+    fixtures = FastSimulator(MODEL, rooms)._members.fixtures
+    assert fixtures.maps[0].tolist() == fixtures.maps[1].tolist()
+    assert fixtures.squares.size == fixtures.maps[0, 1] * fixtures.maps[0, 2]
