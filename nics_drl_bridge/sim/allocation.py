@@ -91,13 +91,11 @@ def surroundings(
     world: World, motions: Sequence[Motion | None], scanner: Scanner, sizes: Sizes
 ) -> arrays.Surroundings:
     """Returns all that stands in every world, with obstacles that move by `motions` (K,)."""
-    low_x, low_y, high_x, high_y = world.extent
-    half = np.array([max(-low_x, high_x), max(-low_y, high_y)])
     moves = any(motion is not None for motion in motions)
     outlines = scanner.table.outlines.arguments
     return arrays.Surroundings(
         world.all_walls(), map_field(scanner.grid), outlines, sizes.crowded, sizes.scattered,
-        arrays.Movers(moves, *plan_arrays(motions), half),
+        arrays.Movers(moves, *plan_arrays(motions), np.array(world.extent)),
     )  # fmt: skip
 
 
