@@ -88,7 +88,8 @@ def state_of(bodies, marks, velocity, seeds):
 def surroundings_of(motions, half, walls, grid=NO_FIELD):
     """A field in which obstacles move."""
     outlines = OutlineArrays(np.zeros((0, 2)), np.zeros(2, np.int64))
-    movers = Movers(True, *plan_arrays(motions), np.asarray(half, dtype=np.float64))
+    field = np.concatenate([np.negative(half), half]).astype(np.float64)
+    movers = Movers(True, *plan_arrays(motions), field)
     return Surroundings(walls, grid, outlines, False, False, movers)
 
 

@@ -24,7 +24,7 @@ def surroundings_of(n: int, members: Members) -> Surroundings:
     frame = members.fixtures.frames[p]
     distances = cells_of(members.distances, members.fields[p])
     grid = MapField(distances, frame[0], frame[1], frame[2], frame[3], frame[4])
-    movers = Movers(members.moves, members.plans[p], members.waypoints, members.half[p])
+    movers = Movers(members.moves, members.plans[p], members.waypoints, members.field[p])
     return Surroundings(
         walls_of(n, members.fixtures), grid, members.outlines, members.crowded,
         members.scattered, movers,
@@ -43,10 +43,10 @@ def members_of(
     distances, places = joined([map_field(grid).distances for grid in grids])
     moves = any(motion is not None for each in motions for motion in each)
     plans, waypoints = _plans(motions if moves else [() for _ in worlds])
-    half = np.array([np.abs(world.extent).reshape(2, 2).max(axis=0) for world in worlds])
+    field = np.array([world.extent for world in worlds])
     return Members(
         stack_fixtures([world.all_walls() for world in worlds], grids, member), distances, places,
-        outlines, *crowds, moves, plans, waypoints, half,
+        outlines, *crowds, moves, plans, waypoints, field,
     )  # fmt: skip
 
 

@@ -65,7 +65,9 @@ def steer(n: int, state: State, scene: Surroundings, period: float, speeds: Arra
     """
     velocity, seed, step, movers = state.velocity[n], state.seeds[n], state.steps[n], scene.movers
     count, plans, bodies = velocity.shape[0], movers.plans, state.bodies[n]
-    traffic = at.Traffic(bodies, count, speeds, plans, scene.walls, movers.half, scene.grid, period)
+    traffic = at.Traffic(
+        bodies, count, speeds, plans, scene.walls, movers.field, scene.grid, period
+    )
     draws = (step + 1) * MOST
     for k in range(count):  # walkers first: they react to the velocities of the last period
         velocity[k, :] = 0.0
@@ -220,12 +222,14 @@ def _from_walls(k, traffic):  # type: ignore[no-untyped-def]
 
 @kernel
 def _new_goal(mark, k, traffic, seed, counter, step):  # type: ignore[no-untyped-def]
-    body, half = traffic.bodies[k], traffic.half
+    body, field = traffic.bodies[k], traffic.field
     x, y, radius = body[X], body[Y], body[RADIUS]
-    wide, deep = max(half[0] - radius - ROOM, 0.0), max(half[1] - radius - ROOM, 0.0)
+    middle_x, middle_y = (field[0] + field[2]) / 2.0, (field[1] + field[3]) / 2.0
+    wide = max((field[2] - field[0]) / 2.0 - radius - ROOM, 0.0)
+    deep = max((field[3] - field[1]) / 2.0 - radius - ROOM, 0.0)
     for i in range(CANDIDATES):
-        gx = (2.0 * _share(seed, counter + 2 * i) - 1.0) * wide
-        gy = (2.0 * _share(seed, counter + 2 * i + 1) - 1.0) * deep
+        gx = middle_x + (2.0 * _share(seed, counter + 2 * i) - 1.0) * wide
+        gy = middle_y + (2.0 * _share(seed, counter + 2 * i + 1) - 1.0) * deep
         mark[at.GOAL_X], mark[at.GOAL_Y] = gx, gy
         if math.hypot(gx - x, gy - y) >= LEAST_WALK:
             free, _, _ = at.clearance(gx, gy, k, traffic)

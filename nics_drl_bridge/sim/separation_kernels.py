@@ -39,7 +39,7 @@ class Traffic(NamedTuple):
     speeds: Array  # (M, 2) velocity of the robots in `map` [m/s]
     plans: Array  # (K, P) motions of the obstacles
     walls: Array  # (W, 4)
-    half: Array  # (2,) half the size of the field [m]
+    field: Array  # (4,) least x, y and greatest x, y of the field [m]
     grid: MapField
     period: float  # [s]
 
@@ -78,10 +78,11 @@ def map_direction(x, y, grid):  # type: ignore[no-untyped-def]
 @kernel
 def clearance(x, y, k, traffic):  # type: ignore[no-untyped-def]
     """Distance from a point to the nearest object except body k [m], and the unit vector to it."""
-    bodies, walls, half = traffic.bodies, traffic.walls, traffic.half
-    least, nx, ny = half[0] - abs(x), math.copysign(1.0, x), 0.0
-    if half[1] - abs(y) < least:
-        least, nx, ny = half[1] - abs(y), 0.0, math.copysign(1.0, y)
+    bodies, walls, field = traffic.bodies, traffic.walls, traffic.field
+    left, right, low, high = x - field[0], field[2] - x, y - field[1], field[3] - y
+    least, nx, ny = min(left, right), (1.0 if right <= left else -1.0), 0.0
+    if min(low, high) < least:
+        least, nx, ny = min(low, high), 0.0, (1.0 if high <= low else -1.0)
     for w in range(walls.shape[0]):
         px, py = on_wall(x, y, walls[w])
         ox, oy = px - x, py - y
@@ -145,11 +146,11 @@ def _hold_bodies(dx, dy, k, traffic, bend):  # type: ignore[no-untyped-def]
 
 @kernel
 def _hold_walls(dx, dy, body, traffic, bend):  # type: ignore[no-untyped-def]
-    x, y, radius, walls, half = body[X], body[Y], body[RADIUS], traffic.walls, traffic.half
+    x, y, radius, walls, field = body[X], body[Y], body[RADIUS], traffic.walls, traffic.field
     reach = radius + math.sqrt(dx * dx + dy * dy) + 2.0 * SLACK
-    for side in (-1.0, 1.0):
-        dx, dy = _hold(dx, dy, side, 0.0, half[0] - radius - side * x, bend)
-        dx, dy = _hold(dx, dy, 0.0, side, half[1] - radius - side * y, bend)
+    for side, bound in ((-1.0, 0), (1.0, 2)):
+        dx, dy = _hold(dx, dy, side, 0.0, side * field[bound] - radius - side * x, bend)
+        dx, dy = _hold(dx, dy, 0.0, side, side * field[bound + 1] - radius - side * y, bend)
     for w in range(walls.shape[0]):
         px, py = on_wall(x, y, walls[w])
         ox, oy = px - x, py - y

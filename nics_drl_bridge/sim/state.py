@@ -64,7 +64,7 @@ class Movers(NamedTuple):
     moves: bool  # True if any obstacle moves
     plans: Array  # (K, P) see `obstacles.plan_arrays`
     waypoints: Array  # (Q, 2) of all patrols [m]
-    half: Array  # (2,) half the size of the field [m]
+    field: Array  # (4,) least x, y and greatest x, y of the field [m]
 
 
 class Surroundings(NamedTuple):
@@ -90,7 +90,7 @@ class Members(NamedTuple):
     moves: bool
     plans: Array  # (P, K, L)
     waypoints: Array  # (Q, 2) of all patrols in all worlds [m]
-    half: Array  # (P, 2)
+    field: Array  # (P, 4)
 
 
 class Dynamics(NamedTuple):

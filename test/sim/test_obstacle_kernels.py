@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from moving import PERIOD, scattered, sides, state_of, surroundings_of, watch
 from pydantic import TypeAdapter
+from robots import circles, direct_model
 from shapely import LineString, MultiLineString, box, unary_union
 
 from nics_drl_bridge.config import Schema, validate
@@ -18,6 +19,8 @@ from nics_drl_bridge.sim.members import map_field
 from nics_drl_bridge.sim.obstacle_kernels import FAR, repulsion
 from nics_drl_bridge.sim.obstacles import Motion, Patrol, Pedestrian, Wander, plan_arrays
 from nics_drl_bridge.sim.separation_kernels import MARK
+from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.world import World
 
 WANDER, WALKER = Wander(speed=(0.3, 0.8)), Pedestrian()
 SQUARE = Patrol(waypoints=((-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0)), speed=0.7)
@@ -59,6 +62,23 @@ def test_two_that_move_do_not_touch_within_a_period_either(motions):
         between = seen.places[:-1] + share * np.diff(seen.places, axis=0)
         away = np.linalg.norm(between[:, :, None] - between[:, None], axis=-1)
         assert away[:, ~np.eye(6, dtype=bool)].min() > 0.5 - TOUCH
+
+
+@pytest.mark.parametrize("motion", ["wander", "pedestrian"])
+def test_what_moves_stays_within_open_bounds_wherever_they_lie_and_uses_all_of_them(motion):
+    low, high = np.array([10.0, -2.0]), np.array([13.0, 1.0])
+    group = circles(4) | {"motion": {"kind": motion, "speed": [0.5, 0.9]}}
+    world = {"name": "open", "bounds": [*low, *high], "goal_distance": [0.5, 2.0]}
+    world = World.model_validate(world | {"obstacles": [group], "clearance": 0.05})
+    simulator = FastSimulator(direct_model(), world, 3)
+    simulator.reset(range(3))
+    seen = []
+    for _ in range(300):
+        simulator.step(np.zeros((3, 1, 3)))
+        seen.append(simulator.data.bodies[:, :4, :2].reshape(-1, 2).copy())
+    places = np.concatenate(seen)
+    assert ((places >= low) & (places <= high)).all()
+    assert np.ptp(places, axis=0).min() > 2.0
 
 
 def test_what_has_no_motion_stands_still():

@@ -32,7 +32,8 @@ def traffic(bodies, kinds, speeds=NOBODY, walls=WALLS, half=HALF, grid=NO_FIELD)
     """Obstacles that move by some kinds of motion, then robots with some speeds (M, 2)."""
     plans = np.zeros((len(kinds), PLAN))
     plans[:, at.KIND] = kinds
-    return Traffic(bodies, len(kinds), speeds, plans, walls, half, grid, PERIOD)
+    field = np.concatenate([-half, half])
+    return Traffic(bodies, len(kinds), speeds, plans, walls, field, grid, PERIOD)
 
 
 @pytest.mark.parametrize("bends", [True, False])
