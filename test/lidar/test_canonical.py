@@ -11,8 +11,8 @@ from nics_drl_bridge.lidar.spec import ScanHeader, load_lidar
 
 AROUND = ScanLayout(sectors=72, range_max=3.0)
 SHIPPED = (
-    "paper", "paper_12m", "rplidar_a1", "rplidar_a2", "hokuyo_ust_10lx", "sick_tim571",
-    "turtlebot3_lds_02",
+    "paper", "paper_12m", "rplidar_a1", "rplidar_a2", "hokuyo_ust_10lx", "jackal_hokuyo",
+    "sick_tim571", "turtlebot3_lds_02",
 )  # fmt: skip
 
 
