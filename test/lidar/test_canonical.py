@@ -62,7 +62,7 @@ def test_a_sector_holds_the_nearest_return_of_its_beams(heading, angles):
 def test_any_shipped_lidar_sees_the_same_room(name):
     spec, layout = load_lidar(name), LAYOUTS["front"]
     origin = np.array([0.3, -0.2])
-    seen = resampled(plan_of(spec, layout), room(origin, spec.angles))
+    seen = resampled(plan_of(spec, layout), room(origin + spec.mount[:2], spec.angles))
     fine = np.linspace(-layout.width / 2, layout.width / 2, 201)
     exact = room(origin, layout.angles[:, None] + fine).min(axis=1)
     assert np.abs(np.minimum(seen, 3.0) - np.minimum(exact, 3.0)).max() < 0.08
