@@ -19,13 +19,8 @@ from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World, load_world
 
-NAMES = [
-    "differential",
-    *(
-        pytest.param(name, marks=pytest.mark.campaign)
-        for name in ("ackermann", "mecanum", "jackal")
-    ),
-]
+OTHERS = ("ackermann", "mecanum", "jackal")
+NAMES = ["differential", *(pytest.param(name, marks=pytest.mark.campaign) for name in OTHERS)]
 WORLDS = [
     "crowd", "room",
     *(pytest.param(name, marks=pytest.mark.campaign) for name in ("arena", "clutter", "doorway")),
