@@ -9,8 +9,7 @@ import numpy as np
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.robot.ackermann import track_and_radius
-from nics_drl_bridge.robot.kinds import require_textbook
-from nics_drl_bridge.robot.skid_steer import wheel_places
+from nics_drl_bridge.robot.kinds import places_of_four, require_textbook
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Parameters = dict[str, float]
@@ -247,7 +246,7 @@ def _mecanum(p: Parameters, step: float, physics: Physics) -> Machine:
 
 def _skid_steer(p: Parameters, step: float, physics: Physics) -> Machine:
     # A point of contact for each wheel: how far a turn skids follows from where the wheels stand.
-    radius, places = p["wheel_radius"], wheel_places(p)
+    radius, places = p["wheel_radius"], places_of_four(p)
     x, y = places["front_left"]
     rotor = ROTOR * 0.25 * physics.mass * radius**2
     inertia = (0.25 * physics.mass + 1.5 * physics.wheel_mass) * radius**2 + rotor
