@@ -36,7 +36,7 @@ CONTROLS = {
 }
 ERROR, WORST, FASTER = 0.05, 0.1, 1000.0
 """Bars: error over the path, on average and on the worst drive, and times MuJoCo's speed."""
-ROBOTS = ("ackermann", "differential", "mecanum")
+ROBOTS = ("ackermann", "differential", "mecanum", "jackal")
 FIRST_SEED = 201
 HOLDS_S = (0.5, 1.0, 0.3, 2.0)
 """How long the unseen drives hold a command, in turn [s]."""

@@ -26,9 +26,10 @@ BARS = {
     # 180 and 33,000 until it read any recording, knew ten kinds of robots instead of six, and what
     # motors do to every command, judged itself by yardsticks, and named units and clocks that
     # can't be; 194 and 40,000 until it imported worlds of Gazebo, held those of a benchmark, and
-    # drew its episodes from sets of worlds.
-    "modules": 202,
-    "lines": 41_500,
+    # drew its episodes from sets of worlds; 202 and 41,500 until it grew such sets, and a robot
+    # named its lidar and skidded in MuJoCo.
+    "modules": 203,
+    "lines": 41_750,
     "single_importers": 50,
     "circles": 0,
     "max_arguments": 10,

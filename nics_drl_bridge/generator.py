@@ -141,12 +141,17 @@ def footprint_shape(robot: RobotSpec) -> Circle | Polygon:
     return Polygon(points=robot.footprint)
 
 
+def usual_lidar(robot: RobotSpec) -> LidarSpec:
+    """The lidar that a robot's file names, else that of the paper. Raises ConfigError."""
+    return load_lidar(robot.lidar or DEFAULT_LIDAR)
+
+
 @lru_cache(maxsize=8)
 def builtin_model(robot: str) -> SimulatorModel:
     """The model of a shipped robot, generated from a drive of its textbook kinematics."""
     spec = load_robot(robot)
     drive = textbook.record(spec, np.random.default_rng(BUILTIN_SEED))
-    return generate(drive, spec, load_lidar(DEFAULT_LIDAR), ())[0]
+    return generate(drive, spec, usual_lidar(spec), ())[0]
 
 
 def open_model(name: str | Path) -> SimulatorModel:

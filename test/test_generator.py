@@ -26,6 +26,7 @@ from nics_drl_bridge.generator import (
     save_model,
 )
 from nics_drl_bridge.identify.calibration import Calibration, Response
+from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.robot.noise import Delay, Latency, Level
 from nics_drl_bridge.sim.simulator import FastSimulator
 
@@ -325,6 +326,26 @@ def test_a_folder_with_other_files_is_never_replaced(tmp_path):
 
 def test_a_model_is_opened_by_folder_or_by_the_name_of_a_robot(saved):
     assert open_model(str(saved)).fingerprint == open_model("ackermann").fingerprint
+
+
+def test_a_robot_has_the_lidar_that_its_file_names_and_else_that_of_the_paper(tmp_path):
+    assert builtin_model("ackermann").lidar == load_lidar("paper")
+    jackal = builtin_model("jackal")
+    assert jackal.lidar == load_lidar("jackal_hokuyo")
+    save_model(jackal, tmp_path / "model")
+    assert load_model(tmp_path / "model").robot == jackal.robot
+
+
+def test_a_lidar_that_a_robots_file_does_not_name_leaves_no_trace_in_its_model():
+    assert "lidar" not in builtin_model("ackermann").robot.model_dump()
+    assert builtin_model("jackal").robot.model_dump()["lidar"] == "jackal_hokuyo"
+
+
+def test_a_lidar_that_there_is_not_is_refused(tmp_path):
+    data = parse_yaml(find_config("differential", "robots").read_text(), "robot")
+    (tmp_path / "mine.yaml").write_text(dump_yaml(data | {"lidar": "papper"}))
+    with pytest.raises(ModelError, match="did you mean 'paper'"):
+        open_model(tmp_path / "mine.yaml")
 
 
 def test_a_robots_file_is_a_model_by_any_path(tmp_path):

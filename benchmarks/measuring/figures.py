@@ -230,7 +230,7 @@ MUJOCO = Table(
         ("generate_from_mujoco", title, f"{{robots.{robot}.position_error_over_path|.3f}}",
          f"{{robots.{robot}.worst_drive_error_over_path|.3f}}",
          f"{{robots.{robot}.speed_up_batched|.1e}}", f"{{robots.{robot}.speed_up_single|.1e}}")
-        for robot, title in ROBOTS.items()
+        for robot, title in (*ROBOTS.items(), ("jackal", "Jackal, skid-steer"))
     ),
 )  # fmt: skip
 ERRORS = ("{%s.error_m|.3f} m", "{%s.share_of_path|.1%%}", "{%s.yardstick_share|.1%%}",

@@ -16,11 +16,10 @@ from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, PolicyError
 from nics_drl_bridge.files import write_text
-from nics_drl_bridge.generator import SimulatorModel, generate, save_model
+from nics_drl_bridge.generator import SimulatorModel, generate, save_model, usual_lidar
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.judgement import shortfall
 from nics_drl_bridge.identify.report import COMPARED, HEADS, judgement_rows
-from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.policy import evaluation
 from nics_drl_bridge.policy.evaluation import FIRST_SEED, Episode, Summary, deviation, successes
 from nics_drl_bridge.policy.policies import open_policy, shipped_policies
@@ -119,7 +118,7 @@ def _generate(plan: DemoPlan, say: Say) -> tuple[SimulatorModel, Identified]:
     say(f"generating a simulator of the robot {robot.name!r} from {source}")
     recording = read_recording(source, robot)
     # The demo has to steer even if the drive never did; the report names the assumptions.
-    model, identified = generate(recording, robot, load_lidar("paper"), world.shapes, assume=True)
+    model, identified = generate(recording, robot, usual_lidar(robot), world.shapes, assume=True)
     save_model(model, plan.model)
     say(model.report.rstrip())
     return model, identified

@@ -186,7 +186,9 @@ def generate(
     topics: console.TopicsOption = None,
     topic: console.TopicOption = None,
     world: console.WorldOption = "arena",
-    lidar: Annotated[str, Option(help="A shipped lidar (paper) or a YAML file.")] = "paper",
+    lidar: Annotated[
+        str | None, Option(help="A shipped lidar or a YAML file; else the robot's own, or paper.")
+    ] = None,
     sensor: Annotated[
         list[Path] | None, Option(help="YAML of a further sensor, docs/sensors.md; repeatable.")
     ] = None,
@@ -204,7 +206,7 @@ def generate(
 ) -> None:
     """Generates a simulator from a recording and writes it as a folder."""
     with one_sentence():
-        from nics_drl_bridge.generator import check_place, save_model
+        from nics_drl_bridge.generator import check_place, save_model, usual_lidar
         from nics_drl_bridge.generator import generate as generate_model
         from nics_drl_bridge.identify.fit import parse_alpha, parse_order
         from nics_drl_bridge.lidar.sensor import load_sensor
@@ -214,7 +216,9 @@ def generate(
         from nics_drl_bridge.sim.world import load_world
 
         check_place(out)
-        first, threshold, terms = load_lidar(lidar), parse_alpha(alpha), parse_order(order)
+        own, threshold, terms = None, parse_alpha(alpha), parse_order(order)
+        if lidar is not None:  # first: a wrong name is told before the drive is read
+            own = load_lidar(lidar)
         further = tuple(load_sensor(file) for file in sensor or ())
         shapes = load_world(world).shapes
         with intact(recording, salvage) as whole:
@@ -222,8 +226,9 @@ def generate(
             spec, drive = robot_and_drive(whole, robot, roles, mapping)
         drive = replace(drive, source=str(recording))
         model, identified = generate_model(
-            drive, spec, first, shapes, terms, threshold, assume_textbook, strict, anyway, further
-        )
+            drive, spec, own or usual_lidar(spec), shapes, terms, threshold, assume_textbook,
+            strict, anyway, further,
+        )  # fmt: skip
         save_model(model, out)
         if pictures:
             from nics_drl_bridge.report.fit_pictures import write_pictures

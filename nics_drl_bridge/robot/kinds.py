@@ -7,7 +7,7 @@ speed and steering angle in the state by their units. An actuator is of first or
 Robots, ch. 3; the paper's reference for Table I.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import TypeVar
@@ -103,6 +103,17 @@ def wheels_at(
         names = tuple(v.name for v in spec.state)
     both = zip(names, places, strict=True)
     return tuple(Wheel(name, place, radius, turns=turns) for name, place in both)
+
+
+def places_of_four(parameters: Mapping[str, float]) -> dict[str, tuple[float, float]]:
+    """Returns x, y in `base_link` [m] of a robot's four wheels by name; KeyError without lengths.
+
+    They stand at `half_length` and `half_width`, each half a `track` where it is not given.
+    """
+    x, y = (parameters[k] if k in parameters else 0.5 * parameters["track"]
+            for k in ("half_length", "half_width"))  # fmt: skip
+    return {f"{end}_{side}": (s * x, t * y) for end, s in (("front", 1.0), ("rear", -1.0))
+            for side, t in (("left", 1.0), ("right", -1.0))}  # fmt: skip
 
 
 @dataclass(frozen=True)

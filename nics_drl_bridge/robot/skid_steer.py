@@ -1,13 +1,14 @@
 """A robot whose wheels or tracks on either side turn alike, so that it skids when it turns.
 
 Its commands are its body twist, or the speeds of both sides [rad/s]. It turns by the distance
-`effective_track` between the centres about which its sides turn, greater than its `track` [m], by
-which its drive makes wheel speeds of a turn rate (Mandow et al. 2007).
+`effective_track` between the centres about which its sides turn, no less than its `track` [m], by
+which its drive makes wheel speeds of a turn rate (Mandow et al. 2007). Its four wheels stand at
+`half_length` and `half_width` [m] from `base_link`, half a track if they are not given.
 """
 
 import numpy as np
 
-from nics_drl_bridge.robot.kinds import Drawing, RobotKind, Textbook, Wheel, wheeled
+from nics_drl_bridge.robot.kinds import Drawing, RobotKind, Textbook, Wheel, places_of_four, wheeled
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
 from nics_drl_bridge.robot.template import LAGS, TWIST, WHEELS, Template, names_of
 
@@ -29,11 +30,10 @@ def kinematics(spec: RobotSpec) -> Textbook:
 
 def drawing(spec: RobotSpec) -> Drawing:
     """A box on four wheels, which stand still."""
-    y, radius = spec.parameters["track"] / 2.0, spec.parameters["wheel_radius"]
-    places = {(end, side): (x, s * y) for end, x in (("front", y), ("rear", -y))
-              for side, s in (("left", 1.0), ("right", -1.0))}  # fmt: skip
-    wheels = (Wheel(f"{end}_{side}_wheel", at, radius) for (end, side), at in places.items())
-    return Drawing((2.0 * (y + radius), 1.6 * y), (0.0, 1.2 * radius), tuple(wheels))
+    places, radius = places_of_four(spec.parameters), spec.parameters["wheel_radius"]
+    x, y = places["front_left"]
+    wheels = (Wheel(f"{name}_wheel", at, radius) for name, at in places.items())
+    return Drawing((2.0 * (x + radius), 1.6 * y), (0.0, 1.2 * radius), tuple(wheels))
 
 
 KIND = RobotKind(kinematics, drawing, TEMPLATE, slips=True)

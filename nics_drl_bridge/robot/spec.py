@@ -19,7 +19,13 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, field_validator, model_validator
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from nics_drl_bridge import extensions, geometry
 from nics_drl_bridge.config import Schema, find_config, parse_yaml, read_text, validate
@@ -130,6 +136,8 @@ class RobotSpec(Schema):
     footprint: tuple[tuple[float, float], ...] | None = Field(
         default=None, min_length=3, max_length=MOST_CORNERS
     )
+    # its usual lidar, a shipped one or a YAML file, where none is given; None: that of the paper
+    lidar: str | None = Field(default=None, min_length=1)
     # S and C components, in the order of every state and command vector
     state: tuple[StateVariable, ...] = Field(default=(), max_length=MOST_VARIABLES)
     command: tuple[CommandVariable, ...] = Field(min_length=1, max_length=MOST_VARIABLES)
@@ -145,6 +153,12 @@ class RobotSpec(Schema):
     @classmethod
     def _with_radius(cls, data: Any) -> Any:
         return _circumscribed(data) if isinstance(data, dict) else data
+
+    @model_serializer(mode="wrap")
+    def _without_none(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # Models and policies are known by what is written: a key that says nothing is left out.
+        data: dict[str, Any] = dump(self)
+        return data if self.lidar else {k: v for k, v in data.items() if k != "lidar"}
 
     @model_validator(mode="after")
     def _consistent(self) -> RobotSpec:

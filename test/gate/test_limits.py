@@ -16,7 +16,7 @@ from nics_drl_bridge.gate.inputs import Command
 from nics_drl_bridge.gate.limits import Limits, follow, implausible, load_limits, saturate, within
 from nics_drl_bridge.robot.spec import load_robot
 
-ROBOTS = ("ackermann", "differential", "mecanum")
+ROBOTS = ("ackermann", "differential", "mecanum", "jackal")
 LIMITS = {robot: load_limits(robot, load_robot(robot)) for robot in ROBOTS}
 TOLERANCE = 1e-6
 WISH = st.floats(-3.0, 3.0)

@@ -11,8 +11,8 @@ from nics_drl_bridge.lidar.spec import ScanHeader, load_lidar
 
 AROUND = ScanLayout(sectors=72, range_max=3.0)
 SHIPPED = (
-    "paper", "paper_12m", "rplidar_a1", "rplidar_a2", "hokuyo_ust_10lx", "sick_tim571",
-    "turtlebot3_lds_02",
+    "paper", "paper_12m", "rplidar_a1", "rplidar_a2", "hokuyo_ust_10lx", "jackal_hokuyo",
+    "sick_tim571", "turtlebot3_lds_02",
 )  # fmt: skip
 
 
@@ -62,7 +62,7 @@ def test_a_sector_holds_the_nearest_return_of_its_beams(heading, angles):
 def test_any_shipped_lidar_sees_the_same_room(name):
     spec, layout = load_lidar(name), LAYOUTS["front"]
     origin = np.array([0.3, -0.2])
-    seen = resampled(plan_of(spec, layout), room(origin, spec.angles))
+    seen = resampled(plan_of(spec, layout), room(origin + spec.mount[:2], spec.angles))
     fine = np.linspace(-layout.width / 2, layout.width / 2, 201)
     exact = room(origin, layout.angles[:, None] + fine).min(axis=1)
     assert np.abs(np.minimum(seen, 3.0) - np.minimum(exact, 3.0)).max() < 0.08

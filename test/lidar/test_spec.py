@@ -49,6 +49,7 @@ DATA_SHEETS = {
     "rplidar_a1": (360, 360.0, 1.0, 0.15, 12.0, 5.5, 0.005, "inf"),
     "rplidar_a2": (800, 360.0, 0.45, 0.15, 12.0, 10.0, 0.005, "inf"),
     "hokuyo_ust_10lx": (1081, 270.0, 0.25, 0.06, 10.0, 40.0, 0.03, "nan"),
+    "jackal_hokuyo": (720, 270.0, 270.0 / 719.0, 0.06, 10.0, 40.0, 0.03, "nan"),
     "sick_tim571": (811, 270.0, 1.0 / 3.0, 0.05, 25.0, 15.0, 0.02, "zero"),
     "turtlebot3_lds_02": (360, 360.0, 1.0, 0.16, 8.0, 5.0, 0.0155, "nan"),
 }
@@ -72,6 +73,12 @@ def test_a_shipped_lidar_is_that_of_its_data_sheet(name):
     assert (spec.range_min, spec.range_max, spec.rate) == (range_min, range_max, rate)
     assert spec.noise_std + spec.faults.noise_proportional == pytest.approx(std)
     assert spec.no_return == no_return
+
+
+def test_the_jackals_lidar_is_a_hokuyo_ahead_of_its_middle():
+    jackal, hokuyo = load_lidar("jackal_hokuyo"), load_lidar("hokuyo_ust_10lx")
+    own = {"name": jackal.name, "beams": 720, "mount": (0.12, 0.0, 0.0)}
+    assert jackal == hokuyo.model_copy(update=own)
 
 
 @pytest.mark.parametrize("name", ["paper", "paper_12m"])

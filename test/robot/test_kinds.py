@@ -72,6 +72,7 @@ def test_nobody_but_the_spec_asks_for_a_field_of_cmd_vel():
         ("ackermann", True, False, [False, True]),
         ("differential", False, False, [False, True]),
         ("mecanum", False, True, [False, False, True]),
+        ("jackal", False, False, [False, True]),
         (NEW, True, False, [False, True]),
     ],
 )
@@ -83,7 +84,7 @@ def test_the_spec_tells_what_its_commands_mean(name, steers, moves_sideways, tur
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("name", [*SHIPPED, "jackal"])
 def test_a_held_command_leads_to_its_steady_twist(name):
     robot = load_robot(name)
     book, command = textbook(robot), 0.6 * robot.command_high

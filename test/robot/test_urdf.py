@@ -6,12 +6,12 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from nics_drl_bridge.lidar.spec import load_lidar
+from nics_drl_bridge.generator import usual_lidar
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.robot.urdf import urdf_of
 
 ROOT = Path(__file__).resolve().parents[2]
-ROBOTS = ("ackermann", "differential", "mecanum")
+ROBOTS = ("ackermann", "differential", "mecanum", "jackal")
 
 
 def joints(text: str) -> dict[str, ElementTree.Element]:
@@ -41,7 +41,7 @@ def wheels(text: str) -> dict[str, float]:
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_the_shipped_files_are_those_of_the_shipped_robots(name: str) -> None:
-    lidar = load_lidar("paper")
+    lidar = usual_lidar(load_robot(name))
     file = ROOT / "urdf" / f"{name}.urdf"
     assert file.read_text(encoding="utf-8") == urdf_of(load_robot(name), lidar.mount, lidar.frame)
 
@@ -84,6 +84,12 @@ def test_a_mecanum_robot_has_four_wheels_in_the_order_of_its_state() -> None:
     assert place(text, "front_left_wheel_link") == pytest.approx([0.1, 0.1, 0.05])
     assert place(text, "rear_right_wheel_link") == pytest.approx([-0.1, -0.1, 0.05])
     assert set(wheels(text).values()) == {0.05}
+
+
+def test_a_jackal_stands_on_its_wheels_not_on_the_track_of_its_drive() -> None:
+    text = urdf_of(load_robot("jackal"))
+    assert place(text, "front_left_wheel_link") == pytest.approx([0.131, 0.188, 0.098])
+    assert place(text, "rear_right_wheel_link") == pytest.approx([-0.131, -0.188, 0.098])
 
 
 def test_a_car_has_its_wheelbase_and_steers_within_its_limits() -> None:

@@ -1,4 +1,4 @@
-"""The three robots in MuJoCo as MJCF; tyres are ellipsoids, which neither jump nor scrub."""
+"""Robots in MuJoCo as MJCF; tyres are ellipsoids, which neither jump nor scrub."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,13 +9,18 @@ import numpy as np
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.robot.ackermann import track_and_radius
-from nics_drl_bridge.robot.kinds import require_textbook
+from nics_drl_bridge.robot.kinds import places_of_four, require_textbook
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Parameters = dict[str, float]
 
 TORQUE_RESERVE = 1.5  # torque limit of a motor, relative to that for the maximum acceleration
 SERVO_LAG_S = 0.005  # lag of a motor behind its set point
+STIFF_SERVO_LAG_S = 0.001  # the same, of one that keeps its speed though its tyres are dragged
+ROTOR = 0.25  # inertia of a geared motor, relative to its share of the robot's
+# Resistance of tyres to skidding relative to that to being pressed in, MuJoCo's `impratio`: at 1,
+# its convex contacts lift what slides so far that wheels hop off the floor.
+SKIDDING = 0.01
 STEERING_STIFFNESS = 1.0  # torque of a steering servo per error [N m/rad]
 STEERING_TORQUE = 1.0  # torque limit of a steering servo [N m], that of a small hobby servo
 THICKNESS = 0.25  # radius of a roller at its middle, relative to the radius of the wheel
@@ -47,14 +52,15 @@ class Machine:
 
 
 def _motor(
-    transmission: str, inertia: float, lag: float, radius: float, step: float, physics: Physics
-) -> str:
+    transmission: str, inertia: float, lag: float, radius: float, step: float, physics: Physics,
+    servo_lag: float = SERVO_LAG_S,
+) -> str:  # fmt: skip
     # Torque = gain x (wanted - actual speed), up to a limit. The wanted speed follows the command
     # with a first-order lag [s], so that the servo is stiff and keeps its speed under load.
     # Spinning or locked wheels do not steer, so the lag is longer if the maximum step [m/s] would
     # accelerate the robot too much. The inertia [kg m^2] is at the shaft, with the robot's share.
-    lag = max(lag, step / physics.acceleration) - SERVO_LAG_S
-    gain = inertia / SERVO_LAG_S
+    lag = max(lag, step / physics.acceleration) - servo_lag
+    gain = inertia / servo_lag
     torque = inertia * TORQUE_RESERVE * physics.acceleration / radius
     return f"""
     <general {transmission} dyntype="filterexact" dynprm="{lag:.8g}" gainprm="{gain:.8g}"
@@ -62,12 +68,14 @@ def _motor(
              forcerange="{-torque:.8g} {torque:.8g}"/>"""
 
 
-def _document(name: str, physics: Physics, height: float, robot: str, actuators: str) -> str:
+def _document(
+    name: str, physics: Physics, height: float, robot: str, actuators: str, impratio: float = 1.0
+) -> str:
     return f"""
 <mujoco model="{name}">
   <compiler angle="radian" autolimits="true"/>
   <option timestep="{physics.timestep}" integrator="implicitfast" cone="elliptic"
-          jacobian="sparse"/>
+          jacobian="sparse" impratio="{impratio:g}"/>
   <default>
     <geom contype="0" conaffinity="0" condim="3" friction="{physics.friction}"/>
     <default class="tread">
@@ -92,9 +100,12 @@ def _chassis(mass: float, centre: tuple[float, float, float], size: tuple[float,
       <geom name="chassis" type="box" mass="{mass}" pos="{x:.6g} {y:.6g} {z:.6g}" size="{half}"/>"""
 
 
-def _wheel(name: str, radius: float, width: float, physics: Physics, damping: float = 0.0) -> str:
+def _wheel(
+    name: str, radius: float, width: float, physics: Physics, damping: float = 0.0,
+    rotor: float = 0.0,
+) -> str:  # fmt: skip
     return f"""
-        <joint name="{name}" axis="0 1 0" damping="{damping}"/>
+        <joint name="{name}" axis="0 1 0" damping="{damping}" armature="{rotor:.8g}"/>
         <geom type="cylinder" mass="{physics.wheel_mass}" size="{radius:.6g} {0.5 * width:.6g}"
               zaxis="0 1 0"/>
         <geom class="tread" type="ellipsoid" mass="0" zaxis="0 1 0"
@@ -233,6 +244,24 @@ def _mecanum(p: Parameters, step: float, physics: Physics) -> Machine:
     return Machine(xml, names, lambda state: state, lambda _, speed: speed)
 
 
+def _skid_steer(p: Parameters, step: float, physics: Physics) -> Machine:
+    # A point of contact for each wheel: how far a turn skids follows from where the wheels stand.
+    radius, places = p["wheel_radius"], places_of_four(p)
+    x, y = places["front_left"]
+    rotor = ROTOR * 0.25 * physics.mass * radius**2
+    inertia = (0.25 * physics.mass + 1.5 * physics.wheel_mass) * radius**2 + rotor
+    body = _chassis(physics.mass, (0.0, 0.0, 0.0), (2.0 * x + radius, 1.4 * y, 0.1))
+    for name, (px, py) in places.items():
+        body += f"""
+      <body pos="{px:.6g} {py:.6g} 0">{_wheel(name, radius, 0.4 * radius, physics, rotor=rotor)}
+      </body>"""
+    names = tuple(places)
+    motors = _motors(names, inertia, p["wheel_lag"], radius, step, physics, STIFF_SERVO_LAG_S)
+    xml = _document("skid_steer", physics, radius, body, motors, SKIDDING)
+    both = lambda _, speed: 0.5 * (speed[:2] + speed[2:])  # noqa: E731
+    return Machine(xml, names, lambda state: np.tile(state, 2), both)
+
+
 def _motors(names: tuple[str, ...], *servo: Any) -> str:
     rows = "".join(_motor(f'joint="{name}"', *servo) for name in names)
     return f"""
@@ -244,6 +273,7 @@ _BUILDERS: dict[str, Callable[[Parameters, float, Physics], Machine]] = {
     "ackermann": _ackermann,
     "differential": _differential,
     "mecanum": _mecanum,
+    "skid_steer": _skid_steer,
 }
 
 

@@ -13,7 +13,7 @@ from nics_drl_bridge.recording.recording import check
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
-NAMES = ("ackermann", "differential", "mecanum")
+NAMES = ("ackermann", "differential", "mecanum", "jackal")
 STEADY_S = 1.5
 
 try:
@@ -61,7 +61,12 @@ def test_it_drives_straight_at_the_commanded_speed(robots, name):
 @needs_mujoco
 @pytest.mark.parametrize(
     ("name", "command"),
-    [("ackermann", [0.4, 0.3]), ("differential", [0.4, 0.8]), ("mecanum", [0.3, 0.0, 1.0])],
+    [
+        ("ackermann", [0.4, 0.3]),
+        ("differential", [0.4, 0.8]),
+        ("mecanum", [0.3, 0.0, 1.0]),
+        ("jackal", [0.4, 0.8]),
+    ],
 )
 def test_it_turns_with_the_curvature_of_the_textbook(robots, name, command):
     robot = robots[name]
@@ -80,6 +85,31 @@ def test_a_mecanum_robot_moves_sideways_to_the_left(robots):
     assert twist[1] == pytest.approx(0.5, rel=0.1)
     assert abs(twist[0]) < 0.02
     assert abs(reading.pose[2]) < 0.05
+
+
+@needs_mujoco
+@pytest.mark.parametrize("command", [[0.0, 0.5], [0.0, 2.0], [1.0, 1.0], [2.0, 1.0]])
+def test_a_jackal_skids_in_turns_and_so_about_reaches_the_commanded_rate(robots, command):
+    """Wheels whose speeds are made by 1.5 times the distance between them."""
+    robot = robots["jackal"]
+    robot.reset(np.zeros(3))
+    robot.step(command, 2.5)
+    readings = [robot.step(command, 0.01) for _ in range(50)]
+    state, twist = (np.mean([getattr(r, k) for r in readings], axis=0) for k in ("state", "twist"))
+    assert twist[2] == pytest.approx(command[1], rel=0.04)
+    p = robot.spec.parameters
+    turned_by = (state[1] - state[0]) * p["wheel_radius"] / twist[2]
+    assert turned_by == pytest.approx(p["effective_track"], rel=0.04)
+    assert turned_by > 1.4 * 2.0 * p["half_width"]
+
+
+@needs_mujoco
+def test_a_jackal_in_a_fast_turn_is_carried_outwards(robots):
+    slow, _ = steady(robots["jackal"], [0.5, 0.5])
+    fast, _ = steady(robots["jackal"], [2.0, 2.0])
+    assert abs(slow[1]) < 0.02 * slow[0]
+    assert fast[1] < -0.05 * fast[0]  # to the right of a turn to the left
+    assert fast[2] > 2.0
 
 
 @needs_mujoco

@@ -20,10 +20,8 @@ from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World, load_world
 from nics_drl_bridge.sim.world_set import load_worlds
 
-NAMES = [
-    "differential",
-    *(pytest.param(name, marks=pytest.mark.campaign) for name in ("ackermann", "mecanum")),
-]
+OTHERS = ("ackermann", "mecanum", "jackal")
+NAMES = ["differential", *(pytest.param(name, marks=pytest.mark.campaign) for name in OTHERS)]
 WORLDS = [
     "crowd", "room",
     *(pytest.param(name, marks=pytest.mark.campaign) for name in ("arena", "clutter", "doorway")),
@@ -104,7 +102,9 @@ def test_a_robot_that_drives_into_a_wall_stops_there(name):
     model = builtin_model(name)
     simulator = MujocoSimulator(model, load_world("empty"))
     simulator.reset([0], starts=np.array([[[2.0, 0.0, 0.0]]]))
-    free, wall = 3.0 - model.robot.footprint_radius, simulator.data
+    robot, wall = model.robot, simulator.data
+    outline = robot.footprint or [(robot.footprint_radius, 0.0)]
+    free = 3.0 - max(x for x, _ in outline)
     collided = []
     for _ in range(30):
         simulator.step(forward(model, 0.7))
