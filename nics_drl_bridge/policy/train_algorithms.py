@@ -1,4 +1,4 @@
-"""PPO and SAC of Stable-Baselines3, built from settings, and the networks that they train."""
+"""What the engines share: the layers of their networks, and checks of the settings."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import VecEnv
@@ -27,36 +26,6 @@ LEAST_STD, LIMIT = 0.05, 5.0
 OBSERVED_STEPS = 64
 GAIN = 2.0**0.5
 ACTION_GAIN = 0.01  # initial gain of an actor's last layer: all its actions are near zero
-
-
-def make_algorithm(
-    settings: TrainingSettings, env: TrainVecEnv, seed: int, normaliser: tuple[Array, Array]
-) -> BaseAlgorithm:
-    """Makes an untrained algorithm; `normaliser` is mean and deviation (O,). See `check_serves`."""
-    check_serves(settings, env)
-    torch.set_num_threads(settings.threads)
-    shared: dict[str, Any] = {"seed": seed, "device": "cpu", "stats_window_size": RECENT}
-    network: dict[str, Any] = {
-        "net_arch": list(settings.hidden),
-        "features_extractor_class": Normaliser,
-        "features_extractor_kwargs": {"mean": normaliser[0], "std": normaliser[1]},
-    }
-    if settings.algorithm == "sac":
-        sac = settings.sac
-        return SAC(
-            "MlpPolicy", env, sac.learning_rate, buffer_size=sac.buffer,
-            learning_starts=sac.begin_after, batch_size=sac.batch, tau=sac.soft_update,
-            gamma=sac.discount, train_freq=1, gradient_steps=sac.updates,
-            policy_kwargs=network, **shared,
-        )  # fmt: skip
-    ppo = settings.ppo
-    network |= {"log_std_init": ppo.log_std, "activation_fn": torch.nn.Tanh}
-    return PPO(
-        "MlpPolicy", env, lambda remaining: ppo.learning_rate * max(remaining, LEAST_RATE),
-        n_steps=ppo.rollout, batch_size=ppo.batch, n_epochs=ppo.epochs, gamma=ppo.discount,
-        gae_lambda=ppo.gae_lambda, clip_range=ppo.clip, ent_coef=ppo.entropy,
-        policy_kwargs=network, **shared,
-    )  # fmt: skip
 
 
 def check_serves(settings: TrainingSettings, env: TrainVecEnv) -> None:
@@ -123,13 +92,14 @@ class Actor(torch.nn.Module):
     def __init__(
         self, observations: gymnasium.spaces.Box,
         actions: gymnasium.spaces.Box | gymnasium.spaces.Discrete, hidden: Sequence[int],
-        normaliser: tuple[Array, Array],
+        normaliser: tuple[Array, Array], activation: type[torch.nn.Module] = torch.nn.Tanh,
     ) -> None:  # fmt: skip
         super().__init__()
         self.discrete, size = isinstance(actions, gymnasium.spaces.Discrete), actions.shape or ()
         count = int(actions.n if isinstance(actions, gymnasium.spaces.Discrete) else np.prod(size))
         self.normaliser = Normaliser(observations, *normaliser)
-        self.layers = layers_of([self.normaliser.features_dim, *hidden, count], ACTION_GAIN)
+        widths = [self.normaliser.features_dim, *hidden, count]
+        self.layers = layers_of(widths, ACTION_GAIN, activation)
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """Parameters of the distribution of actions: its mode if continuous, else logits."""
@@ -142,11 +112,13 @@ class Actor(torch.nn.Module):
         return raw.argmax(dim=1) if self.discrete else raw
 
 
-def layers_of(widths: Sequence[int], gain: float) -> torch.nn.Sequential:
-    """Linear layers with tanh in between, initialised as in Stable-Baselines3, the last by gain."""
+def layers_of(
+    widths: Sequence[int], gain: float, activation: type[torch.nn.Module] = torch.nn.Tanh
+) -> torch.nn.Sequential:
+    """Linear layers, initialised as in Stable-Baselines3, the last by gain."""
     layers: list[torch.nn.Module] = []
     for ins, outs in itertools.pairwise(widths):
-        layers += [torch.nn.Linear(ins, outs), torch.nn.Tanh()]
+        layers += [torch.nn.Linear(ins, outs), activation()]
     del layers[-1]
     for layer in layers[::2]:
         torch.nn.init.orthogonal_(layer.weight, gain if layer is layers[-1] else GAIN)

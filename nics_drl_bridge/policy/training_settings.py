@@ -14,12 +14,17 @@ Count = Annotated[int, Field(ge=1, le=10**12)]
 MOST_WORLDS = 65_536  # maximum number of copies of all worlds together
 MOST_LAYERS, MOST_WIDE = 16, 8_192
 MOST_KEPT = 2**26  # stored transitions: of a roll-out in all worlds, or of SAC's buffer
+Engine = Literal["lean", "sb3"]
 Width = Annotated[int, Field(ge=1, le=MOST_WIDE)]
 
 
 class PpoSettings(Schema):
-    """Proximal policy optimisation (Schulman and others 2017), as in Stable-Baselines3."""
+    """Proximal policy optimisation (Schulman and others 2017), as in Stable-Baselines3.
 
+    The engine `lean` learns on one core while it collects on another; `sb3` is Stable-Baselines3.
+    """
+
+    engine: Engine = "lean"
     learning_rate: float = Field(default=1e-3, gt=0.0)  # at the start; falls linearly to a fiftieth
     rollout: Count = 32  # steps in each world between two updates
     batch: Count = 2048  # transitions of one gradient step
@@ -82,6 +87,11 @@ class TrainingSettings(Schema):
         """Suitable name for the folder of its runs."""
         task = self.task.rpartition(":")[2]
         return f"{task}_{Path(self.robot).stem}_{self.algorithm}"
+
+    @property
+    def lean(self) -> bool:
+        """True if the lean engine learns."""
+        return self.algorithm == "ppo" and self.ppo.engine == "lean"
 
     @property
     def num_envs(self) -> int:
