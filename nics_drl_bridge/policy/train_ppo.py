@@ -35,8 +35,6 @@ class Layers:
 
     def __init__(self, layers: torch.nn.Sequential) -> None:
         self._linear: list[Any] = [one for one in layers if isinstance(one, torch.nn.Linear)]
-        for parameter in layers.parameters():
-            parameter.grad = torch.zeros_like(parameter)
         self._kept: list[torch.Tensor] = []
         self._rows: list[torch.Tensor] = []
 
@@ -55,7 +53,7 @@ class Layers:
         return self._rows[-1]
 
     def backward(self, gradient: torch.Tensor) -> None:
-        """Sets the gradients of weights and biases, by that of the outputs (n, C)."""
+        """Writes the gradients of weights and biases, by that of the outputs (n, C)."""
         for k in range(len(self._linear) - 1, -1, -1):
             layer, rows = self._linear[k], self._rows[k]
             torch.mm(gradient.t(), rows, out=layer.weight.grad)
@@ -84,6 +82,21 @@ class Networks(torch.nn.Module):
             return Categorical(logits=raw, validate_args=False)
         each = Normal(raw, self.log_std.exp(), validate_args=False)
         return Independent(each, 1, validate_args=False)
+
+
+def flattened(networks: Networks) -> torch.nn.Parameter:
+    """One vector of all weights, of which those of the networks become views; gradients likewise.
+
+    An optimiser goes through one vector in a fifth of the time that it takes for many arrays.
+    """
+    every = list(networks.parameters())
+    flat = torch.nn.Parameter(torch.nn.utils.parameters_to_vector(every).detach())
+    flat.grad = torch.zeros_like(flat)
+    sizes = [one.numel() for one in every]
+    parts = zip(every, flat.detach().split(sizes), flat.grad.split(sizes), strict=True)
+    for parameter, values, gradient in parts:
+        parameter.data, parameter.grad = values.view_as(parameter), gradient.view_as(parameter)
+    return flat
 
 
 def drawn(distribution: Distribution, generator: torch.Generator) -> torch.Tensor:
@@ -132,7 +145,8 @@ class Learner:
     def __init__(self, networks: Networks, ppo: PpoSettings, seed: int) -> None:
         self.networks, self.ppo = networks, ppo
         self.generator = torch.Generator().manual_seed(seed)
-        self.optimiser = torch.optim.Adam(networks.parameters(), eps=ADAM_EPSILON, fused=True)
+        self._all = flattened(networks)
+        self.optimiser = torch.optim.Adam([self._all], eps=ADAM_EPSILON, fused=True)
         self._parts = [Layers(layers) for layers in (networks.actor.layers, networks.critic)]
 
     def learn(self, rollout: Rollout, rate: float) -> float:
@@ -143,7 +157,7 @@ class Learner:
             order = torch.randperm(len(rollout.seen), generator=self.generator)
             for rows in order.split(self.ppo.batch):
                 loss = self.differentiate(Rollout(*(each[rows] for each in rollout)))
-                torch.nn.utils.clip_grad_norm_(self.networks.parameters(), GRADIENT_LIMIT)
+                torch.nn.utils.clip_grad_norm_(self._all, GRADIENT_LIMIT)
                 self.optimiser.step()
         return float(loss)
 
@@ -154,10 +168,9 @@ class Learner:
         raw, values = (each.detach().requires_grad_() for each in outputs)
         loss = loss_of(self.networks, raw, values, batch, self.ppo)
         wanted = raw, values, self.networks.log_std
-        *gradients, self.networks.log_std.grad = torch.autograd.grad(
-            loss, wanted, allow_unused=True
-        )
+        *gradients, spread = torch.autograd.grad(loss, wanted, materialize_grads=True)
         with torch.no_grad():
+            self.networks.log_std.grad.copy_(spread)
             for part, gradient in zip(self._parts, gradients, strict=True):
                 part.backward(gradient)
         return loss.detach()
