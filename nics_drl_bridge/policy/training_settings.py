@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml, share_folder, validate
+from nics_drl_bridge.errors import ConfigError
 
 Share = Annotated[float, Field(gt=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=1, le=10**12)]
@@ -115,4 +116,9 @@ def chosen_settings(task: str, name: str | None, changes: dict[str, Any]) -> Tra
     changed = base.model_dump(mode="json") | changes
     if worlds := changed.pop("world", None):
         changed["worlds"] = dict.fromkeys(worlds, max(1, base.num_envs // len(worlds)))
+    if engine := changed.pop("engine", None):
+        if engine == "lean" and changed["algorithm"] != "ppo":
+            given = changed["algorithm"]
+            raise ConfigError(f"--engine lean learns with ppo, not {given!r}; leave it out.")
+        changed["ppo"] |= {"engine": engine}
     return validate(changed, TrainingSettings, "training settings")

@@ -101,9 +101,7 @@ def test_training_again_with_the_same_seed_gives_the_same_weights_and_with_anoth
     engine, parameter, tmp_path
 ):
     chosen = settings(steps=640, **ENGINES[engine])
-    one, same, other = (
-        train(chosen, seed, tmp_path / str(k)) for k, seed in enumerate((0, 0, 1))
-    )
+    one, same, other = (train(chosen, seed, tmp_path / str(k)) for k, seed in enumerate((0, 0, 1)))
     assert torch.equal(weights(one.algorithm)[parameter], weights(same.algorithm)[parameter])
     assert not torch.equal(weights(one.algorithm)[parameter], weights(other.algorithm)[parameter])
 

@@ -69,7 +69,7 @@ def their_weights(ppo):
 
 
 def test_advantages_are_those_of_stable_baselines3():
-    lean, theirs = pair()
+    _, theirs = pair()
     rng = np.random.default_rng(1)
     rewards, values = rng.normal(size=(STEPS, WORLDS)), rng.normal(size=(STEPS + 1, WORLDS))
     done = rng.random((STEPS, WORLDS)) < 0.3
