@@ -21,10 +21,9 @@ from nics_drl_bridge.files import write_text
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.policy import train_checkpoint as checkpoints
 from nics_drl_bridge.policy.evaluation import FIRST_SEED, Outcomes, Summary, drive_worlds, summarise
-from nics_drl_bridge.policy.train_algorithms import Actor, act_of, observed
+from nics_drl_bridge.policy.train_algorithms import Actor, Sb3Training, act_of, observed
 from nics_drl_bridge.policy.train_export import export_policy
-from nics_drl_bridge.policy.train_lean import LeanPpo
-from nics_drl_bridge.policy.train_sb3 import Sb3Training
+from nics_drl_bridge.policy.train_ppo import LeanPpo
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 from nics_drl_bridge.seeds import checked_seeds

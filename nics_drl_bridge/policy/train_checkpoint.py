@@ -18,7 +18,6 @@ from stable_baselines3.common.logger import Logger
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import check_sealed, sealed, write_bytes
-from nics_drl_bridge.policy.train_algorithms import RECENT
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
@@ -88,6 +87,7 @@ def tensors(arrays: dict[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
     return {name: torch.from_numpy(np.ascontiguousarray(rows)) for name, rows in arrays.items()}
 
 
+RECENT = 1000  # number of episodes over which the progress reports its rates
 TOLD_S = 0.2  # minimum time between two reports of the progress [s]
 
 

@@ -13,8 +13,7 @@ from stable_baselines3.common.logger import Logger
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.policy.train_algorithms import Normaliser
-from nics_drl_bridge.policy.train_lean import LeanPpo
-from nics_drl_bridge.policy.train_ppo import Rollout, advantages_of
+from nics_drl_bridge.policy.train_ppo import LeanPpo, Transitions, advantages_of
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
@@ -106,7 +105,7 @@ def filled(lean, theirs, seed=2):
         target = getattr(buffer, name)
         target[...] = np.asarray(values, np.float32).reshape(target.shape)
     buffer.full = True
-    return Rollout(normalised, actions, log_probs, gains, returns)
+    return Transitions(normalised, actions, log_probs, gains, returns)
 
 
 @pytest.mark.parametrize("actions", ["continuous", "discrete"])
@@ -138,7 +137,7 @@ def test_an_update_moves_the_weights_as_stable_baselines3_does():
 def test_a_batch_of_fewer_rows_than_the_one_before_has_gradients_of_its_own():
     lean, theirs = pair()
     batch = filled(lean, theirs)
-    few = Rollout(*(each[:7] for each in batch))
+    few = Transitions(*(each[:7] for each in batch))
     lean.learner.differentiate(few)
     wanted = [each.grad.clone() for each in weights_of(lean)]
     lean.learner.differentiate(batch)
