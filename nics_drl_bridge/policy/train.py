@@ -55,9 +55,7 @@ def train(
     content = checkpoints.read_checkpoint(path) if resumed else None
     about: dict[str, Any] = {"seed": seed, "settings": settings.model_dump(mode="json")}
     env = make_train_env(settings)
-    engine = (
-        LeanPpo if (settings.algorithm, settings.ppo.engine) == ("ppo", "lean") else Sb3Training
-    )
+    engine = LeanPpo if settings.lean else Sb3Training
     if content is None:
         rng = np.random.default_rng(seed)
         env.seed(int(rng.integers(SEEDS)))
