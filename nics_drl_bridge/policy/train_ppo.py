@@ -9,6 +9,7 @@ rollout, so that the bits do not depend on which of them is faster.
 from __future__ import annotations
 
 import copy
+import math
 from collections import deque
 from collections.abc import Callable
 from functools import partial
@@ -19,7 +20,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.logger import Logger
-from torch.distributions import Categorical, Distribution, Independent, Normal
 
 from nics_drl_bridge.policy.train_algorithms import LEAST_RATE, Actor, check_serves, layers_of
 from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch
@@ -31,6 +31,7 @@ Array = NDArray[np.float64]
 Ended = list[tuple[bool, bool]]  # success and collision of episodes
 VALUE_WEIGHT, GRADIENT_LIMIT = 0.5, 0.5  # of the loss, and of the norm of its gradient
 ADAM_EPSILON = 1e-5
+LOG_NORM = 0.5 * math.log(2.0 * math.pi)  # of the normal distribution
 
 
 class Transitions(NamedTuple):
@@ -92,12 +93,24 @@ class Networks(torch.nn.Module):
         outputs = actor.layers[-1].out_features
         self.log_std = torch.nn.Parameter(torch.full((0 if actor.discrete else outputs,), log_std))
 
-    def distribution(self, raw: torch.Tensor) -> Distribution:
-        """Distribution of the actions, by the outputs of the actor (n, C)."""
+    def draw(self, raw: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+        """Draws actions (n, C) or (n,), by the outputs of the actor (n, C)."""
         if self.actor.discrete:
-            return Categorical(logits=raw, validate_args=False)
-        each = Normal(raw, self.log_std.exp(), validate_args=False)
-        return Independent(each, 1, validate_args=False)
+            return torch.multinomial(raw.softmax(1), 1, generator=generator).squeeze(1)
+        return torch.normal(raw, self.log_std.exp().expand_as(raw), generator=generator)
+
+    def log_probs(self, raw: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        """Logarithm of the probability, or its density, (n,) of actions (n, C) or (n,)."""
+        if self.actor.discrete:
+            return raw.log_softmax(1).gather(1, actions[:, None]).squeeze(1)
+        apart = (actions - raw) * torch.exp(-self.log_std)
+        return -0.5 * apart.square().sum(1) - (self.log_std + LOG_NORM).sum()
+
+    def entropy(self, raw: torch.Tensor) -> torch.Tensor:
+        """Entropy of the actions, averaged over outputs of the actor (n, C)."""
+        if self.actor.discrete:
+            return -(raw.softmax(1) * raw.log_softmax(1)).sum(1).mean()
+        return (self.log_std + 0.5 + LOG_NORM).sum()
 
 
 def flattened(networks: Networks) -> torch.nn.Parameter:
@@ -113,13 +126,6 @@ def flattened(networks: Networks) -> torch.nn.Parameter:
     for parameter, values, gradient in parts:
         parameter.data, parameter.grad = values.view_as(parameter), gradient.view_as(parameter)
     return flat
-
-
-def drawn(distribution: Distribution, generator: torch.Generator) -> torch.Tensor:
-    """Draws an action from each of the distributions."""
-    if isinstance(distribution, Categorical):
-        return torch.multinomial(distribution.probs, 1, generator=generator).squeeze(-1)
-    return torch.normal(distribution.mean, distribution.stddev, generator=generator)
 
 
 def advantages_of(
@@ -150,13 +156,12 @@ def loss_of(
     """
     gains = batch.advantages
     gains = (gains - gains.mean()) / (gains.std() + 1e-8)
-    distribution = networks.distribution(raw)
-    ratio = torch.exp(distribution.log_prob(batch.actions) - batch.log_probs)
+    ratio = torch.exp(networks.log_probs(raw, batch.actions) - batch.log_probs)
     bounded = ratio.clamp(1.0 - ppo.clip, 1.0 + ppo.clip)
     policy = -torch.min(gains * ratio, gains * bounded).mean()
     value = torch.nn.functional.mse_loss(values.squeeze(-1), batch.returns)
     loss = policy + VALUE_WEIGHT * value
-    return loss - ppo.entropy * distribution.entropy().mean() if ppo.entropy else loss
+    return loss - ppo.entropy * networks.entropy(raw) if ppo.entropy else loss
 
 
 class Learner:
@@ -213,13 +218,12 @@ class Collector:
         steps, worlds, ppo = self.ppo.rollout, self.env.num_envs, self.ppo
         networks, see = self.networks, self.networks.actor.normaliser
         seen = torch.empty(steps + 1, worlds, self.last.shape[1])
-        rewards, done, log_probs = torch.zeros(3, steps, worlds)
-        actions, ended, cut, final = [], [], [], []
+        rewards, done = torch.zeros(2, steps, worlds)
+        raw, actions, ended, cut, final = [], [], [], [], []
         for t in range(steps):
             seen[t] = see(torch.from_numpy(self.last))
-            distribution = networks.distribution(networks.actor.layers(seen[t]))
-            actions.append(drawn(distribution, self.generator))
-            log_probs[t] = distribution.log_prob(actions[t])
+            raw.append(networks.actor.layers(seen[t]))
+            actions.append(networks.draw(raw[t], self.generator))
             self.last, reward, over, infos = self.env.step(self._bounded(actions[t].numpy()))
             rewards[t], done[t] = torch.from_numpy(reward), torch.from_numpy(over)
             for n in np.flatnonzero(over):
@@ -234,8 +238,10 @@ class Collector:
             after = networks.critic(see(torch.from_numpy(np.stack(final)))).squeeze(-1)
             rewards.view(-1)[cut] += ppo.discount * after
         gains = advantages_of(rewards, values, done, ppo.discount, ppo.gae_lambda)
-        parts = seen[:-1], torch.stack(actions), log_probs, gains, gains + values[:-1]
-        return Transitions(*(each.flatten(0, 1) for each in parts)), ended
+        drawn, returns = torch.cat(actions), gains + values[:-1]
+        log_probs = networks.log_probs(torch.cat(raw), drawn)
+        rows = seen[:-1].flatten(0, 1), drawn, log_probs, gains.flatten(), returns.flatten()
+        return Transitions(*rows), ended
 
     def _bounded(self, actions: NDArray[Any]) -> NDArray[Any]:
         space = self.env.action_space

@@ -91,9 +91,9 @@ def filled(lean, theirs, seed=2):
     see = lean.networks.actor.normaliser
     with torch.no_grad():
         normalised = see(torch.from_numpy(seen))
-        distribution = lean.networks.distribution(lean.networks.actor.layers(normalised))
-        actions = distribution.sample()
-        log_probs = distribution.log_prob(actions) + 0.3 * torch.randn(rows)
+        raw = lean.networks.actor.layers(normalised)
+        actions = lean.networks.draw(raw, torch.Generator().manual_seed(seed))
+        log_probs = lean.networks.log_probs(raw, actions) + 0.3 * torch.randn(rows)
     gains, returns = torch.randn(2, rows)
     buffer = theirs.rollout_buffer
     buffer.reset()
