@@ -41,7 +41,7 @@ def test_an_engine_that_is_named_replaces_that_of_the_settings_and_nothing_else(
 
 def test_worlds_that_are_named_share_the_copies_among_them():
     settings = chosen_settings("navigation", None, {"world": ["arena", "crowd"]})
-    assert settings.worlds == {"arena": 256, "crowd": 256}
+    assert settings.worlds == {"arena": 512, "crowd": 512}
 
 
 def test_a_robot_or_task_without_settings_gets_the_defaults():
