@@ -216,11 +216,11 @@ BASELINES = Table(
     ),
 )  # fmt: skip
 TRAINING = Table(
-    ("robot", "success", "collision", "environment steps", "time", "of that in the simulator"),
+    ("robot", "success", "collision", "environment steps", "time", "steps per second"),
     tuple(
         (f"training_{robot}", robot,
          "{success_rate|.1%} ({success_95ci.0 x100|.1f} to {success_95ci.1 x100|.1f})",
-         "{collision_rate|.1%}", "{env_steps|,}", "{wall_s|.0f} s", "{env_share_of_wall|.0%}")
+         "{collision_rate|.1%}", "{env_steps|,}", "{wall_s|.0f} s", "{steps_per_s|,.0f}")
         for robot in ("differential", "mecanum", "ackermann")
     ),
 )  # fmt: skip

@@ -16,7 +16,7 @@ from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.console import one_sentence, progress_bar
 from nics_drl_bridge.errors import ConfigError, nearest
 
-SB3 = "sb3"
+OWN = ("lean", "sb3")  # the engines of PPO in this process, see `training_settings.Engine`
 policy = typer.Typer(help="Policy files.", no_args_is_help=True)
 
 
@@ -39,8 +39,9 @@ def train(
     out: Annotated[Path | None, Option(help="Folder of the run.")] = None,
     resume: Annotated[bool, Option(help="Go on where --out was interrupted.")] = False,
     engine: Annotated[
-        str, Option(help="sb3 (Stable-Baselines3, this process) or ray (RLlib, a cluster).")
-    ] = "sb3",
+        str | None,
+        Option(help="lean or sb3 (Stable-Baselines3), in this process; ray (RLlib), a cluster."),
+    ] = None,
     address: Annotated[
         str | None, Option(help="Ray cluster: auto (this machine's), HOST:PORT; else started here.")
     ] = None,
@@ -53,6 +54,7 @@ def train(
         from nics_drl_bridge.policy.training_settings import chosen_settings
 
         given = {"robot": robot, "algorithm": algorithm, "steps": steps, "world": world}
+        given["engine"] = engine if engine in OWN else None
         named = {name: value for name, value in given.items() if value}
         if resume and (settings or named):
             option = next(iter(named), "settings")
@@ -75,11 +77,13 @@ def train(
 
 
 @contextmanager
-def _learner(engine: str, address: str | None, runners: int | None, worlds: int) -> Iterator[Any]:
-    engines = (SB3, *extensions.known("engines"))
-    if engine not in engines:
+def _learner(
+    engine: str | None, address: str | None, runners: int | None, worlds: int
+) -> Iterator[Any]:
+    engines = (*OWN, *extensions.known("engines"))
+    if engine is not None and engine not in engines:
         raise ConfigError(f"unknown engine {engine!r}; {nearest(engine, engines)}")
-    if engine == SB3:
+    if engine is None or engine in OWN:
         from nics_drl_bridge.policy.train import train as learn
 
         for name, value in (("address", address), ("env-runners", runners)):

@@ -1,4 +1,4 @@
-"""Trains policies with Stable-Baselines3 on the vector env, seed after seed, and evaluates them."""
+"""Trains policies on the vector env, seed after seed, and evaluates them."""
 
 import dataclasses
 import json
@@ -21,8 +21,9 @@ from nics_drl_bridge.files import write_text
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.policy import train_checkpoint as checkpoints
 from nics_drl_bridge.policy.evaluation import FIRST_SEED, Outcomes, Summary, drive_worlds, summarise
-from nics_drl_bridge.policy.train_algorithms import Actor, act_of, make_algorithm, observed
+from nics_drl_bridge.policy.train_algorithms import Actor, Sb3Training, act_of, observed
 from nics_drl_bridge.policy.train_export import export_policy
+from nics_drl_bridge.policy.train_ppo import LeanPpo
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 from nics_drl_bridge.seeds import checked_seeds
@@ -32,7 +33,6 @@ CHECKPOINT, SETTINGS = "checkpoint.pt", "settings.yaml"
 EVALUATION, POLICY = "evaluation.json", "policy.onnx"
 SEEDS = 2**40
 GREATEST_SEED = 2**32 - 1  # of numpy's global generator, from which Stable-Baselines3 draws
-LOG_EVERY = {"ppo": 1, "sac": 1000}  # roll-outs or episodes between two entries of TensorBoard
 Tell = checkpoints.Tell
 
 
@@ -40,7 +40,7 @@ Tell = checkpoints.Tell
 class Trained:
     """A finished training."""
 
-    algorithm: BaseAlgorithm | Actor  # with its policy; on Ray only the acting part
+    algorithm: BaseAlgorithm | Actor  # with its policy, or the acting part alone
     steps: int  # environment steps of all worlds together
     wall_s: float  # time that this process spent on it [s]
     stepping_s: float  # part of it in the simulator [s]
@@ -55,25 +55,26 @@ def train(
     content = checkpoints.read_checkpoint(path) if resumed else None
     about: dict[str, Any] = {"seed": seed, "settings": settings.model_dump(mode="json")}
     env = make_train_env(settings)
+    engine = LeanPpo if settings.lean else Sb3Training
     if content is None:
         rng = np.random.default_rng(seed)
         env.seed(int(rng.integers(SEEDS)))
-        algorithm = make_algorithm(settings, env, seed, observed(env, rng))
+        training = engine(settings, env, seed, observed(env, rng))
         env.seed(int(rng.integers(SEEDS)))  # replaces the algorithm's, near those of other runs
     else:
-        algorithm = _again(content, about, settings, env, path)
-    algorithm.set_logger(configure(str(folder), ["tensorboard"]))
+        check_same(content["about"], about, path)
+        size = int(np.prod(env.observation_space.shape))
+        training = engine(settings, env, seed, (np.zeros(size), np.ones(size)))
+        _restore(content, training, env, path)
     busy = env.stepping_s
-    save = partial(checkpoints.save_checkpoint, path, algorithm, env, about)
-    companion = checkpoints.Companion(env, seed, settings, save, tell)
-    left = settings.steps - algorithm.num_timesteps
-    if left > 0:
-        every = LOG_EVERY[settings.algorithm]
-        algorithm.learn(left, companion, log_interval=every, reset_num_timesteps=False)
+    save = partial(checkpoints.save_checkpoint, path, training.state, env, about)
+    if training.steps < settings.steps:
+        logger = configure(str(folder), ["tensorboard"])
+        training.learn(checkpoints.Watch(env, seed, settings, save, tell), logger)
         save()
-    algorithm.logger.close()
+        logger.close()
     taken = time.perf_counter() - begin
-    return Trained(algorithm, algorithm.num_timesteps, taken, env.stepping_s - busy)
+    return Trained(training.policy, training.steps, taken, env.stepping_s - busy)
 
 
 def make_train_env(
@@ -92,19 +93,15 @@ def make_train_env(
     return TrainVecEnv(*envs)
 
 
-def _again(
-    content: dict[str, Any], about: dict[str, Any], settings: TrainingSettings, env: TrainVecEnv,
-    path: Path,
-) -> BaseAlgorithm:  # fmt: skip
-    check_same(content["about"], about, path)
-    size = int(np.prod(env.observation_space.shape))
-    algorithm = make_algorithm(settings, env, about["seed"], (np.zeros(size), np.ones(size)))
+def _restore(
+    content: dict[str, Any], training: LeanPpo | Sb3Training, env: TrainVecEnv, path: Path
+) -> None:
     try:
-        checkpoints.resume(content, algorithm, env)
+        training.restore(content["state"])
+        checkpoints.restore_envs(content, env)
     except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
         reason = f"does not hold what a training needs ({shortened(str(error), 120)})"
         raise ConfigError(f"{path}: {reason}; train anew.") from None
-    return algorithm
 
 
 def check_same(old: dict[str, Any], new: dict[str, Any], path: Path) -> None:

@@ -1,8 +1,10 @@
-"""PPO and SAC of Stable-Baselines3, built from settings, and the networks that they train."""
+"""PPO and SAC of Stable-Baselines3, and the layers of networks that all engines share."""
 
 from __future__ import annotations
 
 import itertools
+import json
+from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,51 +14,29 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.policy.evaluation import Act
+from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch, tensors
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
 Array = NDArray[np.float64]
-RECENT = 1000  # number of episodes over which the progress reports its rates
 LEAST_RATE = 0.02  # share of PPO's learning rate that is left at the end
 LEAST_STD, LIMIT = 0.05, 5.0
 OBSERVED_STEPS = 64
 GAIN = 2.0**0.5
 ACTION_GAIN = 0.01  # initial gain of an actor's last layer: all its actions are near zero
-
-
-def make_algorithm(
-    settings: TrainingSettings, env: TrainVecEnv, seed: int, normaliser: tuple[Array, Array]
-) -> BaseAlgorithm:
-    """Makes an untrained algorithm; `normaliser` is mean and deviation (O,). See `check_serves`."""
-    check_serves(settings, env)
-    torch.set_num_threads(settings.threads)
-    shared: dict[str, Any] = {"seed": seed, "device": "cpu", "stats_window_size": RECENT}
-    network: dict[str, Any] = {
-        "net_arch": list(settings.hidden),
-        "features_extractor_class": Normaliser,
-        "features_extractor_kwargs": {"mean": normaliser[0], "std": normaliser[1]},
-    }
-    if settings.algorithm == "sac":
-        sac = settings.sac
-        return SAC(
-            "MlpPolicy", env, sac.learning_rate, buffer_size=sac.buffer,
-            learning_starts=sac.begin_after, batch_size=sac.batch, tau=sac.soft_update,
-            gamma=sac.discount, train_freq=1, gradient_steps=sac.updates,
-            policy_kwargs=network, **shared,
-        )  # fmt: skip
-    ppo = settings.ppo
-    network |= {"log_std_init": ppo.log_std, "activation_fn": torch.nn.Tanh}
-    return PPO(
-        "MlpPolicy", env, lambda remaining: ppo.learning_rate * max(remaining, LEAST_RATE),
-        n_steps=ppo.rollout, batch_size=ppo.batch, n_epochs=ppo.epochs, gamma=ppo.discount,
-        gae_lambda=ppo.gae_lambda, clip_range=ppo.clip, ent_coef=ppo.entropy,
-        policy_kwargs=network, **shared,
-    )  # fmt: skip
+LOG_EVERY = {"ppo": 1, "sac": 1000}  # roll-outs or episodes between two entries of TensorBoard
+COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
+LAST = ("_last_obs", "_last_episode_starts")
+REPLAYED = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
 def check_serves(settings: TrainingSettings, env: TrainVecEnv) -> None:
@@ -123,13 +103,14 @@ class Actor(torch.nn.Module):
     def __init__(
         self, observations: gymnasium.spaces.Box,
         actions: gymnasium.spaces.Box | gymnasium.spaces.Discrete, hidden: Sequence[int],
-        normaliser: tuple[Array, Array],
+        normaliser: tuple[Array, Array], activation: type[torch.nn.Module] = torch.nn.Tanh,
     ) -> None:  # fmt: skip
         super().__init__()
         self.discrete, size = isinstance(actions, gymnasium.spaces.Discrete), actions.shape or ()
         count = int(actions.n if isinstance(actions, gymnasium.spaces.Discrete) else np.prod(size))
         self.normaliser = Normaliser(observations, *normaliser)
-        self.layers = layers_of([self.normaliser.features_dim, *hidden, count], ACTION_GAIN)
+        widths = [self.normaliser.features_dim, *hidden, count]
+        self.layers = layers_of(widths, ACTION_GAIN, activation)
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """Parameters of the distribution of actions: its mode if continuous, else logits."""
@@ -142,13 +123,150 @@ class Actor(torch.nn.Module):
         return raw.argmax(dim=1) if self.discrete else raw
 
 
-def layers_of(widths: Sequence[int], gain: float) -> torch.nn.Sequential:
-    """Linear layers with tanh in between, initialised as in Stable-Baselines3, the last by gain."""
+def layers_of(
+    widths: Sequence[int], gain: float, activation: type[torch.nn.Module] = torch.nn.Tanh
+) -> torch.nn.Sequential:
+    """Linear layers, initialised as in Stable-Baselines3, the last by gain."""
     layers: list[torch.nn.Module] = []
     for ins, outs in itertools.pairwise(widths):
-        layers += [torch.nn.Linear(ins, outs), torch.nn.Tanh()]
+        layers += [torch.nn.Linear(ins, outs), activation()]
     del layers[-1]
     for layer in layers[::2]:
         torch.nn.init.orthogonal_(layer.weight, gain if layer is layers[-1] else GAIN)
         torch.nn.init.zeros_(layer.bias)
     return torch.nn.Sequential(*layers)
+
+
+class Sb3Training:
+    """A training by an algorithm of Stable-Baselines3; `normaliser` is mean and deviation (O,)."""
+
+    def __init__(
+        self, settings: TrainingSettings, env: TrainVecEnv, seed: int,
+        normaliser: tuple[Array, Array],
+    ) -> None:  # fmt: skip
+        self.policy = make_algorithm(settings, env, seed, normaliser)
+        self._total, self._log_every = settings.steps, LOG_EVERY[settings.algorithm]
+
+    @property
+    def steps(self) -> int:
+        """Environment steps of all worlds together, so far."""
+        return int(self.policy.num_timesteps)
+
+    def learn(self, watch: Watch, logger: Logger) -> None:
+        """Learns until all steps are done."""
+        self.policy.set_logger(logger)
+        left, companion = self._total - self.steps, Companion(watch)
+        self.policy.learn(left, companion, self._log_every, reset_num_timesteps=False)
+
+    def state(self) -> dict[str, Any]:
+        """All that changes, for a checkpoint."""
+        algorithm = self.policy
+        replay: dict[str, Any] = {}
+        if isinstance(algorithm, OffPolicyAlgorithm):
+            buffer: Any = algorithm.replay_buffer
+            rows = {name: getattr(buffer, name)[: buffer.size()] for name in REPLAYED}
+            replay = {"pos": buffer.pos, "full": buffer.full, **tensors(rows)}
+        return {
+            "parameters": algorithm.get_parameters(),
+            "variables": {  # other than the networks: the temperature of SAC
+                name: getattr(algorithm, name).detach().clone()
+                for name in algorithm._get_torch_save_params()[1]
+            },
+            "counters": {name: getattr(algorithm, name) for name in COUNTERS},
+            "recent": list(algorithm.ep_success_buffer or ()),
+            "last": tensors({name: getattr(algorithm, name) for name in LAST}),
+            "replay": replay,
+            "random": _random_state(algorithm),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continues with the state of another, made with the same arguments."""
+        algorithm = self.policy
+        algorithm.set_parameters(state["parameters"], exact_match=True)
+        for name, value in state["variables"].items():
+            getattr(algorithm, name).data.copy_(value)
+        for name, value in state["counters"].items():
+            setattr(algorithm, name, value)
+        size = algorithm._stats_window_size
+        algorithm.ep_success_buffer = deque(state["recent"], maxlen=size)
+        algorithm.ep_info_buffer = deque(maxlen=size)
+        for name, value in state["last"].items():
+            setattr(algorithm, name, value.numpy().copy())
+        if isinstance(algorithm, OffPolicyAlgorithm):
+            buffer: Any = algorithm.replay_buffer
+            replay = state["replay"]
+            buffer.pos, buffer.full = replay["pos"], replay["full"]
+            for name in REPLAYED:
+                getattr(buffer, name)[: buffer.size()] = replay[name].numpy()
+        _set_random_state(algorithm, state["random"])
+
+
+def make_algorithm(
+    settings: TrainingSettings, env: TrainVecEnv, seed: int, normaliser: tuple[Array, Array]
+) -> BaseAlgorithm:
+    """Makes an untrained algorithm; `normaliser` is mean and deviation (O,). See `check_serves`."""
+    check_serves(settings, env)
+    torch.set_num_threads(settings.threads)
+    shared: dict[str, Any] = {"seed": seed, "device": "cpu", "stats_window_size": RECENT}
+    network: dict[str, Any] = {
+        "net_arch": list(settings.hidden),
+        "features_extractor_class": Normaliser,
+        "features_extractor_kwargs": {"mean": normaliser[0], "std": normaliser[1]},
+    }
+    if settings.algorithm == "sac":
+        sac = settings.sac
+        return SAC(
+            "MlpPolicy", env, sac.learning_rate, buffer_size=sac.buffer,
+            learning_starts=sac.begin_after, batch_size=sac.batch, tau=sac.soft_update,
+            gamma=sac.discount, train_freq=1, gradient_steps=sac.updates,
+            policy_kwargs=network, **shared,
+        )  # fmt: skip
+    ppo = settings.ppo
+    network |= {"log_std_init": ppo.log_std, "activation_fn": torch.nn.Tanh}
+    return PPO(
+        "MlpPolicy", env, lambda remaining: ppo.learning_rate * max(remaining, LEAST_RATE),
+        n_steps=ppo.rollout, batch_size=ppo.batch, n_epochs=ppo.epochs, gamma=ppo.discount,
+        gae_lambda=ppo.gae_lambda, clip_range=ppo.clip, ent_coef=ppo.entropy,
+        policy_kwargs=network, **shared,
+    )  # fmt: skip
+
+
+def _random_state(algorithm: BaseAlgorithm) -> dict[str, Any]:
+    shared = np.random.get_state(legacy=False)  # noqa: NPY002 - Stable-Baselines3 draws from it
+    spaces = algorithm.action_space.np_random.bit_generator.state
+    return {
+        "torch": torch.get_rng_state(),
+        "numpy": json.dumps(shared, default=lambda array: array.tolist()),
+        "actions": json.dumps(spaces),
+    }
+
+
+def _set_random_state(algorithm: BaseAlgorithm, content: dict[str, Any]) -> None:
+    set_random_seed(0)
+    torch.set_rng_state(content["torch"])
+    shared = json.loads(content["numpy"])
+    shared["state"]["key"] = np.array(shared["state"]["key"], np.uint32)
+    np.random.set_state(shared)  # noqa: NPY002 - as above
+    algorithm.action_space.np_random.bit_generator.state = json.loads(content["actions"])
+
+
+class Companion(BaseCallback):
+    """Callback by which Stable-Baselines3 calls a watch in each step and roll-out."""
+
+    def __init__(self, watch: Watch) -> None:
+        super().__init__()
+        self._watch = watch
+
+    def _on_training_start(self) -> None:
+        self._watch.begin(self.num_timesteps)
+
+    def _on_rollout_start(self) -> None:
+        self._watch.keep(self.model.num_timesteps)
+
+    def _on_step(self) -> bool:
+        for n in np.flatnonzero(self.locals["dones"]):
+            self._watch.collisions.append(bool(self.locals["infos"][n].get("collision", False)))
+        return True
+
+    def _on_rollout_end(self) -> None:
+        self._watch.report(self.num_timesteps, self.model.ep_success_buffer or (), self.logger)

@@ -5,7 +5,7 @@ import json
 import time
 import zipfile
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,50 +13,24 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.logger import Logger
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import check_sealed, sealed, write_bytes
-from nics_drl_bridge.policy.train_algorithms import RECENT
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
-FORMAT = "nics_drl_bridge/checkpoint/2"
+FORMAT = "nics_drl_bridge/checkpoint/3"
 MOST_BYTES = 4 * 2**30  # maximum size of a file, which contains all of SAC's buffer
-COUNTERS = ("num_timesteps", "_n_updates", "_episode_num", "_current_progress_remaining")
-LAST = ("_last_obs", "_last_episode_starts")
-REPLAYED = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
 def save_checkpoint(
-    path: Path, algorithm: BaseAlgorithm, env: TrainVecEnv, about: dict[str, Any]
+    path: Path, state: Callable[[], dict[str, Any]], env: TrainVecEnv, about: dict[str, Any]
 ) -> None:
     """Writes a checkpoint between two roll-outs; `about` identifies the training."""
-    replay: dict[str, Any] = {}
-    if isinstance(algorithm, OffPolicyAlgorithm):
-        buffer: Any = algorithm.replay_buffer
-        rows = {name: getattr(buffer, name)[: buffer.size()] for name in REPLAYED}
-        replay = {"pos": buffer.pos, "full": buffer.full, **_tensors(rows)}
-    content = {
-        "format": FORMAT,
-        "about": json.dumps(about),
-        "parameters": algorithm.get_parameters(),
-        "variables": {  # other than the networks: the temperature of SAC
-            name: getattr(algorithm, name).detach().clone()
-            for name in algorithm._get_torch_save_params()[1]
-        },
-        "counters": {name: getattr(algorithm, name) for name in COUNTERS},
-        "recent": list(algorithm.ep_success_buffer or ()),
-        "last": _tensors({name: getattr(algorithm, name) for name in LAST}),
-        "replay": replay,
-        "random": _random_state(algorithm),
-        "envs": [_tensors(snapshot(one)) for one in env.envs],
-    }
-    write_content(path, content)
+    content = {"format": FORMAT, "about": json.dumps(about), "state": state()}
+    write_content(path, content | {"envs": [tensors(snapshot(one)) for one in env.envs]})
 
 
 def write_content(path: Path, content: dict[str, Any]) -> None:
@@ -102,52 +76,18 @@ def _check_tensors(content: Any, size: int) -> None:
         raise ValueError("a tensor is larger than the file")
 
 
-def resume(content: dict[str, Any], algorithm: BaseAlgorithm, env: TrainVecEnv) -> None:
-    """Puts a checkpoint into an algorithm and an env made with the same arguments."""
-    algorithm.set_parameters(content["parameters"], exact_match=True)
-    for name, value in content["variables"].items():
-        getattr(algorithm, name).data.copy_(value)
-    for name, value in content["counters"].items():
-        setattr(algorithm, name, value)
-    size = algorithm._stats_window_size
-    algorithm.ep_success_buffer = deque(content["recent"], maxlen=size)
-    algorithm.ep_info_buffer = deque(maxlen=size)
-    for name, value in content["last"].items():
-        setattr(algorithm, name, value.numpy().copy())
+def restore_envs(content: dict[str, Any], env: TrainVecEnv) -> None:
+    """Puts the worlds of a checkpoint into an env made with the same arguments."""
     for one, state in zip(env.envs, content["envs"], strict=True):
         restore(one, {name: value.numpy() for name, value in state.items()})
-    if isinstance(algorithm, OffPolicyAlgorithm):
-        buffer: Any = algorithm.replay_buffer
-        replay = content["replay"]
-        buffer.pos, buffer.full = replay["pos"], replay["full"]
-        for name in REPLAYED:
-            getattr(buffer, name)[: buffer.size()] = replay[name].numpy()
-    _set_random_state(algorithm, content["random"])
 
 
-def _tensors(arrays: dict[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
+def tensors(arrays: dict[str, NDArray[Any]]) -> dict[str, torch.Tensor]:
+    """Arrays by name as tensors."""
     return {name: torch.from_numpy(np.ascontiguousarray(rows)) for name, rows in arrays.items()}
 
 
-def _random_state(algorithm: BaseAlgorithm) -> dict[str, Any]:
-    shared = np.random.get_state(legacy=False)  # noqa: NPY002 - Stable-Baselines3 draws from it
-    spaces = algorithm.action_space.np_random.bit_generator.state
-    return {
-        "torch": torch.get_rng_state(),
-        "numpy": json.dumps(shared, default=lambda array: array.tolist()),
-        "actions": json.dumps(spaces),
-    }
-
-
-def _set_random_state(algorithm: BaseAlgorithm, content: dict[str, Any]) -> None:
-    set_random_seed(0)
-    torch.set_rng_state(content["torch"])
-    shared = json.loads(content["numpy"])
-    shared["state"]["key"] = np.array(shared["state"]["key"], np.uint32)
-    np.random.set_state(shared)  # noqa: NPY002 - as above
-    algorithm.action_space.np_random.bit_generator.state = json.loads(content["actions"])
-
-
+RECENT = 1000  # number of episodes over which the progress reports its rates
 TOLD_S = 0.2  # minimum time between two reports of the progress [s]
 
 
@@ -168,48 +108,46 @@ Save = Callable[[], None]
 Tell = Callable[[Progress], None]
 
 
-class Companion(BaseCallback):
-    """Callback that monitors each step and roll-out: calls `tell`, and `save` between roll-outs."""
+class Watch:
+    """Follows a training: tells its progress, and saves it now and then, between two roll-outs."""
 
     def __init__(
         self, env: TrainVecEnv, seed: int, settings: TrainingSettings, save: Save, tell: Tell
     ) -> None:
-        super().__init__()
         self._env, self._seed, self._save, self._tell = env, seed, save, tell
         self._total, self._every = settings.steps, settings.checkpoint_every
-        self._collisions: deque[bool] = deque(maxlen=RECENT)
+        self.collisions: deque[bool] = deque(maxlen=RECENT)  # of the last episodes
 
-    def _on_training_start(self) -> None:
+    def begin(self, steps: int) -> None:
+        """Starts the clock of a training that has already done some steps."""
         self._begin = self._told = time.perf_counter()
         self._busy = self._env.stepping_s
-        self._first = self._saved = self.num_timesteps
+        self._first = self._saved = steps
 
-    def _on_rollout_start(self) -> None:
-        if self.model.num_timesteps // self._every > self._saved // self._every:
+    def keep(self, steps: int) -> None:
+        """Saves the training if it is time to."""
+        if steps // self._every > self._saved // self._every:
             self._save()
-            self._saved = self.model.num_timesteps
+            self._saved = steps
 
-    def _on_step(self) -> bool:
-        for n in np.flatnonzero(self.locals["dones"]):
-            self._collisions.append(bool(self.locals["infos"][n].get("collision", False)))
-        return True
-
-    def _on_rollout_end(self) -> None:
+    def report(self, steps: int, successes: Sequence[bool], logger: Logger) -> bool:
+        """Tells and logs the progress if it is time to; True if it was."""
         now = time.perf_counter()
-        if now - self._told < TOLD_S and self.num_timesteps < self._total:
-            return
+        if now - self._told < TOLD_S and steps < self._total:
+            return False
         self._told = now
         taken = max(now - self._begin, 1e-9)
-        recent = self.model.ep_success_buffer, self._collisions
+        recent = successes, self.collisions
         success, collision = (float(np.mean(r)) if r else np.nan for r in recent)
         progress = Progress(
-            self._seed, self.num_timesteps, self._total, success, collision,
-            (self.num_timesteps - self._first) / taken,
+            self._seed, steps, self._total, success, collision, (steps - self._first) / taken,
             (self._env.stepping_s - self._busy) / taken,
         )  # fmt: skip
-        self.logger.record("rollout/collision_rate", progress.collision)
-        self.logger.record("time/env_share", progress.env_share)
+        logger.record("rollout/success_rate", progress.success)
+        logger.record("rollout/collision_rate", progress.collision)
+        logger.record("time/env_share", progress.env_share)
         self._tell(progress)
+        return True
 
 
 Arrays = dict[str, NDArray[Any]]

@@ -8,18 +8,24 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml, share_folder, validate
+from nics_drl_bridge.errors import ConfigError
 
 Share = Annotated[float, Field(gt=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=1, le=10**12)]
 MOST_WORLDS = 65_536  # maximum number of copies of all worlds together
 MOST_LAYERS, MOST_WIDE = 16, 8_192
 MOST_KEPT = 2**26  # stored transitions: of a roll-out in all worlds, or of SAC's buffer
+Engine = Literal["lean", "sb3"]
 Width = Annotated[int, Field(ge=1, le=MOST_WIDE)]
 
 
 class PpoSettings(Schema):
-    """Proximal policy optimisation (Schulman and others 2017), as in Stable-Baselines3."""
+    """Proximal policy optimisation (Schulman and others 2017), as in Stable-Baselines3.
 
+    The engine `lean` learns on one core while it collects on another; `sb3` is Stable-Baselines3.
+    """
+
+    engine: Engine = "lean"
     learning_rate: float = Field(default=1e-3, gt=0.0)  # at the start; falls linearly to a fiftieth
     rollout: Count = 32  # steps in each world between two updates
     batch: Count = 2048  # transitions of one gradient step
@@ -84,6 +90,11 @@ class TrainingSettings(Schema):
         return f"{task}_{Path(self.robot).stem}_{self.algorithm}"
 
     @property
+    def lean(self) -> bool:
+        """True if the lean engine learns."""
+        return self.algorithm == "ppo" and self.ppo.engine == "lean"
+
+    @property
     def num_envs(self) -> int:
         """N, number of worlds of all kinds together."""
         return sum(self.worlds.values())
@@ -105,4 +116,9 @@ def chosen_settings(task: str, name: str | None, changes: dict[str, Any]) -> Tra
     changed = base.model_dump(mode="json") | changes
     if worlds := changed.pop("world", None):
         changed["worlds"] = dict.fromkeys(worlds, max(1, base.num_envs // len(worlds)))
+    if engine := changed.pop("engine", None):
+        if engine == "lean" and changed["algorithm"] != "ppo":
+            given = changed["algorithm"]
+            raise ConfigError(f"--engine lean learns with ppo, not {given!r}; leave it out.")
+        changed["ppo"] |= {"engine": engine}
     return validate(changed, TrainingSettings, "training settings")

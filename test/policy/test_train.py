@@ -34,6 +34,13 @@ def _small_world(monkeypatch):
     )  # fmt: skip
 
 
+ENGINES = {
+    "lean": {"algorithm": "ppo"},
+    "sb3": {"algorithm": "ppo", "ppo": {"rollout": 16, "batch": 64, "epochs": 2, "engine": "sb3"}},
+    "sac": {"algorithm": "sac"},
+}
+
+
 def settings(algorithm="ppo", **changes):
     data = {
         "worlds": {"one": 5, "another": 3},
@@ -50,13 +57,28 @@ def settings(algorithm="ppo", **changes):
 
 
 def weights(algorithm):
-    return {name: value.clone() for name, value in algorithm.policy.state_dict().items()}
+    policy = getattr(algorithm, "policy", algorithm)
+    return {name: value.clone() for name, value in policy.state_dict().items()}
+
+
+def steps_in(path):
+    state = read_checkpoint(path)["state"]
+    return state["counters"]["num_timesteps"] if "counters" in state else state["steps"]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", ["ppo", "sac"])
-def test_an_interrupted_training_comes_to_the_same_weights(algorithm, tmp_path, monkeypatch):
-    whole = train(settings(algorithm), 1, tmp_path / "whole")
+@pytest.mark.parametrize(
+    ("engine", "actions"),
+    [
+        ("lean", "continuous"),
+        ("lean", "discrete"),
+        ("sb3", "continuous"),
+        ("sac", "continuous"),
+    ],
+)
+def test_an_interrupted_training_comes_to_the_same_weights(engine, actions, tmp_path, monkeypatch):
+    chosen = settings(task_options={"actions": actions}, **ENGINES[engine])
+    whole = train(chosen, 1, tmp_path / "whole")
 
     def interrupt(progress):
         if progress.steps > 1000:
@@ -65,33 +87,37 @@ def test_an_interrupted_training_comes_to_the_same_weights(algorithm, tmp_path, 
     # Told of every rollout, whatever the clock says.
     monkeypatch.setattr("nics_drl_bridge.policy.train_checkpoint.TOLD_S", 0.0)
     with pytest.raises(BrokenOffError):
-        train(settings(algorithm), 1, tmp_path / "broken", interrupt)
-    kept = read_checkpoint(tmp_path / "broken" / CHECKPOINT)["counters"]["num_timesteps"]
+        train(chosen, 1, tmp_path / "broken", interrupt)
+    kept = steps_in(tmp_path / "broken" / CHECKPOINT)
     assert 0 < kept < 1000
     torch.manual_seed(99)
     np.random.seed(99)  # noqa: NPY002 - what another program may have done meanwhile
-    again = train(settings(algorithm), 1, tmp_path / "broken", resumed=True)
+    again = train(chosen, 1, tmp_path / "broken", resumed=True)
     assert again.steps == whole.steps
     for name, value in weights(whole.algorithm).items():
         assert torch.equal(value, weights(again.algorithm)[name]), name
 
 
 @pytest.mark.slow
-def test_training_again_with_the_same_seed_gives_the_same_weights_and_with_another_others(tmp_path):
-    one, same, other = (
-        train(settings(steps=128), seed, tmp_path / str(k)) for k, seed in enumerate((0, 0, 1))
-    )
-    parameter = "action_net.weight"
+@pytest.mark.parametrize(
+    ("engine", "parameter"), [("lean", "layers.0.weight"), ("sb3", "action_net.weight")]
+)
+def test_training_again_with_the_same_seed_gives_the_same_weights_and_with_another_others(
+    engine, parameter, tmp_path
+):
+    chosen = settings(steps=640, **ENGINES[engine])
+    one, same, other = (train(chosen, seed, tmp_path / str(k)) for k, seed in enumerate((0, 0, 1)))
     assert torch.equal(weights(one.algorithm)[parameter], weights(same.algorithm)[parameter])
     assert not torch.equal(weights(one.algorithm)[parameter], weights(other.algorithm)[parameter])
 
 
 @pytest.mark.slow
-def test_a_little_training_reaches_more_goals_than_none(tmp_path):
+@pytest.mark.parametrize("engine", ["lean", "sb3"])
+def test_a_little_training_reaches_more_goals_than_none(engine, tmp_path):
     def successes(steps):
         chosen = settings(
             worlds={"one": 32}, steps=steps, hidden=[32, 32], randomisation=None,
-            ppo={"rollout": 32, "batch": 256, "learning_rate": 2e-3},
+            ppo={"engine": engine, "rollout": 32, "batch": 256, "learning_rate": 2e-3},
         )  # fmt: skip
         algorithm = train(chosen, 0, tmp_path / str(steps)).algorithm
         return evaluate(algorithm, chosen, "one", 100).success.mean()

@@ -63,6 +63,8 @@ def test_a_run_leaves_policy_evaluation_and_logs_of_each_seed_and_can_be_resumed
         (["--resume", "--out", "nowhere"], "nowhere: holds no settings.yaml"),
         (["--seeds", "1", "1", "--out", "run"], "give one or more, none twice"),
         (["--engine", "rai"], "unknown engine 'rai'; did you mean 'ray'"),
+        (["--engine", "lean", "--algorithm", "sac"], "--engine lean learns with ppo, not 'sac'"),
+        (["--resume", "--engine", "lean", "--out", "x"], "--engine: a resumed run has its own"),
         (["--address", "auto"], "--address: belongs to --engine ray; add that, or leave it out."),
         (["--env-runners", "2"], "--env-runners: belongs to --engine ray"),
     ],

@@ -31,9 +31,17 @@ def test_settings_are_those_of_task_and_robot_and_a_user_changes_them():
     assert settings.title == "navigation_mecanum_ppo"
 
 
+def test_an_engine_that_is_named_replaces_that_of_the_settings_and_nothing_else():
+    shipped = load_training("navigation_mecanum")
+    named = chosen_settings("navigation", None, {"robot": "mecanum", "engine": "sb3"})
+    assert (shipped.lean, named.lean) == (True, False)
+    assert named.ppo == shipped.ppo.model_copy(update={"engine": "sb3"})
+    assert not chosen_settings("navigation", None, {"algorithm": "sac"}).lean
+
+
 def test_worlds_that_are_named_share_the_copies_among_them():
     settings = chosen_settings("navigation", None, {"world": ["arena", "crowd"]})
-    assert settings.worlds == {"arena": 256, "crowd": 256}
+    assert settings.worlds == {"arena": 512, "crowd": 512}
 
 
 def test_a_robot_or_task_without_settings_gets_the_defaults():

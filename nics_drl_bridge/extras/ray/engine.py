@@ -35,7 +35,12 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.policy import train, train_algorithms
-from nics_drl_bridge.policy.train_checkpoint import Progress, read_checkpoint, write_content
+from nics_drl_bridge.policy.train_checkpoint import (
+    RECENT,
+    Progress,
+    read_checkpoint,
+    write_content,
+)
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
@@ -301,7 +306,7 @@ class Learning:
         self.stepping_s += float(found.get(STEPPING, 0.0)) / self.runners
         ended, success, collision = (int(found.get(n, 0)) for n in (ENDED, SUCCESS, COLLISION))
         self.recent.append((ended, success, collision))
-        while sum(one[0] for one in self.recent) - self.recent[0][0] >= train_algorithms.RECENT:
+        while sum(one[0] for one in self.recent) - self.recent[0][0] >= RECENT:
             self.recent.popleft()
 
     def _check_silence(self, silent_s: float, about: dict[str, Any]) -> None:

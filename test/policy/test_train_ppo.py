@@ -1,0 +1,163 @@
+"""Loss, gradients and rollouts of the lean engine are those of Stable-Baselines3's PPO."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from robots import direct_model, field
+from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import ConvertCallback
+from stable_baselines3.common.logger import Logger
+
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.policy.train_algorithms import Normaliser
+from nics_drl_bridge.policy.train_ppo import LeanPpo, Transitions, advantages_of
+from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
+from nics_drl_bridge.policy.training_settings import TrainingSettings
+
+STEPS, WORLDS, LIMIT = 12, 6, 5  # fewer steps in an episode than in a rollout
+MODEL, WORLD = direct_model(), field(count=2)
+
+
+def pair(actions="continuous", log_std=-0.5, clip=0.2, entropy=0.01):
+    """The lean engine and Stable-Baselines3's PPO with the same weights, in worlds alike."""
+    envs = []
+    for _ in range(2):
+        vector = BridgeVectorEnv(
+            WORLDS, MODEL, WORLD, "navigation", {"actions": actions}, LIMIT, "SameStep"
+        )
+        envs.append(TrainVecEnv(vector))
+        envs[-1].seed(3)
+    batch = STEPS * WORLDS
+    ppo = {"rollout": STEPS, "batch": batch, "epochs": 1, "clip": clip, "entropy": entropy}
+    ppo["log_std"] = log_std
+    settings = TrainingSettings.model_validate({"hidden": [16, 8], "ppo": ppo})
+    size = envs[0].observation_space.shape[0]
+    rng = np.random.default_rng(0)
+    normaliser = rng.uniform(0.0, 0.5, size), rng.uniform(0.2, 1.0, size)
+    lean = LeanPpo(settings, envs[0], 0, normaliser)
+    network = {
+        "net_arch": [16, 8], "activation_fn": torch.nn.ReLU, "log_std_init": log_std,
+        "features_extractor_class": Normaliser,
+        "features_extractor_kwargs": {"mean": normaliser[0], "std": normaliser[1]},
+    }  # fmt: skip
+    theirs = PPO(
+        "MlpPolicy", envs[1], n_steps=STEPS, batch_size=batch, n_epochs=1, gamma=0.98,
+        gae_lambda=0.95, clip_range=clip, ent_coef=entropy, policy_kwargs=network, device="cpu",
+    )  # fmt: skip
+    theirs.set_logger(Logger(None, []))
+    envs[1].seed(3)
+    for ours, other in zip(weights_of(lean), their_weights(theirs), strict=True):
+        other.data.copy_(torch.nn.init.normal_(ours.data, std=0.3))
+    lean.networks.log_std.data.fill_(log_std)
+    return lean, theirs
+
+
+def weights_of(lean):
+    networks = lean.networks
+    return [*networks.actor.layers.parameters(), *networks.critic.parameters()]
+
+
+def their_weights(ppo):
+    policy = ppo.policy
+    actor = [*policy.mlp_extractor.policy_net.parameters(), *policy.action_net.parameters()]
+    critic = [*policy.mlp_extractor.value_net.parameters(), *policy.value_net.parameters()]
+    return actor + critic
+
+
+def test_advantages_are_those_of_stable_baselines3():
+    _, theirs = pair()
+    rng = np.random.default_rng(1)
+    rewards, values = rng.normal(size=(STEPS, WORLDS)), rng.normal(size=(STEPS + 1, WORLDS))
+    done = rng.random((STEPS, WORLDS)) < 0.3
+    buffer = RolloutBuffer(
+        STEPS, theirs.observation_space, theirs.action_space, "cpu", 0.9, 0.97, WORLDS
+    )
+    buffer.rewards[:], buffer.values[:] = rewards, values[:-1]
+    buffer.episode_starts[1:] = done[:-1]
+    last = torch.as_tensor(values[-1], dtype=torch.float32)
+    buffer.compute_returns_and_advantage(last, done[-1])
+    ours = advantages_of(*map(torch.as_tensor, (rewards, values, done * 1.0)), 0.97, 0.9)
+    assert buffer.advantages == pytest.approx(ours.numpy(), abs=1e-5)
+
+
+def filled(lean, theirs, seed=2):
+    """One batch of both, in the same order; the actions were drawn with somewhat other weights."""
+    rng = np.random.default_rng(seed)
+    rows = STEPS * WORLDS
+    seen = rng.uniform(-1.0, 1.0, (rows, *theirs.observation_space.shape)).astype(np.float32)
+    see = lean.networks.actor.normaliser
+    with torch.no_grad():
+        normalised = see(torch.from_numpy(seen))
+        raw = lean.networks.actor.layers(normalised)
+        actions = lean.networks.draw(raw, torch.Generator().manual_seed(seed))
+        log_probs = lean.networks.log_probs(raw, actions) + 0.3 * torch.randn(rows)
+    gains, returns = torch.randn(2, rows)
+    buffer = theirs.rollout_buffer
+    buffer.reset()
+    shapes = {
+        "observations": seen, "actions": actions, "log_probs": log_probs, "advantages": gains,
+        "returns": returns, "values": np.zeros(rows),
+    }  # fmt: skip
+    for name, values in shapes.items():
+        target = getattr(buffer, name)
+        target[...] = np.asarray(values, np.float32).reshape(target.shape)
+    buffer.full = True
+    return Transitions(normalised, actions, log_probs, gains, returns)
+
+
+@pytest.mark.parametrize("actions", ["continuous", "discrete"])
+def test_loss_and_gradients_are_those_of_stable_baselines3(actions):
+    torch.manual_seed(0)
+    lean, theirs = pair(actions)
+    batch = filled(lean, theirs)
+    theirs.policy.optimizer.step = lambda: None
+    theirs.train()
+    logged = theirs.logger.name_to_value["train/loss"]
+    assert float(lean.learner.differentiate(batch)) == pytest.approx(logged, rel=1e-5)
+    torch.nn.utils.clip_grad_norm_(lean.networks.parameters(), theirs.max_grad_norm)
+    for ours, other in zip(weights_of(lean), their_weights(theirs), strict=True):
+        assert torch.allclose(ours.grad, other.grad, atol=1e-6, rtol=1e-4)
+    if actions == "continuous":
+        assert torch.allclose(lean.networks.log_std.grad, theirs.policy.log_std.grad, atol=1e-6)
+
+
+def test_an_update_moves_the_weights_as_stable_baselines3_does():
+    torch.manual_seed(0)
+    lean, theirs = pair()
+    batch = filled(lean, theirs)
+    theirs.train()
+    lean.learner.learn(batch, 3e-4)
+    for ours, other in zip(weights_of(lean), their_weights(theirs), strict=True):
+        assert torch.allclose(ours, other, atol=2e-5)
+
+
+def test_a_batch_of_fewer_rows_than_the_one_before_has_gradients_of_its_own():
+    lean, theirs = pair()
+    batch = filled(lean, theirs)
+    few = Transitions(*(each[:7] for each in batch))
+    lean.learner.differentiate(few)
+    wanted = [each.grad.clone() for each in weights_of(lean)]
+    lean.learner.differentiate(batch)
+    lean.learner.differentiate(few)
+    for ours, grad in zip(weights_of(lean), wanted, strict=True):
+        assert torch.equal(ours.grad, grad)
+
+
+def test_a_rollout_is_that_of_stable_baselines3_over_ends_of_episodes_and_time_limits():
+    lean, theirs = pair(log_std=-30.0)  # no noise to speak of, as both draw it differently
+    _, callback = theirs._setup_learn(1, ConvertCallback(lambda *_: True))
+    theirs.collect_rollouts(theirs.env, callback, theirs.rollout_buffer, STEPS)
+    lean.collector.networks.load_state_dict(lean.networks.state_dict())
+    lean.collector.last = lean.collector.env.reset()
+    rollout, ended = lean.collector.collect()
+    buffer = theirs.rollout_buffer
+    assert len(ended) >= WORLDS
+    for ours, other in [
+        (rollout.actions, buffer.actions),
+        (rollout.advantages, buffer.advantages),
+        (rollout.returns, buffer.returns),
+    ]:
+        assert ours.numpy() == pytest.approx(other.reshape(ours.shape), abs=1e-4)
