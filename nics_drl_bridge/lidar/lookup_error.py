@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
-from nics_drl_bridge.lidar.fixtures import stack_fixtures
+from nics_drl_bridge.lidar.maps import stack_fixtures
 from nics_drl_bridge.lidar.shapes import place
 
 Array = NDArray[np.float64]

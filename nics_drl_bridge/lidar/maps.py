@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import struct
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +20,7 @@ from nics_drl_bridge.config import Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.geometry import rotate
 from nics_drl_bridge.lidar import map_kernels
+from nics_drl_bridge.lidar.fixture_kernels import Fixtures
 from nics_drl_bridge.lidar.shapes import Coordinate, Heading
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
@@ -208,3 +210,29 @@ def _pixels(image: Image.Image) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | 
     pixels = np.asarray(image.convert("RGBA"))
     grey = np.floor(pixels[..., :3] @ LUMA + 0.5).astype(np.uint8)
     return grey, pixels[..., 3] == 255 if image.has_transparency_data else None
+
+
+def stack_fixtures(
+    walls: Sequence[NDArray[np.float64]], grids: Sequence[GridMap | None], member: NDArray[np.int64]
+) -> Fixtures:
+    """Stacks the fixtures of P worlds: walls (W, 4) and the map of each."""
+    maps = [NO_MAP if grid is None else grid.arrays for grid in grids]
+    squares, places = joined([each.squares for each in maps])
+    frames = np.zeros((len(maps), 5))
+    for frame, each in zip(frames, maps, strict=True):
+        frame[: len(each.frame)] = each.frame
+    first = np.cumsum([0, *map(len, walls)])
+    return Fixtures(member, np.concatenate(walls), first, squares, places, frames)
+
+
+def joined(cells: Sequence[NDArray[Any]]) -> tuple[NDArray[Any], NDArray[np.int64]]:
+    """Cells (rows, columns) one after the other, and first cell, rows, columns of each (P, 3).
+
+    An array that occurs again, as the map of several worlds, is stored once.
+    """
+    once = {id(each): each for each in cells}
+    starts = np.cumsum([0, *(each.size for each in once.values())]).tolist()
+    first = dict(zip(once, starts, strict=False))
+    shapes = [(first[id(each)], *each.shape) for each in cells]
+    flat = [each.reshape(-1) for each in once.values()]  # of one alone, no copy
+    return flat[0] if len(flat) == 1 else np.concatenate(flat), np.array(shapes, np.int64)

@@ -16,7 +16,7 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import baked_kernels as baked
 from nics_drl_bridge.lidar import exact_kernels, map_kernels
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, LidarPose, X, Y
-from nics_drl_bridge.lidar.fixtures import grid_of, walls_of
+from nics_drl_bridge.lidar.fixture_kernels import grid_of, walls_of
 
 BLOCK = 16  # Beams that are fused at once
 LANES = 9 * BLOCK  # Bodies looked up together: so few that their scans stay in the L1 cache

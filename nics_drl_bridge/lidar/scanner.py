@@ -14,9 +14,8 @@ from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.exact_kernels import SHAPE, Beams
-from nics_drl_bridge.lidar.fixtures import stack_fixtures
 from nics_drl_bridge.lidar.lookup_error import lookup_distances
-from nics_drl_bridge.lidar.maps import GridMap
+from nics_drl_bridge.lidar.maps import GridMap, stack_fixtures
 from nics_drl_bridge.lidar.shapes import BODY, Shape, place
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import LidarTable

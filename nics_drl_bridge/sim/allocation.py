@@ -1,20 +1,28 @@
 """Allocation of worlds, as the kernels take them: state, surroundings, and scratch memory."""
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from nics_drl_bridge.files import sha256
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar import scan_kernels
+from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
+from nics_drl_bridge.lidar.maps import GridMap, joined, stack_fixtures
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.robot.kernels import SERIES, scratch, term_arrays
 from nics_drl_bridge.sim import state as arrays
 from nics_drl_bridge.sim.contact_kernels import FRAME, SEVERAL
 from nics_drl_bridge.sim.impact_kernels import EVENT, FLIGHT
+from nics_drl_bridge.sim.obstacles import Motion, plan_arrays
 from nics_drl_bridge.sim.sensing_kernels import PAST
-from nics_drl_bridge.sim.separation_kernels import MARK
+from nics_drl_bridge.sim.separation_kernels import FIRST, MARK, PLAN
+from nics_drl_bridge.sim.world import World
 
 SLICES = 16  # Number of groups of beams in which a skewed scan is rendered
 LANES = 256  # Number of robots moved side by side: their arrays stay in the L1 cache
@@ -74,6 +82,56 @@ def split(worlds: int, threads: int) -> tuple[slice, ...]:
     """Splits N worlds into contiguous parts of nearly equal size, one per thread."""
     edges = np.arange(min(threads, worlds) + 1) * worlds // min(threads, worlds)
     return tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(edges))
+
+
+def members_of(
+    worlds: Sequence[World], motions: Sequence[Sequence[Motion | None]], outlines: OutlineArrays,
+    crowds: tuple[bool, bool], member: NDArray[np.int64],
+) -> arrays.Members:  # fmt: skip
+    """Stacks P worlds, of up to K obstacles that move by `motions` (P, K), for N copies.
+
+    `crowds` are `Surroundings.crowded` and `scattered`; `member` (N,) is read as the kernels run.
+    """
+    grids = _shared([world.grid for world in worlds])
+    distances, places = joined([map_field(grid).distances for grid in grids])
+    moves = any(motion is not None for each in motions for motion in each)
+    plans, waypoints = _plans(motions if moves else [() for _ in worlds])
+    field = np.array([world.extent for world in worlds])
+    return arrays.Members(
+        stack_fixtures([world.all_walls() for world in worlds], grids, member), distances, places,
+        outlines, *crowds, moves, plans, waypoints, field,
+    )  # fmt: skip
+
+
+def _shared(grids: Sequence[GridMap | None]) -> list[GridMap | None]:
+    """The same object for maps of the same content, which is then baked and stored once."""
+    once: dict[Any, GridMap] = {}
+    found: list[GridMap | None] = []
+    for grid in grids:
+        if grid is None:
+            found.append(None)
+        else:
+            about = grid.cells.shape, grid.resolution, grid.origin, sha256(grid.cells.tobytes())
+            found.append(once.setdefault(about, grid))
+    return found
+
+
+def map_field(grid: GridMap | None) -> arrays.MapField:
+    """Returns a static map as the kernels take it."""
+    if grid is None:
+        return arrays.NO_FIELD
+    return arrays.MapField(np.ascontiguousarray(grid.distance_field), *grid.arrays.frame.tolist())
+
+
+def _plans(motions: Sequence[Sequence[Motion | None]]) -> tuple[arrays.Array, arrays.Array]:
+    each = [plan_arrays(one) for one in motions]
+    plans = np.zeros((len(each), max(map(len, motions)), PLAN))
+    first = 0
+    for into, (rows, waypoints) in zip(plans, each, strict=True):
+        into[: len(rows)] = rows
+        into[:, FIRST] += first
+        first += len(waypoints)
+    return plans, np.concatenate([waypoints for _, waypoints in each])
 
 
 def part_of(

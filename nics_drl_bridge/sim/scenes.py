@@ -19,7 +19,7 @@ from nics_drl_bridge.lidar.shapes import BODY, LARGEST, SMALLEST, Circle, Outlin
 from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim import scene_kernels as kernels
 from nics_drl_bridge.sim.obstacles import Motion
-from nics_drl_bridge.sim.packing import pack
+from nics_drl_bridge.sim.packing_kernels import pack
 from nics_drl_bridge.sim.scene_kernels import FreeSpace, ScenePlan, SceneScratch
 from nics_drl_bridge.sim.state import NO_FIELD, MapField
 from nics_drl_bridge.sim.world import Goals, Starts, World, check_places
@@ -66,7 +66,7 @@ class Scenes(Scene):
 
 @dataclass(frozen=True)
 class Catalogue:
-    """What the worlds of a set share: every shape, all in the first size, then in the next."""
+    """Things that the worlds of a set share: all shapes in the first size, then in the next."""
 
     shapes: tuple[Shape, ...]
     place: Mapping[Shape, int]  # of each shape in the first size

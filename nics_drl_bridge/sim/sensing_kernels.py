@@ -11,7 +11,7 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import fault_kernels, scan_kernels
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, X, Y
-from nics_drl_bridge.lidar.fixtures import fixtures_around
+from nics_drl_bridge.lidar.fixture_kernels import fixtures_around
 from nics_drl_bridge.robot.kernels import move, wrap
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim.state import Array, Dynamics, Members, Scratch, State

@@ -19,9 +19,8 @@ from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.sim import step_kernels
-from nics_drl_bridge.sim.allocation import Sizes, allocate, part_of, split
-from nics_drl_bridge.sim.members import members_of
-from nics_drl_bridge.sim.packing import pack
+from nics_drl_bridge.sim.allocation import Sizes, allocate, members_of, part_of, split
+from nics_drl_bridge.sim.packing_kernels import pack
 from nics_drl_bridge.sim.randomisation import Draws, Randomisation, Sampler, load_randomisation
 from nics_drl_bridge.sim.scenes import Scenes, SetSampler
 from nics_drl_bridge.sim.state import Members

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
-from nics_drl_bridge.lidar.fixtures import Fixtures
+from nics_drl_bridge.lidar.fixture_kernels import Fixtures
 from nics_drl_bridge.lidar.scan_kernels import ScanLanes
 from nics_drl_bridge.robot.kernels import Terms
 
@@ -79,7 +79,7 @@ class Surroundings(NamedTuple):
 
 
 class Members(NamedTuple):
-    """The surroundings of P worlds, one after the other; see `members.surroundings_of`."""
+    """The surroundings of P worlds, one after the other; see `step_kernels.surroundings_of`."""
 
     fixtures: Fixtures
     distances: NDArray[np.float32]  # of all maps, see `MapField`

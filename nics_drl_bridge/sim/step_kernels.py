@@ -11,22 +11,38 @@ import numpy as np
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
+from nics_drl_bridge.lidar.fixture_kernels import cells_of, walls_of
 from nics_drl_bridge.robot.kernels import bend, delayed, run, with_coefficients, wrap
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import obstacle_kernels as obstacles
 from nics_drl_bridge.sim import sensing_kernels as sensing
 from nics_drl_bridge.sim.careful_kernels import drift_carefully, move_carefully, rates_at
-from nics_drl_bridge.sim.members import surroundings_of
 from nics_drl_bridge.sim.state import (
     Array,
     Dynamics,
     Integers,
     Lanes,
+    MapField,
     Members,
+    Movers,
     Scratch,
     State,
     Surroundings,
 )
+
+
+@kernel(view=True)
+def surroundings_of(n: int, members: Members) -> Surroundings:
+    """Returns all that stands in world n of the simulation."""
+    p = members.fixtures.member[n]
+    frame = members.fixtures.frames[p]
+    distances = cells_of(members.distances, members.fields[p])
+    grid = MapField(distances, frame[0], frame[1], frame[2], frame[3], frame[4])
+    movers = Movers(members.moves, members.plans[p], members.waypoints, members.field[p])
+    return Surroundings(
+        walls_of(n, members.fixtures), grid, members.outlines, members.crowded,
+        members.scattered, movers,
+    )  # fmt: skip
 
 
 @kernel

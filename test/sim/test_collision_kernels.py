@@ -10,7 +10,7 @@ from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Polygon, Rectangle, Segment, place
 from nics_drl_bridge.sim import collision_kernels as kernels
-from nics_drl_bridge.sim.members import map_field
+from nics_drl_bridge.sim.allocation import map_field
 from nics_drl_bridge.sim.state import NO_FIELD
 
 L = Polygon(points=((0, 0), (1, 0), (1, 0.3), (0.3, 0.3), (0.3, 1), (0, 1)))

@@ -15,7 +15,7 @@ from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.sim import obstacle_kernels as kernels
 from nics_drl_bridge.sim import separation_kernels as at
-from nics_drl_bridge.sim.members import map_field
+from nics_drl_bridge.sim.allocation import map_field
 from nics_drl_bridge.sim.obstacle_kernels import FAR, repulsion
 from nics_drl_bridge.sim.obstacles import Motion, Patrol, Pedestrian, Wander, plan_arrays
 from nics_drl_bridge.sim.separation_kernels import MARK

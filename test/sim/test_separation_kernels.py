@@ -8,8 +8,8 @@ from shapely import LineString, MultiLineString, Point
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.sim import separation_kernels as at
+from nics_drl_bridge.sim.allocation import map_field
 from nics_drl_bridge.sim.collision_kernels import on_wall
-from nics_drl_bridge.sim.members import map_field
 from nics_drl_bridge.sim.separation_kernels import PLAN, Traffic, clearance, map_distance, restrain
 from nics_drl_bridge.sim.state import NO_FIELD
 

@@ -1,18 +1,16 @@
-"""Fixtures of the worlds of a set, as lidars see them: walls and static maps.
+"""Compiled fixtures of the worlds of a set, as lidars see them: walls and static maps.
 
 P worlds lie one after the other in flat arrays; of each copy that is simulated, `member` tells
 which one it is a copy of.
 """
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.map_kernels import GridArrays
-from nics_drl_bridge.lidar.maps import NO_MAP, GridMap
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -55,29 +53,3 @@ def cells_of(cells, place):  # type: ignore[no-untyped-def]
     """Cells (rows, columns) of one map among those of many: first cell, rows, columns."""
     first, rows, columns = place[0], place[1], place[2]
     return cells[first : first + rows * columns].reshape((rows, columns))
-
-
-def stack_fixtures(
-    walls: Sequence[Array], grids: Sequence[GridMap | None], member: Integers
-) -> Fixtures:
-    """Stacks the fixtures of P worlds: walls (W, 4) and the map of each."""
-    maps = [NO_MAP if grid is None else grid.arrays for grid in grids]
-    squares, places = joined([each.squares for each in maps])
-    frames = np.zeros((len(maps), 5))
-    for frame, each in zip(frames, maps, strict=True):
-        frame[: len(each.frame)] = each.frame
-    first = np.cumsum([0, *map(len, walls)])
-    return Fixtures(member, np.concatenate(walls), first, squares, places, frames)
-
-
-def joined(cells: Sequence[NDArray[Any]]) -> tuple[NDArray[Any], Integers]:
-    """Cells (rows, columns) one after the other, and first cell, rows, columns of each (P, 3).
-
-    An array that occurs again, as the map of several worlds, is stored once.
-    """
-    once = {id(each): each for each in cells}
-    starts = np.cumsum([0, *(each.size for each in once.values())]).tolist()
-    first = dict(zip(once, starts, strict=False))
-    shapes = [(first[id(each)], *each.shape) for each in cells]
-    flat = [each.reshape(-1) for each in once.values()]  # of one alone, no copy
-    return flat[0] if len(flat) == 1 else np.concatenate(flat), np.array(shapes, np.int64)
