@@ -71,7 +71,8 @@ class Scanner:
         spec, table = self.spec, self.table
         return LidarArrays(
             np.array(spec.mount),
-            Beams(spec.directions, spec.angle_min, spec.angle_increment, spec.full_circle),
+            Beams(np.ascontiguousarray(spec.directions.T), spec.angle_min, spec.angle_increment,
+                  spec.full_circle),
             spec.range_min, spec.range_max, spec.sweep_time, self._looked_up(),
             table.outlines.arguments, table.arrays,
             NO_MAP if self.grid is None else self.grid.arrays, self.renderer == "exact",
