@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
+from nics_drl_bridge.lidar.cell_kernels import body_cells
 from nics_drl_bridge.lidar.shapes import place
 
 Array = NDArray[np.float64]
@@ -80,8 +81,9 @@ def _scans(bodies: Array, exact: LidarArrays, baked: LidarArrays) -> tuple[Array
     robots = np.tile([-mount[0], -mount[1], 0.0], (PLACES, 1, 1))  # the lidar is at the origin
     scans = np.empty((2, PLACES, 1, directions.shape[1]), np.float32)
     worlds, lanes = np.arange(PLACES), scan_kernels.scan_lanes()
+    cells = body_cells(0, bodies.shape[1])
     for ranges, sensor in zip(scans, (exact, baked), strict=True):
-        scan_kernels.scan_worlds(ranges, robots, worlds, bodies, -1, NO_WALLS, sensor, lanes)
+        scan_kernels.scan_worlds(ranges, robots, worlds, bodies, -1, NO_WALLS, sensor, cells, lanes)
     one, other = scans[:, :, 0].astype(np.float64)
     return one, other
 

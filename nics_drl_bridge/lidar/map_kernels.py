@@ -139,7 +139,7 @@ def map_into(out, beams, lidar, range_max, grid, exact, lanes):  # type: ignore[
 
 @kernel
 def _begin(directions, first, u, v, c, s, columns, lanes):  # type: ignore[no-untyped-def]
-    """Puts the beams from `first` on into the lanes, each mirrored so that it points right and up."""
+    """Puts the beams from `first` on into lanes, each mirrored so that it points right and up."""
     c, s, u, v = np.float32(c), np.float32(s), np.float32(u), np.float32(v)
     one, none, singles, wholes = np.float32(1.0), np.float32(0.0), lanes.single, lanes.whole
     for j in range(LANES):

@@ -13,6 +13,7 @@ from nics_drl_bridge.errors import ConfigError, ModelError, nearest
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
+from nics_drl_bridge.lidar.cell_kernels import body_cells
 from nics_drl_bridge.lidar.exact_kernels import SHAPE, Beams
 from nics_drl_bridge.lidar.lookup_error import lookup_distances
 from nics_drl_bridge.lidar.maps import NO_MAP, GridMap
@@ -119,8 +120,17 @@ class Scanner:
             out[:] = self.scan(poses, bodies, walls)
             return out
         worlds, lanes = np.arange(len(poses)), scan_kernels.scan_lanes()
+        cells = body_cells(0, bodies.shape[1])
         scan_kernels.scan_worlds(
-            out[:, None], poses[:, None], worlds, bodies, -1, walls, self.arguments, lanes
+            out[:, None],
+            poses[:, None],
+            worlds,
+            bodies,
+            -1,
+            walls,
+            self.arguments,
+            cells,
+            lanes,
         )
         return out
 

@@ -8,12 +8,13 @@ import numpy as np
 
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar import scan_kernels
+from nics_drl_bridge.lidar.cell_kernels import BodyCells, body_cells
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.robot.kernels import SERIES, scratch, term_arrays
 from nics_drl_bridge.sim import state as arrays
-from nics_drl_bridge.sim.contact_kernels import FRAME, SEVERAL
+from nics_drl_bridge.sim.contact_kernels import SEVERAL
 from nics_drl_bridge.sim.impact_kernels import EVENT, FLIGHT
 from nics_drl_bridge.sim.obstacles import Motion, plan_arrays
 from nics_drl_bridge.sim.sensing_kernels import PAST
@@ -24,7 +25,7 @@ SLICES = 16  # Number of groups of beams in which a skewed scan is rendered
 LANES = 256  # Number of robots moved side by side: their arrays stay in the L1 cache
 CROWD = 4096  # Least number of pairs of a robot and a body for sorting bodies into cells
 FEWEST_OF_A_CROWD = 8  # Least number of robots: for fewer, testing all bodies takes less time
-SCATTERED = 64  # Least number of bodies in cells for a separate scan of each robot among those near
+STANDING = 32  # Least number of obstacles, all of which stand, for sorting them into cells once
 
 
 @dataclass(frozen=True)
@@ -42,11 +43,6 @@ class Sizes:
         """True if it pays to sort the bodies of a world into cells."""
         pairs = self.robots * (self.robots + self.obstacles)
         return self.robots >= FEWEST_OF_A_CROWD and pairs >= CROWD
-
-    @property
-    def scattered(self) -> bool:
-        """True if it pays to scan each robot among the bodies around it only."""
-        return self.crowded and self.robots + self.obstacles >= SCATTERED
 
 
 def allocate(model: SimulatorModel, sizes: Sizes) -> arrays.State:
@@ -87,6 +83,12 @@ def map_field(grid: GridMap | None) -> arrays.MapField:
     return arrays.MapField(np.ascontiguousarray(grid.distance_field), *grid.arrays.frame.tolist())
 
 
+def cells_of(sizes: Sizes, scene: arrays.Surroundings) -> BodyCells:
+    """Allocates the cells of all worlds, none where looking at all bodies takes less time."""
+    worlds = sizes.worlds if scene.crowded or scene.standing else 0
+    return body_cells(worlds, sizes.robots + sizes.obstacles)
+
+
 def surroundings(
     world: World, motions: Sequence[Motion | None], scanner: Scanner, sizes: Sizes
 ) -> arrays.Surroundings:
@@ -96,28 +98,30 @@ def surroundings(
     moves = any(motion is not None for motion in motions)
     outlines = scanner.table.outlines.arguments
     return arrays.Surroundings(
-        world.all_walls(), map_field(scanner.grid), outlines, sizes.crowded, sizes.scattered,
+        world.all_walls(), map_field(scanner.grid), outlines, sizes.crowded,
+        not sizes.crowded and not moves and sizes.obstacles >= STANDING,
         arrays.Movers(moves, *plan_arrays(motions), half),
     )  # fmt: skip
 
 
 def part_of(
     state: arrays.State, scene: arrays.Surroundings, model: SimulatorModel, scanner: Scanner,
-    sizes: Sizes, part: slice,
+    sizes: Sizes, cells: BodyCells, part: slice,
 ) -> arrays.Part:  # fmt: skip
     """Returns the arguments of the kernels for one part of the worlds, with scratch of its own."""
     dt, substeps, _ = model.timing
     motion = arrays.Dynamics(term_arrays(model.kinematics), SERIES, float(dt), int(substeps))
-    own = _scratch(model, scanner, sizes, part.stop - part.start)
+    own = _scratch(model, scanner, sizes, cells, part.stop - part.start)
     return arrays.Part(state, scene, scanner.arguments, motion, own)
 
 
-def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int) -> arrays.Scratch:
+def _scratch(
+    model: SimulatorModel, scanner: Scanner, sizes: Sizes, cells: BodyCells, worlds: int
+) -> arrays.Scratch:
     kinematics, robots, count = model.kinematics, sizes.robots, sizes.obstacles
     bodies = count + robots
     blocks = -(-worlds * robots // LANES)
     lanes = robots * min(worlds, -(-worlds // blocks))
-    side = int(np.sqrt(2.0 * bodies)) if sizes.crowded else 1
     corners = max(int(np.diff(scanner.table.outlines.corner).max(initial=4)), 4)
     x, dq = scratch(kinematics)
     commands = len(kinematics.variables) - kinematics.state_size
@@ -136,15 +140,12 @@ def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int)
             near=np.zeros((robots, 1 + SEVERAL), np.int64), meets=np.zeros(robots, np.int64),
             way=np.zeros(robots), reach=np.zeros(bodies), speeds=np.zeros((robots, 2)),
         ),
-        cells=arrays.Cells(
-            begin=np.zeros(side * side + 2, np.int64), order=np.zeros(bodies, np.int64),
-            cell_of=np.zeros(bodies, np.int64), frame=np.zeros(FRAME),
-            found=np.zeros(bodies, np.int64),
-        ),
+        cells=cells._replace(found=cells.found.copy()),
         scans=arrays.Scans(
             before=np.zeros((lanes, 3)), waiting=np.zeros(worlds, np.int64),
             seen=np.zeros((bodies + 1, BODY)), spot=np.zeros((1, 1, 3)),
             slices=np.zeros((SLICES, 3)), part=np.zeros((1, 1, model.lidar.beams), np.float32),
-            drive=np.zeros(3), none=np.zeros(1, np.int64), lookup=scan_kernels.scan_lanes(),
+            drive=np.zeros(3), none=np.zeros(1, np.int64), every=body_cells(0, bodies + 1),
+            lookup=scan_kernels.scan_lanes(),
         ),
     )  # fmt: skip

@@ -11,6 +11,7 @@ from pydantic import ValidationError
 from scipy import ndimage
 
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.lidar.cell_kernels import FEWEST, BodyCells, body_cells, cover
 from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
 from nics_drl_bridge.lidar.shapes import BODY, LARGEST, SMALLEST, Circle, Outlines, Shape, describe
 from nics_drl_bridge.seeds import checked_seeds
@@ -204,8 +205,20 @@ def _scratch(plan: ScenePlan) -> SceneScratch:
     return SceneScratch(
         np.zeros(cells, np.int64), np.zeros((2, cells), np.int64), np.zeros(1, np.int64),
         np.zeros(count, np.bool_), np.zeros(count), np.zeros(BODY), np.zeros(BODY),
-        np.zeros((corners, 2)),
+        np.zeros((corners, 2)), _cells(plan.space.cells, count),
     )  # fmt: skip
+
+
+def _cells(field: MapField, count: int) -> BodyCells:
+    """Returns cells for so many obstacles, laid over the field; none for few."""
+    cells = body_cells(1 if count >= FEWEST else 0, count)
+    if count < FEWEST:
+        return cells
+    rows, columns = field.distances.shape
+    place = kernels.place_in.py_func  # type: ignore[attr-defined]
+    x, y = place(np.array([0, 0, rows, rows]), np.array([0, columns, 0, columns]), field)
+    cover(0, float(x.min()), float(y.min()), float(max(np.ptp(x), np.ptp(y))), cells)
+    return cells
 
 
 def _free_space(world: World, footprint: float) -> FreeSpace:

@@ -19,7 +19,14 @@ from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.sim import step_kernels
-from nics_drl_bridge.sim.allocation import Sizes, allocate, part_of, split, surroundings
+from nics_drl_bridge.sim.allocation import (
+    Sizes,
+    allocate,
+    cells_of,
+    part_of,
+    split,
+    surroundings,
+)
 from nics_drl_bridge.sim.randomisation import Draws, Randomisation, Sampler, load_randomisation
 from nics_drl_bridge.sim.scenes import Scenes, SceneSampler
 from nics_drl_bridge.sim.world import World
@@ -169,8 +176,17 @@ class FastSimulator:
     def packed(self) -> dict[int, Any]:
         """Packed arguments of the kernels, by the first world of each part."""
         scene = surroundings(self.world, self.sampler.motions, self._scanner, self._sizes)
-        of = (self.data, scene, self.model, self._scanner, self._sizes)
-        return {part.start: step_kernels.pack(part_of(*of, part)) for part in self.parts}
+        cells = cells_of(self._sizes, scene)
+        of = (self.data, scene, self.model, self._scanner, self._sizes, cells)
+        parts = {part.start: step_kernels.pack(part_of(*of, part)) for part in self.parts}
+        for part in self.parts:
+            step_kernels.sort_worlds(parts[part.start], part.start, part.stop)
+        return parts
+
+    def sort_bodies(self) -> None:
+        """Sorts bodies into cells anew, after obstacles in `data` were put elsewhere."""
+        for part in self.parts:
+            step_kernels.sort_worlds(self.packed[part.start], part.start, part.stop)
 
     def __getstate__(self) -> dict[str, Any]:  # a copy rebuilds the rest
         rebuilt = ("packed", "_renders")

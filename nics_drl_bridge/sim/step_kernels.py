@@ -12,6 +12,7 @@ from numba import types
 from numba.experimental import structref
 
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar import cell_kernels as cells
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.robot.kernels import bend, delayed, run, with_coefficients, wrap
 from nics_drl_bridge.sim import contact_kernels as contacts
@@ -104,10 +105,10 @@ def _move_world(
     for m in range(robots):
         drift = math.sqrt(3.0 * period) * (state.noise[n, m, 2] + state.noise[n, m, 3])
         nearby.way[m] = lanes.pose[5, skip + m] + drift
-    longest, moving = contacts.reaches(n, state, nearby, period)
+    longest, moving = contacts.reaches(n, state, scene, nearby, period)
     if scene.crowded:
-        contacts.sort_bodies(state.bodies, n, scratch.cells)
-        scratch.cells.frame[contacts.MOVED] = longest
+        cells.sort(n, state.bodies[n], state.bodies.shape[1], scratch.cells)
+        scratch.cells.frame[n, cells.MOVED] = longest
     tight = False
     for m in range(robots):
         nearby.meets[m] = contacts.find_near(n, m, state.bodies, scene, nearby, scratch.cells)
@@ -157,7 +158,7 @@ def _step(
             state.steps[n] += 1
             skip = (n - low) * many
             _move_world(n, skip, state, scene, motion, scratch)
-            _measure(n, skip, state, motion, scratch)
+            _measure(n, skip, state, scene, motion, scratch)
             waiting = sensing.scan_or_wait(n, waiting, state, scene, lidar, motion, scratch)
         sensing.scan_together(waiting, state, scene, lidar, scratch)
         sensing.distort(low, high, state, lidar)
@@ -184,16 +185,35 @@ def _begin_period(
 
 
 @kernel(inline=True)
-def _measure(n: int, skip: int, state: State, motion: Dynamics, scratch: Scratch) -> None:
+def _measure(
+    n: int, skip: int, state: State, scene: Surroundings, motion: Dynamics, scratch: Scratch
+) -> None:
     frame, pose, first = scratch.cells.frame, state.pose, state.velocity.shape[1]
     for m in range(pose.shape[1]):
         contacts.put_body(state.bodies, n, first + m, pose[n, m])
         rates_at(n, m, motion.substeps - 1, state, motion, scratch.single)
         before = scratch.scans.before[skip + m]
         sensing.measure(n, m, state, pose, before, scratch.single.dq, motion)
-        # The cells count how far the robots came, drift included.
-        dx, dy = pose[n, m, 0] - before[0], pose[n, m, 1] - before[1]
-        frame[contacts.MOVED] = max(frame[contacts.MOVED], math.sqrt(dx * dx + dy * dy))
+        if scene.crowded:  # the cells count how far the robots came, drift included
+            dx, dy = pose[n, m, 0] - before[0], pose[n, m, 1] - before[1]
+            frame[n, cells.MOVED] = max(frame[n, cells.MOVED], math.sqrt(dx * dx + dy * dy))
+
+
+@kernel
+def sort(n: int, state: State, scene: Surroundings, scratch: Scratch) -> None:
+    """Sorts the bodies of a world into its cells, if there are any."""
+    if scene.crowded:
+        cells.sort(n, state.bodies[n], state.bodies.shape[1], scratch.cells)
+    elif scene.standing:
+        cells.sort(n, state.bodies[n], state.velocity.shape[1], scratch.cells)
+
+
+@kernel(allocates=True)
+def sort_worlds(packed: Any, begin: int, end: int) -> None:
+    """Sorts the bodies of the worlds [begin, end) of a part into cells, as they stand."""
+    part = packed.part
+    for n in range(begin, end):
+        sort(n, part.state, part.scene, part.scratch)
 
 
 @kernel(allocates=True)
@@ -205,6 +225,7 @@ def begin(packed: Any, chosen: Integers) -> None:
         waiting[i] = chosen[i]
         if part.scene.movers.moves:
             obstacles.begin(chosen[i], state, part.scene.movers.plans)
+        sort(chosen[i], state, part.scene, part.scratch)
     sensing.scan_together(chosen.shape[0], state, part.scene, part.lidar, part.scratch)
     for n in chosen:
         sensing.distort(n, n + 1, state, part.lidar)
@@ -236,8 +257,7 @@ def end_period(packed: Any, true: Array, before: Array, wheels: Array, counted: 
             for i in range(3):  # the pose by the wheels is not where the lidar is
                 row[m, sensing.POSE + i] = state.pose[n, m, i]
                 row[m, sensing.TWIST + i] = true[n, m, i]
-        if scene.crowded:
-            contacts.sort_bodies(state.bodies, n, scratch.cells)
+        sort(n, state, scene, scratch)
         waiting = sensing.scan_or_wait(n, waiting, state, scene, part.lidar, motion, scratch)
     sensing.scan_together(waiting, state, scene, part.lidar, scratch)
     sensing.distort(0, state.pose.shape[0], state, part.lidar)
