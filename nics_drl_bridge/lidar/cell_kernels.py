@@ -1,8 +1,9 @@
 """Bodies in square cells: those around a point are found without a look at all the others.
 
-A body lies in the cell of its centre, from which a chain leads to the next one there. One larger
-than a cell lies in none: it is always found, as are bodies that are said to move. The outermost
-cells reach to infinity. Shared arguments: n is a world, k a body of it, a place is in [m].
+A body lies in the cell of its centre. One larger than a cell lies in none: it is always found, as
+are those that move. The outermost cells reach to infinity. Bodies are sorted at once, so that those
+of neighbouring cells lie side by side, or added one by one to chains that begin in the cells. Shared
+arguments: n is a world, k a body of it, a place is in [m].
 """
 
 import math
@@ -26,8 +27,10 @@ FEWEST = 20  # Least number of bodies among which those in cells are found in le
 class BodyCells(NamedTuple):
     """The bodies of N worlds in G x G cells each; without rows, all bodies are always found."""
 
-    head: NDArray[np.int32]  # (N, G^2 + 1) first body of each cell, then of those in none; or -1
-    after: NDArray[np.int32]  # (N, K) the next body of the same cell, or -1
+    # (N, G^2 + 2) place in `then` of each cell's first body, those in no cell being the last; of
+    # chains the first body itself, or -1
+    first: NDArray[np.int32]
+    then: NDArray[np.int32]  # (N, K) the bodies in the order of cells; of a chain the next, or -1
     frame: NDArray[np.float64]  # (N, FRAME)
     found: NDArray[np.int32]  # (K,) scratch for one thread: the bodies around a point
 
@@ -36,7 +39,7 @@ def body_cells(worlds: int, bodies: int) -> BodyCells:
     """Allocates cells for K bodies in each of N worlds; 0 worlds if all bodies are looked at."""
     side = max(int(math.sqrt(PER_BODY * bodies)), 1)
     cells = BodyCells(
-        np.full((worlds, side * side + 1), -1, np.int32), np.full((worlds, bodies), -1, np.int32),
+        np.full((worlds, side * side + 2), -1, np.int32), np.full((worlds, bodies), -1, np.int32),
         np.zeros((worlds, FRAME)), np.arange(bodies, dtype=np.int32),
     )  # fmt: skip
     cells.frame[:, SIDE] = side
@@ -60,57 +63,95 @@ def cover(n, low_x, low_y, extent, cells):  # type: ignore[no-untyped-def]
 @kernel
 def clear(n, cells):  # type: ignore[no-untyped-def]
     """Empties the cells of a world."""
-    if cells.head.shape[0] > 0:
-        cells.head[n, :] = -1
+    if cells.first.shape[0] > 0:
+        cells.first[n, :] = -1
         cells.frame[n, LARGEST] = cells.frame[n, MOVED] = 0.0
 
 
+@kernel(inline=True)
+def _cell(body, stands, frame):  # type: ignore[no-untyped-def]
+    side = int(frame[SIDE])
+    if not stands or body[RADIUS] * frame[PER_METRE] > 1.0:
+        return side * side
+    frame[LARGEST] = max(frame[LARGEST], body[RADIUS])
+    row = _place(body[Y] - frame[BOTTOM], frame[PER_METRE], side)
+    return row * side + _place(body[X] - frame[LEFT], frame[PER_METRE], side)
+
+
 @kernel
-def add(n, k, body, stands, cells):  # type: ignore[no-untyped-def]
-    """Adds a body (7,) that is in no cell yet, to a cell if it stands."""
-    if cells.head.shape[0] == 0:
-        return
-    frame, cell = cells.frame[n], cells.head.shape[1] - 1
-    if stands and body[RADIUS] * frame[PER_METRE] <= 1.0:
-        side = frame[SIDE]
-        row = _place(body[Y] - frame[BOTTOM], frame[PER_METRE], side)
-        cell = row * int(side) + _place(body[X] - frame[LEFT], frame[PER_METRE], side)
-        frame[LARGEST] = max(frame[LARGEST], body[RADIUS])
-    cells.after[n, k], cells.head[n, cell] = cells.head[n, cell], k
+def add(n, k, body, cells):  # type: ignore[no-untyped-def]
+    """Adds a body (7,) to the chain of its cell."""
+    if cells.first.shape[0] > 0:
+        cell = _cell(body, True, cells.frame[n])
+        cells.then[n, k], cells.first[n, cell] = cells.first[n, cell], k
 
 
 @kernel
 def sort(n, bodies, standing, cells):  # type: ignore[no-untyped-def]
-    """Sorts the bodies (K, 7) of a world, the first `standing` of them into cells."""
+    """Sorts the bodies (K, 7) of a world, the first `standing` of them by cells."""
     low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
     for k in range(standing):
         if bodies[k, RADIUS] > 0.0:
             low_x, high_x = min(low_x, bodies[k, X]), max(high_x, bodies[k, X])
             low_y, high_y = min(low_y, bodies[k, Y]), max(high_y, bodies[k, Y])
     cover(n, low_x, low_y, max(high_x - low_x, high_y - low_y, 1e-6), cells)
+    first, then, cell_of, frame = cells.first[n], cells.then[n], cells.found, cells.frame[n]
+    first[:] = 0
+    for k in range(bodies.shape[0]):
+        if bodies[k, RADIUS] > 0.0:
+            cell_of[k] = _cell(bodies[k], k < standing, frame)
+            first[cell_of[k] + 1] += 1
+    for cell in range(first.shape[0] - 1):
+        first[cell + 1] += first[cell]
+    end = first[first.shape[0] - 1]
     for k in range(bodies.shape[0] - 1, -1, -1):
         if bodies[k, RADIUS] > 0.0:
-            add(n, k, bodies[k], k < standing, cells)
+            first[cell_of[k] + 1] -= 1
+            then[first[cell_of[k] + 1]] = k
+    for cell in range(first.shape[0] - 1):  # each entry is that of the cell before it
+        first[cell] = first[cell + 1]
+    first[first.shape[0] - 1] = end
+
+
+@kernel(inline=True)
+def _window(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
+    """Returns the least and the greatest row, and column, of the cells around a place."""
+    frame, per_metre, side = cells.frame[n], cells.frame[n, PER_METRE], cells.frame[n, SIDE]
+    far, x, y = reach + frame[LARGEST] + frame[MOVED], x - frame[LEFT], y - frame[BOTTOM]
+    low, high = _place(y - far, per_metre, side), _place(y + far, per_metre, side)
+    return low, high, _place(x - far, per_metre, side), _place(x + far, per_metre, side)
 
 
 @kernel
 def around(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
-    """Writes to `found` the bodies that may be within `reach` [m] of a place; their number."""
-    head, found, count = cells.head, cells.found, 0
-    if head.shape[0] == 0:
+    """Writes to `found` the sorted bodies that may be within `reach` [m] of a place; how many."""
+    first, then, found, count = cells.first, cells.then, cells.found, 0
+    if first.shape[0] == 0:
         return found.shape[0]  # which lists all bodies
-    frame, per_metre, last = cells.frame[n], cells.frame[n, PER_METRE], head.shape[1] - 1
-    reach, side = reach + frame[LARGEST] + frame[MOVED], frame[SIDE]
-    left = _place(x - reach - frame[LEFT], per_metre, side)
-    right = _place(x + reach - frame[LEFT], per_metre, side)
-    low = _place(y - reach - frame[BOTTOM], per_metre, side)
-    high = _place(y + reach - frame[BOTTOM], per_metre, side)
+    low, high, left, right = _window(n, x, y, reach, cells)
+    side = int(cells.frame[n, SIDE])
     for row in range(low, high + 1):
-        for cell in range(row * int(side) + left, row * int(side) + right + 1):
-            k = head[n, cell]
+        for i in range(first[n, row * side + left], first[n, row * side + right + 1]):
+            found[count], count = then[n, i], count + 1
+    for i in range(first[n, side * side], first[n, side * side + 1]):
+        found[count], count = then[n, i], count + 1
+    return count
+
+
+@kernel
+def around_added(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
+    """Like `around`, of the bodies that were added one by one."""
+    first, then, found, count = cells.first, cells.then, cells.found, 0
+    if first.shape[0] == 0:
+        return found.shape[0]
+    low, high, left, right = _window(n, x, y, reach, cells)
+    side = int(cells.frame[n, SIDE])
+    for row in range(low, high + 2):
+        begin, end = row * side + left, row * side + right
+        if row > high:  # of the bodies in no cell
+            begin, end = side * side, side * side
+        for cell in range(begin, end + 1):
+            k = first[n, cell]
             while k >= 0:
-                found[count], k, count = k, cells.after[n, k], count + 1
-    k = head[n, last]
-    while k >= 0:
-        found[count], k, count = k, cells.after[n, k], count + 1
+                found[count], k, count = k, then[n, k], count + 1
     return count

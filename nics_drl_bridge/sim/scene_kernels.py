@@ -161,7 +161,7 @@ def _is_clear(x, y, room, moving, plan, bodies, scratch):  # type: ignore[no-unt
     disc = scratch.disc
     disc[X], disc[Y] = x, y
     near = scratch.cells.found
-    for i in range(cell_kernels.around(0, x, y, disc[RADIUS] + room, scratch.cells)):
+    for i in range(cell_kernels.around_added(0, x, y, disc[RADIUS] + room, scratch.cells)):
         k = near[i]
         counts = moving or plan.groups[plan.group[k], MOVING] == 0.0
         counts = counts and bodies[k, RADIUS] > 0.0
@@ -236,7 +236,9 @@ def _uniform(source, counter):  # type: ignore[no-untyped-def]
 @kernel
 def _point(source, counter, chosen, cells):  # type: ignore[no-untyped-def]
     """Draws a point in one of the chosen cells, given by row-major indices; takes 3 counters."""
-    cell = chosen[int(_uniform(source, counter) * chosen.shape[0])]
+    cell = int(_uniform(source, counter) * chosen.shape[0])
+    if chosen.shape[0] < cells.distances.size:  # of all cells, a look-up would only miss the cache
+        cell = chosen[cell]
     i, j = cell // cells.distances.shape[1], cell % cells.distances.shape[1]
     return place_in(i + _uniform(source, counter + 1), j + _uniform(source, counter + 2), cells)
 
@@ -288,7 +290,7 @@ def _place_obstacles(source, counter, plan, bodies, scratch):  # type: ignore[no
         if group[FIXED] > 0.0:
             pose = plan.poses[k]
             _put(bodies[k], pose[0], pose[1], pose[2], shape, plan)
-            cell_kernels.add(0, k, bodies[k], True, cells)
+            cell_kernels.add(0, k, bodies[k], cells)
     for k in range(bodies.shape[0]):
         if plan.groups[plan.group[k], FIXED] > 0.0 or not scratch.active[k]:
             continue
@@ -305,7 +307,7 @@ def _place_obstacles(source, counter, plan, bodies, scratch):  # type: ignore[no
             )
             if placed:
                 _put(bodies[k], x, y, heading, shape, plan)
-                cell_kernels.add(0, k, bodies[k], True, cells)
+                cell_kernels.add(0, k, bodies[k], cells)
                 break
         if not placed:
             return counter, False
@@ -316,7 +318,7 @@ def _place_obstacles(source, counter, plan, bodies, scratch):  # type: ignore[no
 def _is_apart(k, widest, plan, bodies, scratch):  # type: ignore[no-untyped-def]
     trial, gaps, near = scratch.trial, scratch.gaps, scratch.cells.found
     reach = trial[RADIUS] + widest
-    for i in range(cell_kernels.around(0, trial[X], trial[Y], reach, scratch.cells)):
+    for i in range(cell_kernels.around_added(0, trial[X], trial[Y], reach, scratch.cells)):
         other = bodies[near[i]]
         gap = max(gaps[k], gaps[near[i]])
         if other[RADIUS] > 0.0 and not _clear_of(trial, other, gap, plan.outlines, scratch.spare):

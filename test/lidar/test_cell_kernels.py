@@ -56,19 +56,20 @@ def test_bodies_that_moved_since_are_found_if_the_cells_know_how_far():
 def test_bodies_are_found_as_they_are_added():
     cells = kernels.body_cells(1, 30)
     bodies = bodies_at_random(np.random.default_rng(1), 30)
-    bodies[:, RADIUS] = 0.1
+    bodies[:, RADIUS] = np.where(np.arange(30) % 7, 0.1, 5.0)
     kernels.cover(0, -10.0, -10.0, 20.0, cells)
     for k in range(30):
-        assert k not in cells.found[: kernels.around(0, *bodies[k, :2], 0.0, cells)]
-        kernels.add(0, k, bodies[k], True, cells)
-        assert k in cells.found[: kernels.around(0, *bodies[k, :2], 0.0, cells)]
+        assert k not in cells.found[: kernels.around_added(0, *bodies[k, :2], 0.0, cells)]
+        kernels.add(0, k, bodies[k], cells)
+        assert k in cells.found[: kernels.around_added(0, *bodies[k, :2], 0.0, cells)]
     kernels.clear(0, cells)
-    assert kernels.around(0, 0.0, 0.0, 100.0, cells) == 0
+    assert kernels.around_added(0, 0.0, 0.0, 100.0, cells) == 0
 
 
 def test_without_cells_all_bodies_are_found():
     cells = kernels.body_cells(0, 5)
     kernels.clear(0, cells)
-    kernels.add(0, 2, np.ones(7), True, cells)
-    assert kernels.around(0, 50.0, 50.0, 0.1, cells) == 5
+    kernels.add(0, 2, np.ones(7), cells)
+    for around in (kernels.around, kernels.around_added):
+        assert around(0, 50.0, 50.0, 0.1, cells) == 5
     assert cells.found.tolist() == [0, 1, 2, 3, 4]
