@@ -2,8 +2,8 @@
 
 A body lies in the cell of its centre. One larger than a cell lies in none: it is always found, as
 are those that move. The outermost cells reach to infinity. Bodies are sorted at once, so that those
-of neighbouring cells lie side by side, or added one by one to chains that begin in the cells. Shared
-arguments: n is a world, k a body of it, a place is in [m].
+of neighbouring cells lie side by side, or added one by one to chains that begin in the cells.
+Shared arguments: n is a world, k a body of it, a place is in [m].
 """
 
 import math

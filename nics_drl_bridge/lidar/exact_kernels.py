@@ -144,10 +144,11 @@ def edge(out, beams, x1, y1, angle1, x2, y2, angle2, one_sided):  # type: ignore
 
 @kernel(inline=True)
 def _cross(out, directions, begin, end, cross, ex, ey):  # type: ignore[no-untyped-def]
+    cross = np.float32(cross)  # a division in single precision takes half the time
     for k in range(end - begin):
         i = np.uintp(begin + k)
-        distance = np.float32(cross / (directions[0, i] * ey - directions[1, i] * ex))
-        distance = distance if distance >= 0.0 else np.float32(np.inf)
+        distance = cross / np.float32(directions[0, i] * ey - directions[1, i] * ex)
+        distance = distance if distance >= np.float32(0.0) else np.float32(np.inf)
         held = out[i]
         out[i] = distance if distance < held else held
 

@@ -30,6 +30,8 @@ from nics_drl_bridge.sim.state import (
     Surroundings,
 )
 
+TOGETHER = 48  # Robots whose scans, with their faults, are made together: they stay in the L2 cache
+
 
 @structref.register
 class PackedType(types.StructRef):  # type: ignore[misc]
@@ -153,15 +155,17 @@ def _step(
         high = min(low + block, end)
         _begin_period(low, high, state, scene, motion, scratch)
         move_freely(low, high, state, motion, scratch.lanes)
-        waiting = np.int64(0)
+        waiting, scanned = np.int64(0), low
         for n in range(low, high):
             state.steps[n] += 1
             skip = (n - low) * many
             _move_world(n, skip, state, scene, motion, scratch)
             _measure(n, skip, state, scene, motion, scratch)
             waiting = sensing.scan_or_wait(n, waiting, state, scene, lidar, motion, scratch)
-        sensing.scan_together(waiting, state, scene, lidar, scratch)
-        sensing.distort(low, high, state, lidar)
+            if n + 1 == high or (n + 1 - scanned) * many >= TOGETHER:
+                sensing.scan_together(waiting, state, scene, lidar, scratch)
+                sensing.distort(scanned, n + 1, state, lidar)
+                waiting, scanned = np.int64(0), n + 1
 
 
 @kernel(inline=True)
