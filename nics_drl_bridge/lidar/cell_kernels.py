@@ -18,7 +18,7 @@ from nics_drl_bridge.lidar.exact_kernels import RADIUS, X, Y
 LEFT, BOTTOM, PER_METRE, SIDE, LARGEST, MOVED, FRAME = range(7)
 """Columns of `BodyCells.frame`: x, y of the first cell [m], cells per metre, cells in a row,
 greatest radius of the bodies in cells [m], greatest distance moved since by any of them [m]."""
-PER_BODY = 2.0  # Cells
+PER_BODY = 1.0  # Cells
 
 
 FEWEST = 20  # Least number of bodies among which those in cells are found in less time
@@ -30,17 +30,21 @@ class BodyCells(NamedTuple):
     # (N, G^2 + 2) place in `then` of each cell's first body, those in no cell being the last; of
     # chains the first body itself, or -1
     first: NDArray[np.int32]
-    then: NDArray[np.int32]  # (N, K) the bodies in the order of cells; of a chain the next, or -1
+    # (N, K) the bodies in the order of cells; of a chain the next, or -1. One row if the bodies
+    # themselves are put into that order
+    then: NDArray[np.int32]
+    ordered: bool  # True if they are
     frame: NDArray[np.float64]  # (N, FRAME)
     found: NDArray[np.int32]  # (K,) scratch for one thread: the bodies around a point
 
 
-def body_cells(worlds: int, bodies: int) -> BodyCells:
+def body_cells(worlds: int, bodies: int, ordered: bool = False) -> BodyCells:
     """Allocates cells for K bodies in each of N worlds; 0 worlds if all bodies are looked at."""
+    rows = min(worlds, 1) if ordered else worlds
     side = max(int(math.sqrt(PER_BODY * bodies)), 1)
     cells = BodyCells(
-        np.full((worlds, side * side + 2), -1, np.int32), np.full((worlds, bodies), -1, np.int32),
-        np.zeros((worlds, FRAME)), np.arange(bodies, dtype=np.int32),
+        np.full((worlds, side * side + 2), -1, np.int32), np.full((rows, bodies), -1, np.int32),
+        ordered, np.zeros((worlds, FRAME)), np.arange(bodies, dtype=np.int32),
     )  # fmt: skip
     cells.frame[:, SIDE] = side
     return cells
@@ -95,7 +99,8 @@ def sort(n, bodies, standing, cells):  # type: ignore[no-untyped-def]
             low_x, high_x = min(low_x, bodies[k, X]), max(high_x, bodies[k, X])
             low_y, high_y = min(low_y, bodies[k, Y]), max(high_y, bodies[k, Y])
     cover(n, low_x, low_y, max(high_x - low_x, high_y - low_y, 1e-6), cells)
-    first, then, cell_of, frame = cells.first[n], cells.then[n], cells.found, cells.frame[n]
+    first, cell_of, frame = cells.first[n], cells.found, cells.frame[n]
+    then = cells.then[0 if cells.ordered else n]
     first[:] = 0
     for k in range(bodies.shape[0]):
         if bodies[k, RADIUS] > 0.0:
@@ -111,6 +116,32 @@ def sort(n, bodies, standing, cells):  # type: ignore[no-untyped-def]
     for cell in range(first.shape[0] - 1):  # each entry is that of the cell before it
         first[cell] = first[cell + 1]
     first[first.shape[0] - 1] = end
+
+
+@kernel(inline=True)
+def _copy(body, to):  # type: ignore[no-untyped-def]
+    for i in range(7):
+        to[i] = body[i]
+
+
+@kernel
+def put_in_order(n, bodies, standing, spare, cells):  # type: ignore[no-untyped-def]
+    """Sorts the first `standing` bodies (K, 7) themselves, absent ones last; no others may move.
+
+    Of neighbours in the same lines of memory, few miss the cache; `spare` (K, 7) is scratch.
+    """
+    sort(n, bodies[:standing], standing, cells)
+    first, end = cells.first[n], cells.first.shape[1] - 1
+    present, count = first[end], first[end]
+    for k in range(standing):
+        _copy(bodies[k], spare[k])
+    for i in range(present):
+        _copy(spare[cells.then[0, i]], bodies[i])
+    for k in range(standing):
+        if spare[k, RADIUS] <= 0.0:
+            _copy(spare[k], bodies[count])
+            count += 1
+    first[end] = bodies.shape[0]  # the absent, and those that move, are always found
 
 
 @kernel(inline=True)
@@ -132,9 +163,9 @@ def around(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
     side = int(cells.frame[n, SIDE])
     for row in range(low, high + 1):
         for i in range(first[n, row * side + left], first[n, row * side + right + 1]):
-            found[count], count = then[n, i], count + 1
+            found[count], count = i if cells.ordered else then[n, i], count + 1
     for i in range(first[n, side * side], first[n, side * side + 1]):
-        found[count], count = then[n, i], count + 1
+        found[count], count = i if cells.ordered else then[n, i], count + 1
     return count
 
 

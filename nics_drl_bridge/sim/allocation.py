@@ -86,7 +86,7 @@ def map_field(grid: GridMap | None) -> arrays.MapField:
 def cells_of(sizes: Sizes, scene: arrays.Surroundings) -> BodyCells:
     """Allocates the cells of all worlds, none where looking at all bodies takes less time."""
     worlds = sizes.worlds if scene.crowded or scene.standing else 0
-    return body_cells(worlds, sizes.robots + sizes.obstacles)
+    return body_cells(worlds, sizes.robots + sizes.obstacles, scene.standing)
 
 
 def surroundings(
@@ -140,7 +140,8 @@ def _scratch(
             near=np.zeros((robots, 1 + SEVERAL), np.int64), meets=np.zeros(robots, np.int64),
             way=np.zeros(robots), reach=np.zeros(bodies), speeds=np.zeros((robots, 2)),
         ),
-        cells=cells._replace(found=cells.found.copy()),
+        cells=cells._replace(then=cells.then.copy() if cells.ordered else cells.then,
+                             found=cells.found.copy()),
         scans=arrays.Scans(
             before=np.zeros((lanes, 3)), waiting=np.zeros(worlds, np.int64),
             seen=np.zeros((bodies + 1, BODY)), spot=np.zeros((1, 1, 3)),

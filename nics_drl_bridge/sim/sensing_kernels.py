@@ -180,7 +180,7 @@ def _scan_alone(
         reach += math.hypot(drive[0], drive[1]) * lidar.sweep_time
     count = _gather(n, m, lag, reach, state, scene, motion, scratch)
     seen, every = scans.seen[:count].reshape((1, count, 7)), scans.every
-    every = BodyCells(every.first, every.then, every.frame, every.found[:count])
+    every = BodyCells(every.first, every.then, every.ordered, every.frame, every.found[:count])
     begin = (n * state.ranges.shape[1] + m) * beams
     scan = state.ranges.reshape(-1)[begin : begin + beams].reshape((1, 1, beams))
     groups = 1 if skew == 0.0 else scans.slices.shape[0]

@@ -73,7 +73,7 @@ class Surroundings(NamedTuple):
     grid: MapField
     outlines: OutlineArrays
     crowded: bool  # True if all bodies are sorted into cells in each period
-    standing: bool  # True if the obstacles are, once in an episode: no velocity may be set
+    standing: bool  # True if the obstacles are put in the order of cells: none may get a velocity
     movers: Movers
 
 

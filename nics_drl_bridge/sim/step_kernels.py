@@ -209,7 +209,8 @@ def sort(n: int, state: State, scene: Surroundings, scratch: Scratch) -> None:
     if scene.crowded:
         cells.sort(n, state.bodies[n], state.bodies.shape[1], scratch.cells)
     elif scene.standing:
-        cells.sort(n, state.bodies[n], state.velocity.shape[1], scratch.cells)
+        first, spare = state.velocity.shape[1], scratch.scans.seen
+        cells.put_in_order(n, state.bodies[n], first, spare, scratch.cells)
 
 
 @kernel(allocates=True)

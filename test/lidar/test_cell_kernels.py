@@ -66,6 +66,23 @@ def test_bodies_are_found_as_they_are_added():
     assert kernels.around_added(0, 0.0, 0.0, 100.0, cells) == 0
 
 
+def test_bodies_that_are_put_in_order_are_the_same_and_found_among_those_that_move():
+    rng, cells = np.random.default_rng(2), kernels.body_cells(2, 80, ordered=True)
+    few = 0
+    for n in (0, 1, 1, 0):
+        bodies = bodies_at_random(rng, 80)
+        before = bodies.copy()
+        kernels.put_in_order(n, bodies, 70, np.zeros((81, 7)), cells)
+        assert np.array_equal(bodies[70:], before[70:])
+        assert sorted(map(tuple, bodies)) == sorted(map(tuple, before))
+        for spot in rng.uniform(-12.0, 12.0, (10, 2)):
+            got = cells.found[: kernels.around(n, *spot, 1.0, cells)].tolist()
+            assert len(set(got)) == len(got)
+            assert within(bodies, spot, 1.0) | set(range(70, 80)) <= set(got)
+            few += len(got) < 40
+    assert few > 0
+
+
 def test_without_cells_all_bodies_are_found():
     cells = kernels.body_cells(0, 5)
     kernels.clear(0, cells)
