@@ -25,9 +25,9 @@ PACKAGE = Path(__file__).resolve().parents[1] / "nics_drl_bridge"
 BARS = {
     # 180 and 33,000 until it read any recording, knew ten kinds of robots instead of six, and what
     # motors do to every command, judged itself by yardsticks, and named units and clocks that
-    # can't be.
-    "modules": 194,
-    "lines": 40_000,
+    # can't be. 194 and 40,000 until bodies lay in cells and faults of lidars took no branches.
+    "modules": 195,
+    "lines": 40_400,
     "single_importers": 50,
     "circles": 0,
     "max_arguments": 10,

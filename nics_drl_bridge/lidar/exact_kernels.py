@@ -142,7 +142,7 @@ def edge(out, beams, x1, y1, angle1, x2, y2, angle2, one_sided):  # type: ignore
             _cross(out, beams.directions, 0, first + hits - count, cross, ex, ey)
 
 
-@kernel(inline=True)
+@kernel(contracts=True, inline=True)
 def _cross(out, directions, begin, end, cross, ex, ey):  # type: ignore[no-untyped-def]
     cross = np.float32(cross)  # a division in single precision takes half the time
     for k in range(end - begin):

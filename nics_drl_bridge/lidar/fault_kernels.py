@@ -22,7 +22,7 @@ ROUNDING = 1e-9  # rounding error of a multiple of the quantisation step [m]
 
 
 class Device(NamedTuple):
-    """What a device does to a return, float32; so as to change nothing where it has no fault."""
+    """The effect of a device on a return, float32, such that no fault changes nothing."""
 
     least: float  # [m]
     most: float

@@ -218,12 +218,9 @@ def _is_joined(x, y, gx, gy, plan, bodies, scratch):  # type: ignore[no-untyped-
             if label[row, column] != area or seen[new] == latest[0] + side or seen[new] == blocked:
                 continue
             cx, cy = place_in(row + 0.5, column + 0.5, cells)
-            if _is_clear(cx, cy, room, False, plan, bodies, scratch):
-                seen[new] = latest[0] + side
-                stack[side, height] = new
-                height += 1
-            else:
-                seen[new] = blocked
+            free = _is_clear(cx, cy, room, False, plan, bodies, scratch)
+            seen[new], stack[side, height] = latest[0] + side if free else blocked, new
+            height += int(free)
         height, other, side = other, height, 1 - side
     return False
 
