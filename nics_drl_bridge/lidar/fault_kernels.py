@@ -24,16 +24,16 @@ ROUNDING = 1e-9  # rounding error of a multiple of the quantisation step [m]
 class Device(NamedTuple):
     """The effect of a device on a return, float32, such that no fault changes nothing."""
 
-    least: float  # [m]
-    most: float
-    close: float  # value for what is too close
-    std: float  # [m]
-    grows: float  # [1]
-    per_step: float  # 1 / step of the quantisation [1/m]
-    step: float  # [m]
-    rest: float  # of the step, beyond float32
-    first: float  # least multiple of the step within the limits
-    last: float
+    least: np.float32  # [m]
+    most: np.float32
+    close: np.float32  # value for what is too close
+    std: np.float32  # [m]
+    grows: np.float32  # [1]
+    per_step: np.float32  # 1 / step of the quantisation [1/m]
+    step: np.float32  # [m]
+    rest: np.float32  # of the step, beyond float32
+    first: np.float32  # least multiple of the step within the limits
+    last: np.float32
 
 
 @kernel(allocates=True)

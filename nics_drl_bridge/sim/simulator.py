@@ -20,6 +20,7 @@ from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.sim import step_kernels
 from nics_drl_bridge.sim.allocation import (
+    STANDING,
     Sizes,
     allocate,
     cells_of,
@@ -210,8 +211,10 @@ class FastSimulator:
     ) -> Scenes:
         """Begins episodes in `worlds` (n,), all by default, at `starts` (n, M, 3) if given.
 
-        A seed (n,) fixes scene, start, goal, noise and randomisation. Threads may call it in
-        parallel for different parts. Raises ConfigError if seeds, starts or a scene do not fit.
+        A seed (n,) fixes scene, start, goal, noise and randomisation. The obstacles of the scenes
+        are in the order of `data`; in that of `scenes` only if they are few or move. Threads may
+        call it in parallel for different parts. Raises ConfigError if seeds, starts or a scene do
+        not fit.
         """
         chosen = np.arange(len(self.data.steps)) if worlds is None else np.asarray(worlds, np.int64)
         scenes, draws = self._draw(seeds)
@@ -228,7 +231,9 @@ class FastSimulator:
                 self._boxes[part.start].begin()
                 step_kernels.begin(self.packed[part.start], of_part)
                 self.sense(of_part)
-        return scenes
+        if self.sampler.count < STANDING:
+            return scenes
+        return Scenes(self._obstacles(chosen), scenes.starts, scenes.goals)
 
     def scenes(self, seeds: ArrayLike) -> Scenes:
         """Returns the scenes that `reset` would begin with for seeds (n,)."""
@@ -243,7 +248,10 @@ class FastSimulator:
     @property
     def obstacles(self) -> Array:
         """(N, K, 7) the obstacles at their present poses, in the format of `scenes`."""
-        bodies = self.data.bodies[:, : self.sampler.count].copy()
+        return self._obstacles(slice(None))
+
+    def _obstacles(self, worlds: slice | Indices) -> Array:
+        bodies = self.data.bodies[worlds, : self.sampler.count].copy()
         index = np.zeros(int(self._in_table.max()) + 1)
         index[self._in_table[:-1]] = np.arange(len(self.sampler.shapes))
         bodies[..., SHAPE] = index[bodies[..., SHAPE].astype(np.int64)]

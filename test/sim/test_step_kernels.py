@@ -378,7 +378,10 @@ def drive_among(world, worlds=3, threads=1, steps=200):
     simulator.data.age[:1] = 7  # a scan of where the robot was
     for t in range(steps):
         if t % 50 == 0:
-            simulator.reset(np.arange(worlds) + t)
+            scenes = simulator.reset(np.arange(worlds) + t)
+            assert np.array_equal(scenes.bodies, simulator.obstacles)
+            drawn = simulator.scenes(np.arange(worlds) + t).bodies
+            assert np.array_equal(np.sort(scenes.bodies, axis=1), np.sort(drawn, axis=1))
             command = rng.uniform(-1.0, 1.0, (worlds, 2, 3))
         simulator.step(command)
         touched += int(simulator.data.collided.sum())
