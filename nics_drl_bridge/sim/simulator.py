@@ -248,10 +248,10 @@ class FastSimulator:
     @property
     def obstacles(self) -> Array:
         """(N, K, 7) the obstacles at their present poses, in the format of `scenes`."""
-        return self._obstacles(slice(None))
+        return self._obstacles(np.arange(len(self.data.steps)))
 
-    def _obstacles(self, worlds: slice | Indices) -> Array:
-        bodies = self.data.bodies[worlds, : self.sampler.count].copy()
+    def _obstacles(self, worlds: Indices) -> Array:
+        bodies = self.data.bodies[worlds, : self.sampler.count]
         index = np.zeros(int(self._in_table.max()) + 1)
         index[self._in_table[:-1]] = np.arange(len(self.sampler.shapes))
         bodies[..., SHAPE] = index[bodies[..., SHAPE].astype(np.int64)]
@@ -263,10 +263,10 @@ class FastSimulator:
         for name in ("state", "history", "twist", "collided", "steps", "velocity"):
             getattr(data, name)[chosen] = 0
         data.seeds[chosen] = seeds
-        bodies = scenes.bodies.copy()
-        bodies[..., SHAPE] = self._in_table[bodies[..., SHAPE].astype(np.int64)]
-        footprints = place(starts, self._footprint.radius, self._in_table[-1])
-        data.bodies[chosen] = np.concatenate([bodies, footprints], axis=1)
+        count, shapes = self.sampler.count, scenes.bodies[..., SHAPE].astype(np.int64)
+        data.bodies[chosen, :count] = scenes.bodies
+        data.bodies[chosen, :count, SHAPE] = self._in_table[shapes]
+        data.bodies[chosen, count:] = place(starts, self._footprint.radius, self._in_table[-1])
         self.goals[chosen] = scenes.goals
 
     def _assign(self, chosen: Indices, draws: Draws) -> None:
