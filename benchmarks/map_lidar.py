@@ -98,7 +98,7 @@ def run(out, beams, at, range_max, arrays, walk, lanes):
 
 def timed(*arguments: Any) -> tuple[NDArray[np.float32], float]:
     """Scans, and scans per second of the best of some runs."""
-    out = np.empty((SCANS, len(arguments[0].directions)), np.float32)
+    out = np.empty((SCANS, arguments[0].directions.shape[1]), np.float32)
     run(out, *arguments)
     best = np.inf
     for _ in range(REPEATS):
@@ -119,7 +119,7 @@ def measure(seed: int, control: str | None) -> dict[str, Any]:
         bake = time.perf_counter() - begin
         for lidar in LIDARS:
             spec = load_lidar(lidar)
-            directions = spec.directions.astype(np.float64)
+            directions = np.ascontiguousarray(spec.directions.T)
             beams = Beams(directions, spec.angle_min, spec.angle_increment, spec.full_circle)
             at = poses(grid, seed + 1)
             arguments = (beams, at, spec.range_max, grid.arrays)

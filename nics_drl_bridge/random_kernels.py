@@ -38,10 +38,21 @@ def _mix(z):  # type: ignore[no-untyped-def]
 @kernel(allocates=True)
 def uniform(seed, stream, counter):  # type: ignore[no-untyped-def]
     """A draw from the uniform distribution over [0, 1)."""
+    return uniform_of(source(seed, stream), counter)
+
+
+@kernel(allocates=True)
+def source(seed, stream):  # type: ignore[no-untyped-def]
+    """Returns what all draws of a seed and stream have in common, for `uniform_of`."""
     step = np.uint64(0x9E3779B97F4A7C15)
     z = _mix(np.uint64(seed) * step + step)
-    z = _mix(z + (np.uint64(stream) + np.uint64(1)) * step)
-    z = _mix(z + (np.uint64(counter) + np.uint64(1)) * step)
+    return _mix(z + (np.uint64(stream) + np.uint64(1)) * step)
+
+
+@kernel(allocates=True)
+def uniform_of(source, counter):  # type: ignore[no-untyped-def]
+    """The same draw as `uniform`."""
+    z = _mix(source + (np.uint64(counter) + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15))
     return float(z >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
@@ -56,9 +67,7 @@ def normal(seed, stream, counter):  # type: ignore[no-untyped-def]
 def key(seed, stream, counter):  # type: ignore[no-untyped-def]
     """Returns two numbers of 32 bits, the key of many draws by `bits`."""
     step = np.uint64(0x9E3779B97F4A7C15)
-    z = _mix(np.uint64(seed) * step + step)
-    z = _mix(z + (np.uint64(stream) + np.uint64(1)) * step)
-    z = _mix(z + (np.uint64(counter) + np.uint64(1)) * step)
+    z = _mix(source(seed, stream) + (np.uint64(counter) + np.uint64(1)) * step)
     return np.uint32(z), np.uint32(z >> np.uint64(32))
 
 

@@ -11,6 +11,7 @@ from measuring.table import Table
 def told(*rows: tuple[str, str, str]) -> Table:
     """Figures in words: run, what, figure."""
     of = {"training_differential": "training", "training_ackermann": "training"}
+    of |= dict.fromkeys(("env_throughput_lidar", "env_throughput_obstacles"), "env_throughput")
     return Table(
         ("what", "script", "figure"),
         tuple((run, what, f"`{of.get(run, run)}.py`", text) for run, what, text in rows),
@@ -61,6 +62,16 @@ README = told(
         "{single_thread_env_steps_per_s|.1e} on one thread, {all_threads_env_steps_per_s|.1e} on "
         "{threads}; {single_env_gym_steps_per_s|.1e} by `gymnasium.make`, "
         "{single_env_with_estimator_steps_per_s|.1e} with the estimator",
+    ),
+    (
+        "env_throughput_lidar",
+        "the same on one thread with a Hokuyo UST-10LX: 1,081 beams up to 10 m, noise, millimetres",
+        "{single_thread_env_steps_per_s|.1e}, {share_of_usual|.0%} of the 720 beams' in that run",
+    ),
+    (
+        "env_throughput_obstacles",
+        "the same on one thread among 260 circles instead of ten, as dense",
+        "{single_thread_env_steps_per_s|.1e}, {share_of_usual|.0%} of ten circles' in that run",
     ),
     (
         "table2_lidar",

@@ -39,6 +39,14 @@ RUNS: dict[str, Run] = {
     "baselines": row("baselines", "--episodes 200", "--episodes 20"),
     "env_scaling": row("env_scaling", "", "--ends-only --repeats 5"),
     "env_throughput": row("env_throughput", "", "--worlds 256 --repeats 2"),
+    "env_throughput_lidar": row(
+        "env_throughput",
+        "--lidar hokuyo_ust_10lx",
+        "--lidar hokuyo_ust_10lx --worlds 256 --repeats 2",
+    ),
+    "env_throughput_obstacles": row(
+        "env_throughput", "--obstacles 260", "--obstacles 260 --worlds 256 --repeats 2"
+    ),
     "estimator": row("estimator", "", "--drives 5 --steps 20000"),
     "fig4_pointcloud": row("fig4_pointcloud", "", "--scans 12 --without-slam"),
     "files": row("files", "", "--kills 5 --flips 20 --cuts 10 --changes 20"),

@@ -42,8 +42,8 @@ def silhouettes(hull, radius, distances, turns, edges, hints):  # type: ignore[n
 @kernel(allocates=True)
 def along(angle, corners, radius, distance, cos, sin):  # type: ignore[no-untyped-def]
     """Range to a shape straight ahead in one direction [rad]; see `row`."""
-    ray, out = np.empty((1, 2)), np.full(1, np.inf, np.float32)
-    ray[0, 0], ray[0, 1] = math.cos(angle), math.sin(angle)
+    ray, out = np.empty((2, 1)), np.full(1, np.inf, np.float32)
+    ray[0, 0], ray[1, 0] = math.cos(angle), math.sin(angle)
     beams = Beams(ray, angle, 1.0, False)
     if corners.shape[0] == 0:
         exact_kernels.circle(out, beams, distance, 0.0, radius, np.inf)
@@ -101,8 +101,8 @@ def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # 
         start, begin, width = layout[0, d], layout[1, d], layout[2, d]
         points = width * phases
         angles = (begin * phases + np.arange(points)) * (step / phases)
-        directions = np.empty((points, 2))
-        directions[:, 0], directions[:, 1] = np.cos(angles), np.sin(angles)
+        directions = np.empty((2, points))
+        directions[0], directions[1] = np.cos(angles), np.sin(angles)
         fine = np.empty(points, np.float32)
         beams = Beams(directions, angles[0], step / phases, False)
         row(fine, beams, corners, radius, distances[d], c, s, edges[d])
@@ -112,14 +112,14 @@ def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # 
 @kernel(allocates=True)
 def incidences(angles, step, corners, radius, distance, c, s):  # type: ignore[no-untyped-def]
     """Cosines (P,) of the incidence on a shape straight ahead, 0 where a ray misses it."""
-    directions = np.stack((np.cos(angles), np.sin(angles)), axis=1)
+    directions = np.stack((np.cos(angles), np.sin(angles)))
     beams, count = Beams(directions, angles[0], step, False), len(angles)
     nearest, cosines = np.full(count, np.inf, np.float32), np.zeros(count, np.float32)
     if corners.shape[0] == 0:
         exact_kernels.circle(nearest, beams, distance, 0.0, radius, np.inf)
         for i in range(count):
             if nearest[i] < np.inf:
-                cosine = abs((nearest[i] - directions[i, 0] * distance) / radius)
+                cosine = abs((nearest[i] - directions[0, i] * distance) / radius)
                 cosines[i] = min(cosine, 1.0)
         return cosines
     ax, ay = exact_kernels.turned(distance, 0.0, c, s, corners[corners.shape[0] - 1])

@@ -89,14 +89,11 @@ def scan_robot(out, pose, bodies, me, walls, lidar):  # type: ignore[no-untyped-
     for i in range(out.shape[0]):
         out[i] = np.float32(np.inf)
     x, y, heading = sensor_pose(pose, lidar.mount)
-    computed = False
     for k in range(bodies.shape[0]):
-        way = way_of(bodies[k], x, y, lidar) if k != me else UNSEEN
-        if way == LOOKED_UP:
+        if k != me and way_of(bodies[k], x, y, lidar) == LOOKED_UP:
             look_up(out, x, y, heading, bodies[k], lidar)
-        computed |= way == COMPUTED
     here = LidarPose(x, y, math.cos(heading), math.sin(heading))
-    compute(out, here, bodies, me, computed, walls, lidar)
+    compute(out, here, bodies, me, range(bodies.shape[0]), walls, lidar)
 
 
 @kernel(contracts=True, inline=True)
@@ -132,11 +129,12 @@ def fuse(out, middle, low, high, near, far, blend, lidar):  # type: ignore[no-un
 
 
 @kernel
-def compute(out, here, bodies, me, computed, walls, lidar):  # type: ignore[no-untyped-def]
-    """Fuses walls, and the bodies that are not looked up, if there are any."""
-    for k in range(bodies.shape[0] if computed else 0):
+def compute(out, here, bodies, me, near, walls, lidar):  # type: ignore[no-untyped-def]
+    """Fuses walls, and of the bodies `near` those that are not looked up."""
+    computed = False
+    for k in near:
         if k != me and way_of(bodies[k], here.x, here.y, lidar) == COMPUTED:
-            body, outlines = bodies[k], lidar.outlines
+            body, outlines, computed = bodies[k], lidar.outlines, True
             exact_kernels.body_into(out, lidar.beams, here, body, outlines, lidar.range_max)
     near = exact_kernels.walls_into(out, lidar.beams, here, walls, lidar.range_max)
     if near > 0 or computed:

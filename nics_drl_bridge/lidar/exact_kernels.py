@@ -28,7 +28,7 @@ X, Y, HEADING, COS, SIN, RADIUS, SHAPE = range(7)
 class Beams(NamedTuple):
     """Directions of the beams in the frame of the lidar."""
 
-    directions: NDArray[np.float64]  # (B, 2) cosine and sine
+    directions: NDArray[np.float64]  # (2, B) cosines and sines, in rows that vectorise
     first: float  # angle of beam 0 [rad]
     step: float  # between beams [rad]
     closed: bool  # True for a full circle
@@ -75,7 +75,7 @@ def arctan2(y, x):  # type: ignore[no-untyped-def]
 @kernel
 def beam_span(low, high, beams):  # type: ignore[no-untyped-def]
     """First beam and number of beams in [low, high]; in a full circle modulo the count."""
-    count = beams.directions.shape[0]
+    count = beams.directions.shape[1]
     first = math.ceil((low - beams.first) / beams.step - ROUNDING)
     last = math.floor((high - beams.first) / beams.step + ROUNDING)
     if beams.closed:
@@ -95,7 +95,7 @@ def circle(out, beams, x, y, radius, range_max):  # type: ignore[no-untyped-def]
     count = out.shape[0]
     if d2 <= r2:  # the lidar is inside: every beam hits the far side
         for i in range(count):
-            c, s = beams.directions[i, 0], beams.directions[i, 1]
+            c, s = beams.directions[0, i], beams.directions[1, i]
             across = c * y - s * x
             out[i] = min(out[i], c * x + s * y + math.sqrt(max(r2 - across * across, 0.0)))
         return
@@ -109,7 +109,7 @@ def circle(out, beams, x, y, radius, range_max):  # type: ignore[no-untyped-def]
             i = first + k
             if i >= count:
                 i -= count
-            c, s = beams.directions[i, 0], beams.directions[i, 1]
+            c, s = beams.directions[0, i], beams.directions[1, i]
             across = c * y - s * x
             rest = r2 - across * across
             if rest >= 0.0:
@@ -142,12 +142,13 @@ def edge(out, beams, x1, y1, angle1, x2, y2, angle2, one_sided):  # type: ignore
             _cross(out, beams.directions, 0, first + hits - count, cross, ex, ey)
 
 
-@kernel(inline=True)
+@kernel(contracts=True, inline=True)
 def _cross(out, directions, begin, end, cross, ex, ey):  # type: ignore[no-untyped-def]
+    cross = np.float32(cross)  # a division in single precision takes half the time
     for k in range(end - begin):
         i = np.uintp(begin + k)
-        distance = np.float32(cross / (directions[i, 0] * ey - directions[i, 1] * ex))
-        distance = distance if distance >= 0.0 else np.float32(np.inf)
+        distance = cross / np.float32(directions[0, i] * ey - directions[1, i] * ex)
+        distance = distance if distance >= np.float32(0.0) else np.float32(np.inf)
         held = out[i]
         out[i] = distance if distance < held else held
 

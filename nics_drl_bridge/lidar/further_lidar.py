@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.lidar import fault_kernels, scan_kernels
+from nics_drl_bridge.lidar.cell_kernels import body_cells
 from nics_drl_bridge.lidar.scanner import make_scanner
 from nics_drl_bridge.lidar.sensor import Readings, Render, SensedWorlds, Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device, to_device
@@ -46,9 +47,17 @@ class FurtherLidar(Sensor):
         faults = self.lidar.fault_parameters
 
         def render(out: Readings, worlds: NDArray[np.int64]) -> None:
-            lanes = scan_kernels.scan_lanes()
+            lanes, cells = scan_kernels.scan_lanes(), body_cells(0, state.bodies.shape[1])
             scan_kernels.scan_worlds(
-                out, state.pose, worlds, state.bodies, around.first, around.fixtures, lidar, lanes
+                out,
+                state.pose,
+                worlds,
+                state.bodies,
+                around.first,
+                around.fixtures,
+                lidar,
+                cells,
+                lanes,
             )
             fault_kernels.distort_worlds(
                 out, worlds, limits, faults, state.seeds ^ salt, state.steps

@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
+from nics_drl_bridge.lidar.cell_kernels import body_cells
 from nics_drl_bridge.lidar.maps import stack_fixtures
 from nics_drl_bridge.lidar.shapes import place
 
@@ -79,11 +80,12 @@ def _small(squares: Array, counts: Array, greatest: float) -> bool:
 def _scans(bodies: Array, exact: LidarArrays, baked: LidarArrays) -> tuple[Array, Array]:
     mount, directions = exact.mount, exact.beams.directions
     robots = np.tile([-mount[0], -mount[1], 0.0], (PLACES, 1, 1))  # the lidar is at the origin
-    scans = np.empty((2, PLACES, 1, len(directions)), np.float32)
+    scans = np.empty((2, PLACES, 1, directions.shape[1]), np.float32)
     worlds, lanes = np.arange(PLACES), scan_kernels.scan_lanes()
-    nothing = stack_fixtures([NO_WALLS], [None], np.zeros(PLACES, np.int64))
+    cells, nothing = body_cells(0, bodies.shape[1]), np.zeros(PLACES, np.int64)
+    around = stack_fixtures([NO_WALLS], [None], nothing)
     for ranges, sensor in zip(scans, (exact, baked), strict=True):
-        scan_kernels.scan_worlds(ranges, robots, worlds, bodies, -1, nothing, sensor, lanes)
+        scan_kernels.scan_worlds(ranges, robots, worlds, bodies, -1, around, sensor, cells, lanes)
     one, other = scans[:, :, 0].astype(np.float64)
     return one, other
 
@@ -92,7 +94,7 @@ def _around(exact: LidarArrays, between: Array, seed: int) -> Array:
     rng, beams = np.random.default_rng(seed), exact.beams
     distance = rng.uniform(between[0], between[1], PLACES)
     bearing = exact.mount[2] + beams.first
-    bearing += rng.uniform(0.0, beams.step * len(beams.directions), PLACES)
+    bearing += rng.uniform(0.0, beams.step * beams.directions.shape[1], PLACES)
     heading = rng.uniform(-np.pi, np.pi, PLACES)
     return np.stack([distance * np.cos(bearing), distance * np.sin(bearing), heading], axis=1)
 

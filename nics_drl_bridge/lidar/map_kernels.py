@@ -123,7 +123,7 @@ def map_into(out, beams, lidar, range_max, grid, exact, lanes):  # type: ignore[
     inside = 0.0 <= x < squares.shape[1] - 2 and 0.0 <= y < squares.shape[0] - 2
     if exact or not inside or squares[int(y) + 1, int(x) + 1] == 0:
         for i in range(out.shape[0]):
-            a, b = beams.directions[i, 0], beams.directions[i, 1]
+            a, b = beams.directions[0, i], beams.directions[1, i]
             value = cell * walk(squares, u, v, c * a - s * b, s * a + c * b, limit)
             if value < out[i]:
                 out[i] = value
@@ -131,20 +131,23 @@ def map_into(out, beams, lidar, range_max, grid, exact, lanes):  # type: ignore[
     here = (int(y) + 1) * squares.shape[1] + int(x) + 1
     for first in range(0, out.shape[0], LANES):
         last = min(first + LANES, out.shape[0])
-        _begin(beams.directions[first:last], u - x, v - y, c, s, squares.shape[1], lanes)
+        _begin(beams.directions, first, u - x, v - y, c, s, squares.shape[1], lanes)
         while _jump(squares.reshape(-1), here, np.float32(limit), lanes):
             pass
         _end(out[first:last], int(x), int(y), squares.shape, np.float32(limit), cell, lanes)
 
 
 @kernel
-def _begin(directions, u, v, c, s, columns, lanes):  # type: ignore[no-untyped-def]
-    """Puts beams into the lanes, each mirrored so that it points right and up."""
+def _begin(directions, first, u, v, c, s, columns, lanes):  # type: ignore[no-untyped-def]
+    """Puts the beams from `first` on into lanes, each mirrored so that it points right and up."""
     c, s, u, v = np.float32(c), np.float32(s), np.float32(u), np.float32(v)
     one, none, singles, wholes = np.float32(1.0), np.float32(0.0), lanes.single, lanes.whole
     for j in range(LANES):
-        k, i = np.uintp(j), np.uintp(min(j, directions.shape[0] - 1))  # idle ones repeat the last
-        a, b = np.float32(directions[i, 0]), np.float32(directions[i, 1])
+        k, i = (
+            np.uintp(j),
+            np.uintp(min(first + j, directions.shape[1] - 1)),
+        )  # idle ones repeat the last
+        a, b = np.float32(directions[0, i]), np.float32(directions[1, i])
         du, dv = c * a - s * b, s * a + c * b
         right, up = du > none, dv > none
         du, dv = max(abs(du), PARALLEL), max(abs(dv), PARALLEL)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import baked_kernels as baked
-from nics_drl_bridge.lidar import exact_kernels, map_kernels
+from nics_drl_bridge.lidar import cell_kernels, exact_kernels, map_kernels
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, LidarPose, X, Y
 from nics_drl_bridge.lidar.fixture_kernels import grid_of, walls_of
 
@@ -53,7 +53,7 @@ def scan_lanes() -> ScanLanes:
     )
 
 
-class Device(NamedTuple):
+class Spot(NamedTuple):
     """Lidar of one robot: place in its world [m], bearing of beam 0 [rad], index of its scan."""
 
     x: float
@@ -63,13 +63,14 @@ class Device(NamedTuple):
 
 
 @kernel
-def scan_worlds(ranges, poses, chosen, bodies, first, fixtures, lidar, lanes):  # type: ignore[no-untyped-def]
+def scan_worlds(ranges, poses, chosen, bodies, first, fixtures, lidar, cells, lanes):  # type: ignore[no-untyped-def]
     """Scans from the robots of the worlds `chosen` (n,), at poses (N, M, 3), into ranges (N, M, B).
 
     Of the bodies (N, K, 7) that of robot 0 is `first`, the others follow; -1 if robots are none.
-    Walls and maps are the `fixtures`. Bodies wait in the lanes until these are full.
+    Walls and maps are the `fixtures`, cells (`BodyCells`) are those of the bodies, which wait in
+    the lanes until these are full.
     """
-    count, robots, found = bodies.shape[1], poses.shape[1], 0
+    robots, found = poses.shape[1], 0
     for n in chosen:
         walls = walls_of(n, fixtures)
         for m in range(robots):
@@ -77,37 +78,40 @@ def scan_worlds(ranges, poses, chosen, bodies, first, fixtures, lidar, lanes):  
             for i in range(out.shape[0]):
                 out[i] = np.float32(np.inf)
             x, y, heading = baked.sensor_pose(poses[n, m], lidar.mount)
-            device = Device(x, y, heading, (n * robots + m) * out.shape[0])
+            spot = Spot(x, y, heading, (n * robots + m) * out.shape[0])
+            count = cell_kernels.around(n, x, y, lidar.range_max, cells)
             begin, computed = 0, 0
             while begin < count:
                 end = min(count, begin + LANES - found)
-                found, more = select(found, begin, end, bodies[n], me, device, lidar, lanes)
+                near = cells.found[begin:end]
+                found, more = select(found, near, bodies[n], me, spot, lidar, lanes)
                 begin, computed = end, computed + more
                 if found == LANES:
                     look_up(found, ranges, lidar, lanes)
                     found = 0
             if computed > 0 or walls.shape[0] > 0:
                 here = LidarPose(x, y, math.cos(heading), math.sin(heading))
-                baked.compute(out, here, bodies[n], me, computed > 0, walls, lidar)
+                near = cells.found[: count if computed > 0 else 0]
+                baked.compute(out, here, bodies[n], me, near, walls, lidar)
     look_up(found, ranges, lidar, lanes)
     if fixtures.squares.size > 0:
         add_maps(ranges, poses, chosen, fixtures, lidar, lanes)
 
 
 @kernel(contracts=True, inline=True)
-def select(found, begin, end, bodies, me, device, lidar, lanes):  # type: ignore[no-untyped-def]
-    """Lanes the bodies [begin, end) to look up; returns lanes in use, and bodies computed."""
+def select(found, near, bodies, me, spot, lidar, lanes):  # type: ignore[no-untyped-def]
+    """Lanes the bodies `near` to look up; returns lanes in use, and bodies computed."""
     wide, computed = lanes.wide, 0
-    for j in range(begin, end):
-        b, k = np.uintp(j), np.uintp(found)
-        dx, dy, radius = bodies[b, X] - device.x, bodies[b, Y] - device.y, bodies[b, RADIUS]
+    for j in range(near.shape[0]):
+        b, k = np.uintp(near[j]), np.uintp(found)
+        dx, dy, radius = bodies[b, X] - spot.x, bodies[b, Y] - spot.y, bodies[b, RADIUS]
         d2, reach, shape = dx * dx + dy * dy, lidar.range_max + radius, np.int32(bodies[b, SHAPE])
         wide[k + DX], wide[k + DY], wide[k + TURNED] = dx, dy, bodies[b, HEADING]
         wide[k + COSINE], wide[k + SINE], wide[k + SIZE] = bodies[b, COS], bodies[b, SIN], radius
-        wide[k + BEARING_0], wide[k + SCAN] = device.heading, device.at
+        wide[k + BEARING_0], wide[k + SCAN] = spot.heading, spot.at
         lanes.whole[k + KIND] = shape
         h = np.uintp(shape)
-        seen = (d2 <= reach * reach) & (radius > 0.0) & (j != me)
+        seen = (d2 <= reach * reach) & (radius > 0.0) & (near[j] != me)
         kept = seen & (d2 >= radius * radius)
         kept &= (d2 >= lidar.between[h, 0]) & (d2 <= lidar.between[h, 1])
         found += kept

@@ -13,6 +13,7 @@ from nics_drl_bridge.errors import ConfigError, ModelError, nearest
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
+from nics_drl_bridge.lidar.cell_kernels import body_cells
 from nics_drl_bridge.lidar.exact_kernels import SHAPE, Beams
 from nics_drl_bridge.lidar.lookup_error import lookup_distances
 from nics_drl_bridge.lidar.maps import GridMap, stack_fixtures
@@ -71,7 +72,8 @@ class Scanner:
         spec, table = self.spec, self.table
         return LidarArrays(
             np.array(spec.mount),
-            Beams(spec.directions, spec.angle_min, spec.angle_increment, spec.full_circle),
+            Beams(np.ascontiguousarray(spec.directions.T), spec.angle_min, spec.angle_increment,
+                  spec.full_circle),
             spec.range_min, spec.range_max, spec.sweep_time, self._looked_up(),
             table.outlines.arguments, table.arrays, self.renderer == "exact",
         )  # fmt: skip
@@ -118,8 +120,9 @@ class Scanner:
             return out
         worlds, lanes = np.arange(len(poses)), scan_kernels.scan_lanes()
         around = stack_fixtures([walls], [self.grid], np.zeros(len(poses), np.int64))
+        cells = body_cells(0, bodies.shape[1])
         scan_kernels.scan_worlds(
-            out[:, None], poses[:, None], worlds, bodies, -1, around, self.arguments, lanes
+            out[:, None], poses[:, None], worlds, bodies, -1, around, self.arguments, cells, lanes
         )
         return out
 

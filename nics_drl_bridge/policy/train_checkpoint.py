@@ -179,6 +179,7 @@ def restore(env: BridgeVectorEnv, state: Mapping[str, NDArray[Any]]) -> None:
     for name, target in targets.items():
         target[...] = given[name]  # in place: the compiled steps refer to these arrays
     env.memory, env.simulator.drawn = parts[MEMORY], parts[DRAWN]
+    env.simulator.sort_bodies()
     env.ready = bool((targets["episode"] >= 0).all())
 
 

@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from nics_drl_bridge.files import sha256
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar import scan_kernels
+from nics_drl_bridge.lidar.cell_kernels import BodyCells, body_cells
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.lidar.maps import GridMap, joined, stack_fixtures
 from nics_drl_bridge.lidar.scanner import Scanner
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.robot.kernels import SERIES, scratch, term_arrays
 from nics_drl_bridge.sim import state as arrays
-from nics_drl_bridge.sim.contact_kernels import FRAME, SEVERAL
+from nics_drl_bridge.sim.contact_kernels import SEVERAL
 from nics_drl_bridge.sim.impact_kernels import EVENT, FLIGHT
 from nics_drl_bridge.sim.obstacles import Motion, plan_arrays
 from nics_drl_bridge.sim.sensing_kernels import PAST
@@ -28,7 +29,7 @@ SLICES = 16  # Number of groups of beams in which a skewed scan is rendered
 LANES = 256  # Number of robots moved side by side: their arrays stay in the L1 cache
 CROWD = 4096  # Least number of pairs of a robot and a body for sorting bodies into cells
 FEWEST_OF_A_CROWD = 8  # Least number of robots: for fewer, testing all bodies takes less time
-SCATTERED = 64  # Least number of bodies in cells for a separate scan of each robot among those near
+STANDING = 32  # Least number of obstacles, all of which stand, for sorting them into cells once
 
 
 @dataclass(frozen=True)
@@ -46,11 +47,6 @@ class Sizes:
         """True if it pays to sort the bodies of a world into cells."""
         pairs = self.robots * (self.robots + self.obstacles)
         return self.robots >= FEWEST_OF_A_CROWD and pairs >= CROWD
-
-    @property
-    def scattered(self) -> bool:
-        """True if it pays to scan each robot among the bodies around it only."""
-        return self.crowded and self.robots + self.obstacles >= SCATTERED
 
 
 def allocate(model: SimulatorModel, sizes: Sizes) -> arrays.State:
@@ -86,20 +82,21 @@ def split(worlds: int, threads: int) -> tuple[slice, ...]:
 
 def members_of(
     worlds: Sequence[World], motions: Sequence[Sequence[Motion | None]], outlines: OutlineArrays,
-    crowds: tuple[bool, bool], member: NDArray[np.int64],
+    sizes: Sizes, member: NDArray[np.int64],
 ) -> arrays.Members:  # fmt: skip
     """Stacks P worlds, of up to K obstacles that move by `motions` (P, K), for N copies.
 
-    `crowds` are `Surroundings.crowded` and `scattered`; `member` (N,) is read as the kernels run.
+    `member` (N,) is read as the kernels run.
     """
     grids = _shared([world.grid for world in worlds])
     distances, places = joined([map_field(grid).distances for grid in grids])
     moves = any(motion is not None for each in motions for motion in each)
+    stands = not (sizes.crowded or moves) and sizes.obstacles >= STANDING
     plans, waypoints = _plans(motions if moves else [() for _ in worlds])
     field = np.array([world.extent for world in worlds])
     return arrays.Members(
         stack_fixtures([world.all_walls() for world in worlds], grids, member), distances, places,
-        outlines, *crowds, moves, plans, waypoints, field,
+        outlines, sizes.crowded, stands, moves, plans, waypoints, field,
     )  # fmt: skip
 
 
@@ -123,6 +120,12 @@ def map_field(grid: GridMap | None) -> arrays.MapField:
     return arrays.MapField(np.ascontiguousarray(grid.distance_field), *grid.arrays.frame.tolist())
 
 
+def cells_of(sizes: Sizes, members: arrays.Members) -> BodyCells:
+    """Allocates the cells of all worlds, none where looking at all bodies takes less time."""
+    worlds = sizes.worlds if members.crowded or members.standing else 0
+    return body_cells(worlds, sizes.robots + sizes.obstacles, members.standing)
+
+
 def _plans(motions: Sequence[Sequence[Motion | None]]) -> tuple[arrays.Array, arrays.Array]:
     each = [plan_arrays(one) for one in motions]
     plans = np.zeros((len(each), max(map(len, motions)), PLAN))
@@ -136,21 +139,22 @@ def _plans(motions: Sequence[Sequence[Motion | None]]) -> tuple[arrays.Array, ar
 
 def part_of(
     state: arrays.State, members: arrays.Members, model: SimulatorModel, scanner: Scanner,
-    sizes: Sizes, part: slice,
+    sizes: Sizes, cells: BodyCells, part: slice,
 ) -> arrays.Part:  # fmt: skip
     """Returns the arguments of the kernels for one part of the worlds, with scratch of its own."""
     dt, substeps, _ = model.timing
     motion = arrays.Dynamics(term_arrays(model.kinematics), SERIES, float(dt), int(substeps))
-    own = _scratch(model, scanner, sizes, part.stop - part.start)
+    own = _scratch(model, scanner, sizes, cells, part.stop - part.start)
     return arrays.Part(state, members, scanner.arguments, motion, own)
 
 
-def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int) -> arrays.Scratch:
+def _scratch(
+    model: SimulatorModel, scanner: Scanner, sizes: Sizes, cells: BodyCells, worlds: int
+) -> arrays.Scratch:
     kinematics, robots, count = model.kinematics, sizes.robots, sizes.obstacles
     bodies = count + robots
     blocks = -(-worlds * robots // LANES)
     lanes = robots * min(worlds, -(-worlds // blocks))
-    side = int(np.sqrt(2.0 * bodies)) if sizes.crowded else 1
     corners = max(int(np.diff(scanner.table.outlines.corner).max(initial=4)), 4)
     x, dq = scratch(kinematics)
     commands = len(kinematics.variables) - kinematics.state_size
@@ -169,15 +173,13 @@ def _scratch(model: SimulatorModel, scanner: Scanner, sizes: Sizes, worlds: int)
             near=np.zeros((robots, 1 + SEVERAL), np.int64), meets=np.zeros(robots, np.int64),
             way=np.zeros(robots), reach=np.zeros(bodies), speeds=np.zeros((robots, 2)),
         ),
-        cells=arrays.Cells(
-            begin=np.zeros(side * side + 2, np.int64), order=np.zeros(bodies, np.int64),
-            cell_of=np.zeros(bodies, np.int64), frame=np.zeros(FRAME),
-            found=np.zeros(bodies, np.int64),
-        ),
+        cells=cells._replace(then=cells.then.copy() if cells.ordered else cells.then,
+                             found=cells.found.copy()),
         scans=arrays.Scans(
             before=np.zeros((lanes, 3)), waiting=np.zeros(worlds, np.int64),
             seen=np.zeros((bodies + 1, BODY)), spot=np.zeros((1, 1, 3)),
             slices=np.zeros((SLICES, 3)), part=np.zeros((1, 1, model.lidar.beams), np.float32),
-            drive=np.zeros(3), none=np.zeros(1, np.int64), lookup=scan_kernels.scan_lanes(),
+            drive=np.zeros(3), none=np.zeros(1, np.int64), every=body_cells(0, bodies + 1),
+            lookup=scan_kernels.scan_lanes(),
         ),
     )  # fmt: skip

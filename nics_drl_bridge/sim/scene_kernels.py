@@ -2,8 +2,8 @@
 
 Every number is drawn from its own counter, so a seed's scene is the same in any batch. Obstacles
 are placed one by one where they overlap nothing, in cells known to be free, then starts and goals
-in pairs; if that fails, with fresh numbers. Shared arguments: `seed` and `counter` are those of the
-next draw, `plan` is the ScenePlan, `scratch` the SceneScratch, `disc` a body without corners.
+in pairs; if that fails, with fresh numbers. Shared arguments: `source` and `counter` are those of
+the next draw, `plan` is the ScenePlan, `scratch` the SceneScratch, `disc` a body without corners.
 """
 
 import math
@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar import exact_kernels
+from nics_drl_bridge.lidar import cell_kernels, exact_kernels
+from nics_drl_bridge.lidar.cell_kernels import BodyCells
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, X, Y
 from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim.state import Array, Integers, MapField
@@ -62,6 +63,7 @@ class ScenePlan(NamedTuple):
     least: float  # distance of a goal from its start [m]
     greatest: float
     around: bool  # True to draw goals around their starts
+    square: Array  # (3,) least x, least y, side of a square over the field [m]
 
 
 class SceneScratch(NamedTuple):
@@ -75,6 +77,7 @@ class SceneScratch(NamedTuple):
     trial: Array  # (7,) an obstacle
     disc: Array  # (7,) a robot
     spare: Array  # see `collision_kernels`
+    cells: BodyCells  # of the obstacles that are placed
 
 
 @kernel
@@ -160,10 +163,12 @@ def _clear_of(body, other, room, outlines, spare):  # type: ignore[no-untyped-de
 def _is_clear(x, y, room, moving, plan, bodies, scratch):  # type: ignore[no-untyped-def]
     disc = scratch.disc
     disc[X], disc[Y] = x, y
-    for k in range(bodies.shape[0]):
+    near = scratch.cells.found
+    for i in range(cell_kernels.around_added(0, x, y, disc[RADIUS] + room, scratch.cells)):
+        k = near[i]
         counts = moving or plan.groups[plan.group[k], MOVING] == 0.0
-        near = counts and bodies[k, RADIUS] > 0.0
-        if near and not _clear_of(disc, bodies[k], room, plan.outlines, scratch.spare):
+        counts = counts and bodies[k, RADIUS] > 0.0
+        if counts and not _clear_of(disc, bodies[k], room, plan.outlines, scratch.spare):
             return False
     return True
 
@@ -191,6 +196,7 @@ def _is_joined(x, y, gx, gy, plan, bodies, scratch):  # type: ignore[no-untyped-
     if start == goal:
         return True
     latest[0] += 2
+    blocked = -latest[0]  # a mark of either side's search
     stack[0, 0], stack[1, 0] = start, goal
     seen[start], seen[goal] = latest[0], latest[0] + 1
     height, other = 1, 1  # of the stack of this side, and of that of the other one
@@ -212,28 +218,29 @@ def _is_joined(x, y, gx, gy, plan, bodies, scratch):  # type: ignore[no-untyped-
             new = row * columns + column
             if seen[new] == latest[0] + 1 - side:
                 return True
-            if label[row, column] != area or seen[new] == latest[0] + side:
+            if label[row, column] != area or seen[new] == latest[0] + side or seen[new] == blocked:
                 continue
             cx, cy = place_in(row + 0.5, column + 0.5, cells)
-            if _is_clear(cx, cy, room, False, plan, bodies, scratch):
-                seen[new] = latest[0] + side
-                stack[side, height] = new
-                height += 1
+            free = _is_clear(cx, cy, room, False, plan, bodies, scratch)
+            seen[new], stack[side, height] = latest[0] + side if free else blocked, new
+            height += int(free)
         height, other, side = other, height, 1 - side
     return False
 
 
 @kernel
-def _uniform(seed, counter):  # type: ignore[no-untyped-def]
-    return random.uniform(seed, random.SCENE_STREAM, counter)
+def _uniform(source, counter):  # type: ignore[no-untyped-def]
+    return random.uniform_of(source, counter)
 
 
 @kernel
-def _point(seed, counter, chosen, cells):  # type: ignore[no-untyped-def]
+def _point(source, counter, chosen, cells):  # type: ignore[no-untyped-def]
     """Draws a point in one of the chosen cells, given by row-major indices; takes 3 counters."""
-    cell = chosen[int(_uniform(seed, counter) * chosen.shape[0])]
+    cell = int(_uniform(source, counter) * chosen.shape[0])
+    if chosen.shape[0] < cells.distances.size:  # of all cells, a look-up would only miss the cache
+        cell = chosen[cell]
     i, j = cell // cells.distances.shape[1], cell % cells.distances.shape[1]
-    return place_in(i + _uniform(seed, counter + 1), j + _uniform(seed, counter + 2), cells)
+    return place_in(i + _uniform(source, counter + 1), j + _uniform(source, counter + 2), cells)
 
 
 @kernel
@@ -244,7 +251,7 @@ def _put(body, x, y, heading, shape, plan):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _choose(seed, wanted, size, plan, bodies, active):  # type: ignore[no-untyped-def]
+def _choose(source, wanted, size, plan, bodies, active):  # type: ignore[no-untyped-def]
     groups = plan.groups
     counter, total, before, k = 0, 0, 0, 0
     for g in range(groups.shape[0]):
@@ -252,7 +259,7 @@ def _choose(seed, wanted, size, plan, bodies, active):  # type: ignore[no-untype
             total += int(groups[g, GREATEST])
     for g in range(groups.shape[0]):
         least, greatest = int(groups[g, LEAST]), int(groups[g, GREATEST])
-        count = least + int(_uniform(seed, counter) * (greatest - least + 1))
+        count = least + int(_uniform(source, counter) * (greatest - least + 1))
         counter += 1
         if groups[g, FIXED] == 0.0:
             if wanted >= 0:  # each group gets its share
@@ -261,7 +268,7 @@ def _choose(seed, wanted, size, plan, bodies, active):  # type: ignore[no-untype
             before += greatest
         first, shapes = int(groups[g, FIRST_SHAPE]), int(groups[g, SHAPES])
         for number in range(greatest):
-            taken = plan.choices[first + int(_uniform(seed, counter) * shapes)]
+            taken = plan.choices[first + int(_uniform(source, counter) * shapes)]
             counter += 1
             active[k] = number < count
             bodies[k, :] = 0.0
@@ -271,31 +278,36 @@ def _choose(seed, wanted, size, plan, bodies, active):  # type: ignore[no-untype
 
 
 @kernel
-def _place_obstacles(seed, counter, plan, bodies, scratch):  # type: ignore[no-untyped-def]
+def _place_obstacles(source, counter, plan, bodies, scratch):  # type: ignore[no-untyped-def]
     space, outlines, gaps, trial = plan.space, plan.outlines, scratch.gaps, scratch.trial
+    cells, widest = scratch.cells, MARGIN
+    cell_kernels.clear(0, cells)
     for k in range(bodies.shape[0]):
         group, shape = plan.groups[plan.group[k]], int(bodies[k, SHAPE])
         gaps[k] = max(group[GAP], MARGIN)
+        widest = max(widest, gaps[k])
         bodies[k, RADIUS] = 0.0
         if group[FIXED] > 0.0:
             pose = plan.poses[k]
             _put(bodies[k], pose[0], pose[1], pose[2], shape, plan)
+            cell_kernels.add(0, k, bodies[k], cells)
     for k in range(bodies.shape[0]):
         if plan.groups[plan.group[k], FIXED] > 0.0 or not scratch.active[k]:
             continue
         shape, heading, placed = int(bodies[k, SHAPE]), 0.0, False
         for _ in range(TRIES):
-            x, y = _point(seed, counter, space.for_anything, space.cells)
+            x, y = _point(source, counter, space.for_anything, space.cells)
             counter += 3
             if outlines.first[shape] < outlines.first[shape + 1]:
-                heading = (2.0 * _uniform(seed, counter) - 1.0) * math.pi
+                heading = (2.0 * _uniform(source, counter) - 1.0) * math.pi
                 counter += 1
             _put(trial, x, y, heading, shape, plan)
-            placed = _is_apart(k, plan, bodies, scratch) and _clear_of_walls(
+            placed = _is_apart(k, widest, plan, bodies, scratch) and _clear_of_walls(
                 trial, MARGIN, plan, scratch.spare
             )
             if placed:
                 _put(bodies[k], x, y, heading, shape, plan)
+                cell_kernels.add(0, k, bodies[k], cells)
                 break
         if not placed:
             return counter, False
@@ -303,29 +315,30 @@ def _place_obstacles(seed, counter, plan, bodies, scratch):  # type: ignore[no-u
 
 
 @kernel
-def _is_apart(k, plan, bodies, scratch):  # type: ignore[no-untyped-def]
-    trial, gaps = scratch.trial, scratch.gaps
-    for other in range(bodies.shape[0]):
-        if bodies[other, RADIUS] > 0.0:
-            gap = max(gaps[k], gaps[other])
-            if not _clear_of(trial, bodies[other], gap, plan.outlines, scratch.spare):
-                return False
+def _is_apart(k, widest, plan, bodies, scratch):  # type: ignore[no-untyped-def]
+    trial, gaps, near = scratch.trial, scratch.gaps, scratch.cells.found
+    reach = trial[RADIUS] + widest
+    for i in range(cell_kernels.around_added(0, trial[X], trial[Y], reach, scratch.cells)):
+        other = bodies[near[i]]
+        gap = max(gaps[k], gaps[near[i]])
+        if other[RADIUS] > 0.0 and not _clear_of(trial, other, gap, plan.outlines, scratch.spare):
+            return False
     return True
 
 
 @kernel
-def _spot(seed, counter, places, space):  # type: ignore[no-untyped-def]
+def _spot(source, counter, places, space):  # type: ignore[no-untyped-def]
     """Draws x, y, heading of a start or goal in one of the places; takes 4 counters."""
-    turn = _uniform(seed, counter + 3)
+    turn = _uniform(source, counter + 3)
     if places.shape[0] == 0:
-        x, y = _point(seed, counter, space.for_robots, space.cells)
+        x, y = _point(source, counter, space.for_robots, space.cells)
         return x, y, (2.0 * turn - 1.0) * math.pi
-    share, p = _uniform(seed, counter), 0
+    share, p = _uniform(source, counter), 0
     while p < places.shape[0] - 1 and share >= places[p, SHARE]:
         p += 1
     place = places[p]
-    x = place[X1] + _uniform(seed, counter + 1) * (place[X2] - place[X1])
-    y = place[Y1] + _uniform(seed, counter + 2) * (place[Y2] - place[Y1])
+    x = place[X1] + _uniform(source, counter + 1) * (place[X2] - place[X1])
+    y = place[Y1] + _uniform(source, counter + 2) * (place[Y2] - place[Y1])
     spread = place[GREATEST_HEADING] - place[LEAST_HEADING]
     return x, y, place[LEAST_HEADING] + turn * spread
 
@@ -340,29 +353,29 @@ def _apart(x, y, others, m, least):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _goal_of(seed, counter, x, y, plan):  # type: ignore[no-untyped-def]
+def _goal_of(source, counter, x, y, plan):  # type: ignore[no-untyped-def]
     """Draws a goal, for some worlds uniformly in the ring around the start; takes 4 counters."""
     if not plan.around:
-        gx, gy, _ = _spot(seed, counter, plan.goals, plan.space)
+        gx, gy, _ = _spot(source, counter, plan.goals, plan.space)
         return gx, gy
     least, greatest = plan.least, plan.greatest
-    turn = 2.0 * math.pi * _uniform(seed, counter)
-    share = _uniform(seed, counter + 1)
+    turn = 2.0 * math.pi * _uniform(source, counter)
+    share = _uniform(source, counter + 1)
     far = math.sqrt(least * least + share * (greatest * greatest - least * least))
     return x + far * math.cos(turn), y + far * math.sin(turn)
 
 
 @kernel
-def _place_robots(seed, counter, plan, bodies, starts, goals, scratch):  # type: ignore[no-untyped-def]
+def _place_robots(source, counter, plan, bodies, starts, goals, scratch):  # type: ignore[no-untyped-def]
     between = 2.0 * plan.footprint + plan.clearance
     for m in range(starts.shape[0]):
         placed, detours = False, 0
         for _ in range(TRIES):
-            x, y, heading = _spot(seed, counter, plan.starts, plan.space)
+            x, y, heading = _spot(source, counter, plan.starts, plan.space)
             counter += 4
             if area_of(x, y, plan.space) == 0 or not _is_free(x, y, plan, bodies, scratch):
                 continue
-            gx, gy = _goal_of(seed, counter, x, y, plan)
+            gx, gy = _goal_of(source, counter, x, y, plan)
             counter += 4
             distance2 = (gx - x) * (gx - x) + (gy - y) * (gy - y)
             fits = plan.least * plan.least <= distance2 <= plan.greatest * plan.greatest
@@ -405,18 +418,24 @@ def draw_scenes(packed, seeds, wanted, sizes, bodies, starts, goals, scratch):  
 
 @kernel
 def _draw(plan, seeds, wanted, sizes, bodies, starts, goals, scratch):  # type: ignore[no-untyped-def]
-    _put(scratch.disc, 0.0, 0.0, 0.0, plan.radii.shape[0] - 1, plan)
-    scratch.disc[RADIUS] = plan.footprint
-    count = plan.group.shape[0]
+    count, s, cells = plan.group.shape[0], scratch, scratch.cells
+    found = cells.found[:count]  # the scratch may be for the most obstacles of several worlds
+    cells = BodyCells(cells.first, cells.then, cells.ordered, cells.frame, found)
+    scratch = SceneScratch(
+        s.seen, s.stack, s.latest, s.active, s.gaps, s.trial, s.disc, s.spare, cells
+    )
+    cell_kernels.cover(0, plan.square[0], plan.square[1], plan.square[2], cells)
+    _put(s.disc, 0.0, 0.0, 0.0, plan.radii.shape[0] - 1, plan)
+    s.disc[RADIUS] = plan.footprint
     for n in range(seeds.shape[0]):
-        state = NO_OBSTACLES
-        counter = _choose(seeds[n], wanted[n], sizes[n], plan, bodies[n, :count], scratch.active)
+        state, source = NO_OBSTACLES, random.source(seeds[n], random.SCENE_STREAM)
+        counter = _choose(source, wanted[n], sizes[n], plan, bodies[n, :count], scratch.active)
         for _ in range(RESTARTS):
-            counter, placed = _place_obstacles(seeds[n], counter, plan, bodies[n, :count], scratch)
+            counter, placed = _place_obstacles(source, counter, plan, bodies[n, :count], scratch)
             if placed:
                 state = NO_ROBOTS
                 counter, placed = _place_robots(
-                    seeds[n], counter, plan, bodies[n, :count], starts[n], goals[n], scratch
+                    source, counter, plan, bodies[n, :count], starts[n], goals[n], scratch
                 )
             if placed:
                 state = DRAWN

@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from scipy import ndimage
 
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.lidar.cell_kernels import FEWEST, body_cells
 from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
 from nics_drl_bridge.lidar.shapes import BODY, LARGEST, SMALLEST, Circle, Outlines, Shape, describe
 from nics_drl_bridge.seeds import checked_seeds
@@ -277,7 +278,7 @@ def _plan(world: World, footprint: float, slots: Sequence[int], known: Catalogue
         np.array(choices, dtype=np.int64),
         np.arange(len(known.shapes)).reshape(-1, max(len(known.place), 1)), poses,
         _places(world.starts), _places(world.goals), float(footprint), world.clearance, least,
-        greatest, around,
+        greatest, around, _square_over(space.cells),
     )  # fmt: skip
 
 
@@ -303,8 +304,16 @@ def _scratch(cells: int, count: int, corners: int) -> SceneScratch:
     return SceneScratch(
         np.zeros(cells, np.int64), np.zeros((2, cells), np.int64), np.zeros(1, np.int64),
         np.zeros(count, np.bool_), np.zeros(count), np.zeros(BODY), np.zeros(BODY),
-        np.zeros((corners, 2)),
+        np.zeros((corners, 2)), body_cells(1 if count >= FEWEST else 0, count),
     )  # fmt: skip
+
+
+def _square_over(field: MapField) -> Array:
+    """Least x, least y and side (3,) of a square that covers a field [m]."""
+    rows, columns = field.distances.shape
+    place = kernels.place_in.py_func  # type: ignore[attr-defined]
+    x, y = place(np.array([0, 0, rows, rows]), np.array([0, columns, 0, columns]), field)
+    return np.array([x.min(), y.min(), max(np.ptp(x), np.ptp(y))])
 
 
 def _free_space(world: World, footprint: float, drawn: bool) -> FreeSpace:

@@ -10,10 +10,10 @@ from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import fault_kernels, scan_kernels
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
+from nics_drl_bridge.lidar.cell_kernels import BodyCells, around
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, X, Y
 from nics_drl_bridge.lidar.fixture_kernels import fixtures_around
 from nics_drl_bridge.robot.kernels import move, wrap
-from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim.state import Array, Dynamics, Members, Scratch, State
 
 POSE, TWIST, ODOM, MEASURED, PAST = 0, 3, 6, 9, 12  # Columns of `past`
@@ -129,7 +129,7 @@ def scan_or_wait(
     scratch: Scratch,
 ) -> int:  # fmt: skip
     """Scans world n, unless `scan_together` can; returns how many worlds now wait for it."""
-    alone = members.scattered
+    alone = False
     for m in range(state.age.shape[1]):  # a scan that is not of a robot's present pose
         alone = alone or state.age[n, m] > 0 or state.faults[n, m, fault_kernels.SKEW] != 0.0
     if alone:
@@ -148,8 +148,9 @@ def scan_together(
     scans = scratch.scans
     chosen, first = scans.waiting[:waiting], state.velocity.shape[1]
     scan_kernels.scan_worlds(
-        state.ranges, state.pose, chosen, state.bodies, first, members.fixtures, lidar, scans.lookup
-    )
+        state.ranges, state.pose, chosen, state.bodies, first, members.fixtures, lidar,
+        scratch.cells, scans.lookup,
+    )  # fmt: skip
 
 
 @kernel
@@ -179,7 +180,8 @@ def _scan_alone(
     if skew != 0.0:
         reach += math.hypot(drive[0], drive[1]) * lidar.sweep_time
     count = _gather(n, m, lag, reach, state, members, motion, scratch)
-    seen = scans.seen[:count].reshape((1, count, 7))
+    seen, every = scans.seen[:count].reshape((1, count, 7)), scans.every
+    every = BodyCells(every.first, every.then, every.ordered, every.frame, every.found[:count])
     begin = (n * state.ranges.shape[1] + m) * beams
     scan = state.ranges.reshape(-1)[begin : begin + beams].reshape((1, 1, beams))
     around = fixtures_around(n, members.fixtures)
@@ -190,7 +192,9 @@ def _scan_alone(
         out = scan if groups == 1 else scans.part
         for i in range(3 if groups > 1 else 0):
             spot[0, 0, i] = scans.slices[g, i]
-        scan_kernels.scan_worlds(out, spot, scans.none, seen, -1, around, lidar, scans.lookup)
+        scan_kernels.scan_worlds(
+            out, spot, scans.none, seen, -1, around, lidar, every, scans.lookup
+        )
         for i in range(g * beams // groups, (g + 1) * beams // groups if groups > 1 else 0):
             scan[0, 0, i] = scans.part[0, 0, i]
 
@@ -204,9 +208,9 @@ def _gather(
     scans, cells, bodies, velocity = scratch.scans, scratch.cells, state.bodies, state.velocity
     spot = scans.spot[0, 0]
     first, several = velocity.shape[1], bodies.shape[1]
-    in_cells = members.scattered and lag == 0  # the cells are of this period
+    in_cells = members.standing or (members.crowded and lag == 0)  # those of a crowd are of now
     if in_cells:
-        several = contacts.bodies_around(spot[0], spot[1], reach, cells)
+        several = around(n, spot[0], spot[1], reach, cells)
     count, ago = 0, lag * motion.dt
     for i in range(several):
         k = cells.found[i] if in_cells else i

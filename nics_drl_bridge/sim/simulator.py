@@ -19,7 +19,15 @@ from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.sim import step_kernels
-from nics_drl_bridge.sim.allocation import Sizes, allocate, members_of, part_of, split
+from nics_drl_bridge.sim.allocation import (
+    STANDING,
+    Sizes,
+    allocate,
+    cells_of,
+    members_of,
+    part_of,
+    split,
+)
 from nics_drl_bridge.sim.packing_kernels import pack
 from nics_drl_bridge.sim.randomisation import Draws, Randomisation, Sampler, load_randomisation
 from nics_drl_bridge.sim.scenes import Scenes, SetSampler
@@ -172,14 +180,22 @@ class FastSimulator:
     def _members(self) -> Members:
         motions = [each.motions for each in self.sampler.samplers]
         outlines = self._scanner.table.outlines.arguments
-        crowds = self._sizes.crowded, self._sizes.scattered
-        return members_of(self.world.members, motions, outlines, crowds, self.data.member)
+        return members_of(self.world.members, motions, outlines, self._sizes, self.data.member)
 
     @cached_property
     def packed(self) -> dict[int, Any]:
         """Packed arguments of the kernels, by the first world of each part."""
-        of = (self.data, self._members, self.model, self._scanner, self._sizes)
-        return {part.start: pack(part_of(*of, part)) for part in self.parts}
+        cells = cells_of(self._sizes, self._members)
+        of = (self.data, self._members, self.model, self._scanner, self._sizes, cells)
+        parts = {part.start: pack(part_of(*of, part)) for part in self.parts}
+        for part in self.parts:
+            step_kernels.sort_worlds(parts[part.start], part.start, part.stop)
+        return parts
+
+    def sort_bodies(self) -> None:
+        """Sorts bodies into cells anew, after obstacles in `data` were put elsewhere."""
+        for part in self.parts:
+            step_kernels.sort_worlds(self.packed[part.start], part.start, part.stop)
 
     def __getstate__(self) -> dict[str, Any]:  # a copy rebuilds the rest
         rebuilt = ("_members", "packed", "_renders")
@@ -203,8 +219,10 @@ class FastSimulator:
     ) -> Scenes:
         """Begins episodes in `worlds` (n,), all by default, at `starts` (n, M, 3) if given.
 
-        A seed (n,) fixes scene, start, goal, noise and randomisation. Threads may call it in
-        parallel for different parts. Raises ConfigError if seeds, starts or a scene do not fit.
+        A seed (n,) fixes scene, start, goal, noise and randomisation. The obstacles of the scenes
+        are in the order of `data`; in that of `scenes` only if they are few or move. Threads may
+        call it in parallel for different parts. Raises ConfigError if seeds, starts or a scene do
+        not fit.
         """
         chosen = np.arange(len(self.data.steps)) if worlds is None else np.asarray(worlds, np.int64)
         scenes, draws = self._draw(seeds)
@@ -221,7 +239,9 @@ class FastSimulator:
                 self._boxes[part.start].begin()
                 step_kernels.begin(self.packed[part.start], of_part)
                 self.sense(of_part)
-        return scenes
+        if self.sampler.count < STANDING:
+            return scenes
+        return Scenes(self._obstacles(chosen), scenes.starts, scenes.goals, scenes.member)
 
     def scenes(self, seeds: ArrayLike) -> Scenes:
         """Returns the scenes that `reset` would begin with for seeds (n,)."""
@@ -236,7 +256,10 @@ class FastSimulator:
     @property
     def obstacles(self) -> Array:
         """(N, K, 7) the obstacles at their present poses, in the format of `scenes`."""
-        bodies = self.data.bodies[:, : self.sampler.count].copy()
+        return self._obstacles(np.arange(len(self.data.steps)))
+
+    def _obstacles(self, worlds: Indices) -> Array:
+        bodies = self.data.bodies[worlds, : self.sampler.count]
         index = np.zeros(int(self._in_table.max()) + 1)
         index[self._in_table[:-1]] = np.arange(len(self.sampler.shapes))
         bodies[..., SHAPE] = index[bodies[..., SHAPE].astype(np.int64)]
@@ -248,10 +271,10 @@ class FastSimulator:
         for name in ("state", "history", "twist", "collided", "steps", "velocity"):
             getattr(data, name)[chosen] = 0
         data.seeds[chosen], data.member[chosen] = seeds, scenes.member
-        bodies = scenes.bodies.copy()
-        bodies[..., SHAPE] = self._in_table[bodies[..., SHAPE].astype(np.int64)]
-        footprints = place(starts, self._footprint.radius, self._in_table[-1])
-        data.bodies[chosen] = np.concatenate([bodies, footprints], axis=1)
+        count, shapes = self.sampler.count, scenes.bodies[..., SHAPE].astype(np.int64)
+        data.bodies[chosen, :count] = scenes.bodies
+        data.bodies[chosen, :count, SHAPE] = self._in_table[shapes]
+        data.bodies[chosen, count:] = place(starts, self._footprint.radius, self._in_table[-1])
         self.goals[chosen] = scenes.goals
 
     def _assign(self, chosen: Indices, draws: Draws) -> None:

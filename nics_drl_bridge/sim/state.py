@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
+from nics_drl_bridge.lidar.cell_kernels import BodyCells
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
 from nics_drl_bridge.lidar.fixture_kernels import Fixtures
 from nics_drl_bridge.lidar.scan_kernels import ScanLanes
@@ -73,8 +74,8 @@ class Surroundings(NamedTuple):
     walls: Array  # (W, 4) x1, y1, x2, y2 [m]
     grid: MapField
     outlines: OutlineArrays
-    crowded: bool  # True if the bodies of a world are sorted into cells
-    scattered: bool  # True if scans use the cells too
+    crowded: bool  # True if all bodies are sorted into cells in each period
+    standing: bool  # True if the obstacles are put in the order of cells: none may get a velocity
     movers: Movers
 
 
@@ -85,8 +86,8 @@ class Members(NamedTuple):
     distances: NDArray[np.float32]  # of all maps, see `MapField`
     fields: Integers  # (P, 3) first distance, rows and columns of each map
     outlines: OutlineArrays
-    crowded: bool  # `crowded`, `scattered`, `moves`: as in `Surroundings` and `Movers`
-    scattered: bool
+    crowded: bool  # `crowded`, `standing`, `moves`: as in `Surroundings` and `Movers`
+    standing: bool
     moves: bool
     plans: Array  # (P, K, L)
     waypoints: Array  # (Q, 2) of all patrols in all worlds [m]
@@ -135,16 +136,6 @@ class Nearby(NamedTuple):
     speeds: Array  # (M, 2) velocity in `map` [m/s]
 
 
-class Cells(NamedTuple):
-    """The bodies of one crowded world in G x G square cells, see `contact_kernels`."""
-
-    begin: Integers  # (G^2 + 2,) first body in `order` of each cell, the last for large bodies
-    order: Integers  # (K + M,) the bodies, cell by cell
-    cell_of: Integers  # (K + M,) cell of each body
-    frame: Array  # (FRAME,) columns as in `contact_kernels`
-    found: Integers  # (K + M,) bodies found around a point
-
-
 class Scans(NamedTuple):
     """Scratch memory of the scans."""
 
@@ -156,6 +147,7 @@ class Scans(NamedTuple):
     part: NDArray[np.float32]  # (1, 1, B) scan of a slice
     drive: Array  # (3,) twist of one robot
     none: Integers  # (1,) index of the only world of one robot
+    every: BodyCells  # of no worlds: all bodies that are seen
     lookup: ScanLanes  # of the lidar
 
 
@@ -165,7 +157,7 @@ class Scratch(NamedTuple):
     lanes: Lanes
     single: Single
     nearby: Nearby
-    cells: Cells
+    cells: BodyCells  # those of all parts, with places of its own for what is found
     scans: Scans
 
 

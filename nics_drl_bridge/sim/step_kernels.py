@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar import cell_kernels as cells
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.fixture_kernels import cells_of, walls_of
 from nics_drl_bridge.robot.kernels import bend, delayed, run, with_coefficients, wrap
@@ -30,6 +31,8 @@ from nics_drl_bridge.sim.state import (
     Surroundings,
 )
 
+TOGETHER = 48  # Robots whose scans, with their faults, are made together: they stay in the L2 cache
+
 
 @kernel(view=True)
 def surroundings_of(n: int, members: Members) -> Surroundings:
@@ -41,7 +44,7 @@ def surroundings_of(n: int, members: Members) -> Surroundings:
     movers = Movers(members.moves, members.plans[p], members.waypoints, members.field[p])
     return Surroundings(
         walls_of(n, members.fixtures), grid, members.outlines, members.crowded,
-        members.scattered, movers,
+        members.standing, movers,
     )  # fmt: skip
 
 
@@ -101,10 +104,10 @@ def _move_world(
     for m in range(robots):
         drift = math.sqrt(3.0 * period) * (state.noise[n, m, 2] + state.noise[n, m, 3])
         nearby.way[m] = lanes.pose[5, skip + m] + drift
-    longest, moving = contacts.reaches(n, state, nearby, period)
+    longest, moving = contacts.reaches(n, state, scene, nearby, period)
     if scene.crowded:
-        contacts.sort_bodies(state.bodies, n, scratch.cells)
-        scratch.cells.frame[contacts.MOVED] = longest
+        cells.sort(n, state.bodies[n], state.bodies.shape[1], scratch.cells)
+        scratch.cells.frame[n, cells.MOVED] = longest
     tight = False
     for m in range(robots):
         nearby.meets[m] = contacts.find_near(n, m, state.bodies, scene, nearby, scratch.cells)
@@ -149,15 +152,17 @@ def _step(
         high = min(low + block, end)
         _begin_period(low, high, state, members, motion, scratch)
         move_freely(low, high, state, motion, scratch.lanes)
-        waiting = np.int64(0)
+        waiting, scanned = np.int64(0), low
         for n in range(low, high):
             state.steps[n] += 1
             skip, scene = (n - low) * many, surroundings_of(n, members)
             _move_world(n, skip, state, scene, motion, scratch)
-            _measure(n, skip, state, motion, scratch)
+            _measure(n, skip, state, scene, motion, scratch)
             waiting = sensing.scan_or_wait(n, waiting, state, members, lidar, motion, scratch)
-        sensing.scan_together(waiting, state, members, lidar, scratch)
-        sensing.distort(low, high, state, lidar)
+            if n + 1 == high or (n + 1 - scanned) * many >= TOGETHER:
+                sensing.scan_together(waiting, state, members, lidar, scratch)
+                sensing.distort(scanned, n + 1, state, lidar)
+                waiting, scanned = np.int64(0), n + 1
 
 
 @kernel(inline=True)
@@ -182,16 +187,36 @@ def _begin_period(
 
 
 @kernel(inline=True)
-def _measure(n: int, skip: int, state: State, motion: Dynamics, scratch: Scratch) -> None:
+def _measure(
+    n: int, skip: int, state: State, scene: Surroundings, motion: Dynamics, scratch: Scratch
+) -> None:
     frame, pose, first = scratch.cells.frame, state.pose, state.velocity.shape[1]
     for m in range(pose.shape[1]):
         contacts.put_body(state.bodies, n, first + m, pose[n, m])
         rates_at(n, m, motion.substeps - 1, state, motion, scratch.single)
         before = scratch.scans.before[skip + m]
         sensing.measure(n, m, state, pose, before, scratch.single.dq, motion)
-        # The cells count how far the robots came, drift included.
-        dx, dy = pose[n, m, 0] - before[0], pose[n, m, 1] - before[1]
-        frame[contacts.MOVED] = max(frame[contacts.MOVED], math.sqrt(dx * dx + dy * dy))
+        if scene.crowded:  # the cells count how far the robots came, drift included
+            dx, dy = pose[n, m, 0] - before[0], pose[n, m, 1] - before[1]
+            frame[n, cells.MOVED] = max(frame[n, cells.MOVED], math.sqrt(dx * dx + dy * dy))
+
+
+@kernel
+def sort(n: int, state: State, scene: Surroundings, scratch: Scratch) -> None:
+    """Sorts the bodies of a world into its cells, if there are any."""
+    if scene.crowded:
+        cells.sort(n, state.bodies[n], state.bodies.shape[1], scratch.cells)
+    elif scene.standing:
+        first, spare = state.velocity.shape[1], scratch.scans.seen
+        cells.put_in_order(n, state.bodies[n], first, spare, scratch.cells)
+
+
+@kernel(allocates=True)
+def sort_worlds(packed: Any, begin: int, end: int) -> None:
+    """Sorts the bodies of the worlds [begin, end) of a part into cells, as they stand."""
+    part = packed.content
+    for n in range(begin, end):
+        sort(n, part.state, surroundings_of(n, part.members), part.scratch)
 
 
 @kernel(allocates=True)
@@ -201,9 +226,10 @@ def begin(packed: Any, chosen: Integers) -> None:
     state, waiting = part.state, part.scratch.scans.waiting
     for i in range(chosen.shape[0]):
         waiting[i] = chosen[i]
+        scene = surroundings_of(chosen[i], part.members)
         if part.members.moves:
-            plans = surroundings_of(chosen[i], part.members).movers.plans
-            obstacles.begin(chosen[i], state, plans)
+            obstacles.begin(chosen[i], state, scene.movers.plans)
+        sort(chosen[i], state, scene, part.scratch)
     sensing.scan_together(chosen.shape[0], state, part.members, part.lidar, part.scratch)
     for n in chosen:
         sensing.distort(n, n + 1, state, part.lidar)
@@ -236,8 +262,7 @@ def end_period(packed: Any, true: Array, before: Array, wheels: Array, counted: 
             for i in range(3):  # the pose by the wheels is not where the lidar is
                 row[m, sensing.POSE + i] = state.pose[n, m, i]
                 row[m, sensing.TWIST + i] = true[n, m, i]
-        if members.crowded:
-            contacts.sort_bodies(state.bodies, n, scratch.cells)
+        sort(n, state, surroundings_of(n, members), scratch)
         waiting = sensing.scan_or_wait(n, waiting, state, members, part.lidar, motion, scratch)
     sensing.scan_together(waiting, state, members, part.lidar, scratch)
     sensing.distort(0, state.pose.shape[0], state, part.lidar)

@@ -36,6 +36,7 @@ def test_the_throughput_is_told_with_the_ratio_at_equal_work_first():
     assert found["single_env_gym_steps_per_s"] > 0.0
     assert found["single_env_with_estimator_steps_per_s"] > 0.0
     assert found["memory_bytes_per_env"] > 0.0
+    assert "share_of_usual" not in found
     # Speed is judged where it is measured, not here; that all move, see and end is not speed.
     assert not [line for line in found["failures"] if not line.startswith("share_of_")]
 
@@ -100,6 +101,42 @@ def test_a_peer_that_is_as_fast_as_ours_misses_no_bar_but_the_ratios(benchmark, 
     result["times_as_fast_at_equal_work"] = {"ir_sim": 1.0, "irsim_x": float("nan")}
     missed = benchmark.judge(result, measured(peers))
     assert [line.split(":")[0] for line in missed] == ["times_as_fast_at_equal_work"] * 2
+
+
+@pytest.mark.parametrize(
+    ("given", "bar"),
+    [({"lidar": "hokuyo_ust_10lx"}, 0.75), ({"obstacles": 260}, 0.65)],
+)
+def test_another_lidar_or_more_obstacles_have_to_keep_their_share_of_the_usual_rate(
+    benchmark, peers, given, bar
+):
+    case = benchmark.Case(**given)
+    for share, enough in ((bar, True), (bar - 0.01, False), (float("nan"), False)):
+        result = {"share_of_usual": share, "drove": {}, "times_as_fast_at_equal_work": {}}
+        missed = benchmark.judge(result, measured(peers), case)
+        assert [line.split(":")[0] for line in missed] == ([] if enough else ["share_of_usual"])
+
+
+def test_another_case_is_of_another_lidar_or_as_dense_with_more_obstacles(benchmark):
+    assert benchmark.USUAL.is_usual
+    case = benchmark.Case(lidar="hokuyo_ust_10lx")
+    assert (case.is_usual, case.model.lidar.beams, case.world) == (False, 1081, benchmark.WORLD)
+    case = benchmark.Case(obstacles=40)
+    assert not case.is_usual
+    assert case.model is benchmark.MODEL
+    assert case.world.obstacles[0].counts == (40, 40)
+    assert case.world.size == pytest.approx((12.0, 12.0))
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("option", [("--lidar", "hokuyo_ust_10lx"), ("--obstacles", "40")])
+def test_another_case_is_told_beside_the_usual_one_and_one_that_is_slow_misses_its_bar(option):
+    _, found = asked(SCRIPT, *FEW, *option)
+    assert found["share_of_usual"] > 0.0
+    assert "usual" in found["drove"]
+    assert not [line for line in found["failures"] if not line.startswith("share_of_")]
+    missed = fails(SCRIPT, "slow", *FEW, *option)
+    assert any(line.startswith("share_of_usual: ") for line in missed), missed
 
 
 def test_a_peer_that_crashes_is_a_missed_bar_and_no_hang(peers, monkeypatch, tmp_path):

@@ -25,7 +25,7 @@ def scan(kernel, grid, pose, range_max=100.0, rays=None, before=np.inf):
     out = np.full(len(rays), before, np.float32)
     c, s = np.cos(pose[2]), np.sin(pose[2])
     arrays = grid if isinstance(grid, tuple) else grid.arrays
-    beams = Beams(rays, -np.pi, 2.0 * np.pi / len(rays), True)
+    beams = Beams(np.ascontiguousarray(rays.T), -np.pi, 2.0 * np.pi / len(rays), True)
     lidar = LidarPose(*map(float, pose[:2]), c, s)
     map_kernels.map_into(out, beams, lidar, range_max, arrays, kernel == "exact", scan_lanes())
     return out

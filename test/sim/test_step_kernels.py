@@ -12,6 +12,7 @@ from robots import FOOTPRINT, RADIUS, direct_model, field, lidar
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.lidar.cell_kernels import body_cells
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -284,8 +285,7 @@ def test_a_robot_sees_and_touches_the_static_map(model):
     assert simulator.data.pose[0, 0, 0] < 0.6 - front + 0.02
 
 
-def test_the_robots_of_a_crowd_see_what_a_scanner_sees_among_all_bodies(monkeypatch):
-    monkeypatch.setattr(sizes, "SCATTERED", 0)
+def test_the_robots_of_a_crowd_see_what_a_scanner_sees_among_all_bodies():
     data = builtin_model("differential").lidar.model_dump() | {"mount": (0.5, 0.2, 0.3)}
     spec = LidarSpec.model_validate(data | {"beams": 72})
     model = direct_model(sensor=spec)
@@ -368,9 +368,43 @@ def test_a_crowd_in_cells_comes_to_the_bits_of_looking_at_all_bodies(monkeypatch
     monkeypatch.setattr(sizes, "CROWD", 0)
     assert sizes.Sizes(1, 12, 3, 0, 0).crowded
     assert digests(2, robots=12, steps=60) == plain
-    monkeypatch.setattr(sizes, "SCATTERED", 0)
-    assert sizes.Sizes(1, 12, 3, 0, 0).scattered
-    assert digests(2, robots=12, steps=60) == plain
+
+
+def drive_among(world, worlds=3, threads=1, steps=200):
+    """All that each world comes to among many obstacles that stand, reset in between."""
+    longest = {"longest_delay": 25, "longest_age": 25}
+    simulator = FastSimulator(model(), world, worlds, 2, threads=threads, **longest)
+    rng, found, touched = np.random.default_rng(3), [], 0
+    simulator.data.age[:1] = 7  # a scan of where the robot was
+    for t in range(steps):
+        if t % 50 == 0:
+            scenes = simulator.reset(np.arange(worlds) + t)
+            assert np.array_equal(scenes.bodies, simulator.obstacles)
+            drawn = simulator.scenes(np.arange(worlds) + t).bodies
+            assert np.array_equal(np.sort(scenes.bodies, axis=1), np.sort(drawn, axis=1))
+            command = rng.uniform(-1.0, 1.0, (worlds, 2, 3))
+        simulator.step(command)
+        touched += int(simulator.data.collided.sum())
+        in_order = np.sort(simulator.data.bodies, axis=1)  # the order is the simulator's own
+        found += [array.copy() for array in simulator.data._replace(bodies=in_order)]
+    assert touched > 0
+    return found
+
+
+def test_obstacles_in_cells_are_seen_and_touched_like_those_that_are_all_looked_at(monkeypatch):
+    world, made = field(12.0, count=40), []
+    monkeypatch.setattr(
+        sizes, "body_cells", lambda n, *rest: made.append(n) or body_cells(n, *rest)
+    )
+    in_cells = [drive_among(world, threads=threads) for threads in (1, 2)]
+    assert 3 in made
+    made.clear()
+    monkeypatch.setattr(sizes, "STANDING", 41)
+    plain = drive_among(world)
+    assert 3 not in made
+    for found in in_cells:
+        for one, other in zip(plain, found, strict=True):
+            assert np.array_equal(one, other, equal_nan=True)
 
 
 def test_the_parts_are_all_worlds_in_order():

@@ -1,0 +1,189 @@
+"""Bodies in square cells: those around a point are found without a look at all the others.
+
+A body lies in the cell of its centre. One larger than a cell lies in none: it is always found, as
+are those that move. The outermost cells reach to infinity. Bodies are sorted at once, so that those
+of neighbouring cells lie side by side, or added one by one to chains that begin in the cells.
+Shared arguments: n is a world, k a body of it, a place is in [m].
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.exact_kernels import RADIUS, X, Y
+
+LEFT, BOTTOM, PER_METRE, SIDE, LARGEST, MOVED, FRAME = range(7)
+"""Columns of `BodyCells.frame`: x, y of the first cell [m], cells per metre, cells in a row,
+greatest radius of the bodies in cells [m], greatest distance moved since by any of them [m]."""
+PER_BODY = 1.0  # Cells
+
+
+FEWEST = 20  # Least number of bodies among which those in cells are found in less time
+
+
+class BodyCells(NamedTuple):
+    """The bodies of N worlds in G x G cells each; without rows, all bodies are always found."""
+
+    # (N, G^2 + 2) place in `then` of each cell's first body, those in no cell being the last; of
+    # chains the first body itself, or -1
+    first: NDArray[np.int32]
+    # (N, K) the bodies in the order of cells; of a chain the next, or -1. One row if the bodies
+    # themselves are put into that order
+    then: NDArray[np.int32]
+    ordered: bool  # True if they are
+    frame: NDArray[np.float64]  # (N, FRAME)
+    found: NDArray[np.int32]  # (K,) scratch for one thread: the bodies around a point
+
+
+def body_cells(worlds: int, bodies: int, ordered: bool = False) -> BodyCells:
+    """Allocates cells for K bodies in each of N worlds; 0 worlds if all bodies are looked at."""
+    rows = min(worlds, 1) if ordered else worlds
+    side = max(int(math.sqrt(PER_BODY * bodies)), 1)
+    cells = BodyCells(
+        np.full((worlds, side * side + 2), -1, np.int32), np.full((rows, bodies), -1, np.int32),
+        ordered, np.zeros((worlds, FRAME)), np.arange(bodies, dtype=np.int32),
+    )  # fmt: skip
+    cells.frame[:, SIDE] = side
+    return cells
+
+
+@kernel(inline=True)
+def _place(way, cells_per_metre, side):  # type: ignore[no-untyped-def]
+    return int(min(max(way * cells_per_metre, 0.0), side - 1.0))
+
+
+@kernel
+def cover(n, low_x, low_y, extent, cells):  # type: ignore[no-untyped-def]
+    """Lays the cells of a world, which are empty then, over a square from (low_x, low_y) on."""
+    if cells.first.shape[0] > 0:
+        frame = cells.frame[n]
+        frame[LEFT], frame[BOTTOM] = low_x, low_y
+        frame[PER_METRE] = frame[SIDE] / extent if 0.0 < extent < np.inf else 1.0
+        clear(n, cells)
+
+
+@kernel
+def clear(n, cells):  # type: ignore[no-untyped-def]
+    """Empties the cells of a world."""
+    if cells.first.shape[0] > 0:
+        cells.first[n, :] = -1
+        cells.frame[n, LARGEST] = cells.frame[n, MOVED] = 0.0
+
+
+@kernel(inline=True)
+def _cell(body, stands, frame):  # type: ignore[no-untyped-def]
+    side = int(frame[SIDE])
+    if not stands or body[RADIUS] * frame[PER_METRE] > 1.0:
+        return side * side
+    frame[LARGEST] = max(frame[LARGEST], body[RADIUS])
+    row = _place(body[Y] - frame[BOTTOM], frame[PER_METRE], side)
+    return row * side + _place(body[X] - frame[LEFT], frame[PER_METRE], side)
+
+
+@kernel
+def add(n, k, body, cells):  # type: ignore[no-untyped-def]
+    """Adds a body (7,) to the chain of its cell."""
+    if cells.first.shape[0] > 0:
+        cell = _cell(body, True, cells.frame[n])
+        cells.then[n, k], cells.first[n, cell] = cells.first[n, cell], k
+
+
+@kernel
+def sort(n, bodies, standing, cells):  # type: ignore[no-untyped-def]
+    """Sorts the bodies (K, 7) of a world, the first `standing` of them by cells."""
+    low_x, low_y, high_x, high_y = np.inf, np.inf, -np.inf, -np.inf
+    for k in range(standing):
+        if bodies[k, RADIUS] > 0.0:
+            low_x, high_x = min(low_x, bodies[k, X]), max(high_x, bodies[k, X])
+            low_y, high_y = min(low_y, bodies[k, Y]), max(high_y, bodies[k, Y])
+    cover(n, low_x, low_y, max(high_x - low_x, high_y - low_y, 1e-6), cells)
+    first, cell_of, frame = cells.first[n], cells.found, cells.frame[n]
+    then = cells.then[0 if cells.ordered else n]
+    first[:] = 0
+    for k in range(bodies.shape[0]):
+        if bodies[k, RADIUS] > 0.0:
+            cell_of[k] = _cell(bodies[k], k < standing, frame)
+            first[cell_of[k] + 1] += 1
+    for cell in range(first.shape[0] - 1):
+        first[cell + 1] += first[cell]
+    end = first[first.shape[0] - 1]
+    for k in range(bodies.shape[0] - 1, -1, -1):
+        if bodies[k, RADIUS] > 0.0:
+            first[cell_of[k] + 1] -= 1
+            then[first[cell_of[k] + 1]] = k
+    for cell in range(first.shape[0] - 1):  # each entry is that of the cell before it
+        first[cell] = first[cell + 1]
+    first[first.shape[0] - 1] = end
+
+
+@kernel(inline=True)
+def _copy(body, to):  # type: ignore[no-untyped-def]
+    for i in range(7):
+        to[i] = body[i]
+
+
+@kernel
+def put_in_order(n, bodies, standing, spare, cells):  # type: ignore[no-untyped-def]
+    """Sorts the first `standing` bodies (K, 7) themselves, absent ones last; no others may move.
+
+    Of neighbours in the same lines of memory, few miss the cache; `spare` (K, 7) is scratch.
+    """
+    sort(n, bodies[:standing], standing, cells)
+    first, end = cells.first[n], cells.first.shape[1] - 1
+    present, count = first[end], first[end]
+    for k in range(standing):
+        _copy(bodies[k], spare[k])
+    for i in range(present):
+        _copy(spare[cells.then[0, i]], bodies[i])
+    for k in range(standing):
+        if spare[k, RADIUS] <= 0.0:
+            _copy(spare[k], bodies[count])
+            count += 1
+    first[end] = bodies.shape[0]  # the absent, and those that move, are always found
+
+
+@kernel(inline=True)
+def _window(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
+    """Returns the least and the greatest row, and column, of the cells around a place."""
+    frame, per_metre, side = cells.frame[n], cells.frame[n, PER_METRE], cells.frame[n, SIDE]
+    far, x, y = reach + frame[LARGEST] + frame[MOVED], x - frame[LEFT], y - frame[BOTTOM]
+    low, high = _place(y - far, per_metre, side), _place(y + far, per_metre, side)
+    return low, high, _place(x - far, per_metre, side), _place(x + far, per_metre, side)
+
+
+@kernel
+def around(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
+    """Writes to `found` the sorted bodies that may be within `reach` [m] of a place; how many."""
+    first, then, found, count = cells.first, cells.then, cells.found, 0
+    if first.shape[0] == 0:
+        return found.shape[0]  # which lists all bodies
+    low, high, left, right = _window(n, x, y, reach, cells)
+    side = int(cells.frame[n, SIDE])
+    for row in range(low, high + 1):
+        for i in range(first[n, row * side + left], first[n, row * side + right + 1]):
+            found[count], count = i if cells.ordered else then[n, i], count + 1
+    for i in range(first[n, side * side], first[n, side * side + 1]):
+        found[count], count = i if cells.ordered else then[n, i], count + 1
+    return count
+
+
+@kernel
+def around_added(n, x, y, reach, cells):  # type: ignore[no-untyped-def]
+    """Like `around`, of the bodies that were added one by one."""
+    first, then, found, count = cells.first, cells.then, cells.found, 0
+    if first.shape[0] == 0:
+        return found.shape[0]
+    low, high, left, right = _window(n, x, y, reach, cells)
+    side = int(cells.frame[n, SIDE])
+    for row in range(low, high + 2):
+        begin, end = row * side + left, row * side + right
+        if row > high:  # of the bodies in no cell
+            begin, end = side * side, side * side
+        for cell in range(begin, end + 1):
+            k = first[n, cell]
+            while k >= 0:
+                found[count], k, count = k, then[n, k], count + 1
+    return count

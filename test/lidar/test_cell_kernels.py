@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nics_drl_bridge.lidar import cell_kernels as kernels
+
+RADIUS = 5
+
+
+def bodies_at_random(rng, count):
+    bodies = np.zeros((count, 7))
+    bodies[:, :2] = rng.uniform(-10.0, 10.0, (count, 2))
+    bodies[:, RADIUS] = rng.choice([0.0, 0.1, 0.3, 5.0], count, p=[0.1, 0.4, 0.4, 0.1])
+    return bodies
+
+
+def within(bodies, spot, reach):
+    """The bodies there that do come within reach."""
+    away = np.hypot(*(bodies[:, :2] - spot).T) - bodies[:, RADIUS]
+    return set(np.flatnonzero((away <= reach) & (bodies[:, RADIUS] > 0.0)).tolist())
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 60, 300])
+def test_every_body_that_comes_within_reach_is_found_once(count):
+    rng = np.random.default_rng(count)
+    cells, some = kernels.body_cells(3, count), False
+    for n in rng.integers(0, 3, 40):
+        bodies, standing = bodies_at_random(rng, count), int(rng.integers(count + 1))
+        kernels.sort(n, bodies, standing, cells)
+        spot, reach = rng.uniform(-12.0, 12.0, 2), rng.uniform(0.0, 3.0)
+        several = kernels.around(n, *spot, reach, cells)
+        got = cells.found[:several].tolist()
+        assert len(set(got)) == len(got)
+        assert within(bodies, spot, reach) <= set(got)
+        moving = np.flatnonzero(bodies[standing:, RADIUS] > 0.0) + standing
+        assert set(moving.tolist()) <= set(got)
+        some = some or several < count // 2
+    assert some or count < 60
+
+
+def test_bodies_that_moved_since_are_found_if_the_cells_know_how_far():
+    rng, cells, late = np.random.default_rng(0), kernels.body_cells(1, 100), 0
+    for _ in range(40):
+        bodies, turn = bodies_at_random(rng, 100), rng.uniform(-np.pi, np.pi, 100)
+        kernels.sort(0, bodies, 100, cells)
+        bodies[:, :2] += 2.0 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        spot = rng.uniform(-10.0, 10.0, 2)
+        missed = within(bodies, spot, 1.0) - {*cells.found[: kernels.around(0, *spot, 1.0, cells)]}
+        late += len(missed)
+        cells.frame[0, kernels.MOVED] = 2.0
+        assert within(bodies, spot, 1.0) <= {*cells.found[: kernels.around(0, *spot, 1.0, cells)]}
+    assert late > 0
+
+
+def test_bodies_are_found_as_they_are_added():
+    cells = kernels.body_cells(1, 30)
+    bodies = bodies_at_random(np.random.default_rng(1), 30)
+    bodies[:, RADIUS] = np.where(np.arange(30) % 7, 0.1, 5.0)
+    kernels.cover(0, -10.0, -10.0, 20.0, cells)
+    for k in range(30):
+        assert k not in cells.found[: kernels.around_added(0, *bodies[k, :2], 0.0, cells)]
+        kernels.add(0, k, bodies[k], cells)
+        assert k in cells.found[: kernels.around_added(0, *bodies[k, :2], 0.0, cells)]
+    kernels.clear(0, cells)
+    assert kernels.around_added(0, 0.0, 0.0, 100.0, cells) == 0
+
+
+def test_bodies_that_are_put_in_order_are_the_same_and_found_among_those_that_move():
+    rng, cells = np.random.default_rng(2), kernels.body_cells(2, 80, ordered=True)
+    few = 0
+    for n in (0, 1, 1, 0):
+        bodies = bodies_at_random(rng, 80)
+        before = bodies.copy()
+        kernels.put_in_order(n, bodies, 70, np.zeros((81, 7)), cells)
+        assert np.array_equal(bodies[70:], before[70:])
+        assert sorted(map(tuple, bodies)) == sorted(map(tuple, before))
+        for spot in rng.uniform(-12.0, 12.0, (10, 2)):
+            got = cells.found[: kernels.around(n, *spot, 1.0, cells)].tolist()
+            assert len(set(got)) == len(got)
+            assert within(bodies, spot, 1.0) | set(range(70, 80)) <= set(got)
+            few += len(got) < 40
+    assert few > 0
+
+
+def test_without_cells_all_bodies_are_found():
+    cells = kernels.body_cells(0, 5)
+    kernels.clear(0, cells)
+    kernels.add(0, 2, np.ones(7), cells)
+    for around in (kernels.around, kernels.around_added):
+        assert around(0, 50.0, 50.0, 0.1, cells) == 5
+    assert cells.found.tolist() == [0, 1, 2, 3, 4]
