@@ -1,0 +1,254 @@
+"""How well is a robot driven through worlds that others made, among which teams are compared?
+
+The 250 public worlds of the BARN challenge (`nics_drl_bridge.sim.barn`), or those of a folder: a
+Jackal drives 10 m between cylinders, without a map. A run's score is the challenge's: success by
+T* / clip(T, 2 T*, 8 T*), where T* is the time that the shortest path takes at 2 m/s; 0.5 is the
+most. Success, collision and time are those of the simulator's true pose and contacts.
+"""
+
+from __future__ import annotations
+
+import csv
+import tempfile
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from measuring.shortest_path import shortest_path
+from measuring.standing import Standing
+from measuring.verdict import answer, parser_of
+from numpy.typing import NDArray
+
+from nics_drl_bridge.commands.episodes import FAST, MUJOCO, drive_in
+from nics_drl_bridge.config import dump_yaml
+from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.generator import open_model
+from nics_drl_bridge.policy.evaluation import DRIFT_M, drive_worlds
+from nics_drl_bridge.policy.policies import POLICIES, Policy, open_policy, shipped_policies
+from nics_drl_bridge.sim import barn
+from nics_drl_bridge.sim.scenes import member_of
+from nics_drl_bridge.sim.sdf import read_sdf
+from nics_drl_bridge.sim.world import World
+from nics_drl_bridge.sim.world_set import WorldSet
+
+CONTROLS = {"standing": "the driving: the robot stands still"}
+ROBOT = "jackal"
+BARS = {"fast": {"success": 0.95, "collision": 0.02, "score": 0.45}, "mujoco_dds": {"score": 0.40}}
+SPEED, GOAL_RADIUS, TIME_OUT_S = 2.0, 1.0, 100.0
+"""[m/s], [m], [s]: of the challenge."""
+FIRST_SEED = 1_000_000
+EVERY = 10
+"""In MuJoCo every tenth world is driven, in real time or slower."""
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Course:
+    """A world and the length of its shortest path, from start to goal [m]."""
+
+    world: World
+    length: float
+
+    @property
+    def best_s(self) -> float:
+        """T*, the time that the shortest path takes at full speed [s]."""
+        return self.length / SPEED
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Runs of one policy (R,), each in one of the courses, by its number."""
+
+    numbers: NDArray[np.int64]
+    success: NDArray[np.bool_]
+    collision: NDArray[np.bool_]
+    time_s: Array
+    score: Array
+
+    def figures(self, rows: Any = slice(None)) -> dict[str, float | None]:
+        """Shares, and the mean time of the successful runs; `rows` are some of the runs."""
+        success, collision = self.success[rows], self.collision[rows]
+        time = self.time_s[rows][success]
+        return {
+            "success": float(success.mean()),
+            "collision": float(collision.mean()),
+            "time_out": float((~success & ~collision).mean()),
+            "time_s": float(time.mean()) if len(time) else None,
+            "score": float(self.score[rows].mean()),
+        }
+
+    def told(self) -> dict[str, Any]:
+        """Figures of all runs, and of those in each world."""
+        each = {str(n): self.figures(self.numbers == n) for n in np.unique(self.numbers).tolist()}
+        return {**self.figures(), "worlds": each}
+
+
+def length_of(path: Array) -> float:
+    """Length of a path (P, 2) from the start to the goal [m]."""
+    whole = np.concatenate([[barn.START[:2]], path, [barn.GOAL]])
+    return float(np.linalg.norm(np.diff(whole, axis=0), axis=1).sum())
+
+
+def courses(folder: Path | None) -> dict[int, Course]:
+    """The courses by number: those that come with the package, or those of a folder.
+
+    A folder has `world_N.world` files as Gazebo reads them, or `cylinders.csv` with the columns
+    world, x_m, y_m. Paths are those of a `reference_paths.csv` there, or the shortest ones that
+    are found. Raises ConfigError if there are none.
+    """
+    if folder is None:
+        return {
+            number: Course(barn.barn_world(number), length_of(barn.barn_path(number)))
+            for number in barn.barn_numbers()
+        }
+    given = {number: worlds(at) for number, at in read_cylinders(folder).items()}
+    known = read_csv(folder / "reference_paths.csv")
+    paths = {n: known[n] if n in known else shortest_path(at) for n, (_, at) in given.items()}
+    return {n: Course(world, length_of(paths[n])) for n, (world, _) in given.items()}
+
+
+def worlds(at: Array) -> tuple[World, Array]:
+    """A world of cylinders (K, 2), and these."""
+    usual = barn.barn_world(1)
+    (group,) = usual.obstacles
+    poses = tuple((x, y, 0.0) for x, y in at.tolist())
+    cylinders = group.model_copy(update={"at": poses})
+    return usual.model_copy(update={"obstacles": (cylinders,)}), at
+
+
+def read_cylinders(folder: Path) -> dict[int, Array]:
+    """The cylinders (K, 2) of each world of a folder, by its number."""
+    found = read_csv(folder / "cylinders.csv")
+    for file in folder.glob("*.world"):
+        number = int("".join(filter(str.isdigit, file.stem)) or -1)
+        poses = [pose[:2] for group in read_sdf(file).obstacles for pose in group.at]
+        found[number] = np.array(poses)
+    if not found:
+        raise ConfigError(f"{folder}: holds neither cylinders.csv nor world files; name another.")
+    return dict(sorted(found.items()))
+
+
+def read_csv(file: Path) -> dict[int, Array]:
+    """Points (P, 2) of each world in a file with the columns world, x_m, y_m; {} for no file."""
+    found: dict[int, list[tuple[float, float]]] = defaultdict(list)
+    if file.is_file():
+        with file.open(newline="") as lines:
+            for row in csv.DictReader(lines):
+                found[int(row["world"])].append((float(row["x_m"]), float(row["y_m"])))
+    return {number: np.array(points) for number, points in found.items()}
+
+
+def seeds_of(world: WorldSet, runs: int) -> NDArray[np.int64]:
+    """Seeds (P * runs,) of episodes, of which `runs` are in each world, one world after another."""
+    found: dict[int, list[int]] = defaultdict(list)
+    seed = FIRST_SEED
+    while sum(map(len, found.values())) < runs * len(world.members):
+        member = member_of(world, seed)
+        if len(found[member]) < runs:
+            found[member].append(seed)
+        seed += 1
+    return np.array([found[p] for p in range(len(world.members))]).ravel()
+
+
+def judged(
+    given: Mapping[int, Course], runs: int, success: Sequence[bool], collision: Sequence[bool],
+    time_s: Sequence[float],
+) -> Runs:  # fmt: skip
+    """Scores the runs in each of the courses, one course after another."""
+    numbers = np.repeat(list(given), runs)
+    best = np.repeat([course.best_s for course in given.values()], runs)
+    score = np.asarray(success) * best / np.clip(time_s, 2.0 * best, 8.0 * best)
+    flags = np.asarray(success, np.bool_), np.asarray(collision, np.bool_)
+    return Runs(numbers, *flags, np.asarray(time_s, np.float64), score)
+
+
+def drive_fast(name: str, given: Mapping[int, Course], runs: int, control: str | None) -> Runs:
+    """Drives in the fast simulator, all worlds side by side."""
+    model = open_model(ROBOT)
+    policy, task = opened(name, control)
+    world = WorldSet("courses", tuple(course.world for course in given.values()))
+    seeds = seeds_of(world, runs)
+    steps = round(TIME_OUT_S / model.control_period)
+    env = BridgeVectorEnv(len(seeds), model, world, task, max_episode_steps=steps)
+    out = drive_worlds(env, policy.act, seeds.tolist())
+    return judged(given, runs, out.success, out.collision, out.steps * model.control_period)
+
+
+def opened(name: str, control: str | None) -> tuple[Policy, Navigation]:
+    """A policy and its task, which ends where the truth, too, is near enough to the goal."""
+    policy, task = open_policy(name, open_model(ROBOT))
+    if control == "standing":
+        policy = Standing(task)
+    return policy, replace(task, goal_radius=GOAL_RADIUS - DRIFT_M)
+
+
+def drive_mujoco(name: str, given: Mapping[int, Course]) -> Runs:
+    """Drives in MuJoCo over DDS, one world after the other."""
+    model = open_model(ROBOT)
+    with tempfile.TemporaryDirectory() as folder:
+        for number, course in given.items():
+            text = dump_yaml(course.world.model_dump(mode="json", exclude_none=True))
+            Path(folder, f"{number:04d}.yaml").write_text(text)
+        world = WorldSet("courses", tuple(course.world for course in given.values()))
+        seeds = seeds_of(world, 1).tolist()
+        episodes = drive_in(MUJOCO, name, ROBOT, folder, seeds, Path(folder), lambda _: None)
+    success = [one.result == "success" for one in episodes]
+    collision = [one.result == "collision" for one in episodes]
+    time_s = [one.steps * model.control_period for one in episodes]
+    return judged(given, 1, success, collision, time_s)
+
+
+def missed(place: str, figures: Mapping[str, Any], policy: str) -> list[str]:
+    """A sentence for each bar that a policy missed."""
+    said = []
+    for name, bar in BARS[place].items():
+        value, least = figures[name], name != "collision"
+        if not (value >= bar if least else value <= bar):
+            said.append(f"{policy}: {name} {value:.3f}, bar {bar}")
+    return said
+
+
+def table_of(figures: Mapping[str, Mapping[str, Any]]) -> str:
+    """A line for each policy."""
+    names = ("success", "collision", "time_out", "time_s", "score")
+    text = f"{'':<24}" + "".join(f"{name:>11}" for name in names) + "\n"
+    for policy, told in figures.items():
+        values = (told[name] for name in names)
+        shown = "".join(f"{'-' if v is None else format(v, '.3g'):>11}" for v in values)
+        text += f"{Path(policy).name:<24}{shown}\n"
+    return text
+
+
+def main() -> None:
+    """Prints a table, or one JSON object; ends with 1 when the first policy misses a bar."""
+    parser = parser_of(__doc__, CONTROLS)
+    parser.add_argument("--worlds", type=Path, help="folder of other worlds")
+    parser.add_argument("--in", dest="place", choices=tuple(BARS), default=FAST)
+    parser.add_argument("--policy", nargs="+", help="files or names; the shipped one, and planners")
+    parser.add_argument("--runs", type=int, default=1, help="in each world")
+    given = parser.parse_args()
+    own = [ROBOT] if ROBOT in shipped_policies() else []
+    policies = given.policy or [*own, *(name for name in POLICIES if name != "random")]
+    found = courses(given.worlds)
+    if given.place == MUJOCO:
+        found = dict(list(found.items())[::EVERY])
+    figures = {
+        name: (
+            drive_fast(name, found, given.runs, given.control)
+            if given.place == FAST
+            else drive_mujoco(name, found)
+        ).told()
+        for name in policies
+    }
+    first = figures[policies[0]]
+    result = {**first, "policy": policies[0], "policies": figures}
+    answer(result, missed(given.place, first, policies[0]), table_of(figures), given.json)
+
+
+if __name__ == "__main__":
+    main()
