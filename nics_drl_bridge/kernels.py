@@ -158,6 +158,14 @@ class _Kernel(CPUDispatcher):  # type: ignore[misc]
         self._inner_only.add(args)
 
 
+class _Index(IndexDataCacheFile):  # type: ignore[misc]
+    def _load_index(self) -> dict[Any, Any]:
+        try:
+            return dict(super()._load_index())
+        except (AttributeError, ImportError):  # a class of some arguments is no longer there
+            return {}
+
+
 class _Cache(FunctionCache):  # type: ignore[misc]
     """Machine code on disk, stamped with the content of all that it was compiled from."""
 
@@ -166,7 +174,7 @@ class _Cache(FunctionCache):  # type: ignore[misc]
         # Without the line of the function: it may move, and leaves nothing behind.
         name = re.sub(r"-\d+(\.py\d+\w*)$", rf"{kind}\1", self._impl.filename_base)
         stamp = digest_of(Path(function.__code__.co_filename))
-        self._cache_file = IndexDataCacheFile(self._cache_path, name, stamp)
+        self._cache_file = _Index(self._cache_path, name, stamp)
         # It is compared before the types are unpickled, whose classes may have other names now.
         self._cache_file._version += stamp
 

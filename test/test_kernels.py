@@ -112,6 +112,17 @@ def test_a_class_of_arguments_may_get_another_name(package):
 
 
 @pytest.mark.slow
+def test_a_class_of_arguments_from_elsewhere_may_go(package):
+    named = "from typing import NamedTuple\n\nclass Pair(NamedTuple):\n    one: float\n"
+    (package / "low_kernels.py").write_text(LOW.replace("x + STEP", "x[0] + STEP"))
+    code = "from nics_drl_bridge import low_kernels, pairs; print(low_kernels.low(pairs.{}(1.0)))"
+    for name in ("Pair", "Couple"):
+        (package / "pairs.py").write_text(named.replace("Pair", name))
+        run = [sys.executable, "-B", "-c", code.format(name)]
+        subprocess.run(run, cwd=package.parent, check=True)
+
+
+@pytest.mark.slow
 def test_a_kernel_that_moves_within_its_file_leaves_nothing_behind(package):
     ask(package)
     before = len(list(package.rglob("*.nbi")))

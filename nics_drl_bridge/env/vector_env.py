@@ -55,7 +55,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     in the next step, whose action it ignores) or `SameStep` (at once; the last observation is in
     `info["final_obs"]`). With `copy` the caller may keep what `step` returns; False reuses the
     array of the observation in the next step. `render_mode` is `rgb_array`, of every world, or
-    None. Further arguments are those of the FastSimulator: `renderer` (`baked` by default, or
+    None. With a `contact_reward` an episode also ends, with this reward, at a contact that the task
+    does not notice, e.g. behind a lidar of 270 degrees. Further arguments are those of the FastSimulator: `renderer` (`baked` by default, or
     `exact`), `threads`, on which the numbers do not depend, and `randomisation`, see `BridgeEnv`.
     Raises ConfigError, ModelError for an unknown name or a wrong file.
     """
@@ -70,12 +71,12 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         world: str | AnyWorld = "arena", task: str | type[Task] | Task = "navigation",
         task_options: dict[str, Any] | None = None, max_episode_steps: int = 300,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP, copy: bool = True, *,
-        render_mode: str | None = None, **simulation: Any,
+        render_mode: str | None = None, contact_reward: float | None = None, **simulation: Any,
     ) -> None:  # fmt: skip
         self._pictures: list[Any] = []  # `close` needs it even if the rest raises
         check_render_mode(render_mode, self.metadata)
         self.num_envs, self.render_mode = num_envs, render_mode
-        self._limit, self.copy = max_episode_steps, copy
+        self._limit, self.copy, self._contact_reward = max_episode_steps, copy, contact_reward
         mode = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
         if mode not in MODES:
             raise ConfigError(f"autoreset_mode {mode!r}: must be one of {', '.join(MODES)}.")
@@ -216,6 +217,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self.simulator.step_part(part, command)
         memory = {name: rows[part] for name, rows in self.memory.items()}
         outcome = self.task.step_into(out[part], before, self._view(part), memory)
+        if self._contact_reward is not None:
+            outcome = with_contacts(outcome, data.collided[part] != 0, self._contact_reward)
         terms = outcome.terms
         if self.robots > 1 and ended.any():
             terms = {name: np.where(ended, 0.0, term) for name, term in terms.items()}
@@ -285,6 +288,14 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         """Closes the pictures."""
         for picture in self._pictures:
             picture.close()
+
+
+def with_contacts(outcome: Outcome, touched: Flags, reward: float) -> Outcome:
+    """An outcome in which robots that touched something (n, M) have ended, with this reward."""
+    unseen = touched & ~outcome.ended
+    terms = outcome.terms | {"contact": np.multiply(reward, unseen)}
+    info = outcome.info | {"collision": unseen | outcome.info.get("collision", unseen)}
+    return Outcome(terms, outcome.ended | unseen, info)
 
 
 def flat(observations: Observation) -> Observation:

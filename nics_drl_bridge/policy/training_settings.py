@@ -57,6 +57,8 @@ class TrainingSettings(Schema):
     robot: str = "differential"  # name of a shipped robot, or the folder of a model
     worlds: dict[str, Count] = Field(default_factory=lambda: {"circles": 256}, min_length=1)
     randomisation: str | None = None  # quantities drawn in each episode: a shipped one or a file
+    # ends an episode at a contact that the task does not notice, e.g. behind a lidar of 270 degrees
+    contact_reward: float | None = None
     steps: Count = 1_000_000  # environment steps of all worlds together
     max_episode_steps: Count = 300  # an episode ends as a time-out after this many steps
     algorithm: Literal["ppo", "sac"] = "ppo"
