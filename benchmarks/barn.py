@@ -41,6 +41,7 @@ ROBOT = "jackal"
 BARS = {"fast": {"success": 0.95, "collision": 0.02, "score": 0.45}, "mujoco_dds": {"score": 0.40}}
 SPEED, GOAL_RADIUS, TIME_OUT_S = 2.0, 1.0, 100.0
 """[m/s], [m], [s]: of the challenge."""
+HEIGHT = 0.2  # of the lidar [m]
 FIRST_SEED = 1_000_000
 EVERY = 10
 """In MuJoCo every tenth world is driven, in real time or slower."""
@@ -126,7 +127,7 @@ def read_cylinders(folder: Path) -> dict[int, Array]:
     found = read_csv(folder / "cylinders.csv")
     for file in folder.glob("*.world"):
         number = int("".join(filter(str.isdigit, file.stem)) or -1)
-        poses = [pose[:2] for group in read_sdf(file).obstacles for pose in group.at]
+        poses = [pose[:2] for group in read_sdf(file, HEIGHT).obstacles for pose in group.at]
         found[number] = np.array(poses)
     if not found:
         raise ConfigError(f"{folder}: holds neither cylinders.csv nor world files; name another.")

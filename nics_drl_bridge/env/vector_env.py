@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
 from nics_drl_bridge.env.guard import check_action, check_reset, give, override
 from nics_drl_bridge.env.kernels import episode_seeds
+from nics_drl_bridge.env.privileged import Privileged, Supervisor
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task, still, team_space, total
 from nics_drl_bridge.errors import ConfigError
@@ -55,8 +56,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     in the next step, whose action it ignores) or `SameStep` (at once; the last observation is in
     `info["final_obs"]`). With `copy` the caller may keep what `step` returns; False reuses the
     array of the observation in the next step. `render_mode` is `rgb_array`, of every world, or
-    None. With a `contact_reward` an episode also ends, with this reward, at a contact that the task
-    does not notice, e.g. behind a lidar of 270 degrees. Further arguments are those of the FastSimulator: `renderer` (`baked` by default, or
+    None. `privileged` are rewards by what only the simulator knows. Further arguments are those of the FastSimulator: `renderer` (`baked` by default, or
     `exact`), `threads`, on which the numbers do not depend, and `randomisation`, see `BridgeEnv`.
     Raises ConfigError, ModelError for an unknown name or a wrong file.
     """
@@ -71,12 +71,12 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         world: str | AnyWorld = "arena", task: str | type[Task] | Task = "navigation",
         task_options: dict[str, Any] | None = None, max_episode_steps: int = 300,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP, copy: bool = True, *,
-        render_mode: str | None = None, contact_reward: float | None = None, **simulation: Any,
+        render_mode: str | None = None, privileged: Privileged | None = None, **simulation: Any,
     ) -> None:  # fmt: skip
         self._pictures: list[Any] = []  # `close` needs it even if the rest raises
         check_render_mode(render_mode, self.metadata)
         self.num_envs, self.render_mode = num_envs, render_mode
-        self._limit, self.copy, self._contact_reward = max_episode_steps, copy, contact_reward
+        self._limit, self.copy = max_episode_steps, copy
         mode = autoreset_mode.value if isinstance(autoreset_mode, AutoresetMode) else autoreset_mode
         if mode not in MODES:
             raise ConfigError(f"autoreset_mode {mode!r}: must be one of {', '.join(MODES)}.")
@@ -92,6 +92,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self.action_space = batch_space(self.single_action_space, num_envs)
         simulation = {"renderer": "baked", **simulation}
         self.simulator = FastSimulator(self.model, self.world, num_envs, self.robots, **simulation)
+        self._supervisor = Supervisor(privileged, self.simulator) if privileged else None
         self._each = (num_envs, self.robots, *(self.task.action_space.shape or ()))
         self._still = still(self.model.robot)
         self._period_ns = round(self.model.control_period * NS_PER_S)
@@ -119,7 +120,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             "episode": self._episode, "starts": self._starts, "bodies": self._bodies,
         }  # fmt: skip
         data = {f"data.{name}": rows for name, rows in self.simulator.data._asdict().items()}
-        return {**own, **data, "goals": self.simulator.goals}
+        known = self._supervisor.changing if self._supervisor else {}
+        return {**own, **data, **known, "goals": self.simulator.goals}
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None,
@@ -154,6 +156,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             starts = np.empty((len(worlds), self.robots, 3))
             give(starts, "start", options["start"])
         scenes = self.simulator.reset(seeds, worlds, starts)
+        if self._supervisor is not None:
+            self._supervisor.begin(worlds, scenes)
         self._bodies[worlds] = scenes.bodies
         self._starts[worlds] = self.simulator.data.pose[worlds]
         fresh = self.task.reset(Episodes(seeds, self._starts[worlds], self.simulator.goals[worlds]))
@@ -217,8 +221,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self.simulator.step_part(part, command)
         memory = {name: rows[part] for name, rows in self.memory.items()}
         outcome = self.task.step_into(out[part], before, self._view(part), memory)
-        if self._contact_reward is not None:
-            outcome = with_contacts(outcome, data.collided[part] != 0, self._contact_reward)
+        if self._supervisor is not None:
+            outcome = self._supervisor.judge(part, outcome)
         terms = outcome.terms
         if self.robots > 1 and ended.any():
             terms = {name: np.where(ended, 0.0, term) for name, term in terms.items()}
@@ -288,14 +292,6 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         """Closes the pictures."""
         for picture in self._pictures:
             picture.close()
-
-
-def with_contacts(outcome: Outcome, touched: Flags, reward: float) -> Outcome:
-    """An outcome in which robots that touched something (n, M) have ended, with this reward."""
-    unseen = touched & ~outcome.ended
-    terms = outcome.terms | {"contact": np.multiply(reward, unseen)}
-    info = outcome.info | {"collision": unseen | outcome.info.get("collision", unseen)}
-    return Outcome(terms, outcome.ended | unseen, info)
 
 
 def flat(observations: Observation) -> Observation:

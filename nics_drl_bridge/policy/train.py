@@ -87,7 +87,7 @@ def make_train_env(
         BridgeVectorEnv(
             count, model, (scenes or {}).get(world, world), settings.task, settings.task_options,
             settings.max_episode_steps, "SameStep", randomisation=settings.randomisation,
-            contact_reward=settings.contact_reward,
+            privileged=settings.privileged,
         )
         for world, count in settings.worlds.items()
     )  # fmt: skip

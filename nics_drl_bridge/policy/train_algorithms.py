@@ -30,6 +30,7 @@ from nics_drl_bridge.policy.training_settings import TrainingSettings
 Array = NDArray[np.float64]
 LEAST_RATE = 0.02  # share of PPO's learning rate that is left at the end
 LEAST_STD, LIMIT = 0.05, 5.0
+LEAST_SHARE = 0.25  # of the span of an observation, or of its mean if that is less
 OBSERVED_STEPS = 64
 GAIN = 2.0**0.5
 ACTION_GAIN = 0.01  # initial gain of an actor's last layer: all its actions are near zero
@@ -94,7 +95,10 @@ def observed(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Array]:
                 actions = rng.uniform(-1.0, 1.0, (env.num_envs, *space.shape)).astype(np.float32)
         seen.append(np.array(env.step(actions)[0]))
     rows = np.concatenate(seen).reshape(-1, seen[0].shape[-1]).astype(np.float64)
-    return rows.mean(axis=0), np.maximum(rows.std(axis=0), LEAST_STD)
+    mean = rows.mean(axis=0)
+    # What is seen later may differ by more than what is seen near the starts.
+    span = np.minimum(env.observation_space.high - env.observation_space.low, np.abs(mean))
+    return mean, np.maximum(rows.std(axis=0), np.maximum(LEAST_STD, LEAST_SHARE * span))
 
 
 class Actor(torch.nn.Module):

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml, share_folder, validate
+from nics_drl_bridge.env.privileged import Privileged
 from nics_drl_bridge.errors import ConfigError
 
 Share = Annotated[float, Field(gt=0.0, le=1.0)]
@@ -57,8 +58,7 @@ class TrainingSettings(Schema):
     robot: str = "differential"  # name of a shipped robot, or the folder of a model
     worlds: dict[str, Count] = Field(default_factory=lambda: {"circles": 256}, min_length=1)
     randomisation: str | None = None  # quantities drawn in each episode: a shipped one or a file
-    # ends an episode at a contact that the task does not notice, e.g. behind a lidar of 270 degrees
-    contact_reward: float | None = None
+    privileged: Privileged = Privileged()  # rewards by what only the simulator knows
     steps: Count = 1_000_000  # environment steps of all worlds together
     max_episode_steps: Count = 300  # an episode ends as a time-out after this many steps
     algorithm: Literal["ppo", "sac"] = "ppo"

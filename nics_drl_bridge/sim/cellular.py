@@ -72,7 +72,8 @@ def _field(given: Cellular, rng: np.random.Generator) -> NDArray[np.bool_]:
     around = np.ones((3, 3), np.int64)
     around[1, 1] = 0
     for _ in range(rng.integers(given.smoothing[0], given.smoothing[1] + 1)):
-        neighbours = ndimage.convolve(filled.astype(np.int64), around, mode="constant")
+        beside = np.pad(filled.astype(np.int64), ((0, 0), (1, 1)), constant_values=1)  # the walls
+        neighbours = ndimage.convolve(beside, around, mode="constant")[:, 1:-1]
         filled = (neighbours >= FILLED) | (filled & (neighbours > EMPTIED))
     return filled
 

@@ -102,14 +102,14 @@ class SceneSampler:
         slots = [g for g, group in enumerate(world.obstacles) for _ in range(group.counts[1])]
         self.count = len(slots)  # K, the greatest number of obstacles
         self.motions: tuple[Motion | None, ...] = tuple(world.obstacles[g].motion for g in slots)
-        self._plan = _plan(world, footprint_radius, slots, known)
+        self.plan = _plan(world, footprint_radius, slots, known)
         # Greatest number of cells, obstacles and corners; threads draw with a scratch memory each.
-        self.room = _room_for(self._plan)
+        self.room = _room_for(self.plan)
         self.scratches: list[SceneScratch] = []
 
     @cached_property
     def _packed(self) -> Any:
-        return pack(self._plan)
+        return pack(self.plan)
 
     def __getstate__(self) -> dict[str, Any]:  # a copy packs its plan anew
         return {name: value for name, value in vars(self).items() if name != "_packed"}
@@ -165,7 +165,7 @@ class SceneSampler:
         least, greatest = self.world.goal_distance
         return ConfigError(
             f"{where}: key 'goal_distance': no free places for {self.robots} start(s) and goal(s) "
-            f"of robots of radius {self._plan.footprint:g} m, {least:g} to {greatest:g} m apart "
+            f"of robots of radius {self.plan.footprint:g} m, {least:g} to {greatest:g} m apart "
             f"with a way between among {self.count} obstacles, {scene}; change `goal_distance`, "
             "lower `clearance` or `obstacles`, or enlarge the field."
         )

@@ -1,0 +1,60 @@
+"""Rewards for training by what only the simulator knows: true contacts, and ways to the goals."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.config import Schema
+from nics_drl_bridge.env.task import Outcome
+from nics_drl_bridge.generator import footprint_shape
+from nics_drl_bridge.sim.guide import Guide
+from nics_drl_bridge.sim.scenes import Scenes
+from nics_drl_bridge.sim.simulator import FastSimulator
+
+Array = NDArray[np.float64]
+
+
+class Privileged(Schema):
+    """Rewards beside those of the task; none by default."""
+
+    # of a contact that the task does not notice, e.g. behind a lidar of 270 deg; it ends the episode
+    contact: float | None = None
+    path: float = 0.0  # for each metre by which the way to the goal, around obstacles, gets shorter
+
+
+class Supervisor:
+    """Gives the privileged rewards in the worlds of a simulator."""
+
+    def __init__(self, given: Privileged, simulator: FastSimulator) -> None:
+        self._given, self._data = given, simulator.data
+        self._guide: Guide | None = None
+        self._left = np.zeros(simulator.data.pose.shape[:2])  # (N, M) lengths of the ways [m]
+        if given.path:
+            footprint = footprint_shape(simulator.model.robot)
+            self._guide = Guide(simulator.sampler, footprint, len(self._left))
+
+    @property
+    def changing(self) -> dict[str, NDArray[np.generic]]:
+        """The arrays that change from step to step, by name."""
+        if self._guide is None:
+            return {}
+        return {"guide.fields": self._guide.fields, "guide.left": self._left}
+
+    def begin(self, worlds: NDArray[np.intp], scenes: Scenes) -> None:
+        """Begins episodes in some worlds (n,)."""
+        if self._guide is not None:
+            self._guide.begin(worlds, scenes)
+            self._left[worlds] = self._guide.lengths(worlds, self._data)
+
+    def judge(self, part: slice, outcome: Outcome) -> Outcome:
+        """An outcome of a part of the worlds, with these rewards besides."""
+        terms, ended, info = outcome.terms, outcome.ended, outcome.info
+        if self._guide is not None:
+            left = self._guide.lengths(part, self._data)
+            terms = terms | {"path": self._given.path * (self._left[part] - left)}
+            self._left[part] = left
+        if self._given.contact is not None:
+            unseen = (self._data.collided[part] != 0) & ~ended
+            terms = terms | {"contact": np.multiply(self._given.contact, unseen)}
+            info = info | {"collision": unseen | info.get("collision", unseen)}
+            ended = ended | unseen
+        return Outcome(terms, ended, info)

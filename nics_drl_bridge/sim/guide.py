@@ -1,0 +1,74 @@
+"""Guide: how far robots still have to drive to their goals, around all that stands in a scene.
+
+Only a simulator knows it: it is for the reward of a training.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.lidar.shapes import Circle, Polygon
+from nics_drl_bridge.sim import guide_kernels as kernels
+from nics_drl_bridge.sim.guide_kernels import GuideGrid
+from nics_drl_bridge.sim.scenes import Scenes, SetSampler
+from nics_drl_bridge.sim.state import State
+
+Array = NDArray[np.float64]
+CELL, MOST_CELLS = 0.15, 10_000  # side of a cell [m]; in fields with more cells it is larger
+
+
+class Guide:
+    """Lengths of the ways from the robots to their goals, in `worlds` copies of a world or set.
+
+    Args:
+        sampler: of the scenes.
+        footprint: outline of the robots.
+        worlds: N, number of copies.
+    """
+
+    def __init__(self, sampler: SetSampler, footprint: Circle | Polygon, worlds: int) -> None:
+        members = [each.world for each in sampler.samplers]
+        extents = np.array([member.extent for member in members])
+        spans = extents[:, 2:] - extents[:, :2]
+        cells = np.maximum(CELL, np.sqrt(spans.prod(axis=1) / MOST_CELLS))
+        sizes = np.maximum(np.ceil(spans / cells[:, None])[:, ::-1], 2.0).astype(np.int64)
+        walls = np.full((len(members), *sizes.max(axis=0)), np.inf, np.float32)
+        stands = np.zeros((len(members), sampler.count), np.bool_)
+        for p, each in enumerate(sampler.samplers):
+            kernels.walls_of(
+                walls[p, : sizes[p, 0], : sizes[p, 1]], extents[p], cells[p], each.plan.space.cells
+            )
+            stands[p, : each.count] = [motion is None for motion in each.motions]
+        frames = np.column_stack([extents[:, :2], cells])
+        inner = footprint.radius
+        if isinstance(footprint, Polygon):
+            inner = _inscribed(np.array(footprint.outline))
+        self._grid = GuideGrid(
+            walls, frames, sizes, stands, sampler.samplers[0].plan.outlines, inner,
+            footprint.radius,
+        )  # fmt: skip
+        self.fields = np.zeros((worlds, sampler.robots, *walls.shape[1:]), np.float32)
+
+    def begin(self, worlds: NDArray[np.intp], scenes: Scenes) -> None:
+        """Finds the ways in the scenes of episodes that begin in some worlds (n,)."""
+        given = worlds, np.asarray(scenes.member, np.int64), scenes.bodies, scenes.goals
+        kernels.guide(self.fields, *given, self._grid)
+
+    def lengths(self, rows: slice | NDArray[np.intp], data: State) -> Array:
+        """Lengths (n, M) [m] of the ways from where the robots of some worlds are.
+
+        A metre counts for more than one where obstacles are near, see `guide_kernels`.
+        """
+        poses = data.pose[rows]
+        out = np.empty(poses.shape[:2])
+        kernels.lengths(out, poses, data.member[rows], self.fields[rows], self._grid)
+        return out
+
+
+def _inscribed(outline: Array) -> float:
+    """Distance of the origin from the nearest side of an outline (V, 2) [m]."""
+    sides = np.roll(outline, -1, axis=0) - outline
+    shares = np.clip(-(outline * sides).sum(axis=1) / (sides * sides).sum(axis=1), 0.0, 1.0)
+    nearest = outline + shares[:, None] * sides
+    return float(np.hypot(*nearest.T).min())

@@ -1,0 +1,170 @@
+"""Compiled: how far a robot still has to drive to its goal, around all that stands.
+
+The arrival times of a front that starts at the goal (eikonal equation), on square cells, by fast
+sweeping (Zhao 2005). Near obstacles the front is slower, so that wide ways are shorter than tight
+ones; inside them it is slow, but goes on, so that every place has its way.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SIN, OutlineArrays, X, Y
+from nics_drl_bridge.sim import collision_kernels as collision
+from nics_drl_bridge.sim import scene_kernels
+from nics_drl_bridge.sim.state import Array, Integers
+
+COMFORT = 0.3  # space beside the robot's circle from which on a way is no longer tight [m]
+TIGHT, SQUEEZED, BLOCKED = 2.0, 6.0, 12.0
+"""Cost of a metre where the circle just fits, where only the outline does, and where nothing does;
+in between it is interpolated."""
+ROUNDS = 20
+"""Greatest number of sweeps in all four directions."""
+
+
+class GuideGrid(NamedTuple):
+    """Cells over the worlds of a set of P, and all that stands in every scene."""
+
+    walls: NDArray[np.float32]  # (P, rows, columns) distance to walls and map [m]
+    frames: Array  # (P, 3) least x, y and the cells' side [m]
+    sizes: Integers  # (P, 2) rows and columns that a world has
+    stands: NDArray[np.bool_]  # (P, K) obstacles that do not move
+    outlines: OutlineArrays  # of the obstacles' shapes
+    inner: float  # radii of the robot's inscribed and circumscribed circles [m]
+    outer: float
+
+
+@kernel(allocates=True)
+def walls_of(out, extent, cell, cells):  # type: ignore[no-untyped-def]
+    """Writes the distances (rows, columns) to walls and map, which `cells` have, of coarser cells.
+
+    The field is `extent` (4,), beyond which nothing is free.
+    """
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            x, y = extent[0] + (j + 0.5) * cell, extent[1] + (i + 0.5) * cell
+            row, column, _ = scene_kernels.cell_of(x, y, cells)
+            inside = 0 <= row < cells.distances.shape[0] and 0 <= column < cells.distances.shape[1]
+            out[i, j] = cells.distances[row, column] if inside else np.float32(0.0)
+
+
+@kernel(allocates=True)
+def guide(out, worlds, member, bodies, goals, grid):  # type: ignore[no-untyped-def]
+    """Writes lengths of ways [m] from each cell to out[world, m] (rows, columns) float32.
+
+    Of the worlds (n,) given: member (n,), bodies (n, K, 7), goals (n, M, 2).
+    """
+    rows, columns = grid.walls.shape[1], grid.walls.shape[2]
+    gaps = np.empty((rows, columns), np.float32)
+    for n in range(worlds.shape[0]):
+        p = member[n]
+        wide = grid.sizes[p]
+        space = gaps[: wide[0], : wide[1]]
+        space[...] = grid.walls[p, : wide[0], : wide[1]]
+        x, y, cell = grid.frames[p, 0], grid.frames[p, 1], grid.frames[p, 2]
+        for k in range(bodies.shape[1]):
+            if grid.stands[p, k] and bodies[n, k, RADIUS] > 0.0:
+                _approach(space, bodies[n, k], x, y, cell, grid)
+        for i in range(wide[0]):
+            for j in range(wide[1]):
+                space[i, j] = np.float32(cell * _cost(space[i, j], grid))
+        for m in range(goals.shape[1]):
+            field = out[worlds[n], m, : wide[0], : wide[1]]
+            u, v = (goals[n, m, 0] - x) / cell - 0.5, (goals[n, m, 1] - y) / cell - 0.5
+            _sweep(field, space, u, v)
+
+
+@kernel
+def _approach(space, body, x, y, cell, grid):  # type: ignore[no-untyped-def]
+    """Lowers the space (rows, columns) around cells to that beside a body [m]."""
+    far = body[RADIUS] + grid.outer + COMFORT
+    first = max(int((body[Y] - far - y) / cell), 0)
+    last = min(int((body[Y] + far - y) / cell), space.shape[0] - 1)
+    left = max(int((body[X] - far - x) / cell), 0)
+    right = min(int((body[X] + far - x) / cell), space.shape[1] - 1)
+    outline = collision.outline_of(body, grid.outlines)
+    for i in range(first, last + 1):
+        for j in range(left, right + 1):
+            dx, dy = x + (j + 0.5) * cell - body[X], y + (i + 0.5) * cell - body[Y]
+            gap = math.sqrt(dx * dx + dy * dy) - body[RADIUS]
+            if outline.begin < outline.end:
+                across = body[COS] * dy - body[SIN] * dx
+                gap = collision.outline_point(body[COS] * dx + body[SIN] * dy, across, outline)
+            space[i, j] = min(space[i, j], np.float32(gap))
+
+
+@kernel
+def _cost(space, grid):  # type: ignore[no-untyped-def]
+    """Cost of a metre at a place with so much space around it [m]."""
+    beside = space - grid.outer
+    if beside >= COMFORT:
+        return 1.0
+    if beside >= 0.0:
+        return TIGHT + (1.0 - TIGHT) * beside / COMFORT
+    if space > grid.inner:
+        return SQUEEZED + (TIGHT - SQUEEZED) * (space - grid.inner) / (grid.outer - grid.inner)
+    return BLOCKED
+
+
+@kernel
+def _sweep(field, cost, u, v):  # type: ignore[no-untyped-def]
+    """Arrival times of a front that starts at column u, row v (fractions) and takes `cost`."""
+    rows, columns = field.shape
+    field[...] = np.inf
+    gi, gj = min(max(round(v), 0), rows - 1), min(max(round(u), 0), columns - 1)
+    for i in range(max(gi - 1, 0), min(gi + 2, rows)):
+        for j in range(max(gj - 1, 0), min(gj + 2, columns)):
+            field[i, j] = math.sqrt((u - j) ** 2 + (v - i) ** 2) * cost[i, j]
+    for _ in range(ROUNDS):
+        changed = False
+        for way in range(4):
+            down, left = way >= 2, way % 2 == 1
+            for a in range(rows):
+                i = rows - 1 - a if down else a
+                for b in range(columns):
+                    j = columns - 1 - b if left else b
+                    beside, above = np.float32(np.inf), np.float32(np.inf)
+                    if j > 0:
+                        beside = field[i, j - 1]
+                    if j < columns - 1:
+                        beside = min(beside, field[i, j + 1])
+                    if i > 0:
+                        above = field[i - 1, j]
+                    if i < rows - 1:
+                        above = min(above, field[i + 1, j])
+                    least, f = min(beside, above), cost[i, j]
+                    if least == np.inf:
+                        continue
+                    apart = abs(beside - above)
+                    if apart >= f:
+                        time = least + f
+                    else:
+                        time = np.float32(0.5) * (
+                            beside + above + math.sqrt(np.float32(2.0) * f * f - apart * apart)
+                        )
+                    if time < field[i, j]:
+                        changed |= field[i, j] - time > np.float32(1e-3)
+                        field[i, j] = time
+        if not changed:
+            return
+
+
+@kernel(allocates=True)
+def lengths(out, poses, member, fields, grid):  # type: ignore[no-untyped-def]
+    """Writes the lengths (N, M) [m] of the ways from poses (N, M, 3), interpolated linearly."""
+    for n in range(out.shape[0]):
+        p = member[n]
+        x, y, cell = grid.frames[p, 0], grid.frames[p, 1], grid.frames[p, 2]
+        rows, columns = grid.sizes[p, 0], grid.sizes[p, 1]
+        for m in range(out.shape[1]):
+            u = min(max((poses[n, m, 0] - x) / cell - 0.5, 0.0), columns - 1.000001)
+            v = min(max((poses[n, m, 1] - y) / cell - 0.5, 0.0), rows - 1.000001)
+            i, j = int(v), int(u)
+            s, t = v - i, u - j
+            one, two = fields[n, m, i], fields[n, m, i + 1]
+            out[n, m] = (1.0 - s) * ((1.0 - t) * one[j] + t * one[j + 1]) + s * (
+                (1.0 - t) * two[j] + t * two[j + 1]
+            )
