@@ -56,7 +56,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     in the next step, whose action it ignores) or `SameStep` (at once; the last observation is in
     `info["final_obs"]`). With `copy` the caller may keep what `step` returns; False reuses the
     array of the observation in the next step. `render_mode` is `rgb_array`, of every world, or
-    None. `privileged` are rewards by what only the simulator knows. Further arguments are those of the FastSimulator: `renderer` (`baked` by default, or
+    None. `privileged` are rewards by what only the simulator knows; an episode that is no success is
+    driven again up to `retries` times (`SameStep` only). Further arguments are those of the FastSimulator: `renderer` (`baked` by default, or
     `exact`), `threads`, on which the numbers do not depend, and `randomisation`, see `BridgeEnv`.
     Raises ConfigError, ModelError for an unknown name or a wrong file.
     """
@@ -71,7 +72,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         world: str | AnyWorld = "arena", task: str | type[Task] | Task = "navigation",
         task_options: dict[str, Any] | None = None, max_episode_steps: int = 300,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP, copy: bool = True, *,
-        render_mode: str | None = None, privileged: Privileged | None = None, **simulation: Any,
+        render_mode: str | None = None, privileged: Privileged | None = None, retries: int = 0,
+        **simulation: Any,
     ) -> None:  # fmt: skip
         self._pictures: list[Any] = []  # `close` needs it even if the rest raises
         check_render_mode(render_mode, self.metadata)
@@ -92,6 +94,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self.action_space = batch_space(self.single_action_space, num_envs)
         simulation = {"renderer": "baked", **simulation}
         self.simulator = FastSimulator(self.model, self.world, num_envs, self.robots, **simulation)
+        self._retries = retries
         self._supervisor = Supervisor(privileged, self.simulator) if privileged else None
         self._each = (num_envs, self.robots, *(self.task.action_space.shape or ()))
         self._still = still(self.model.robot)
@@ -107,6 +110,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self._over: Flags = np.zeros(count, np.bool_)
         self._first: NDArray[np.int64] = np.zeros(count, np.int64)
         self._episode: NDArray[np.int64] = np.full(count, -1)
+        self._tries: NDArray[np.int64] = np.zeros(count, np.int64)  # of the running episode again
         self._starts: Array = np.zeros((count, robots, 3))
         self._bodies: Array = np.zeros((count, self.simulator.sampler.count, BODY))
         self.memory: Memory = {}
@@ -117,7 +121,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         """The arrays that change from step to step, by name; see `policy.train_checkpoint`."""
         own = {
             "ended": self.ended, "over": self._over, "first": self._first,
-            "episode": self._episode, "starts": self._starts, "bodies": self._bodies,
+            "episode": self._episode, "tries": self._tries, "starts": self._starts, "bodies": self._bodies,
         }  # fmt: skip
         data = {f"data.{name}": rows for name, rows in self.simulator.data._asdict().items()}
         known = self._supervisor.changing if self._supervisor else {}
@@ -241,9 +245,17 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
                 shown[n] = flat(out)[n].copy()
             infos |= masked({"final_obs": shown}, over)
             infos |= masked({"final_info": self._known() | facts}, over, True)
+            self._try_again(over, facts)
             run = self.simulator.run_parts
             run(lambda part: self._begin(part.start + np.flatnonzero(over[part]), out))
         self._tell(infos, facts, over)
+
+    def _try_again(self, over: Flags, facts: dict[str, Any]) -> None:
+        """Lets worlds whose episode is `over` without success begin it once more, up to a limit."""
+        success = np.reshape(facts.get("is_success", over), (self.num_envs, -1)).all(axis=1)
+        again = over & ~success & (self._tries < self._retries)
+        self._tries[over] = np.where(again, self._tries + 1, 0)[over]
+        self._episode[again] -= 1
 
     def _tell(self, infos: dict[str, Any], facts: dict[str, Any], begun: Flags) -> None:
         infos |= masked(self._known(), np.ones_like(begun))

@@ -87,7 +87,7 @@ def make_train_env(
         BridgeVectorEnv(
             count, model, (scenes or {}).get(world, world), settings.task, settings.task_options,
             settings.max_episode_steps, "SameStep", randomisation=settings.randomisation,
-            privileged=settings.privileged,
+            privileged=settings.privileged, retries=settings.retries,
         )
         for world, count in settings.worlds.items()
     )  # fmt: skip

@@ -59,6 +59,7 @@ class TrainingSettings(Schema):
     worlds: dict[str, Count] = Field(default_factory=lambda: {"circles": 256}, min_length=1)
     randomisation: str | None = None  # quantities drawn in each episode: a shipped one or a file
     privileged: Privileged = Privileged()  # rewards by what only the simulator knows
+    retries: int = Field(default=0, ge=0, le=1000)  # times that a failed episode is driven again
     steps: Count = 1_000_000  # environment steps of all worlds together
     max_episode_steps: Count = 300  # an episode ends as a time-out after this many steps
     algorithm: Literal["ppo", "sac"] = "ppo"
