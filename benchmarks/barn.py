@@ -30,11 +30,13 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.policy.evaluation import DRIFT_M, drive_worlds
 from nics_drl_bridge.policy.policies import POLICIES, Policy, open_policy, shipped_policies
+from nics_drl_bridge.policy.train import POLICY, TrainOrder, run
+from nics_drl_bridge.policy.training_settings import load_training
 from nics_drl_bridge.sim import barn
 from nics_drl_bridge.sim.scenes import member_of
 from nics_drl_bridge.sim.sdf import read_sdf
 from nics_drl_bridge.sim.world import World
-from nics_drl_bridge.sim.world_set import WorldSet
+from nics_drl_bridge.sim.world_set import BARN, AnyWorld, WorldSet, load_worlds
 
 CONTROLS = {"standing": "the driving: the robot stands still"}
 ROBOT = "jackal"
@@ -43,6 +45,7 @@ SPEED, GOAL_RADIUS, TIME_OUT_S = 2.0, 1.0, 100.0
 """[m/s], [m], [s]: of the challenge."""
 HEIGHT = 0.2  # of the lidar [m]
 FIRST_SEED = 1_000_000
+FOLDS = 5
 EVERY = 10
 """In MuJoCo every tenth world is driven, in real time or slower."""
 Array = NDArray[np.float64]
@@ -144,7 +147,7 @@ def read_csv(file: Path) -> dict[int, Array]:
     return {number: np.array(points) for number, points in found.items()}
 
 
-def seeds_of(world: WorldSet, runs: int) -> NDArray[np.int64]:
+def seeds_of(world: AnyWorld, runs: int) -> NDArray[np.int64]:
     """Seeds (P * runs,) of episodes, of which `runs` are in each world, one world after another."""
     found: dict[int, list[int]] = defaultdict(list)
     seed = FIRST_SEED
@@ -188,20 +191,52 @@ def opened(name: str, control: str | None) -> tuple[Policy, Navigation]:
     return policy, replace(task, goal_radius=GOAL_RADIUS - DRIFT_M)
 
 
+def drive_folds(settings: str, given: Mapping[int, Course], runs: int, control: str | None) -> Runs:
+    """Learns `FOLDS` policies, each from the other worlds than those that it then drives in."""
+    chosen, driven = load_training(settings), []
+    numbers = list(given)
+    for fold in range(FOLDS):
+        held = {number: given[number] for number in numbers[fold::FOLDS]}
+        with tempfile.TemporaryDirectory() as folder:
+            rest = {n: course for n, course in given.items() if n not in held}
+            worlds = {
+                saved(rest, Path(folder, "worlds")) if world == BARN else world: copies
+                for world, copies in chosen.worlds.items()
+            }
+            order = TrainOrder(
+                chosen.model_copy(update={"worlds": worlds}), (fold,), Path(folder, "run"), 1
+            )
+            run(order)
+            policy = str(order.out / f"seed_{fold}" / POLICY)
+            driven.append(drive_fast(policy, held, runs, control))
+    parts = zip(*(vars(one).values() for one in driven), strict=True)
+    return Runs(*(np.concatenate(part) for part in parts))
+
+
+def saved(given: Mapping[int, Course], folder: Path) -> str:
+    """Writes the worlds into a folder; returns its name."""
+    folder.mkdir()
+    for number, course in given.items():
+        text = dump_yaml(course.world.model_dump(mode="json", exclude_none=True))
+        Path(folder, f"{number:04d}.yaml").write_text(text)
+    return str(folder)
+
+
 def drive_mujoco(name: str, given: Mapping[int, Course]) -> Runs:
     """Drives in MuJoCo over DDS, one world after the other."""
     model = open_model(ROBOT)
     with tempfile.TemporaryDirectory() as folder:
-        for number, course in given.items():
-            text = dump_yaml(course.world.model_dump(mode="json", exclude_none=True))
-            Path(folder, f"{number:04d}.yaml").write_text(text)
-        world = WorldSet("courses", tuple(course.world for course in given.values()))
-        seeds = seeds_of(world, 1).tolist()
-        episodes = drive_in(MUJOCO, name, ROBOT, folder, seeds, Path(folder), lambda _: None)
-    success = [one.result == "success" for one in episodes]
-    collision = [one.result == "collision" for one in episodes]
-    time_s = [one.steps * model.control_period for one in episodes]
-    return judged(given, 1, success, collision, time_s)
+        worlds = saved(given, Path(folder, "worlds"))
+        seeds = seeds_of(load_worlds(worlds), 1).tolist()
+        episodes = drive_in(MUJOCO, name, ROBOT, worlds, seeds, Path(folder), lambda _: None)
+    away = [np.linalg.norm(one.path[:, :2] - one.goal, axis=1) < GOAL_RADIUS for one in episodes]
+    success = [bool(near.any()) for near in away]  # an episode goes on to the policy's own radius
+    collision = [
+        one.result == "collision" and not near
+        for one, near in zip(episodes, success, strict=True)
+    ]  # fmt: skip
+    steps = [int(near.argmax()) or one.steps for one, near in zip(episodes, away, strict=True)]
+    return judged(given, 1, success, collision, [model.control_period * n for n in steps])
 
 
 def missed(place: str, figures: Mapping[str, Any], policy: str) -> list[str]:
@@ -231,21 +266,29 @@ def main() -> None:
     parser.add_argument("--worlds", type=Path, help="folder of other worlds")
     parser.add_argument("--in", dest="place", choices=tuple(BARS), default=FAST)
     parser.add_argument("--policy", nargs="+", help="files or names; the shipped one, and planners")
+    parser.add_argument(
+        "--five-fold",
+        metavar="SETTINGS",
+        nargs="?",
+        const=f"shipped_{ROBOT}",
+        help="learn from four fifths of the worlds, judge in the others",
+    )
     parser.add_argument("--runs", type=int, default=1, help="in each world")
     given = parser.parse_args()
-    own = [ROBOT] if ROBOT in shipped_policies() else []
-    policies = given.policy or [*own, *(name for name in POLICIES if name != "random")]
     found = courses(given.worlds)
     if given.place == MUJOCO:
         found = dict(list(found.items())[::EVERY])
-    figures = {
-        name: (
-            drive_fast(name, found, given.runs, given.control)
-            if given.place == FAST
-            else drive_mujoco(name, found)
-        ).told()
-        for name in policies
-    }
+    own = [ROBOT] if ROBOT in shipped_policies() else []
+    policies = given.policy or [*own, *(name for name in POLICIES if name != "random")]
+    figures = {}
+    if given.five_fold:
+        policies = [given.five_fold]
+        figures[given.five_fold] = drive_folds(given.five_fold, found, given.runs, given.control)
+    elif given.place == FAST:
+        figures = {name: drive_fast(name, found, given.runs, given.control) for name in policies}
+    else:
+        figures = {name: drive_mujoco(name, found) for name in policies}
+    figures = {name: runs.told() for name, runs in figures.items()}
     first = figures[policies[0]]
     result = {**first, "policy": policies[0], "policies": figures}
     answer(result, missed(given.place, first, policies[0]), table_of(figures), given.json)

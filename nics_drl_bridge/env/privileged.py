@@ -16,9 +16,9 @@ Array = NDArray[np.float64]
 class Privileged(Schema):
     """Rewards beside those of the task; none by default."""
 
-    # of a contact that the task does not notice, e.g. behind a lidar of 270 deg; it ends the episode
+    # of a contact that the task does not notice, e.g. behind a lidar of 270 deg; it ends an episode
     contact: float | None = None
-    path: float = 0.0  # for each metre by which the way to the goal, around obstacles, gets shorter
+    path: float = 0.0  # for each metre by which the way around obstacles to the goal gets shorter
 
 
 class Supervisor:

@@ -56,9 +56,10 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     in the next step, whose action it ignores) or `SameStep` (at once; the last observation is in
     `info["final_obs"]`). With `copy` the caller may keep what `step` returns; False reuses the
     array of the observation in the next step. `render_mode` is `rgb_array`, of every world, or
-    None. `privileged` are rewards by what only the simulator knows; an episode that is no success is
-    driven again up to `retries` times (`SameStep` only). Further arguments are those of the FastSimulator: `renderer` (`baked` by default, or
-    `exact`), `threads`, on which the numbers do not depend, and `randomisation`, see `BridgeEnv`.
+    None. For training, `privileged` are rewards by what only the simulator knows, and an episode
+    that is no success is driven again up to `retries` times (`SameStep` only). Further arguments
+    are those of the FastSimulator: `renderer` (`baked` by default, or `exact`), `threads`, on which
+    the numbers do not depend, and `randomisation`, see `BridgeEnv`.
     Raises ConfigError, ModelError for an unknown name or a wrong file.
     """
 
@@ -121,7 +122,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         """The arrays that change from step to step, by name; see `policy.train_checkpoint`."""
         own = {
             "ended": self.ended, "over": self._over, "first": self._first,
-            "episode": self._episode, "tries": self._tries, "starts": self._starts, "bodies": self._bodies,
+            "episode": self._episode, "tries": self._tries, "starts": self._starts,
+            "bodies": self._bodies,
         }  # fmt: skip
         data = {f"data.{name}": rows for name, rows in self.simulator.data._asdict().items()}
         known = self._supervisor.changing if self._supervisor else {}

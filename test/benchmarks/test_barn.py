@@ -1,0 +1,104 @@
+"""BARN in small: the worlds of a folder are those of the package, and scores the benchmark's."""
+
+from __future__ import annotations
+
+import csv
+from importlib import import_module
+
+import numpy as np
+import pytest
+
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.sim import barn as worlds
+
+from .runs import BENCHMARKS, asked, fails
+
+NUMBERS = (1, 150 - 1, 299)
+SDF = """<sdf version="1.6"><world name="default">{}</world></sdf>"""
+CYLINDER = """<model name="c{}"><pose frame="">{} {} 0 0 0 0</pose><static>1</static><link name="l">
+<collision name="c"><geometry><cylinder><radius>0.075</radius><length>1</length></cylinder>
+</geometry><pose>0 0 0.5 0 0 0</pose></collision></link></model>"""
+
+
+@pytest.fixture
+def barn(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    return import_module("barn")
+
+
+def cylinders(number):
+    (group,) = worlds.barn_world(number).obstacles
+    return [(x, y) for x, y, _ in group.at]
+
+
+def write(file, points):
+    with file.open("w", newline="") as lines:
+        rows = csv.writer(lines)
+        rows.writerow(("world", "x_m", "y_m"))
+        rows.writerows((n, x, y) for n in NUMBERS for x, y in points(n))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write(tmp_path / "cylinders.csv", cylinders)
+    write(tmp_path / "reference_paths.csv", lambda n: worlds.barn_path(n).tolist())
+    return tmp_path
+
+
+def test_worlds_of_a_folder_are_those_that_come_with_the_package(barn, folder):
+    own, given = barn.courses(None), barn.courses(folder)
+    assert tuple(given) == NUMBERS
+    for number, course in given.items():
+        assert course.length == pytest.approx(own[number].length)
+        assert course.world.obstacles == own[number].world.obstacles
+
+
+def test_a_folder_of_gazebo_worlds_is_read_without_paths(barn, tmp_path):
+    text = "".join(CYLINDER.format(k, *at) for k, at in enumerate(cylinders(1)))
+    (tmp_path / "world_1.world").write_text(SDF.format(text))
+    (number, course), *_ = barn.courses(tmp_path).items()
+    own = barn.courses(None)[1]
+    assert number == 1
+    assert sorted(course.world.obstacles[0].at) == sorted(own.world.obstacles[0].at)
+    assert course.length == pytest.approx(own.length, rel=0.15)
+
+
+def test_own_shortest_paths_are_a_little_shorter_than_those_of_the_benchmark(barn):
+    from measuring.shortest_path import shortest_path
+
+    shares = [
+        barn.length_of(shortest_path(np.array(cylinders(n)))) / barn.length_of(worlds.barn_path(n))
+        for n in worlds.barn_numbers()[::25]
+    ]
+    assert 0.85 < min(shares) <= max(shares) < 1.02
+
+
+def test_a_folder_without_worlds_is_refused(barn, tmp_path):
+    with pytest.raises(ConfigError, match=r"holds neither cylinders\.csv nor world files"):
+        barn.courses(tmp_path)
+
+
+def test_a_score_is_half_for_twice_the_best_time_and_falls_with_more(barn):
+    course = barn.courses(None)[1]
+    times = [course.best_s * k for k in (1.0, 2.0, 4.0, 20.0, 2.0)]
+    flags = [True, True, True, True, False]
+    told = barn.judged(dict.fromkeys(range(5), course), 1, flags, [False] * 5, times)
+    np.testing.assert_allclose(told.score, [0.5, 0.5, 0.25, 0.125, 0.0])
+
+
+@pytest.mark.slow
+def test_a_robot_that_stands_misses_every_bar(folder):
+    missed = fails("barn.py", "standing", "--worlds", str(folder), "--policy", "straight")
+    assert [line.split(": ")[1].split()[0] for line in missed] == ["success", "score"]
+
+
+@pytest.mark.slow
+def test_each_world_has_its_figures(folder):
+    _, told = asked("barn.py", "--worlds", str(folder), "--policy", "straight", "--runs", "2")
+    assert set(told["worlds"]) == {str(n) for n in NUMBERS}
+    keys = {"success", "collision", "time_out", "time_s", "score"}
+    assert keys == set(told["worlds"]["1"]) < set(told)
+    means = np.mean(
+        [[one[key] for key in ("success", "score")] for one in told["worlds"].values()], axis=0
+    )
+    np.testing.assert_allclose(means, [told["success"], told["score"]])
