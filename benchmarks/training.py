@@ -70,7 +70,7 @@ class Run:
 
 def measure(settings: TrainingSettings, seed: int, episodes: int) -> Run:
     """Trains with one seed and drives unseen episodes."""
-    model = open_model(settings.robot)
+    model = open_model(settings.robot, settings.lidar)
     begin, cpu = time.perf_counter(), time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         trained = train(settings, seed, Path(folder))

@@ -154,8 +154,14 @@ def builtin_model(robot: str) -> SimulatorModel:
     return generate(drive, spec, usual_lidar(spec), ())[0]
 
 
-def open_model(name: str | Path) -> SimulatorModel:
-    """Opens a model by its folder, by a shipped robot (`ackermann`), or by a robot's YAML file."""
+def open_model(name: str | Path, lidar: str | None = None) -> SimulatorModel:
+    """Opens a model by its folder, by a shipped robot (`ackermann`), or by a robot's YAML file.
+
+    A `lidar`, shipped or a YAML file, takes the place of the model's own.
+    """
+    if lidar is not None:
+        model, spec = open_model(name), load_lidar(lidar)
+        return replace(model, lidar=spec, table=bake(spec, model.table.shapes))
     name = str(name)
     if Path(name).is_dir():
         return load_model(name)

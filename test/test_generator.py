@@ -336,6 +336,13 @@ def test_a_robot_has_the_lidar_that_its_file_names_and_else_that_of_the_paper(tm
     assert load_model(tmp_path / "model").robot == jackal.robot
 
 
+def test_a_model_is_opened_with_another_lidar_than_its_own():
+    own, other = open_model("differential"), open_model("differential", "rplidar_a2")
+    assert other.lidar == load_lidar("rplidar_a2") != own.lidar
+    assert other.kinematics is own.kinematics
+    assert other.table.shapes == own.table.shapes
+
+
 def test_a_lidar_that_a_robots_file_does_not_name_leaves_no_trace_in_its_model():
     assert "lidar" not in builtin_model("ackermann").robot.model_dump()
     assert builtin_model("jackal").robot.model_dump()["lidar"] == "jackal_hokuyo"

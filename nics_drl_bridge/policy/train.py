@@ -82,7 +82,7 @@ def make_train_env(
     scenes: Mapping[str, AnyWorld] | None = None,
 ) -> TrainVecEnv:  # fmt: skip
     """Makes the worlds of the settings in one env; model and worlds may already be open."""
-    model = model or open_model(settings.robot)
+    model = model or open_model(settings.robot, settings.lidar)
     envs = (
         BridgeVectorEnv(
             count, model, (scenes or {}).get(world, world), settings.task, settings.task_options,
@@ -123,7 +123,7 @@ def evaluate(
 ) -> Outcomes:  # fmt: skip
     """Drives the episodes of the evaluation protocol in a world with an algorithm's policy."""
     env = BridgeVectorEnv(
-        episodes, model or open_model(settings.robot), world, settings.task,
+        episodes, model or open_model(settings.robot, settings.lidar), world, settings.task,
         settings.task_options, settings.max_episode_steps, randomisation=settings.randomisation,
     )  # fmt: skip
     return drive_worlds(env, act_of(algorithm), range(FIRST_SEED, FIRST_SEED + episodes))
@@ -159,7 +159,7 @@ def run(
 ) -> list[SeedResult]:  # fmt: skip
     """Trains and evaluates seed after seed; ConfigError for a run in the folder, or none there."""
     _check(order.seeds, order.out, order.resumed)
-    settings, model = order.settings, open_model(order.settings.robot)
+    settings, model = order.settings, open_model(order.settings.robot, order.settings.lidar)
     write_text(order.out / SETTINGS, dump_yaml(settings.model_dump(mode="json")))
     results = []
     for seed in order.seeds:
@@ -181,7 +181,7 @@ def run(
 
 def export(settings: TrainingSettings, result: SeedResult, command: str, path: Path) -> None:
     """Writes the policy file `*.onnx`, with the user's command line and the success rates."""
-    model = open_model(settings.robot)
+    model = open_model(settings.robot, settings.lidar)
     task = make_task(settings.task, model, settings.task_options)
     rates = {f"success in {world}": one.success.value for world, one in result.summaries.items()}
     provenance = {"command": command, "seed": result.seed, "steps": result.trained.steps, **rates}

@@ -56,6 +56,7 @@ class TrainingSettings(Schema):
     task: str = "navigation"  # a name, or `path/to/file.py:ClassName`
     task_options: dict[str, Any] = Field(default_factory=dict)  # of the task's class
     robot: str = "differential"  # name of a shipped robot, or the folder of a model
+    lidar: str | None = None  # a shipped one or a file, instead of the model's own
     worlds: dict[str, Count] = Field(default_factory=lambda: {"circles": 256}, min_length=1)
     randomisation: str | None = None  # quantities drawn in each episode: a shipped one or a file
     privileged: Privileged = Privileged()  # rewards by what only the simulator knows

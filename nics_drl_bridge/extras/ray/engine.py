@@ -340,7 +340,7 @@ class Learning:
 
 def _algorithm(settings: TrainingSettings, seed: int, done: int, runners: int) -> PPO:
     torch.set_num_threads(settings.threads)
-    model = open_model(settings.robot)
+    model = open_model(settings.robot, settings.lidar)
     scenes = {name: load_worlds(name) for name in settings.worlds}
     rng = np.random.default_rng(seed)
     env = train.make_train_env(settings, model, scenes)
