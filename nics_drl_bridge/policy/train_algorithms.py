@@ -30,6 +30,7 @@ from nics_drl_bridge.policy.training_settings import TrainingSettings
 Array = NDArray[np.float64]
 LEAST_RATE = 0.02  # share of PPO's learning rate that is left at the end
 LEAST_STD, LIMIT = 0.05, 5.0
+NEAR = 0.1  # share of the range that counts as half of it, see `bend`
 LEAST_SHARE = 0.25  # of the span of an observation, or of its mean if that is less
 OBSERVED_STEPS = 64
 GAIN = 2.0**0.5
@@ -68,23 +69,47 @@ def act_of(algorithm: BaseAlgorithm | Actor) -> Act:
 
 
 class Normaliser(BaseFeaturesExtractor):
-    """First layer of actor and critic: (observation - mean) / std (O,), cut at +-5; not trained."""
+    """First layer of actor and critic: (bent - mean) / std (O,), cut at +-5; not trained.
+
+    Observations from 0 to 1 are bent, see `bend`, as shares of a range are the more telling the
+    nearer a thing is; the others are not.
+    """
 
     mean: torch.Tensor
     std: torch.Tensor
+    shares: torch.Tensor  # (O,) 1 for those from 0 to 1, else 0
 
     def __init__(self, space: gymnasium.spaces.Box, mean: Array, std: Array) -> None:
         super().__init__(space, features_dim=int(np.prod(space.shape)))
         self.register_buffer("mean", torch.as_tensor(mean, dtype=torch.float32))
         self.register_buffer("std", torch.as_tensor(std, dtype=torch.float32))
+        self.register_buffer("shares", torch.as_tensor(shares_of(space)))
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """Normalises observations (N, O)."""
-        return torch.clamp((observations - self.mean) / self.std, -LIMIT, LIMIT)
+        seen = bend(observations, self.shares)
+        return torch.clamp((seen - self.mean) / self.std, -LIMIT, LIMIT)
+
+
+def shares_of(space: gymnasium.spaces.Box) -> NDArray[np.float32]:
+    """1 for the observations (O,) of a space that lie between 0 and 1, else 0."""
+    shares: NDArray[np.bool_] = (space.low == 0.0) & (space.high == 1.0)
+    return shares.astype(np.float32)
+
+
+def bend(observations: Any, shares: Any) -> Any:
+    """Bends shares x to (1 + k) x / (k + x), from 0 to 1 again, where k = `NEAR` becomes a half.
+
+    Observations are (N, O); `shares` (O,) are 1 for those to be bent, and 0 for the others.
+    """
+    return observations * (1.0 + NEAR * shares) / (shares * (observations + NEAR - 1.0) + 1.0)
 
 
 def observed(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Mean and standard deviation (O,), at least 0.05, of observations under random actions."""
+    """Mean and standard deviation (O,) of bent observations under random actions.
+
+    The deviation is at least 0.05, and a quarter of the span, or of the mean if that is less.
+    """
     seen = [np.array(env.reset())]
     for k in range(OBSERVED_STEPS):
         if k % 8 == 0:  # else a robot with inertia would stay in place
@@ -95,6 +120,7 @@ def observed(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Array]:
                 actions = rng.uniform(-1.0, 1.0, (env.num_envs, *space.shape)).astype(np.float32)
         seen.append(np.array(env.step(actions)[0]))
     rows = np.concatenate(seen).reshape(-1, seen[0].shape[-1]).astype(np.float64)
+    rows = bend(rows, shares_of(env.observation_space))
     mean = rows.mean(axis=0)
     # What is seen later may differ by more than what is seen near the starts.
     span = np.minimum(env.observation_space.high - env.observation_space.low, np.abs(mean))
