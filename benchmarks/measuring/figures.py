@@ -11,6 +11,7 @@ from measuring.table import Table
 def told(*rows: tuple[str, str, str]) -> Table:
     """Figures in words: run, what, figure."""
     of = {"training_differential": "training", "training_ackermann": "training"}
+    of |= dict.fromkeys(("barn_five_fold", "barn_mujoco"), "barn")
     of |= dict.fromkeys(("env_throughput_lidar", "env_throughput_obstacles"), "env_throughput")
     return Table(
         ("what", "script", "figure"),
@@ -112,6 +113,13 @@ README = told(
             for robot, title in (("differential", "differential"), ("ackermann", "car"),
                                  ("mecanum", "mecanum"))
         ) + " (`docs/evaluation.md`)",
+    ),
+    (
+        "barn_five_fold",
+        "the 250 worlds of the BARN challenge, a Jackal without a map, learnt from 200, judged in the "
+        "others, in turn",
+        "{success|.1%} success, {collision|.1%} collisions, score {score|.3f} of 0.5 "
+        "(`docs/worlds.md`)",
     ),
     (
         "parity",
@@ -226,6 +234,21 @@ BASELINES = Table(
         for policy in ("dynamic_window", "straight", "random")
     ),
 )  # fmt: skip
+BARN = Table(
+    ("in the 250 worlds", "success", "collision", "time-out", "time", "score"),
+    tuple(
+        (run, who, *(f"{{{at}{key}|.1%}}" for key in ("success", "collision", "time_out")),
+         f"{{{at}time_s|.1f}} s", f"{{{at}score|.3f}}")
+        for run, at, who in (
+            ("barn", "", "the Jackal's policy, which was learnt from them"),
+            ("barn_five_fold", "", "learnt from four fifths, in the rest"),
+            ("barn_mujoco", "", "the Jackal's policy in MuJoCo over DDS, every tenth world"),
+            ("barn", "policies.mppi.", "`mppi`"),
+            ("barn", "policies.dynamic_window.", "`dynamic_window`"),
+            ("barn", "policies.straight.", "`straight`"),
+        )
+    ),
+)  # fmt: skip
 TRAINING = Table(
     ("robot", "success", "collision", "environment steps", "time", "steps per second"),
     tuple(
@@ -304,6 +327,7 @@ TABLES: Mapping[str, Table] = {
     "fig4": lidar.FIG4,
     "estimator": ESTIMATOR,
     "transfer": TRANSFER,
+    "barn": BARN,
     "baselines": BASELINES,
     "training": TRAINING,
     "mujoco": MUJOCO,
