@@ -16,6 +16,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes.runner import declare
 from nics_drl_bridge.robot.noise import Delay
+from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 
 LOCKSTEP = "lockstep"
 MODES = ("realtime", LOCKSTEP, "as_fast_as_possible")
@@ -62,6 +63,8 @@ def declare_device(node: Node, laser_frame: str) -> None:
     node.declare_parameter("robots", 1, fleet)
     for name, fixed, about in (
         ("world", "arena", "World file, or the name of a shipped world."),
+        ("randomisation", "",
+         "What is drawn in each episode: a file, or a shipped one (mild); nothing if empty."),
         ("mode", "realtime", f"How time runs: {', '.join(MODES)}."),
         ("enable_stamped_cmd_vel", False, "Whether cmd_vel is a TwistStamped; a Twist otherwise."),
         ("frame_prefix", "",
@@ -101,6 +104,12 @@ def declare_device(node: Node, laser_frame: str) -> None:
 def number(node: Node, name: str) -> float:
     """Returns the value of a numeric parameter."""
     return float(node.get_parameter(name).value or 0.0)
+
+
+def randomisation(node: Node) -> Randomisation | None:
+    """Returns what is drawn in each episode, if anything. Raises ConfigError."""
+    name = str(node.get_parameter("randomisation").value)
+    return load_randomisation(name) if name else None
 
 
 def timing(node: Node, model: SimulatorModel) -> DeviceTiming:

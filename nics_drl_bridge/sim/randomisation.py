@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, Field, model_validator
 
+from nics_drl_bridge import files
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.config import Schema, find_config, load_yaml, validate
 from nics_drl_bridge.errors import ConfigError, nearest
@@ -143,6 +144,11 @@ class Randomisation(Schema):
         low, high = self.obstacles.size
         rungs = self.obstacles.rungs if high > low else 1
         return tuple(np.linspace(low, high, rungs).tolist())
+
+    @property
+    def fingerprint(self) -> str:
+        """Identifies the ranges: 16 digits of a SHA-256."""
+        return files.sha256(self.model_dump_json().encode())[:16]
 
 
 def load_randomisation(name: str | Path) -> Randomisation:
