@@ -2,9 +2,9 @@
 
 The shipped policy of each robot, one file, drives the same episodes in three places: the fast
 simulator in process, the fast simulator over DDS, and the robot's machine in MuJoCo over DDS. The
-conditions are those of a deployment: a real lidar, mild randomisation, the gate and its shield. What
-counts is where the robot truly ended and whether it truly touched something; what the robot itself
-took for a success is told beside it. `without_randomisation` are policies that were trained
+conditions are those of a deployment: a real lidar, mild randomisation, the gate and its shield.
+What counts is where the robot truly ended and whether it truly touched something; what the robot
+itself took for a success is told beside it. `without_randomisation` are policies that were trained
 in `circles` without any, see `benchmarks/policies`. Two robots are driven at a time, each in
 processes of its own.
 """

@@ -19,7 +19,7 @@ class Conditions:
 
     @property
     def ranges(self) -> Randomisation | None:
-        """What is drawn in each episode. Raises ConfigError."""
+        """The ranges that each episode draws from. Raises ConfigError."""
         return None if self.randomisation is None else load_randomisation(self.randomisation)
 
     def model(self, name: str, folder: Path) -> tuple[SimulatorModel, str]:

@@ -312,12 +312,11 @@ def dds_backend(
         raise ConfigError("backend 'dds' always estimates; leave out `estimator`.")
     if randomisation is not None:
         if mode != "lockstep" or robots > 1:
-            given = f"{robots} robot{'s' * (robots > 1)} in mode {mode!r}"
-            raise ConfigError(
-                f"backend 'dds': only one robot in lock-step is randomised, not {given}."
-            )
-        known = isinstance(randomisation, Randomisation)
-        options["randomisation"] = randomisation if known else load_randomisation(randomisation)
+            needed = "one robot in mode 'lockstep' alone can be randomised"
+            raise ConfigError(f"backend 'dds': {needed}, not {robots} in mode {mode!r}.")
+        if not isinstance(randomisation, Randomisation):
+            randomisation = load_randomisation(randomisation)
+        options["randomisation"] = randomisation
     if mode not in MODES:
         raise ConfigError(f"backend_options: there is no mode {mode!r}; {nearest(mode, MODES)}")
     if robots > 1:

@@ -63,12 +63,10 @@ def declare_device(node: Node, laser_frame: str) -> None:
     node.declare_parameter("robots", 1, fleet)
     for name, fixed, about in (
         ("world", "arena", "World file, or the name of a shipped world."),
-        ("randomisation", "",
-         "What is drawn in each episode: a file, or a shipped one (mild); nothing if empty."),
+        ("randomisation", "", "Draws in each episode: a file, mild or strong; none if empty."),
         ("mode", "realtime", f"How time runs: {', '.join(MODES)}."),
         ("enable_stamped_cmd_vel", False, "Whether cmd_vel is a TwistStamped; a Twist otherwise."),
-        ("frame_prefix", "",
-         "Put before the frames of the robot; in a fleet before its namespace there."),
+        ("frame_prefix", "", "Put before the robot's frames; in a fleet before its namespace."),
         ("map_frame", "map", "Frame id of map."),
         ("odom_frame", "odom", "Frame id of odom."),
         ("base_frame", "base_link", "Frame id of base_link."),

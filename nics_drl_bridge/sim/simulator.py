@@ -123,7 +123,7 @@ def _check_memory(model: SimulatorModel, world: AnyWorld, worlds: int, robots: i
 
 
 class EpisodeSampler:
-    """Draws what episodes begin with: their scenes, and the numbers of a randomisation, if any."""
+    """Draws the scenes of episodes, and the numbers of a randomisation, if there is one."""
 
     def __init__(
         self, model: SimulatorModel, world: AnyWorld, robots: int = 1,

@@ -72,8 +72,9 @@ def test_the_transition_is_the_numerical_derivative_of_the_motion(robot, dt, ste
     motion = MotionModel(term_arrays(model.kinematics), SERIES, 0, 0)
     for _ in range(10):
         mean, command = random_mean(model, rng), random_command(model, rng)
+        size = len(mean)
 
-        def of(given, command=command, size=len(mean)):
+        def of(given, command=command, size=size):
             end, error = given[:size].copy(), given[size:]  # of the state's rates
             for _ in range(steps):
                 kernels.predict(end, kernels.unmoved(size, 0.0), command, dt, 1, motion)
