@@ -4,6 +4,7 @@ import gc
 import os
 import signal
 import threading
+from contextlib import closing
 
 import gymnasium
 import numpy as np
@@ -26,7 +27,6 @@ from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.backends import DdsBackend, _Mailbox, dds_backend
 from nics_drl_bridge.nodes.executor import HANDED_OVER
-from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.scenes import member_of
 from nics_drl_bridge.sim.world import load_world
 
@@ -459,18 +459,10 @@ def test_a_team_over_dds_sees_what_a_team_in_process_sees(launch, model, domain_
 
 
 def test_a_randomised_episode_over_dds_is_the_one_in_process(launch, model, domain_id):
-    drawn = Randomisation(
-        name="drawn", observation_latency=(0.0, 1.5), lidar={"noise_std": (0.0, 0.05)},
-        kinematics={"scale": (0.9, 1.1)}, obstacles={"count": (1, 5), "size": (0.7, 1.3)},
-    )  # fmt: skip
     launch("simulator_node", domain_id, mode="lockstep", randomisation="strong")
-    options = {"domain_id": domain_id}
-    given = {"model": model, "randomisation": "strong"}
-    here = BridgeEnv(estimator=True, **given)
-    there = BridgeEnv("dds", backend_options=options, **given)
-    other = BridgeEnv("dds", model, randomisation=drawn, backend_options=options)
-    plain = BridgeEnv("dds", model, backend_options=options)
-    try:
+    options = {"backend_options": {"domain_id": domain_id}}
+    here = BridgeEnv(model=model, randomisation="strong", estimator=True)
+    with closing(BridgeEnv("dds", model, randomisation="strong", **options)) as there:
         for seed in (3, 4):
             (mine, info), (theirs, told) = (env.reset(seed=seed) for env in (here, there))
             assert (mine == theirs).all()
@@ -478,12 +470,12 @@ def test_a_randomised_episode_over_dds_is_the_one_in_process(launch, model, doma
             for k in range(5):
                 action = np.full(here.action_space.shape, 0.1 * k, np.float32)
                 assert (here.step(action)[0] == there.step(action)[0]).all()
-        for env in (other, plain):
-            with pytest.raises(ModelError, match="start both with the same randomisation"):
-                env.reset(seed=3)
-    finally:
-        for env in (there, other, plain):
-            env.close()
+    for drawn in (None, "mild"):
+        with (
+            closing(BridgeEnv("dds", model, randomisation=drawn, **options)) as env,
+            pytest.raises(ModelError, match="start both with the same randomisation"),
+        ):
+            env.reset(seed=3)
 
 
 def test_what_topics_can_not_give_is_refused(model):
