@@ -35,6 +35,7 @@ from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.policy.evaluation import drive_all, successes
 from nics_drl_bridge.policy.policies import open_policy, shipped_policies
+from nics_drl_bridge.policy.training_settings import load_training
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 from nics_drl_bridge.sim.world import load_world
@@ -46,7 +47,8 @@ CONTROLS = {
 PERTURBATIONS = ("noise", "drop-out", "latency", "response", "drift", "footprint")
 MULTIPLES = (0.5, 1.0, 2.0)
 DECLARED = 1.0
-LIDAR, RANDOMISATION = "rplidar_a2", "mild"
+LIDAR, SETTINGS = "rplidar_a2", "shipped_{}"
+"""Of a robot that has no lidar of its own; and the settings by which its policy was trained."""
 FOOTPRINT = 0.05
 """How much larger the outline is than the policy and the gate believe, as a share of it."""
 FLOOR, MOST_LOSS = 0.95, 5.0
@@ -66,15 +68,23 @@ class Job:
     control: str | None
 
 
-def ranges(perturbation: str, times: float, lidar_noise: float = 0.0) -> Randomisation:
+def of_training(robot: str) -> Randomisation:
+    """The randomisation by which the shipped policy of a robot was trained."""
+    name = load_training(SETTINGS.format(robot)).randomisation
+    return Randomisation(name="none") if name is None else load_randomisation(name)
+
+
+def ranges(
+    whole: Randomisation, perturbation: str, times: float, lidar_noise: float = 0.0
+) -> Randomisation:
     """One perturbation alone, with the greatest declared value `times` as large in each episode.
 
     Args:
+        whole: the declared ranges.
         perturbation: one of `PERTURBATIONS`.
         times: multiple of the declared range.
         lidar_noise: that the lidar has anyway [m], below which its noise does not fall.
     """
-    whole = load_randomisation(RANDOMISATION)
     given: dict[str, Any] = {"name": f"{perturbation} x {times:g}"}
 
     def most(group: Any, names: Sequence[str]) -> dict[str, tuple[float, float]]:
@@ -112,9 +122,8 @@ def grown(model: SimulatorModel, factor: float) -> SimulatorModel:
     return replace(model, robot=RobotSpec.model_validate(data))
 
 
-def declared() -> dict[str, str]:
+def declared(whole: Randomisation) -> dict[str, str]:
     """The greatest value of each perturbation, in words."""
-    whole = load_randomisation(RANDOMISATION)
     late, seen = whole.action_latency[1], whole.observation_latency[1]
     kinematics, odometry, lidar = whole.kinematics, whole.odometry, whole.lidar
     drift = odometry.position_drift or (0.0, 0.0), odometry.heading_drift or (0.0, 0.0)
@@ -148,7 +157,7 @@ def reached(job: Job, perturbation: str | None, times: float) -> int:
     if perturbation == "footprint":
         simulated = grown(model, 1.0 + times * FOOTPRINT)
     elif perturbation is not None:
-        drawn = ranges(perturbation, times, model.lidar.noise_std)
+        drawn = ranges(of_training(job.robot), perturbation, times, model.lidar.noise_std)
     backend = SimBackend(simulated, world, estimator=True, randomisation=drawn)
     gated = GatedBackend(backend, model, job.robot)
     env = gymnasium.make(NAVIGATION, backend=gated, model=model, world=world, task=task)
@@ -218,7 +227,8 @@ def draw(success: Mapping[str, Mapping[str, Sequence[float]]], file: Path) -> No
     """One panel for each perturbation: success over multiples of the declared range, by robot."""
     from matplotlib.figure import Figure
 
-    figure, told = Figure(figsize=(10, 5.6), layout="constrained"), declared()
+    figure = Figure(figsize=(10, 5.6), layout="constrained")
+    amounts = [declared(of_training(robot)) for robot in success]
     perturbations = list(dict.fromkeys(each for own in success.values() for each in own))
     rows, where = -(-len(perturbations) // 3), [0.0, *MULTIPLES]
     panels = figure.subplots(rows, 3, sharex=True, sharey=True, squeeze=False)
@@ -226,7 +236,8 @@ def draw(success: Mapping[str, Mapping[str, Sequence[float]]], file: Path) -> No
         for robot, own in success.items():
             axes.plot(where, 100.0 * np.array(own[each]), "o-", markersize=4, label=robot)
         axes.axvline(DECLARED, color="0.6", linestyle="--", linewidth=1.0)
-        axes.set_title(f"{each}\n{told[each]}", fontsize=9)
+        told = " / ".join(dict.fromkeys(some[each] for some in amounts))
+        axes.set_title(f"{each}\n{told}", fontsize=9)
         axes.grid(visible=True, alpha=0.3)
     for axes in panels[-1]:
         axes.set_xlabel("multiple of the declared range")
@@ -270,7 +281,7 @@ def main() -> None:
         draw(success, given.picture)
     lost = losses(success)
     result = {
-        "declared": declared(), "multiples": [0.0, *MULTIPLES], "success": success,
+        "declared": {robot: declared(of_training(robot)) for robot in success}, "multiples": [0.0, *MULTIPLES], "success": success,
         "lost_points": lost, "worst": worst(lost), "episodes": given.episodes * len(given.worlds),
     }  # fmt: skip
     answer(result, missed(success), table_of(success, time.perf_counter() - begin), given.json)

@@ -234,7 +234,7 @@ PLAIN = Table(
 ROBUSTNESS = Table(
     ("success [%] at 0, 1/2, 1, 2 times the range", "declared range", *POLICIES.values()),
     tuple(
-        ("robustness", each, f"{{declared.{each}}}", *(
+        ("robustness", each, f"{{declared.differential.{each}}}", *(
             ", ".join(f"{{success.{robot}.{each}.{k} x100|.0f}}" for k in range(4))
             for robot in POLICIES
         ))

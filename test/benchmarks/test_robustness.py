@@ -12,6 +12,7 @@ from nics_drl_bridge.sim.randomisation import Sampler, load_randomisation
 from .runs import BENCHMARKS, asked, fails
 
 ready = "differential" in shipped_policies()
+MILD = load_randomisation("mild")
 NAMES = ("noise", "drop-out", "latency", "response", "drift", "footprint")
 
 
@@ -57,10 +58,10 @@ def test_the_worst_loss_is_that_of_one_policy_to_one_perturbation(robustness):
 @pytest.mark.parametrize("name", [each for each in NAMES if each != "footprint"])
 def test_a_perturbation_alone_has_the_greatest_declared_value(robustness, name):
     model = builtin_model("differential")
-    once, twice = (robustness.ranges(name, times) for times in (1.0, 2.0))
+    once, twice = (robustness.ranges(MILD, name, times) for times in (1.0, 2.0))
     assert once != twice
     drawn = Sampler(once, model).draw([1, 2, 3])
-    whole = Sampler(load_randomisation("mild"), model).draw(range(200))
+    whole = Sampler(MILD, model).draw(range(200))
     told = {
         "noise": lambda d: d.faults[..., 0], "drop-out": lambda d: d.faults[..., 2],
         "latency": lambda d: d.delay + d.age, "response": lambda d: d.response,
@@ -68,12 +69,18 @@ def test_a_perturbation_alone_has_the_greatest_declared_value(robustness, name):
     }  # fmt: skip
     assert told[name](drawn).min() >= told[name](whole).max() - 1e-12
     others = [one for other, one in told.items() if other not in (name, "response")]
-    plain = Sampler(robustness.ranges("footprint", 0.0), model).draw([1, 2, 3])
+    plain = Sampler(robustness.ranges(MILD, "footprint", 0.0), model).draw([1, 2, 3])
     assert all((one(drawn) == one(plain)).all() for one in others)
 
 
+def test_the_ranges_are_those_of_the_training_of_each_policy(robustness):
+    for robot in shipped_policies():
+        assert set(robustness.declared(robustness.of_training(robot))) == set(NAMES)
+    assert robustness.declared(MILD)["noise"] == "20 mm on each range"
+
+
 def test_a_lidar_keeps_the_noise_that_it_has_anyway(robustness):
-    assert robustness.ranges("noise", 1.0, 0.03).lidar.noise_std == (0.03, 0.03)
+    assert robustness.ranges(MILD, "noise", 1.0, 0.03).lidar.noise_std == (0.03, 0.03)
 
 
 @pytest.mark.parametrize("robot", ["mecanum", "jackal"])
@@ -95,7 +102,7 @@ def test_it_draws_its_curves_and_prints_one_json_object(tmp_path):
     code, told = asked("robustness.py", *ONE, "--picture", str(picture), "--only", "drop-out")
     assert set(told["success"]["differential"]) == {"drop-out"}
     assert len(told["success"]["differential"]["drop-out"]) == len(told["multiples"]) == 4
-    assert set(told["declared"]) == set(NAMES)
+    assert set(told["declared"]["differential"]) == set(NAMES)
     assert code == bool(told["failures"])
     assert picture.read_bytes().startswith(b"\x89PNG")
 
