@@ -281,7 +281,8 @@ def main() -> None:
         draw(success, given.picture)
     lost = losses(success)
     result = {
-        "declared": {robot: declared(of_training(robot)) for robot in success}, "multiples": [0.0, *MULTIPLES], "success": success,
+        "declared": {robot: declared(of_training(robot)) for robot in success},
+        "multiples": [0.0, *MULTIPLES], "success": success,
         "lost_points": lost, "worst": worst(lost), "episodes": given.episodes * len(given.worlds),
     }  # fmt: skip
     answer(result, missed(success), table_of(success, time.perf_counter() - begin), given.json)
