@@ -56,6 +56,26 @@ def test_the_same_episodes_are_driven_in_three_worlds(tmp_path):
     assert "dynamic_window: success in process " in done.stdout.splitlines()[-2]
 
 
+@pytest.mark.ros
+@pytest.mark.process
+@pytest.mark.slow
+@needs_nodes
+def test_lidar_randomisation_and_gate_are_the_same_in_process_and_over_dds(tmp_path):
+    with claimed_domain() as domain_id:
+        words = ("evaluate", "dynamic_window", "--model", "differential", "--episodes", 2)
+        under = ("--lidar", "rplidar_a2", "--randomisation", "mild", "--gate", "differential")
+        words = (*words, *under, "--in", "fast", "--in", "dds", "--out", "out")
+        done = started(*words, cwd=tmp_path, domain_id=domain_id)
+    assert done.returncode == 0, done.stderr
+    told = json.loads((tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8"))
+    assert told["conditions"] == {
+        "lidar": "rplidar_a2", "randomisation": "mild", "gate": "differential",
+    }  # fmt: skip
+    fast, dds = told["policies"]["dynamic_window"].values()
+    assert dds["greatest_deviation"] < 1e-6
+    assert [one["result"] for one in fast["each"]] == [one["result"] for one in dds["each"]]
+
+
 @pytest.mark.slow
 def test_several_policies_drive_the_same_episodes_in_one_table(tmp_path):
     words = ("evaluate", "dynamic_window", "random", "--in", "fast", "--episodes", 3, "--seed", 7)
@@ -90,6 +110,9 @@ def test_a_shipped_policy_brings_its_own_robot(tmp_path):
         (("dynamic_window", "--hardware"), "--backend dds"),
         (("dynamic_window", "--backend", "sim"), "--backend 'sim'"),
         (("dynamic_window", "--goal", "there"), "--goal 'there'"),
+        (("dynamic_window", "--gate", "diferential", "--in", "fast"), "differential"),
+        (("dynamic_window", "--lidar", "rplidar_a9", "--in", "fast"), "rplidar_a"),
+        (("dynamic_window", "--shadow", "nothing", "--lidar", "rplidar_a2"), "leave out --lidar"),
         (("dynamic_window", "--shadow", "nothing"), "nothing"),
         (("dynamic_window", "--backend", "dds", "--hardware", "--in", "dds"), "--in"),
         (("dynamic_window", "random", "--backend", "dds", "--hardware"), "one policy at a time"),

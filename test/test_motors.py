@@ -179,7 +179,7 @@ def test_the_estimator_knows_how_drag_and_back_emf_dampen_an_error_of_the_speed(
     motion = MotionModel(term_arrays(motors()), SERIES, 0, 0)
 
     def ahead(speed: float) -> tuple[float, float]:
-        mean, transition = np.array([0.0, 0.0, 0.0, speed, 0.0]), np.eye(5)
+        mean, transition = np.array([0.0, 0.0, 0.0, speed, 0.0]), kernels.unmoved(5, 0.0)
         kernels.predict(mean, transition, np.array([throttle, 0.0]), 0.01, 10, motion)
         return mean[3], transition[3, 3]
 

@@ -7,11 +7,13 @@ import os
 import random
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+
+from nics_drl_bridge.commands.conditions import NO_CONDITIONS, Conditions
 
 BENCHMARKS = Path(__file__).resolve().parents[1]
 AT_ONCE = 2
@@ -22,7 +24,7 @@ DOMAINS = range(1, 102)
 class Run:
     """One evaluation: a policy, the robot, the world, how many episodes, the first seed.
 
-    And a control, if it is to fail: see `deceived`.
+    And a control, if it is to fail, see `deceived`; the conditions; and where, all by default.
     """
 
     policy: str
@@ -32,10 +34,14 @@ class Run:
     seed: int
     out: Path
     control: str | None = None
+    conditions: Conditions = NO_CONDITIONS
+    places: Sequence[str] = ()
 
 
-def evaluations(runs: Mapping[str, Run]) -> dict[str, dict[str, Any]]:
-    """What `evaluation.json` says of each run's policy: place -> figures.
+def evaluations(
+    runs: Mapping[str, Run], tell: Callable[[str, dict[str, Any]], None] = lambda *_: None
+) -> dict[str, dict[str, Any]]:
+    """What `evaluation.json` says of each run's policy: place -> figures; `tell` hears it at once.
 
     Raises:
         RuntimeError: one failed; its own words are in it.
@@ -46,13 +52,22 @@ def evaluations(runs: Mapping[str, Run]) -> dict[str, dict[str, Any]]:
             name: pool.submit(_evaluate, run, domain)
             for (name, run), domain in zip(runs.items(), domains, strict=True)
         }
-        return {name: future.result() for name, future in waiting.items()}
+        found = {}
+        for name, future in waiting.items():
+            found[name] = future.result()
+            tell(name, found[name])
+        return found
 
 
 def _evaluate(run: Run, domain: int) -> dict[str, Any]:
     words: Sequence[object] = (
         "evaluate", run.policy, "--model", run.robot, "--world", run.world, "--episodes",
         run.episodes, "--seed", run.seed, "--out", run.out,
+        *(word for place in run.places for word in ("--in", place)),
+        *(
+            word for name, value in asdict(run.conditions).items() if value is not None
+            for word in (f"--{name}", value)
+        ),
     )  # fmt: skip
     program = (
         ["measuring.deceived", run.control] if run.control else ["nics_drl_bridge.commands.cli"]

@@ -80,7 +80,13 @@ RUNS: dict[str, Run] = {
     "training_mecanum": row(
         "training", "--robot mecanum --seeds 0 1 2", "--robot mecanum --episodes 50"
     ),
-    "transfer": row("transfer", "", "--episodes 5", HOUR),
+    "robustness": row(
+        "robustness",
+        "--picture docs/robustness.png",
+        "--episodes 2 --worlds circles --robots differential",
+        4 * HOUR,
+    ),
+    "transfer": row("transfer", "", "--episodes 3 --worlds circles doorway", 6 * HOUR),
 }
 
 

@@ -3,7 +3,7 @@
 import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib.util import find_spec
 from math import isnan
@@ -13,9 +13,12 @@ from typing import Any
 import gymnasium
 
 from nics_drl_bridge import extensions
+from nics_drl_bridge.commands.conditions import NO_CONDITIONS, Conditions
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
+from nics_drl_bridge.env.sim_backend import make_backend
 from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, nearest
 from nics_drl_bridge.files import write_bytes, write_text
+from nics_drl_bridge.gate.gated_backend import GatedBackend
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.policy import evaluation
 from nics_drl_bridge.policy.evaluation import Episode, Tally, drive, drive_all
@@ -47,25 +50,29 @@ Tell = Callable[[str, int, int], None]
 def drive_in(
     place: str, policy: str, name: str, world: str, seeds: Sequence[int], logs: Path,
     on_episode: Callable[[Episode], None], say: Say = lambda _: None,
+    conditions: Conditions = NO_CONDITIONS,
 ) -> list[Episode]:  # fmt: skip
     """Drives episodes in one of `PLACES`, whose node, if any, has then ended. BridgeError."""
     check_place(place)
-    model = open_model(name)
+    model, drawn = open_model(name), conditions.ranges
     if place == FAST:
-        env, opened = env_of(policy, model, world, "sim", estimator=True)
+        given = {"estimator": True, "randomisation": drawn}
+        env, opened = env_of(policy, model, world, "sim", conditions.gate, **given)
         with closing(env):
             return drive_all(env, opened, seeds, on_episode)
     from nics_drl_bridge.nodes.processes import NodeProcess, Witness, free_domain_id
 
     node, domain_id = NODES[place], free_domain_id()
     parameters = {"model": name, "world": world, "mode": "lockstep"}
+    parameters["randomisation"] = conditions.randomisation or ""
     options = {"domain_id": domain_id, "simulator": node, "timeout_s": START_S, "truth": True}
+    options["randomisation"] = drawn
     with (
         NodeProcess(node, logs, parameters, domain_id) as process, Witness(domain_id) as witness
     ):  # fmt: skip
         say(f"started {node} as process {process.pid} in ROS domain {domain_id}")
         try:
-            env, opened = env_of(policy, model, world, "dds", backend_options=options)
+            env, opened = env_of(policy, model, world, "dds", conditions.gate, **options)
             with closing(env):
                 touched = partial(witness.touched, node, START_S)
                 return drive_all(env, opened, seeds, on_episode, touched)
@@ -75,12 +82,18 @@ def drive_in(
 
 
 def env_of(
-    policy: str, model: SimulatorModel, world: str, backend: str, **arguments: Any
-) -> tuple[gymnasium.Env[Any, Any], Policy]:
-    """Makes the env of a policy's task with a backend, and opens the policy."""
+    policy: str, model: SimulatorModel, world: str, backend: str, gate: str | None = None,
+    **options: Any,
+) -> tuple[gymnasium.Env[Any, Any], Policy]:  # fmt: skip
+    """Makes the env of a policy's task with a backend, behind a gate if any; opens the policy."""
     register_envs()
     opened, task = open_policy(policy, model)
-    given = {"backend": backend, "model": model, "world": world, "task": task, **arguments}
+    field = load_worlds(world)
+    given = {name: value for name, value in options.items() if value is not None}
+    made = make_backend(backend, model, field, **given)
+    if gate is not None:
+        made = GatedBackend(made, model, gate)
+    given = {"backend": made, "model": model, "world": field, "task": task}
     return gymnasium.make(NAVIGATION, **given), opened
 
 
@@ -114,6 +127,7 @@ class EvaluationOrder:
     episodes: int = 20
     seed: int = evaluation.FIRST_SEED
     places: Sequence[str] = PLACES  # some of `PLACES`; the others are compared with the first
+    conditions: Conditions = NO_CONDITIONS
 
     @property
     def seeds(self) -> range:
@@ -134,8 +148,9 @@ class Evaluated:
 
 def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
     """Drives all policies through the same episodes everywhere; writes results, pictures."""
-    name, seeds, logs = _model_name(order), order.seeds, order.out / "logs"
-    model, world = open_model(name), load_worlds(order.world)
+    seeds, logs = order.seeds, order.out / "logs"
+    model, name = order.conditions.model(_model_name(order), order.out)
+    world = load_worlds(order.world)
     places, evaluated = _places(order, model, say), []
     for policy in order.policies:
         runs = {}
@@ -147,9 +162,9 @@ def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
                 tell(what, episode.seed - order.seed + 1, order.episodes)
 
             given = place, policy, name, order.world, seeds, logs
-            runs[place] = drive_in(*given, on_episode, say)
+            runs[place] = drive_in(*given, on_episode, say, order.conditions)
         evaluated.append(judged(policy, runs, model, world, order.out, PANELS))
-    write_evaluation(order.out, name, model, order.world, order.seed, evaluated)
+    write_evaluation(order, name, model, evaluated)
     return evaluated
 
 
@@ -192,9 +207,9 @@ def _model_name(order: EvaluationOrder) -> str:
 
 
 def write_evaluation(
-    out: Path, name: str, model: SimulatorModel, world: str, seed: int, evaluated: list[Evaluated]
+    order: EvaluationOrder, name: str, model: SimulatorModel, evaluated: list[Evaluated]
 ) -> None:
-    """Writes `evaluation.json`; the name is that of the model, the seed of the first episode."""
+    """Writes `evaluation.json` of an order, driven with a model of a name."""
     policies = {
         one.policy: {
             place: {**one.tallies[place].figures(), "each": [episode.plain() for episode in some]}
@@ -204,9 +219,10 @@ def write_evaluation(
     }
     data = {
         "model": name, "model_fingerprint": model.fingerprint, "robot": model.robot.name,
-        "world": world, "seed": seed, "policies": policies,
+        "world": order.world, "seed": order.seed, "conditions": asdict(order.conditions),
+        "policies": policies,
     }  # fmt: skip
-    write_text(out / "evaluation.json", json.dumps(data) + "\n")
+    write_text(order.out / "evaluation.json", json.dumps(data) + "\n")
 
 
 def rows_of(evaluated: Sequence[Evaluated]) -> list[tuple[str, ...]]:
@@ -258,7 +274,7 @@ def drive_vehicle(
     if errors:
         raise BackendError(f"the vehicle is not driven: {errors[0]}; see nics doctor for the rest.")
     given = {"mode": "realtime", "vehicle": True, "command_topic": RAW, "say": say, **options}
-    env, driver = env_of(policy, model, order.world, "dds", backend_options=given)
+    env, driver = env_of(policy, model, order.world, "dds", **given)
     episodes, chosen = list[Episode](), {} if goal is None else {"goal": goal}
     with closing(env):
         for count, seed in enumerate(order.seeds, 1):
@@ -274,7 +290,7 @@ def drive_vehicle(
         starts = [(one.seed, {"start": one.path[0], "goal": one.goal}) for one in episodes]
         again = [drive(env, driver, *each) for each in starts]
     made = judged(policy, {VEHICLE: episodes, FAST: again}, model, world, order.out)
-    write_evaluation(order.out, name, model, order.world, order.seed, [made])
+    write_evaluation(order, name, model, [made])
     return made
 
 

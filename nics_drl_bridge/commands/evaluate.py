@@ -25,6 +25,13 @@ def evaluate(
         "--in", help="fast, dds or mujoco_dds; several times; all by default.")] = None,
     episodes: Annotated[int | None, Option(min=1, help="How many; 20, or 1 on a vehicle.")] = None,
     seed: Annotated[int, Option(min=0, help="Of the first episode.")] = 1_000_000,
+    lidar: Annotated[str | None, Option(
+        help="A shipped lidar (rplidar_a2) or a YAML file, instead of the model's.")] = None,
+    randomisation: Annotated[str | None, Option(
+        help="Drawn in each episode: a shipped one (mild) or a YAML file.")] = None,
+    gate: Annotated[str | None, Option(
+        metavar="LIMITS", help="Drive through the gate and its shield, with these limits: shipped "
+        "ones (differential) or a YAML file.")] = None,
     out: Annotated[Path, Option(help="Folder for all that is written.")] = Path("runs/evaluate"),
     shadow: Annotated[Path | None, Option(help="A bag: compare policies with its drive.")] = None,
     topic: Annotated[list[str] | None, Option(
@@ -52,16 +59,25 @@ def evaluate(
             raise ConfigError(f"--hardware and --backend dds {reason}")
         if hardware and (shadow is not None or places):
             raise ConfigError("--hardware drives a vehicle: leave out --in and --shadow.")
+        conditions = {"lidar": lidar, "randomisation": randomisation, "gate": gate}
+        named = [f"--{name}" for name, value in conditions.items() if value is not None]
+        if named and (hardware or shadow is not None):
+            where = "a vehicle has its own" if hardware else "a bag was recorded under its own"
+            raise ConfigError(f"{', '.join(named)}: {where}; leave out {', '.join(named)}.")
         if hardware and len(policies) > 1:
             raise ConfigError(f"--hardware drives one policy at a time, not {', '.join(policies)}.")
         if shadow is not None:
             _shadow(shadow, policies, model, topic or [], place, ahead, out)
             return
         from nics_drl_bridge.commands import episodes as driving
+        from nics_drl_bridge.commands.conditions import Conditions
 
         chosen = {"places": tuple(dict.fromkeys(places))} if places else {}
         count, tell = episodes or (1 if hardware else 20), partial(typer.echo, err=True)
-        order = driving.EvaluationOrder(policies, out, model, world, count, seed, **chosen)
+        under = Conditions(**conditions)
+        order = driving.EvaluationOrder(
+            policies, out, model, world, count, seed, **chosen, conditions=under
+        )
         if hardware:
             options = {"start": start, "namespace": namespace, "pose_type": pose_type}
             with needs_ros("nics evaluate --hardware"):

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +19,21 @@ UNKNOWN_LAG_S = 0.5  # lag of a robot whose model shows none [s]
 SLOWEST_LAG_S = 5.0  # slower modes are not lags but combinations that no command moves [s]
 UNKNOWN_DECELERATION = 0.5  # deceleration of a robot whose limits are not known [m/s^2]
 LEAST_DATA = 2  # least number that must arrive while the gate settles, for a rate to be known
+
+
+def gate_config(
+    model: SimulatorModel, limits: Limits | None, shield: ShieldConfig | None, **rules: Any
+) -> GateConfig:
+    """Returns the configuration of a robot's gate; `rules` are further fields of it."""
+    lidar, robot = model.lidar, model.robot
+    given = {"odom_rate": 1.0 / model.control_period, **rules}
+    return GateConfig(
+        fields=robot.cmd_vel_places, bicycle=robot.bicycle if robot.takes_turn_rate else None,
+        limits=limits, beam_angles=lidar.angles, mount=lidar.mount, range_min=lidar.range_min,
+        range_max=lidar.range_max, scan_rate=lidar.rate,
+        sensors=tuple(sensor.name for sensor in model.sensors), odom_std=model.noise.odometry,
+        shield=shield, **given,
+    )  # fmt: skip
 
 
 def shield_config(

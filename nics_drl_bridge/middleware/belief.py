@@ -33,6 +33,7 @@ class Belief(NamedTuple):
     outliers: tuple[int, ...]  # consecutive ones, by kind
     anchor: Anchor | None  # None before the first odometry
     lost: bool  # True if the robot may have moved unobserved since
+    error: Array  # (3 + S, S) derivative to a constant error of the state's rates since before
 
 
 class Foreseen(NamedTuple):
@@ -42,6 +43,7 @@ class Foreseen(NamedTuple):
     mean: Array
     covariance: Array
     expected: tuple[Array, Array]
+    error: Array  # see `Belief`
     update: tuple[Array, Array] | None = None  # gain (3 + S, 3), covariance after; if in advance
 
 

@@ -58,7 +58,7 @@ class Estimator:
             Kind.POSE: np.diag(np.maximum(model.noise.pose, LEAST_POSE_STD) ** 2),
         }
         self.unseen = Unseen(model, self._process, self._noise[Kind.TWIST], self._news)
-        self._observe_pose = np.eye(3, 3 + size)
+        self._observe_pose, self._suddenly = np.eye(3, 3 + size), np.eye(3 + size, size, -3)
         self._filter, self._trial = (ExtendedKalmanFilter(3 + size, 3) for _ in range(2))
         self._anchor: Anchor | None = None
         self._foreseen: Foreseen | None = None  # of the present belief and commands
@@ -68,7 +68,8 @@ class Estimator:
         """Begins at a time [ns] and a pose (3,) in `map`, of a deviation [m, rad], at rest."""
         mean, deviation = np.zeros(self._filter.dim_x), np.full(self._filter.dim_x, START_STD)
         mean[:3], deviation[:3] = pose, std
-        self.belief = Belief(time_ns, mean, np.diag(deviation**2), (0, 0, 0), None, False)
+        spread, error = np.diag(deviation**2), self._suddenly
+        self.belief = Belief(time_ns, mean, spread, (0, 0, 0), None, False, error)
         self._log = log_of(np.zeros(len(self._least)))
 
     def anchor(self, odom: Array) -> None:
@@ -85,19 +86,21 @@ class Estimator:
         covariance = self.unseen.doubted(anchor.covariance, seconds)
         known = self._anchor is not None and continuous
         since = anchor._replace(time_ns=time_ns - round(seconds * NS_PER_S)) if known else None
-        self.belief = Belief(time_ns, anchor.mean, covariance, (0, 0, 0), since, True)
+        error = self._suddenly
+        self.belief = Belief(time_ns, anchor.mean, covariance, (0, 0, 0), since, True, error)
         self._log = log_of(np.minimum(np.maximum(command, self._least), self._most))
 
     @property
     def belief(self) -> Belief:
         """State of the filter; set to an earlier one when the past has changed."""
         own = self._filter
-        return Belief(self.time_ns, own.x, own.P, self._outliers, self._anchor, self._lost)
+        known = self.time_ns, own.x, own.P, self._outliers, self._anchor, self._lost
+        return Belief(*known, self._error)
 
     @belief.setter
     def belief(self, belief: Belief) -> None:
         self.time_ns, self._filter.x, self._filter.P = belief[:3]
-        self._outliers, self._anchor, self._lost = belief[3:]
+        self._outliers, self._anchor, self._lost, self._error = belief[3:]
         self._foreseen = None
 
     @property
@@ -142,7 +145,7 @@ class Estimator:
         if self._foreseen is None or self._foreseen.time_ns != time_ns:
             self._foreseen = self._forecast(time_ns)
         self._lost = self._lost or time_ns - self.time_ns > self._motion.longest_ns
-        self.time_ns, self._filter.x, self._filter.P, *_ = self._foreseen
+        self.time_ns, self._filter.x, self._filter.P, _, self._error, _ = self._foreseen
 
     def foresee(self, time_ns: int) -> None:
         """Computes in advance the prediction to a time and the update by a twist measured then.
@@ -159,12 +162,12 @@ class Estimator:
 
     def _forecast(self, time_ns: int) -> Foreseen:
         own, motion, log, now = self._filter, self._motion, self._log, self.time_ns
-        mean, covariance, expected = kernels.forecast(
+        mean, covariance, expected, error = kernels.forecast(
             own.x, own.P, self._process, now, time_ns, motion, log
         )
         if time_ns - now > motion.longest_ns:
             covariance = self.unseen.doubted(covariance, (time_ns - now) / NS_PER_S)
-        return Foreseen(time_ns, mean, covariance, expected)
+        return Foreseen(time_ns, mean, covariance, expected, error)
 
     def update(self, kind: Kind, value: ArrayLike, std: ArrayLike | None = None) -> Judgement:
         """Corrects by a measured value (n,), with its standard deviations or the model's."""
@@ -240,7 +243,9 @@ class Estimator:
         believed = self._outliers[kind] + 1 >= PATIENCE[kind]
         if kind is Kind.TWIST:
             doubt = np.maximum(self._news - np.diag(self._filter.P), 0.0)
-            doubtful = self._filter.P + np.diag(doubt)
+            # What moved the state moved the pose, too, since the prediction began.
+            moved = self._error @ np.linalg.inv(self._error[3:])
+            doubtful = self._filter.P + (moved * doubt[3:]) @ moved.T
             if kernels.distance(innovation, derivative, doubtful, noise) <= GATE[kind]:
                 self._filter.P = doubtful
                 return Acceptance.NEWS

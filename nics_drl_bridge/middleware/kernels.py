@@ -80,7 +80,7 @@ def _kept(value, dt, drag):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def predict(mean, transition, command, dt, steps, motion):  # type: ignore[no-untyped-def]
-    """Moves the mean by `steps` of `dt` [s] under a command (C,), multiplying the transition."""
+    """Moves the mean by `steps` of `dt` [s] under a command (C,), and its `unmoved` derivative."""
     size, width = mean.shape[0] - 3, command.shape[0]
     x, dq = np.ones(size + width + 1), np.zeros(3 + size)
     jacobian, step = np.zeros((3 + size, size + width)), np.eye(3 + size)
@@ -106,6 +106,8 @@ def predict(mean, transition, command, dt, steps, motion):  # type: ignore[no-un
                 kept = _kept(mean[3 + d] + dt * dq[3 + d], dt, motion.terms.drag[d])
                 step[3 + d, 3 + i] = kept * ((1.0 if d == i else 0.0) + slope)
         transition[:] = step @ transition
+        for i in range(size):
+            transition[3 + i, 3 + size + i] += dt
         advance(mean[:3], dq, dt, motion.series)
         for i in range(size):
             mean[3 + i] = next_state(mean[3 + i], dq[3 + i], dt, bounds_of(motion.terms, i))
@@ -160,6 +162,17 @@ def take(command, time, motion, log):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
+def unmoved(width, time):  # type: ignore[no-untyped-def]
+    """Derivative (3 + S, 3 + 2 S) to the mean (3 + S,) and to a constant error of the S rates."""
+    size = width - 3
+    derivative = np.zeros((width, width + size))
+    derivative[:, :width] = np.eye(width)
+    for i in range(size):  # after a time [s] for which nothing else moved
+        derivative[3 + i, width + i] = time
+    return derivative
+
+
+@kernel(allocates=True)
 def carry(mean, transition, begin, end, motion, log):  # type: ignore[no-untyped-def]
     """Moves a mean between two times, command by command, in place, see `predict`.
 
@@ -168,6 +181,7 @@ def carry(mean, transition, begin, end, motion, log):  # type: ignore[no-untyped
     step = motion.step_ns
     if end - begin > motion.longest_ns:
         mean[3:] = 0.0
+        transition[:] = unmoved(mean.shape[0], (end - begin) / NS_PER_S)
         return
     before, command, now = mean[:3].copy(), np.empty(log.commands.shape[1]), begin
     while now < end:
@@ -179,7 +193,7 @@ def carry(mean, transition, begin, end, motion, log):  # type: ignore[no-untyped
         now = until
     if not (np.all(np.abs(mean) < RUNAWAY) and np.all(np.abs(transition) < RUNAWAY)):
         mean[:3], mean[3:] = before, 0.0
-        transition[:] = np.eye(mean.shape[0])
+        transition[:] = unmoved(mean.shape[0], (end - begin) / NS_PER_S)
 
 
 @kernel(allocates=True)
@@ -200,11 +214,19 @@ def expect(mean, now, motion, log):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def forecast(mean, covariance, process, begin, end, motion, log):  # type: ignore[no-untyped-def]
-    """Predicts mean, covariance, and what `expect` returns; `process` is added per second."""
-    moved, transition = mean.copy(), np.eye(mean.shape[0])
-    carry(moved, transition, begin, end, motion, log)
-    spread = transition @ covariance @ transition.T + process * ((end - begin) / NS_PER_S)
-    return moved, (spread + spread.T) * 0.5, expect(moved, end, motion, log)
+    """Predicts mean, covariance, what `expect` returns, and the derivative to a rates' error.
+
+    `process` is added per second.
+    """
+    # A model that is wrong stays wrong for a while: the error of the state's rates is constant in
+    # between, so that it moves the pose, too. A correction of the state then corrects the pose.
+    moved, width, time = mean.copy(), mean.shape[0], (end - begin) / NS_PER_S
+    derivative = unmoved(width, 0.0)
+    carry(moved, derivative, begin, end, motion, log)
+    transition, error = derivative[:, :width].copy(), derivative[:, width:].copy()
+    spread = transition @ covariance @ transition.T + error @ (process[3:, 3:] / time) @ error.T
+    spread[:3, :3] += process[:3, :3] * time
+    return moved, (spread + spread.T) * 0.5, expect(moved, end, motion, log), error
 
 
 @kernel(allocates=True)
@@ -212,7 +234,7 @@ def look_ahead(mean, begin, end, motion, log):  # type: ignore[no-untyped-def]
     """Predicts mean and body twist (3,) at a time; the present ones if that is earlier."""
     moved = mean.copy()
     if end > begin:
-        carry(moved, np.eye(mean.shape[0]), begin, end, motion, log)
+        carry(moved, unmoved(mean.shape[0], 0.0), begin, end, motion, log)
     return moved, expect(moved, max(begin, end), motion, log)[0]
 
 

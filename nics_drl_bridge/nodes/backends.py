@@ -26,6 +26,8 @@ from nics_drl_bridge.nodes.executor import HANDED_OVER
 from nics_drl_bridge.nodes.link import EpisodeServices, Link
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.nodes.robot_topics import data_facts
+from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
+from nics_drl_bridge.sim.simulator import EpisodeSampler
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 T = TypeVar("T")
@@ -103,7 +105,8 @@ def _take_odometry(middleware: Middleware, stamp_ns: int, arrival_ns: int, messa
 class DdsBackend:
     """One robot behind `cmd_vel`, `scan` and `odom`, in lock-step with a simulator node.
 
-    `truth` adds the true pose to `info`; `timeout_s` bounds each wait. Raises BackendError if no
+    `truth` adds the true pose to `info`; `timeout_s` bounds each wait; the simulator must draw by
+    the same `randomisation`. Raises BackendError if no
     simulator is there, it refuses, is not in lock-step, or another node moved it; ModelError if it
     runs another model or world; StaleDataError if its data do not arrive.
     """
@@ -111,7 +114,7 @@ class DdsBackend:
     def __init__(
         self, model: SimulatorModel, world: AnyWorld, namespace: str = "",
         simulator: str = "simulator_node", timeout_s: float = 30.0, truth: bool = False,
-        domain_id: int | None = None,
+        domain_id: int | None = None, randomisation: Randomisation | None = None,
     ) -> None:  # fmt: skip
         self._robot, self._lidar = model.robot, model.lidar
         self._robot.require_cmd_vel()
@@ -124,6 +127,9 @@ class DdsBackend:
         take = partial(_take_odometry, self._middleware)
         self._now_ns, self._mail = 0, _Mailbox(self._topics, take)
         self._known: BackendFacts = {}
+        if randomisation is not None:
+            sampler = EpisodeSampler(model, world, randomisation=randomisation)
+            self._known["scenes"] = lambda seeds: sampler.draw(seeds)[0]
         self._link = Link(namespace, domain_id)
         for topic in self._topics:
             kind = LaserScan if topic == SCAN else Odometry
@@ -131,7 +137,7 @@ class DdsBackend:
                 kind = sensor_type(self._sensors[topic])
             put = partial(_put, self._mail, topic)
             self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
-        self._episodes = EpisodeServices(self._link, simulator, model, world)
+        self._episodes = EpisodeServices(self._link, simulator, model, world, randomisation)
         self._link.begin()
         try:
             self._link.wait_for_peers(self._topics, self._episodes.clients, timeout_s, ADVICE)
@@ -196,7 +202,7 @@ class DdsBackend:
         facts = {"stamp_ns": now, **data_facts(self._middleware, time.monotonic_ns())}
         if TRUTH in self._topics:
             facts["true_pose"] = _read(TRUTH, wire.odometry_of, mail[TRUTH].content)[0]
-            self._known = {"true_pose": facts["true_pose"]}
+            self._known["true_pose"] = facts["true_pose"]
         return self._middleware.view(now), facts
 
     def _await(self, stamp_ns: int) -> dict[str, _Mail]:
@@ -299,12 +305,18 @@ MODES = {"lockstep": DdsBackend, "realtime": RealtimeBackend}
 
 def dds_backend(
     model: SimulatorModel, world: AnyWorld, mode: str = "lockstep", robots: int = 1,
-    estimator: bool = True, randomisation: None = None, **options: Any,
+    estimator: bool = True, randomisation: str | Randomisation | None = None, **options: Any,
 ) -> interface.Backend:  # fmt: skip
     """Returns the backend for the options; ConfigError if they do not go together, BackendError."""
-    if not estimator or randomisation is not None:
-        refused = "is never randomised; leave out `estimator` and `randomisation`."
-        raise ConfigError(f"backend 'dds' always estimates and {refused}")
+    if not estimator:
+        raise ConfigError("backend 'dds' always estimates; leave out `estimator`.")
+    if randomisation is not None:
+        if mode != "lockstep" or robots > 1:
+            needed = "one robot in mode 'lockstep' alone can be randomised"
+            raise ConfigError(f"backend 'dds': {needed}, not {robots} in mode {mode!r}.")
+        if not isinstance(randomisation, Randomisation):
+            randomisation = load_randomisation(randomisation)
+        options["randomisation"] = randomisation
     if mode not in MODES:
         raise ConfigError(f"backend_options: there is no mode {mode!r}; {nearest(mode, MODES)}")
     if robots > 1:

@@ -23,7 +23,7 @@ from nics_drl_bridge.gate.black_box import Entry
 from nics_drl_bridge.gate.gate import decide
 from nics_drl_bridge.gate.limits import PERIOD_S, Limits, load_limits
 from nics_drl_bridge.gate.state import Decision, GateConfig, ShieldConfig, begin
-from nics_drl_bridge.gate.stopping import doubtful, require_possible, shield_config
+from nics_drl_bridge.gate.stopping import doubtful, gate_config, require_possible, shield_config
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
@@ -45,17 +45,12 @@ REFUSED = (
 
 def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
     """Declares and reads a gate's parameters, logs doubts; ConfigError if one can't be used."""
-    lidar, robot = model.lidar, model.robot
     about = "Limits of the robot: a shipped file, or a YAML file; no default."
     file = str(runner.declare(node, "limits", "", about, read_only=True))
-    limits = load_limits(file, robot) if file else None
-    config = GateConfig(
-        fields=robot.cmd_vel_places, bicycle=robot.bicycle if robot.takes_turn_rate else None,
-        limits=limits, beam_angles=lidar.angles, mount=lidar.mount, range_min=lidar.range_min,
-        range_max=lidar.range_max, scan_rate=lidar.rate,
-        sensors=tuple(sensor.name for sensor in model.sensors), odom_std=model.noise.odometry,
-        simulated=bool(node.get_parameter("use_sim_time").value),
-        shield=_declare_shield(node, model, limits, file), **_declare_rules(node, model),
+    limits = load_limits(file, model.robot) if file else None
+    config = gate_config(
+        model, limits, _declare_shield(node, model, limits, file),
+        simulated=bool(node.get_parameter("use_sim_time").value), **_declare_rules(node, model),
     )  # fmt: skip
     require_possible(config)
     if doubt := doubtful(config, model.control_period):

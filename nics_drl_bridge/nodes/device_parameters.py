@@ -16,6 +16,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes.runner import declare
 from nics_drl_bridge.robot.noise import Delay
+from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 
 LOCKSTEP = "lockstep"
 MODES = ("realtime", LOCKSTEP, "as_fast_as_possible")
@@ -62,10 +63,10 @@ def declare_device(node: Node, laser_frame: str) -> None:
     node.declare_parameter("robots", 1, fleet)
     for name, fixed, about in (
         ("world", "arena", "World file, or the name of a shipped world."),
+        ("randomisation", "", "Draws in each episode: a file, mild or strong; none if empty."),
         ("mode", "realtime", f"How time runs: {', '.join(MODES)}."),
         ("enable_stamped_cmd_vel", False, "Whether cmd_vel is a TwistStamped; a Twist otherwise."),
-        ("frame_prefix", "",
-         "Put before the frames of the robot; in a fleet before its namespace there."),
+        ("frame_prefix", "", "Put before the robot's frames; in a fleet before its namespace."),
         ("map_frame", "map", "Frame id of map."),
         ("odom_frame", "odom", "Frame id of odom."),
         ("base_frame", "base_link", "Frame id of base_link."),
@@ -101,6 +102,12 @@ def declare_device(node: Node, laser_frame: str) -> None:
 def number(node: Node, name: str) -> float:
     """Returns the value of a numeric parameter."""
     return float(node.get_parameter(name).value or 0.0)
+
+
+def randomisation(node: Node) -> Randomisation | None:
+    """Returns what is drawn in each episode, if anything. Raises ConfigError."""
+    name = str(node.get_parameter("randomisation").value)
+    return load_randomisation(name) if name else None
 
 
 def timing(node: Node, model: SimulatorModel) -> DeviceTiming:

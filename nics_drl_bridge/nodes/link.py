@@ -33,9 +33,11 @@ from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.runner import holds, last_word, open_context
 from nics_drl_bridge.nodes.wire import twist_to_bytes
+from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 SPIN_S, POLL_S = 0.2, 0.002
+NO_RANDOMISATION = "none"
 LOST_S = 1.0  # a request to repeat data that stays unanswered for longer was itself lost [s]
 
 
@@ -196,12 +198,25 @@ class CommandTimeout:
         last_word(self._publisher, self._kind())
 
 
+def identity(
+    model: SimulatorModel, world: AnyWorld, randomisation: Randomisation | None
+) -> dict[str, str]:
+    """Returns the fingerprints of what a simulator simulates; by `none` of no randomisation."""
+    drawn = NO_RANDOMISATION if randomisation is None else randomisation.fingerprint
+    return {
+        "model": model.fingerprint, "world": world.fingerprint, "randomisation": drawn,
+    }  # fmt: skip
+
+
 class EpisodeServices:
     """The services of a simulator node that begin an episode of a model in a world."""
 
-    def __init__(self, link: Link, simulator: str, model: SimulatorModel, world: AnyWorld) -> None:
+    def __init__(
+        self, link: Link, simulator: str, model: SimulatorModel, world: AnyWorld,
+        randomisation: Randomisation | None = None,
+    ) -> None:  # fmt: skip
         self._link = link
-        self._identity = {"model": model.fingerprint, "world": world.fingerprint}
+        self._identity = identity(model, world, randomisation)
         client, setting = link.node.create_client, f"{simulator}/set_parameters_atomically"
         self._parameters = client(SetParametersAtomically, setting)
         self._reset = client(Trigger, f"{simulator}/reset")

@@ -31,6 +31,7 @@ from nics_drl_bridge.lidar.scanner import RENDERERS, Renderer
 from nics_drl_bridge.lidar.spec import to_device
 from nics_drl_bridge.nodes import conversions, device_parameters, qos, runner, wire
 from nics_drl_bridge.nodes.conversions import sensor_to_ros, sensor_type
+from nics_drl_bridge.nodes.link import identity
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, variances
 from nics_drl_bridge.sim.simulator import FastSimulator
@@ -244,7 +245,7 @@ class DeviceNode(qos.QosWatch):
         self._time = device_parameters.timing(self, model)
         self._names = device_parameters.namespaces(self)
         world = load_worlds(str(self.get_parameter("world").value))
-        self._identity = {"model": model.fingerprint, "world": world.fingerprint}
+        self._identity = identity(model, world, device_parameters.randomisation(self))
         model = device_parameters.timed_model(self, model, self._time)
         simulator = make(self, model, world, len(self._names))
         self._world = DeviceWorld(simulator, model, len(self._names))
@@ -441,7 +442,9 @@ def fast_simulator(
 ) -> FastSimulator:
     """Makes the fast simulator, with the lidar that the parameter `renderer` names."""
     renderer, tell = declare_renderer(node, "baked"), node.get_logger().warning
-    return FastSimulator(model, world, robots=robots, renderer=renderer, tell=tell)
+    drawn = device_parameters.randomisation(node)
+    given: Any = {"renderer": renderer, "randomisation": drawn, "tell": tell}
+    return FastSimulator(model, world, robots=robots, **given)
 
 
 def simulator_node(context: Context) -> DeviceNode:

@@ -128,10 +128,20 @@ class DrivenSimulator(FastSimulator):
         self.wheels: Array = self.data.pose[0].copy()
         return scenes
 
-    def begin_period(self) -> None:
-        """Sets the obstacles' velocities for the period that begins."""
+    def begin_period(self, commands: Array) -> None:
+        """Takes the commands (M, C) of the period that begins, and steers the obstacles in it."""
+        history = self.data.history[0]
+        history[:, 1:] = history[:, :-1].copy()
+        history[:, 0] = commands
         self._start = self.data.bodies[0, :, :3].copy()
         step_kernels.begin_period(self.packed[0])
+
+    def in_force(self, time: float) -> Array:
+        """Commands (M, C) in force `time` [s] after the beginning, by the drawn latency alone."""
+        dt, _, own = self.model.timing
+        late = (self.data.delay[0] - own) * dt - time
+        rows = np.ceil(np.maximum(late, 0.0) / self.model.control_period - 1e-6).astype(np.int64)
+        return np.asarray(self.data.history[0, np.arange(len(rows)), rows])
 
     def move_obstacles(self, time: float) -> Array:
         """Moves the obstacles (K, 7) to their poses `time` [s] after the period's beginning."""

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, Field, model_validator
 
+from nics_drl_bridge import files
 from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.config import Schema, find_config, load_yaml, validate
 from nics_drl_bridge.errors import ConfigError, nearest
@@ -43,7 +44,8 @@ FAULT_COLUMNS = (  # see `lidar.fault_kernels`
 CHOICES: dict[str, tuple[int, Mapping[Any, int]]] = {  # faults drawn from words: column, values
     "skew": (fault_kernels.SKEW, SKEW), "too_close": (fault_kernels.TOO_CLOSE, TOO_CLOSE)
 }  # fmt: skip
-KINEMATICS_GROUP, LATENCY_GROUP, ODOMETRY_GROUP, LIDAR_GROUP, CHOICES_GROUP, SCENE_GROUP = range(6)
+KINEMATICS_GROUP, LATENCY_GROUP, ODOMETRY_GROUP, LIDAR_GROUP = range(4)
+CHOICES_GROUP, SCENE_GROUP, RESPONSE_GROUP = range(4, 7)
 GROUPS = 8
 PLACES = 1 << 20  # More than a group has columns; the counters of two groups never collide
 UNIT = (np.zeros(1), np.ones(1))
@@ -68,6 +70,7 @@ class KinematicRanges(Schema):
     """Factors on the coefficients of the Taylor model, drawn independently for each coefficient."""
 
     scale: Factor = AS_IT_IS  # for every coefficient
+    response: Factor = AS_IT_IS  # on all time constants of the state alike, one for each robot
     dofs: dict[str, Factor] = Field(default_factory=dict)  # overrides it, by name of a rate (`wz`)
     # overrides both, by rate and term: `{wz: {speed*steering: [0.8, 1.2]}}`
     terms: dict[str, dict[str, Factor]] = Field(default_factory=dict)
@@ -144,6 +147,11 @@ class Randomisation(Schema):
         rungs = self.obstacles.rungs if high > low else 1
         return tuple(np.linspace(low, high, rungs).tolist())
 
+    @property
+    def fingerprint(self) -> str:
+        """Identifies the ranges: 16 digits of a SHA-256."""
+        return files.sha256(self.model_dump_json().encode())[:16]
+
 
 def load_randomisation(name: str | Path) -> Randomisation:
     """Loads a shipped randomisation by name (`mild`), or any other by the path of its YAML file."""
@@ -159,6 +167,7 @@ class Draws:
     """Draws for n episodes of M robots: every number the simulator needs, drawn or the model's."""
 
     coefficient: Array  # (n, M, T) kept terms, in the order of `robot.kernels.term_arrays`
+    response: Array  # (n, M) factor on the time constants, which is in `coefficient`
     delay: Integers  # (n, M) from a command to its effect, including the model's [substeps]
     age: Integers  # (n, M) of scan and odometry when they are observed [substeps]
     noise: Array  # (n, M, 2 + 3 + S) see `State.noise`
@@ -186,6 +195,9 @@ class Sampler:
         self.randomisation, self._robots = randomisation, robots
         where = f"randomisation {randomisation.name!r}"
         self._coefficient = _coefficients(randomisation.kinematics, model.kinematics, where)
+        fastest, slowest = randomisation.kinematics.response
+        self._response = np.array([fastest]), np.array([slowest])
+        self._rates = np.nonzero(model.kinematics.coefficients)[0] >= 3  # (T,) terms of the state's
         self._timing, self._step = _latencies(randomisation, model), model.timing[0]
         self._noise = _levels(randomisation, model, where)
         self._faults = _faults(randomisation, model.lidar, where)
@@ -210,12 +222,15 @@ class Sampler:
         noise = _between(self._noise, chosen, robots, ODOMETRY_GROUP)
         faults = _between(self._faults, chosen, robots, LIDAR_GROUP)
         noise[..., 3] = noise[..., 2]
+        coefficient = _between(self._coefficient, chosen, robots, KINEMATICS_GROUP)
+        response = _between(self._response, chosen, robots, RESPONSE_GROUP)
+        coefficient[..., self._rates] /= response
         for column, values in self._choices.items():
             drawn = _between(UNIT, chosen, robots, CHOICES_GROUP, column)[..., 0]
             faults[..., column] = values[(drawn * len(values)).astype(np.int64)]
         counts, sizes = self.randomisation.obstacles.count is not None, len(self._sizes) > 1
         return Draws(
-            _between(self._coefficient, chosen, robots, KINEMATICS_GROUP),
+            coefficient, response[..., 0],
             timing[..., 0].copy(), timing[..., 1].copy(), noise, faults,
             scene[:, 0] if counts else None, scene[:, 1] if sizes else None,
             self._sizes[scene[:, 1]] if sizes else None, np.multiply(timing, self._step),
@@ -238,6 +253,8 @@ class Sampler:
                 chosen = field == "faults" and column in self._choices
                 if name and (chosen or low[column] != high[column]):
                     yield name, field, column
+        if self._response[0] != self._response[1]:
+            yield "kinematics.response", "response", None
         if self.randomisation.obstacles.count is not None:
             yield "obstacles.count", "count", None
         if len(self._sizes) > 1:
@@ -265,7 +282,12 @@ def _coefficients(ranges: KinematicRanges, model: TaylorModel, where: str) -> Bo
         d, place = model.dofs.index(dof), f"{where}: key 'kinematics.terms', rate {dof!r}"
         for term, span in terms.items():
             spans[d, _term(d, term, model, place)] = span
-    _check_stable(model, spans, where)
+    if ranges.response != AS_IT_IS and not model.state_size:
+        none = "the model has no state, so it has no time constants"
+        raise ConfigError(f"{where}: key 'kinematics.response': {none}; leave it out.")
+    spread = spans.copy()
+    spread[3:] /= ranges.response[::-1]
+    _check_stable(model, spread, where)
     kept = np.nonzero(model.coefficients)
     base = term_arrays(model).coefficient
     return base * spans[kept][:, 0], base * spans[kept][:, 1]

@@ -122,6 +122,27 @@ def _check_memory(model: SimulatorModel, world: AnyWorld, worlds: int, robots: i
         )
 
 
+class EpisodeSampler:
+    """Draws the scenes of episodes, and the numbers of a randomisation, if there is one."""
+
+    def __init__(
+        self, model: SimulatorModel, world: AnyWorld, robots: int = 1,
+        randomisation: Randomisation | None = None,
+    ) -> None:  # fmt: skip
+        given = randomisation
+        sizes = (1.0,) if given is None else given.sizes
+        most = None if given is None or given.obstacles.count is None else given.obstacles.count[1]
+        self.scenes = SetSampler(world, footprint_shape(model.robot).radius, robots, sizes, most)
+        self.draws = None if given is None else Sampler(given, model, robots)
+
+    def draw(self, seeds: ArrayLike) -> tuple[Scenes, Draws | None]:
+        """Draws the scenes and the numbers of seeds (n,)."""
+        if self.draws is None:
+            return self.scenes.draw(seeds), None
+        draws = self.draws.draw(seeds)
+        return self.scenes.draw(seeds, draws.count, draws.size), draws
+
+
 class FastSimulator:
     """The simulator that a SimulatorModel describes, in a world, or in those of a set.
 
@@ -152,18 +173,15 @@ class FastSimulator:
             randomisation = load_randomisation(randomisation)
         _check_speed(model.kinematics, model.robot, world)
         self.model, self.world, self.randomisation = model, world, randomisation
-        self._draws = None if randomisation is None else Sampler(randomisation, model, robots)
-        if self._draws is not None:
-            delay = max(delay, self._draws.longest_delay)
-            longest_age = max(longest_age, self._draws.longest_age)
+        self._episodes = EpisodeSampler(model, world, robots, randomisation)
+        if (draws := self._episodes.draws) is not None:
+            delay = max(delay, draws.longest_delay)
+            longest_age = max(longest_age, draws.longest_age)
         self.goals: Array = np.zeros((worlds, robots, 2))  # of the episodes [m]
         # Draws of the randomisation for the running episodes, (N, M) per robot or (N,) per scene.
         self.drawn: dict[str, NDArray[Any]] = {}
         self._footprint = footprint_shape(model.robot)
-        sizes = (1.0,) if randomisation is None else randomisation.sizes
-        counts = None if randomisation is None else randomisation.obstacles.count
-        most = None if counts is None else counts[1]
-        self.sampler = SetSampler(world, self._footprint.radius, robots, sizes, most)
+        self.sampler = self._episodes.scenes
         shapes = (*self.sampler.shapes, self._footprint)
         table = with_shapes(model.lidar, model.table, shapes)
         self._in_table = np.array([table.outlines.index_of(shape) for shape in shapes])
@@ -225,7 +243,7 @@ class FastSimulator:
         not fit.
         """
         chosen = np.arange(len(self.data.steps)) if worlds is None else np.asarray(worlds, np.int64)
-        scenes, draws = self._draw(seeds)
+        scenes, draws = self._episodes.draw(seeds)
         begin = scenes.starts if starts is None else np.asarray(starts, dtype=np.float64)
         if len(scenes) != len(chosen) or begin.shape != scenes.starts.shape:
             needed = f"{len(chosen)} worlds with {self.data.pose.shape[1]} robots each."
@@ -245,13 +263,7 @@ class FastSimulator:
 
     def scenes(self, seeds: ArrayLike) -> Scenes:
         """Returns the scenes that `reset` would begin with for seeds (n,)."""
-        return self._draw(seeds)[0]
-
-    def _draw(self, seeds: ArrayLike) -> tuple[Scenes, Draws | None]:
-        if self._draws is None:
-            return self.sampler.draw(seeds), None
-        draws = self._draws.draw(seeds)
-        return self.sampler.draw(seeds, draws.count, draws.size), draws
+        return self._episodes.draw(seeds)[0]
 
     @property
     def obstacles(self) -> Array:

@@ -11,14 +11,18 @@ from robots import direct_model, field
 from scipy.stats import chi2
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.interface import Start
 from nics_drl_bridge.middleware import kernels
 from nics_drl_bridge.middleware.ekf import Estimator
 from nics_drl_bridge.middleware.kernels import Log, MotionModel
 from nics_drl_bridge.middleware.measurement import Acceptance, Kind
 from nics_drl_bridge.robot.kernels import SERIES, rates, scratch, term_arrays
 from nics_drl_bridge.robot.noise import Level, Noise
+from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.world import load_world
 
 ROBOTS = ("ackermann", "differential", "mecanum")
 SECOND = 1_000_000_000
@@ -68,16 +72,20 @@ def test_the_transition_is_the_numerical_derivative_of_the_motion(robot, dt, ste
     motion = MotionModel(term_arrays(model.kinematics), SERIES, 0, 0)
     for _ in range(10):
         mean, command = random_mean(model, rng), random_command(model, rng)
+        size = len(mean)
 
-        def of(start, command=command):
-            end = start.copy()
-            kernels.predict(end, np.eye(len(end)), command, dt, steps, motion)
-            end[2] = start[2] + geometry.wrap_angle(end[2] - start[2])
+        def of(given, command=command, size=size):
+            end, error = given[:size].copy(), given[size:]  # of the state's rates
+            for _ in range(steps):
+                kernels.predict(end, kernels.unmoved(size, 0.0), command, dt, 1, motion)
+                end[3:] += error * dt
+            end[2] = given[2] + geometry.wrap_angle(end[2] - given[2])
             return end
 
-        transition, moved = np.eye(len(mean)), mean.copy()
-        kernels.predict(moved, transition, command, dt, steps, motion)
-        assert transition == pytest.approx(numerical_jacobian(of, mean), abs=2e-5)
+        derivative, moved = kernels.unmoved(len(mean), 0.0), mean.copy()
+        kernels.predict(moved, derivative, command, dt, steps, motion)
+        start = np.append(mean, np.zeros(len(mean) - 3))
+        assert derivative == pytest.approx(numerical_jacobian(of, start), abs=2e-5)
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -284,6 +292,21 @@ def test_the_estimate_is_as_uncertain_as_it_claims(robot, pose_std):
         nees.append(errors[-1] @ np.linalg.solve(covariances[-1], errors[-1]))
     low, high = chi2.ppf([0.025, 0.975], 3 * RUNS) / RUNS
     assert low < np.mean(nees) < high
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_a_model_that_is_a_little_wrong_does_not_lead_the_estimate_astray(robot):
+    model = builtin_model(robot)
+    wrong = Randomisation(name="wrong", kinematics={"scale": [0.95, 1.05]})
+    backend = SimBackend(model, load_world("empty"), estimator=True, randomisation=wrong)
+    start, command = np.array([0.0, -1.0, 0.0]), np.zeros(len(model.robot.command))
+    command[0], command[-1] = 0.5, 0.3 if model.robot.steers else 0.5
+    for seed in range(3):
+        backend.reset(Start(seed, start))
+        for _ in range(100):
+            view, info = backend.step(command)
+        assert not info["true_collision"]
+        assert np.hypot(*(view.pose - info["true_pose"])[:2]) < 0.1
 
 
 def test_a_robot_that_is_stuck_is_noticed_at_once():

@@ -4,6 +4,7 @@ import gc
 import os
 import signal
 import threading
+from contextlib import closing
 
 import gymnasium
 import numpy as np
@@ -457,10 +458,31 @@ def test_a_team_over_dds_sees_what_a_team_in_process_sees(launch, model, domain_
         there.close()
 
 
-@pytest.mark.parametrize("wish", [{"estimator": False}, {"randomisation": "mild"}])
-def test_what_topics_can_not_give_is_refused(model, wish):
-    with pytest.raises(ConfigError, match="'dds' always estimates and is never randomised"):
-        BridgeEnv("dds", model, **wish)
+def test_a_randomised_episode_over_dds_is_the_one_in_process(launch, model, domain_id):
+    launch("simulator_node", domain_id, mode="lockstep", randomisation="strong")
+    options = {"backend_options": {"domain_id": domain_id}}
+    here = BridgeEnv(model=model, randomisation="strong", estimator=True)
+    with closing(BridgeEnv("dds", model, randomisation="strong", **options)) as there:
+        for seed in (3, 4):
+            (mine, info), (theirs, told) = (env.reset(seed=seed) for env in (here, there))
+            assert (mine == theirs).all()
+            assert info["goal"].tolist() == told["goal"].tolist()
+            for k in range(5):
+                action = np.full(here.action_space.shape, 0.1 * k, np.float32)
+                assert (here.step(action)[0] == there.step(action)[0]).all()
+    for drawn in (None, "mild"):
+        with (
+            closing(BridgeEnv("dds", model, randomisation=drawn, **options)) as env,
+            pytest.raises(ModelError, match="start both with the same randomisation"),
+        ):
+            env.reset(seed=3)
+
+
+def test_what_topics_can_not_give_is_refused(model):
+    with pytest.raises(ConfigError, match="'dds' always estimates"):
+        BridgeEnv("dds", model, estimator=False)
+    with pytest.raises(ConfigError, match="one robot in mode 'lockstep' alone can be randomised"):
+        BridgeEnv("dds", model, randomisation="mild", backend_options={"mode": "realtime"})
 
 
 @pytest.mark.parametrize("options", [{"mode": "realtime"}, {"namespaces": ["a"]}])

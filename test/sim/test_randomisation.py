@@ -112,6 +112,29 @@ def test_each_coefficient_is_scaled_evenly_and_on_its_own():
     assert (np.sign(drawn.coefficient) == np.sign(nominal)).all()
 
 
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_a_slower_response_scales_all_time_constants_alike_and_leads_to_the_same_state(robot):
+    nominal, command = builtin_model(robot).kinematics, builtin_model(robot).robot.command_high
+    sampler = Sampler(given(kinematics={"response": [1.0, 3.0]}), builtin_model(robot), 2)
+    drawn = sampler.draw(SEEDS[:50])
+    kept, size = np.nonzero(nominal.coefficients), nominal.state_size
+    factor = term_arrays(nominal).coefficient / drawn.coefficient
+    assert np.allclose(factor[..., kept[0] < 3], 1.0)
+    assert np.allclose(factor[..., kept[0] >= 3], drawn.named()["kinematics.response"][..., None])
+    assert drawn.response.min() < 1.2
+    assert drawn.response.max() > 2.8
+    settled = []
+    for coefficient in (term_arrays(nominal).coefficient, drawn.coefficient[0, 0]):
+        coefficients = nominal.coefficients.copy()
+        coefficients[kept] = coefficient
+        state = np.zeros(size)
+        for _ in range(1000):
+            slow = dataclasses.replace(nominal, coefficients=coefficients)
+            state = slow.step(np.zeros(3), state, command)[1]
+        settled.append(state)
+    assert settled[0] == pytest.approx(settled[1], rel=1e-3)
+
+
 def test_a_rate_and_a_term_may_have_ranges_of_their_own():
     kinematics = {
         "scale": [0.9, 1.1],

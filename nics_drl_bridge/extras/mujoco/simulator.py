@@ -19,6 +19,7 @@ from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import DrivenSimulator
+from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.world_set import AnyWorld
 
@@ -136,13 +137,14 @@ class MujocoRobot:
 class MujocoSimulator(DrivenSimulator):
     """One world of robots in MuJoCo, with motors, wheels and contact, as seeded for FastSimulator.
 
-    A command acts on motors with their own lag: the model's latency is not added. ConfigError if
+    A command acts on motors with their own lag: the model's latency is not added, that of a
+    randomisation is; its factors on the model's kinematics mean nothing here. ConfigError if
     MuJoCo, textbook kinematics, a parameter of the machine or free space in the world is missing.
     """
 
     def __init__(
         self, model: SimulatorModel, world: AnyWorld, robots: int = 1, renderer: Renderer = "auto",
-        physics: Physics | None = None,
+        physics: Physics | None = None, randomisation: Randomisation | None = None,
     ) -> None:  # fmt: skip
         self._mujoco = load_mujoco()
         physics = physics or Physics()
@@ -151,7 +153,8 @@ class MujocoSimulator(DrivenSimulator):
         alone = MujocoRobot(model.robot, self._physics)
         self._machine, self._rest = alone.machine, alone.rest
         self._twist = textbook(model.robot).twist
-        super().__init__(model, world, robots=robots, renderer=renderer)
+        drawn: Any = {"renderer": renderer, "randomisation": randomisation}
+        super().__init__(model, world, robots=robots, **drawn)
         self.reset([0])
 
     def reset(
@@ -183,9 +186,10 @@ class MujocoSimulator(DrivenSimulator):
         shape = (1, len(self._rigs), len(self.model.robot.command))
         if commands.shape != shape:
             raise ConfigError(f"commands are {commands.shape}; they must be {shape}.")
-        for rig, command in zip(self._rigs, commands[0], strict=True):
-            rig.command(self._data, command)
-        self.begin_period()
+        if not np.isfinite(commands).all():
+            needed = f"must be finite numbers, as robot {self.model.robot.name!r} takes them."
+            raise BackendError(f"commands {commands.tolist()} {needed}")
+        self.begin_period(commands[0])
         self._move()
         for rig, collided in zip(self._rigs, self.data.collided[0], strict=True):
             if not collided:
@@ -201,6 +205,8 @@ class MujocoSimulator(DrivenSimulator):
         touched = np.zeros(len(rigs), np.bool_)
         turned = [rig.encoders(data) for rig in rigs]
         for part in range(self._subperiods):
+            for rig, command in zip(rigs, self.in_force(part * part_s), strict=True):
+                rig.command(data, command)
             self._place_obstacles((part + 1) * part_s)
             self._mujoco.mj_step(self._simulation, data, nstep=self._steps)
             bumped = self._bumper_of[data.contact.geom.ravel()]

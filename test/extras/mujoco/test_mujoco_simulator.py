@@ -16,6 +16,7 @@ from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator, divide
 from nics_drl_bridge.generator import SimulatorModel, builtin_model
 from nics_drl_bridge.lidar.exact_kernels import X, Y
 from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import World, load_world
 from nics_drl_bridge.sim.world_set import load_worlds
@@ -58,6 +59,32 @@ def test_an_episode_begins_as_in_the_fast_simulator(name):
     for known in ("pose", "bodies", "ranges", "odom", "steps"):
         assert np.array_equal(getattr(ours.data, known), getattr(theirs.data, known))
     assert np.array_equal(ours.goals, theirs.goals)
+
+
+def test_a_latency_that_is_drawn_delays_the_motors_and_the_rest_is_drawn_as_elsewhere():
+    model, world = builtin_model("differential"), load_world("empty")
+    late = Randomisation(
+        name="late", action_latency=(1.0, 1.0), lidar={"dropout": (0.5, 0.5)},
+        odometry={"odom_linear": (0.1, 0.1)},
+    )  # fmt: skip
+    ours, theirs = (
+        kind(model, world, randomisation=late) for kind in (MujocoSimulator, FastSimulator)
+    )
+    prompt = MujocoSimulator(model, world)
+    for simulator in (ours, theirs, prompt):
+        simulator.reset([3])
+    assert np.array_equal(ours.data.noise, theirs.data.noise)
+    assert np.array_equal(ours.data.ranges, theirs.data.ranges)
+    assert np.isinf(ours.data.ranges).sum() > 0.4 * model.lidar.beams
+    start = ours.data.pose[0, 0, :2].copy()
+    paths = []
+    for simulator in (ours, prompt):
+        paths.append([])
+        for _ in range(4):
+            drive(simulator, forward(model, 0.5), 1)
+            paths[-1].append(float(np.linalg.norm(simulator.data.pose[0, 0, :2] - start)))
+    assert paths[0][0] < 1e-3 < paths[1][0]
+    assert paths[0][1:] == pytest.approx(paths[1][:-1], abs=1e-3)  # a period later, the same
 
 
 @pytest.mark.parametrize("name", WORLDS)

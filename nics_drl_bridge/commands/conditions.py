@@ -1,0 +1,33 @@
+"""Conditions under which the episodes of an evaluation are driven, alike in every place."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from nics_drl_bridge.generator import SimulatorModel, open_model, save_model
+from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Lidar, randomisation and gate of an evaluation; None leaves each as in the model, or out."""
+
+    lidar: str | None = None  # shipped lidar or file, instead of the model's
+    randomisation: str | None = None  # shipped one or file, which draws each episode's numbers
+    gate: str | None = None  # limits, shipped or a file, of a gate between policy and robot
+
+    @property
+    def ranges(self) -> Randomisation | None:
+        """The ranges that each episode draws from. Raises ConfigError."""
+        return None if self.randomisation is None else load_randomisation(self.randomisation)
+
+    def model(self, name: str, folder: Path) -> tuple[SimulatorModel, str]:
+        """Opens a model and returns its name; with another lidar, it is saved below a folder."""
+        model = open_model(name, self.lidar)
+        if self.lidar is None:
+            return model, name
+        place = folder / "model"
+        save_model(model, place)
+        return open_model(place), str(place)
+
+
+NO_CONDITIONS = Conditions()

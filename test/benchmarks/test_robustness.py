@@ -1,0 +1,116 @@
+from __future__ import annotations
+
+import math
+from importlib import import_module
+
+import pytest
+
+from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.policy.policies import shipped_policies
+from nics_drl_bridge.sim.randomisation import Sampler, load_randomisation
+
+from .runs import BENCHMARKS, asked, fails
+
+ready = "differential" in shipped_policies()
+MILD = load_randomisation("mild")
+NAMES = ("noise", "drop-out", "latency", "response", "drift", "footprint")
+
+
+@pytest.fixture
+def robustness(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    return import_module("robustness")
+
+
+def curves(nothing=0.97, **at):
+    """Success without a perturbation, and at a half of, at, and at twice the declared range."""
+    return {each: [nothing, nothing, at.get(each, nothing), 0.0] for each in NAMES}
+
+
+@pytest.mark.parametrize(
+    ("success", "bars"),
+    [
+        (curves(), []),
+        (curves(latency=0.92), []),
+        (curves(latency=0.91, drift=1.0), ["latency takes 6.0 points, more than 5"]),
+        (curves(nothing=0.94), ["94.0% success without a perturbation, less than 95%"]),
+        (curves(noise=math.nan), ["noise takes nan points"]),
+    ],
+)
+def test_no_perturbation_may_take_five_points_at_its_declared_range(robustness, success, bars):
+    missed = robustness.missed({"mecanum": success})
+    assert len(missed) == len(bars)
+    assert all(bar in line for bar, line in zip(bars, missed, strict=True))
+
+
+def test_no_policy_is_no_robustness(robustness):
+    assert robustness.missed({}) == ["no policy was driven"]
+
+
+def test_the_worst_loss_is_that_of_one_policy_to_one_perturbation(robustness):
+    lost = robustness.losses({"mecanum": curves(drift=0.95), "ackermann": curves(noise=0.93)})
+    assert lost["mecanum"]["drift"] == pytest.approx(2.0)
+    assert robustness.worst(lost) == {
+        "points": pytest.approx(4.0), "robot": "ackermann", "perturbation": "noise",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", [each for each in NAMES if each != "footprint"])
+def test_a_perturbation_alone_has_the_greatest_declared_value(robustness, name):
+    model = builtin_model("differential")
+    once, twice = (robustness.ranges(MILD, name, times) for times in (1.0, 2.0))
+    assert once != twice
+    drawn = Sampler(once, model).draw([1, 2, 3])
+    whole = Sampler(MILD, model).draw(range(200))
+    told = {
+        "noise": lambda d: d.faults[..., 0], "drop-out": lambda d: d.faults[..., 2],
+        "latency": lambda d: d.delay + d.age, "response": lambda d: d.response,
+        "drift": lambda d: d.noise[..., 2:5],
+    }  # fmt: skip
+    assert told[name](drawn).min() >= told[name](whole).max() - 1e-12
+    others = [one for other, one in told.items() if other not in (name, "response")]
+    plain = Sampler(robustness.ranges(MILD, "footprint", 0.0), model).draw([1, 2, 3])
+    assert all((one(drawn) == one(plain)).all() for one in others)
+
+
+def test_the_ranges_are_those_of_the_training_of_each_policy(robustness):
+    for robot in shipped_policies():
+        assert set(robustness.declared(robustness.of_training(robot))) == set(NAMES)
+    assert robustness.declared(MILD)["noise"] == "20 mm on each range"
+
+
+def test_a_lidar_keeps_the_noise_that_it_has_anyway(robustness):
+    assert robustness.ranges(MILD, "noise", 1.0, 0.03).lidar.noise_std == (0.03, 0.03)
+
+
+@pytest.mark.parametrize("robot", ["mecanum", "jackal"])
+def test_a_larger_footprint_is_the_same_outline_scaled(robustness, robot):
+    model = builtin_model(robot)
+    larger = robustness.grown(model, 1.1)
+    assert larger.robot.footprint_radius == pytest.approx(1.1 * model.robot.footprint_radius)
+    assert (larger.robot.footprint is None) == (model.robot.footprint is None)
+    assert larger.kinematics is model.kinematics
+
+
+ONE = ("--episodes", "2", "--robots", "differential", "--worlds", "circles")
+
+
+@pytest.mark.campaign
+@pytest.mark.skipif(not ready, reason="no policy is shipped")
+def test_it_draws_its_curves_and_prints_one_json_object(tmp_path):
+    picture = tmp_path / "curves.png"
+    code, told = asked("robustness.py", *ONE, "--picture", str(picture), "--only", "drop-out")
+    assert set(told["success"]["differential"]) == {"drop-out"}
+    assert len(told["success"]["differential"]["drop-out"]) == len(told["multiples"]) == 4
+    assert set(told["declared"]["differential"]) == set(NAMES)
+    assert code == bool(told["failures"])
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.campaign
+@pytest.mark.skipif(not ready, reason="no policy is shipped")
+@pytest.mark.parametrize(
+    ("control", "bar"), [("tenfold", "drift takes"), ("standing", "0.0% success")]
+)
+def test_a_perturbation_tenfold_or_a_policy_that_stands_misses_a_bar(control, bar):
+    assert any(bar in line for line in fails("robustness.py", control, *ONE, "--only", "drift"))
