@@ -124,8 +124,8 @@ README = told(
     ),
     (
         "barn_five_fold",
-        "the 250 worlds of the BARN challenge, a Jackal without a map, learnt from 200 and judged in "
-        "the others, in turn",
+        "the 250 worlds of the BARN challenge, a Jackal without a map, learnt from 200 and judged "
+        "in the others, in turn",
         "{success|.1%} success, {collision|.1%} collisions, score {score|.3f} of 0.5 "
         "(`docs/worlds.md`)",
     ),

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
 from nics_drl_bridge.env.guard import check_action, check_reset, give, override
 from nics_drl_bridge.env.kernels import episode_seeds
-from nics_drl_bridge.env.privileged import Privileged, Supervisor
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task, still, team_space, total
+from nics_drl_bridge.env.teaching import Teacher, Teaching
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import NS_PER_S, RobotView
@@ -56,10 +56,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     in the next step, whose action it ignores) or `SameStep` (at once; the last observation is in
     `info["final_obs"]`). With `copy` the caller may keep what `step` returns; False reuses the
     array of the observation in the next step. `render_mode` is `rgb_array`, of every world, or
-    None. For training, `privileged` are rewards by what only the simulator knows, and an episode
-    that is no success is driven again up to `retries` times (`SameStep` only). Further arguments
-    are those of the FastSimulator: `renderer` (`baked` by default, or `exact`), `threads`, on which
-    the numbers do not depend, and `randomisation`, see `BridgeEnv`.
+    None. Further arguments are those of the FastSimulator: `renderer` (`baked` by default, or
+    `exact`), `threads`, on which the numbers do not depend, and `randomisation`, see `BridgeEnv`.
     Raises ConfigError, ModelError for an unknown name or a wrong file.
     """
 
@@ -73,8 +71,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         world: str | AnyWorld = "arena", task: str | type[Task] | Task = "navigation",
         task_options: dict[str, Any] | None = None, max_episode_steps: int = 300,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP, copy: bool = True, *,
-        render_mode: str | None = None, privileged: Privileged | None = None, retries: int = 0,
-        **simulation: Any,
+        render_mode: str | None = None, **simulation: Any,
     ) -> None:  # fmt: skip
         self._pictures: list[Any] = []  # `close` needs it even if the rest raises
         check_render_mode(render_mode, self.metadata)
@@ -95,8 +92,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self.action_space = batch_space(self.single_action_space, num_envs)
         simulation = {"renderer": "baked", **simulation}
         self.simulator = FastSimulator(self.model, self.world, num_envs, self.robots, **simulation)
-        self._retries = retries
-        self._supervisor = Supervisor(privileged, self.simulator) if privileged else None
+        self._teacher: Teacher | None = None
         self._each = (num_envs, self.robots, *(self.task.action_space.shape or ()))
         self._still = still(self.model.robot)
         self._period_ns = round(self.model.control_period * NS_PER_S)
@@ -111,22 +107,24 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self._over: Flags = np.zeros(count, np.bool_)
         self._first: NDArray[np.int64] = np.zeros(count, np.int64)
         self._episode: NDArray[np.int64] = np.full(count, -1)
-        self._tries: NDArray[np.int64] = np.zeros(count, np.int64)  # of the running episode again
         self._starts: Array = np.zeros((count, robots, 3))
         self._bodies: Array = np.zeros((count, self.simulator.sampler.count, BODY))
         self.memory: Memory = {}
         self.ready = False  # False after an exception too, which leaves worlds between two steps
+
+    def teach(self, given: Teaching) -> None:
+        """Adds rewards beside the task's from the next reset on, and retries in `SameStep`."""
+        self._teacher = Teacher(given, self.simulator)
 
     @property
     def changing(self) -> dict[str, NDArray[Any]]:
         """The arrays that change from step to step, by name; see `policy.train_checkpoint`."""
         own = {
             "ended": self.ended, "over": self._over, "first": self._first,
-            "episode": self._episode, "tries": self._tries, "starts": self._starts,
-            "bodies": self._bodies,
+            "episode": self._episode, "starts": self._starts, "bodies": self._bodies,
         }  # fmt: skip
         data = {f"data.{name}": rows for name, rows in self.simulator.data._asdict().items()}
-        known = self._supervisor.changing if self._supervisor else {}
+        known = self._teacher.changing if self._teacher else {}
         return {**own, **data, **known, "goals": self.simulator.goals}
 
     def reset(
@@ -162,8 +160,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             starts = np.empty((len(worlds), self.robots, 3))
             give(starts, "start", options["start"])
         scenes = self.simulator.reset(seeds, worlds, starts)
-        if self._supervisor is not None:
-            self._supervisor.begin(worlds, scenes)
+        if self._teacher is not None:
+            self._teacher.begin(worlds, scenes)
         self._bodies[worlds] = scenes.bodies
         self._starts[worlds] = self.simulator.data.pose[worlds]
         fresh = self.task.reset(Episodes(seeds, self._starts[worlds], self.simulator.goals[worlds]))
@@ -227,8 +225,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self.simulator.step_part(part, command)
         memory = {name: rows[part] for name, rows in self.memory.items()}
         outcome = self.task.step_into(out[part], before, self._view(part), memory)
-        if self._supervisor is not None:
-            outcome = self._supervisor.judge(part, outcome)
+        if self._teacher is not None:
+            outcome = self._teacher.judge(part, outcome)
         terms = outcome.terms
         if self.robots > 1 and ended.any():
             terms = {name: np.where(ended, 0.0, term) for name, term in terms.items()}
@@ -247,17 +245,13 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
                 shown[n] = flat(out)[n].copy()
             infos |= masked({"final_obs": shown}, over)
             infos |= masked({"final_info": self._known() | facts}, over, True)
-            self._try_again(over, facts)
+            if self._teacher is not None:
+                success = np.reshape(facts.get("is_success", over), (self.num_envs, -1))
+                once_more = self._teacher.again(over, np.asarray(success.all(axis=1)))
+                self._episode[once_more] -= 1
             run = self.simulator.run_parts
             run(lambda part: self._begin(part.start + np.flatnonzero(over[part]), out))
         self._tell(infos, facts, over)
-
-    def _try_again(self, over: Flags, facts: dict[str, Any]) -> None:
-        """Lets worlds whose episode is `over` without success begin it once more, up to a limit."""
-        success = np.reshape(facts.get("is_success", over), (self.num_envs, -1)).all(axis=1)
-        again = over & ~success & (self._tries < self._retries)
-        self._tries[over] = np.where(again, self._tries + 1, 0)[over]
-        self._episode[again] -= 1
 
     def _tell(self, infos: dict[str, Any], facts: dict[str, Any], begun: Flags) -> None:
         infos |= masked(self._known(), np.ones_like(begun))

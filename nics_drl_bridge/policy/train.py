@@ -83,14 +83,15 @@ def make_train_env(
 ) -> TrainVecEnv:  # fmt: skip
     """Makes the worlds of the settings in one env; model and worlds may already be open."""
     model = model or open_model(settings.robot, settings.lidar)
-    envs = (
+    envs = [
         BridgeVectorEnv(
             count, model, (scenes or {}).get(world, world), settings.task, settings.task_options,
             settings.max_episode_steps, "SameStep", randomisation=settings.randomisation,
-            privileged=settings.privileged, retries=settings.retries,
         )
         for world, count in settings.worlds.items()
-    )  # fmt: skip
+    ]  # fmt: skip
+    for env in envs:
+        env.teach(settings.teaching)
     return TrainVecEnv(*envs)
 
 

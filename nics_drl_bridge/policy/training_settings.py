@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml, share_folder, validate
-from nics_drl_bridge.env.privileged import Privileged
+from nics_drl_bridge.env.teaching import Teaching
 from nics_drl_bridge.errors import ConfigError
 
 Share = Annotated[float, Field(gt=0.0, le=1.0)]
@@ -59,8 +59,7 @@ class TrainingSettings(Schema):
     lidar: str | None = None  # a shipped one or a file, instead of the model's own
     worlds: dict[str, Count] = Field(default_factory=lambda: {"circles": 256}, min_length=1)
     randomisation: str | None = None  # quantities drawn in each episode: a shipped one or a file
-    privileged: Privileged = Privileged()  # rewards by what only the simulator knows
-    retries: int = Field(default=0, ge=0, le=1000)  # times that a failed episode is driven again
+    teaching: Teaching = Teaching()  # rewards by what only the simulator knows, and repetition
     steps: Count = 1_000_000  # environment steps of all worlds together
     max_episode_steps: Count = 300  # an episode ends as a time-out after this many steps
     algorithm: Literal["ppo", "sac"] = "ppo"

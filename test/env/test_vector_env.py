@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import hashlib
-import itertools
 import subprocess
 import sys
 import warnings
@@ -336,29 +335,3 @@ def test_actions_that_hold_nan_are_refused():
         env.step(np.full((2, 3), np.nan, np.float32))
     with pytest.raises(gymnasium.error.InvalidAction, match="shape"):
         env.step(np.zeros((3, 3), np.float32))
-
-
-def test_an_episode_that_failed_is_driven_again_so_often():
-    env = vector(2, autoreset_mode="SameStep", retries=2, max_episode_steps=5)
-    _, info = env.reset(seed=3)
-    seeds = [info["episode_seed"]]
-    for _ in range(20):
-        _, _, _, truncated, info = env.step(np.zeros((2, 3), np.float32))
-        if truncated.all():
-            seeds.append(info["episode_seed"])
-    same = [(one == other).all() for one, other in itertools.pairwise(seeds)]
-    assert same == [True, True, False, True]
-
-
-def test_an_episode_that_succeeded_is_not_driven_again():
-    near = {"starts": {"at": [[0.0, 0.0, 0.0]]}, "goals": {"at": [[1.0, 0.0]]}}
-    world = field(**near, goal_distance=[0.5, 2.0])
-    env = vector(1, world=world, autoreset_mode="SameStep", retries=2, max_episode_steps=100)
-    _, info = env.reset(seed=3)
-    first = info["episode_seed"]
-    done = False
-    while not done:
-        _, _, terminated, _, info = env.step(np.array([[1.0, 0.0, 0.0]], np.float32))
-        done = bool(terminated[0])
-    assert info["final_info"]["is_success"][0]
-    assert info["episode_seed"] != first

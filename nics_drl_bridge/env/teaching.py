@@ -1,7 +1,8 @@
-"""Rewards for training by what only the simulator knows: true contacts, and ways to the goals."""
+"""Teaching beside the task: rewards by the truth, and failed episodes driven once more."""
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from nics_drl_bridge.config import Schema
 from nics_drl_bridge.env.task import Outcome
@@ -13,21 +14,23 @@ from nics_drl_bridge.sim.simulator import FastSimulator
 Array = NDArray[np.float64]
 
 
-class Privileged(Schema):
-    """Rewards beside those of the task; none by default."""
+class Teaching(Schema):
+    """Rewards by what only the simulator knows, and repetition; nothing by default."""
 
-    # of a contact that the task does not notice, e.g. behind a lidar of 270 deg; it ends an episode
+    # reward of a contact that the task does not notice, e.g. behind a lidar of 270 deg, and its end
     contact: float | None = None
-    path: float = 0.0  # for each metre by which the way around obstacles to the goal gets shorter
+    path: float = 0.0  # reward of each metre by which the way around obstacles gets shorter
+    retries: int = Field(default=0, ge=0, le=1000)  # times that a failed episode is driven again
 
 
-class Supervisor:
-    """Gives the privileged rewards in the worlds of a simulator."""
+class Teacher:
+    """Teaches in the worlds of a simulator."""
 
-    def __init__(self, given: Privileged, simulator: FastSimulator) -> None:
+    def __init__(self, given: Teaching, simulator: FastSimulator) -> None:
         self._given, self._data = given, simulator.data
         self._guide: Guide | None = None
         self._left = np.zeros(simulator.data.pose.shape[:2])  # (N, M) lengths of the ways [m]
+        self._tries = np.zeros(len(self._left), np.int64)  # (N,) of the running episode again
         if given.path:
             footprint = footprint_shape(simulator.model.robot)
             self._guide = Guide(simulator.sampler, footprint, len(self._left))
@@ -36,8 +39,8 @@ class Supervisor:
     def changing(self) -> dict[str, NDArray[np.generic]]:
         """The arrays that change from step to step, by name."""
         if self._guide is None:
-            return {}
-        return {"guide.fields": self._guide.fields, "guide.left": self._left}
+            return {"tries": self._tries}
+        return {"tries": self._tries, "guide": self._guide.fields, "left": self._left}
 
     def begin(self, worlds: NDArray[np.intp], scenes: Scenes) -> None:
         """Begins episodes in some worlds (n,)."""
@@ -58,3 +61,9 @@ class Supervisor:
             info = info | {"collision": unseen | info.get("collision", unseen)}
             ended = ended | unseen
         return Outcome(terms, ended, info)
+
+    def again(self, over: NDArray[np.bool_], success: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Chooses the worlds (N,) that begin the episode which is over again."""
+        again: NDArray[np.bool_] = over & ~success & (self._tries < self._given.retries)
+        self._tries[over] = np.where(again, self._tries + 1, 0)[over]
+        return again
