@@ -22,7 +22,7 @@ from nics_drl_bridge.sim.world import Goals, Obstacles, Starts, World
 MOST_CELLS = 10_000
 TRIES = 200  # fields drawn for one world, until there is a way through
 FILLED, EMPTIED = 5, 1  # at least, at most so many of a cell's 8 neighbours are filled
-FINE = 4  # points of the search for a way, along a cell
+FINE = 2  # points of the search for a way, along a cell
 
 
 class Cellular(Schema):

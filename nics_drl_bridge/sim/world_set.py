@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from pydantic import Field
 
-from nics_drl_bridge.config import Schema, parse_yaml, read_text, validate
+from nics_drl_bridge.config import Schema, parse_yaml, read_text, share_folder, validate
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import sha256
 from nics_drl_bridge.lidar.shapes import Shape
@@ -75,13 +75,14 @@ def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
     """Loads a world or a world set.
 
     A world is a shipped one by name (`arena`, `barn/7`), or any other by the path of its YAML file.
-    A set is `barn`, see `sim.barn`, a list of worlds, a folder of files, a glob (`worlds/*.yaml`),
+    A set is a shipped one (`cellular`; `barn`, see `sim.barn`), a list of worlds, a folder of files, a glob (`worlds/*.yaml`),
     or a YAML file with the key `worlds` or `generate`. Raises ConfigError for a missing or wrong
     file; of a member it names which.
     """
     if not isinstance(name, str | Path):
         return _set_of("worlds", _members([str(one) for one in name], Path()))
-    text, path = str(name), Path(name)
+    text, shipped = str(name), share_folder() / "config" / "world_sets" / f"{name}.yaml"
+    path = shipped if shipped.is_file() else Path(name)
     if (content := _set_in(path)) is not None:
         return _read_set(path, validate(content, SetFile, text))
     if path.is_dir() or any(sign in text for sign in SPECIAL):

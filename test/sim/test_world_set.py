@@ -209,7 +209,7 @@ def test_what_worlds_share_is_stored_once():
         for n in range(5)
     )
     samplers = SetSampler(WorldSet("alike", fields), 0.2).samplers
-    assert all(one._plan.space is samplers[0]._plan.space for one in samplers)
+    assert all(one.plan.space is samplers[0].plan.space for one in samplers)
     rooms = WorldSet("rooms", (load_world("room"), load_world("room"), load_world("circles")))
     fixtures = FastSimulator(MODEL, rooms)._members.fixtures
     assert fixtures.maps[0].tolist() == fixtures.maps[1].tolist()
