@@ -4,6 +4,8 @@
 # scaled down, on its path, until no obstacle is swept (dynamic window of Fox, Burgard, Thrun 1997).
 # An obstacle may approach if it is where the robot saw free space a moment ago.
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +15,7 @@ from nics_drl_bridge.gate.inputs import Scan
 from nics_drl_bridge.gate.state import GateConfig, GateState, Motion, ShieldConfig, View, replace
 from nics_drl_bridge.gate.stops import age
 from nics_drl_bridge.interface import S_PER_NS, Array
+from nics_drl_bridge.sim.collision_kernels import Outline
 
 Ranges = NDArray[np.float32]
 Flags = NDArray[np.bool_]
@@ -111,9 +114,20 @@ def obstacles(config: GateConfig, ranges: Ranges, views: tuple[View, ...]) -> Ar
     return np.concatenate([evidence(config, given, ranges, moves) for evidence in EVIDENCE])
 
 
+@cache
+def body_of(shield: ShieldConfig) -> shield_kernels.Body:
+    """Returns the footprint that is swept."""
+    corners = np.array(shield.outline, np.float64).reshape(-1, 2)
+    reach = float(np.hypot(*corners.T).max(initial=0.0))
+    outline = Outline(corners, 0, len(corners))
+    return shield_kernels.Body(outline, shield.footprint_radius, reach, shield.margin)
+
+
 def rehearse() -> None:
     """Compiles what `shield` calls: that takes seconds, which a moving robot does not have."""
-    shield_kernels.free(np.zeros((1, 3)), np.zeros((1, 3)), 0.0, 1.0, 0.0, STEP)
+    shield_kernels.grid(np.zeros(3), np.zeros(3), np.ones(3, np.int64))
+    body = body_of(ShieldConfig(0.0, 1.0, 0.0, 0.0, footprint_radius=1.0))
+    shield_kernels.free(np.zeros((1, 3)), np.zeros((1, 3)), body, 0.0, 1.0, STEP)
     lidar, scan = shield_kernels.MountedBeams(0.0, 0.1, 0.0, 0.0, 0.0), np.ones(1, np.float32)
     shield_kernels.entered(np.zeros(1, np.bool_), scan, scan, lidar, np.zeros(3), 1.0, (0.0, 0.0))
 
@@ -147,7 +161,7 @@ def _safe(config: GateConfig, state: GateState, value: Array, now: float) -> boo
     # What further sensors show counts as standing.
     seen_further = [np.pad(sensor.points, ((0, 0), (0, 1))) for sensor in state.sensors]
     points = np.concatenate([points, *seen_further])
-    room = given.footprint_radius + given.margin
+    body = body_of(given)
     odometry = np.zeros(3) if state.odometry is None else state.odometry.twist
     old = max(0.0, age(state.scans, now), *(age(s.arrivals, now) for s in state.sensors))
     # Commands that the scan does not show yet: since it was taken, or within the latency before.
@@ -162,7 +176,7 @@ def _safe(config: GateConfig, state: GateState, value: Array, now: float) -> boo
         (points, [*past, state.value, value], odometry, hard, given.deceleration),
     ):
         twists = _family(config, given, np.array(commands), twist)
-        if not shield_kernels.free(seen, twists, blind, deceleration, room, STEP):
+        if not shield_kernels.free(seen, twists, body, blind, deceleration, STEP):
             return False
     return True
 
@@ -179,8 +193,7 @@ def _family(
         twists = np.concatenate([twists, odometry[None]])
     low, high = twists.min(axis=0), twists.max(axis=0)
     counts = np.where(high > low, (SPEEDS, SPEEDS, TURNS), 1)
-    axes = [np.linspace(*ends) for ends in zip(low, high, counts, strict=True)]
-    return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
+    return np.asarray(shield_kernels.grid(low, high, counts))
 
 
 def _car_family(wheelbase: float, commands: Array, odometry: Array | None) -> Array:

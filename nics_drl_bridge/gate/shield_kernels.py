@@ -1,4 +1,4 @@
-"""Compiled: sweep of a round footprint along arcs, and obstacles where the view was free before."""
+"""Compiled: sweep of a footprint along arcs, and obstacles where the view was free before."""
 
 import math
 from typing import NamedTuple
@@ -6,58 +6,146 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.sim.collision_kernels import Outline, outline_point
 
+ROUNDING = 1e-9  # tolerance for the distance that must not become smaller [m]
 WIDTH = 0.02  # old beams within this angle of a bearing are compared [rad]
 
 
-@kernel(allocates=True)
+@kernel
 def place(twist, time):  # type: ignore[no-untyped-def]
-    """Returns the position x, y after a time on the exact arc of a body twist (3,)."""
+    """Returns x, y, cosine and sine of heading after a time on the exact arc of a twist (3,)."""
     turn = twist[2] * time
+    cosine, sine = math.cos(turn), math.sin(turn)
     if abs(turn) < 1e-6:
         a, b = 1.0, turn / 2.0
     else:
-        a, b = math.sin(turn) / turn, (1.0 - math.cos(turn)) / turn
-    return (a * twist[0] - b * twist[1]) * time, (b * twist[0] + a * twist[1]) * time
+        a, b = sine / turn, (1.0 - cosine) / turn
+    x, y = (a * twist[0] - b * twist[1]) * time, (b * twist[0] + a * twist[1]) * time
+    return x, y, cosine, sine
 
 
 @kernel(allocates=True)
-def free(points, twists, blind, deceleration, room, step):  # type: ignore[no-untyped-def]
-    """True if no point (P, 3) comes within `room` [m] of twists (K, 3) until the robot rests."""
+def grid(low, high, counts):  # type: ignore[no-untyped-def]
+    """Returns twists (K, 3) evenly between two (3,), so many along each axis."""
+    out = np.empty((counts[0] * counts[1] * counts[2], 3))
+    for k in range(out.shape[0]):
+        left = k
+        for axis in range(3):
+            at, left = left % counts[axis], left // counts[axis]
+            gaps = max(counts[axis] - 1, 1)
+            out[k, axis] = at * ((high[axis] - low[axis]) / gaps) + low[axis]
+            if at == gaps:
+                out[k, axis] = high[axis]
+    return out
+
+
+class Body(NamedTuple):
+    """The footprint that is swept, and the clearance that is kept around it.
+
+    Attributes:
+        outline: of the footprint, in the robot's frame; without corners for a circle.
+        radius: of the circle around it [m].
+        reach: by which a turn moves it, [m/rad]; 0 for a circle.
+        margin: clearance [m].
+    """
+
+    outline: Outline
+    radius: float
+    reach: float
+    margin: float
+
+
+@kernel
+def clearance(x, y, body):  # type: ignore[no-untyped-def]
+    """Returns the signed distance from a point to a footprint [m]; negative inside."""
+    if body.outline.begin == body.outline.end:
+        return math.sqrt(x * x + y * y) - body.radius
+    return outline_point(x, y, body.outline)
+
+
+@kernel(allocates=True)
+def free(points, twists, body, blind, deceleration, step):  # type: ignore[no-untyped-def]
+    """True if no point (P, 3) comes within the margin of twists (K, 3) until the robot rests."""
     # One that is already that near must not come nearer. Points are x, y [m] and greatest speed
-    # [m/s]; the robot keeps its twist for `blind` [s], then brakes; places are a `step` [m] apart.
-    longest, rest = 0.0, 0.0
+    # [m/s]; the robot keeps its twist for `blind` [s], then brakes, a turn as the speed of what it
+    # moves most. Places are a `step` [m] apart; those are skipped that a point is too far from.
+    longest, rest, most = 0.0, 0.0, 0
     for k in range(twists.shape[0]):
-        speed = math.hypot(twists[k, 0], twists[k, 1])
-        longest = max(longest, speed * (blind + speed / (2.0 * deceleration)))
-        rest = max(rest, blind + speed / deceleration)
-    near = np.empty((points.shape[0], 4))
-    count = 0
-    for p in range(points.shape[0]):
-        away = math.hypot(points[p, 0], points[p, 1])
-        if away < room + longest + points[p, 2] * rest:
-            near[count, 0], near[count, 1] = points[p, 0], points[p, 1]
-            near[count, 2], near[count, 3] = points[p, 2], away * (1.0 - 1e-9)
-            count += 1
-    if count == 0:
-        return True
+        path, pace = _path(twists[k], body, blind, deceleration)
+        longest, rest = max(longest, path), max(rest, blind + pace / deceleration)
+        most = max(most, math.ceil(path / step))
+    near = _near(points, body, longest, rest)
+    places = np.empty((most + 1, 5))
     for k in range(twists.shape[0]):
-        speed = math.hypot(twists[k, 0], twists[k, 1])
-        duration = blind + speed / (2.0 * deceleration)
-        steps = math.ceil(speed * duration / step)
-        for s in range(1, steps + 1):
-            part = duration * s / steps
-            x, y = place(twists[k], part)
-            time = _reached(part, speed, blind, deceleration)
-            for p in range(count):
-                dx, dy = near[p, 0] - x, near[p, 1] - y
-                least = min(room, near[p, 3]) + near[p, 2] * time
-                if dx * dx + dy * dy < least * least:
+        path, pace = _path(twists[k], body, blind, deceleration)
+        steps = math.ceil(path / step)
+        if steps == 0:
+            continue
+        duration = blind + pace / (2.0 * deceleration)
+        each = duration / steps
+        slowest = each + math.sqrt(2.0 * pace * each / deceleration)  # time of the last step
+        made = False
+        for p in range(near.shape[0]):
+            most_each = path / steps + near[p, 2] * slowest
+            s = _steps_apart(near[p, 4] - near[p, 3], most_each, steps)
+            if s <= steps and not made:
+                made = True
+                _follow(places[: steps + 1], twists[k], duration, pace, blind, deceleration)
+            while s <= steps:
+                dx, dy = near[p, 0] - places[s, 0], near[p, 1] - places[s, 1]
+                c, sine = places[s, 2], places[s, 3]
+                away = clearance(c * dx + sine * dy, c * dy - sine * dx, body)
+                spare = away - near[p, 3] - near[p, 2] * places[s, 4]
+                if spare < 0.0:
                     return False
+                s += _steps_apart(spare, most_each, steps)
     return True
 
 
+@kernel
+def _steps_apart(spare, each, steps):  # type: ignore[no-untyped-def]
+    """Returns how many places further on a point may be too near for the first time, at least 1."""
+    return max(1, math.floor(min(spare / each, steps + 1.0)))
+
+
+@kernel
+def _path(twist, body, blind, deceleration):  # type: ignore[no-untyped-def]
+    """Returns the longest path of a point of the footprint [m], and the speed that brakes [m/s]."""
+    speed, turn = math.hypot(twist[0], twist[1]), abs(twist[2]) * body.reach
+    pace = max(speed, turn)
+    return (speed + turn) * (blind + pace / (2.0 * deceleration)), pace
+
+
 @kernel(allocates=True)
+def _near(points, body, longest, rest):  # type: ignore[no-untyped-def]
+    """Returns points that may come too near (Q, 5), with the distances to keep and of now."""
+    near, count = np.empty((points.shape[0], 5)), 0
+    for p in range(points.shape[0]):
+        x, y, speed = points[p, 0], points[p, 1], points[p, 2]
+        room = body.margin + longest + speed * rest
+        if math.hypot(x, y) - body.radius >= room:
+            continue
+        away = clearance(x, y, body)
+        if away < room:
+            near[count, 0], near[count, 1], near[count, 2] = x, y, speed
+            near[count, 3], near[count, 4] = min(body.margin, away) - ROUNDING, away
+            count += 1
+    return near[:count]
+
+
+@kernel(allocates=True)
+def _follow(places, twist, duration, pace, blind, deceleration):  # type: ignore[no-untyped-def]
+    """Fills places (S + 1, 5) of a braking robot: x, y, cosine and sine of heading, time [s]."""
+    steps = len(places) - 1
+    for s in range(1, steps + 1):
+        part = duration * s / steps
+        x, y, cosine, sine = place(twist, part)
+        places[s, 0], places[s, 1], places[s, 2], places[s, 3] = x, y, cosine, sine
+        places[s, 4] = _reached(part, pace, blind, deceleration)
+
+
+@kernel
 def _reached(part, speed, blind, deceleration):  # type: ignore[no-untyped-def]
     """Returns when a braking robot is where it would be at `part` at its initial speed [s]."""
     if part <= blind:

@@ -34,13 +34,15 @@ class ShieldConfig:
     deceleration: float  # of the braking that follows [m/s^2]
     margin: float  # clearance kept around the footprint [m]
     hold_s: float  # longest time until the next decision
-    footprint_radius: float  # [m]
+    footprint_radius: float  # of the circle around the robot [m]
     wheelbase: float = 0.0  # of a car, which is commanded by steering angle [m]; 0 for others
     obstacle_speed: float = 0.0  # of moving obstacles that approach [m/s]; 0: all are static
     range_max: float = INF  # of the lidar [m]
     range_noise: tuple[float, float] = (0.0, 0.0)  # std, in metres and as a share of the range
     unknown_share: float = 0.5  # of unknown beams from which a direction counts as blocked
     unknown_width: float = 0.35  # angle over which that share is taken [rad]
+    # Corners of the footprint in `base_link`, in order [m]; none of a robot that is a circle.
+    outline: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True)
