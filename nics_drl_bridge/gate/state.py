@@ -151,6 +151,16 @@ class View:
 
 
 @dataclass(frozen=True)
+class Ground:
+    """What is known about the ground around a robot whose lidar does not see all around it."""
+
+    since_ns: int  # stamp from which times count
+    corner: tuple[int, int]  # cells from the origin of odometry to the first: along x, along y
+    times: Ranges  # (n, n), rows along y, when a cell was last known to be free [s]; -inf: is not
+    unseen: Array  # (Q, 2) middles of the cells where that ends, in `base_link` [m]
+
+
+@dataclass(frozen=True)
 class Push:
     """Motion commanded without a pause."""
 
@@ -207,6 +217,7 @@ class GateState:
     pending: Command | None = None  # whose scan has not arrived yet
     pending_s: float | None = None  # since when commands name such scans; None: the newest does not
     views: tuple[View, ...] = ()  # recent ones, for the detection of motion; empty without shield
+    ground: Ground | None = None  # None if the lidar sees all around, and without shield
     # (P, 3) in the newest scan: x, y in `base_link` [m], and greatest speed of each [m/s].
     obstacles: Array | None = None
     behind_s: float = -INF  # arrival of the scan behind the newest command, less its delay
