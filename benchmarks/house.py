@@ -29,7 +29,7 @@ BARS = {
     # drew its episodes from sets of worlds; 202 and 41,500 until it grew such sets, and a robot
     # named its lidar and skidded in MuJoCo, training had an engine of its own, and bodies lay in
     # cells; 204 and 42,400 until the shield knew the ground where a lidar never looks.
-    "modules": 206,
+    "modules": 205,
     "lines": 42_750,
     "single_importers": 50,
     "circles": 0,

@@ -4,9 +4,8 @@ import math
 
 import numpy as np
 
-from nics_drl_bridge.gate import ground_kernels
-from nics_drl_bridge.gate.ground_kernels import Cells, Look
-from nics_drl_bridge.gate.shield_kernels import Body, MountedBeams
+from nics_drl_bridge.gate import shield_kernels
+from nics_drl_bridge.gate.shield_kernels import Body, Cells, Look, MountedBeams
 from nics_drl_bridge.gate.state import Ground, Ranges, View
 from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.sim.collision_kernels import Outline
@@ -38,15 +37,15 @@ def look(
         since, times = view.stamp_ns, np.full((CELLS, CELLS), -np.inf, np.float32)
         if not _returns_within(view.ranges, lidar, room):
             disc = body._replace(outline=Outline(np.zeros((0, 2)), 0, 0))
-            ground_kernels.cover(times, place, disc, room - body.radius, 0.0)
+            shield_kernels.cover(times, place, disc, room - body.radius, 0.0)
     else:
         since, moved = before.since_ns, np.subtract(corner, before.corner)
-        times = ground_kernels.shifted(before.times, *moved.tolist())
+        times = shield_kernels.shifted(before.times, *moved.tolist())
     now = (view.stamp_ns - since) * S_PER_NS
     given = Look(now, now - REMEMBERED_S, far, tolerance)
-    sees = ground_kernels.survey(times, place, view.ranges, lidar, room, given)
-    ground_kernels.cover(times, place, body, 0.0, now)
-    return Ground(since, corner, times, ground_kernels.unseen(times, sees, place))
+    sees = shield_kernels.survey(times, place, view.ranges, lidar, room, given)
+    shield_kernels.cover(times, place, body, 0.0, now)
+    return Ground(since, corner, times, shield_kernels.unseen(times, sees, place))
 
 
 def _returns_within(ranges: Ranges, lidar: MountedBeams, room: float) -> bool:

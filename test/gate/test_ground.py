@@ -118,6 +118,13 @@ def test_a_wall_that_it_has_turned_away_from_is_not_forgotten(walls, may):
     assert robot.may((-0.6, 0.0, 0.0)) == may
 
 
+def test_what_came_to_stand_where_the_ground_was_free_is_not_forgotten():
+    robot = Robot()
+    robot.walls = np.array([[0.5, -3.0, 0.5, 3.0]])
+    robot.moves(TURN, np.pi / 0.6)
+    assert not robot.may((-0.6, 0.0, 0.0))
+
+
 def test_ground_is_forgotten_but_for_what_is_beside_the_robot():
     robot = Robot()
     robot.moves((0.3, 0.0, 0.0), 3.0)
