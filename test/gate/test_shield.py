@@ -128,6 +128,21 @@ def test_a_scan_shows_its_returns_where_they_are():
     assert obstacles(given, seen, ()) == pytest.approx(np.array([[0.1, 2.0, 0.0]]), abs=1e-6)
 
 
+def test_unknown_beams_are_a_wall_on_the_outline_and_blind_directions_are_none():
+    corners = ((0.25, 0.2), (-0.25, 0.2), (-0.25, -0.2), (0.25, -0.2))
+    some = slice(180, 540)  # of 720, those to the front
+    for unseen, front in ((slice(0), False), (slice(None), True), (slice(0, 90), False)):
+        given = config(shield=replace(CAR, outline=corners), beam_angles=LIDAR.angles[some])
+        seen = np.full(360, np.inf, np.float32)
+        seen[unseen] = np.nan
+        wall = obstacles(given, seen, ())[:, :2]
+        assert (np.abs(wall) == (0.25, 0.2)).any(axis=1).all()
+        assert (len(wall) > 0) == (unseen != slice(0))
+        assert (wall[:, 0] == 0.25).any() == front
+        assert (wall[:, 0] >= -0.05).all()
+        assert front or (wall[:, 1] < 0.0).all()
+
+
 def disc(room):
     """A robot that is a circle with its margin."""
     return body_of(replace(CAR, footprint_radius=0.75 * room, margin=0.25 * room))
