@@ -28,9 +28,10 @@ BARS = {
     # can't be; 194 and 40,000 until it imported worlds of Gazebo, held those of a benchmark, and
     # drew its episodes from sets of worlds; 202 and 41,500 until it grew such sets, and a robot
     # named its lidar and skidded in MuJoCo, training had an engine of its own, and bodies lay in
-    # cells; 204 and 42,400 until evaluations had a gate, a lidar and a randomisation.
-    "modules": 206,
-    "lines": 42_700,
+    # cells; 204 and 42,400 until evaluations had a gate, a lidar and a randomisation, the shield
+    # knew the ground where a lidar never looks, and trainings the ways around obstacles.
+    "modules": 212,
+    "lines": 44_000,
     "single_importers": 50,
     "circles": 0,
     "max_arguments": 10,

@@ -39,6 +39,7 @@ CONTROLS = {
     "no_braking_distance": "what the robot needs to stop: the shield is told that it needs nothing",
 }
 ROBOTS, WORLDS = ("ackermann", "differential", "mecanum"), ("arena", "clutter", "crowd")
+OUTLINED = "jackal"  # has an outline, and a lidar that does not look behind it
 WITHOUT, GOALS = 10, 10
 """One in so many episodes is driven without the shield as well; and so many goals are tried."""
 MOST_HELD_UP = 0.02
@@ -219,11 +220,15 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--in-process", action="store_true", help="without DDS, with drawn delays")
     names = [f"{robot}/{world}" for robot in ROBOTS for world in WORLDS]
-    parser.add_argument("--place", action="append", choices=names, help="only there; repeatable")
+    more = [f"{OUTLINED}/{world}" for world in WORLDS]
+    about = f"only there; repeatable; those of the {OUTLINED} go in process alone"
+    parser.add_argument("--place", action="append", choices=names + more, help=about)
     parser.add_argument(
         "--at-once", type=int, default=Plan.at_once, help="robots side by side over DDS"
     )
     given = parser.parse_args()
+    if not given.in_process and set(more) & set(given.place or ()):
+        parser.error(f"the {OUTLINED} drives in process alone; add --in-process")
     plan = Plan(given.episodes, given.seed, given.in_process, given.control or "", given.at_once)
     places = [Place(*name.split("/")) for name in given.place or names]
     with_it, without = plan.jobs(len(places))

@@ -93,7 +93,9 @@ class Place:
 
     def __init__(self, robot: str, world: str) -> None:
         self.robot, self.world = robot, world
-        self.model = builtin_model(robot)
+        model = builtin_model(robot)
+        lidar = model.lidar.model_copy(update={"rate": 1.0 / (SCAN_STEPS * STEP_S)})
+        self.model = replace(model, lidar=lidar)
         self._sim = FastSimulator(replace(self.model, control_period=STEP_S), load_world(world))
         self._walls = self._sim.world.all_walls()
         self._drivers: dict[str, Driver] = {}

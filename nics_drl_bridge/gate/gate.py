@@ -78,6 +78,10 @@ def _serve(
         if failed := [f"{name}: {answer}" for name, answer in answers if answer]:
             return state, "; ".join(failed), False
         sensors = tuple(replace(each, arrivals=settled(each.arrivals)) for each in state.sensors)
+        ground = shield.ground_of(config, state.views, None)  # it may have been carried here
+        if ground is not None:
+            seen = shield.obstacles(config, state.views[-1].ranges, state.views, ground)
+            state = replace(state, ground=ground, obstacles=seen)
         return replace(
             state, armed=True, scans=settled(state.scans),
             odometries=settled(state.odometries), sensors=sensors, seen=(), frozen="", push=None,
@@ -224,9 +228,10 @@ def _take_scan(
     pose = None if state.odometry is None else state.odometry.pose
     seen, why = frozen.look(config, state.seen, scan.ranges, pose)
     views = shield.remember(config, state, scan)
+    ground = shield.ground_of(config, views, state.ground)
     state = replace(
-        state, scans=arrivals, scan=scan, seen=seen, frozen=why, views=views,
-        obstacles=shield.obstacles(config, scan.ranges, views),
+        state, scans=arrivals, scan=scan, seen=seen, frozen=why, views=views, ground=ground,
+        obstacles=shield.obstacles(config, scan.ranges, views, ground),
     )  # fmt: skip
     if state.pending is not None and state.pending.stamp_ns == scan.stamp_ns:
         state = _take_command(state, state.pending, now)

@@ -4,15 +4,27 @@
 # scaled down, on its path, until no obstacle is swept (dynamic window of Fox, Burgard, Thrun 1997).
 # An obstacle may approach if it is where the robot saw free space a moment ago.
 
+import math
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.gate import shield_kernels
+from nics_drl_bridge.gate import ground, shield_kernels
 from nics_drl_bridge.gate.inputs import Scan
-from nics_drl_bridge.gate.state import GateConfig, GateState, Motion, ShieldConfig, View, replace
+from nics_drl_bridge.gate.state import (
+    GateConfig,
+    GateState,
+    Ground,
+    Motion,
+    ShieldConfig,
+    View,
+    replace,
+)  # fmt: skip
 from nics_drl_bridge.gate.stops import age
 from nics_drl_bridge.interface import S_PER_NS, Array
+from nics_drl_bridge.sim.collision_kernels import Outline
 
 Ranges = NDArray[np.float32]
 Flags = NDArray[np.bool_]
@@ -22,6 +34,7 @@ SPEEDS, TURNS = 3, 9
 MOVING = 0.1  # above this speed the ratio of turn rate to speed gives the curvature [m/s]
 CALM = 0.5  # share of its deceleration with which the robot should stop when nothing is sudden
 STEP = 0.02  # distance between two checked places of the footprint on an arc [m]
+WALL_M = 0.05  # greatest distance between places of a wall on the footprint [m]
 MEMORY_S, SPACING_S = 0.45, 0.09
 """Greatest age of a scan that the newest is compared with, and least time between them [s]."""
 TOLERANCE_M, DEVIATIONS = 0.03, 3.0
@@ -48,8 +61,7 @@ def movers(config: GateConfig, shield: ShieldConfig, views: tuple[View, ...]) ->
     marked = np.zeros(len(newest.ranges), np.bool_)
     if len(angles) < 2 or shield.obstacle_speed == 0.0:
         return marked
-    step = float(angles[1] - angles[0])
-    lidar = shield_kernels.MountedBeams(float(angles[0]), step, *config.mount)
+    lidar = _beams(config)
     noise, share = (DEVIATIONS * std for std in shield.range_noise)
     for view in views[:-1]:
         moved = geometry.between(view.pose, newest.pose)
@@ -78,18 +90,36 @@ def too_close(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: F
 
 def unknown(config: GateConfig, shield: ShieldConfig, ranges: Ranges, moves: Flags) -> Array:
     """Returns a wall (P, 3) on the footprint wherever too many beams, or all, are unknown."""
-    blocked = np.linspace(-np.pi, np.pi, len(ranges), endpoint=False)
-    angles = config.beam_angles[~np.isnan(ranges)] + config.mount[2]
-    known = np.sort(np.mod(angles + np.pi, 2.0 * np.pi) - np.pi)
-    if len(known):
-        around = np.concatenate([known - 2.0 * np.pi, known, known + 2.0 * np.pi])
-        half = shield.unknown_width / 2.0
-        seen = np.searchsorted(around, blocked + half) - np.searchsorted(around, blocked - half)
-        spacing = config.beam_angles[1] - config.beam_angles[0] if len(ranges) > 1 else 2.0 * np.pi
-        least = (1.0 - shield.unknown_share) * shield.unknown_width / spacing
-        blocked = blocked[seen < least]
-    wall = shield.footprint_radius * np.stack([np.cos(blocked), np.sin(blocked)])
-    return np.stack([*wall, np.zeros_like(blocked)], axis=1)
+    bearings, wall = _sides(shield, config.mount, len(ranges))
+    angles, half = config.beam_angles + config.mount[2], shield.unknown_width / 2.0
+    known, every = (_within(bearings, some, half) for some in (angles[~np.isnan(ranges)], angles))
+    spacing = angles[1] - angles[0] if len(ranges) > 1 else 2.0 * np.pi
+    whole = shield.unknown_width / spacing  # at the end of the lidar's view it has fewer
+    least = (1.0 - shield.unknown_share) * np.where(every < int(whole), every, whole)
+    return np.pad(wall[known < least], ((0, 0), (0, 1)))
+
+
+@cache
+def _sides(
+    shield: ShieldConfig, mount: tuple[float, float, float], count: int
+) -> tuple[Array, Array]:
+    """Returns places (M, 2) around the footprint, and their bearings (M,) from the lidar."""
+    corners = np.array(shield.outline)
+    if not len(corners):  # as seen from the middle
+        bearings = np.linspace(-np.pi, np.pi, count, endpoint=False)
+        wall = shield.footprint_radius * np.stack([np.cos(bearings), np.sin(bearings)])
+        return bearings, wall.T
+    sides = zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    parts = [(a, b, math.ceil(np.hypot(*(b - a)) / WALL_M)) for a, b in sides]
+    wall = np.concatenate([np.linspace(a, b, n, endpoint=False) for a, b, n in parts])
+    return np.arctan2(wall[:, 1] - mount[1], wall[:, 0] - mount[0]), wall
+
+
+def _within(bearings: Array, angles: Array, half: float) -> NDArray[np.int64]:
+    """Returns how many angles (B,) lie around each bearing (M,), up to an angle [rad] beside it."""
+    angles = np.sort(np.mod(angles + np.pi, 2.0 * np.pi) - np.pi)
+    around = np.concatenate([angles - 2.0 * np.pi, angles, angles + 2.0 * np.pi])
+    return np.searchsorted(around, bearings + half) - np.searchsorted(around, bearings - half)
 
 
 EVIDENCE = (returns, too_close, unknown)
@@ -102,20 +132,55 @@ def _ends(config: GateConfig, angles: Array, ranges: Array, speeds: Array | floa
     return np.stack([x + ranges * np.cos(angles), y + ranges * np.sin(angles), speeds], axis=1)
 
 
-def obstacles(config: GateConfig, ranges: Ranges, views: tuple[View, ...]) -> Array | None:
+def ground_of(config: GateConfig, views: tuple[View, ...], before: Ground | None) -> Ground | None:
+    """Returns what is known after the newest view of where the lidar never looks, if anywhere."""
+    given, angles = config.shield, config.beam_angles
+    if given is None or not views or len(angles) < 2:
+        return None
+    lidar = _beams(config)
+    seen = abs(lidar.step) * len(angles)
+    if 2.0 * np.pi - seen < given.unknown_share * given.unknown_width:
+        return None
+    return ground.look(before, views[-1], lidar, body_of(given), given.range_max, TOLERANCE_M)
+
+
+def obstacles(
+    config: GateConfig, ranges: Ranges, views: tuple[View, ...], known: Ground | None = None
+) -> Array | None:
     """Returns obstacles (P, 3) in a scan (B,): x, y [m], greatest speed [m/s]; None if off."""
     given = config.shield
     if given is None:
         return None
     moves = movers(config, given, views) if views else np.zeros(len(ranges), np.bool_)
-    return np.concatenate([evidence(config, given, ranges, moves) for evidence in EVIDENCE])
+    found = [evidence(config, given, ranges, moves) for evidence in EVIDENCE]
+    unseen = [] if known is None else [np.pad(known.unseen, ((0, 0), (0, 1)))]
+    return np.concatenate([*found, *unseen])
+
+
+def _beams(config: GateConfig) -> shield_kernels.MountedBeams:
+    angles = config.beam_angles
+    step = float(angles[1] - angles[0])
+    return shield_kernels.MountedBeams(float(angles[0]), step, *config.mount)
+
+
+@cache
+def body_of(shield: ShieldConfig) -> shield_kernels.Body:
+    """Returns the footprint that is swept."""
+    corners = np.array(shield.outline, np.float64).reshape(-1, 2)
+    reach = float(np.hypot(*corners.T).max(initial=0.0))
+    outline = Outline(corners, 0, len(corners))
+    return shield_kernels.Body(outline, shield.footprint_radius, reach, shield.margin)
 
 
 def rehearse() -> None:
     """Compiles what `shield` calls: that takes seconds, which a moving robot does not have."""
-    shield_kernels.free(np.zeros((1, 3)), np.zeros((1, 3)), 0.0, 1.0, 0.0, STEP)
+    shield_kernels.grid(np.zeros(3), np.zeros(3), np.ones(3, np.int64))
+    body = body_of(ShieldConfig(0.0, 1.0, 0.0, 0.0, footprint_radius=1.0))
+    shield_kernels.free(np.zeros((1, 3)), np.zeros((1, 3)), body, 0.0, 1.0, STEP)
     lidar, scan = shield_kernels.MountedBeams(0.0, 0.1, 0.0, 0.0, 0.0), np.ones(1, np.float32)
     shield_kernels.entered(np.zeros(1, np.bool_), scan, scan, lidar, np.zeros(3), 1.0, (0.0, 0.0))
+    view = View(0, np.zeros(3), scan)
+    ground.look(ground.look(None, view, lidar, body, 1.0, 0.0), view, lidar, body, 1.0, 0.0)
 
 
 def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
@@ -147,7 +212,7 @@ def _safe(config: GateConfig, state: GateState, value: Array, now: float) -> boo
     # What further sensors show counts as standing.
     seen_further = [np.pad(sensor.points, ((0, 0), (0, 1))) for sensor in state.sensors]
     points = np.concatenate([points, *seen_further])
-    room = given.footprint_radius + given.margin
+    body = body_of(given)
     odometry = np.zeros(3) if state.odometry is None else state.odometry.twist
     old = max(0.0, age(state.scans, now), *(age(s.arrivals, now) for s in state.sensors))
     # Commands that the scan does not show yet: since it was taken, or within the latency before.
@@ -162,7 +227,7 @@ def _safe(config: GateConfig, state: GateState, value: Array, now: float) -> boo
         (points, [*past, state.value, value], odometry, hard, given.deceleration),
     ):
         twists = _family(config, given, np.array(commands), twist)
-        if not shield_kernels.free(seen, twists, blind, deceleration, room, STEP):
+        if not shield_kernels.free(seen, twists, body, blind, deceleration, STEP):
             return False
     return True
 
@@ -179,8 +244,7 @@ def _family(
         twists = np.concatenate([twists, odometry[None]])
     low, high = twists.min(axis=0), twists.max(axis=0)
     counts = np.where(high > low, (SPEEDS, SPEEDS, TURNS), 1)
-    axes = [np.linspace(*ends) for ends in zip(low, high, counts, strict=True)]
-    return np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
+    return np.asarray(shield_kernels.grid(low, high, counts))
 
 
 def _car_family(wheelbase: float, commands: Array, odometry: Array | None) -> Array:

@@ -1,4 +1,4 @@
-"""Compiled: sweep of a round footprint along arcs, and obstacles where the view was free before."""
+"""Compiled: sweep of a footprint along arcs, what moves, and ground that was seen or stood on."""
 
 import math
 from typing import NamedTuple
@@ -6,58 +6,146 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.sim.collision_kernels import Outline, outline_point
 
+ROUNDING = 1e-9  # tolerance for the distance that must not become smaller [m]
 WIDTH = 0.02  # old beams within this angle of a bearing are compared [rad]
 
 
-@kernel(allocates=True)
+@kernel
 def place(twist, time):  # type: ignore[no-untyped-def]
-    """Returns the position x, y after a time on the exact arc of a body twist (3,)."""
+    """Returns x, y, cosine and sine of heading after a time on the exact arc of a twist (3,)."""
     turn = twist[2] * time
+    cosine, sine = math.cos(turn), math.sin(turn)
     if abs(turn) < 1e-6:
         a, b = 1.0, turn / 2.0
     else:
-        a, b = math.sin(turn) / turn, (1.0 - math.cos(turn)) / turn
-    return (a * twist[0] - b * twist[1]) * time, (b * twist[0] + a * twist[1]) * time
+        a, b = sine / turn, (1.0 - cosine) / turn
+    x, y = (a * twist[0] - b * twist[1]) * time, (b * twist[0] + a * twist[1]) * time
+    return x, y, cosine, sine
 
 
 @kernel(allocates=True)
-def free(points, twists, blind, deceleration, room, step):  # type: ignore[no-untyped-def]
-    """True if no point (P, 3) comes within `room` [m] of twists (K, 3) until the robot rests."""
+def grid(low, high, counts):  # type: ignore[no-untyped-def]
+    """Returns twists (K, 3) evenly between two (3,), so many along each axis."""
+    out = np.empty((counts[0] * counts[1] * counts[2], 3))
+    for k in range(out.shape[0]):
+        left = k
+        for axis in range(3):
+            at, left = left % counts[axis], left // counts[axis]
+            gaps = max(counts[axis] - 1, 1)
+            out[k, axis] = at * ((high[axis] - low[axis]) / gaps) + low[axis]
+            if at == gaps:
+                out[k, axis] = high[axis]
+    return out
+
+
+class Body(NamedTuple):
+    """The footprint that is swept, and the clearance that is kept around it.
+
+    Attributes:
+        outline: of the footprint, in the robot's frame; without corners for a circle.
+        radius: of the circle around it [m].
+        reach: by which a turn moves it, [m/rad]; 0 for a circle.
+        margin: clearance [m].
+    """
+
+    outline: Outline
+    radius: float
+    reach: float
+    margin: float
+
+
+@kernel
+def clearance(x, y, body):  # type: ignore[no-untyped-def]
+    """Returns the signed distance from a point to a footprint [m]; negative inside."""
+    if body.outline.begin == body.outline.end:
+        return math.sqrt(x * x + y * y) - body.radius
+    return outline_point(x, y, body.outline)
+
+
+@kernel(allocates=True)
+def free(points, twists, body, blind, deceleration, step):  # type: ignore[no-untyped-def]
+    """True if no point (P, 3) comes within the margin of twists (K, 3) until the robot rests."""
     # One that is already that near must not come nearer. Points are x, y [m] and greatest speed
-    # [m/s]; the robot keeps its twist for `blind` [s], then brakes; places are a `step` [m] apart.
-    longest, rest = 0.0, 0.0
+    # [m/s]; the robot keeps its twist for `blind` [s], then brakes, a turn as the speed of what it
+    # moves most. Places are a `step` [m] apart; those are skipped that a point is too far from.
+    longest, rest, most = 0.0, 0.0, 0
     for k in range(twists.shape[0]):
-        speed = math.hypot(twists[k, 0], twists[k, 1])
-        longest = max(longest, speed * (blind + speed / (2.0 * deceleration)))
-        rest = max(rest, blind + speed / deceleration)
-    near = np.empty((points.shape[0], 4))
-    count = 0
-    for p in range(points.shape[0]):
-        away = math.hypot(points[p, 0], points[p, 1])
-        if away < room + longest + points[p, 2] * rest:
-            near[count, 0], near[count, 1] = points[p, 0], points[p, 1]
-            near[count, 2], near[count, 3] = points[p, 2], away * (1.0 - 1e-9)
-            count += 1
-    if count == 0:
-        return True
+        path, pace = _path(twists[k], body, blind, deceleration)
+        longest, rest = max(longest, path), max(rest, blind + pace / deceleration)
+        most = max(most, math.ceil(path / step))
+    near = _near(points, body, longest, rest)
+    places = np.empty((most + 1, 5))
     for k in range(twists.shape[0]):
-        speed = math.hypot(twists[k, 0], twists[k, 1])
-        duration = blind + speed / (2.0 * deceleration)
-        steps = math.ceil(speed * duration / step)
-        for s in range(1, steps + 1):
-            part = duration * s / steps
-            x, y = place(twists[k], part)
-            time = _reached(part, speed, blind, deceleration)
-            for p in range(count):
-                dx, dy = near[p, 0] - x, near[p, 1] - y
-                least = min(room, near[p, 3]) + near[p, 2] * time
-                if dx * dx + dy * dy < least * least:
+        path, pace = _path(twists[k], body, blind, deceleration)
+        steps = math.ceil(path / step)
+        if steps == 0:
+            continue
+        duration = blind + pace / (2.0 * deceleration)
+        each = duration / steps
+        slowest = each + math.sqrt(2.0 * pace * each / deceleration)  # time of the last step
+        made = False
+        for p in range(near.shape[0]):
+            most_each = path / steps + near[p, 2] * slowest
+            s = _steps_apart(near[p, 4] - near[p, 3], most_each, steps)
+            if s <= steps and not made:
+                made = True
+                _follow(places[: steps + 1], twists[k], duration, pace, blind, deceleration)
+            while s <= steps:
+                dx, dy = near[p, 0] - places[s, 0], near[p, 1] - places[s, 1]
+                c, sine = places[s, 2], places[s, 3]
+                away = clearance(c * dx + sine * dy, c * dy - sine * dx, body)
+                spare = away - near[p, 3] - near[p, 2] * places[s, 4]
+                if spare < 0.0:
                     return False
+                s += _steps_apart(spare, most_each, steps)
     return True
 
 
+@kernel
+def _steps_apart(spare, each, steps):  # type: ignore[no-untyped-def]
+    """Returns how many places further on a point may be too near for the first time, at least 1."""
+    return max(1, math.floor(min(spare / each, steps + 1.0)))
+
+
+@kernel
+def _path(twist, body, blind, deceleration):  # type: ignore[no-untyped-def]
+    """Returns the longest path of a point of the footprint [m], and the speed that brakes [m/s]."""
+    speed, turn = math.hypot(twist[0], twist[1]), abs(twist[2]) * body.reach
+    pace = max(speed, turn)
+    return (speed + turn) * (blind + pace / (2.0 * deceleration)), pace
+
+
 @kernel(allocates=True)
+def _near(points, body, longest, rest):  # type: ignore[no-untyped-def]
+    """Returns points that may come too near (Q, 5), with the distances to keep and of now."""
+    near, count = np.empty((points.shape[0], 5)), 0
+    for p in range(points.shape[0]):
+        x, y, speed = points[p, 0], points[p, 1], points[p, 2]
+        room = body.margin + longest + speed * rest
+        if math.hypot(x, y) - body.radius >= room:
+            continue
+        away = clearance(x, y, body)
+        if away < room:
+            near[count, 0], near[count, 1], near[count, 2] = x, y, speed
+            near[count, 3], near[count, 4] = min(body.margin, away) - ROUNDING, away
+            count += 1
+    return near[:count]
+
+
+@kernel(allocates=True)
+def _follow(places, twist, duration, pace, blind, deceleration):  # type: ignore[no-untyped-def]
+    """Fills places (S + 1, 5) of a braking robot: x, y, cosine and sine of heading, time [s]."""
+    steps = len(places) - 1
+    for s in range(1, steps + 1):
+        part = duration * s / steps
+        x, y, cosine, sine = place(twist, part)
+        places[s, 0], places[s, 1], places[s, 2], places[s, 3] = x, y, cosine, sine
+        places[s, 4] = _reached(part, pace, blind, deceleration)
+
+
+@kernel
 def _reached(part, speed, blind, deceleration):  # type: ignore[no-untyped-def]
     """Returns when a braking robot is where it would be at `part` at its initial speed [s]."""
     if part <= blind:
@@ -101,3 +189,135 @@ def entered(out, ranges, old, lidar, moved, far, tolerance):  # type: ignore[no-
             seen = beyond if not beyond >= seen else seen
         if away < seen - tolerance[0] - tolerance[1] * away:
             out[b] = True
+
+
+class Cells(NamedTuple):
+    """Where square cells lie, whose rows run along y of odometry, as seen from the robot.
+
+    Attributes:
+        x: of their first corner from the robot, along x of odometry [m].
+        y: the same along y [m].
+        width: of a cell [m].
+        cosine: of the robot's heading.
+        sine: of it.
+    """
+
+    x: float
+    y: float
+    width: float
+    cosine: float
+    sine: float
+
+
+class Look(NamedTuple):
+    """What a scan is judged by.
+
+    Attributes:
+        now: its time [s].
+        oldest: time of ground that is still remembered [s].
+        far: greatest range [m].
+        tolerance: margin before a return that is not free [m].
+    """
+
+    now: float
+    oldest: float
+    far: float
+    tolerance: float
+
+
+@kernel
+def _middle(i, j, cells):  # type: ignore[no-untyped-def]
+    """Returns the middle of a cell in the robot's frame [m]."""
+    dx, dy = cells.x + (j + 0.5) * cells.width, cells.y + (i + 0.5) * cells.width
+    return cells.cosine * dx + cells.sine * dy, cells.cosine * dy - cells.sine * dx
+
+
+@kernel(allocates=True)
+def shifted(times, across, up):  # type: ignore[no-untyped-def]
+    """Returns times (n, n) of cells that moved by so many columns and rows; -inf of new ones."""
+    out = np.full(times.shape, -np.inf, times.dtype)
+    rows, columns = times.shape
+    for i in range(max(0, -up), min(rows, rows - up)):
+        for j in range(max(0, -across), min(columns, columns - across)):
+            out[i, j] = times[i + up, j + across]
+    return out
+
+
+@kernel
+def cover(times, cells, body, away, now):  # type: ignore[no-untyped-def]
+    """Notes in times (n, n) that cells up to a distance from the footprint are free."""
+    for i in range(times.shape[0]):
+        for j in range(times.shape[1]):
+            x, y = _middle(i, j, cells)
+            far = x * x + y * y > (body.radius + away) ** 2
+            if not far and clearance(x, y, body) <= away:
+                times[i, j] = now
+
+
+@kernel(allocates=True)
+def survey(times, cells, ranges, lidar, room, look):  # type: ignore[no-untyped-def]
+    """Notes in times (n, n) what a scan (B,) shows; returns which cells it sees as a whole."""
+    # What is older is forgotten, but for cells within `room` [m] of the robot.
+    sees, beams = np.zeros(times.shape, np.bool_), len(ranges)
+    for i in range(times.shape[0]):
+        for j in range(times.shape[1]):
+            x, y = _middle(i, j, cells)
+            if times[i, j] >= look.oldest and x * x + y * y <= room * room:
+                times[i, j] = look.now
+            dx, dy = x - lidar.x, y - lidar.y
+            away = max(math.sqrt(dx * dx + dy * dy), cells.width)
+            middle = _beam(x, y, lidar)
+            beside = math.ceil(0.5 * cells.width / (away * abs(lidar.step)))
+            if middle - beside >= 0 and middle + beside < beams:
+                sees[i, j], least = True, look.far
+                for b in range(middle - beside, middle + beside + 1):
+                    # Not `min`: an unknown beam shows nothing.
+                    least = ranges[b] if not ranges[b] >= least else least
+                if least > away + look.tolerance:
+                    times[i, j] = look.now
+            if not times[i, j] >= look.oldest:
+                times[i, j] = -np.inf
+    _note_returns(times, cells, ranges, lidar)
+    return sees
+
+
+@kernel
+def _note_returns(times, cells, ranges, lidar):  # type: ignore[no-untyped-def]
+    """Notes in times (n, n) that cells in which beams (B,) end are not free."""
+    for b in range(len(ranges)):
+        if np.isfinite(ranges[b]):
+            angle = lidar.first + b * lidar.step + lidar.heading
+            x, y = lidar.x + ranges[b] * math.cos(angle), lidar.y + ranges[b] * math.sin(angle)
+            j = math.floor((cells.cosine * x - cells.sine * y - cells.x) / cells.width)
+            i = math.floor((cells.sine * x + cells.cosine * y - cells.y) / cells.width)
+            if 0 <= i < times.shape[0] and 0 <= j < times.shape[1]:
+                times[i, j] = -np.inf
+
+
+@kernel
+def _beam(x, y, lidar):  # type: ignore[no-untyped-def]
+    """Returns the number of the beam towards a point, beyond those of a scan if there is none."""
+    circle = 2.0 * math.pi / abs(lidar.step)
+    at = (math.atan2(y - lidar.y, x - lidar.x) - lidar.heading - lidar.first) / lidar.step
+    return math.floor(at - circle * math.floor((at + 0.5) / circle) + 0.5)
+
+
+@kernel(allocates=True)
+def unseen(times, sees, cells):  # type: ignore[no-untyped-def]
+    """Returns the middles (Q, 2) of the cells in which free or seen ground ends [m]."""
+    # What lies beyond the outermost cells is not known.
+    last_i, last_j = times.shape[0] - 1, times.shape[1] - 1
+    out, count = np.empty((times.size, 2)), 0
+    for i in range(last_i + 1):
+        for j in range(last_j + 1):
+            inner = 0 < i < last_i and 0 < j < last_j
+            if sees[i, j] or (inner and times[i, j] > -np.inf):
+                continue
+            known = False
+            for across, up in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+                k, m = min(max(i + up, 0), last_i), min(max(j + across, 0), last_j)
+                known = known or sees[k, m] or times[k, m] > -np.inf
+            if known:
+                out[count, 0], out[count, 1] = _middle(i, j, cells)
+                count += 1
+    return out[:count].copy()

@@ -34,13 +34,15 @@ class ShieldConfig:
     deceleration: float  # of the braking that follows [m/s^2]
     margin: float  # clearance kept around the footprint [m]
     hold_s: float  # longest time until the next decision
-    footprint_radius: float  # [m]
+    footprint_radius: float  # of the circle around the robot [m]
     wheelbase: float = 0.0  # of a car, which is commanded by steering angle [m]; 0 for others
     obstacle_speed: float = 0.0  # of moving obstacles that approach [m/s]; 0: all are static
     range_max: float = INF  # of the lidar [m]
     range_noise: tuple[float, float] = (0.0, 0.0)  # std, in metres and as a share of the range
     unknown_share: float = 0.5  # of unknown beams from which a direction counts as blocked
     unknown_width: float = 0.35  # angle over which that share is taken [rad]
+    # Corners of the footprint in `base_link`, in order [m]; none of a robot that is a circle.
+    outline: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -149,6 +151,16 @@ class View:
 
 
 @dataclass(frozen=True)
+class Ground:
+    """What is known about the ground around a robot whose lidar does not see all around it."""
+
+    since_ns: int  # stamp from which times count
+    corner: tuple[int, int]  # cells from the origin of odometry to the first: along x, along y
+    times: Ranges  # (n, n), rows along y, when a cell was last known to be free [s]; -inf: is not
+    unseen: Array  # (Q, 2) middles of the cells where that ends, in `base_link` [m]
+
+
+@dataclass(frozen=True)
 class Push:
     """Motion commanded without a pause."""
 
@@ -205,6 +217,7 @@ class GateState:
     pending: Command | None = None  # whose scan has not arrived yet
     pending_s: float | None = None  # since when commands name such scans; None: the newest does not
     views: tuple[View, ...] = ()  # recent ones, for the detection of motion; empty without shield
+    ground: Ground | None = None  # None if the lidar sees all around, and without shield
     # (P, 3) in the newest scan: x, y in `base_link` [m], and greatest speed of each [m/s].
     obstacles: Array | None = None
     behind_s: float = -INF  # arrival of the scan behind the newest command, less its delay

@@ -70,6 +70,7 @@ def shield_config(
         obstacle_speed=values.obstacle_speed,
         range_max=lidar.range_max,
         range_noise=(lidar.noise_std, lidar.faults.noise_proportional),
+        outline=model.robot.footprint or (),
     )
     source = f"by {path}" if measured is not None else "derived from model and limits"
     if given:

@@ -15,6 +15,7 @@ from nics_drl_bridge.gate.inputs import Odometry, Scan, Tick
 from nics_drl_bridge.gate.shield import (
     MEMORY_S,
     SPACING_S,
+    body_of,
     movers,
     obstacles,
     rehearse,
@@ -127,6 +128,26 @@ def test_a_scan_shows_its_returns_where_they_are():
     assert obstacles(given, seen, ()) == pytest.approx(np.array([[0.1, 2.0, 0.0]]), abs=1e-6)
 
 
+def test_unknown_beams_are_a_wall_on_the_outline_and_blind_directions_are_none():
+    corners = ((0.25, 0.2), (-0.25, 0.2), (-0.25, -0.2), (0.25, -0.2))
+    some = slice(180, 540)  # of 720, those to the front
+    for unseen, front in ((slice(0), False), (slice(None), True), (slice(0, 90), False)):
+        given = config(shield=replace(CAR, outline=corners), beam_angles=LIDAR.angles[some])
+        seen = np.full(360, np.inf, np.float32)
+        seen[unseen] = np.nan
+        wall = obstacles(given, seen, ())[:, :2]
+        assert (np.abs(wall) == (0.25, 0.2)).any(axis=1).all()
+        assert (len(wall) > 0) == (unseen != slice(0))
+        assert (wall[:, 0] == 0.25).any() == front
+        assert (wall[:, 0] >= -0.05).all()
+        assert front or (wall[:, 1] < 0.0).all()
+
+
+def disc(room):
+    """A robot that is a circle with its margin."""
+    return body_of(replace(CAR, footprint_radius=0.75 * room, margin=0.25 * room))
+
+
 def test_the_sweep_agrees_with_geometry():
     rng = np.random.default_rng(0)
     room, step, unclear = 0.2, 0.005, 0
@@ -134,12 +155,12 @@ def test_the_sweep_agrees_with_geometry():
         twist = np.array([rng.uniform(-1, 1), rng.uniform(-1, 1), rng.uniform(-2, 2)])
         blind, point = rng.uniform(0.1, 0.8), rng.uniform(-1.2, 1.2, 2)
         duration = blind + np.hypot(*twist[:2]) / (2.0 * BRAKE)
-        path = LineString([place(twist, t) for t in np.linspace(0.0, duration, 400)])
+        path = LineString([place(twist, t)[:2] for t in np.linspace(0.0, duration, 400)])
         away = path.distance(Point(point))
         if abs(away - room) < step or np.hypot(*point) <= room:
             unclear += 1
             continue
-        swept_free = free(np.array([[*point, 0.0]]), twist[None], blind, BRAKE, room, step)
+        swept_free = free(np.array([[*point, 0.0]]), twist[None], disc(room), blind, BRAKE, step)
         assert swept_free == (away > room)
     assert unclear < 50
 
@@ -147,7 +168,7 @@ def test_the_sweep_agrees_with_geometry():
 @pytest.mark.parametrize(("speed", "may"), [(0.3, False), (-0.3, True)])
 def test_a_robot_in_the_margin_may_leave_and_not_come_nearer(speed, may):
     near = np.array([[0.17, 0.02, 0.0]])
-    assert free(near, np.array([[speed, 0.0, 0.0]]), 0.5, BRAKE, 0.2, 0.02) == may
+    assert free(near, np.array([[speed, 0.0, 0.0]]), disc(0.2), 0.5, BRAKE, 0.02) == may
 
 
 @pytest.mark.parametrize(("away", "may"), [(1.19, False), (1.21, True)])
@@ -156,16 +177,16 @@ def test_what_comes_on_is_met_no_sooner_than_the_robot_is_at_rest(away, may):
     near = 0.2 + 0.2625 + 0.65
     twists = np.array([[0.5, 0.0, 0.0]])
     comes = np.array([[near + away - 1.2, 0.0, 1.0]])
-    assert free(comes, twists, 0.4, 2.0, 0.2, 0.005) == may
-    assert free(comes * (1.0, 1.0, 0.0), twists, 0.4, 2.0, 0.2, 0.005)
+    assert free(comes, twists, disc(0.2), 0.4, 2.0, 0.005) == may
+    assert free(comes * (1.0, 1.0, 0.0), twists, disc(0.2), 0.4, 2.0, 0.005)
 
 
 @pytest.mark.parametrize(("away", "may"), [(0.3, False), (0.6, False), (1.5, True)])
 def test_who_catches_up_from_behind_finds_the_robot_at_rest(away, may):
     """At 0.3 m/s it is no faster than who comes on, and would be met in motion."""
     behind = np.array([[-away, 0.1, 1.0]])
-    assert free(behind, np.array([[0.3, 0.0, 0.0]]), 0.5, BRAKE, 0.2, 0.02) == may
-    assert free(behind * (1.0, 1.0, 0.0), np.array([[0.3, 0.0, 0.0]]), 0.5, BRAKE, 0.2, 0.02)
+    assert free(behind, np.array([[0.3, 0.0, 0.0]]), disc(0.2), 0.5, BRAKE, 0.02) == may
+    assert free(behind * (1.0, 1.0, 0.0), np.array([[0.3, 0.0, 0.0]]), disc(0.2), 0.5, BRAKE, 0.02)
 
 
 def test_a_command_of_before_that_the_scan_does_not_show_yet_is_reckoned_with():

@@ -1,0 +1,56 @@
+"""Ground where the lidar never looks: free as far as it was seen, or the robot stood there."""
+
+import math
+
+import numpy as np
+
+from nics_drl_bridge.gate import shield_kernels
+from nics_drl_bridge.gate.shield_kernels import Body, Cells, Look, MountedBeams
+from nics_drl_bridge.gate.state import Ground, Ranges, View
+from nics_drl_bridge.interface import S_PER_NS
+from nics_drl_bridge.sim.collision_kernels import Outline
+
+CELL, CELLS = 0.05, 48
+"""Width of a cell [m], and their number along each side of what is remembered."""
+REMEMBERED_S = 30.0  # time after which ground is forgotten, but for what is beside the robot [s]
+
+
+def look(
+    before: Ground | None, view: View, lidar: MountedBeams, body: Body, far: float, tolerance: float
+) -> Ground:
+    """Returns the ground after a view; without an earlier one that around the robot may be free.
+
+    Args:
+        before: what was known.
+        view: of the newest scan.
+        lidar: its beams.
+        body: footprint of the robot, and the margin around it.
+        far: greatest range [m].
+        tolerance: margin before a return that is not free [m].
+    """
+    x, y, heading = view.pose.tolist()
+    corner = (math.floor(x / CELL) - CELLS // 2, math.floor(y / CELL) - CELLS // 2)
+    away = (corner[0] * CELL - x, corner[1] * CELL - y)
+    place = Cells(*away, CELL, math.cos(heading), math.sin(heading))
+    room = body.radius + body.margin + CELL
+    if before is None:
+        since, times = view.stamp_ns, np.full((CELLS, CELLS), -np.inf, np.float32)
+        if not _returns_within(view.ranges, lidar, room):
+            disc = body._replace(outline=Outline(np.zeros((0, 2)), 0, 0))
+            shield_kernels.cover(times, place, disc, room - body.radius, 0.0)
+    else:
+        since, moved = before.since_ns, np.subtract(corner, before.corner)
+        times = shield_kernels.shifted(before.times, *moved.tolist())
+    now = (view.stamp_ns - since) * S_PER_NS
+    given = Look(now, now - REMEMBERED_S, far, tolerance)
+    sees = shield_kernels.survey(times, place, view.ranges, lidar, room, given)
+    shield_kernels.cover(times, place, body, 0.0, now)
+    return Ground(since, corner, times, shield_kernels.unseen(times, sees, place))
+
+
+def _returns_within(ranges: Ranges, lidar: MountedBeams, room: float) -> bool:
+    """True if a beam (B,) ends, or is too short to be measured, within a distance of the robot."""
+    angles = lidar.first + lidar.step * np.arange(len(ranges)) + lidar.heading
+    short = np.where(np.isneginf(ranges), 0.0, ranges)
+    ends = np.hypot(lidar.x + short * np.cos(angles), lidar.y + short * np.sin(angles))
+    return bool((ends <= room).any())
