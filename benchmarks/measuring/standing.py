@@ -24,7 +24,8 @@ class Standing:
             off = np.abs(discrete_commands(robot) - rest).sum(axis=1)
             self._action = np.asarray(off.argmin())
         else:
-            share = (rest - robot.command_low) / (robot.command_high - robot.command_low)
+            low, high = task.command_limits
+            share = (rest - low) / (high - low)
             self._action = (2.0 * share - 1.0).astype(np.float32)
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[Any]:

@@ -79,6 +79,7 @@ class Task(ABC):
     lidar: LidarSpec  # gives the scan
     actions: Actions = "continuous"  # a Box, or `discrete`: the paper's drives, see `DRIVES`
     contact_margin: float = 0.02  # a return this close to the footprint counts as a contact [m]
+    top_speed: float | None = None  # of commands in m/s, where the robot's limits are wider [m/s]
     # sectors instead of beams, to mean the same for any lidar; contact is judged from the beams
     scan: ScanLayout | None = None
     sensors: tuple[Sensor, ...] = ()  # further ones, whose shares end each observation
@@ -87,6 +88,8 @@ class Task(ABC):
         if self.actions not in ("continuous", "discrete"):
             known = nearest(str(self.actions), ("continuous", "discrete"))
             raise ConfigError(f"task option actions={self.actions!r}: no such actions; {known}")
+        if self.top_speed is not None and not self.top_speed > 0.0:
+            raise ConfigError(f"task option top_speed={self.top_speed!r}: must be above 0 m/s.")
         if self.sensors and not self.observes_sensors:
             name = type(self).__name__
             raise ConfigError(f"task option sensors: {name} observes no further sensors.")
@@ -106,7 +109,7 @@ class Task(ABC):
     def action_space(self) -> gymnasium.Space[Any]:
         """Action space of one robot: Box [-1, 1] of its commands, or Discrete."""
         if self.actions == "discrete":
-            return gymnasium.spaces.Discrete(len(self._commands))
+            return gymnasium.spaces.Discrete(len(self.discrete_commands))
         return gymnasium.spaces.Box(-1.0, 1.0, (len(self.robot.command),), np.float32)
 
     @abstractmethod
@@ -135,10 +138,10 @@ class Task(ABC):
     def command(self, action: ArrayLike) -> Array:
         """Returns the command (..., C) of a discrete action, or one (..., C) cut to [-1, 1]."""
         if self.actions == "discrete":
-            return np.asarray(self._commands[np.asarray(action)])
+            return np.asarray(self.discrete_commands[np.asarray(action)])
         given = np.ascontiguousarray(action)
         out, rows = np.empty(given.shape), given.reshape(-1, given.shape[-1])
-        low, high = self.robot.command_low, self.robot.command_high
+        low, high = self.command_limits
         kernels.commands(out.reshape(rows.shape), rows, low, high)
         # What a vehicle can't do is not to be learnt: a car by turn rates does not steer at rest.
         return self.robot.through_cmd_vel(out) if self.robot.takes_turn_rate else out
@@ -153,8 +156,19 @@ class Task(ABC):
         return Outcome(terms, self.end(after, memory), self.info(after, memory))
 
     @cached_property
-    def _commands(self) -> Array:
-        return discrete_commands(self.robot)
+    def command_limits(self) -> tuple[Array, Array]:
+        """Commands (C,) of the least and of the greatest action."""
+        low, high = self.robot.command_low, self.robot.command_high
+        if self.top_speed is None:
+            return low, high
+        speeds = np.array([each.unit == "m/s" for each in self.robot.command])
+        top = np.where(speeds, self.top_speed, np.inf)
+        return np.maximum(low, -top), np.minimum(high, top)
+
+    @cached_property
+    def discrete_commands(self) -> Array:
+        """(A, C) commands of the discrete actions."""
+        return np.clip(discrete_commands(self.robot), *self.command_limits)
 
     # Building blocks of tasks.
 

@@ -61,9 +61,9 @@ def _settled(task: Navigation, commands: Array, model: SimulatorModel | None) ->
     return geometry.log(moved) / kinematics.dt
 
 
-def _actions(robot: RobotSpec, commands: Array) -> Array:
-    low, high = robot.command_low, robot.command_high
-    return np.asarray(2.0 * (commands - low) / (high - low) - 1.0)
+def _actions(task: Navigation, commands: Array) -> Array:
+    low, high = task.command_limits
+    return np.clip(2.0 * (commands - low) / (high - low) - 1.0, -1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class StraightToGoal:
             wanted = robot.of_fields(shares) * robot.command_high
         else:
             wanted = self._command(shares)
-        return np.clip(_actions(robot, wanted), -1.0, 1.0).astype(np.float32)
+        return _actions(self.task, wanted).astype(np.float32)
 
     def _command(self, shares: Array) -> Array:
         """Returns commands (..., C) for shares (..., 3) of the greatest twist."""
@@ -181,7 +181,7 @@ class DynamicWindow:
 
     @cached_property
     def _scaled(self) -> NDArray[np.float32]:
-        return _actions(self.task.robot, self._commands).astype(np.float32)
+        return _actions(self.task, self._commands).astype(np.float32)
 
 
 POLICIES: dict[str, Callable[[Navigation, SimulatorModel | None], Policy]] = {

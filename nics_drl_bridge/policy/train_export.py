@@ -11,7 +11,7 @@ import onnx
 import torch
 from numpy.typing import ArrayLike, NDArray
 
-from nics_drl_bridge.env.task import Task, discrete_commands
+from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import SimulatorModel
@@ -37,10 +37,10 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
             self.register_buffer("mean", _vector(normaliser[0]))
             self.register_buffer("std", _vector(normaliser[1]))
         if self.discrete:
-            self.register_buffer("commands", _vector(discrete_commands(task.robot)))
+            self.register_buffer("commands", _vector(task.discrete_commands))
         else:
-            self.register_buffer("low", _vector(task.robot.command_low))
-            self.register_buffer("high", _vector(task.robot.command_high))
+            self.register_buffer("low", _vector(task.command_limits[0]))
+            self.register_buffer("high", _vector(task.command_limits[1]))
 
     def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Actions (n, C) in [-1, 1] or (n,), and commands (n, C) in SI, for observations (n, O)."""

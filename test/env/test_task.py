@@ -23,6 +23,7 @@ from nics_drl_bridge.env.task import (
 )
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.robot.spec import load_robot
 
@@ -254,3 +255,19 @@ def test_a_round_footprint_is_left_at_its_radius_from_the_middle():
     spec = load_robot("differential")
     found = contact_ranges(spec, mounted((0.0, 0.0, 0.5)), MARGIN)
     assert found == pytest.approx(spec.footprint_radius + MARGIN, abs=1e-6)
+
+
+def test_a_top_speed_limits_commands_in_m_per_s_and_no_others():
+    jackal = open_model("jackal")
+    slow = Navigation(jackal.robot, jackal.lidar, top_speed=0.4)
+    assert slow.command([[-1.0, -1.0], [1.0, 1.0]]).tolist() == [[-0.4, -2.5], [0.4, 2.5]]
+    assert np.abs(slow.discrete_commands[:, 0]).max() == 0.4
+    free = Navigation(jackal.robot, jackal.lidar)
+    fast = Navigation(jackal.robot, jackal.lidar, top_speed=9.0)
+    assert fast.command([1.0, 1.0]).tolist() == free.command([1.0, 1.0]).tolist() == [2.0, 2.5]
+
+
+def test_a_top_speed_that_is_none_is_refused():
+    jackal = open_model("jackal")
+    with pytest.raises(ConfigError, match=r"top_speed=0\.0: must be above 0 m/s"):
+        Navigation(jackal.robot, jackal.lidar, top_speed=0.0)
