@@ -75,8 +75,8 @@ def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
     """Loads a world or a world set.
 
     A world is a shipped one by name (`arena`, `barn/7`), or any other by the path of its YAML file.
-    A set is a shipped one (`cellular`; `barn`, see `sim.barn`), a list of worlds, a folder of files,
-    a glob (`worlds/*.yaml`), or a YAML file with the key `worlds` or `generate`. Raises ConfigError
+    A set is a shipped one (`cellular`; `barn`, see `sim.barn`), a list of worlds, a folder, a glob
+    (`worlds/*.yaml`), or a YAML file with the key `worlds` or `generate`. Raises ConfigError
     for a missing or wrong file; of a member it names which.
     """
     if not isinstance(name, str | Path):
