@@ -210,7 +210,7 @@ class Cells(NamedTuple):
 
 
 class Look(NamedTuple):
-    """What a scan is judged by.
+    """Terms by which a scan is judged.
 
     Attributes:
         now: its time [s].

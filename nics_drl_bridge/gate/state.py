@@ -152,7 +152,7 @@ class View:
 
 @dataclass(frozen=True)
 class Ground:
-    """What is known about the ground around a robot whose lidar does not see all around it."""
+    """Ground around a robot whose lidar does not see all around it."""
 
     since_ns: int  # stamp from which times count
     corner: tuple[int, int]  # cells from the origin of odometry to the first: along x, along y
