@@ -20,7 +20,7 @@ def test_shipped_settings_name_worlds_and_a_task_that_there_are(name):
     settings = load_training(name)
     for world in settings.worlds:
         env = BridgeVectorEnv(1, settings.robot, world, settings.task, settings.task_options)
-        assert env.single_observation_space.shape == (78,)
+        assert env.single_observation_space.shape == (96 if settings.robot == "jackal" else 78,)
     assert settings.ppo.rollout * settings.num_envs >= settings.ppo.batch
 
 
