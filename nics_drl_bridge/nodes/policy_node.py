@@ -145,7 +145,7 @@ class PolicyNode(ManagedNode):
             self.get_logger().info(why, throttle_duration_sec=5.0)
             return np.zeros(3)
         if told := resume(self._policy, self._acted_ns * S_PER_NS):
-            self.get_logger().warning(told)
+            self.get_logger().warning(told, throttle_duration_sec=5.0)
         return self._asked(view, self._goal)
 
     def _asked(self, view: RobotView, goal: Array) -> Array:

@@ -24,6 +24,7 @@ from nics_drl_bridge.policy.policy_file import (
     open_session,
     policy_of,
 )
+from nics_drl_bridge.policy.train_memory import Memory
 
 Rows = NDArray[np.float32]
 Normaliser = tuple[ArrayLike, ArrayLike, float]
@@ -51,8 +52,10 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
     @property
     def state(self) -> tuple[int, float] | None:
         """Size and start value of the actor's state, if it has one."""
-        memory: Any = getattr(self.actor, "memory", None)
-        return None if memory is None or not memory.size else (memory.size, memory.start)
+        memory = getattr(self.actor, "memory", None)
+        if not isinstance(memory, Memory) or not memory.size:
+            return None
+        return memory.size, memory.start
 
     def forward(self, observation: torch.Tensor, *state: torch.Tensor) -> tuple[torch.Tensor, ...]:
         """Actions (n, C) in [-1, 1] or (n,), and commands (n, C) in SI, for observations (n, O).
@@ -74,7 +77,7 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
 def actor_of(model: Any) -> torch.nn.Module:
     """Returns the acting part of a PPO, A2C or SAC, or module like `Actor`, else ConfigError.
 
-    One with a state has it told by `memory.size` and `memory.start`, see `train_memory.Memory`.
+    One with a state has a `memory`, see `train_memory.Memory`.
     """
     policy = getattr(model, "policy", model)
     if hasattr(policy, "action_net") and hasattr(policy, "mlp_extractor"):
