@@ -138,7 +138,8 @@ def _shadow(
             rows.append((policy, command, unit, *cells, f"{100 * opposite:.1f} %"))
         compared = f"{policy}: compared at {len(made.time)} times"
         left_out = ", ".join(f"{count} {why}" for why, count in made.skipped.items() if count)
-        lines.append(f"{compared}; left out: {left_out or 'none'}")
+        anew = f"; its state began anew after {made.resets} gaps" if made.resets else ""
+        lines.append(f"{compared}; left out: {left_out or 'none'}{anew}")
     heads = (
         "policy", "command", "unit", "mean", "mean size", *(f"{q} %" for q in PERCENTILES),
         "greatest", "opposite sign",

@@ -41,6 +41,9 @@ class ManagedNode(QosWatch, LifecycleNode):
     def configure(self) -> None:
         """Makes what the parameters request. Raises BridgeError if one can't be used."""
 
+    def activate(self) -> None:
+        """Begins to act."""
+
     def deactivate(self) -> None:
         """Leaves the robot at rest; publishes nothing afterwards."""
 
@@ -79,7 +82,7 @@ class ManagedNode(QosWatch, LifecycleNode):
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Transition of the state machine."""
         super().on_activate(state)  # the publishers
-        return self._attempt(lambda: None, ACTIVE)
+        return self._attempt(self.activate, ACTIVE)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Transition of the state machine."""

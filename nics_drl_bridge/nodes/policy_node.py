@@ -12,7 +12,7 @@ from rclpy.context import Context
 
 from nics_drl_bridge.errors import BridgeError, ConfigError, shortened
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.interface import Array, RobotView
+from nics_drl_bridge.interface import S_PER_NS, Array, RobotView
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
@@ -20,7 +20,7 @@ from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.lifecycle import ACTIVE, UNCONFIGURED, ManagedNode
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
 from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
-from nics_drl_bridge.policy.policies import open_policy
+from nics_drl_bridge.policy.policies import begin, open_policy, resume
 
 POLLS = 0.1  # time between two checks whether to act, as a share of the control period
 LONGEST_REASON = 300  # greatest length of a policy's error text, in characters
@@ -67,6 +67,10 @@ class PolicyNode(ManagedNode):
         timer = runner.steadily(self, POLLS * model.control_period, self._act)
         self.undo.callback(self.destroy_timer, timer)
 
+    def activate(self) -> None:
+        """Begins with a fresh state of the policy."""
+        begin(self._policy)
+
     def deactivate(self) -> None:
         """Leaves a zero command behind."""
         runner.last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
@@ -86,6 +90,7 @@ class PolicyNode(ManagedNode):
         view = rehearse(model)  # so that all compiles now
         self._task.judge(view, {"goal": np.zeros(2)})
         self._asked(view, np.zeros(2))
+        begin(self._policy)
 
     def _on_lidar(self, lidar: LidarSpec) -> None:
         self._open_policy(replace(self._model, lidar=lidar))
@@ -95,7 +100,10 @@ class PolicyNode(ManagedNode):
         self.get_logger().info(f"scans of {lidar.beams} beams {span} are {done}")
 
     def _on_goal(self, message: PoseStamped) -> None:
-        self._goal = np.array([message.pose.position.x, message.pose.position.y])
+        goal = np.array([message.pose.position.x, message.pose.position.y])
+        if not np.array_equal(goal, self._goal):
+            begin(self._policy)
+        self._goal = goal
         self.get_logger().info(f"new goal ({self._goal[0]:.2f}, {self._goal[1]:.2f}) m")
 
     def _act(self, _: int = 0) -> None:
@@ -136,6 +144,8 @@ class PolicyNode(ManagedNode):
             why = "touching something, stopped" if verdict.touched else "goal reached"
             self.get_logger().info(why, throttle_duration_sec=5.0)
             return np.zeros(3)
+        if told := resume(self._policy, self._acted_ns * S_PER_NS):
+            self.get_logger().warning(told, throttle_duration_sec=5.0)
         return self._asked(view, self._goal)
 
     def _asked(self, view: RobotView, goal: Array) -> Array:

@@ -26,6 +26,7 @@ from nics_drl_bridge.robot.spec import RobotSpec
 FORMAT = "nics_drl_bridge/policy/1"
 SUFFIX = ".onnx"
 GOLDEN = 16
+GAP_PERIODS = 5  # control periods without an observation after which a state is reset
 MOST_ENTRIES = 20_000
 CHECKSUM = 8  # hexadecimal digits of a field's checksum, which detects mistakes but is no signature
 Rows = NDArray[np.float32]
@@ -53,8 +54,19 @@ class ObservationEntry(Schema):
     rest_high: tuple[float, ...]
 
 
+class StateEntry(Schema):
+    """State of a policy, which its graph takes and gives: `state_in` and `state_out` (n, size)."""
+
+    size: int = Field(ge=1, le=200_000)
+    start: float = Field(ge=-1e6, le=1e6)  # each element when an episode begins
+    longest_gap: float = Field(gt=0.0)  # between two observations [s]; after a longer one: as above
+
+
 class GoldenEntry(Schema):
-    """Sixteen pairs that must be reproduced; float32, little endian, in base 64."""
+    """Sixteen pairs that must be reproduced; float32, little endian, in base 64.
+
+    Those of a policy with a state are one episode, from its first step on.
+    """
 
     observations: str  # (16, O)
     actions: str  # (16, C), or (16, 1) discrete
@@ -76,6 +88,7 @@ class Contract(Schema):
     sensors: tuple[AnySensor, ...] = ()  # further ones that it observes
     task: TaskEntry
     observation: ObservationEntry
+    state: StateEntry | None = None  # None: each action follows from one observation alone
     actions: Literal["continuous", "discrete"]
     control_period: float = Field(gt=0.0, le=10.0)  # time between commands [s]
     model_fingerprint: str = Field(pattern="^[0-9a-f]{16}$")
@@ -94,9 +107,12 @@ class Contract(Schema):
 
 def contract_of(
     task: Task, model: SimulatorModel, golden: Mapping[str, Rows], graph_sha256: str,
-    provenance: Mapping[str, Any],
+    provenance: Mapping[str, Any], state: tuple[int, float] | None = None,
 ) -> str:  # fmt: skip
-    """Writes the contract of a policy as JSON. Raises ConfigError if an entry has a wrong type."""
+    """Writes the contract of a policy as JSON; the state is its size and start value.
+
+    Raises ConfigError if an entry has a wrong type.
+    """
     entry, observation = task_entry(task), observation_entry(task)
     data: dict[str, Any] = {
         "format": FORMAT,
@@ -117,6 +133,9 @@ def contract_of(
     }
     if task.sensors:
         data["sensors"] = [sensor.model_dump(mode="json") for sensor in task.sensors]
+    if state is not None:
+        gap = GAP_PERIODS * model.control_period
+        data["state"] = {"size": state[0], "start": state[1], "longest_gap": gap}
     data["checksums"] = checksums(data)
     validate(data, Contract, "policy")
     return json.dumps(data, allow_nan=False)

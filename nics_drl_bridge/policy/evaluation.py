@@ -14,7 +14,7 @@ from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.guard import uninterrupted
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
-from nics_drl_bridge.policy.policies import Policy
+from nics_drl_bridge.policy.policies import Policy, begin
 from nics_drl_bridge.seeds import checked_seeds
 
 Array = NDArray[np.float64]
@@ -86,6 +86,7 @@ def drive(
     try:
         observation, info = env.reset(seed=seed, options=options)
         on_start()
+        begin(policy)
         goal, bodies = info["goal"], info["bodies"]
         paths, estimates, total, ended = [info["start"]], [info["pose"]], 0.0, False
         while not ended:
@@ -163,7 +164,10 @@ class Outcomes:
 
 
 def drive_worlds(env: BridgeVectorEnv, act: Act, seeds: Sequence[int]) -> Outcomes:
-    """Drives an episode per seed, to the bit as `BridgeEnv.reset(seed=...)` without estimator."""
+    """Drives an episode per seed, to the bit as `BridgeEnv.reset(seed=...)` without estimator.
+
+    A policy with a state is given by its method `act`, so that its episodes can begin.
+    """
     width, given = env.num_envs, checked_seeds(seeds)
     # The last batch is padded with seeds that are driven but not counted.
     batches = (np.resize(given[k : k + width], width) for k in range(0, len(given), width))
@@ -175,6 +179,7 @@ def _drive_once(env: BridgeVectorEnv, act: Act, seeds: NDArray[np.int64]) -> tup
     """Drives one episode in each world: success, collision, steps, length, reward, each (N,)."""
     count = env.num_envs
     observation, info = env.reset(seed=list(seeds))
+    begin(act)
     where = np.reshape(info["start"], (count, -1, 3))[..., :2]
     success, collision = np.zeros((2, count), np.bool_)
     steps, (length, reward) = np.zeros(count, np.int64), np.zeros((2, count))

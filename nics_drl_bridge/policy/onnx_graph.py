@@ -30,6 +30,7 @@ SMALL = 1024  # maximum length of an integer array that may be a shape, an axis 
 GREATEST_SETTING = 65_536  # maximum size, stride, padding or dilation of a kernel
 MOST_AXES = 256  # axes that all nodes together may add to their arrays; each makes inference longer
 INPUT, ACTION, COMMAND = "observation", "action", "command"
+STATE_IN, STATE_OUT = "state_in", "state_out"  # of a policy with a state
 OPERATORS = frozenset({
     "Abs", "Add", "ArgMax", "AveragePool", "Cast", "Clip", "Concat", "Constant", "Conv", "Div",
     "Elu", "Erf", "Exp", "Flatten", "Gather", "Gelu", "Gemm", "GlobalAveragePool", "HardSigmoid",
@@ -241,10 +242,14 @@ def check_ends(model: Any, widths: dict[str, int | None], source: str) -> None:
     """Raises PolicyError unless inputs and outputs have their widths; None: integers (n,)."""
     weights = {tensor.name for tensor in model.graph.initializer}
     inputs = [one for one in model.graph.input if one.name not in weights]
-    for kind, ends, names in (
-        ("inputs", inputs, [INPUT]),
-        ("outputs", model.graph.output, [ACTION, COMMAND]),
+    if STATE_IN not in widths and STATE_IN in [one.name for one in inputs]:
+        reason = "is missing, although the graph takes one; export the policy anew."
+        raise PolicyError(source, "state", reason)
+    for kind, ends, known in (
+        ("inputs", inputs, [INPUT, STATE_IN]),
+        ("outputs", model.graph.output, [ACTION, COMMAND, STATE_OUT]),
     ):
+        names = [name for name in known if name in widths]
         if [end.name for end in ends] != names:
             reason = f"are {[end.name for end in ends]}, not {names}; export the policy anew."
             raise PolicyError(source, f"graph.{kind}", reason)

@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,13 @@ from nics_drl_bridge.policy.contract import SUFFIX, shipped
 from nics_drl_bridge.robot.kinds import command_for, has_textbook, reach, steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec
 
+if TYPE_CHECKING:
+    from nics_drl_bridge.policy.policy_file import PolicyFile
+
 Array = NDArray[np.float64]
+Rows = NDArray[np.float32]
+Step = Callable[[Rows, Rows], tuple[NDArray[Any], Rows]]
+"""Actions (..., C) and the next state (..., S), for observations (..., O) and a state (..., S)."""
 
 FULL_TURN_RAD = 0.8  # bearing of the goal from which a robot turns as fast as it can
 SETTLED_S = 5.0  # after which a held command has led to its twist
@@ -32,6 +38,56 @@ class Policy(Protocol):
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """Returns the action (C,) in [-1, 1] for an observation (O,); or (N, C) for (N, O)."""
+
+
+class Stateful:
+    """Acts with a state that it keeps from step to step of an episode, a row for each world."""
+
+    def __init__(self, step: Step, size: int, start: float, longest_gap: float = math.inf) -> None:
+        self._step, self._start = step, np.full(size, start, np.float32)
+        self._longest_gap = longest_gap  # between two observations [s]
+        self._state: Rows | None = None
+        self._time = math.inf  # of the last observation [s]
+
+    def reset(self, worlds: NDArray[np.bool_] | None = None) -> None:
+        """Begins an episode, in some worlds (N,) or in all of them."""
+        if worlds is None or self._state is None:
+            self._state, self._time = None, math.inf
+        else:
+            self._state[worlds] = self._start
+
+    def resume(self, time_s: float) -> str:
+        """Resets after a gap before an observation of this time [s]; a sentence says so, or ''."""
+        gap, self._time = time_s - self._time, time_s
+        if gap <= self._longest_gap:
+            return ""
+        self.reset()
+        self._time = time_s
+        limit = f"the {self._longest_gap:g} s after which the policy's state is no longer valid"
+        return f"nothing was observed for {gap:.3g} s, longer than {limit}; it begins anew."
+
+    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """See `Policy`. Raises ConfigError for another number of worlds than before."""
+        lead = observation.shape[:-1]
+        if self._state is None:
+            self._state = np.tile(self._start, (*lead, 1))
+        if self._state.shape[:-1] != lead:
+            given = f"a state of {self._state.shape[:-1]} worlds was given observations of {lead}"
+            raise ConfigError(f"{given}; reset the policy when episodes begin.")
+        action, self._state = self._step(observation, self._state)
+        return action
+
+
+def begin(policy: Any) -> None:
+    """Tells a policy, or whose method `act` this is, that episodes begin; few need to know."""
+    reset = getattr(getattr(policy, "__self__", policy), "reset", None)
+    if reset is not None:
+        reset()
+
+
+def resume(policy: Policy, time_s: float) -> str:
+    """See `Stateful.resume`; '' for a policy without a state."""
+    return policy.resume(time_s) if isinstance(policy, Stateful) else ""
 
 
 def _grid(robot: RobotSpec) -> Array:
@@ -212,7 +268,7 @@ def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None
 
     policy = load_policy(name)
     policy.check_fits(model, task)
-    return policy
+    return _acting(policy)
 
 
 def open_policy(name: str, model: SimulatorModel) -> tuple[Policy, Navigation]:
@@ -227,4 +283,12 @@ def open_policy(name: str, model: SimulatorModel) -> tuple[Policy, Navigation]:
     if not isinstance(found, Navigation):
         reason = f"is {policy.contract.task.name!r}; this drives policies of 'navigation'."
         raise PolicyError(name, "task.name", reason)
-    return policy, found
+    return _acting(policy), found
+
+
+def _acting(policy: "PolicyFile") -> Policy:
+    """The policy of a file, which keeps its state if it has one."""
+    kept = policy.contract.state
+    if kept is None:
+        return policy
+    return Stateful(policy.step, kept.size, kept.start, kept.longest_gap)

@@ -1,6 +1,6 @@
 """Policy files: one `.onnx` with network, normaliser, commands and contract; never unpickled."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -41,23 +41,38 @@ class PolicyFile:
         """Returns the command (C,) in SI, in the robot's order, for (O,); or (n, C) for (n, O)."""
         return self.run(observation)[1]
 
-    def run(self, observation: Rows) -> list[NDArray[Any]]:
-        """Returns action and command for (O,) or (n, O)."""
+    def step(self, observation: Rows, state: Rows) -> tuple[NDArray[Any], Rows]:
+        """Returns the action, and the state (S,) or (n, S) for the next observation."""
+        action, _, following = self.run(observation, state)
+        return action, following
+
+    def run(self, observation: Rows, state: Rows | None = None) -> list[NDArray[Any]]:
+        """Returns action and command for (O,) or (n, O), and the next state for one (S,), (n, S).
+
+        Raises PolicyError if a shape does not fit, or a state is missing; see `make_policy`.
+        """
         given = np.asarray(observation, np.float32)
-        size = self.contract.observation.size
+        size, kept = self.contract.observation.size, self.contract.state
         if given.ndim not in (1, 2) or given.shape[-1] != size:
             reason = f"is {size}, but was given observations {given.shape}; use its own task."
             raise PolicyError(str(self.path), "observation.size", reason)
-        rows = given.reshape(-1, size)
-        firsts = range(0, max(len(rows), 1), self._rows_at_once)
-        out = [self._run_rows(rows[first : first + self._rows_at_once]) for first in firsts]
+        wanted = None if kept is None else (*given.shape[:-1], kept.size)
+        if wanted != (None if state is None else np.shape(state)):
+            reason = f"must be given as {wanted}, not {None if state is None else np.shape(state)}"
+            raise PolicyError(str(self.path), "state", f"{reason}; `make_policy` keeps it.")
+        feeds = {onnx_graph.INPUT: given.reshape(-1, size)}
+        if kept is not None:
+            feeds[onnx_graph.STATE_IN] = np.asarray(state, np.float32).reshape(-1, kept.size)
+        firsts = range(0, max(len(feeds[onnx_graph.INPUT]), 1), self._rows_at_once)
+        out = [self._run_rows(feeds, slice(k, k + self._rows_at_once)) for k in firsts]
         whole = [np.concatenate(parts) for parts in zip(*out, strict=True)]
         return [part[0] if given.ndim == 1 else part for part in whole]
 
-    def _run_rows(self, rows: Rows) -> list[NDArray[Any]]:
-        names = [onnx_graph.ACTION, onnx_graph.COMMAND]
+    def _run_rows(self, feeds: Mapping[str, Rows], which: slice) -> list[NDArray[Any]]:
+        given = {name: rows[which] for name, rows in feeds.items()}
+        rows = given[onnx_graph.INPUT]
         try:
-            out: list[NDArray[Any]] = self._session.run(names, {onnx_graph.INPUT: rows})
+            out: list[NDArray[Any]] = self._session.run(None, given)
         except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
             raise _cannot_run(str(self.path), error) from None
         if any(len(part) != len(rows) for part in out):
@@ -153,7 +168,12 @@ def policy_of(data: bytes, path: Path) -> PolicyFile:
     contract = contracts.read_contract(onnx_graph.metadata(model, source), source)
     commands = len(contract.robot.command)
     action = None if contract.actions == "discrete" else commands
-    widths = {"observation": contract.observation.size, "command": commands, "action": action}
+    widths = {
+        onnx_graph.INPUT: contract.observation.size,
+        onnx_graph.COMMAND: commands, onnx_graph.ACTION: action,
+    }  # fmt: skip
+    if contract.state is not None:
+        widths |= dict.fromkeys((onnx_graph.STATE_IN, onnx_graph.STATE_OUT), contract.state.size)
     onnx_graph.check_ends(model, widths, source)
     if onnx_graph.graph_hash(model) != contract.graph_sha256:
         reason = "does not belong to the graph, which was changed after the export."
@@ -188,9 +208,23 @@ def _cannot_run(source: str, error: Exception) -> PolicyError:
     return PolicyError(source, "graph", f"onnxruntime can't run it ({words}).")
 
 
+def in_turn(
+    run: Callable[..., Sequence[NDArray[Any]]], seen: Rows, start: Rows | None
+) -> list[NDArray[Any]]:
+    """Actions and commands for observations (T, O): of an episode if there is a state (S,)."""
+    if start is None:
+        return list(run(seen))
+    state, rows = start[None], []
+    for k in range(len(seen)):
+        *out, state = run(seen[k : k + 1], state)
+        rows.append(out)
+    return [np.concatenate(parts) for parts in zip(*rows, strict=True)]
+
+
 def _check_golden(policy: PolicyFile, source: str) -> None:
-    golden = policy.contract.golden
-    action, command = policy.run(golden.rows("observations"))
+    golden, kept = policy.contract.golden, policy.contract.state
+    start = None if kept is None else np.full(kept.size, kept.start, np.float32)
+    action, command = in_turn(policy.run, golden.rows("observations"), start)
     found = {"actions": action.reshape(len(command), -1), "commands": command}
     for name, rows in found.items():
         gap = np.abs(rows - golden.rows(name)).max()

@@ -14,7 +14,7 @@ from nics_drl_bridge.interface import S_PER_NS, RobotView
 from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, POSE, SCAN
 from nics_drl_bridge.middleware.playback import Playback, in_order, played
 from nics_drl_bridge.policy.pacing import ActionPace
-from nics_drl_bridge.policy.policies import open_policy
+from nics_drl_bridge.policy.policies import open_policy, resume
 from nics_drl_bridge.recording.bag_file import Message
 from nics_drl_bridge.recording.messages import commanded
 
@@ -38,6 +38,7 @@ class Shadow:
     driven: Array  # (T, C) recorded commands
     scale: Array  # (C,) maximum magnitude of each command
     skipped: Mapping[str, int]  # reason -> number of times that were not compared
+    resets: int = 0  # gaps after which the policy's state began anew
 
     def differences(self) -> dict[str, dict[str, float]]:
         """Mean of policy minus drive by command; its magnitude; the share of opposite signs."""
@@ -134,10 +135,13 @@ def _goals(moments: list[_Moment], goal: ArrayLike | None, ahead_s: float) -> Ar
 
 def _answered(moments: list[_Moment], goals: Array, name: str, model: SimulatorModel) -> Shadow:
     policy, task = open_policy(name, model)
-    robot, rows = model.robot, list[tuple[Any, ...]]()
+    robot, rows, resets = model.robot, list[tuple[Any, ...]](), 0
     skipped = {"no command was driven": 0, "at the goal": 0, "touching something": 0}
     for moment, goal in zip(moments, goals, strict=True):
         verdict = task.judge(moment.view, memory := {"goal": goal})
+        if not (verdict.touched or verdict.reached):  # its state needs what is not compared, too
+            resets += bool(resume(policy, moment.stamp_ns * S_PER_NS))
+            command = task.command(policy.act(task.observation(moment.view, memory)))
         if moment.driven is None:
             skipped["no command was driven"] += 1
         elif verdict.touched:
@@ -145,7 +149,6 @@ def _answered(moments: list[_Moment], goals: Array, name: str, model: SimulatorM
         elif verdict.reached:
             skipped["at the goal"] += 1
         else:
-            command = task.command(policy.act(task.observation(moment.view, memory)))
             wanted = robot.through_cmd_vel(command)
             rows.append((moment.stamp_ns, moment.view.pose, goal, wanted, moment.driven))
     if not rows:
@@ -158,5 +161,5 @@ def _answered(moments: list[_Moment], goals: Array, name: str, model: SimulatorM
         (stamps - stamps[0]) * S_PER_NS,
         poses, aims, wanted, driven,
         np.maximum(np.abs(robot.command_low), np.abs(robot.command_high)),
-        skipped,
+        skipped, resets,
     )  # fmt: skip

@@ -17,7 +17,14 @@ from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy import onnx_graph
 from nics_drl_bridge.policy.contract import GOLDEN, SUFFIX, contract_of
-from nics_drl_bridge.policy.policy_file import GOLDEN_TOLERANCE, PolicyFile, open_session, policy_of
+from nics_drl_bridge.policy.policy_file import (
+    GOLDEN_TOLERANCE,
+    PolicyFile,
+    in_turn,
+    open_session,
+    policy_of,
+)
+from nics_drl_bridge.policy.train_memory import Memory
 
 Rows = NDArray[np.float32]
 Normaliser = tuple[ArrayLike, ArrayLike, float]
@@ -42,22 +49,36 @@ class Deployed(torch.nn.Module):  # type: ignore[misc]
             self.register_buffer("low", _vector(task.command_limits[0]))
             self.register_buffer("high", _vector(task.command_limits[1]))
 
-    def forward(self, observation: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Actions (n, C) in [-1, 1] or (n,), and commands (n, C) in SI, for observations (n, O)."""
+    @property
+    def state(self) -> tuple[int, float] | None:
+        """Size and start value of the actor's state, if it has one."""
+        memory = getattr(self.actor, "memory", None)
+        if not isinstance(memory, Memory) or not memory.size:
+            return None
+        return memory.size, memory.start
+
+    def forward(self, observation: torch.Tensor, *state: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        """Actions (n, C) in [-1, 1] or (n,), and commands (n, C) in SI, for observations (n, O).
+
+        An actor with a state takes one (n, S) in addition, and gives the next.
+        """
         seen = observation
         if self.limit is not None:
             seen = torch.clamp((seen - self.mean) / self.std, -self.limit, self.limit)
-        raw = self.actor(seen)
+        raw, *following = self.actor(seen, *state) if state else (self.actor(seen),)
         if self.discrete:
             action = torch.argmax(raw, dim=1)
-            return action, self.commands[action]
+            return action, self.commands[action], *following
         action = torch.clamp(raw, -1.0, 1.0)
         command = self.low + (action + 1.0) / 2.0 * (self.high - self.low)
-        return action, torch.minimum(torch.maximum(command, self.low), self.high)
+        return action, torch.minimum(torch.maximum(command, self.low), self.high), *following
 
 
 def actor_of(model: Any) -> torch.nn.Module:
-    """Returns the acting part of a PPO, A2C or SAC, or module like `Actor`, else ConfigError."""
+    """Returns the acting part of a PPO, A2C or SAC, or module like `Actor`, else ConfigError.
+
+    One with a state has a `memory`, see `train_memory.Memory`.
+    """
     policy = getattr(model, "policy", model)
     if hasattr(policy, "action_net") and hasattr(policy, "mlp_extractor"):
         latent = policy.mlp_extractor.policy_net
@@ -88,7 +109,7 @@ def export_policy(
     graph = _graph(deployed, task)
     golden = _golden(deployed, graph, task, str(file))
     sha256 = onnx_graph.graph_hash(graph)
-    text = contract_of(task, simulator_model, golden, sha256, provenance or {})
+    text = contract_of(task, simulator_model, golden, sha256, provenance or {}, deployed.state)
     onnx.helper.set_model_props(graph, {onnx_graph.KEY: text})
     data = onnx_graph.sealed(graph.SerializeToString(deterministic=True))
     policy = policy_of(data, file)
@@ -103,9 +124,17 @@ def _golden(deployed: Deployed, graph: Any, task: Task, source: str) -> dict[str
     rng = np.random.default_rng(GOLDEN_SEED)
     seen = rng.uniform(low, high, (GOLDEN, len(low))).astype(np.float32)
     session = open_session(graph.SerializeToString(), source)
-    out = session.run([onnx_graph.ACTION, onnx_graph.COMMAND], {onnx_graph.INPUT: seen})
-    with torch.no_grad():
-        wanted = [part.numpy() for part in deployed(torch.as_tensor(seen))]
+    inputs, kept = (onnx_graph.INPUT, onnx_graph.STATE_IN), deployed.state
+    start = None if kept is None else np.full(kept[0], kept[1], np.float32)
+
+    def infer(*given: Rows) -> list[Rows]:
+        return list(session.run(None, dict(zip(inputs, given, strict=False))))
+
+    def compute(*given: Rows) -> list[Rows]:
+        with torch.no_grad():
+            return [part.numpy() for part in deployed(*map(torch.as_tensor, given))]
+
+    out, wanted = (in_turn(run, seen, start) for run in (infer, compute))
     for name, ours, theirs in zip(("actions", "commands"), out, wanted, strict=True):
         error = float(np.abs(ours - theirs).max())
         if not error <= GOLDEN_TOLERANCE:
@@ -116,15 +145,18 @@ def _golden(deployed: Deployed, graph: Any, task: Task, source: str) -> dict[str
 
 
 def _graph(deployed: Deployed, task: Task) -> Any:
-    example = torch.zeros(1, task.observation_space.shape[0])
-    names, buffer = [onnx_graph.ACTION, onnx_graph.COMMAND], io.BytesIO()
+    inputs, outputs = [onnx_graph.INPUT], [onnx_graph.ACTION, onnx_graph.COMMAND]
+    examples, buffer = [torch.zeros(1, task.observation_space.shape[0])], io.BytesIO()
+    if deployed.state is not None:
+        examples.append(torch.zeros(1, deployed.state[0]))
+        inputs, outputs = [*inputs, onnx_graph.STATE_IN], [*outputs, onnx_graph.STATE_OUT]
     with warnings.catch_warnings():
         # This exporter is deprecated; the new one takes several times longer.
         warnings.simplefilter("ignore")
         torch.onnx.export(
-            deployed, (example,), buffer,
-            input_names=[onnx_graph.INPUT], output_names=names, opset_version=OPSET,
-            dynamic_axes={name: {0: "n"} for name in (onnx_graph.INPUT, *names)},
+            deployed, tuple(examples), buffer,
+            input_names=inputs, output_names=outputs, opset_version=OPSET,
+            dynamic_axes={name: {0: "n"} for name in (*inputs, *outputs)},
             dynamo=False,
         )  # fmt: skip
     return onnx.load_model_from_string(buffer.getvalue())

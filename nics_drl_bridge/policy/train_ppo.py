@@ -11,7 +11,7 @@ from __future__ import annotations
 import copy
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -23,25 +23,42 @@ from stable_baselines3.common.logger import Logger
 
 from nics_drl_bridge.policy.train_algorithms import LEAST_RATE, Actor, check_serves, layers_of
 from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch
+from nics_drl_bridge.policy.train_memory import memory_of
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import PpoSettings, TrainingSettings
 from nics_drl_bridge.threads import run_parts
 
 Array = NDArray[np.float64]
 Ended = list[tuple[bool, bool]]  # success and collision of episodes
+Seen = tuple[torch.Tensor, torch.Tensor]  # features and state
 VALUE_WEIGHT, GRADIENT_LIMIT = 0.5, 0.5  # of the loss, and of the norm of its gradient
 ADAM_EPSILON = 1e-5
 LOG_NORM = 0.5 * math.log(2.0 * math.pi)  # of the normal distribution
 
 
 class Transitions(NamedTuple):
-    """R transitions, T steps of N worlds, step after step."""
+    """R transitions, T steps of N worlds, step after step; the last two for a learnt memory."""
 
-    seen: torch.Tensor  # (R, O) normalised observations
+    seen: torch.Tensor  # (R, O) normalised observations, with what a memory adds
     actions: torch.Tensor  # (R, C), or (R,) discrete
     log_probs: torch.Tensor  # (R,) of the actions when they were drawn
     advantages: torch.Tensor  # (R,)
     returns: torch.Tensor  # (R,) targets of the critic
+    state: torch.Tensor | None = None  # (N, S) at the first step
+    done: torch.Tensor | None = None  # (T, N) ends of episodes, which are 1
+
+    def batches(self, size: int, generator: torch.Generator) -> Iterator[Transitions]:
+        """Parts of about `size` transitions in random order; for a memory, all of some worlds."""
+        if self.state is None or self.done is None:
+            for rows in torch.randperm(len(self.seen), generator=generator).split(size):
+                yield Transitions(*(each[rows] for each in self[:5]))
+            return
+        steps, worlds = self.done.shape
+        firsts = worlds * torch.arange(steps)[:, None]
+        for some in torch.randperm(worlds, generator=generator).split(max(1, size // steps)):
+            rows = (firsts + some).flatten()
+            part = Transitions(*(each[rows] for each in self[:5]))
+            yield part._replace(state=self.state[some], done=self.done[:, some])
 
 
 class Layers:
@@ -89,7 +106,7 @@ class Networks(torch.nn.Module):
     def __init__(self, actor: Actor, hidden: tuple[int, ...], log_std: float) -> None:
         super().__init__()
         self.actor = actor
-        self.critic = layers_of([actor.normaliser.features_dim, *hidden, 1], 1.0, torch.nn.ReLU)
+        self.critic = layers_of([actor.layers[0].in_features, *hidden, 1], 1.0, torch.nn.ReLU)
         outputs = actor.layers[-1].out_features
         self.log_std = torch.nn.Parameter(torch.full((0 if actor.discrete else outputs,), log_std))
 
@@ -179,15 +196,16 @@ class Learner:
         for group in self.optimiser.param_groups:
             group["lr"] = rate
         for _ in range(self.ppo.epochs):
-            order = torch.randperm(len(rollout.seen), generator=self.generator)
-            for rows in order.split(self.ppo.batch):
-                loss = self.differentiate(Transitions(*(each[rows] for each in rollout)))
+            for batch in rollout.batches(self.ppo.batch, self.generator):
+                loss = self.differentiate(batch)
                 torch.nn.utils.clip_grad_norm_(self._all, GRADIENT_LIMIT)
                 self.optimiser.step()
         return float(loss)
 
     def differentiate(self, batch: Transitions) -> torch.Tensor:
         """Sets the gradients of all weights for a batch; returns the loss."""
+        if batch.state is not None and batch.done is not None:
+            return self._through_time(batch, batch.state, batch.done)
         with torch.no_grad():
             outputs = [part.forward(batch.seen) for part in self._parts]
         raw, values = (each.detach().requires_grad_() for each in outputs)
@@ -200,6 +218,19 @@ class Learner:
                 part.backward(gradient)
         return loss.detach()
 
+    def _through_time(
+        self, batch: Transitions, state: torch.Tensor, done: torch.Tensor
+    ) -> torch.Tensor:
+        """The same by autograd, through all steps of the batch; the critic moves no memory."""
+        actor = self.networks.actor
+        seen = batch.seen[:, : actor.normaliser.features_dim].unflatten(0, done.shape)
+        features = actor.memory.unroll(seen, state, done).flatten(0, 1)
+        raw, values = actor.layers(features), self.networks.critic(features.detach())
+        self._all.grad.zero_()
+        loss = loss_of(self.networks, raw, values, batch, self.ppo)
+        loss.backward()
+        return loss.detach()
+
 
 class Collector:
     """Drives the worlds with a copy of the networks."""
@@ -208,6 +239,7 @@ class Collector:
         self.env, self.networks, self.ppo = env, copy.deepcopy(networks), ppo
         self.generator = torch.Generator().manual_seed(seed)
         self.last = np.zeros((env.num_envs, *env.observation_space.shape), np.float32)
+        self.state = networks.actor.memory.begin(env.num_envs)  # (N, S) of the actor
 
     def collect(self) -> tuple[Transitions, Ended]:
         """Drives all worlds for the steps of a rollout."""
@@ -216,12 +248,12 @@ class Collector:
 
     def _collect(self) -> tuple[Transitions, Ended]:
         steps, worlds, ppo = self.ppo.rollout, self.env.num_envs, self.ppo
-        networks, see = self.networks, self.networks.actor.normaliser
-        seen = torch.empty(steps + 1, worlds, self.last.shape[1])
+        networks, first = self.networks, self.state
+        seen = torch.empty(steps + 1, worlds, networks.critic[0].in_features)
         rewards, done = torch.zeros(2, steps, worlds)
         raw, actions, ended, cut, final = [], [], [], [], []
         for t in range(steps):
-            seen[t] = see(torch.from_numpy(self.last))
+            seen[t], state = self._see(self.last, self.state)
             raw.append(networks.actor.layers(seen[t]))
             actions.append(networks.draw(raw[t], self.generator))
             self.last, reward, over, infos = self.env.step(self._bounded(actions[t].numpy()))
@@ -231,17 +263,27 @@ class Collector:
                 ended.append((one.get("is_success", False), one.get("collision", False)))
                 if one["TimeLimit.truncated"]:
                     cut.append(t * worlds + int(n))
-                    final.append(one["terminal_observation"])
-        seen[steps] = see(torch.from_numpy(self.last))
+                    final.append(self._see(one["terminal_observation"][None], state[n : n + 1])[0])
+            self.state = networks.actor.memory.begun(state, done[t])
+        seen[steps], _ = self._see(self.last, self.state)
         values = networks.critic(seen).squeeze(-1)
         if cut:  # what would have come after the time limit
-            after = networks.critic(see(torch.from_numpy(np.stack(final)))).squeeze(-1)
+            after = networks.critic(torch.cat(final)).squeeze(-1)
             rewards.view(-1)[cut] += ppo.discount * after
         gains = advantages_of(rewards, values, done, ppo.discount, ppo.gae_lambda)
         drawn, returns = torch.cat(actions), gains + values[:-1]
         log_probs = networks.log_probs(torch.cat(raw), drawn)
         rows = seen[:-1].flatten(0, 1), drawn, log_probs, gains.flatten(), returns.flatten()
-        return Transitions(*rows), ended
+        rollout = Transitions(*rows)
+        if networks.actor.memory.learnt:
+            rollout = rollout._replace(state=first, done=done)
+        return rollout, ended
+
+    def _see(self, observations: NDArray[np.float32], state: torch.Tensor) -> Seen:
+        """Features of observations (n, O) for the networks, and the next state (n, S)."""
+        actor = self.networks.actor
+        seen: Seen = actor.memory(actor.normaliser(torch.from_numpy(observations)), state)
+        return seen
 
     def _bounded(self, actions: NDArray[Any]) -> NDArray[Any]:
         space = self.env.action_space
@@ -262,7 +304,9 @@ class LeanPpo:
         torch.manual_seed(seed)
         self._total, self._ppo, hidden = settings.steps, settings.ppo, settings.hidden
         spaces = env.observation_space, env.action_space
-        actor = Actor(*spaces, hidden, normaliser, torch.nn.ReLU)
+        inputs, parts = len(normaliser[0]), env.envs[0].task.scan_parts
+        memory = memory_of(settings.memory, inputs, parts)
+        actor = Actor(*spaces, hidden, normaliser, torch.nn.ReLU, memory)
         self.networks = Networks(actor, hidden, self._ppo.log_std)
         seeds = np.random.SeedSequence(seed).generate_state(2)
         self.collector = Collector(env, self.networks, self._ppo, int(seeds[0]))
@@ -311,6 +355,7 @@ class LeanPpo:
             "steps": self.steps,
             "recent": list(self._successes),
             "last": torch.from_numpy(self.collector.last),
+            "memory": self.collector.state,
             "rollout": self._rollout and self._rollout._asdict(),
             "random": [part.generator.get_state() for part in (self.collector, self.learner)],
         }
@@ -323,6 +368,7 @@ class LeanPpo:
         self._rollout = rollout and Transitions(**rollout)
         self._successes.extend(state["recent"])
         self.collector.last = state["last"].numpy()
+        self.collector.state = state.get("memory", self.collector.state)
         generators = self.collector.generator, self.learner.generator
         for generator, random in zip(generators, state["random"], strict=True):
             generator.set_state(random)

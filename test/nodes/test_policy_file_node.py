@@ -13,15 +13,17 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 pytest.importorskip("torch", reason="needs the extra 'train'")
 
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import TwistStamped
+from geometry_msgs.msg import PoseStamped, TwistStamped
+from lifecycle_msgs.srv import ChangeState
 from nav_msgs.msg import Odometry
-from policy.policy_rig import network
+from policy.policy_rig import MEMORIES, export_remembering, network
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.policy.policies import open_policy
 from nics_drl_bridge.policy.policy_file import load_policy
 from nics_drl_bridge.policy.train_export import export_policy
 from nodes.peer import stamp_ns
@@ -68,9 +70,9 @@ class Robot:
         self.scans = peer.speak(LaserScan, "scan")
         self.odometry = peer.speak(Odometry, "odom")
 
-    def says(self, scan):
-        """Publishes a scan and an odometry of now; returns their stamp [ns]."""
-        now = time.time_ns()
+    def says(self, scan, stamp=None):
+        """Publishes a scan and an odometry of now or a stamp; returns it [ns]."""
+        now = stamp or time.time_ns()
         scan.header.stamp = conversions.stamp_to_ros(now)
         self.odometry.publish(
             conversions.odometry_to_ros(
@@ -231,3 +233,117 @@ def test_a_policy_that_fails_when_it_runs_leaves_a_zero_and_ends_with_a_sentence
     assert sentence.startswith(f"{file}: field 'graph': onnxruntime can't run it (")
     assert "Traceback" not in node.log.read_text(encoding="utf-8")
     assert node.close() == 2
+
+
+# A policy with a state: what it commands depends on what it saw before.
+
+PHASES = np.linspace(0.0, 2.0, 6)  # of the surroundings that it sees, scan after scan
+
+
+@pytest.fixture(scope="module", params=MEMORIES)
+def remembering(request, model, tmp_path_factory):
+    path = tmp_path_factory.mktemp("remembering") / "car.onnx"
+    export_remembering(path, request.param, model, scan="around")
+    return path
+
+
+@pytest.fixture
+def stateful(launch, meet, domain_id, remembering):
+    given = {"policy": str(remembering), "goal": GOAL, "deadline": 5.0, "rate": 0.0}
+    node = launch("policy_node", domain_id, **given)
+    robot = Robot(meet(domain_id))
+    robot.goals = robot.peer.speak(PoseStamped, "goal_pose")
+    robot.peer.until(lambda: robot.raw or robot.says(scan_of(around(720))) is None, "a command")
+    yield robot, node
+    node.check()
+
+
+def scan_at(angles, phase):
+    scan = scan_of(angles)
+    scan.ranges = array.array("f", ranges_of(angles + phase).tobytes())
+    return scan
+
+
+def aims(robot, node, x):
+    """Gives another goal, from which the policy begins anew."""
+    known = node.log.read_text(encoding="utf-8").count("new goal")
+    goal = PoseStamped()
+    goal.pose.position.x, goal.pose.position.y = x, GOAL[1]
+
+    def heard():
+        robot.goals.publish(goal)
+        return node.log.read_text(encoding="utf-8").count("new goal") > known
+
+    robot.peer.until(heard, "a new goal")
+
+
+def drives(robot, phases, angles, first_ns, period_s=0.1):
+    """Shows scan after scan, each answered before the next; returns the commands."""
+    commands = []
+    for k, phase in enumerate(phases):
+        stamp = first_ns + round(k * period_s * 1e9)
+        scan, known = scan_at(angles, phase), len(robot.raw)
+
+        def answered(scan=scan, stamp=stamp):
+            robot.says(scan, stamp)
+            return any(stamp_ns(raw) == stamp for raw in robot.raw[known:])  # noqa: B023
+
+        robot.peer.until(answered, "an answer")
+        found = [raw for raw in robot.raw[known:] if stamp_ns(raw) == stamp]
+        assert len(found) == 1  # a scan that is heard twice is answered once
+        commands.append(conversions.twist_from_ros(found[0].twist))
+    return np.array(commands)
+
+
+def driven_in_process(file, model, phases, x):
+    policy, task = open_policy(str(file), model)
+    commands = []
+    for phase in phases:
+        seen = ranges_of(model.lidar.angles + phase)
+        view = RobotView(np.zeros(3), np.zeros(3), seen, 0.0, 0.0, 0.0)
+        action = policy.act(task.observation(view, {"goal": np.array([x, GOAL[1]])}))
+        commands.append(task.robot.to_cmd_vel(task.command(action)))
+    return np.array(commands)
+
+
+def test_a_policy_with_a_state_commands_over_dds_what_it_does_in_process(
+    stateful, remembering, model
+):
+    robot, node = stateful
+    wanted = driven_in_process(remembering, model, PHASES, 1.7)
+    fresh = [driven_in_process(remembering, model, [phase], 1.7)[0] for phase in PHASES]
+    assert np.abs(wanted[1:] - fresh[1:]).max() > 0.01  # its state matters
+    begin = time.time_ns()
+    for k, x in enumerate((1.7, 2.5, 1.7)):  # nothing is to be left of the goal before
+        aims(robot, node, x)
+        first = begin + round(k * 0.1e9 * len(PHASES))
+        commands = drives(robot, PHASES, model.lidar.angles, first)
+        if x == 1.7:
+            assert commands == pytest.approx(wanted, abs=1e-4)
+
+
+def test_a_policy_that_is_activated_again_begins_anew(stateful, remembering, model):
+    robot, node = stateful
+    aims(robot, node, 1.7)
+    begin = time.time_ns()
+    before = drives(robot, PHASES[:3], model.lidar.angles, begin)
+    for transition in ("deactivate", "activate"):
+        request = ChangeState.Request()
+        request.transition.label = transition
+        assert robot.peer.call(ChangeState, "policy_node/change_state", request).success
+    after = drives(robot, PHASES[:3], model.lidar.angles, begin + 3 * 10**8)
+    assert after == pytest.approx(before, abs=1e-4)
+
+
+def test_after_a_gap_it_begins_anew_and_says_so_once(stateful, remembering, model):
+    robot, node = stateful
+    aims(robot, node, 1.7)
+    begin = time.time_ns()
+    wanted = driven_in_process(remembering, model, PHASES, 1.7)
+    before = drives(robot, PHASES, model.lidar.angles, begin)
+    after = drives(robot, PHASES, model.lidar.angles, begin + 3 * 10**9)
+    assert before == pytest.approx(wanted, abs=1e-4)
+    assert after == pytest.approx(wanted, abs=1e-4)
+    log = node.log.read_text(encoding="utf-8")
+    assert log.count("it begins anew") == 1
+    assert "nothing was observed for 2.5 s, longer than the 0.5 s" in log

@@ -12,7 +12,10 @@ from robots import direct_model, lidar
 
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.policy import contract, onnx_graph
+from nics_drl_bridge.policy.train_algorithms import Actor
 from nics_drl_bridge.policy.train_export import export_policy
+from nics_drl_bridge.policy.train_memory import memory_of
+from nics_drl_bridge.policy.training_settings import GruMemory, StackMemory
 
 SECTORS = 24
 
@@ -64,3 +67,34 @@ def weight(proto):
     """The first weight, as an array that can be put back."""
     tensor = proto.graph.initializer[0]
     return tensor, np.array(onnx.numpy_helper.to_array(tensor))
+
+
+MEMORIES = {
+    "gru": GruMemory(kind="gru", units=6),
+    "stack": StackMemory(kind="stack", scans=3, every=2),
+}
+
+
+def remembering(task, kind: str) -> Actor:
+    """An actor with a memory, whose actions differ from step to step."""
+    torch.manual_seed(0)
+    size = task.observation_space.shape[0]
+    spaces = task.observation_space, task.action_space
+    memory = memory_of(MEMORIES[kind], size, task.scan_parts)
+    actor = Actor(*spaces, [16], (np.zeros(size), np.ones(size)), memory=memory)
+    actor.layers[-1].weight.data.mul_(40.0)
+    return actor
+
+
+def export_remembering(path: Path, kind: str, model=None, **options):
+    model = model or model_of()
+    task = make_task("navigation", model, {"scan": SECTORS} | options)
+    actor = remembering(task, kind)
+    return export_policy(actor, task, model, path), task, actor
+
+
+def sequence(task, steps: int, *lead: int, seed: int = 1):
+    """Observations (T, ..., O) within their limits."""
+    space, rng = task.observation_space, np.random.default_rng(seed)
+    low, high = np.maximum(space.low, -2.0), np.minimum(space.high, 2.0)
+    return rng.uniform(low, high, (steps, *lead, len(low))).astype(np.float32)

@@ -28,7 +28,7 @@ from nics_drl_bridge.policy.evaluation import (
     summarise,
     tallies,
 )
-from nics_drl_bridge.policy.policies import make_policy
+from nics_drl_bridge.policy.policies import Stateful, make_policy
 
 LIMIT = 40
 MODEL, WORLD = direct_model(odometry=(0.02, 0.02)), field(count=6)
@@ -179,6 +179,24 @@ def test_many_at_once_end_as_one_after_the_other(worlds):
     assert found.success.tolist() == [one.result == "success" for one in episodes]
     assert found.collision.tolist() == [one.result == "collision" for one in episodes]
     assert len({one.result for one in episodes}) > 1
+
+
+def ever_faster(seen, state):
+    """Drives the faster the longer the episode lasts."""
+    turn = np.sin(state[..., 0])
+    return np.stack([state[..., 0], 0.0 * turn, turn], -1).clip(-1.0, 1.0), state + 0.1
+
+
+@pytest.mark.parametrize("worlds", [3, 8])
+def test_the_state_of_a_policy_begins_with_each_episode(worlds):
+    policy = Stateful(ever_faster, 1, 0.0)
+    env = BridgeVectorEnv(worlds, MODEL, WORLD, max_episode_steps=LIMIT)
+    seeds = [7, 3, 11, 5, 100, 42, 43]
+    found = drive_worlds(env, policy.act, seeds)
+    alone = TimeLimit(BridgeEnv(model=MODEL, world=WORLD), LIMIT)
+    episodes = [drive(alone, policy, seed) for seed in seeds]
+    assert found.steps.tolist() == [one.steps for one in episodes]
+    assert np.allclose(found.length, [one.length for one in episodes], atol=1e-12)
 
 
 class Aside(BridgeVectorEnv):

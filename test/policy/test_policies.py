@@ -16,7 +16,15 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.policy.evaluation import drive_all, drive_worlds, successes
-from nics_drl_bridge.policy.policies import POLICIES, DynamicWindow, make_policy
+from nics_drl_bridge.policy.policies import (
+    POLICIES,
+    DynamicWindow,
+    RandomActions,
+    Stateful,
+    begin,
+    make_policy,
+    resume,
+)
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.kinds import steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
@@ -156,3 +164,38 @@ def test_an_unknown_policy_gives_the_nearest():
     sentence = "unknown policy 'dynamic_widow'; did you mean 'dynamic_window'"
     with pytest.raises(ConfigError, match=sentence):
         make_policy("dynamic_widow", task_of("ackermann"))
+
+
+def counting(longest_gap=0.5):
+    """A policy whose action is the number of its steps, for its states begin at 3."""
+    return Stateful(lambda seen, state: (state[..., 0] - 2.0, state + 1.0), 2, 3.0, longest_gap)
+
+
+def test_a_state_goes_on_from_step_to_step_and_begins_anew_where_it_is_reset():
+    policy, seen = counting(), np.zeros((2, 5), np.float32)
+    assert [policy.act(seen).tolist() for _ in range(2)] == [[1, 1], [2, 2]]
+    policy.reset(np.array([False, True]))
+    assert policy.act(seen).tolist() == [3, 1]
+    begin(policy.act)
+    assert policy.act(seen[0]) == 1.0
+    begin(RandomActions)  # has nothing to begin
+
+
+def test_other_worlds_than_before_are_refused_unless_an_episode_begins():
+    policy = counting()
+    policy.act(np.zeros((2, 5), np.float32))
+    with pytest.raises(ConfigError, match=r"of \(2,\) worlds .* of \(3,\); reset the policy"):
+        policy.act(np.zeros((3, 5), np.float32))
+
+
+def test_after_a_gap_a_state_begins_anew_and_one_sentence_says_so():
+    policy, seen = counting(), np.zeros(5, np.float32)
+    told, acted = [], []
+    for time_s in (10.0, 10.4, 10.9, 11.5, 12.0):
+        told.append(resume(policy, time_s))
+        acted.append(float(policy.act(seen)))
+    assert acted == [1, 2, 3, 1, 2]
+    assert [bool(one) for one in told] == [False, False, False, True, False]
+    assert told[3].startswith("nothing was observed for 0.6 s, longer than the 0.5 s")
+    policy.reset()
+    assert resume(policy, 99.0) == ""  # an episode begins, so there was no gap

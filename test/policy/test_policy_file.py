@@ -22,10 +22,12 @@ from nics_drl_bridge.policy.contract import GoldenEntry
 from nics_drl_bridge.policy.policies import make_policy
 from nics_drl_bridge.policy.policy_file import load_policy
 from policy.policy_rig import (
+    MEMORIES,
     SECTORS,
     bytes_of,
     contract_in,
     export,
+    export_remembering,
     model_of,
     signed,
     weight,
@@ -337,6 +339,88 @@ def test_a_file_that_is_not_there_or_too_large_is_refused(tmp_path):
         large.truncate(onnx_graph.SIZE_LIMIT + 1)
     with pytest.raises(PolicyError, match="at most 32 MB"):
         load_policy(path)
+
+
+# A state.
+
+
+@pytest.fixture(scope="module", params=MEMORIES)
+def remembering(request, tmp_path_factory):
+    path = tmp_path_factory.mktemp("remembering") / "go.onnx"
+    export_remembering(path, request.param)
+    return path
+
+
+def stateless(proto):
+    data = contract_in(proto)
+    del data["state"]
+    return bytes_of(signed(proto, data))
+
+
+def shapeless(proto):
+    data = contract_in(proto)
+    del data["state"]["size"]
+    return bytes_of(signed(proto, data))
+
+
+def forgetful(proto):
+    """The state comes back as it was given."""
+    for node in proto.graph.node:
+        for k, name in enumerate(node.output):
+            node.output[k] = "forgotten" if name == "state_out" else name
+        for k, name in enumerate(node.input):
+            node.input[k] = "forgotten" if name == "state_out" else name
+    last = onnx.helper.make_node("Identity", ["state_in"], ["state_out"])
+    proto.graph.node.append(last)
+    return bytes_of(signed(proto))
+
+
+REFUSED_STATES = {
+    "none": (stateless, "state", "is missing, although the graph takes one"),
+    "no shape": (shapeless, "state.size", "the key 'state.size' is missing"),
+    "another shape": (changed(["state", "size"], 5, True), "graph.state_in", "5] is needed"),
+    "another start": (changed(["state", "start"], 0.5, True), "golden.actions", "differ by"),
+    "unsigned": (changed(["state", "start"], 0.5, False), "state.start", "was changed"),
+    "no gap": (changed(["state", "longest_gap"], 0.0, True), "state.longest_gap", "greater than 0"),
+    "not passed on": (forgetful, "golden.actions", "differ by"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED_STATES)
+def test_a_spoilt_state_is_refused_in_one_sentence(remembering, tmp_path, name):
+    spoil, field, words = REFUSED_STATES[name]
+    path = tmp_path / "spoilt.onnx"
+    path.write_bytes(spoil(onnx.load(remembering)))
+    with pytest.raises(PolicyError) as refused:
+        load_policy(path)
+    assert refused.value.field == field
+    assert words in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_state_that_the_graph_does_not_take_is_refused(file, tmp_path):
+    data = contract_in(proto := onnx.load(file))
+    data["state"] = {"size": 4, "start": 0.0, "longest_gap": 1.0}
+    path = tmp_path / "spoilt.onnx"
+    path.write_bytes(bytes_of(signed(proto, data)))
+    with pytest.raises(PolicyError, match=r"field 'graph\.inputs'.*'state_in'"):
+        load_policy(path)
+
+
+def test_a_policy_without_a_state_says_nothing_of_one(file):
+    assert "state" not in contract_in(onnx.load(file))
+    assert load_policy(file).contract.state is None
+
+
+def test_an_observation_without_the_state_that_a_policy_needs_is_refused(remembering, file):
+    policy, seen = load_policy(remembering), np.zeros((3, SECTORS + 6), np.float32)
+    size = policy.contract.state.size
+    with pytest.raises(PolicyError, match=rf"field 'state'.*\(3, {size}\), not None"):
+        policy.act(seen)
+    with pytest.raises(PolicyError, match=rf"field 'state'.*\(3, {size}\), not \(2, {size}\)"):
+        policy.run(seen, np.zeros((2, size), np.float32))
+    with pytest.raises(PolicyError, match=r"field 'state'.*None, not \(3, 4\)"):
+        load_policy(file).run(seen, np.zeros((3, 4), np.float32))
 
 
 # What it runs on.

@@ -17,6 +17,7 @@ from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.policy.policies import make_policy
 from nics_drl_bridge.policy.shadow import Shadow, shadow
 from nics_drl_bridge.robot.spec import load_robot
+from policy.policy_rig import MEMORIES, export_remembering
 
 pytestmark = pytest.mark.slow
 LIDAR, ROBOT = load_lidar("paper"), load_robot("ackermann")
@@ -80,6 +81,41 @@ def test_a_policy_in_the_shadow_of_its_own_drive_commands_what_was_driven(record
     assert np.abs(made.policy - made.driven).max() < 1e-4
     assert np.abs(made.driven).max() > 0.1
     assert all(figures["opposite"] == 0.0 for figures in made.differences().values())
+
+
+@pytest.fixture(params=MEMORIES)
+def remembering(request, tmp_path):
+    """A policy with a state, the goal and the messages of its drive."""
+    path = tmp_path / "car.onnx"
+    export_remembering(path, request.param, builtin_model("ackermann"), scan=None)
+    return str(path), *driven_by(str(path))
+
+
+def test_a_policy_with_a_state_commands_what_it_drove_even_where_no_command_is_left(
+    remembering, tmp_path
+):
+    policy, goal, topics = remembering
+    count = len(topics["/scan"])
+    assert count > 15
+    bag = bags.write(tmp_path / "whole", topics)
+    made = shadow(bag, builtin_model("ackermann"), policy, {}, goal)
+    assert np.abs(made.policy - made.driven).max() < 1e-4
+    assert np.ptp(made.driven, axis=0).min() > 0.02
+    topics["/cmd_vel"] = topics["/cmd_vel"][12:]
+    bag = bags.write(tmp_path / "fewer", topics)
+    made = shadow(bag, builtin_model("ackermann"), policy, {}, goal)
+    assert np.abs(made.policy - made.driven).max() < 5e-3  # the estimator hears commands, too
+    assert made.skipped["no command was driven"] >= 10
+    assert made.resets == 0
+
+
+def test_after_a_gap_in_a_drive_the_state_begins_anew_and_it_is_counted(remembering, tmp_path):
+    policy, goal, topics = remembering
+    bag = bags.write(
+        tmp_path / "gap", {name: rows[:4] + rows[12:] for name, rows in topics.items()}
+    )
+    made = shadow(bag, builtin_model("ackermann"), policy, {}, goal)
+    assert made.resets == 1
 
 
 def test_another_policy_differs(recorded):

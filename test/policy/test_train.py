@@ -36,6 +36,8 @@ def _small_world(monkeypatch):
 
 ENGINES = {
     "lean": {"algorithm": "ppo"},
+    "gru": {"algorithm": "ppo", "memory": {"kind": "gru", "units": 5}},
+    "stack": {"algorithm": "ppo", "memory": {"kind": "stack", "scans": 3, "every": 2}},
     "sb3": {"algorithm": "ppo", "ppo": {"rollout": 16, "batch": 64, "epochs": 2, "engine": "sb3"}},
     "sac": {"algorithm": "sac"},
 }
@@ -72,6 +74,9 @@ def steps_in(path):
     [
         ("lean", "continuous"),
         ("lean", "discrete"),
+        ("gru", "continuous"),
+        ("gru", "discrete"),
+        ("stack", "continuous"),
         ("sb3", "continuous"),
         ("sac", "continuous"),
     ],
@@ -101,7 +106,13 @@ def test_an_interrupted_training_comes_to_the_same_weights(engine, actions, tmp_
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("engine", "parameter"), [("lean", "layers.0.weight"), ("sb3", "action_net.weight")]
+    ("engine", "parameter"),
+    [
+        ("lean", "layers.0.weight"),
+        ("gru", "memory.kept.weight"),
+        ("stack", "layers.0.weight"),
+        ("sb3", "action_net.weight"),
+    ],
 )
 def test_training_again_with_the_same_seed_gives_the_same_weights_and_with_another_others(
     engine, parameter, tmp_path
@@ -113,12 +124,16 @@ def test_training_again_with_the_same_seed_gives_the_same_weights_and_with_anoth
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("engine", ["lean", "sb3"])
+@pytest.mark.parametrize("engine", ["lean", "gru", "stack", "sb3"])
 def test_a_little_training_reaches_more_goals_than_none(engine, tmp_path):
     def successes(steps):
         chosen = settings(
             worlds={"one": 32}, steps=steps, hidden=[32, 32], randomisation=None,
-            ppo={"engine": engine, "rollout": 32, "batch": 256, "learning_rate": 2e-3},
+            memory=ENGINES[engine].get("memory"),
+            ppo={
+                "engine": "sb3" if engine == "sb3" else "lean", "rollout": 32, "batch": 256,
+                "learning_rate": 2e-3,
+            },
         )  # fmt: skip
         algorithm = train(chosen, 0, tmp_path / str(steps)).algorithm
         return evaluate(algorithm, chosen, "one", 100).success.mean()

@@ -9,9 +9,18 @@ from stable_baselines3 import PPO, SAC
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.errors import ConfigError, PolicyError
+from nics_drl_bridge.policy.policies import make_policy
 from nics_drl_bridge.policy.policy_file import load_policy
 from nics_drl_bridge.policy.train_export import Deployed, export_policy
-from policy.policy_rig import SECTORS, export, model_of, network
+from policy.policy_rig import (
+    MEMORIES,
+    SECTORS,
+    export,
+    export_remembering,
+    model_of,
+    network,
+    sequence,
+)
 
 
 @pytest.fixture(params=["continuous", "discrete"])
@@ -98,3 +107,34 @@ def test_what_the_graph_computes_lies_within_the_limits_of_the_robot():
 
 
 DIRECT_LOW, DIRECT_HIGH = model_of().robot.command_low, model_of().robot.command_high
+
+
+@pytest.mark.parametrize("kind", MEMORIES)
+@pytest.mark.parametrize("actions", ["continuous", "discrete"])
+def test_a_file_with_a_state_acts_as_the_module_step_by_step(tmp_path, kind, actions):
+    policy, task, actor = export_remembering(tmp_path / "one.onnx", kind, actions=actions)
+    kept = policy.contract.state
+    assert (kept.size, kept.start) == (actor.memory.size, actor.memory.start)
+    ours = theirs = actor.memory.begin(4).numpy()
+    for seen in sequence(task, 8, 4):
+        before = ours
+        action, command, ours = policy.run(seen, ours)
+        wanted, theirs = actor.step(seen, theirs)
+        assert ours == pytest.approx(theirs, abs=1e-5)
+        assert command == pytest.approx(task.command(wanted), abs=1e-5)
+        assert command == pytest.approx(task.command(action), abs=1e-5)
+    assert np.abs(ours - before).max() > 0.01
+    alone, _, _ = policy.run(seen[1], before[1])
+    assert alone == pytest.approx(action[1], abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", MEMORIES)
+def test_what_a_policy_with_a_state_does_depends_on_what_it_saw_before(tmp_path, kind):
+    policy, task, _ = export_remembering(tmp_path / "one.onnx", kind)
+    rows, acting = sequence(task, 2), make_policy(str(policy.path), task)
+    first = acting.act(rows[0])
+    second = acting.act(rows[1])
+    acting.reset()
+    assert np.abs(acting.act(rows[1]) - second).max() > 0.01
+    acting.reset()
+    assert acting.act(rows[0]).tolist() == first.tolist()

@@ -58,6 +58,12 @@ def test_a_robot_or_task_without_settings_gets_the_defaults():
         ("worlds: {}", r"key 'worlds'"),
         ("worlds: {arena: 0}", r"key 'worlds.arena': .* greater than or equal to 1, not 0"),
         ("steps: 0.5", r"key 'steps'"),
+        ("memory: {units: 8}", r"the key 'memory.kind' is missing"),
+        ("memory: {kind: lstm}", r"key 'memory': unknown kind 'lstm'; .*'stack'"),
+        ("memory: {kind: gru, scans: 4}", r"unknown key 'memory.*scans'; .*'units'"),
+        ("memory: {kind: stack, scans: 1}", r"key 'memory.*scans': .* greater than or equal to 2"),
+        ("memory: {kind: gru}\nppo: {engine: sb3}", r"ppo's engine 'lean' alone learns a memory"),
+        ("memory: {kind: stack}\nalgorithm: sac", r"ppo's engine 'lean' alone learns a memory"),
         ("task_options: {robot: x}", r"task_options can't hold 'robot', which the model gives"),
     ],
 )
