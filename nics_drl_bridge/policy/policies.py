@@ -16,6 +16,9 @@ from nics_drl_bridge.errors import ConfigError, PolicyError, nearest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy import dynamic_window_kernels as kernels
 from nics_drl_bridge.policy.contract import SUFFIX, shipped
+from nics_drl_bridge.policy.local_map import CLEARANCE, outline_of, rays_of, scratch_of
+from nics_drl_bridge.policy.local_map_kernels import Clearance, Outline, ScanRays, Scratch
+from nics_drl_bridge.policy.mppi import Mppi
 from nics_drl_bridge.robot.kinds import command_for, has_textbook, reach, steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -132,10 +135,13 @@ class RandomActions:
 
 @dataclass(frozen=True)
 class DynamicWindow:
-    """The dynamic-window approach (Fox, Burgard, Thrun 1997); ConfigError: see `steady_twist`."""
+    """The dynamic-window approach (Fox, Burgard, Thrun 1997); ConfigError: see `steady_twist`.
+
+    Towards the goal it takes the shortest way around what is seen (Brock, Khatib 1999).
+    """
 
     task: Navigation
-    margin: float = 0.05  # clearance to keep around the footprint [m]
+    clearance: Clearance = CLEARANCE
     period: float = 0.1  # between commands [s]
     steps: int = 10  # of the look-ahead, each a period and a half long
     weights: tuple[float, float, float, float] = (1.0, 0.6, 0.3, 1.5)  # see `TwistWeights`
@@ -152,16 +158,14 @@ class DynamicWindow:
         chosen = np.empty(len(seen), np.int64)
         kernels.choose_all(
             chosen, np.ascontiguousarray(seen[:, :parts]), goals,
-            np.ascontiguousarray(seen[:, parts + 3 : parts + 6]), *self._search,
+            np.ascontiguousarray(seen[:, parts + 3 : parts + 6]), *self._search, self._sense,
         )  # fmt: skip
         return self._scaled[chosen[0] if observation.ndim == 1 else chosen]
 
     @cached_property
-    def _search(self) -> tuple[Array, kernels.ScanRays, kernels.LookAhead, kernels.TwistWeights]:
-        robot, sight = self.task.robot, self.task.sight
+    def _search(self) -> tuple[Array, kernels.LookAhead, kernels.TwistWeights]:
+        robot = self.task.robot
         twists = _settled(self.task, self._commands, self.model)
-        directions = np.stack([np.cos(sight.angles), np.sin(sight.angles)], axis=-1)
-        rays = kernels.ScanRays(directions, sight.origin, float(sight.range_max))
         lags = [value for name, value in robot.parameters.items() if name.endswith("_lag")]
         lag = max(lags, default=0.0)
         brakes = [] if self.model is None else self.model.kinematics.braking.tolist()
@@ -170,10 +174,17 @@ class DynamicWindow:
         slow = (fastest / rate for v, rate in states if v.unit == "m/s")
         share = 1.0 - math.exp(-self.period / lag) if lag > 0.0 else 1.0
         reach = share * (twists.max(axis=0) - twists.min(axis=0)) + 1e-6
-        radius = robot.footprint_radius + self.margin
         rest = 2.0 * self.period + lag + max(slow, default=0.0)
-        ahead = kernels.LookAhead(reach, radius, 1.5 * self.period, self.steps, rest)
-        return twists, rays, ahead, kernels.TwistWeights(*self.weights)
+        ahead = kernels.LookAhead(reach, 1.5 * self.period, self.steps, rest)
+        return twists, ahead, kernels.TwistWeights(*self.weights)
+
+    @cached_property
+    def _sense(self) -> tuple[ScanRays, Outline, Clearance, Scratch]:
+        outline, (twists, ahead, _) = outline_of(self.task.robot), self._search
+        far = float(np.hypot(twists[:, 0], twists[:, 1]).max()) * ahead.period * ahead.steps
+        half = min(far, self.task.sight.range_max) + outline.outer
+        scratch = scratch_of(self.task.scan_parts, outline, self.clearance, half)
+        return rays_of(self.task), outline, self.clearance, scratch
 
     @cached_property
     def _commands(self) -> Array:
@@ -186,6 +197,7 @@ class DynamicWindow:
 
 POLICIES: dict[str, Callable[[Navigation, SimulatorModel | None], Policy]] = {
     "dynamic_window": lambda task, model: DynamicWindow(task, model=model),
+    "mppi": Mppi,
     "random": lambda task, _: RandomActions(task),
     "straight": StraightToGoal,
 }
