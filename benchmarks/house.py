@@ -28,9 +28,9 @@ BARS = {
     # can't be; 194 and 40,000 until it imported worlds of Gazebo, held those of a benchmark, and
     # drew its episodes from sets of worlds; 202 and 41,500 until it grew such sets, and a robot
     # named its lidar and skidded in MuJoCo, training had an engine of its own, and bodies lay in
-    # cells.
-    "modules": 204,
-    "lines": 42_400,
+    # cells; 204 and 42,400 until planners mapped a scan, rolled out a model and were imitated.
+    "modules": 209,
+    "lines": 43_250,
     "single_importers": 50,
     "circles": 0,
     "max_arguments": 10,

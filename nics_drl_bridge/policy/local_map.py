@@ -1,4 +1,4 @@
-"""What planners know of a robot and its scan, for `local_map_kernels`."""
+"""Footprint, rays and memory from which `local_map_kernels` map a scan for planners."""
 
 import math
 
@@ -9,10 +9,10 @@ from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.policy.local_map_kernels import (
     COARSE,
     Clearance,
+    FootprintDiscs,
     LocalMap,
-    Outline,
+    MapScratch,
     ScanRays,
-    Scratch,
 )
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -20,8 +20,6 @@ Array = NDArray[np.float64]
 CELL_M, MOST_M = 0.05, 4.0  # side of the cells of distances; greatest reach of a map
 FINE_M, DEEP_M, BORDER_M = 0.02, 0.03, 0.08
 """Lattice of the discs, depth from which they cover all, and space of points on the border."""
-
-CLEARANCE = Clearance(margin=0.08, soft=0.4)  # more than thrice the deviation of many a range
 
 
 def rays_of(task: Navigation) -> ScanRays:
@@ -31,11 +29,11 @@ def rays_of(task: Navigation) -> ScanRays:
     return ScanRays(directions, sight.origin, float(sight.range_max))
 
 
-def outline_of(robot: RobotSpec) -> Outline:
+def outline_of(robot: RobotSpec) -> FootprintDiscs:
     """The footprint of a robot as discs: some that fill it, and points along its border."""
     if robot.footprint is None:
         radius = robot.footprint_radius
-        return Outline(np.zeros((0, 3)), np.zeros(2), radius, radius)
+        return FootprintDiscs(np.zeros((0, 3)), np.zeros(2), radius, radius)
     corners = np.array(robot.footprint)
     low, high = corners.min(axis=0), corners.max(axis=0)
     axes = (np.arange(a + FINE_M / 2, b, FINE_M) for a, b in zip(low, high, strict=True))
@@ -54,7 +52,9 @@ def outline_of(robot: RobotSpec) -> Outline:
         chosen += [np.array([*(corner + side * k / count), 0.0]) for k in range(count)]
     reach = np.linalg.norm(lattice[:, None] - corners, axis=-1).max(axis=1)
     middle = int(reach.argmin())
-    return Outline(np.array(chosen), lattice[middle], float(depth.max()), float(reach[middle]))
+    return FootprintDiscs(
+        np.array(chosen), lattice[middle], float(depth.max()), float(reach[middle])
+    )
 
 
 def depths(points: Array, corners: Array) -> Array:
@@ -71,10 +71,12 @@ def depths(points: Array, corners: Array) -> Array:
     return np.asarray(np.where(inside, away, -away))
 
 
-def scratch_of(parts: int, outline: Outline, clearance: Clearance, half: float) -> Scratch:
+def scratch_of(
+    parts: int, outline: FootprintDiscs, clearance: Clearance, half: float
+) -> MapScratch:
     """Memory for maps of scans of P parts that reach `half` [m] to each side, `MOST_M` at most."""
     coarse = 2 * math.ceil(min(half, MOST_M) / (COARSE * CELL_M))
     distances = np.zeros((COARSE * coarse, COARSE * coarse), np.float32)
     ways, prices = np.zeros((2, coarse, coarse), np.float32)
     reach = outline.outer + clearance.margin + clearance.soft + CELL_M
-    return Scratch(np.zeros((parts, 2)), LocalMap(distances, ways, CELL_M, reach), prices)
+    return MapScratch(np.zeros((parts, 2)), LocalMap(distances, ways, CELL_M, reach), prices)

@@ -32,7 +32,7 @@ class ScanRays(NamedTuple):
     range_max: float  # [m]
 
 
-class Outline(NamedTuple):
+class FootprintDiscs(NamedTuple):
     """Footprint of a robot in `base_link`, as discs within it that leave hardly anything out."""
 
     discs: Array  # (D, 3) x, y, radius [m]
@@ -57,7 +57,7 @@ class Clearance(NamedTuple):
     soft: float  # beyond that, within which it costs [m]
 
 
-class Scratch(NamedTuple):
+class MapScratch(NamedTuple):
     """Memory of a map in the making."""
 
     hits: Array  # (P, 2) [m]
@@ -65,12 +65,12 @@ class Scratch(NamedTuple):
     prices: Grid  # as `ways`
 
 
-class Surroundings(NamedTuple):
-    """What a planner knows: a map, the goal, and the robot that is to keep clear."""
+class Situation(NamedTuple):
+    """The map, the goal, and the robot that is to keep clear."""
 
     map: LocalMap
     goal: Array  # (2,) [m]
-    outline: Outline
+    outline: FootprintDiscs
     clearance: Clearance
 
 
@@ -78,7 +78,7 @@ class Surroundings(NamedTuple):
 def look(shares, goal, rays, outline, clearance, scratch):  # type: ignore[no-untyped-def]
     """Maps a scan of range shares (P,) around a robot whose goal (2,) is in `base_link` [m]."""
     count = hits_of(scratch.hits, shares, rays)
-    around = Surroundings(scratch.map, goal, outline, clearance)
+    around = Situation(scratch.map, goal, outline, clearance)
     put_distances(scratch.map, scratch.hits[:count])
     put_ways(around, scratch.prices)
     return around

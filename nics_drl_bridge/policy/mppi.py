@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.task import still
 from nics_drl_bridge.generator import BUILTIN_SEED, CONTROL_PERIOD_S, SimulatorModel
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.policy import mppi_kernels as kernels
-from nics_drl_bridge.policy.local_map import CLEARANCE, outline_of, rays_of, scratch_of
-from nics_drl_bridge.policy.local_map_kernels import Clearance, Outline, ScanRays, Scratch
+from nics_drl_bridge.policy.local_map import outline_of, rays_of, scratch_of
+from nics_drl_bridge.policy.local_map_kernels import Clearance, FootprintDiscs, MapScratch, ScanRays
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.robot.kernels import SERIES, term_arrays, with_coefficients
 from nics_drl_bridge.robot.kinds import steady_twist
@@ -22,10 +23,11 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.threads import run_parts
 
 Array = NDArray[np.float64]
-Sense = tuple[ScanRays, Outline, Clearance]
+Sense = tuple[ScanRays, FootprintDiscs, Clearance]
 SETTLED_S = 3.0  # after which a held command has led to its state
 FINEST = 0.25  # share of a lag that a step of the roll-outs may take
 FEWEST = 8  # robots of a thread
+CLEARANCE = Clearance(margin=0.08, soft=0.4)
 WORTH = kernels.Worth(near=4.0, early=0.3, change=0.02, astray=0.2)
 
 
@@ -74,10 +76,10 @@ class Mppi:
         self._free.append((scratch, lanes))
 
     @cached_property
-    def _free(self) -> list[tuple[Scratch, kernels.Lanes]]:
+    def _free(self) -> list[tuple[MapScratch, kernels.RollOuts]]:
         return []  # memory that no thread uses now
 
-    def _memory(self) -> tuple[Scratch, kernels.Lanes]:
+    def _memory(self) -> tuple[MapScratch, kernels.RollOuts]:
         robot, (_, outline, clearance) = self.task.robot, self._sense
         low, high = robot.command_low, robot.command_high
         ends = np.stack([low, high]) if self.task.robot.takes_cmd_vel else np.zeros((1, len(low)))
@@ -86,7 +88,7 @@ class Mppi:
         scratch = scratch_of(self.task.scan_parts, outline, clearance, half)
         (states, count), many = self._plant.settled.shape, self.samples
         x, rate = np.ones(states + count + 1), np.zeros(3 + states)
-        return scratch, kernels.Lanes(
+        return scratch, kernels.RollOuts(
             np.zeros((6, many)), np.repeat(x[:, None], many, 1), np.repeat(rate[:, None], many, 1),
             np.zeros((many, self.knots, count)), np.zeros((self.knots, count)), np.zeros(count),
             x, rate, np.zeros(3), np.zeros(many), np.zeros(many), np.zeros(many, np.int64),
@@ -126,7 +128,9 @@ class Mppi:
     def _sampling(self) -> kernels.Sampling:
         shape = self.samples, self.knots, len(self.task.robot.command)
         offers, noise = np.empty((2, *shape))
-        kernels.draw(offers, noise, self.seed)
+        low, high = self.task.robot.command_low, self.task.robot.command_high
+        rest = 2.0 * (still(self.task.robot) - low) / (high - low) - 1.0
+        kernels.draw(offers, noise, rest, self.seed)
         places = np.linspace(0.0, self.knots - 1.0, round(self.horizon / self._period))
         between = np.maximum(0.0, 1.0 - np.abs(places[:, None] - np.arange(self.knots)))
         return kernels.Sampling(offers, noise, np.array(self.spreads), between, self.temperature)

@@ -61,7 +61,7 @@ class Worth(NamedTuple):
     astray: float  # of a heading at the end that leads away from the goal [m]
 
 
-class Lanes(NamedTuple):
+class RollOuts(NamedTuple):
     """Scratch memory of one robot's plan."""
 
     pose: Array  # (6, K) see `robot.kernels.run`
@@ -79,8 +79,8 @@ class Lanes(NamedTuple):
 
 
 @kernel(allocates=True)
-def draw(offers, noise, seed):  # type: ignore[no-untyped-def]
-    """Draws `Sampling.offers` and `Sampling.noise`, by a seed."""
+def draw(offers, noise, rest, seed):  # type: ignore[no-untyped-def]
+    """Draws `Sampling.offers`, the first of which is rest (C,), and `Sampling.noise`, by a seed."""
     for k in range(offers.shape[0]):
         for q in range(offers.shape[1]):
             for c in range(offers.shape[2]):
@@ -88,6 +88,8 @@ def draw(offers, noise, seed):  # type: ignore[no-untyped-def]
                 drawn = BEYOND * (2.0 * uniform(seed, PLANNER_STREAM, 3 * i) - 1.0)
                 held = k < offers.shape[0] // 2 and q > 0  # half of them hold one action
                 offers[k, q, c] = offers[k, 0, c] if held else min(max(drawn, -1.0), 1.0)
+                if k == 0:
+                    offers[k, q, c] = rest[c]
                 noise[k, q, c] = normal(seed, PLANNER_STREAM, 3 * i + 1)
 
 

@@ -16,14 +16,15 @@ from nics_drl_bridge.errors import ConfigError, PolicyError, nearest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy import dynamic_window_kernels as kernels
 from nics_drl_bridge.policy.contract import SUFFIX, shipped
-from nics_drl_bridge.policy.local_map import CLEARANCE, outline_of, rays_of, scratch_of
-from nics_drl_bridge.policy.local_map_kernels import Clearance, Outline, ScanRays, Scratch
+from nics_drl_bridge.policy.local_map import outline_of, rays_of, scratch_of
+from nics_drl_bridge.policy.local_map_kernels import Clearance, FootprintDiscs, MapScratch, ScanRays
 from nics_drl_bridge.policy.mppi import Mppi
 from nics_drl_bridge.robot.kinds import command_for, has_textbook, reach, steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
 
+CLEARANCE = Clearance(margin=0.1, soft=0.4)  # of the dynamic window, whose twists are few
 FULL_TURN_RAD = 0.8  # bearing of the goal from which a robot turns as fast as it can
 SETTLED_S = 5.0  # after which a held command has led to its twist
 LEAST_REACH = 1e-3  # of a component of the twist that no command moves [m/s, rad/s]
@@ -179,7 +180,7 @@ class DynamicWindow:
         return twists, ahead, kernels.TwistWeights(*self.weights)
 
     @cached_property
-    def _sense(self) -> tuple[ScanRays, Outline, Clearance, Scratch]:
+    def _sense(self) -> tuple[ScanRays, FootprintDiscs, Clearance, MapScratch]:
         outline, (twists, ahead, _) = outline_of(self.task.robot), self._search
         far = float(np.hypot(twists[:, 0], twists[:, 1]).max()) * ahead.period * ahead.steps
         half = min(far, self.task.sight.range_max) + outline.outer
