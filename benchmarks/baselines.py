@@ -20,7 +20,7 @@ from nics_drl_bridge.policy.train import line_of
 
 ROBOTS = ("differential", "ackermann", "mecanum")
 CONTROLS = {"standing": "every policy stands still"}
-FLOORS = {"dynamic_window": 0.7, "straight": 0.05}
+FLOORS = {"dynamic_window": 0.7, "mppi": 0.7, "straight": 0.05}
 FLOORS |= dict.fromkeys(ROBOTS, 0.8)
 """Least success in the world `circles`; the shipped policies go by the names of their robots."""
 LEAST_WAY_M = 1.0
@@ -46,7 +46,7 @@ def missed(figures: dict[str, dict[str, Any]]) -> list[str]:
         floor = FLOORS.get(name, 0.0) if world == "circles" else 0.0
         if not success >= floor:
             said.append(f"{place}: {success:.0%} success, less than {floor:.0%}")
-        if name in (*ROBOTS, "dynamic_window") and not length >= LEAST_WAY_M:
+        if name in (*ROBOTS, "dynamic_window", "mppi") and not length >= LEAST_WAY_M:
             said.append(f"{place}: no successful way of at least {LEAST_WAY_M:g} m")
     return said if figures else ["no policy was driven"]
 

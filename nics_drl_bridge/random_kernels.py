@@ -16,7 +16,8 @@ from nics_drl_bridge.kernels import kernel
 (
     SCENE_STREAM, ODOMETRY_STREAM, RANGE_STREAM, DRIFT_STREAM, DROPOUT_STREAM, GHOST_STREAM,
     RANDOMISATION_STREAM, MOTION_STREAM, EPISODE_STREAM, MEMBER_STREAM,
-) = range(1, 11)  # fmt: skip
+    PLANNER_STREAM,
+) = range(1, 12)  # fmt: skip
 
 # Coefficients of least greatest error: sine and cosine of y quarters of a turn, |y| <= 1/2, and
 # log(1 + f) / f from the root of a half to the root of 2.

@@ -258,7 +258,7 @@ BASELINES = Table(
             for at in (f"circles/{robot}/{policy}"
                        for robot in ("differential", "ackermann", "mecanum"))
         ))
-        for policy in ("dynamic_window", "straight", "random")
+        for policy in ("dynamic_window", "mppi", "straight", "random")
     ),
 )  # fmt: skip
 BARN = Table(

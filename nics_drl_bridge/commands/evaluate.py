@@ -15,7 +15,7 @@ from nics_drl_bridge.errors import ConfigError
 def evaluate(
     policies: Annotated[list[str], Argument(
         metavar="POLICY...", help="Policy files, shipped policies (differential), or baselines "
-        "(dynamic_window, straight, random).")],
+        "(dynamic_window, mppi, straight, random).")],
     model: Annotated[str | None, Option(
         "--model", "--robot", help="A model's folder, or a shipped robot; else the policy's own.")
     ] = None,

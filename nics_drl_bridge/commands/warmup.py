@@ -66,6 +66,7 @@ def _drive(model: Any) -> None:
     from nics_drl_bridge.middleware.middleware import rehearse
     from nics_drl_bridge.policy.policies import open_policy
 
-    policy, task = open_policy("dynamic_window", model)
-    policy.act(task.observation(rehearse(model), {"goal": np.ones(2)}))
+    for name in ("dynamic_window", "mppi"):
+        policy, task = open_policy(name, model)
+        policy.act(task.observation(rehearse(model), {"goal": np.ones(2)}))
     shield.rehearse()

@@ -16,6 +16,9 @@ from nics_drl_bridge.errors import ConfigError, PolicyError, nearest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy import dynamic_window_kernels as kernels
 from nics_drl_bridge.policy.contract import SUFFIX, shipped
+from nics_drl_bridge.policy.local_map import outline_of, rays_of, scratch_of
+from nics_drl_bridge.policy.local_map_kernels import Clearance, FootprintDiscs, MapScratch, ScanRays
+from nics_drl_bridge.policy.mppi import Mppi
 from nics_drl_bridge.robot.kinds import command_for, has_textbook, reach, steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -27,6 +30,7 @@ Rows = NDArray[np.float32]
 Step = Callable[[Rows, Rows], tuple[NDArray[Any], Rows]]
 """Actions (..., C) and the next state (..., S), for observations (..., O) and a state (..., S)."""
 
+CLEARANCE = Clearance(margin=0.1, soft=0.4)  # of the dynamic window, whose twists are few
 FULL_TURN_RAD = 0.8  # bearing of the goal from which a robot turns as fast as it can
 SETTLED_S = 5.0  # after which a held command has led to its twist
 LEAST_REACH = 1e-3  # of a component of the twist that no command moves [m/s, rad/s]
@@ -188,10 +192,13 @@ class RandomActions:
 
 @dataclass(frozen=True)
 class DynamicWindow:
-    """The dynamic-window approach (Fox, Burgard, Thrun 1997); ConfigError: see `steady_twist`."""
+    """The dynamic-window approach (Fox, Burgard, Thrun 1997); ConfigError: see `steady_twist`.
+
+    Towards the goal it takes the shortest way around what is seen (Brock, Khatib 1999).
+    """
 
     task: Navigation
-    margin: float = 0.05  # clearance to keep around the footprint [m]
+    clearance: Clearance = CLEARANCE
     period: float = 0.1  # between commands [s]
     steps: int = 10  # of the look-ahead, each a period and a half long
     weights: tuple[float, float, float, float] = (1.0, 0.6, 0.3, 1.5)  # see `TwistWeights`
@@ -208,16 +215,14 @@ class DynamicWindow:
         chosen = np.empty(len(seen), np.int64)
         kernels.choose_all(
             chosen, np.ascontiguousarray(seen[:, :parts]), goals,
-            np.ascontiguousarray(seen[:, parts + 3 : parts + 6]), *self._search,
+            np.ascontiguousarray(seen[:, parts + 3 : parts + 6]), *self._search, self._sense,
         )  # fmt: skip
         return self._scaled[chosen[0] if observation.ndim == 1 else chosen]
 
     @cached_property
-    def _search(self) -> tuple[Array, kernels.ScanRays, kernels.LookAhead, kernels.TwistWeights]:
-        robot, sight = self.task.robot, self.task.sight
+    def _search(self) -> tuple[Array, kernels.LookAhead, kernels.TwistWeights]:
+        robot = self.task.robot
         twists = _settled(self.task, self._commands, self.model)
-        directions = np.stack([np.cos(sight.angles), np.sin(sight.angles)], axis=-1)
-        rays = kernels.ScanRays(directions, sight.origin, float(sight.range_max))
         lags = [value for name, value in robot.parameters.items() if name.endswith("_lag")]
         lag = max(lags, default=0.0)
         brakes = [] if self.model is None else self.model.kinematics.braking.tolist()
@@ -226,10 +231,17 @@ class DynamicWindow:
         slow = (fastest / rate for v, rate in states if v.unit == "m/s")
         share = 1.0 - math.exp(-self.period / lag) if lag > 0.0 else 1.0
         reach = share * (twists.max(axis=0) - twists.min(axis=0)) + 1e-6
-        radius = robot.footprint_radius + self.margin
         rest = 2.0 * self.period + lag + max(slow, default=0.0)
-        ahead = kernels.LookAhead(reach, radius, 1.5 * self.period, self.steps, rest)
-        return twists, rays, ahead, kernels.TwistWeights(*self.weights)
+        ahead = kernels.LookAhead(reach, 1.5 * self.period, self.steps, rest)
+        return twists, ahead, kernels.TwistWeights(*self.weights)
+
+    @cached_property
+    def _sense(self) -> tuple[ScanRays, FootprintDiscs, Clearance, MapScratch]:
+        outline, (twists, ahead, _) = outline_of(self.task.robot), self._search
+        far = float(np.hypot(twists[:, 0], twists[:, 1]).max()) * ahead.period * ahead.steps
+        half = min(far, self.task.sight.range_max) + outline.outer
+        scratch = scratch_of(self.task.scan_parts, outline, self.clearance, half)
+        return rays_of(self.task), outline, self.clearance, scratch
 
     @cached_property
     def _commands(self) -> Array:
@@ -242,6 +254,7 @@ class DynamicWindow:
 
 POLICIES: dict[str, Callable[[Navigation, SimulatorModel | None], Policy]] = {
     "dynamic_window": lambda task, model: DynamicWindow(task, model=model),
+    "mppi": Mppi,
     "random": lambda task, _: RandomActions(task),
     "straight": StraightToGoal,
 }

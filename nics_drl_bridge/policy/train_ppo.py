@@ -21,6 +21,7 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.logger import Logger
 
+from nics_drl_bridge.policy import train_imitation
 from nics_drl_bridge.policy.train_algorithms import LEAST_RATE, Actor, check_serves, layers_of
 from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch
 from nics_drl_bridge.policy.train_memory import memory_of
@@ -308,10 +309,10 @@ class LeanPpo:
         memory = memory_of(settings.memory, inputs, parts)
         actor = Actor(*spaces, hidden, normaliser, torch.nn.ReLU, memory)
         self.networks = Networks(actor, hidden, self._ppo.log_std)
-        seeds = np.random.SeedSequence(seed).generate_state(2)
+        seeds = np.random.SeedSequence(seed).generate_state(3)
         self.collector = Collector(env, self.networks, self._ppo, int(seeds[0]))
         self.learner = Learner(self.networks, self._ppo, int(seeds[1]))
-        self.policy = actor
+        self.policy, self._settings, self._imitation_seed = actor, settings, int(seeds[2])
         self.steps = 0  # of all worlds together, learnt from so far
         self._rollout: Transitions | None = None  # the next one to learn from
         self._successes: deque[bool] = deque(maxlen=RECENT)
@@ -321,6 +322,7 @@ class LeanPpo:
         watch.begin(self.steps)
         if self._rollout is None:
             self.collector.last = self.collector.env.reset()
+            self._imitate()
             self._take(watch, *self.collector.collect())
         while self._rollout:
             watch.keep(self.steps)
@@ -328,6 +330,19 @@ class LeanPpo:
             if watch.report(self.steps, self._successes, logger):
                 logger.record("train/loss", loss)
                 logger.dump(self.steps)
+
+    def _imitate(self) -> None:
+        """Begins with what an expert does, if the settings say so; its steps count as well."""
+        given, part = self._settings.imitation, self.collector
+        if given is None:
+            return
+        steps, rng = given.steps // part.env.num_envs, np.random.default_rng(self._imitation_seed)
+        expert = train_imitation.expert_of(self._settings, part.env)
+        drive = partial(train_imitation.drive, discount=self._ppo.discount, rng=rng)
+        shown, part.last = drive(part.env, expert, part.last, steps)
+        train_imitation.imitate(self.networks, shown, given.epochs, self.learner.generator)
+        part.networks.load_state_dict(self.networks.state_dict())
+        self.steps = len(shown.seen)
 
     def _advance(self, rollout: Transitions, watch: Watch) -> float:
         """Learns from a rollout, with the next one collected meanwhile."""

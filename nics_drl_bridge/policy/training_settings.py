@@ -65,6 +65,14 @@ class SacSettings(Schema):
     soft_update: Share = 0.01  # by which each gradient step moves the target critics
 
 
+class ImitationSettings(Schema):
+    """A start of the lean engine from what an expert does, by behaviour cloning."""
+
+    expert: str  # name of a planner, or a policy file
+    steps: Count = 50_000  # driven by it, of all worlds together; they count as steps of training
+    epochs: Count = 10  # passes through them
+
+
 class TrainingSettings(Schema):
     """A training, as in `config/training/*.yaml`; `worlds` maps names or files to their copies."""
 
@@ -84,6 +92,7 @@ class TrainingSettings(Schema):
     checkpoint_every: Count = 200_000  # environment steps between two checkpoints
     ppo: PpoSettings = PpoSettings()
     sac: SacSettings = SacSettings()
+    imitation: ImitationSettings | None = None
 
     @field_validator("task_options")
     @classmethod
@@ -102,6 +111,19 @@ class TrainingSettings(Schema):
         if kept > MOST_KEPT:
             kept_by = f"{self.algorithm} would keep {kept} transitions, and may keep {MOST_KEPT}"
             raise ValueError(f"{kept_by}; lower the copies of worlds, ppo.rollout or sac.buffer")
+        return self
+
+    @model_validator(mode="after")
+    def _imitable(self) -> TrainingSettings:
+        if (given := self.imitation) is None:
+            return self
+        if not self.lean:
+            raise ValueError("imitation needs the lean engine of ppo; choose it, or leave that out")
+        if not self.num_envs <= given.steps < self.steps:
+            span = f"from {self.num_envs}, one in each world, to less than all {self.steps}"
+            raise ValueError(f"imitation.steps must be {span}; change them")
+        if given.steps > MOST_KEPT:
+            raise ValueError(f"imitation.steps may be {MOST_KEPT}; lower them")
         return self
 
     @property

@@ -1,0 +1,82 @@
+"""Footprint, rays and memory from which `local_map_kernels` map a scan for planners."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.policy.local_map_kernels import (
+    COARSE,
+    Clearance,
+    FootprintDiscs,
+    LocalMap,
+    MapScratch,
+    ScanRays,
+)
+from nics_drl_bridge.robot.spec import RobotSpec
+
+Array = NDArray[np.float64]
+CELL_M, MOST_M = 0.05, 4.0  # side of the cells of distances; greatest reach of a map
+FINE_M, DEEP_M, BORDER_M = 0.02, 0.03, 0.08
+"""Lattice of the discs, depth from which they cover all, and space of points on the border."""
+
+
+def rays_of(task: Navigation) -> ScanRays:
+    """The rays of a task's scan parts."""
+    sight = task.sight
+    directions = np.stack([np.cos(sight.angles), np.sin(sight.angles)], axis=-1)
+    return ScanRays(directions, sight.origin, float(sight.range_max))
+
+
+def outline_of(robot: RobotSpec) -> FootprintDiscs:
+    """The footprint of a robot as discs: some that fill it, and points along its border."""
+    if robot.footprint is None:
+        radius = robot.footprint_radius
+        return FootprintDiscs(np.zeros((0, 3)), np.zeros(2), radius, radius)
+    corners = np.array(robot.footprint)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    axes = (np.arange(a + FINE_M / 2, b, FINE_M) for a, b in zip(low, high, strict=True))
+    lattice = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    depth = depths(lattice, corners)
+    lattice, depth = lattice[depth > 0.0], depth[depth > 0.0]
+    left, chosen = depth > DEEP_M, list[Array]()
+    covers = np.linalg.norm(lattice[:, None] - lattice, axis=-1) < depth[:, None]
+    while left.any():
+        best = int((covers & left).sum(axis=1).argmax())
+        chosen.append(np.array([*lattice[best], depth[best]]))
+        left &= ~covers[best]
+    sides = np.roll(corners, -1, axis=0) - corners
+    for corner, side in zip(corners, sides, strict=True):
+        count = max(1, round(float(np.linalg.norm(side)) / BORDER_M))
+        chosen += [np.array([*(corner + side * k / count), 0.0]) for k in range(count)]
+    reach = np.linalg.norm(lattice[:, None] - corners, axis=-1).max(axis=1)
+    middle = int(reach.argmin())
+    return FootprintDiscs(
+        np.array(chosen), lattice[middle], float(depth.max()), float(reach[middle])
+    )
+
+
+def depths(points: Array, corners: Array) -> Array:
+    """Distances (n,) of points (n, 2) to the border of an outline (V, 2), below 0 outside [m]."""
+    side = np.roll(corners, -1, axis=0) - corners
+    apart = points[:, None] - corners
+    share = np.clip((apart * side).sum(axis=-1) / (side * side).sum(axis=-1), 0.0, 1.0)
+    away = np.linalg.norm(apart - share[..., None] * side, axis=-1).min(axis=1)
+    above = apart[..., 1] >= 0.0
+    crosses = above != np.roll(above, -1, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        where = apart[..., 0] - apart[..., 1] * side[:, 0] / side[:, 1]
+    inside = (crosses & (where < 0.0)).sum(axis=1) % 2 == 1
+    return np.asarray(np.where(inside, away, -away))
+
+
+def scratch_of(
+    parts: int, outline: FootprintDiscs, clearance: Clearance, half: float
+) -> MapScratch:
+    """Memory for maps of scans of P parts that reach `half` [m] to each side, `MOST_M` at most."""
+    coarse = 2 * math.ceil(min(half, MOST_M) / (COARSE * CELL_M))
+    distances = np.zeros((COARSE * coarse, COARSE * coarse), np.float32)
+    ways, prices = np.zeros((2, coarse, coarse), np.float32)
+    reach = outline.outer + clearance.margin + clearance.soft + CELL_M
+    return MapScratch(np.zeros((parts, 2)), LocalMap(distances, ways, CELL_M, reach), prices)

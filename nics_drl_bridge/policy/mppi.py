@@ -1,0 +1,145 @@
+"""Model-predictive path integral control (Williams and others 2017), as a policy."""
+
+import math
+import os
+from dataclasses import dataclass
+from functools import cached_property, partial
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.task import still
+from nics_drl_bridge.generator import BUILTIN_SEED, CONTROL_PERIOD_S, SimulatorModel
+from nics_drl_bridge.identify.identify import identify
+from nics_drl_bridge.policy import mppi_kernels as kernels
+from nics_drl_bridge.policy.local_map import outline_of, rays_of, scratch_of
+from nics_drl_bridge.policy.local_map_kernels import Clearance, FootprintDiscs, MapScratch, ScanRays
+from nics_drl_bridge.recording import textbook
+from nics_drl_bridge.robot.kernels import SERIES, term_arrays, with_coefficients
+from nics_drl_bridge.robot.kinds import steady_twist
+from nics_drl_bridge.robot.taylor import TaylorModel
+from nics_drl_bridge.threads import run_parts
+
+Array = NDArray[np.float64]
+Sense = tuple[ScanRays, FootprintDiscs, Clearance]
+SETTLED_S = 3.0  # after which a held command has led to its state
+FINEST = 0.25  # share of a lag that a step of the roll-outs may take
+FEWEST = 8  # robots of a thread
+CLEARANCE = Clearance(margin=0.08, soft=0.4)
+WORTH = kernels.Worth(near=4.0, early=0.3, change=0.02, astray=0.2)
+
+
+@dataclass(frozen=True)
+class Mppi:
+    """Plans by sampled roll-outs in the robot's model, with its true outline, without a map.
+
+    Its model is a textbook's where none is given; ConfigError for a robot without either.
+    """
+
+    task: Navigation
+    model: SimulatorModel | None = None
+    samples: int = 256  # roll-outs of each round
+    horizon: float = 2.0  # [s]
+    knots: int = 4  # actions along a roll-out, linear in between
+    spreads: tuple[float, ...] = (0.4, 0.2)  # of the noise in the rounds after the first
+    temperature: float = 0.05  # of the weights of roll-outs, as a way [m]
+    clearance: Clearance = CLEARANCE
+    worth: kernels.Worth = WORTH
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        _ = self._plant
+
+    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """See `Policy`."""
+        parts = self.task.scan_parts
+        seen = np.atleast_2d(observation).astype(np.float64)
+        goals = seen[:, parts : parts + 1] * seen[:, parts + 1 : parts + 3]
+        given = seen[:, :parts], goals, seen[:, parts + 3 : parts + 6]
+        out = np.empty((len(seen), len(self.task.robot.command)))
+        count = max(1, min(os.cpu_count() or 1, len(seen) // FEWEST))
+        cuts = np.linspace(0, len(seen), count + 1).astype(int).tolist()
+        rows = [slice(*ends) for ends in pairwise(cuts)]
+        run_parts(partial(self._plan, out, [np.ascontiguousarray(each) for each in given]), rows)
+        actions = out.astype(np.float32)
+        return actions[0] if observation.ndim == 1 else actions
+
+    def _plan(self, out: Array, given: list[Array], rows: slice) -> None:
+        scratch, lanes = self._free.pop() if self._free else self._memory()
+        sense = (*self._sense, scratch)
+        kernels.plan_all(
+            out[rows], *(each[rows] for each in given), sense, self._plant, self._sampling,
+            self.worth, lanes,
+        )  # fmt: skip
+        self._free.append((scratch, lanes))
+
+    @cached_property
+    def _free(self) -> list[tuple[MapScratch, kernels.RollOuts]]:
+        return []  # memory that no thread uses now
+
+    def _memory(self) -> tuple[MapScratch, kernels.RollOuts]:
+        robot, (_, outline, clearance) = self.task.robot, self._sense
+        low, high = robot.command_low, robot.command_high
+        ends = np.stack([low, high]) if self.task.robot.takes_cmd_vel else np.zeros((1, len(low)))
+        half = math.hypot(*np.abs(steady_twist(robot, ends))[:, :2].max(axis=0)) * self.horizon
+        half = min(half or np.inf, self.task.sight.range_max) + outline.outer
+        scratch = scratch_of(self.task.scan_parts, outline, clearance, half)
+        (states, count), many = self._plant.settled.shape, self.samples
+        x, rate = np.ones(states + count + 1), np.zeros(3 + states)
+        return scratch, kernels.RollOuts(
+            np.zeros((6, many)), np.repeat(x[:, None], many, 1), np.repeat(rate[:, None], many, 1),
+            np.zeros((many, self.knots, count)), np.zeros((self.knots, count)), np.zeros(count),
+            x, rate, np.zeros(3), np.zeros(many), np.zeros(many), np.zeros(many, np.int64),
+        )  # fmt: skip
+
+    @cached_property
+    def _sense(self) -> Sense:
+        return rays_of(self.task), outline_of(self.task.robot), self.clearance
+
+    @cached_property
+    def _kinematics(self) -> TaylorModel:
+        if self.model is not None:
+            return self.model.kinematics
+        robot = self.task.robot
+        return identify(textbook.record(robot, np.random.default_rng(BUILTIN_SEED)), robot).model
+
+    @property
+    def _period(self) -> float:
+        return CONTROL_PERIOD_S if self.model is None else self.model.control_period
+
+    @cached_property
+    def _plant(self) -> kernels.Plant:
+        model, robot, period = self._kinematics, self.task.robot, self._period
+        terms, latency = term_arrays(model), float(model.delays.max(initial=0.0))
+        if self.model is not None:
+            latency += max(0.0, self.model.calibration.command_latency_s)
+        own = (terms.dof >= 3) & (terms.degree == 1) & (terms.factors[:, 0] == terms.dof - 3)
+        fastest = np.abs(terms.coefficient[own]).max(initial=0.0)
+        substeps = min(max(1, math.ceil(period * fastest / FINEST)), round(period / model.dt))
+        rows = np.repeat(terms.coefficient[:, None], self.samples, axis=1)
+        return kernels.Plant(
+            with_coefficients(terms, rows), terms, SERIES, period / substeps, substeps, latency,
+            _settled(model, robot.command_high), robot.command_low, robot.command_high,
+        )  # fmt: skip
+
+    @cached_property
+    def _sampling(self) -> kernels.Sampling:
+        shape = self.samples, self.knots, len(self.task.robot.command)
+        offers, noise = np.empty((2, *shape))
+        low, high = self.task.robot.command_low, self.task.robot.command_high
+        rest = 2.0 * (still(self.task.robot) - low) / (high - low) - 1.0
+        kernels.draw(offers, noise, rest, self.seed)
+        places = np.linspace(0.0, self.knots - 1.0, round(self.horizon / self._period))
+        between = np.maximum(0.0, 1.0 - np.abs(places[:, None] - np.arange(self.knots)))
+        return kernels.Sampling(offers, noise, np.array(self.spreads), between, self.temperature)
+
+
+def _settled(model: TaylorModel, high: Array) -> Array:
+    """Returns the state (S, C) to which each command leads, per unit of it."""
+    given, pose = np.diag(0.5 * high), np.zeros((len(high), 3))
+    state = np.zeros((len(high), model.state_size))
+    for _ in range(round(SETTLED_S / model.dt)):
+        pose, state = model.step(pose, state, given)
+    return np.ascontiguousarray((state / (0.5 * high)[:, None]).T)

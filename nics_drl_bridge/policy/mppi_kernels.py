@@ -1,0 +1,256 @@
+"""Compiled model-predictive path integral control (Williams and others 2017).
+
+Roll-outs in the model of the robot, K at a time, over H periods. Commands are actions in [-1, 1] at
+`knots` along the way, linear in between. Shapes: N robots, S states, C commands, Q knots.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.policy.local_map_kernels import (
+    ARRIVED_M,
+    astray,
+    look,
+    room_at,
+    touching,
+    way_at,
+)
+from nics_drl_bridge.random_kernels import PLANNER_STREAM, normal, uniform
+from nics_drl_bridge.robot.kernels import Terms, advance, bend, rates, run
+
+Array = NDArray[np.float64]
+HIT = 1e3  # cost of a touch at once; later ones cost less
+BEYOND = 1.3  # offers are drawn over this much of the range and cut: many are at its ends
+PASSES, EASE = 12, 1e-6  # over the commands, to find those that a twist follows
+
+
+class Plant(NamedTuple):
+    """The model of a robot, for K roll-outs at a time."""
+
+    terms: Terms  # with coefficients (T, K)
+    single: Terms  # with coefficients (T,)
+    series: Array
+    dt: float  # [s]
+    substeps: int  # in a period
+    latency: float  # until a command has an effect [s]
+    settled: Array  # (S, C) state by the command that is held
+    low: Array  # (C,) of the commands
+    high: Array
+
+
+class Sampling(NamedTuple):
+    """The roll-outs of a plan."""
+
+    offers: Array  # (K, Q, C) actions of the first round
+    noise: Array  # (K, Q, C) standard normal, added to the best in the others
+    spreads: Array  # (R,) of the noise in these rounds
+    between: Array  # (H, Q) shares of the knots in the action of each period
+    temperature: float  # of the weights, as a cost
+
+
+class Worth(NamedTuple):
+    """Weights of the cost of a roll-out."""
+
+    near: float  # of a whole roll-out at the margin [m]
+    early: float  # share of the mean way to the goal, the rest is that of the end
+    change: float  # of the square of a change of action from knot to knot [m]
+    astray: float  # of a heading at the end that leads away from the goal [m]
+
+
+class RollOuts(NamedTuple):
+    """Scratch memory of one robot's plan."""
+
+    pose: Array  # (6, K) see `robot.kernels.run`
+    x: Array  # (S + C + 1, K)
+    dq: Array  # (3 + S, K)
+    actions: Array  # (K, Q, C)
+    nominal: Array  # (Q, C)
+    held: Array  # (C,) command that is followed
+    one: Array  # (S + C + 1,)
+    rate: Array  # (3 + S,)
+    start: Array  # (3,)
+    cost: Array  # (K,)
+    way: Array  # (K,)
+    ended: NDArray[np.int64]  # (K,) period of a touch or an arrival, below 0 for none
+
+
+@kernel(allocates=True)
+def draw(offers, noise, rest, seed):  # type: ignore[no-untyped-def]
+    """Draws `Sampling.offers`, the first of which is rest (C,), and `Sampling.noise`, by a seed."""
+    for k in range(offers.shape[0]):
+        for q in range(offers.shape[1]):
+            for c in range(offers.shape[2]):
+                i = (k * offers.shape[1] + q) * offers.shape[2] + c
+                drawn = BEYOND * (2.0 * uniform(seed, PLANNER_STREAM, 3 * i) - 1.0)
+                held = k < offers.shape[0] // 2 and q > 0  # half of them hold one action
+                offers[k, q, c] = offers[k, 0, c] if held else min(max(drawn, -1.0), 1.0)
+                if k == 0:
+                    offers[k, q, c] = rest[c]
+                noise[k, q, c] = normal(seed, PLANNER_STREAM, 3 * i + 1)
+
+
+@kernel(allocates=True)
+def plan_all(out, scans, goals, twists, sense, plant, sampling, worth, lanes):  # type: ignore[no-untyped-def]
+    """Writes the actions (N, C) of N robots, by scans (N, P), goals (N, 2), twists (N, 3)."""
+    for n in range(out.shape[0]):
+        around = look(scans[n], goals[n], *sense)
+        _plan(out[n], twists[n], around, plant, sampling, worth, lanes)
+
+
+@kernel(allocates=True)
+def _plan(out, twist, around, plant, sampling, worth, lanes):  # type: ignore[no-untyped-def]
+    """Writes the action (C,) that begins the plan.
+
+    The first round offers actions of the whole range, and the cheapest takes the place of the plan
+    of the step before: so nothing is remembered, and an action follows from what is seen alone.
+    """
+    follow(twist, plant, lanes)
+    lanes.start[:] = 0.0
+    if plant.latency > 0.0:
+        advance(lanes.start, twist, plant.latency, plant.series)
+    lanes.actions[:] = sampling.offers
+    best = _roll(around, plant, sampling, worth, lanes)
+    lanes.nominal[:] = lanes.actions[best]
+    for spread in sampling.spreads:
+        for k in range(lanes.actions.shape[0]):
+            for q in range(lanes.nominal.shape[0]):
+                for c in range(lanes.nominal.shape[1]):
+                    action = lanes.nominal[q, c]
+                    if k > 0:
+                        action += spread * sampling.noise[k, q, c]
+                    lanes.actions[k, q, c] = min(max(action, -1.0), 1.0)
+        best = _roll(around, plant, sampling, worth, lanes)
+        _average(best, sampling.temperature, lanes)
+    out[:] = lanes.nominal[0]
+
+
+@kernel
+def _average(best, temperature, lanes):  # type: ignore[no-untyped-def]
+    """Makes the mean of the actions, weighted by their costs, the nominal ones."""
+    lanes.nominal[:] = 0.0
+    total = 0.0
+    for k in range(lanes.cost.shape[0]):
+        weight = math.exp((lanes.cost[best] - lanes.cost[k]) / temperature)
+        total += weight
+        for q in range(lanes.nominal.shape[0]):
+            for c in range(lanes.nominal.shape[1]):
+                lanes.nominal[q, c] += weight * lanes.actions[k, q, c]
+    for q in range(lanes.nominal.shape[0]):
+        for c in range(lanes.nominal.shape[1]):
+            lanes.nominal[q, c] /= total
+
+
+@kernel
+def follow(twist, plant, lanes):  # type: ignore[no-untyped-def]
+    """Writes the command that a twist (3,) follows when it is held, and the state it has led to.
+
+    By coordinate descent on the squared difference.
+    """
+    held, x, dq, terms = lanes.held, lanes.one, lanes.rate, plant.single
+    count = plant.settled.shape[1]
+    for c in range(count):
+        held[c] = min(max(0.0, plant.low[c]), plant.high[c])
+    for _ in range(PASSES):
+        for c in range(count):
+            _settle(held, plant, lanes)
+            rates(dq, x, terms)
+            r0, r1, r2 = twist[0] - dq[0], twist[1] - dq[1], twist[2] - dq[2]
+            b0, b1, b2 = dq[0], dq[1], dq[2]
+            step = 1e-3 * (plant.high[c] - plant.low[c])
+            held[c] += step
+            _settle(held, plant, lanes)
+            rates(dq, x, terms)
+            held[c] -= step
+            g0, g1, g2 = (dq[0] - b0) / step, (dq[1] - b1) / step, (dq[2] - b2) / step
+            size = g0 * g0 + g1 * g1 + g2 * g2 + EASE
+            value = held[c] + (g0 * r0 + g1 * r1 + g2 * r2) / size
+            held[c] = min(max(value, plant.low[c]), plant.high[c])
+    _settle(held, plant, lanes)
+
+
+@kernel
+def _settle(command, plant, lanes):  # type: ignore[no-untyped-def]
+    """Writes the state to which a command (C,) leads, and its effect, into `one`."""
+    states, count = plant.settled.shape
+    x = lanes.one
+    for s in range(states):
+        x[s] = 0.0
+        for c in range(count):
+            x[s] += plant.settled[s, c] * command[c]
+    for c in range(count):
+        x[states + c] = bend(command[c], plant.single.curves[c])
+    x[states + count] = 1.0
+
+
+@kernel
+def _roll(around, plant, sampling, worth, lanes):  # type: ignore[no-untyped-def]
+    """Rolls out the actions of all lanes; writes their costs and returns the cheapest."""
+    _begin(around, plant, worth, lanes)
+    states, periods = plant.settled.shape[0], sampling.between.shape[0]
+    limit = touching(around)
+    for t in range(periods):
+        for c in range(plant.low.shape[0]):
+            middle = 0.5 * (plant.low[c] + plant.high[c])
+            half = 0.5 * (plant.high[c] - plant.low[c])
+            row, curve = lanes.x[states + c], plant.single.curves[c]
+            for k in range(row.shape[0]):
+                action = 0.0
+                for q in range(lanes.nominal.shape[0]):
+                    action += sampling.between[t, q] * lanes.actions[k, q, c]
+                row[k] = bend(middle + half * action, curve)
+        run(lanes.pose, lanes.x, lanes.dq, plant.terms, plant.series, plant.dt, plant.substeps)
+        for k in range(lanes.cost.shape[0]):
+            if lanes.ended[k] < 0:
+                _judge(k, t, periods, limit, around, worth, lanes)
+    best = 0
+    for k in range(lanes.cost.shape[0]):
+        lanes.cost[k] += (1.0 - worth.early) * lanes.way[k]
+        if lanes.cost[k] < lanes.cost[best]:
+            best = k
+    return best
+
+
+@kernel
+def _begin(around, plant, worth, lanes):  # type: ignore[no-untyped-def]
+    """Puts all lanes at the start, with the cost of how their actions change."""
+    states, count = plant.settled.shape
+    x, y, heading = lanes.start[0], lanes.start[1], lanes.start[2]
+    for k in range(lanes.cost.shape[0]):
+        lanes.pose[0, k], lanes.pose[1, k] = x, y
+        lanes.pose[2, k], lanes.pose[3, k] = math.cos(heading), math.sin(heading)
+        lanes.pose[4, k], lanes.pose[5, k] = heading, 0.0
+        for s in range(states):
+            lanes.x[s, k] = lanes.one[s]
+        change = 0.0
+        for c in range(count):
+            before = 2.0 * (lanes.held[c] - plant.low[c]) / (plant.high[c] - plant.low[c]) - 1.0
+            for q in range(lanes.nominal.shape[0]):
+                change += (lanes.actions[k, q, c] - before) ** 2
+                before = lanes.actions[k, q, c]
+        lanes.cost[k] = worth.change * change
+        lanes.way[k] = 0.0
+        lanes.ended[k] = -1
+
+
+@kernel
+def _judge(k, t, periods, limit, around, worth, lanes):  # type: ignore[no-untyped-def]
+    """Adds what period t of lane k costs."""
+    x, y, c, s = lanes.pose[0, k], lanes.pose[1, k], lanes.pose[2, k], lanes.pose[3, k]
+    room, way = room_at(x, y, c, s, around), way_at(x, y, around)
+    lanes.way[k] = way
+    lanes.cost[k] += worth.early * way / periods
+    if room < limit:
+        lanes.cost[k] += HIT * (2.0 - t / periods)
+        lanes.ended[k] = t
+        return
+    keep = around.clearance
+    near = max(keep.margin + keep.soft - room, 0.0) / keep.soft
+    lanes.cost[k] += worth.near * near * near / periods
+    if math.hypot(around.goal[0] - x, around.goal[1] - y) < ARRIVED_M:
+        lanes.ended[k], lanes.way[k] = t, 0.0
+    elif t == periods - 1:
+        lanes.cost[k] += worth.astray * astray(x, y, c, s, way, around) * min(way, 1.0)

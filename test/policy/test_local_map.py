@@ -1,0 +1,117 @@
+"""What planners see: distances from the outline, and the way to the goal around obstacles."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from shapely.geometry import Point, Polygon
+from shapely.prepared import prep
+
+from nics_drl_bridge.policy.local_map import CELL_M, depths, outline_of, scratch_of
+from nics_drl_bridge.policy.local_map_kernels import (
+    Clearance,
+    ScanRays,
+    astray,
+    look,
+    room_at,
+    touching,
+    way_at,
+)
+from nics_drl_bridge.robot.spec import load_robot
+
+CLOSE = Clearance(margin=0.05, soft=0.3)
+GOAL = np.array([3.0, 0.0])
+ROBOTS = ("differential", "jackal", "tricycle")
+
+
+def seen(points, robot="jackal", goal=GOAL):
+    """What a robot knows whose scan ends at points (P, 2)."""
+    at = np.asarray(points, np.float64).reshape(-1, 2)
+    away = np.linalg.norm(at, axis=1)
+    outline = outline_of(load_robot(robot))
+    rays = ScanRays(at / away[:, None], np.zeros(2), 10.0)
+    return look(away / 10.0, goal, rays, outline, CLOSE, scratch_of(len(at), outline, CLOSE, 3.0))
+
+
+def footprint(robot):
+    spec = load_robot(robot)
+    if spec.footprint is None:
+        return Point(0.0, 0.0).buffer(spec.footprint_radius, quad_segs=64)
+    return Polygon(spec.footprint)
+
+
+def wall(x, low, high):
+    return np.stack([np.full(200, x), np.linspace(low, high, 200)], axis=-1)
+
+
+def test_depths_are_distances_to_the_border_and_negative_outside():
+    shape = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [1.0, 0.4], [0.0, 1.0]])  # not convex
+    points = np.random.default_rng(0).uniform(-1.0, 3.0, (300, 2))
+    exact, inside = Polygon(shape).exterior, prep(Polygon(shape))
+    for point, depth in zip(points, depths(points, shape), strict=True):
+        assert abs(depth) == pytest.approx(exact.distance(Point(point)))
+        assert (depth > 0.0) == inside.contains(Point(point))
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_room_is_the_distance_from_the_outline_up_to_a_cell(robot):
+    rng, shape = np.random.default_rng(1), footprint(robot)
+    for _ in range(200):
+        x, y, heading = rng.uniform([-0.5, -0.5, -3.0], [0.5, 0.5, 3.0])
+        c, s = math.cos(heading), math.sin(heading)
+        ahead, left = rng.uniform(-0.5, 0.5, 2)
+        hit = np.array([[x + c * ahead - s * left, y + s * ahead + c * left]])
+        if np.linalg.norm(hit) < 1e-3:
+            continue
+        room = room_at(x, y, c, s, seen(hit, robot))
+        exact = shape.exterior.distance(Point(ahead, left))
+        if shape.contains(Point(ahead, left)):
+            assert room < CELL_M
+            assert exact < 2.0 * CELL_M or room < 0.0
+        elif exact < CLOSE.margin + CLOSE.soft:
+            assert room == pytest.approx(exact, abs=0.7 * CELL_M)
+        else:
+            assert room > CLOSE.margin + CLOSE.soft - CELL_M
+
+
+def test_a_robot_that_is_too_near_already_may_only_move_away():
+    around = seen([[0.254 + 0.02, 0.0]])
+    assert touching(around) == pytest.approx(room_at(0.0, 0.0, 1.0, 0.0, around), abs=2e-3)
+    assert room_at(0.1, 0.0, 1.0, 0.0, around) < touching(around)
+    assert room_at(-0.1, 0.0, 1.0, 0.0, around) > touching(around)
+    assert touching(seen([[2.0, 0.0]])) == CLOSE.margin
+
+
+def test_the_way_in_the_open_is_straight_and_leads_around_a_wall():
+    free, blocked = seen([[0.0, 9.0]]), seen(wall(1.5, -1.2, 1.2))
+    assert way_at(0.0, 0.0, free) == pytest.approx(3.0, rel=0.05)
+    around = 2.0 * math.hypot(1.5, 1.2 + 0.215)
+    assert around < way_at(0.0, 0.0, blocked) < 2.0 * around
+    assert way_at(2.5, 0.0, blocked) < 1.0
+
+
+def test_a_gap_too_narrow_for_the_robot_costs_more_than_the_way_around():
+    narrow, wide = (
+        seen(np.concatenate([wall(1.5, -1.0, -half), wall(1.5, half, 1.0)])) for half in (0.2, 0.5)
+    )
+    assert way_at(0.0, 0.0, wide) < way_at(0.0, 0.0, narrow) - 0.5
+
+
+def test_a_heading_along_the_way_is_not_astray_and_the_other_way_is():
+    around = seen([[0.0, 9.0]])
+    way = way_at(0.0, 0.0, around)
+    along, aside, against = (
+        astray(0.0, 0.0, math.cos(a), math.sin(a), way, around) for a in (0.0, math.pi / 2, math.pi)
+    )
+    assert along < 0.1 < aside < 0.9 < against
+
+
+def test_unknown_shares_and_those_without_a_return_are_no_obstacles():
+    outline = outline_of(load_robot("jackal"))
+    rays = ScanRays(np.array([[1.0, 0.0]] * 3), np.array([0.12, 0.0]), 10.0)
+    for share, free in ((0.0, True), (1.0, True), (0.015, False)):
+        scratch = scratch_of(3, outline, CLOSE, 3.0)
+        around = look(np.full(3, share), GOAL, rays, outline, CLOSE, scratch)
+        assert (touching(around) == CLOSE.margin) == free
