@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.sim.guide_kernels import sweep
 
 Array = NDArray[np.float64]
 Grid = NDArray[np.float32]
@@ -186,34 +187,9 @@ def put_ways(around, prices):  # type: ignore[no-untyped-def]
     for _ in range(ROUNDS):
         most = np.float32(0.0)
         for turn in range(4):
-            most = max(most, _sweep(ways, prices, turn & 1, turn >> 1))
+            most = max(most, sweep(ways, prices, turn & 1, turn >> 1))
         if most < SETTLED_M:
             break
-
-
-@kernel
-def _sweep(ways, prices, down, left):  # type: ignore[no-untyped-def]
-    """Updates the ways row by row, from one of the corners; returns the greatest change [m]."""
-    size, most = ways.shape[0], np.float32(0.0)
-    for a in range(size):
-        i = size - 1 - a if down else a
-        for b in range(size):
-            j = size - 1 - b if left else b
-            beside = min(ways[i, max(j - 1, 0)], ways[i, min(j + 1, size - 1)])
-            above = min(ways[max(i - 1, 0), j], ways[min(i + 1, size - 1), j])
-            price, apart = prices[i, j], beside - above
-            least = min(beside, above)
-            if not least < ways[i, j]:
-                continue
-            way = least + price
-            if abs(apart) < price:
-                way = np.float32(0.5) * (
-                    beside + above + math.sqrt(np.float32(2.0) * price * price - apart * apart)
-                )
-            if way < ways[i, j]:
-                most = max(most, min(ways[i, j] - way, np.float32(1e3)))
-                ways[i, j] = way
-    return most
 
 
 @kernel

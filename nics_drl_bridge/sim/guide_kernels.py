@@ -21,8 +21,8 @@ COMFORT = 0.3  # space beside the robot's circle from which on a way is no longe
 TIGHT, SQUEEZED, BLOCKED = 2.0, 6.0, 12.0
 """Cost of a metre where the circle just fits, where only the outline does, and where nothing does;
 in between it is interpolated."""
-ROUNDS = 20
-"""Greatest number of sweeps in all four directions."""
+ROUNDS, SETTLED = 20, np.float32(1e-3)
+"""Greatest number of sweeps in all four directions, and their change that ends them before [m]."""
 
 
 class GuideGrid(NamedTuple):
@@ -74,7 +74,7 @@ def guide(out, worlds, member, bodies, goals, grid):  # type: ignore[no-untyped-
         for m in range(goals.shape[1]):
             field = out[worlds[n], m, : wide[0], : wide[1]]
             u, v = (goals[n, m, 0] - x) / cell - 0.5, (goals[n, m, 1] - y) / cell - 0.5
-            _sweep(field, space, u, v)
+            _spread(field, space, u, v)
 
 
 @kernel
@@ -110,7 +110,7 @@ def _cost(space, grid):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _sweep(field, cost, u, v):  # type: ignore[no-untyped-def]
+def _spread(field, cost, u, v):  # type: ignore[no-untyped-def]
     """Arrival times of a front that starts at column u, row v (fractions) and takes `cost`."""
     rows, columns = field.shape
     field[...] = np.inf
@@ -119,37 +119,40 @@ def _sweep(field, cost, u, v):  # type: ignore[no-untyped-def]
         for j in range(max(gj - 1, 0), min(gj + 2, columns)):
             field[i, j] = math.sqrt((u - j) ** 2 + (v - i) ** 2) * cost[i, j]
     for _ in range(ROUNDS):
-        changed = False
+        change = np.float32(0.0)
         for way in range(4):
-            down, left = way >= 2, way % 2 == 1
-            for a in range(rows):
-                i = rows - 1 - a if down else a
-                for b in range(columns):
-                    j = columns - 1 - b if left else b
-                    beside, above = np.float32(np.inf), np.float32(np.inf)
-                    if j > 0:
-                        beside = field[i, j - 1]
-                    if j < columns - 1:
-                        beside = min(beside, field[i, j + 1])
-                    if i > 0:
-                        above = field[i - 1, j]
-                    if i < rows - 1:
-                        above = min(above, field[i + 1, j])
-                    least, f = min(beside, above), cost[i, j]
-                    if least == np.inf:
-                        continue
-                    apart = abs(beside - above)
-                    if apart >= f:
-                        time = least + f
-                    else:
-                        time = np.float32(0.5) * (
-                            beside + above + math.sqrt(np.float32(2.0) * f * f - apart * apart)
-                        )
-                    if time < field[i, j]:
-                        changed |= field[i, j] - time > np.float32(1e-3)
-                        field[i, j] = time
-        if not changed:
+            change = max(change, sweep(field, cost, way >= 2, way % 2 == 1))
+        if change <= SETTLED:
             return
+
+
+@kernel
+def sweep(ways, prices, down, left):  # type: ignore[no-untyped-def]
+    """Updates the ways row by row, from one of the corners; returns the greatest change [m].
+
+    Both (rows, columns) are float32; the price of a cell is that of crossing it.
+    """
+    rows, columns = ways.shape
+    most = np.float32(0.0)
+    for a in range(rows):
+        i = rows - 1 - a if down else a
+        for b in range(columns):
+            j = columns - 1 - b if left else b
+            beside = min(ways[i, max(j - 1, 0)], ways[i, min(j + 1, columns - 1)])
+            above = min(ways[max(i - 1, 0), j], ways[min(i + 1, rows - 1), j])
+            price, apart = prices[i, j], beside - above
+            least = min(beside, above)
+            if not least < ways[i, j]:
+                continue
+            way = least + price
+            if abs(apart) < price:
+                way = np.float32(0.5) * (
+                    beside + above + math.sqrt(np.float32(2.0) * price * price - apart * apart)
+                )
+            if way < ways[i, j]:
+                most = max(most, min(ways[i, j] - way, np.float32(1e3)))
+                ways[i, j] = way
+    return most
 
 
 @kernel(allocates=True)
