@@ -228,7 +228,10 @@ def drive_mujoco(name: str, given: Mapping[int, Course]) -> Runs:
     with tempfile.TemporaryDirectory() as folder:
         worlds = saved(given, Path(folder, "worlds"))
         seeds = seeds_of(load_worlds(worlds), 1).tolist()
-        episodes = drive_in(MUJOCO, name, ROBOT, worlds, seeds, Path(folder), lambda _: None)
+        episodes = drive_in(
+            MUJOCO, name, ROBOT, worlds, seeds, Path(folder), lambda _: None,
+            steps=round(TIME_OUT_S / model.control_period),
+        )  # fmt: skip
     away = [np.linalg.norm(one.path[:, :2] - one.goal, axis=1) < GOAL_RADIUS for one in episodes]
     success = [bool(near.any()) for near in away]  # an episode goes on to the policy's own radius
     collision = [
