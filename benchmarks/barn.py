@@ -22,9 +22,11 @@ from measuring.standing import Standing
 from measuring.verdict import answer, parser_of
 from numpy.typing import NDArray
 
+from nics_drl_bridge.commands.conditions import Conditions
 from nics_drl_bridge.commands.episodes import FAST, MUJOCO, drive_in
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.teaching import Teaching
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import open_model
@@ -43,6 +45,8 @@ ROBOT = "jackal"
 BARS = {"fast": {"success": 0.95, "collision": 0.02, "score": 0.45}, "mujoco_dds": {"score": 0.40}}
 SPEED, GOAL_RADIUS, TIME_OUT_S = 2.0, 1.0, 100.0
 """[m/s], [m], [s]: of the challenge."""
+OPTIONS = {"goal_radius": GOAL_RADIUS - DRIFT_M, "contact_margin": -1.0}
+"""An episode ends where the truth, too, is near enough to the goal, and at true contacts alone."""
 HEIGHT = 0.2  # of the lidar [m]
 FIRST_SEED = 1_000_000
 FOLDS = 5
@@ -179,16 +183,17 @@ def drive_fast(name: str, given: Mapping[int, Course], runs: int, control: str |
     seeds = seeds_of(world, runs)
     steps = round(TIME_OUT_S / model.control_period)
     env = BridgeVectorEnv(len(seeds), model, world, task, max_episode_steps=steps)
+    env.teach(Teaching(contact=0.0))  # which ends an episode at a true contact
     out = drive_worlds(env, policy.act, seeds.tolist())
     return judged(given, runs, out.success, out.collision, out.steps * model.control_period)
 
 
 def opened(name: str, control: str | None) -> tuple[Policy, Navigation]:
-    """A policy and its task, which ends where the truth, too, is near enough to the goal."""
+    """A policy and its task, with `OPTIONS`."""
     policy, task = open_policy(name, open_model(ROBOT))
     if control == "standing":
         policy = Standing(task)
-    return policy, replace(task, goal_radius=GOAL_RADIUS - DRIFT_M)
+    return policy, replace(task, **OPTIONS)
 
 
 def drive_folds(settings: str, given: Mapping[int, Course], runs: int, control: str | None) -> Runs:
@@ -228,17 +233,12 @@ def drive_mujoco(name: str, given: Mapping[int, Course]) -> Runs:
     with tempfile.TemporaryDirectory() as folder:
         worlds = saved(given, Path(folder, "worlds"))
         seeds = seeds_of(load_worlds(worlds), 1).tolist()
-        episodes = drive_in(
-            MUJOCO, name, ROBOT, worlds, seeds, Path(folder), lambda _: None,
-            steps=round(TIME_OUT_S / model.control_period),
-        )  # fmt: skip
-    away = [np.linalg.norm(one.path[:, :2] - one.goal, axis=1) < GOAL_RADIUS for one in episodes]
-    success = [bool(near.any()) for near in away]  # an episode goes on to the policy's own radius
-    collision = [
-        one.result == "collision" and not near
-        for one, near in zip(episodes, success, strict=True)
-    ]  # fmt: skip
-    steps = [int(near.argmax()) or one.steps for one, near in zip(episodes, away, strict=True)]
+        conditions = Conditions(steps=round(TIME_OUT_S / model.control_period), task=OPTIONS)
+        told = Path(folder), lambda _: None
+        episodes = drive_in(MUJOCO, name, ROBOT, worlds, seeds, *told, conditions=conditions)
+    success = [one.result == "success" for one in episodes]
+    collision = [one.result == "collision" for one in episodes]
+    steps = [one.steps for one in episodes]
     return judged(given, 1, success, collision, [model.control_period * n for n in steps])
 
 

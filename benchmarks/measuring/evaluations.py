@@ -9,7 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -65,8 +65,9 @@ def _evaluate(run: Run, domain: int) -> dict[str, Any]:
         run.episodes, "--seed", run.seed, "--out", run.out,
         *(word for place in run.places for word in ("--in", place)),
         *(
-            word for name, value in asdict(run.conditions).items() if value is not None
-            for word in (f"--{name}", value)
+            word for name in ("lidar", "randomisation", "gate")
+            for word in (f"--{name}", getattr(run.conditions, name))
+            if getattr(run.conditions, name) is not None
         ),
     )  # fmt: skip
     program = (

@@ -1,19 +1,24 @@
 """Conditions under which the episodes of an evaluation are driven, alike in every place."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS
 from nics_drl_bridge.generator import SimulatorModel, open_model, save_model
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """Lidar, randomisation and gate of an evaluation; None leaves each as in the model, or out."""
+    """Conditions of an evaluation; None leaves the model's lidar, or randomisation and gate out."""
 
     lidar: str | None = None  # shipped lidar or file, instead of the model's
     randomisation: str | None = None  # shipped one or file, which draws each episode's numbers
     gate: str | None = None  # limits, shipped or a file, of a gate between policy and robot
+    steps: int = MAX_EPISODE_STEPS  # greatest number of an episode
+    task: Mapping[str, Any] = field(default_factory=dict)  # options, instead of the policy's own
 
     @property
     def ranges(self) -> Randomisation | None:

@@ -14,7 +14,7 @@ import gymnasium
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.conditions import NO_CONDITIONS, Conditions
-from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS, NAVIGATION, register_envs
+from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.env.sim_backend import make_backend
 from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, nearest
 from nics_drl_bridge.files import write_bytes, write_text
@@ -50,14 +50,14 @@ Tell = Callable[[str, int, int], None]
 def drive_in(
     place: str, policy: str, name: str, world: str, seeds: Sequence[int], logs: Path,
     on_episode: Callable[[Episode], None], say: Say = lambda _: None,
-    conditions: Conditions = NO_CONDITIONS, steps: int = MAX_EPISODE_STEPS,
+    conditions: Conditions = NO_CONDITIONS,
 ) -> list[Episode]:  # fmt: skip
     """Drives episodes in one of `PLACES`, whose node, if any, has then ended. BridgeError."""
     check_place(place)
     model, drawn = open_model(name), conditions.ranges
     if place == FAST:
         given = {"estimator": True, "randomisation": drawn}
-        env, opened = env_of(policy, model, world, "sim", conditions.gate, steps, **given)
+        env, opened = env_of(policy, model, world, "sim", conditions, **given)
         with closing(env):
             return drive_all(env, opened, seeds, on_episode)
     from nics_drl_bridge.nodes.processes import NodeProcess, Witness, free_domain_id
@@ -72,7 +72,7 @@ def drive_in(
     ):  # fmt: skip
         say(f"started {node} as process {process.pid} in ROS domain {domain_id}")
         try:
-            env, opened = env_of(policy, model, world, "dds", conditions.gate, steps, **options)
+            env, opened = env_of(policy, model, world, "dds", conditions, **options)
             with closing(env):
                 touched = partial(witness.touched, node, START_S)
                 return drive_all(env, opened, seeds, on_episode, touched)
@@ -82,19 +82,20 @@ def drive_in(
 
 
 def env_of(
-    policy: str, model: SimulatorModel, world: str, backend: str, gate: str | None = None,
-    steps: int = MAX_EPISODE_STEPS, **options: Any,
+    policy: str, model: SimulatorModel, world: str, backend: str,
+    conditions: Conditions = NO_CONDITIONS, **options: Any,
 ) -> tuple[gymnasium.Env[Any, Any], Policy]:  # fmt: skip
     """Makes the env of a policy's task with a backend, behind a gate if any; opens the policy."""
     register_envs()
     opened, task = open_policy(policy, model)
+    task = replace(task, **conditions.task)
     field = load_worlds(world)
     given = {name: value for name, value in options.items() if value is not None}
     made = make_backend(backend, model, field, **given)
-    if gate is not None:
-        made = GatedBackend(made, model, gate)
+    if conditions.gate is not None:
+        made = GatedBackend(made, model, conditions.gate)
     given = {"backend": made, "model": model, "world": field, "task": task}
-    return gymnasium.make(NAVIGATION, max_episode_steps=steps, **given), opened
+    return gymnasium.make(NAVIGATION, max_episode_steps=conditions.steps, **given), opened
 
 
 def check_place(place: str) -> None:

@@ -74,7 +74,7 @@ def evaluate(
 
         chosen = {"places": tuple(dict.fromkeys(places))} if places else {}
         count, tell = episodes or (1 if hardware else 20), partial(typer.echo, err=True)
-        under = Conditions(**conditions)
+        under = Conditions(lidar, randomisation, gate)
         order = driving.EvaluationOrder(
             policies, out, model, world, count, seed, **chosen, conditions=under
         )

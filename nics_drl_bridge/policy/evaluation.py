@@ -101,9 +101,12 @@ def drive(
         if "true_pose" not in info:
             return Episode(seed, believed, *driven)
         known = info.get("true_collision")
-        hit = bool(np.any(known)) if known is not None else touched is not None and touched()
+        if known is None:  # then `touched` tells, or else the robot itself
+            known = believed == "collision" if touched is None else touched()
+        hit = bool(np.any(known))
         there = truly_near(getattr(env.unwrapped, "task", None), info["true_pose"], goal).all()
-        true = ELSEWHERE if believed == "success" and not there else believed
+        wrong = (believed == "success" and not there) or believed == "collision"
+        true = ELSEWHERE if wrong else believed
         return Episode(seed, "collision" if hit else true, *driven, believed)
     except BaseException:
         if isinstance(env.unwrapped, BridgeEnv):  # it does not see errors of a policy
@@ -152,7 +155,7 @@ class Outcomes:
 
     seeds: NDArray[np.int64]
     success: Flags  # the goal was truly reached, and nothing touched
-    collision: Flags  # the task reports one, or the robot truly touched something
+    collision: Flags  # the robot truly touched something
     steps: NDArray[np.int64]  # control periods
     length: Array  # of the true path [m]; for a team, the mean over its robots
     reward: Array  # sum over the episode
@@ -193,14 +196,14 @@ def _drive_once(env: BridgeVectorEnv, act: Act, seeds: NDArray[np.int64]) -> tup
         reward += np.where(running, gain, 0.0)
         steps += running
         ended = running & (terminated | truncated)
-        touched = _robots(info, "collision").any(axis=1)
-        touched = touched | _robots(info, "true_collision").any(axis=1)
-        collision |= ended & touched
+        seen = _robots(info, "collision").any(axis=1)
+        hit = _robots(info, "true_collision" if "true_collision" in info else "collision")
+        collision |= ended & hit.any(axis=1)
         arrived = _robots(info, "is_success").all(axis=1)
         if arrived.any() and "goal" in info:
             near = truly_near(env.task, info["true_pose"], info["goal"])
             arrived = arrived & near.reshape(count, -1).all(axis=1)
-        success |= ended & ~touched & arrived
+        success |= ended & ~seen & ~hit.any(axis=1) & arrived
         running &= ~ended
     return success, collision, steps, length, reward
 
