@@ -69,7 +69,8 @@ def test_lidar_randomisation_and_gate_are_the_same_in_process_and_over_dds(tmp_p
     assert done.returncode == 0, done.stderr
     told = json.loads((tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8"))
     assert told["conditions"] == {
-        "lidar": "rplidar_a2", "randomisation": "mild", "gate": "differential",
+        "lidar": "rplidar_a2", "randomisation": "mild", "gate": "differential", "steps": 300,
+        "task": {},
     }  # fmt: skip
     fast, dds = told["policies"]["dynamic_window"].values()
     assert dds["greatest_deviation"] < 1e-6

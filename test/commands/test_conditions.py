@@ -45,7 +45,9 @@ def test_an_episode_is_driven_through_the_gate_and_with_what_was_drawn():
     model, told = builtin_model("differential"), []
     for gate in (None, "differential"):
         given = {"estimator": True, "randomisation": Conditions(randomisation="mild").ranges}
-        env, policy = env_of("dynamic_window", model, "circles", "sim", gate, **given)
+        env, policy = env_of(
+            "dynamic_window", model, "circles", "sim", Conditions(gate=gate), **given
+        )
         episode = drive(env, policy, 5)
         told.append((episode, env.reset(seed=5)[1]["randomisation"]))
     (bare, drawn), (behind, again) = told

@@ -25,7 +25,7 @@ class BrokenOffError(Exception):
 @pytest.fixture(autouse=True)
 def _small_world(monkeypatch):
     """Trains a robot of few beams in a small field, whatever names the settings hold."""
-    monkeypatch.setattr(training, "open_model", lambda _: MODEL)
+    monkeypatch.setattr(training, "open_model", lambda *_: MODEL)
     made = training.BridgeVectorEnv
     monkeypatch.setattr(
         training, "BridgeVectorEnv", lambda n, model, _, *rest, **more: made(
