@@ -278,6 +278,8 @@ def main() -> None:
     )
     parser.add_argument("--runs", type=int, default=1, help="in each world")
     given = parser.parse_args()
+    if given.control and given.place != FAST:
+        parser.error("--control: the robot stands in the fast simulator alone; leave out --in")
     found = courses(given.worlds)
     if given.place == MUJOCO:
         found = dict(list(found.items())[::EVERY])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import subprocess
+import sys
 from importlib import import_module
 
 import numpy as np
@@ -102,3 +104,13 @@ def test_each_world_has_its_figures(folder):
         [[one[key] for key in ("success", "score")] for one in told["worlds"].values()], axis=0
     )
     np.testing.assert_allclose(means, [told["success"], told["score"]])
+
+
+def test_a_control_that_would_drive_all_the_same_is_refused():
+    words = ("--control", "standing", "--in", "mujoco_dds")
+    done = subprocess.run(
+        [sys.executable, str(BENCHMARKS / "barn.py"), *words],
+        capture_output=True, text=True, check=False, timeout=100.0,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert "stands in the fast simulator alone; leave out --in" in done.stderr
