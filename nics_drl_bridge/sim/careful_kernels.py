@@ -2,7 +2,9 @@
 
 All bodies move at the same time. At the first contact, each body that approached the other stops:
 a robot until the end of the substep, an obstacle until the end of the period. Then the next
-contact is sought. Shared arguments: m is a robot, until and time are in the substep [s].
+contact is sought. A robot that touched something before does not stop but is turned aside: it
+loses what would bring it nearer, and slides and turns on. Shared arguments: m is a robot, until
+and time are in the substep [s].
 """
 
 import math
@@ -22,7 +24,18 @@ from nics_drl_bridge.robot.kernels import (
 )
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import impact_kernels as impact
-from nics_drl_bridge.sim.impact_kernels import AFTER, DEPTH, STOP, TIME, TURN, VX, VY, Moving
+from nics_drl_bridge.sim.impact_kernels import (
+    AFTER,
+    DEPTH,
+    FROM,
+    HOLDS,
+    STOP,
+    TIME,
+    TURN,
+    VX,
+    VY,
+    Moving,
+)
 from nics_drl_bridge.sim.sensing_kernels import drift_of
 from nics_drl_bridge.sim.state import Array, Dynamics, Nearby, Single, State, Surroundings
 
@@ -104,6 +117,19 @@ def _within(p: int, b: int, until: float, moving: Moving) -> bool:
 
 
 @kernel
+def _hold(
+    m: int, nx: float, ny: float, px: float, py: float, time: float, events: Array, moving: Moving
+) -> None:
+    """Lets robot m, whose point (px, py) approaches something against n, come no nearer."""
+    flight, event = moving.flights[moving.first + m], events[m]
+    slides = event[impact.PRESSED] != 0.0 and event[DEPTH] >= 0.0 and (nx != 0.0 or ny != 0.0)
+    if slides and flight[HOLDS] < impact.MOST_HOLDS:
+        impact.hold(moving.first + m, nx, ny, px, py, time, moving)
+    else:
+        flight[STOP] = min(flight[STOP], time)
+
+
+@kernel
 def _settle(
     until: float, scene: Surroundings, nearby: Nearby, events: Array, touched: Array, moving: Moving
 ) -> None:
@@ -113,7 +139,7 @@ def _settle(
         events[m, TIME] = until
         if meets[m] != contacts.FREE:
             _first_touch(m, 0.0, until, scene, nearby, events, moving)
-    for _ in range(2 * moving.world.shape[0] + 2):
+    for _ in range(2 * moving.world.shape[0] + 2 + impact.MOST_HOLDS * robots):
         m = 0
         for p in range(1, robots):
             if events[p, TIME] < events[m, TIME]:
@@ -125,10 +151,17 @@ def _settle(
         touched[m] = 1
         if k >= first:
             touched[k - first] = 1
+        touch = events[m]
+        nx, ny = touch[impact.NX], touch[impact.NY]
         if own >= SHARE * (own + others):
-            flights[first + m, STOP] = min(flights[first + m, STOP], time)
+            px, py = touch[impact.OWN_X], touch[impact.OWN_Y]
+            _hold(m, nx, ny, px, py, time, events, moving)
         if k >= 0 and others >= SHARE * (own + others):
-            flights[k, STOP] = min(flights[k, STOP], time)
+            if k >= first:
+                px, py = touch[impact.OTHERS_X], touch[impact.OTHERS_Y]
+                _hold(k - first, -nx, -ny, px, py, time, events, moving)
+            else:
+                flights[k, STOP] = min(flights[k, STOP], time)
         for p in range(robots):
             if meets[p] != contacts.FREE and (
                 p == m
@@ -140,15 +173,19 @@ def _settle(
 
 @kernel
 def _arrive(
-    n: int, any_moves: bool, motion: Dynamics, state: State, nearby: Nearby, single: Single
-) -> None:
+    n: int, any_moves: bool, motion: Dynamics, state: State, nearby: Nearby, single: Single,
+    moving: Moving,
+) -> None:  # fmt: skip
     bodies, velocity, start = state.bodies[n], state.velocity[n], single.start
     for m in range(nearby.meets.shape[0]):
         if nearby.meets[m] != contacts.FREE:
-            body, flight = bodies[velocity.shape[0] + m], single.flights[velocity.shape[0] + m]
-            _fly(single.trial, body, flight, flight[STOP], motion.series)
-            for i in range(5):
-                body[i] = single.trial[i]
+            me = velocity.shape[0] + m
+            body, flight = bodies[me], moving.flights[me]
+            x, y, c, s = impact.pose_at(me, flight[STOP], moving)
+            body[HEADING] += flight[TURN] * (flight[STOP] - flight[FROM])
+            body[X], body[Y], body[COS], body[SIN] = x, y, c, s
+            if flight[STOP] < motion.dt or flight[HOLDS] > 0.0:
+                single.events[m, impact.PRESSED] = 1.0
             if single.events[m, DEPTH] < 0.0:
                 single.events[m, DEPTH] = single.events[m, AFTER]
     for k in range(velocity.shape[0] if any_moves else 0):
@@ -168,14 +205,17 @@ def move_carefully(
 ) -> None:  # fmt: skip
     """Moves the robots of one world that may meet something by one period, up to their contacts.
 
-    A robot in contact is marked and stops for the rest of the substep, and again in the next ones
-    while it would come nearer. One that already overlaps something gets no deeper. Without a
-    contact it moves exactly as in `step_kernels.move_freely`. An obstacle stopped by a robot is
-    left with its mean velocity over the period; `any_moves` is true if any obstacle does.
+    A robot in contact is marked and stops for the rest of the substep. In the next ones it slides
+    along what it touches, and turns, as far as that lets it. One that already overlaps something
+    gets no deeper. Without a contact it moves exactly as in `step_kernels.move_freely`. An obstacle
+    stopped by a robot is left with its mean velocity over the period; `any_moves` is true if any
+    obstacle does.
     """
     events, touched, dt = single.events, state.collided[n], motion.dt
     first, meets = state.velocity.shape[1], nearby.meets
-    moving = Moving(state.bodies[n], single.flights, first, scene.outlines, motion.series)
+    moving = Moving(
+        state.bodies[n], single.flights, first, single.holds, scene.outlines, motion.series
+    )
     for m in range(meets.shape[0]):
         single.flights[first + m, :] = 0.0
         if meets[m] != contacts.FREE:
@@ -193,13 +233,14 @@ def move_carefully(
                 rates_at(n, m, j, state, motion, single)
                 flight, dq = single.flights[first + m], single.dq
                 flight[VX], flight[VY], flight[TURN], flight[STOP] = dq[0], dq[1], dq[2], dt
+                flight[FROM] = flight[HOLDS] = 0.0
                 for s in range(state.state.shape[2]):
                     now, bounds = state.state[n, m, s], bounds_of(motion.terms, s)
                     state.state[n, m, s] = next_state(now, dq[3 + s], dt, bounds)
                 if events[m, DEPTH] < 0.0:
                     _leave(m, dt, scene, nearby, single, moving)
         _settle(dt, scene, nearby, events, touched, moving)
-        _arrive(n, any_moves, motion, state, nearby, single)
+        _arrive(n, any_moves, motion, state, nearby, single, moving)
     if any_moves:
         period = motion.substeps * dt
         contacts.move_obstacles(state.bodies, single.start, state.velocity, n, period)
@@ -216,8 +257,9 @@ def _check_overlap(
 ) -> None:
     events, body = single.events, moving.world[moving.first + m]
     depth, whom = contacts.contact(
-        body, m, moving.world, scene, nearby, single.spare, 2.0 * impact.NOTHING
+        body, m, moving.world, scene, nearby, single.spare, 4.0 * impact.SLACK
     )
+    events[m, impact.PRESSED] = depth <= 2.0 * impact.SLACK
     events[m, DEPTH] = min(depth, -np.finfo(np.float64).tiny) if depth <= impact.NOTHING else 0.0
     if depth < 0.0:
         touched[m] = 1
@@ -243,7 +285,7 @@ def drift_carefully(
     """Lets the robots of one world drift, one after the other, up to their contacts."""
     pose, collided, meets = state.pose, state.collided, nearby.meets
     flights, events, first = single.flights, single.events, state.velocity.shape[1]
-    moving = Moving(state.bodies[n], flights, first, scene.outlines, motion.series)
+    moving = Moving(state.bodies[n], flights, first, single.holds, scene.outlines, motion.series)
     stood = False
     for m in range(pose.shape[1]):
         if collided[n, m] != 0:

@@ -16,19 +16,30 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SIN, OutlineArrays, X, Y
+from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SIN, OutlineArrays, X, Y
 from nics_drl_bridge.robot.kernels import move
 from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim.state import Array, MapField
 
-VX, VY, TURN, STOP, FLIGHT = range(5)
-"""Columns of `flights`: velocity [m/s, m/s, rad/s], and time of its stop in the substep [s]."""
-TIME, WITH, OWN, OTHERS, DEPTH, AFTER, EVENT = range(7)
+VX, VY, TURN, STOP, FROM, WISH_X, WISH_Y, WISH_TURN, HOLDS, FLIGHT = range(10)
+"""Columns of `flights`: velocity [m/s, m/s, rad/s]; time of its stop in the substep [s]; time at
+which the body is where `world` says [s]; the velocity that a robot would have if nothing held it;
+and the number of its `holds`, with which both are in the map frame, too."""
+HOLD_X, HOLD_Y, ARM, PUSH, HOLD = range(5)
+"""Columns of `holds`: direction away from what holds a robot; lever arm of its point there [m]; and
+the speed that it is given [m/s]."""
+MOST_HOLDS = 8  # Of a robot in a substep; then it stops: it is wedged in
+SWEEPS = 30  # Through the holds, to find the speeds with which they agree
+(
+    TIME, WITH, OWN, OTHERS, NX, NY, OWN_X, OWN_Y, OTHERS_X, OTHERS_Y, DEPTH, AFTER, PRESSED, EVENT,
+) = range(14)  # fmt: skip
 """Columns of `events`: time of a robot's first contact [s]; the other body; the rates of its own
-and of the other's nearest point along the direction between them, negative if approaching [m/s];
-and the clearance, negative where it overlaps something, before and after the substep [m]."""
+and of the other's nearest point along the direction (NX, NY) from the other to it, 0 if there is
+none, negative if approaching [m/s]; these points [m]; the clearance, negative where it overlaps
+something, before and after the substep [m]; and 1 if it touched something before."""
 SLACK = 1e-7  # Bodies touch if they are nearer than this to each other and approach [m]
 NOTHING = 1e-12  # Distances up to this count as zero [m]
+PARTING = 1e-5  # Speed at which what is turned aside parts, so that roundings don't add up [m/s]
 MOST_LOOKS = 2000  # After so many a pair counts as touching: only absurdly fast turns need more
 
 
@@ -36,8 +47,9 @@ class Moving(NamedTuple):
     """The bodies of one world within a substep."""
 
     world: Array  # (K + M, 7) obstacles, then robots, as the substep begins
-    flights: Array  # (K + M, FLIGHT) their motion; obstacles in the map frame, robots in their own
+    flights: Array  # (K + M, FLIGHT) their motion; robots in their own frame, all else in the map
     first: int  # index of the first robot
+    holds: Array  # (M, MOST_HOLDS, HOLD) contacts that the robots may not come nearer to
     outlines: OutlineArrays
     series: Array  # see `robot.kernels`
 
@@ -49,6 +61,20 @@ class Edge(NamedTuple):
     ay: float
     bx: float
     by: float
+
+
+class Contact(NamedTuple):
+    """The first contact of two edges; its fields are columns of `events`."""
+
+    time: float
+    own: float
+    others: float
+    nx: float
+    ny: float
+    own_x: float
+    own_y: float
+    others_x: float
+    others_y: float
 
 
 class Placed(NamedTuple):
@@ -64,15 +90,21 @@ class Placed(NamedTuple):
 
 
 @kernel
+def in_own_frame(b: int, moving: Moving) -> bool:
+    """True if the velocity of a body is in its own frame: that of a robot until it slides."""
+    return b >= moving.first and moving.flights[b, HOLDS] == 0.0  # type: ignore[no-any-return]
+
+
+@kernel
 def pose_at(b: int, time: float, moving: Moving) -> tuple[float, float, float, float]:
     """Returns x, y [m], cosine and sine of the heading of a body at a time."""
     if b < 0:
         return 0.0, 0.0, 1.0, 0.0
     world, flights = moving.world, moving.flights
-    time = min(time, flights[b, STOP])
+    time = max(min(time, flights[b, STOP]) - flights[b, FROM], 0.0)
     x, y, c, s = world[b, X], world[b, Y], world[b, COS], world[b, SIN]
     vx, vy, turn = flights[b, VX], flights[b, VY], flights[b, TURN] * time
-    if b >= moving.first:
+    if in_own_frame(b, moving):
         return move(x, y, c, s, vx, vy, turn, time, moving.series)  # type: ignore[no-any-return]
     if turn != 0.0:
         cos, sin = math.cos(turn), math.sin(turn)
@@ -88,7 +120,7 @@ def _placed_at(b: int, edge: Edge, time: float, moving: Moving) -> Placed:
         return Placed(there, x, y, 0.0, 0.0, 0.0, 0.0)
     flight = moving.flights[b]
     vx, vy, turn = flight[VX], flight[VY], flight[TURN]
-    if b < moving.first:
+    if not in_own_frame(b, moving):
         return Placed(there, x, y, vx, vy, turn, 0.0)
     bend = abs(turn) * math.sqrt(vx * vx + vy * vy)
     return Placed(there, x, y, c * vx - s * vy, s * vx + c * vy, turn, bend)
@@ -152,8 +184,11 @@ def _rate(nx: float, ny: float, body: Placed, x: float, y: float) -> float:
 @kernel
 def _free_time(
     p: Placed, q: Placed, nx: float, ny: float, gap: float, bend: float
-) -> tuple[float, float, float]:
-    """Time in which edges `gap` [m] apart along n (q to p) cannot meet, with its corners' rates."""
+) -> tuple[float, float, float, bool, bool]:
+    """Time in which edges `gap` [m] apart along n (q to p) cannot meet.
+
+    With it come the rates of the corners that would meet first, and True for the first ends.
+    """
     far, far2 = nx * p.edge.ax + ny * p.edge.ay, nx * p.edge.bx + ny * p.edge.by
     near, near2 = nx * q.edge.ax + ny * q.edge.ay, nx * q.edge.bx + ny * q.edge.by
     rate_p, rate_p2 = _rate(nx, ny, p, p.edge.ax, p.edge.ay), _rate(nx, ny, p, p.edge.bx, p.edge.by)
@@ -161,24 +196,23 @@ def _free_time(
     rate_q2 = -_rate(nx, ny, q, q.edge.bx, q.edge.by)
     front, beyond = min(far, far2), max(near, near2)
     keep = 0.5 * SLACK if gap > SLACK else 0.25 * gap
-    free, own, others = np.inf, 0.0, 0.0
-    for ahead, u in ((far, rate_p), (far2, rate_p2)):
-        for behind, v in ((near, rate_q), (near2, rate_q2)):
+    free, own, others, first_p, first_q = np.inf, 0.0, 0.0, True, True
+    for ahead, u, of_p in ((far, rate_p, True), (far2, rate_p2, False)):
+        for behind, v, of_q in ((near, rate_q, True), (near2, rate_q2, False)):
             root = _root(gap - keep + (ahead - front) + (beyond - behind), u + v, bend)
             if root < free:
-                free, own, others = root, u, v
-    return free, own, others
+                free, own, others, first_p, first_q = root, u, v, of_p, of_q
+    return free, own, others, first_p, first_q
 
 
 @kernel
 def touch(
     a: int, edge: Edge, round_a: float, b: int, other: Edge, round_b: float,
     begin: float, until: float, moving: Moving,
-) -> tuple[float, float, float]:  # fmt: skip
-    """Returns the time [s] of the first contact of an edge of body a with one of body b, else inf.
+) -> Contact:  # fmt: skip
+    """Returns the first contact of an edge of body a with one of body b; its time is inf if none.
 
-    With it come the velocities of the nearest points of both along the direction between them
-    [m/s]. The edges are in the bodies' frames, with a radius [m] around each.
+    The edges are in the bodies' frames, with a radius [m] around each.
     """
     reach_a, reach_b, time, flights = _reach(edge), _reach(other), begin, moving.flights
     for _ in range(MOST_LOOKS):
@@ -186,21 +220,61 @@ def touch(
         nx, ny = _between(p.edge, q.edge)
         away = math.sqrt(nx * nx + ny * ny)
         if away <= NOTHING:
-            return time, -1.0, -1.0
+            break
         gap, nx, ny = max(away - round_a - round_b, NOTHING), nx / away, ny / away
         bend = p.bend + q.bend + p.turn * p.turn * reach_a + q.turn * q.turn * reach_b
-        free, own, others = _free_time(p, q, nx, ny, gap, bend)
+        free, own, others, first_p, first_q = _free_time(p, q, nx, ny, gap, bend)
         rest = _next_stop(b, time, _next_stop(a, time, until, flights), flights) - time
         if free >= rest:
             if time + rest >= until:
-                return np.inf, 0.0, 0.0
+                return Contact(np.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
             time += rest
             continue
-        closing = -(own + others)
-        if gap <= SLACK and closing * rest >= 0.5 * gap:
-            return time, own, others
+        # Nearer than half the slack not even a creep is let through: it would end in an overlap.
+        least = 0.5 * gap if gap > 0.5 * SLACK else NOTHING
+        if gap <= SLACK and -(own + others) * rest >= least:
+            ax, ay = (p.edge.ax, p.edge.ay) if first_p else (p.edge.bx, p.edge.by)
+            bx, by = (q.edge.ax, q.edge.ay) if first_q else (q.edge.bx, q.edge.by)
+            return Contact(time, own, others, nx, ny, ax, ay, bx, by)
         time += free
-    return time, -1.0, -1.0
+    return Contact(time, -1.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+@kernel
+def hold(
+    b: int, nx: float, ny: float, px: float, py: float, time: float, moving: Moving
+) -> None:  # fmt: skip
+    """Lets the point (px, py) of a robot approach nothing against n from a time on.
+
+    Of all motions that its holds allow, it makes the one nearest to its wish by the energy of a
+    ring: it slides without friction, and a corner that is held turns it aside. The speeds
+    that the holds give are found by projected Gauss-Seidel sweeps.
+    """
+    flight, body, holds = moving.flights[b], moving.world[b], moving.holds[b - moving.first]
+    count, inertia = int(flight[HOLDS]), body[RADIUS] * body[RADIUS]
+    x, y, c, s = pose_at(b, time, moving)
+    if count == 0:
+        vx, vy = flight[VX], flight[VY]
+        flight[WISH_X], flight[WISH_Y] = c * vx - s * vy, s * vx + c * vy
+        flight[WISH_TURN] = flight[TURN]
+    body[HEADING] += flight[TURN] * (time - flight[FROM])
+    body[X], body[Y], body[COS], body[SIN] = x, y, c, s
+    holds[count, HOLD_X], holds[count, HOLD_Y], holds[count, PUSH] = nx, ny, 0.0
+    holds[count, ARM] = (px - x) * ny - (py - y) * nx
+    vx, vy, turn = flight[WISH_X], flight[WISH_Y], flight[WISH_TURN]
+    for i in range(count):
+        vx += holds[i, PUSH] * holds[i, HOLD_X]
+        vy += holds[i, PUSH] * holds[i, HOLD_Y]
+        turn += holds[i, PUSH] * holds[i, ARM] / inertia
+    for _ in range(SWEEPS if count else 1):
+        for i in range(count + 1):
+            ux, uy, arm = holds[i, HOLD_X], holds[i, HOLD_Y], holds[i, ARM]
+            lacks = PARTING - ux * vx - uy * vy - turn * arm
+            push = max(holds[i, PUSH] + lacks / (1.0 + arm * arm / inertia), 0.0)
+            more, holds[i, PUSH] = push - holds[i, PUSH], push
+            vx, vy, turn = vx + more * ux, vy + more * uy, turn + more * arm / inertia
+    flight[VX], flight[VY], flight[TURN], flight[FROM] = vx, vy, turn, time
+    flight[HOLDS] += 1.0
 
 
 @kernel
@@ -238,9 +312,17 @@ def touch_edge(
     round_a = world[a, RADIUS] if outline.begin == outline.end else 0.0
     for v in range(_edges(outline)):
         edge = _edge_of(v, outline)
-        time, own, others = touch(a, edge, round_a, b, other, round_b, begin, event[TIME], moving)
-        if time < event[TIME]:
-            event[TIME], event[WITH], event[OWN], event[OTHERS] = time, b, own, others
+        found = touch(a, edge, round_a, b, other, round_b, begin, event[TIME], moving)
+        if found.time < event[TIME]:
+            event[TIME], event[WITH], event[OWN], event[OTHERS] = (
+                found.time,
+                b,
+                found.own,
+                found.others,
+            )
+            event[NX], event[NY] = found.nx, found.ny
+            event[OWN_X], event[OWN_Y] = found.own_x, found.own_y
+            event[OTHERS_X], event[OTHERS_Y] = found.others_x, found.others_y
 
 
 @kernel

@@ -360,6 +360,117 @@ def test_a_robot_that_is_placed_in_something_may_leave_it_and_gets_no_deeper():
     assert simulator.data.collided[:, 0].tolist() == [1, 1, 0]
 
 
+def turned_by(simulator, twist, steps):
+    """Drives one robot by a twist; returns how far it turned [rad]."""
+    turned, before = 0.0, simulator.data.pose[0, 0, 2]
+    for _ in range(steps):
+        simulator.step([[twist]])
+        after = simulator.data.pose[0, 0, 2]
+        turned, before = turned + (after - before + np.pi) % (2.0 * np.pi) - np.pi, after
+    return turned
+
+
+def at_a_wall(footprint, x, heading=0.0):
+    """One robot at (x, 0), a wall along y at x = 1."""
+    world = field(8.0, walls=[(1.0, -4.0, 1.0, 4.0)])
+    simulator = FastSimulator(fast_model(footprint), world, tell=silent)
+    simulator.reset([0], starts=np.array([[[x, 0.0, heading]]]))
+    return simulator
+
+
+def test_a_round_robot_that_pushes_against_a_wall_turns_as_told_and_leaves():
+    simulator = at_a_wall(0.2, 0.7)
+    simulator.step([[[30.0, 0.0, 0.0]]])
+    assert simulator.data.pose[0, 0] == pytest.approx([0.8, 0.0, 0.0], abs=OVERLAP)
+    assert turned_by(simulator, [0.5, 0.0, 2.0], 75) == pytest.approx(1.5, abs=1e-6)
+    assert simulator.data.pose[0, 0, 0] == pytest.approx(0.8, abs=OVERLAP)
+    assert turned_by(simulator, [0.5, 0.0, 2.0], 75) == pytest.approx(1.5, abs=1e-6)
+    turned_by(simulator, [0.5, 0.0, 0.0], 100)
+    assert simulator.data.pose[0, 0, 0] < 0.4
+
+
+def test_a_robot_whose_push_against_a_wall_dies_away_is_not_held_there():
+    simulator = at_a_wall(0.2, 0.7)
+    for k in range(400):
+        simulator.step([[[0.5 * 0.9**k, 0.0, 0.0]]])
+    assert turned_by(simulator, [0.0, 0.0, 2.0], 150) == pytest.approx(3.0)
+    turned_by(simulator, [1.0, 0.0, 0.0], 10)
+    assert simulator.data.pose[0, 0, 0] < 0.71
+
+
+def test_a_robot_that_drives_into_a_wall_at_a_slant_slides_along_it():
+    simulator = at_a_wall(0.2, 0.7, heading=0.5)
+    turned_by(simulator, [1.0, 0.0, 0.0], 20)
+    assert simulator.data.pose[0, 0, 0] == pytest.approx(0.8, abs=1e-6)
+    before = simulator.data.pose[0, 0, 1]
+    turned_by(simulator, [1.0, 0.0, 0.0], 100)
+    after = [0.8, before + np.sin(0.5), 0.5]
+    assert simulator.data.pose[0, 0] == pytest.approx(after, abs=1e-6)
+
+
+def test_a_wall_turns_a_robot_with_corners_parallel_and_lets_it_leave():
+    simulator = at_a_wall(BAR, 0.7, heading=np.pi / 2.0 - 0.4)
+    turned_by(simulator, [1.0, 0.0, 0.0], 350)
+    assert simulator.data.pose[0, 0, 0] == pytest.approx(0.95, abs=5e-3)
+    assert simulator.data.pose[0, 0, 2] == pytest.approx(np.pi / 2.0, abs=2e-2)
+    assert turned_by(simulator, [0.0, 0.0, 2.0], 150) > 1.0
+    turned_by(simulator, [1.0, 0.0, 0.0], 60)
+    assert simulator.data.pose[0, 0, 0] < 0.6
+
+
+def test_a_robot_that_is_pushed_flat_against_a_wall_stands():
+    simulator = at_a_wall(BAR, 0.6)
+    turned_by(simulator, [1.0, 0.0, 0.3], 100)
+    assert simulator.data.pose[0, 0, 0] == pytest.approx(0.7, abs=1e-2)
+    stands = simulator.data.pose[0, 0].copy()
+    turned_by(simulator, [1.0, 0.0, 0.3], 100)
+    assert simulator.data.pose[0, 0] == pytest.approx(stands, abs=1e-3)
+
+
+def test_a_robot_in_a_narrow_corner_stands_still_and_comes_out_again():
+    walls = [(1.0, 0.0, -1.0, 0.3), (1.0, 0.0, -1.0, -0.3)]
+    simulator = FastSimulator(fast_model(0.1), field(8.0, walls=walls), tell=silent)
+    simulator.reset([0], starts=np.array([[[-0.5, 0.0, 0.3]]]))
+    turned_by(simulator, [1.0, 0.0, 0.0], 100)
+    stuck = simulator.data.pose[0, 0].copy()
+    turned_by(simulator, [1.0, 0.0, 0.0], 20)
+    assert simulator.data.pose[0, 0] == pytest.approx(stuck, abs=1e-5)
+    turned_by(simulator, [-1.0, 0.0, 0.0], 20)
+    assert simulator.data.pose[0, 0, 0] < stuck[0] - 0.15
+
+
+@pytest.mark.parametrize("footprint", [BAR, DART], ids=["bar", "dart"])
+def test_nothing_overlaps_where_robots_with_corners_push_and_slide(footprint):
+    rng, number = np.random.default_rng(3), 24
+    groups = [{"shapes": [CIRCLE, PLATE], "count": 4}]
+    world = field(3.0, obstacles=groups, walls=[(0.0, 0.0, 1.0, 0.4)])
+    simulator = FastSimulator(fast_model(footprint), world, number, 2, tell=silent)
+    drawn = simulator.reset(range(number))
+    shapes, moved = simulator.sampler.shapes, 0.0
+    scenes = [
+        [still(world.all_walls())]
+        + [still(*edges_of(shapes[int(body[6])], body[:3])) for body in bodies]
+        for bodies in drawn.bodies
+    ]
+    for k in range(120):
+        if k % 15 == 0:
+            twists = rng.uniform(-1.0, 1.0, (number, 2, 3)) * [4.0, 4.0, 10.0]
+        before = simulator.data.pose[..., :2].copy()
+        simulator.step(twists)
+        touching = simulator.data.collided != 0
+        moved += np.abs(simulator.data.pose[..., :2] - before)[touching].sum()
+        if k % 10:
+            continue
+        for n in range(number):
+            ends = simulator.data.pose[n]
+            robots = [footprint_mover(footprint, end, np.zeros(3)) for end in ends]
+            for robot, rest in ((robots[0], [*scenes[n], robots[1]]), (robots[1], scenes[n])):
+                gaps = [clearance(robot, other, np.zeros(1))[0] for other in rest]
+                assert min(gaps) > 0.0, (n, k)
+    assert simulator.data.collided.any(axis=1).sum() > number // 2
+    assert moved > 1.0
+
+
 def test_a_model_that_could_cross_the_world_in_a_step_is_refused():
     model = fast_model(0.05)
     about = model.robot.model_dump()

@@ -241,8 +241,9 @@ def test_a_long_robot_that_turns_touches_what_it_turns_into():
     for _ in range(10):
         simulator.step([[[0.0, 0.0, 1.0]]])
     assert simulator.data.collided[0, 0] == 1
-    corner = 0.3 * np.sin(simulator.data.pose[0, 0, 2]) + 0.1 * np.cos(simulator.data.pose[0, 0, 2])
-    assert corner == pytest.approx(0.2, abs=OVERLAP)
+    _, y, heading = simulator.data.pose[0, 0]
+    corner = y + 0.3 * np.sin(heading) + 0.1 * np.cos(heading)
+    assert corner == pytest.approx(0.2, abs=1e-5)
 
 
 def test_two_long_robots_touch_by_their_outlines():
