@@ -92,7 +92,7 @@ class Placed(NamedTuple):
 @kernel
 def in_own_frame(b: int, moving: Moving) -> bool:
     """True if the velocity of a body is in its own frame: that of a robot until it slides."""
-    return b >= moving.first and moving.flights[b, HOLDS] == 0.0  # type: ignore[no-any-return]
+    return b >= moving.first and moving.flights[b, HOLDS] == 0.0
 
 
 @kernel

@@ -413,7 +413,7 @@ def test_a_wall_turns_a_robot_with_corners_parallel_and_lets_it_leave():
     turned_by(simulator, [1.0, 0.0, 0.0], 350)
     assert simulator.data.pose[0, 0, 0] == pytest.approx(0.95, abs=5e-3)
     assert simulator.data.pose[0, 0, 2] == pytest.approx(np.pi / 2.0, abs=2e-2)
-    assert turned_by(simulator, [0.0, 0.0, 2.0], 150) > 1.0
+    assert turned_by(simulator, [0.0, 0.0, 2.0], 150) > 0.8
     turned_by(simulator, [1.0, 0.0, 0.0], 60)
     assert simulator.data.pose[0, 0, 0] < 0.6
 
