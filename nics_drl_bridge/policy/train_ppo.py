@@ -22,7 +22,13 @@ from numpy.typing import NDArray
 from stable_baselines3.common.logger import Logger
 
 from nics_drl_bridge.policy import train_imitation
-from nics_drl_bridge.policy.train_algorithms import LEAST_RATE, Actor, check_serves, layers_of
+from nics_drl_bridge.policy.train_algorithms import (
+    LEAST_RATE,
+    Actor,
+    act_of,
+    check_serves,
+    layers_of,
+)
 from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch
 from nics_drl_bridge.policy.train_memory import memory_of
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
@@ -318,7 +324,7 @@ class LeanPpo:
         self._successes: deque[bool] = deque(maxlen=RECENT)
 
     def learn(self, watch: Watch, logger: Logger) -> None:
-        """Learns until all steps are done."""
+        """Learns until all steps are done, or the watch ends it."""
         watch.begin(self.steps)
         if self._rollout is None:
             self.collector.last = self.collector.env.reset()
@@ -326,6 +332,9 @@ class LeanPpo:
             self._take(watch, *self.collector.collect())
         while self._rollout:
             watch.keep(self.steps)
+            if watch.ends(self.steps, act_of(self.policy), logger):
+                watch.report(self.steps, self._successes, logger)
+                return
             loss = self._advance(self._rollout, watch)
             if watch.report(self.steps, self._successes, logger):
                 logger.record("train/loss", loss)

@@ -73,6 +73,14 @@ class ImitationSettings(Schema):
     epochs: Count = 10  # passes through them
 
 
+class StopSettings(Schema):
+    """An early end, as soon as held-out success has stood in two evaluations in a row."""
+
+    success: Share  # least share of the episodes in each world
+    every: Count = 200_000  # environment steps between two evaluations
+    episodes: int = Field(default=200, ge=1, le=10_000)  # in each world, others each time
+
+
 class TrainingSettings(Schema):
     """A training, as in `config/training/*.yaml`; `worlds` maps names or files to their copies."""
 
@@ -83,7 +91,8 @@ class TrainingSettings(Schema):
     worlds: dict[str, Count] = Field(default_factory=lambda: {"circles": 256}, min_length=1)
     randomisation: str | None = None  # quantities drawn in each episode: a shipped one or a file
     teaching: Teaching = Teaching()  # rewards by what only the simulator knows, and repetition
-    steps: Count = 1_000_000  # environment steps of all worlds together
+    steps: Count = 1_000_000  # environment steps of all worlds together, at most with `stop`
+    stop: StopSettings | None = None  # ends earlier
     max_episode_steps: Count = 300  # an episode ends as a time-out after this many steps
     algorithm: Literal["ppo", "sac"] = "ppo"
     hidden: tuple[Width, ...] = Field(default=(64, 64), min_length=1, max_length=MOST_LAYERS)

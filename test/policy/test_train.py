@@ -105,6 +105,30 @@ def test_an_interrupted_training_comes_to_the_same_weights(engine, actions, tmp_
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("engine", ["lean", "stack", "sb3", "sac"])
+def test_a_training_that_stops_early_comes_to_the_same_end_if_interrupted(
+    engine, tmp_path, monkeypatch
+):
+    stop = {"success": 0.01, "every": 320, "episodes": 40}  # a random robot arrives now and then
+    chosen = settings(steps=16000, stop=stop, **ENGINES[engine])
+    whole = train(chosen, 1, tmp_path / "whole")
+    assert 640 <= whole.steps < 16000
+
+    def interrupt(progress):
+        if not np.isnan(progress.held_out):
+            raise BrokenOffError
+
+    monkeypatch.setattr("nics_drl_bridge.policy.train_checkpoint.TOLD_S", 0.0)
+    with pytest.raises(BrokenOffError):
+        train(chosen, 1, tmp_path / "broken", interrupt)
+    for _ in range(2):  # what has ended does not go on
+        again = train(chosen, 1, tmp_path / "broken", resumed=True)
+        assert again.steps == whole.steps
+        for name, value in weights(whole.algorithm).items():
+            assert torch.equal(value, weights(again.algorithm)[name]), name
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("engine", "parameter"),
     [
