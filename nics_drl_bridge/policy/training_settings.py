@@ -36,6 +36,7 @@ class PpoSettings(Schema):
     clip: float = Field(default=0.2, gt=0.0)
     entropy: float = Field(default=0.0, ge=0.0)
     log_std: float = -0.5  # of the actions at the start
+    mirror: bool = False  # True learns from half of the transitions with left and right exchanged
 
 
 class StackMemory(Schema):
@@ -114,6 +115,10 @@ class TrainingSettings(Schema):
     def _holdable(self) -> TrainingSettings:
         if self.memory is not None and not self.lean:
             raise ValueError("ppo's engine 'lean' alone learns a memory; use it, or leave it out")
+        if self.ppo.mirror and not self.lean:
+            raise ValueError("ppo's engine 'lean' alone learns by ppo.mirror; leave that out")
+        if self.ppo.mirror and isinstance(self.memory, GruMemory):
+            raise ValueError("the state of a gru has no mirror image; leave out ppo.mirror")
         if self.num_envs > MOST_WORLDS:
             raise ValueError(f"all worlds together may have {MOST_WORLDS} copies")
         kept = self.num_envs * self.ppo.rollout if self.algorithm == "ppo" else self.sac.buffer

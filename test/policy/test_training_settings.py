@@ -64,6 +64,8 @@ def test_a_robot_or_task_without_settings_gets_the_defaults():
         ("memory: {kind: lstm}", r"key 'memory': unknown kind 'lstm'; .*'stack'"),
         ("memory: {kind: gru, scans: 4}", r"unknown key 'memory.*scans'; .*'units'"),
         ("memory: {kind: stack, scans: 1}", r"key 'memory.*scans': .* greater than or equal to 2"),
+        ("memory: {kind: gru}\nppo: {mirror: true}", r"a gru has no mirror image; leave out ppo"),
+        ("ppo: {engine: sb3, mirror: true}", r"engine 'lean' alone learns by ppo.mirror; leave"),
         ("memory: {kind: gru}\nppo: {engine: sb3}", r"ppo's engine 'lean' alone learns a memory"),
         ("memory: {kind: stack}\nalgorithm: sac", r"ppo's engine 'lean' alone learns a memory"),
         ("task_options: {robot: x}", r"task_options can't hold 'robot', which the model gives"),
