@@ -121,6 +121,7 @@ class Watch:
     ) -> None:  # fmt: skip
         self._env, self._seed, self._save, self._tell = env, seed, save, tell
         self._stop = stop
+        self._levels = list(settings.worlds) if settings.teaching.curriculum else []
         self._total, self._every = settings.steps, settings.checkpoint_every
         self.collisions: deque[bool] = deque(maxlen=RECENT)  # of the last episodes
 
@@ -160,6 +161,8 @@ class Watch:
         logger.record("rollout/success_rate", progress.success)
         logger.record("rollout/collision_rate", progress.collision)
         logger.record("time/env_share", progress.env_share)
+        for world, one in zip(self._levels, self._env.envs, strict=False):
+            logger.record(f"curriculum/{world}", one.level)
         self._tell(progress)
         return True
 

@@ -84,7 +84,8 @@ def steps_in(path):
     ],
 )
 def test_an_interrupted_training_comes_to_the_same_weights(engine, actions, tmp_path, monkeypatch):
-    teaching = {"path": 1.0, "contact": -10.0, "retries": 1}
+    curriculum = {"success": 0.01}  # so that levels rise
+    teaching = {"path": 1.0, "contact": -10.0, "retries": 1, "curriculum": curriculum}
     chosen = settings(task_options={"actions": actions}, teaching=teaching, **ENGINES[engine])
     whole = train(chosen, 1, tmp_path / "whole")
 

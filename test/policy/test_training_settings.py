@@ -58,6 +58,10 @@ def test_a_robot_or_task_without_settings_gets_the_defaults():
         ("worlds: {}", r"key 'worlds'"),
         ("worlds: {arena: 0}", r"key 'worlds.arena': .* greater than or equal to 1, not 0"),
         ("steps: 0.5", r"key 'steps'"),
+        (
+            "teaching: {curriculum: {begin: 0}}",
+            r"key 'teaching.curriculum.begin': .* greater than 0",
+        ),
         ("stop: {every: 10}", r"the key 'stop.success' is missing"),
         ("stop: {success: 1.1}", r"key 'stop.success': .* less than or equal to 1, not 1.1"),
         ("memory: {units: 8}", r"the key 'memory.kind' is missing"),
