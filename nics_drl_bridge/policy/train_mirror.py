@@ -1,8 +1,9 @@
 """Mirrored transitions: a robot that learnt to pass on the left has learnt to pass on the right.
 
-About half of the transitions of a rollout, drawn at random, are replaced by their mirror images
-(Abdolhosseini and others 2019, `DUP` without the copies). Their old probability is that with which
-the policy that drove would have done the mirrored action.
+To the transitions of a rollout come their mirror images, with the same advantages and returns
+(`DUP` of Abdolhosseini and others 2019). Each was as probable as the action that was drawn, since a
+mirrored policy would have driven so. What the policy itself would have done in the mirrored place
+is no measure: where it is not symmetric yet, ratios to that grow without bound.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge.env.mirror import Mirror
 
 if TYPE_CHECKING:
-    from nics_drl_bridge.policy.train_ppo import Networks, Transitions
+    from nics_drl_bridge.policy.train_ppo import Transitions
 
 Array = NDArray[np.float64]
 
@@ -37,7 +38,7 @@ class Reflection:
         self._uneven = torch.from_numpy((mirror.offset != 0.0) | (np.abs(mirror.scale) != 1.0))
 
     def balanced(self, mean: Array, std: Array) -> tuple[Array, Array]:
-        """Mean and deviation (O,) of observations that are mirrored half of the time.
+        """Mean and deviation (O,) of observations and their mirror images together.
 
         A normaliser with them mirrors alike before and after.
         """
@@ -58,17 +59,12 @@ class Reflection:
         beyond = (mirrored.abs() > 1.0) & self._uneven
         return mirrored, ~beyond.any(1)
 
-    def mirror(
-        self, rollout: Transitions, networks: Networks, generator: torch.Generator
-    ) -> Transitions:
-        """Replaces half of the transitions, of those whose mirror image the robot can do."""
+    def doubled(self, rollout: Transitions) -> Transitions:
+        """Adds the mirror images of the transitions, of those that the robot can do."""
         actions, possible = self.actions(rollout.actions)
-        drawn = torch.rand(len(possible), generator=generator) < 0.5
-        rows = (drawn & possible).nonzero().squeeze(1)
-        seen = self.seen(rollout.seen[rows])
-        log_probs = networks.log_probs(networks.actor.layers(seen), actions[rows])
-        return rollout._replace(
-            seen=rollout.seen.index_copy(0, rows, seen),
-            actions=rollout.actions.index_copy(0, rows, actions[rows]),
-            log_probs=rollout.log_probs.index_copy(0, rows, log_probs),
-        )
+        more = rollout._replace(
+            seen=self.seen(rollout.seen), actions=actions,
+            log_probs=rollout.log_probs - self._scale.abs().log().sum(),
+        )  # fmt: skip
+        pairs = zip(rollout[:5], more[:5], strict=True)
+        return type(rollout)(*(torch.cat([one, other[possible]]) for one, other in pairs))

@@ -290,7 +290,7 @@ class Collector:
         if networks.actor.memory.learnt:
             rollout = rollout._replace(state=first, done=done)
         if self._reflection is not None:
-            rollout = self._reflection.mirror(rollout, networks, self.generator)
+            rollout = self._reflection.doubled(rollout)
         return rollout, ended
 
     def _see(self, observations: NDArray[np.float32], state: torch.Tensor) -> Seen:
@@ -367,7 +367,7 @@ class LeanPpo:
         """Learns from a rollout, with the next one collected meanwhile."""
         rate = self._ppo.learning_rate * max(1.0 - self.steps / self._total, LEAST_RATE)
         learn = partial(self.learner.learn, rollout, rate)
-        self.steps += len(rollout.seen)
+        self.steps += self._ppo.rollout * self.collector.env.num_envs
         self.collector.networks.load_state_dict(self.networks.state_dict())
         jobs: list[Callable[[], Any]] = [learn, self.collector.collect]
         loss, *collected = run_parts(lambda job: job(), jobs[: 1 + (self.steps < self._total)])

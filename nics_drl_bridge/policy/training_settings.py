@@ -36,7 +36,7 @@ class PpoSettings(Schema):
     clip: float = Field(default=0.2, gt=0.0)
     entropy: float = Field(default=0.0, ge=0.0)
     log_std: float = -0.5  # of the actions at the start
-    mirror: bool = False  # True learns from half of the transitions with left and right exchanged
+    mirror: bool = False  # True learns from each transition with left and right exchanged, too
 
 
 class StackMemory(Schema):
@@ -121,7 +121,8 @@ class TrainingSettings(Schema):
             raise ValueError("the state of a gru has no mirror image; leave out ppo.mirror")
         if self.num_envs > MOST_WORLDS:
             raise ValueError(f"all worlds together may have {MOST_WORLDS} copies")
-        kept = self.num_envs * self.ppo.rollout if self.algorithm == "ppo" else self.sac.buffer
+        rows = self.num_envs * self.ppo.rollout * (1 + self.ppo.mirror)
+        kept = rows if self.algorithm == "ppo" else self.sac.buffer
         if kept > MOST_KEPT:
             kept_by = f"{self.algorithm} would keep {kept} transitions, and may keep {MOST_KEPT}"
             raise ValueError(f"{kept_by}; lower the copies of worlds, ppo.rollout or sac.buffer")

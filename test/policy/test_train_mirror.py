@@ -1,6 +1,10 @@
-"""Half of the transitions are mirrored, each as a whole, and as the policy would have done it."""
+"""To transitions come their mirror images, each as a whole, and as the policy would do it."""
 
 from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -9,7 +13,7 @@ from robots import direct_model, field
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.policy.train_mirror import Reflection
-from nics_drl_bridge.policy.train_ppo import LeanPpo
+from nics_drl_bridge.policy.train_ppo import LeanPpo, Transitions
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
@@ -39,28 +43,33 @@ def engine(mirror=True, actions="continuous", memory=None):
 
 @pytest.mark.parametrize("actions", ["continuous", "discrete"])
 @pytest.mark.parametrize("memory", [None, STACK])
-def test_about_half_of_the_transitions_are_mirrored_and_the_others_are_as_they_were(
-    actions, memory
-):
+def test_each_transition_is_followed_by_its_mirror_image(actions, memory):
     lean, mirror = engine(True, actions, memory)
     plain, _ = engine(False, actions, memory)
     plain.collector.networks.load_state_dict(lean.networks.state_dict())
-    mirrored, driven = (one.collector.collect()[0] for one in (lean, plain))
-    reflection = Reflection(mirror, lean.networks.actor.memory.extra, 72)
-    other = reflection.seen(driven.seen)
-    as_it_was = (mirrored.seen == driven.seen).all(1)
-    assert torch.equal(mirrored.seen, torch.where(as_it_was[:, None], driven.seen, other))
-    assert 20 < int(as_it_was.sum()) < 52
-    acted, _ = reflection.actions(driven.actions)
-    for k in range(STEPS * WORLDS):
-        assert torch.equal(mirrored.actions[k], driven.actions[k] if as_it_was[k] else acted[k])
-    assert torch.equal(mirrored.advantages, driven.advantages)
-    assert torch.equal(mirrored.returns, driven.returns)
-    networks = lean.collector.networks
-    with torch.no_grad():
-        raw = networks.actor.layers(mirrored.seen)
-        expected = networks.log_probs(raw, mirrored.actions)
-    assert torch.allclose(mirrored.log_probs, expected, atol=1e-5)
+    both, driven = (one.collector.collect()[0] for one in (lean, plain))
+    reflection, count = Reflection(mirror, lean.networks.actor.memory.extra, 72), STEPS * WORLDS
+    for one, other in zip(both[:5], driven[:5], strict=True):
+        assert len(one) == 2 * count
+        assert torch.equal(one[:count], other)
+    assert torch.equal(both.seen[count:], reflection.seen(driven.seen))
+    assert not torch.equal(both.seen[count:], driven.seen)
+    assert torch.equal(both.actions[count:], reflection.actions(driven.actions)[0])
+    assert torch.equal(both.advantages[count:], driven.advantages)
+    assert torch.equal(both.returns[count:], driven.returns)
+    assert torch.equal(both.log_probs[count:], driven.log_probs)
+
+
+def test_mirror_images_do_not_count_as_steps():
+    lean, _ = engine()
+    lean._advance(lean.collector.collect()[0], Watched())
+    assert lean.steps == STEPS * WORLDS
+
+
+class Watched:
+    """As much of a watch as a rollout needs."""
+
+    collisions: ClassVar[list[bool]] = []
 
 
 def test_normalised_observations_mirror_as_the_observations_do():
@@ -81,7 +90,7 @@ def test_a_balanced_normaliser_has_mean_and_deviation_of_both_kinds_of_observati
     np.testing.assert_allclose(std, both.std(axis=0), rtol=1e-12)
 
 
-def test_what_the_mirror_image_can_not_do_is_not_mirrored():
+def test_what_the_mirror_image_can_not_do_is_not_learnt():
     robot = MODEL.robot.model_dump(mode="json")
     robot["command"][2] |= {"min": -1.0, "max": 3.0}
     lopsided = type(MODEL.robot).model_validate(robot)
@@ -92,3 +101,15 @@ def test_what_the_mirror_image_can_not_do_is_not_mirrored():
     actions = torch.stack([torch.tensor([0.0, 1.5, float(turn)]) for turn in turns])
     _, possible = Reflection(mirror, 0, 72).actions(actions)
     assert possible.tolist() == [True, True, False, False]
+    rows = [torch.rand(4, 78), actions, *torch.rand(3, 4)]
+    both = Reflection(mirror, 0, 72).doubled(Transitions(*rows))
+    assert both.actions[4:, 2].tolist() == pytest.approx([-0.1, -0.6])  # 0.8 and -0.2 rad/s
+    assert len(both.seen) == len(both.returns) == 6
+
+
+def test_an_action_is_as_dense_as_limits_that_differ_stretch_it():
+    _, mirror = engine()
+    stretched = replace(mirror, scale=np.array([1.0, -2.0, -1.0]))
+    rows = [torch.rand(3, 78), torch.zeros(3, 3), *torch.rand(3, 3)]
+    both = Reflection(stretched, 0, 72).doubled(Transitions(*rows))
+    assert torch.allclose(both.log_probs[3:], both.log_probs[:3] - math.log(2.0))
