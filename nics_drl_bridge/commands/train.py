@@ -99,6 +99,8 @@ def _run(train_run: Any, order: Any, learn: Any) -> None:
     def told(progress: Any) -> None:
         success, speed = 100 * progress.success, progress.steps_per_s
         what = f"seed {progress.seed}: success {success:.1f} %, {speed:,.0f} steps/s"
+        if not math.isnan(progress.held_out):
+            what += f", held out {100 * progress.held_out:.1f} %"
         tell(what, progress.steps, progress.total)
 
     def done(result: Any) -> None:

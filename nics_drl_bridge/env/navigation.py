@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.env import kernels
 from nics_drl_bridge.env.kernels import LIMIT
+from nics_drl_bridge.env.mirror import Mirror, mirror_of
 from nics_drl_bridge.env.task import Episodes, Flags, Memory, Observation, Outcome, Task
 from nics_drl_bridge.interface import RobotView
 
@@ -115,6 +116,10 @@ class Navigation(Task):
         progress = self._see(out, before.pose, after, memory)
         over = progress.reached | progress.touched
         return Outcome(self._terms(progress), over, self._facts(progress))
+
+    def mirror(self) -> Mirror:
+        """Sine of the bearing, velocity to the left and turn rate change their signs."""
+        return mirror_of(self, [1, 1, -1, 1, -1, -1])
 
     def _see(
         self, out: Observation, before: Array, view: RobotView, memory: Memory

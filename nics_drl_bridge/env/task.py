@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.env import kernels
 from nics_drl_bridge.env.kernels import LIMIT, ScanScale
+from nics_drl_bridge.env.mirror import Mirror
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan
@@ -169,6 +170,14 @@ class Task(ABC):
     def discrete_commands(self) -> Array:
         """(A, C) commands of the discrete actions."""
         return np.clip(discrete_commands(self.robot), *self.command_limits)
+
+    def mirror(self) -> Mirror:
+        """Observations and actions with left and right exchanged; see `mirror.mirror_of`.
+
+        A training asks for it if `ppo.mirror` says so. Raises ConfigError if there is none.
+        """
+        fault = f"task {type(self).__name__} does not tell what it looks like in a mirror"
+        raise ConfigError(f"{fault}; give it a method `mirror`, or leave out ppo.mirror.")
 
     # Building blocks of tasks.
 

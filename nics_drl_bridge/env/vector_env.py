@@ -21,6 +21,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import NS_PER_S, RobotView
 from nics_drl_bridge.lidar.shapes import BODY
+from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
@@ -117,6 +118,11 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self._teacher = Teacher(given, self.simulator)
 
     @property
+    def level(self) -> float:
+        """Share of the way from start to goal with which episodes begin, 1 but for a curriculum."""
+        return 1.0 if self._teacher is None else self._teacher.level
+
+    @property
     def changing(self) -> dict[str, NDArray[Any]]:
         """The arrays that change from step to step, by name; see `policy.train_checkpoint`."""
         own = {
@@ -159,9 +165,14 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         if options and "start" in options:
             starts = np.empty((len(worlds), self.robots, 3))
             give(starts, "start", options["start"])
-        scenes = self.simulator.reset(seeds, worlds, starts)
+
+        def places(scenes: Scenes) -> Array | None:
+            moved = None if self._teacher is None else self._teacher.places(worlds, scenes)
+            return moved if starts is None else starts
+
+        scenes = self.simulator.reset(seeds, worlds, places)
         if self._teacher is not None:
-            self._teacher.begin(worlds, scenes)
+            self._teacher.begin(worlds)
         self._bodies[worlds] = scenes.bodies
         self._starts[worlds] = self.simulator.data.pose[worlds]
         fresh = self.task.reset(Episodes(seeds, self._starts[worlds], self.simulator.goals[worlds]))

@@ -3,9 +3,8 @@
 import dataclasses
 import json
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +23,7 @@ from nics_drl_bridge.policy.evaluation import FIRST_SEED, Outcomes, Summary, dri
 from nics_drl_bridge.policy.train_algorithms import Actor, Sb3Training, act_of, observed
 from nics_drl_bridge.policy.train_export import export_policy
 from nics_drl_bridge.policy.train_ppo import LeanPpo
+from nics_drl_bridge.policy.train_stop import Stop
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 from nics_drl_bridge.seeds import checked_seeds
@@ -54,7 +54,7 @@ def train(
     begin, path = time.perf_counter(), folder / CHECKPOINT
     content = checkpoints.read_checkpoint(path) if resumed else None
     about: dict[str, Any] = {"seed": seed, "settings": settings.model_dump(mode="json")}
-    env = make_train_env(settings)
+    env, stop = make_train_env(settings), _stop_of(settings)
     engine = LeanPpo if settings.lean else Sb3Training
     if content is None:
         rng = np.random.default_rng(seed)
@@ -65,12 +65,16 @@ def train(
         check_same(content["about"], about, path)
         size = int(np.prod(env.observation_space.shape))
         training = engine(settings, env, seed, (np.zeros(size), np.ones(size)))
-        _restore(content, training, env, path)
+        _restore(content, (training, stop), env, path)
     busy = env.stepping_s
-    save = partial(checkpoints.save_checkpoint, path, training.state, env, about)
-    if training.steps < settings.steps:
+
+    def save() -> None:
+        state = training.state() | stop.state()
+        checkpoints.save_checkpoint(path, state, env, about)
+
+    if training.steps < settings.steps and not stop.over:
         logger = configure(str(folder), ["tensorboard"])
-        training.learn(checkpoints.Watch(env, seed, settings, save, tell), logger)
+        training.learn(checkpoints.Watch(env, seed, settings, save, tell, stop), logger)
         save()
         logger.close()
     taken = time.perf_counter() - begin
@@ -96,10 +100,12 @@ def make_train_env(
 
 
 def _restore(
-    content: dict[str, Any], training: LeanPpo | Sb3Training, env: TrainVecEnv, path: Path
-) -> None:
+    content: dict[str, Any], parts: Iterable[LeanPpo | Sb3Training | Stop], env: TrainVecEnv,
+    path: Path,
+) -> None:  # fmt: skip
     try:
-        training.restore(content["state"])
+        for part in parts:
+            part.restore(content["state"])
         checkpoints.restore_envs(content, env)
     except (AttributeError, IndexError, KeyError, RuntimeError, TypeError, ValueError) as error:
         reason = f"does not hold what a training needs ({shortened(str(error), 120)})"
@@ -123,11 +129,27 @@ def evaluate(
     model: SimulatorModel | None = None,
 ) -> Outcomes:  # fmt: skip
     """Drives the episodes of the evaluation protocol in a world with an algorithm's policy."""
-    env = BridgeVectorEnv(
-        episodes, model or open_model(settings.robot, settings.lidar), world, settings.task,
-        settings.task_options, settings.max_episode_steps, randomisation=settings.randomisation,
-    )  # fmt: skip
+    env = _env_of(settings, world, episodes, model or open_model(settings.robot, settings.lidar))
     return drive_worlds(env, act_of(algorithm), range(FIRST_SEED, FIRST_SEED + episodes))
+
+
+def _stop_of(settings: TrainingSettings) -> Stop:
+    """The early stop of a training, with worlds of its own."""
+    if (given := settings.stop) is None:
+        return Stop(None, {})
+    model = open_model(settings.robot, settings.lidar)
+    envs = {world: _env_of(settings, world, given.episodes, model) for world in settings.worlds}
+    return Stop(given, envs)
+
+
+def _env_of(
+    settings: TrainingSettings, world: str, episodes: int, model: SimulatorModel
+) -> BridgeVectorEnv:
+    """Copies of a world for an evaluation, one for each episode; without any teaching."""
+    return BridgeVectorEnv(
+        episodes, model, world, settings.task, settings.task_options, settings.max_episode_steps,
+        randomisation=settings.randomisation,
+    )  # fmt: skip
 
 
 Learn = Callable[[TrainingSettings, int, Path, Tell, bool], Trained]  # a function like `train`
@@ -172,7 +194,8 @@ def run(
             driven = evaluate(trained.algorithm, settings, world, order.episodes, model)
             summaries[world] = summarise(driven, model.control_period)
         result = SeedResult(seed, trained, summaries)
-        plain = {world: dataclasses.asdict(one) for world, one in summaries.items()}
+        plain: dict[str, Any] = {"training_steps": trained.steps}
+        plain |= {world: dataclasses.asdict(one) for world, one in summaries.items()}
         write_text(folder / EVALUATION, json.dumps(plain, indent=2) + "\n")
         export(settings, result, order.command, folder / POLICY)
         done(result)

@@ -208,7 +208,7 @@ class Sb3Training:
     def learn(self, watch: Watch, logger: Logger) -> None:
         """Learns until all steps are done."""
         self.policy.set_logger(logger)
-        left, companion = self._total - self.steps, Companion(watch)
+        left, companion = self._total - self.steps, Companion(watch, act_of(self.policy))
         self.policy.learn(left, companion, self._log_every, reset_num_timesteps=False)
 
     def state(self) -> dict[str, Any]:
@@ -306,20 +306,24 @@ def _set_random_state(algorithm: BaseAlgorithm, content: dict[str, Any]) -> None
 class Companion(BaseCallback):
     """Callback by which Stable-Baselines3 calls a watch in each step and roll-out."""
 
-    def __init__(self, watch: Watch) -> None:
+    def __init__(self, watch: Watch, act: Act) -> None:
         super().__init__()
-        self._watch = watch
+        self._watch, self._act, self._ends = watch, act, False
 
     def _on_training_start(self) -> None:
         self._watch.begin(self.num_timesteps)
 
     def _on_rollout_start(self) -> None:
-        self._watch.keep(self.model.num_timesteps)
+        steps = self.model.num_timesteps
+        self._watch.keep(steps)
+        self._ends = self._watch.ends(steps, self._act, self.logger)
 
     def _on_step(self) -> bool:
         for n in np.flatnonzero(self.locals["dones"]):
             self._watch.collisions.append(bool(self.locals["infos"][n].get("collision", False)))
-        return True
+        if self._ends:  # Stable-Baselines3 can't be ended before the first step of a roll-out
+            self._on_rollout_end()
+        return not self._ends
 
     def _on_rollout_end(self) -> None:
         self._watch.report(self.num_timesteps, self.model.ep_success_buffer or (), self.logger)

@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import time
 import zipfile
 from collections import deque
@@ -18,6 +19,8 @@ from stable_baselines3.common.logger import Logger
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import check_sealed, sealed, write_bytes
+from nics_drl_bridge.policy.evaluation import Act
+from nics_drl_bridge.policy.train_stop import Stop
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
@@ -26,10 +29,10 @@ MOST_BYTES = 4 * 2**30  # maximum size of a file, which contains all of SAC's bu
 
 
 def save_checkpoint(
-    path: Path, state: Callable[[], dict[str, Any]], env: TrainVecEnv, about: dict[str, Any]
+    path: Path, state: dict[str, Any], env: TrainVecEnv, about: dict[str, Any]
 ) -> None:
     """Writes a checkpoint between two roll-outs; `about` identifies the training."""
-    content = {"format": FORMAT, "about": json.dumps(about), "state": state()}
+    content = {"format": FORMAT, "about": json.dumps(about), "state": state}
     write_content(path, content | {"envs": [tensors(snapshot(one)) for one in env.envs]})
 
 
@@ -102,6 +105,7 @@ class Progress:
     collision: float
     steps_per_s: float  # since this process began or resumed it
     env_share: float  # share of the wall time that went to the simulator
+    held_out: float = math.nan  # least success of a world in the latest evaluation of `stop`
 
 
 Save = Callable[[], None]
@@ -112,9 +116,12 @@ class Watch:
     """Follows a training: tells its progress, and saves it now and then, between two roll-outs."""
 
     def __init__(
-        self, env: TrainVecEnv, seed: int, settings: TrainingSettings, save: Save, tell: Tell
-    ) -> None:
+        self, env: TrainVecEnv, seed: int, settings: TrainingSettings, save: Save, tell: Tell,
+        stop: Stop,
+    ) -> None:  # fmt: skip
         self._env, self._seed, self._save, self._tell = env, seed, save, tell
+        self._stop = stop
+        self._levels = list(settings.worlds) if settings.teaching.curriculum else []
         self._total, self._every = settings.steps, settings.checkpoint_every
         self.collisions: deque[bool] = deque(maxlen=RECENT)  # of the last episodes
 
@@ -130,10 +137,18 @@ class Watch:
             self._save()
             self._saved = steps
 
+    def ends(self, steps: int, act: Act, logger: Logger) -> bool:
+        """Drives held-out episodes if it is time to; True if the training is to end by them."""
+        if self._stop.judge(steps, act):
+            for world, share in self._stop.shares.items():
+                logger.record(f"held_out/{world}", share)
+            logger.dump(steps)
+        return self._stop.over
+
     def report(self, steps: int, successes: Sequence[bool], logger: Logger) -> bool:
         """Tells and logs the progress if it is time to; True if it was."""
         now = time.perf_counter()
-        if now - self._told < TOLD_S and steps < self._total:
+        if now - self._told < TOLD_S and steps < self._total and not self._stop.over:
             return False
         self._told = now
         taken = max(now - self._begin, 1e-9)
@@ -141,11 +156,13 @@ class Watch:
         success, collision = (float(np.mean(r)) if r else np.nan for r in recent)
         progress = Progress(
             self._seed, steps, self._total, success, collision, (steps - self._first) / taken,
-            (self._env.stepping_s - self._busy) / taken,
+            (self._env.stepping_s - self._busy) / taken, self._stop.least,
         )  # fmt: skip
         logger.record("rollout/success_rate", progress.success)
         logger.record("rollout/collision_rate", progress.collision)
         logger.record("time/env_share", progress.env_share)
+        for world, one in zip(self._levels, self._env.envs, strict=False):
+            logger.record(f"curriculum/{world}", one.level)
         self._tell(progress)
         return True
 

@@ -22,9 +22,16 @@ from numpy.typing import NDArray
 from stable_baselines3.common.logger import Logger
 
 from nics_drl_bridge.policy import train_imitation
-from nics_drl_bridge.policy.train_algorithms import LEAST_RATE, Actor, check_serves, layers_of
+from nics_drl_bridge.policy.train_algorithms import (
+    LEAST_RATE,
+    Actor,
+    act_of,
+    check_serves,
+    layers_of,
+)
 from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch
 from nics_drl_bridge.policy.train_memory import memory_of
+from nics_drl_bridge.policy.train_mirror import Reflection
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import PpoSettings, TrainingSettings
 from nics_drl_bridge.threads import run_parts
@@ -236,7 +243,11 @@ class Learner:
 class Collector:
     """Drives the worlds with a copy of the networks."""
 
-    def __init__(self, env: TrainVecEnv, networks: Networks, ppo: PpoSettings, seed: int) -> None:
+    def __init__(
+        self, env: TrainVecEnv, networks: Networks, ppo: PpoSettings, seed: int,
+        reflection: Reflection | None = None,
+    ) -> None:  # fmt: skip
+        self._reflection = reflection
         self.env, self.networks, self.ppo = env, copy.deepcopy(networks), ppo
         self.generator = torch.Generator().manual_seed(seed)
         self.last = np.zeros((env.num_envs, *env.observation_space.shape), np.float32)
@@ -278,6 +289,8 @@ class Collector:
         rollout = Transitions(*rows)
         if networks.actor.memory.learnt:
             rollout = rollout._replace(state=first, done=done)
+        if self._reflection is not None:
+            rollout = self._reflection.doubled(rollout)
         return rollout, ended
 
     def _see(self, observations: NDArray[np.float32], state: torch.Tensor) -> Seen:
@@ -306,11 +319,14 @@ class LeanPpo:
         self._total, self._ppo, hidden = settings.steps, settings.ppo, settings.hidden
         spaces = env.observation_space, env.action_space
         inputs, parts = len(normaliser[0]), env.envs[0].task.scan_parts
-        memory = memory_of(settings.memory, inputs, parts)
+        memory, reflection = memory_of(settings.memory, inputs, parts), None
+        if self._ppo.mirror:
+            reflection = Reflection(env.envs[0].task.mirror(), memory.extra, parts)
+            normaliser = reflection.balanced(*normaliser)
         actor = Actor(*spaces, hidden, normaliser, torch.nn.ReLU, memory)
         self.networks = Networks(actor, hidden, self._ppo.log_std)
         seeds = np.random.SeedSequence(seed).generate_state(3)
-        self.collector = Collector(env, self.networks, self._ppo, int(seeds[0]))
+        self.collector = Collector(env, self.networks, self._ppo, int(seeds[0]), reflection)
         self.learner = Learner(self.networks, self._ppo, int(seeds[1]))
         self.policy, self._settings, self._imitation_seed = actor, settings, int(seeds[2])
         self.steps = 0  # of all worlds together, learnt from so far
@@ -318,7 +334,7 @@ class LeanPpo:
         self._successes: deque[bool] = deque(maxlen=RECENT)
 
     def learn(self, watch: Watch, logger: Logger) -> None:
-        """Learns until all steps are done."""
+        """Learns until all steps are done, or the watch ends it."""
         watch.begin(self.steps)
         if self._rollout is None:
             self.collector.last = self.collector.env.reset()
@@ -326,6 +342,9 @@ class LeanPpo:
             self._take(watch, *self.collector.collect())
         while self._rollout:
             watch.keep(self.steps)
+            if watch.ends(self.steps, act_of(self.policy), logger):
+                watch.report(self.steps, self._successes, logger)
+                return
             loss = self._advance(self._rollout, watch)
             if watch.report(self.steps, self._successes, logger):
                 logger.record("train/loss", loss)
@@ -348,7 +367,7 @@ class LeanPpo:
         """Learns from a rollout, with the next one collected meanwhile."""
         rate = self._ppo.learning_rate * max(1.0 - self.steps / self._total, LEAST_RATE)
         learn = partial(self.learner.learn, rollout, rate)
-        self.steps += len(rollout.seen)
+        self.steps += self._ppo.rollout * self.collector.env.num_envs
         self.collector.networks.load_state_dict(self.networks.state_dict())
         jobs: list[Callable[[], Any]] = [learn, self.collector.collect]
         loss, *collected = run_parts(lambda job: job(), jobs[: 1 + (self.steps < self._total)])

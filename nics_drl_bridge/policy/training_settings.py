@@ -36,6 +36,7 @@ class PpoSettings(Schema):
     clip: float = Field(default=0.2, gt=0.0)
     entropy: float = Field(default=0.0, ge=0.0)
     log_std: float = -0.5  # of the actions at the start
+    mirror: bool = False  # True learns from each transition with left and right exchanged, too
 
 
 class StackMemory(Schema):
@@ -73,6 +74,14 @@ class ImitationSettings(Schema):
     epochs: Count = 10  # passes through them
 
 
+class StopSettings(Schema):
+    """An early end, as soon as held-out success has stood in two evaluations in a row."""
+
+    success: Share  # least share of the episodes in each world
+    every: Count = 200_000  # environment steps between two evaluations
+    episodes: int = Field(default=200, ge=1, le=10_000)  # in each world, others each time
+
+
 class TrainingSettings(Schema):
     """A training, as in `config/training/*.yaml`; `worlds` maps names or files to their copies."""
 
@@ -83,7 +92,8 @@ class TrainingSettings(Schema):
     worlds: dict[str, Count] = Field(default_factory=lambda: {"circles": 256}, min_length=1)
     randomisation: str | None = None  # quantities drawn in each episode: a shipped one or a file
     teaching: Teaching = Teaching()  # rewards by what only the simulator knows, and repetition
-    steps: Count = 1_000_000  # environment steps of all worlds together
+    steps: Count = 1_000_000  # environment steps of all worlds together, at most with `stop`
+    stop: StopSettings | None = None  # ends earlier
     max_episode_steps: Count = 300  # an episode ends as a time-out after this many steps
     algorithm: Literal["ppo", "sac"] = "ppo"
     hidden: tuple[Width, ...] = Field(default=(64, 64), min_length=1, max_length=MOST_LAYERS)
@@ -105,9 +115,14 @@ class TrainingSettings(Schema):
     def _holdable(self) -> TrainingSettings:
         if self.memory is not None and not self.lean:
             raise ValueError("ppo's engine 'lean' alone learns a memory; use it, or leave it out")
+        if self.ppo.mirror and not self.lean:
+            raise ValueError("ppo's engine 'lean' alone learns by ppo.mirror; leave that out")
+        if self.ppo.mirror and isinstance(self.memory, GruMemory):
+            raise ValueError("the state of a gru has no mirror image; leave out ppo.mirror")
         if self.num_envs > MOST_WORLDS:
             raise ValueError(f"all worlds together may have {MOST_WORLDS} copies")
-        kept = self.num_envs * self.ppo.rollout if self.algorithm == "ppo" else self.sac.buffer
+        rows = self.num_envs * self.ppo.rollout * (1 + self.ppo.mirror)
+        kept = rows if self.algorithm == "ppo" else self.sac.buffer
         if kept > MOST_KEPT:
             kept_by = f"{self.algorithm} would keep {kept} transitions, and may keep {MOST_KEPT}"
             raise ValueError(f"{kept_by}; lower the copies of worlds, ppo.rollout or sac.buffer")

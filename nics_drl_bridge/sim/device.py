@@ -11,7 +11,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.sim import contact_kernels, step_kernels
 from nics_drl_bridge.sim.scenes import Scenes
-from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.simulator import FastSimulator, Starts
 
 Array = NDArray[np.float64]
 
@@ -121,7 +121,7 @@ class DrivenSimulator(FastSimulator):
     """
 
     def reset(
-        self, seeds: ArrayLike, worlds: ArrayLike | None = None, starts: ArrayLike | None = None
+        self, seeds: ArrayLike, worlds: ArrayLike | None = None, starts: Starts = None
     ) -> Scenes:
         """Begins an episode, see `FastSimulator.reset`."""
         scenes = super().reset(seeds, worlds, starts)

@@ -38,6 +38,8 @@ from nics_drl_bridge.threads import run_parts
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 R = TypeVar("R")
+# Poses of robots (n, M, 3), or a function that tells them for scenes; None: as the scenes have them
+Starts = ArrayLike | Callable[[Scenes], Array | None] | None
 MOST_ROBOTS = 1_000  # Greatest number of robots in one world; each is tested against every other
 MOST_NUMBERS = 2**30  # Most values in all worlds, some GB: beams of robots, states of obstacles
 PER_BODY = 64
@@ -233,10 +235,12 @@ class FastSimulator:
             render(self.readings[name], worlds)
 
     def reset(
-        self, seeds: ArrayLike, worlds: ArrayLike | None = None, starts: ArrayLike | None = None
-    ) -> Scenes:
+        self, seeds: ArrayLike, worlds: ArrayLike | None = None,
+        starts: Starts = None,
+    ) -> Scenes:  # fmt: skip
         """Begins episodes in `worlds` (n,), all by default, at `starts` (n, M, 3) if given.
 
+        They may follow from the scenes that were drawn, by a function.
         A seed (n,) fixes scene, start, goal, noise and randomisation. The obstacles of the scenes
         are in the order of `data`; in that of `scenes` only if they are few or move. Threads may
         call it in parallel for different parts. Raises ConfigError if seeds, starts or a scene do
@@ -244,7 +248,8 @@ class FastSimulator:
         """
         chosen = np.arange(len(self.data.steps)) if worlds is None else np.asarray(worlds, np.int64)
         scenes, draws = self._episodes.draw(seeds)
-        begin = scenes.starts if starts is None else np.asarray(starts, dtype=np.float64)
+        given = starts(scenes) if callable(starts) else starts
+        begin = scenes.starts if given is None else np.asarray(given, dtype=np.float64)
         if len(scenes) != len(chosen) or begin.shape != scenes.starts.shape:
             needed = f"{len(chosen)} worlds with {self.data.pose.shape[1]} robots each."
             raise ConfigError(f"{len(scenes)} seeds and starts {begin.shape} must be of {needed}")

@@ -38,6 +38,7 @@ ENGINES = {
     "lean": {"algorithm": "ppo"},
     "gru": {"algorithm": "ppo", "memory": {"kind": "gru", "units": 5}},
     "stack": {"algorithm": "ppo", "memory": {"kind": "stack", "scans": 3, "every": 2}},
+    "mirror": {"algorithm": "ppo", "ppo": {"rollout": 16, "batch": 64, "mirror": True}},
     "sb3": {"algorithm": "ppo", "ppo": {"rollout": 16, "batch": 64, "epochs": 2, "engine": "sb3"}},
     "sac": {"algorithm": "sac"},
 }
@@ -77,12 +78,14 @@ def steps_in(path):
         ("gru", "continuous"),
         ("gru", "discrete"),
         ("stack", "continuous"),
+        ("mirror", "continuous"),
         ("sb3", "continuous"),
         ("sac", "continuous"),
     ],
 )
 def test_an_interrupted_training_comes_to_the_same_weights(engine, actions, tmp_path, monkeypatch):
-    teaching = {"path": 1.0, "contact": -10.0, "retries": 1}
+    curriculum = {"success": 0.01}  # so that levels rise
+    teaching = {"path": 1.0, "contact": -10.0, "retries": 1, "curriculum": curriculum}
     chosen = settings(task_options={"actions": actions}, teaching=teaching, **ENGINES[engine])
     whole = train(chosen, 1, tmp_path / "whole")
 
@@ -102,6 +105,30 @@ def test_an_interrupted_training_comes_to_the_same_weights(engine, actions, tmp_
     assert again.steps == whole.steps
     for name, value in weights(whole.algorithm).items():
         assert torch.equal(value, weights(again.algorithm)[name]), name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ["lean", "stack", "sb3", "sac"])
+def test_a_training_that_stops_early_comes_to_the_same_end_if_interrupted(
+    engine, tmp_path, monkeypatch
+):
+    stop = {"success": 0.01, "every": 320, "episodes": 40}  # a random robot arrives now and then
+    chosen = settings(steps=16000, stop=stop, **ENGINES[engine])
+    whole = train(chosen, 1, tmp_path / "whole")
+    assert 640 <= whole.steps < 16000
+
+    def interrupt(progress):
+        if not np.isnan(progress.held_out):
+            raise BrokenOffError
+
+    monkeypatch.setattr("nics_drl_bridge.policy.train_checkpoint.TOLD_S", 0.0)
+    with pytest.raises(BrokenOffError):
+        train(chosen, 1, tmp_path / "broken", interrupt)
+    for _ in range(2):  # what has ended does not go on
+        again = train(chosen, 1, tmp_path / "broken", resumed=True)
+        assert again.steps == whole.steps
+        for name, value in weights(whole.algorithm).items():
+            assert torch.equal(value, weights(again.algorithm)[name]), name
 
 
 @pytest.mark.slow

@@ -41,7 +41,9 @@ def test_a_run_leaves_policy_evaluation_and_logs_of_each_seed_and_can_be_resumed
     for seed in (3, 4):
         folder = out / f"seed_{seed}"
         assert load_policy(folder / "policy.onnx").contract.provenance["seed"] == seed
-        figures = json.loads((folder / "evaluation.json").read_text())["arena"]
+        told = json.loads((folder / "evaluation.json").read_text())
+        figures = told["arena"]
+        assert told["training_steps"] == 256
         assert figures["success"]["low"] <= figures["success"]["value"]
         assert any(folder.glob("events.out.tfevents.*"))
     again = nics("--resume", "--seeds", 4, "--episodes", 10, "--out", out)

@@ -21,6 +21,7 @@ from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import DrivenSimulator
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.scenes import Scenes
+from nics_drl_bridge.sim.simulator import Starts
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 ENCODER_PERIOD_S = 0.01  # approximate period of encoder readings and of updates of moving obstacles
@@ -158,7 +159,7 @@ class MujocoSimulator(DrivenSimulator):
         self.reset([0])
 
     def reset(
-        self, seeds: ArrayLike, worlds: ArrayLike | None = None, starts: ArrayLike | None = None
+        self, seeds: ArrayLike, worlds: ArrayLike | None = None, starts: Starts = None
     ) -> Scenes:
         """Begins the episode of a seed (1,), at poses (1, M, 3); see `FastSimulator.reset`."""
         scenes = super().reset(seeds, worlds, starts)

@@ -235,6 +235,10 @@ def train_on_ray(
         raise ConfigError(f"--engine ray learns with ppo, not {given!r}; leave it out.")
     if settings.memory is not None:
         raise ConfigError("--engine ray learns no memory; leave out --engine, or memory.")
+    if settings.ppo.mirror:
+        raise ConfigError("--engine ray mirrors nothing; leave out --engine, or ppo.mirror.")
+    if settings.stop is not None:
+        raise ConfigError("--engine ray does not stop early; leave out --engine, or stop.")
     begin, path = time.perf_counter(), folder / train.CHECKPOINT
     about: dict[str, Any] = {"seed": seed, "settings": settings.model_dump(mode="json")}
     content = read_checkpoint(path, FORMAT) if resumed else None

@@ -1,0 +1,63 @@
+"""Early stop: a training ends once success in held-out episodes has stood twice in a row.
+
+Each evaluation has episodes of its own, so that chance in one says nothing about the next: a true
+success of 95 % shows as 97 % of 200 episodes about once in eight times, in two evaluations in a row
+once in sixty. The weights that are kept are those of the second one.
+"""
+
+from collections.abc import Mapping
+from typing import Any
+
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.policy.evaluation import Act, drive_worlds
+from nics_drl_bridge.policy.training_settings import StopSettings
+
+HELD_OUT_SEED = 2**41  # first of the episodes, beyond those of trainings and of the protocol
+IN_A_ROW = 2
+
+
+class Stop:
+    """Decides when a training ends early; without settings it never does.
+
+    Args:
+        given: the settings.
+        envs: by the name of their worlds, with as many copies as an evaluation has episodes.
+    """
+
+    def __init__(self, given: StopSettings | None, envs: Mapping[str, BridgeVectorEnv]) -> None:
+        self._given, self._envs = given, envs
+        self._due, self._reached = 0, 0  # number of the latest evaluation; reached in a row
+        self.shares: dict[str, float] = {}  # success by world in the latest evaluation
+
+    @property
+    def over(self) -> bool:
+        """True if the training is to end."""
+        return self._reached >= IN_A_ROW
+
+    @property
+    def least(self) -> float:
+        """Least success of a world in the latest evaluation; NaN before the first."""
+        return min(self.shares.values(), default=float("nan"))
+
+    def judge(self, steps: int, act: Act) -> bool:
+        """Evaluates the policy `act` if it is time to, after so many steps; True if it was."""
+        given = self._given
+        if given is None or steps // given.every <= self._due:
+            return False
+        self._due = steps // given.every
+        first = HELD_OUT_SEED + self._due * given.episodes
+        seeds = range(first, first + given.episodes)
+        driven = {world: drive_worlds(env, act, seeds) for world, env in self._envs.items()}
+        self.shares = {world: float(one.success.mean()) for world, one in driven.items()}
+        self._reached = self._reached + 1 if self.least >= given.success else 0
+        return True
+
+    def state(self) -> dict[str, Any]:
+        """All that changes, for a checkpoint."""
+        return {"stop": {"due": self._due, "reached": self._reached, "shares": self.shares}}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continues with the state of another; with one of before there was any, as if new."""
+        if known := state.get("stop"):
+            self._due, self._reached = known["due"], known["reached"]
+            self.shares = dict(known["shares"])
