@@ -3,7 +3,7 @@
 ros2 launch nics_drl_bridge bridge.launch.py namespace:=car
 """
 
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
@@ -31,6 +31,12 @@ def generate_launch_description():
             output="screen",
         )
 
+    def policy(context):
+        # Empty leaves the file's, which an empty parameter would go before.
+        fallback = context.launch_configurations["fallback"]
+        given = {"fallback": fallback} if fallback else {}
+        return [node("policy_node", autostart=autostart, **given)]
+
     return LaunchDescription(
         [
             DeclareLaunchArgument("namespace", default_value="", description="Of the robot"),
@@ -43,8 +49,9 @@ def generate_launch_description():
                 default_value="true",
                 description="An e_stop that was never heard counts as pressed",
             ),
+            DeclareLaunchArgument("fallback", default_value="", description="Of policy_node"),
             node("command_gate", e_stop_required=e_stop_required),
             node("middleware_node", autostart=autostart),
-            node("policy_node", autostart=autostart),
+            OpaqueFunction(function=policy),
         ]
     )

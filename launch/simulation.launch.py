@@ -34,6 +34,7 @@ def generate_launch_description():
             DeclareLaunchArgument("autostart", default_value="true", description="Lead lifecycles"),
             DeclareLaunchArgument("use_rviz", default_value="false", description="Start RViz"),
             DeclareLaunchArgument("log_level", default_value="info", description="Of all nodes"),
+            DeclareLaunchArgument("fallback", default_value="", description="Of policy_node"),
             DeclareLaunchArgument(
                 "e_stop_required",
                 default_value="false",
@@ -55,7 +56,7 @@ def generate_launch_description():
                 arguments=["--ros-args", "--log-level", value("log_level")],
                 output="screen",
             ),
-            include("bridge.launch.py", "params_file", "autostart", "e_stop_required"),
+            include("bridge.launch.py", "params_file", "autostart", "fallback", "e_stop_required"),
             include("description.launch.py", "use_rviz"),
         ]
     )

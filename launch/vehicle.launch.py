@@ -32,7 +32,10 @@ def generate_launch_description():
             DeclareLaunchArgument("autostart", default_value="true", description="Lead lifecycles"),
             DeclareLaunchArgument("use_rviz", default_value="false", description="Start RViz"),
             DeclareLaunchArgument("log_level", default_value="info", description="Of all nodes"),
-            include("bridge.launch.py", "params_file", "autostart", e_stop_required="true"),
+            DeclareLaunchArgument("fallback", default_value="", description="Of policy_node"),
+            include(
+                "bridge.launch.py", "params_file", "autostart", "fallback", e_stop_required="true"
+            ),
             include("description.launch.py", "use_rviz"),
         ]
     )

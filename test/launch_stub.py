@@ -29,6 +29,11 @@ class Launched:
     declared: dict[str, str] = field(default_factory=dict)
     nodes: dict[str, dict[str, Any]] = field(default_factory=dict)
 
+    @property
+    def launch_configurations(self) -> dict[str, str]:
+        """As of the context that upstream gives to an `OpaqueFunction`."""
+        return self.values
+
     def run(self, file: str) -> Launched:
         """Runs a file of `launch/`."""
         with self._stubs():
@@ -109,6 +114,7 @@ class Launched:
             "launch.actions": {
                 "DeclareLaunchArgument": declare,
                 "IncludeLaunchDescription": include,
+                "OpaqueFunction": lambda function: lambda run: [one(run) for one in function(run)],
             },
             "launch.conditions": {
                 "IfCondition": lambda given: lambda run: run.text(given).lower() in ("true", "1")

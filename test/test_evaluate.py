@@ -64,17 +64,20 @@ def test_lidar_randomisation_and_gate_are_the_same_in_process_and_over_dds(tmp_p
     with claimed_domain() as domain_id:
         words = ("evaluate", "dynamic_window", "--model", "differential", "--episodes", 2)
         under = ("--lidar", "rplidar_a2", "--randomisation", "mild", "--gate", "differential")
-        words = (*words, *under, "--in", "fast", "--in", "dds", "--out", "out")
+        words = (*words, *under, "--fallback", "mppi", "--in", "fast", "--in", "dds")
+        words = (*words, "--out", "out")
         done = started(*words, cwd=tmp_path, domain_id=domain_id)
     assert done.returncode == 0, done.stderr
     told = json.loads((tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8"))
     assert told["conditions"] == {
-        "lidar": "rplidar_a2", "randomisation": "mild", "gate": "differential", "steps": 300,
-        "task": {},
+        "lidar": "rplidar_a2", "randomisation": "mild", "gate": "differential",
+        "fallback": "mppi", "steps": 300, "task": {},
     }  # fmt: skip
     fast, dds = told["policies"]["dynamic_window"].values()
     assert dds["greatest_deviation"] < 1e-6
-    assert [one["result"] for one in fast["each"]] == [one["result"] for one in dds["each"]]
+    for name in ("result", "fallback_actions"):
+        assert [one[name] for one in fast["each"]] == [one[name] for one in dds["each"]]
+    assert fast["fallback"] == dds["fallback"] >= 0.0
 
 
 @pytest.mark.slow
@@ -115,6 +118,9 @@ def test_a_shipped_policy_brings_its_own_robot(tmp_path):
         (("dynamic_window", "--lidar", "rplidar_a9", "--in", "fast"), "rplidar_a"),
         (("dynamic_window", "--shadow", "nothing", "--lidar", "rplidar_a2"), "leave out --lidar"),
         (("dynamic_window", "--shadow", "nothing"), "nothing"),
+        (("random", "--fallback", "mpi"), "fallback 'mpi': no such planner; did you mean 'mppi'"),
+        (("random", "mppi", "--fallback", "mppi"), "fallback 'mppi' is the policy itself"),
+        (("random", "--shadow", "nothing", "--fallback", "mppi"), "leave it out"),
         (("dynamic_window", "--backend", "dds", "--hardware", "--in", "dds"), "--in"),
         (("dynamic_window", "random", "--backend", "dds", "--hardware"), "one policy at a time"),
     ],

@@ -70,6 +70,15 @@ def test_arguments_reach_every_node() -> None:
     assert nodes["rviz2"]["remappings"]["/scan"] == "scan"
 
 
+@pytest.mark.parametrize("file", [*WHOLE, "bridge.launch.py"])
+def test_a_fallback_reaches_the_policy_and_without_the_argument_the_file_decides(file: str) -> None:
+    assert "fallback" not in Launched().run(file).nodes["policy_node"]["parameters"]
+    nodes = Launched(values={"fallback": "mppi"}).run(file).nodes
+    told = [name for name, node in nodes.items() if "fallback" in node["parameters"]]
+    assert told == ["policy_node"]
+    assert nodes["policy_node"]["parameters"]["fallback"] == "mppi"
+
+
 def test_the_transforms_of_a_robot_stay_in_its_namespace() -> None:
     nodes = Launched(values={"use_rviz": "true"}).run("simulation.launch.py").nodes
     for name in ("simulator_node", "robot_state_publisher", "rviz2"):

@@ -17,6 +17,7 @@ class Conditions:
     lidar: str | None = None  # shipped lidar or file, instead of the model's
     randomisation: str | None = None  # shipped one or file, which draws each episode's numbers
     gate: str | None = None  # limits, shipped or a file, of a gate between policy and robot
+    fallback: str = ""  # planner behind the policy, none by default
     steps: int = MAX_EPISODE_STEPS  # greatest number of an episode
     task: Mapping[str, Any] = field(default_factory=dict)  # options, instead of the policy's own
 

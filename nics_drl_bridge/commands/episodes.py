@@ -22,7 +22,8 @@ from nics_drl_bridge.gate.gated_backend import GatedBackend
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.policy import evaluation
 from nics_drl_bridge.policy.evaluation import Episode, Tally, drive, drive_all
-from nics_drl_bridge.policy.policies import Policy, is_policy_file, open_policy
+from nics_drl_bridge.policy.policies import check_fallback, is_policy_file, open_policy
+from nics_drl_bridge.policy.stateful import Policy
 from nics_drl_bridge.report.doctor import examine
 from nics_drl_bridge.report.doctor_facts import expected_of
 from nics_drl_bridge.report.pictures import trajectories
@@ -87,7 +88,7 @@ def env_of(
 ) -> tuple[gymnasium.Env[Any, Any], Policy]:  # fmt: skip
     """Makes the env of a policy's task with a backend, behind a gate if any; opens the policy."""
     register_envs()
-    opened, task = open_policy(policy, model)
+    opened, task = open_policy(policy, model, conditions.fallback)
     task = replace(task, **conditions.task)
     field = load_worlds(world)
     given = {name: value for name, value in options.items() if value is not None}
@@ -150,6 +151,8 @@ class Evaluated:
 def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
     """Drives all policies through the same episodes everywhere; writes results, pictures."""
     seeds, logs = order.seeds, order.out / "logs"
+    for policy in order.policies:
+        check_fallback(order.conditions.fallback, policy)
     model, name = order.conditions.model(_model_name(order), order.out)
     world = load_worlds(order.world)
     places, evaluated = _places(order, model, say), []
@@ -248,7 +251,12 @@ def _percent(share: float) -> str:
 def line_of(one: Evaluated) -> str:
     """Summarises a policy in one line."""
     each = ", ".join(f"{LABELS[p]} {_percent(t.success.value)}" for p, t in one.tallies.items())
-    return f"{one.policy}: success {each}"
+    planned = ", ".join(
+        f"{_percent(tally.fallback)} {LABELS[place]}"
+        for place, tally in one.tallies.items()
+        if not isnan(tally.fallback)
+    )
+    return f"{one.policy}: success {each}" + (f"; fallback acted {planned}" if planned else "")
 
 
 def drive_vehicle(
@@ -263,7 +271,8 @@ def drive_vehicle(
     policy = order.policies[0]
     name, namespace = order.model or robot_of(policy), options.get("namespace", "")
     model, world = open_model(name), load_worlds(order.world)
-    open_policy(policy, model)  # a misfit is an error before anything moves
+    # A misfit is an error before anything moves.
+    open_policy(policy, model, order.conditions.fallback)
     from nics_drl_bridge.nodes.listen import listen
 
     say(f"listening to the vehicle for {LISTEN_S:g} s, as nics doctor does")
@@ -275,7 +284,7 @@ def drive_vehicle(
     if errors:
         raise BackendError(f"the vehicle is not driven: {errors[0]}; see nics doctor for the rest.")
     given = {"mode": "realtime", "vehicle": True, "command_topic": RAW, "say": say, **options}
-    env, driver = env_of(policy, model, order.world, "dds", **given)
+    env, driver = env_of(policy, model, order.world, "dds", order.conditions, **given)
     episodes, chosen = list[Episode](), {} if goal is None else {"goal": goal}
     with closing(env):
         for count, seed in enumerate(order.seeds, 1):
@@ -286,7 +295,7 @@ def drive_vehicle(
             # The vehicle's own estimate is all that is known of its path.
             episodes.append(replace(driven, path=driven.estimate))
             say(f"  {driven.result}, {driven.steps} steps, {episodes[-1].length:.2f} m")
-    env, driver = env_of(policy, model, order.world, "sim", estimator=True)
+    env, driver = env_of(policy, model, order.world, "sim", order.conditions, estimator=True)
     with closing(env):
         starts = [(one.seed, {"start": one.path[0], "goal": one.goal}) for one in episodes]
         again = [drive(env, driver, *each) for each in starts]

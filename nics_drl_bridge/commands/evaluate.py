@@ -32,6 +32,9 @@ def evaluate(
     gate: Annotated[str | None, Option(
         metavar="LIMITS", help="Drive through the gate and its shield, with these limits: shipped "
         "ones (differential) or a YAML file.")] = None,
+    fallback: Annotated[str, Option(
+        metavar="PLANNER", help="dynamic_window or mppi: acts where the policy asks for what can't "
+        "be stopped before a touch.")] = "",
     out: Annotated[Path, Option(help="Folder for all that is written.")] = Path("runs/evaluate"),
     shadow: Annotated[Path | None, Option(help="A bag: compare policies with its drive.")] = None,
     topic: Annotated[list[str] | None, Option(
@@ -64,6 +67,9 @@ def evaluate(
         if named and (hardware or shadow is not None):
             where = "a vehicle has its own" if hardware else "a bag was recorded under its own"
             raise ConfigError(f"{', '.join(named)}: {where}; leave out {', '.join(named)}.")
+        if fallback and shadow is not None:
+            reason = "is driven, and --shadow compares the policy alone; leave it out"
+            raise ConfigError(f"--fallback {fallback}: {reason}.")
         if hardware and len(policies) > 1:
             raise ConfigError(f"--hardware drives one policy at a time, not {', '.join(policies)}.")
         if shadow is not None:
@@ -74,7 +80,7 @@ def evaluate(
 
         chosen = {"places": tuple(dict.fromkeys(places))} if places else {}
         count, tell = episodes or (1 if hardware else 20), partial(typer.echo, err=True)
-        under = Conditions(lidar, randomisation, gate)
+        under = Conditions(lidar, randomisation, gate, fallback)
         order = driving.EvaluationOrder(
             policies, out, model, world, count, seed, **chosen, conditions=under
         )

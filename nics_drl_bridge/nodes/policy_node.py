@@ -19,8 +19,10 @@ from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.lifecycle import ACTIVE, UNCONFIGURED, ManagedNode
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
+from nics_drl_bridge.policy.fallback import acted
 from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
-from nics_drl_bridge.policy.policies import begin, open_policy, resume
+from nics_drl_bridge.policy.policies import open_policy
+from nics_drl_bridge.policy.stateful import begin, resume
 
 POLLS = 0.1  # time between two checks whether to act, as a share of the control period
 LONGEST_REASON = 300  # greatest length of a policy's error text, in characters
@@ -37,6 +39,9 @@ class PolicyNode(ManagedNode):
         for name, default, about in (
             ("policy", "dynamic_window",
              "A policy file (*.onnx), or the name of a shipped one or of a baseline."),
+            ("fallback", "",
+             "A planner (dynamic_window, mppi) that acts where the policy asks for what can't be "
+             "stopped before a touch; empty for none."),
             ("goal", [math.nan] * 2, "x, y in map [m]; NaN waits for goal_pose."),
             ("rate", math.nan,
              "Actions per second of the steady clock; NaN: of the control period; 0: one for each "
@@ -86,7 +91,8 @@ class PolicyNode(ManagedNode):
         return ActionPace(period), Deadline(limit, patience)
 
     def _open_policy(self, model: SimulatorModel) -> None:
-        self._policy, self._task = open_policy(str(self.get_parameter("policy").value), model)
+        name, fallback = (str(self.get_parameter(key).value) for key in ("policy", "fallback"))
+        self._policy, self._task = open_policy(name, model, fallback)
         view = rehearse(model)  # so that all compiles now
         self._task.judge(view, {"goal": np.zeros(2)})
         self._asked(view, np.zeros(2))
@@ -133,6 +139,8 @@ class PolicyNode(ManagedNode):
             return runner.Condition(self.state, warns=False, facts={})
         done, longest = self._deadline, f"{1e3 * self._deadline.longest_s:.2f}"
         facts = {"answered": done.answered, "late": done.late, "longest inference [ms]": longest}
+        if (planned := acted(self._policy)) is not None:
+            facts["by the fallback"] = planned
         return runner.Condition(f"{self.state}; {done.late} late inferences", done.late > 0, facts)
 
     def _twist(self) -> Array:

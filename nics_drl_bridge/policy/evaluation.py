@@ -14,7 +14,8 @@ from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.guard import uninterrupted
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
-from nics_drl_bridge.policy.policies import Policy, begin
+from nics_drl_bridge.policy.fallback import acted
+from nics_drl_bridge.policy.stateful import Policy, begin
 from nics_drl_bridge.seeds import checked_seeds
 
 Array = NDArray[np.float64]
@@ -39,6 +40,7 @@ class Episode:
     bodies: Array  # (K, 7) obstacles at the start, see `sim.scenes.Scene`
     reward: float  # sum over the episode
     believed: str | None = None  # by the robot itself, where `result` is by the truth
+    planned: int | None = None  # actions of the fallback, if the policy has one
 
     @property
     def believed_success(self) -> bool:
@@ -69,6 +71,7 @@ class Episode:
             "goal_distance_m": round(self.miss, 4),
             "steps": self.steps,
             "length_m": round(self.length, 4),
+            "fallback_actions": self.planned,
             "goal": self.goal.tolist(),
             "path": np.round(self.path, 4).tolist(),
         }
@@ -87,6 +90,7 @@ def drive(
         observation, info = env.reset(seed=seed, options=options)
         on_start()
         begin(policy)
+        before = acted(policy)
         goal, bodies = info["goal"], info["bodies"]
         paths, estimates, total, ended = [info["start"]], [info["pose"]], 0.0, False
         while not ended:
@@ -98,8 +102,9 @@ def drive(
         collided = "collision" if np.any(info["collision"]) else "time-out"
         believed = "success" if np.all(info["is_success"]) else collided
         driven = np.array(paths), np.array(estimates), goal, bodies, total
+        planned = None if before is None else (acted(policy) or 0) - before
         if "true_pose" not in info:
-            return Episode(seed, believed, *driven)
+            return Episode(seed, believed, *driven, planned=planned)
         known = info.get("true_collision")
         if known is None:  # then `touched` tells, or else the robot itself
             known = believed == "collision" if touched is None else touched()
@@ -107,7 +112,7 @@ def drive(
         there = truly_near(getattr(env.unwrapped, "task", None), info["true_pose"], goal).all()
         wrong = (believed == "success" and not there) or believed == "collision"
         true = ELSEWHERE if wrong else believed
-        return Episode(seed, "collision" if hit else true, *driven, believed)
+        return Episode(seed, "collision" if hit else true, *driven, believed, planned)
     except BaseException:
         if isinstance(env.unwrapped, BridgeEnv):  # it does not see errors of a policy
             with uninterrupted():
@@ -281,6 +286,7 @@ class Tally(Summary):
     deviation: ConfidenceInterval
     greatest_deviation: float  # maximum over all episodes [m]
     believed: ConfidenceInterval  # share of episodes that the robot itself believed successful
+    fallback: float  # share of the actions that were the fallback's, NaN without one
 
     def figures(self) -> dict[str, Any]:
         """The tally as plain data, an interval as a list; non-finite values become null."""
@@ -307,5 +313,11 @@ def tallies(runs: Mapping[str, Sequence[Episode]], control_period: float) -> dic
             deviation=mean(gaps),
             greatest_deviation=max(gaps),
             believed=rate(sum(episode.believed_success for episode in episodes), len(pairs)),
+            fallback=_planned_share(episodes),
         )
     return found
+
+
+def _planned_share(episodes: Sequence[Episode]) -> float:
+    counts = [one.planned for one in episodes if one.planned is not None]
+    return sum(counts) / max(sum(one.steps for one in episodes), 1) if counts else math.nan

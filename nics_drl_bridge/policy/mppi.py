@@ -3,8 +3,9 @@
 import math
 import os
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ from nics_drl_bridge.threads import run_parts
 Array = NDArray[np.float64]
 Sense = tuple[ScanRays, FootprintDiscs, Clearance]
 SETTLED_S = 3.0  # after which a held command has led to its state
+LONGEST_STOP_S = 10.0  # for which a stop is looked at
 FINEST = 0.25  # share of a lag that a step of the roll-outs may take
 FEWEST = 8  # robots of a thread
 CLEARANCE = Clearance(margin=0.08, soft=0.4)
@@ -54,26 +56,45 @@ class Mppi:
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """See `Policy`."""
-        parts = self.task.scan_parts
-        seen = np.atleast_2d(observation).astype(np.float64)
-        goals = seen[:, parts : parts + 1] * seen[:, parts + 1 : parts + 3]
-        given = seen[:, :parts], goals, seen[:, parts + 3 : parts + 6]
-        out = np.empty((len(seen), len(self.task.robot.command)))
-        count = max(1, min(os.cpu_count() or 1, len(seen) // FEWEST))
-        cuts = np.linspace(0, len(seen), count + 1).astype(int).tolist()
-        rows = [slice(*ends) for ends in pairwise(cuts)]
-        run_parts(partial(self._plan, out, [np.ascontiguousarray(each) for each in given]), rows)
+        given = self._seen(observation)
+        out = np.empty((len(given[0]), len(self.task.robot.command)))
+        self._run(kernels.plan_all, (out, *given), self._plant, self._sampling, self.worth)
         actions = out.astype(np.float32)
         return actions[0] if observation.ndim == 1 else actions
 
-    def _plan(self, out: Array, given: list[Array], rows: slice) -> None:
-        scratch, lanes = self._free.pop() if self._free else self._memory()
-        sense = (*self._sense, scratch)
-        kernels.plan_all(
-            out[rows], *(each[rows] for each in given), sense, self._plant, self._sampling,
-            self.worth, lanes,
-        )  # fmt: skip
-        self._free.append((scratch, lanes))
+    def can_stop(self, observation: NDArray[np.float32], commands: Array) -> NDArray[np.bool_]:
+        """True (...) where a robot that follows a command (..., C) for a period can stop after it.
+
+        That is with a margin between its true outline and all that the observation (..., O) shows;
+        what is within the margin already must not come nearer. Angles are held meanwhile.
+        """
+        scans, _, twists = self._seen(observation)
+        out = np.empty(len(scans), np.bool_)
+        given = out, np.atleast_2d(commands).astype(np.float64), scans, twists
+        angles = np.array([each.unit == "rad" for each in self.task.robot.command])
+        most = math.ceil(LONGEST_STOP_S / self._period)
+        halt = kernels.Halt(angles, still(self.task.robot), most)
+        self._run(kernels.stops_all, given, self._plant, halt)
+        return out.reshape(observation.shape[:-1])
+
+    def _seen(self, observation: NDArray[np.float32]) -> tuple[Array, Array, Array]:
+        """Scans (N, P) in shares, goals (N, 2) in `base_link` [m], and twists (N, 3)."""
+        parts, rows = self.task.scan_parts, np.atleast_2d(observation).astype(np.float64)
+        goals = rows[:, parts : parts + 1] * rows[:, parts + 1 : parts + 3]
+        scans, twists = rows[:, :parts], rows[:, parts + 3 : parts + 6]
+        return np.ascontiguousarray(scans), goals, np.ascontiguousarray(twists)
+
+    def _run(self, kernel: Any, arrays: tuple[NDArray[Any], ...], *given: Any) -> None:
+        """Runs a kernel for the rows of arrays (N, ...) on all cores, each with its own memory."""
+        count = max(1, min(os.cpu_count() or 1, len(arrays[0]) // FEWEST))
+        cuts = np.linspace(0, len(arrays[0]), count + 1).astype(int).tolist()
+
+        def part(rows: slice) -> None:
+            scratch, lanes = self._free.pop() if self._free else self._memory()
+            kernel(*(each[rows] for each in arrays), (*self._sense, scratch), *given, lanes)
+            self._free.append((scratch, lanes))
+
+        run_parts(part, [slice(*ends) for ends in pairwise(cuts)])
 
     @cached_property
     def _free(self) -> list[tuple[MapScratch, kernels.RollOuts]]:
@@ -81,7 +102,7 @@ class Mppi:
 
     def _memory(self) -> tuple[MapScratch, kernels.RollOuts]:
         robot, (_, outline, clearance) = self.task.robot, self._sense
-        low, high = robot.command_low, robot.command_high
+        low, high = self.task.command_limits
         ends = np.stack([low, high]) if self.task.robot.takes_cmd_vel else np.zeros((1, len(low)))
         half = math.hypot(*np.abs(steady_twist(robot, ends))[:, :2].max(axis=0)) * self.horizon
         half = min(half or np.inf, self.task.sight.range_max) + outline.outer
@@ -121,14 +142,14 @@ class Mppi:
         rows = np.repeat(terms.coefficient[:, None], self.samples, axis=1)
         return kernels.Plant(
             with_coefficients(terms, rows), terms, SERIES, period / substeps, substeps, latency,
-            _settled(model, robot.command_high), robot.command_low, robot.command_high,
+            _settled(model, robot.command_high), *self.task.command_limits,
         )  # fmt: skip
 
     @cached_property
     def _sampling(self) -> kernels.Sampling:
         shape = self.samples, self.knots, len(self.task.robot.command)
         offers, noise = np.empty((2, *shape))
-        low, high = self.task.robot.command_low, self.task.robot.command_high
+        low, high = self.task.command_limits
         rest = 2.0 * (still(self.task.robot) - low) / (high - low) - 1.0
         kernels.draw(offers, noise, rest, self.seed)
         places = np.linspace(0.0, self.knots - 1.0, round(self.horizon / self._period))

@@ -15,6 +15,7 @@ from nics_drl_bridge.policy.local_map_kernels import (
     ARRIVED_M,
     astray,
     look,
+    look_near,
     room_at,
     touching,
     way_at,
@@ -25,6 +26,7 @@ from nics_drl_bridge.robot.kernels import Terms, advance, bend, rates, run
 Array = NDArray[np.float64]
 HIT = 1e3  # cost of a touch at once; later ones cost less
 BEYOND = 1.3  # offers are drawn over this much of the range and cut: many are at its ends
+STOPPED = 0.01  # speed of the outline at which a robot has stopped [m/s]
 PASSES, EASE = 12, 1e-6  # over the commands, to find those that a twist follows
 
 
@@ -40,6 +42,14 @@ class Plant(NamedTuple):
     settled: Array  # (S, C) state by the command that is held
     low: Array  # (C,) of the commands
     high: Array
+
+
+class Halt(NamedTuple):
+    """A stop that follows on a command."""
+
+    holds: NDArray[np.bool_]  # (C,) True for commands that are held while the robot stops
+    rest: Array  # (C,) of the others
+    most: int  # periods that it may take
 
 
 class Sampling(NamedTuple):
@@ -108,10 +118,7 @@ def _plan(out, twist, around, plant, sampling, worth, lanes):  # type: ignore[no
     The first round offers actions of the whole range, and the cheapest takes the place of the plan
     of the step before: so nothing is remembered, and an action follows from what is seen alone.
     """
-    follow(twist, plant, lanes)
-    lanes.start[:] = 0.0
-    if plant.latency > 0.0:
-        advance(lanes.start, twist, plant.latency, plant.series)
+    _wait(twist, plant, lanes)
     lanes.actions[:] = sampling.offers
     best = _roll(around, plant, sampling, worth, lanes)
     lanes.nominal[:] = lanes.actions[best]
@@ -126,6 +133,51 @@ def _plan(out, twist, around, plant, sampling, worth, lanes):  # type: ignore[no
         best = _roll(around, plant, sampling, worth, lanes)
         _average(best, sampling.temperature, lanes)
     out[:] = lanes.nominal[0]
+
+
+@kernel(allocates=True)
+def stops_all(out, commands, scans, twists, sense, plant, halt, lanes):  # type: ignore[no-untyped-def]
+    """Writes whether N robots can still stop after commands (N, C), without a touch, to out (N,).
+
+    As in a plan, by scans (N, P) and twists (N, 3); only the first lane is rolled out.
+    """
+    nowhere = np.zeros(2)
+    for n in range(out.shape[0]):
+        around = look_near(scans[n], nowhere, *sense)
+        out[n] = _stops(commands[n], twists[n], around, plant, halt, lanes)
+
+
+@kernel
+def _stops(command, twist, around, plant, halt, lanes):  # type: ignore[no-untyped-def]
+    """Returns True if a robot that follows a command (C,) for a period, then stops, is clear."""
+    for given in command:
+        if not math.isfinite(given):
+            return False
+    _wait(twist, plant, lanes)
+    _put(lanes, plant.settled.shape[0])
+    states, limit = plant.settled.shape[0], touching(around)
+    for t in range(1 + halt.most):
+        for c in range(command.shape[0]):
+            given = command[c] if t == 0 or halt.holds[c] else halt.rest[c]
+            lanes.x[states + c, 0] = bend(given, plant.single.curves[c])
+        run(lanes.pose, lanes.x, lanes.dq, plant.terms, plant.series, plant.dt, plant.substeps)
+        pose = lanes.pose
+        if room_at(pose[0, 0], pose[1, 0], pose[2, 0], pose[3, 0], around) < limit:
+            return False
+        dq = lanes.dq
+        fastest = math.hypot(dq[0, 0], dq[1, 0]) + around.outline.outer * abs(dq[2, 0])
+        if t > 0 and fastest < STOPPED:
+            break
+    return True
+
+
+@kernel
+def _wait(twist, plant, lanes):  # type: ignore[no-untyped-def]
+    """Writes where a robot of a twist (3,) is once commands have an effect, and its state there."""
+    follow(twist, plant, lanes)
+    lanes.start[:] = 0.0
+    if plant.latency > 0.0:
+        advance(lanes.start, twist, plant.latency, plant.series)
 
 
 @kernel
@@ -218,13 +270,8 @@ def _roll(around, plant, sampling, worth, lanes):  # type: ignore[no-untyped-def
 def _begin(around, plant, worth, lanes):  # type: ignore[no-untyped-def]
     """Puts all lanes at the start, with the cost of how their actions change."""
     states, count = plant.settled.shape
-    x, y, heading = lanes.start[0], lanes.start[1], lanes.start[2]
+    _put(lanes, states)
     for k in range(lanes.cost.shape[0]):
-        lanes.pose[0, k], lanes.pose[1, k] = x, y
-        lanes.pose[2, k], lanes.pose[3, k] = math.cos(heading), math.sin(heading)
-        lanes.pose[4, k], lanes.pose[5, k] = heading, 0.0
-        for s in range(states):
-            lanes.x[s, k] = lanes.one[s]
         change = 0.0
         for c in range(count):
             before = 2.0 * (lanes.held[c] - plant.low[c]) / (plant.high[c] - plant.low[c]) - 1.0
@@ -234,6 +281,18 @@ def _begin(around, plant, worth, lanes):  # type: ignore[no-untyped-def]
         lanes.cost[k] = worth.change * change
         lanes.way[k] = 0.0
         lanes.ended[k] = -1
+
+
+@kernel
+def _put(lanes, states):  # type: ignore[no-untyped-def]
+    """Puts all lanes at the start."""
+    x, y, heading = lanes.start[0], lanes.start[1], lanes.start[2]
+    for k in range(lanes.cost.shape[0]):
+        lanes.pose[0, k], lanes.pose[1, k] = x, y
+        lanes.pose[2, k], lanes.pose[3, k] = math.cos(heading), math.sin(heading)
+        lanes.pose[4, k], lanes.pose[5, k] = heading, 0.0
+        for s in range(states):
+            lanes.x[s, k] = lanes.one[s]
 
 
 @kernel

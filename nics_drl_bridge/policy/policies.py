@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +16,11 @@ from nics_drl_bridge.errors import ConfigError, PolicyError, nearest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy import dynamic_window_kernels as kernels
 from nics_drl_bridge.policy.contract import SUFFIX, shipped
+from nics_drl_bridge.policy.fallback import Fallback, check_readable
 from nics_drl_bridge.policy.local_map import outline_of, rays_of, scratch_of
 from nics_drl_bridge.policy.local_map_kernels import Clearance, FootprintDiscs, MapScratch, ScanRays
 from nics_drl_bridge.policy.mppi import Mppi
+from nics_drl_bridge.policy.stateful import Policy, Stateful
 from nics_drl_bridge.robot.kinds import command_for, has_textbook, reach, steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -26,72 +28,12 @@ if TYPE_CHECKING:
     from nics_drl_bridge.policy.policy_file import PolicyFile
 
 Array = NDArray[np.float64]
-Rows = NDArray[np.float32]
-Step = Callable[[Rows, Rows], tuple[NDArray[Any], Rows]]
-"""Actions (..., C) and the next state (..., S), for observations (..., O) and a state (..., S)."""
 
 CLEARANCE = Clearance(margin=0.1, soft=0.4)  # of the dynamic window, whose twists are few
 FULL_TURN_RAD = 0.8  # bearing of the goal from which a robot turns as fast as it can
 SETTLED_S = 5.0  # after which a held command has led to its twist
 LEAST_REACH = 1e-3  # of a component of the twist that no command moves [m/s, rad/s]
 CREEP = 0.3  # share of the speed for a robot that can't turn on the spot and has its goal behind
-
-
-class Policy(Protocol):
-    """Maps observations to actions; the same in every world."""
-
-    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Returns the action (C,) in [-1, 1] for an observation (O,); or (N, C) for (N, O)."""
-
-
-class Stateful:
-    """Acts with a state that it keeps from step to step of an episode, a row for each world."""
-
-    def __init__(self, step: Step, size: int, start: float, longest_gap: float = math.inf) -> None:
-        self._step, self._start = step, np.full(size, start, np.float32)
-        self._longest_gap = longest_gap  # between two observations [s]
-        self._state: Rows | None = None
-        self._time = math.inf  # of the last observation [s]
-
-    def reset(self, worlds: NDArray[np.bool_] | None = None) -> None:
-        """Begins an episode, in some worlds (N,) or in all of them."""
-        if worlds is None or self._state is None:
-            self._state, self._time = None, math.inf
-        else:
-            self._state[worlds] = self._start
-
-    def resume(self, time_s: float) -> str:
-        """Resets after a gap before an observation of this time [s]; a sentence says so, or ''."""
-        gap, self._time = time_s - self._time, time_s
-        if gap <= self._longest_gap:
-            return ""
-        self.reset()
-        self._time = time_s
-        limit = f"the {self._longest_gap:g} s after which the policy's state is no longer valid"
-        return f"nothing was observed for {gap:.3g} s, longer than {limit}; it begins anew."
-
-    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """See `Policy`. Raises ConfigError for another number of worlds than before."""
-        lead = observation.shape[:-1]
-        if self._state is None:
-            self._state = np.tile(self._start, (*lead, 1))
-        if self._state.shape[:-1] != lead:
-            given = f"a state of {self._state.shape[:-1]} worlds was given observations of {lead}"
-            raise ConfigError(f"{given}; reset the policy when episodes begin.")
-        action, self._state = self._step(observation, self._state)
-        return action
-
-
-def begin(policy: Any) -> None:
-    """Tells a policy, or whose method `act` this is, that episodes begin; few need to know."""
-    reset = getattr(getattr(policy, "__self__", policy), "reset", None)
-    if reset is not None:
-        reset()
-
-
-def resume(policy: Policy, time_s: float) -> str:
-    """See `Stateful.resume`; '' for a policy without a state."""
-    return policy.resume(time_s) if isinstance(policy, Stateful) else ""
 
 
 def _grid(robot: RobotSpec) -> Array:
@@ -258,6 +200,7 @@ POLICIES: dict[str, Callable[[Navigation, SimulatorModel | None], Policy]] = {
     "random": lambda task, _: RandomActions(task),
     "straight": StraightToGoal,
 }
+PLANNERS = ("dynamic_window", "mppi")  # those that may stand behind another
 
 
 def shipped_policies() -> list[str]:
@@ -273,22 +216,30 @@ def is_policy_file(name: str) -> bool:
     return name not in POLICIES
 
 
-def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None) -> Policy:
-    """Makes a policy by name, or the path of a file. Raises ConfigError, PolicyError."""
+def make_policy(
+    name: str, task: Navigation, model: SimulatorModel | None = None, fallback: str = ""
+) -> Policy:
+    """Makes a policy by name, or the path of a file, with a fallback by name behind it, if any.
+
+    Raises ConfigError, PolicyError.
+    """
     if not is_policy_file(name):
-        return POLICIES[name](task, model)
+        return _backed(POLICIES[name](task, model), name, fallback, task, model)
     from nics_drl_bridge.policy.policy_file import load_policy  # the others need no onnxruntime
 
     policy = load_policy(name)
     policy.check_fits(model, task)
-    return _acting(policy)
+    return _backed(_acting(policy), name, fallback, task, model)
 
 
-def open_policy(name: str, model: SimulatorModel) -> tuple[Policy, Navigation]:
-    """Opens a policy and its navigation task; PolicyError if it was trained for another task."""
+def open_policy(name: str, model: SimulatorModel, fallback: str = "") -> tuple[Policy, Navigation]:
+    """Opens a policy, with a fallback if any, and its navigation task.
+
+    Raises ConfigError, and PolicyError if it was trained for another task.
+    """
     if not is_policy_file(name):
         task = Navigation(model.robot, model.lidar)
-        return POLICIES[name](task, model), task
+        return _backed(POLICIES[name](task, model), name, fallback, task, model), task
     from nics_drl_bridge.policy.policy_file import load_policy
 
     policy = load_policy(name)
@@ -296,7 +247,30 @@ def open_policy(name: str, model: SimulatorModel) -> tuple[Policy, Navigation]:
     if not isinstance(found, Navigation):
         reason = f"is {policy.contract.task.name!r}; this drives policies of 'navigation'."
         raise PolicyError(name, "task.name", reason)
-    return _acting(policy), found
+    return _backed(_acting(policy), name, fallback, found, model), found
+
+
+def check_fallback(fallback: str, policy: str) -> None:
+    """Raises ConfigError unless a name is '', or a planner's other than the policy."""
+    if fallback and fallback not in PLANNERS:
+        raise ConfigError(f"fallback {fallback!r}: no such planner; {nearest(fallback, PLANNERS)}")
+    if fallback and fallback == policy:
+        others = " or ".join(repr(name) for name in PLANNERS if name != policy)
+        raise ConfigError(f"fallback {fallback!r} is the policy itself; take {others}, or none.")
+
+
+def _backed(
+    policy: Policy, name: str, fallback: str, task: Navigation, model: SimulatorModel | None
+) -> Policy:
+    """The policy of a name, with the planner of another behind it unless that is ''."""
+    check_fallback(fallback, name)
+    if not fallback:
+        return policy
+    check_readable(task, fallback)
+    try:
+        return Fallback(policy, POLICIES[fallback](task, model), task, model)
+    except ConfigError as error:
+        raise ConfigError(f"fallback {fallback!r}: {error}") from None
 
 
 def _acting(policy: "PolicyFile") -> Policy:

@@ -14,7 +14,8 @@ from nics_drl_bridge.interface import S_PER_NS, RobotView
 from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, POSE, SCAN
 from nics_drl_bridge.middleware.playback import Playback, in_order, played
 from nics_drl_bridge.policy.pacing import ActionPace
-from nics_drl_bridge.policy.policies import open_policy, resume
+from nics_drl_bridge.policy.policies import open_policy
+from nics_drl_bridge.policy.stateful import resume
 from nics_drl_bridge.recording.bag_file import Message
 from nics_drl_bridge.recording.messages import commanded
 

@@ -23,7 +23,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.policy.evaluation import Act
-from nics_drl_bridge.policy.policies import Stateful
+from nics_drl_bridge.policy.stateful import Stateful
 from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch, tensors
 from nics_drl_bridge.policy.train_memory import Memory
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv

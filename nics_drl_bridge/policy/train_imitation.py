@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.policy.policies import Policy, make_policy
+from nics_drl_bridge.policy.policies import make_policy
+from nics_drl_bridge.policy.stateful import Policy
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 

@@ -28,7 +28,8 @@ from nics_drl_bridge.policy.evaluation import (
     summarise,
     tallies,
 )
-from nics_drl_bridge.policy.policies import Stateful, make_policy
+from nics_drl_bridge.policy.policies import make_policy
+from nics_drl_bridge.policy.stateful import Stateful
 
 LIMIT = 40
 MODEL, WORLD = direct_model(odometry=(0.02, 0.02)), field(count=6)

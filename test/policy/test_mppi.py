@@ -79,6 +79,16 @@ def test_it_waits_out_the_latency_of_its_model():
     )
 
 
+def test_it_plans_with_the_speeds_that_its_task_allows():
+    slow = planner()
+    slow = replace(slow, task=replace(slow.task, top_speed=0.2))
+    fastest, _ = slow.task.command(np.ones(2))
+    assert slow._plant.high[0] == fastest == 0.2
+    ahead = RobotView(np.zeros(3), np.zeros(3), np.full(90, np.inf, np.float32), 0.0, 0.0, 0.0)
+    action = slow.act(slow.task.observation(ahead, {"goal": np.array([2.0, 0.0])}))
+    assert slow.task.command(action)[0] > 0.15
+
+
 def test_a_robot_of_which_neither_model_nor_textbook_is_known_is_refused():
     robot = load_robot("ackermann").model_copy(update={"textbook": None, "parameters": {}})
     with pytest.raises(BridgeError, match="ackermann"):

@@ -21,11 +21,9 @@ from nics_drl_bridge.policy.policies import (
     POLICIES,
     DynamicWindow,
     RandomActions,
-    Stateful,
-    begin,
     make_policy,
-    resume,
 )
+from nics_drl_bridge.policy.stateful import Stateful, begin, resume
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.kinds import steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot

@@ -1,0 +1,72 @@
+"""A policy, and the state that one may keep from step to step of an episode."""
+
+import math
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.errors import ConfigError
+
+Rows = NDArray[np.float32]
+Step = Callable[[Rows, Rows], tuple[NDArray[Any], Rows]]
+"""Actions (..., C) and the next state (..., S), for observations (..., O) and a state (..., S)."""
+
+
+class Policy(Protocol):
+    """Maps observations to actions; the same in every world."""
+
+    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Returns the action (C,) in [-1, 1] for an observation (O,); or (N, C) for (N, O)."""
+
+
+class Stateful:
+    """Acts with a state that it keeps from step to step of an episode, a row for each world."""
+
+    def __init__(self, step: Step, size: int, start: float, longest_gap: float = math.inf) -> None:
+        self._step, self._start = step, np.full(size, start, np.float32)
+        self._longest_gap = longest_gap  # between two observations [s]
+        self._state: Rows | None = None
+        self._time = math.inf  # of the last observation [s]
+
+    def reset(self, worlds: NDArray[np.bool_] | None = None) -> None:
+        """Begins an episode, in some worlds (N,) or in all of them."""
+        if worlds is None or self._state is None:
+            self._state, self._time = None, math.inf
+        else:
+            self._state[worlds] = self._start
+
+    def resume(self, time_s: float) -> str:
+        """Resets after a gap before an observation of this time [s]; a sentence says so, or ''."""
+        gap, self._time = time_s - self._time, time_s
+        if gap <= self._longest_gap:
+            return ""
+        self.reset()
+        self._time = time_s
+        limit = f"the {self._longest_gap:g} s after which the policy's state is no longer valid"
+        return f"nothing was observed for {gap:.3g} s, longer than {limit}; it begins anew."
+
+    def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """See `Policy`. Raises ConfigError for another number of worlds than before."""
+        lead = observation.shape[:-1]
+        if self._state is None:
+            self._state = np.tile(self._start, (*lead, 1))
+        if self._state.shape[:-1] != lead:
+            given = f"a state of {self._state.shape[:-1]} worlds was given observations of {lead}"
+            raise ConfigError(f"{given}; reset the policy when episodes begin.")
+        action, self._state = self._step(observation, self._state)
+        return action
+
+
+def begin(policy: Any) -> None:
+    """Tells a policy, or whose method `act` this is, that episodes begin; few need to know."""
+    reset = getattr(getattr(policy, "__self__", policy), "reset", None)
+    if reset is not None:
+        reset()
+
+
+def resume(policy: Policy, time_s: float) -> str:
+    """See `Stateful.resume`; '' for a policy without a state."""
+    told = getattr(policy, "resume", None)
+    return "" if told is None else str(told(time_s))
