@@ -63,7 +63,7 @@ HOMES = {
     "pettingzoo": ("env/pettingzoo_env.py",),
     "ray": ("extras/ray/*",),
     "rosbags": ("recording/*", "extras/bags/*"),
-    "pyarrow": ("recording/*",),
+    "pyarrow": ("recording/*", "extras/bags/*"),
     "mcap": ("recording/*", "extras/bags/*"),
     "threadpoolctl": ("threads.py",),
 }

@@ -235,6 +235,12 @@ class BagFile:
         """True if messages of the topic can be decoded."""
         return self.types[topic] in self._store.fielddefs
 
+    def definition(self, topic: str) -> str:
+        """Returns the definition of a topic's type as ROS 2 has it, with all that it contains."""
+        if self.knows(topic):
+            return str(self._store.generate_msgdef(self.types[topic], ros_version=2)[0])
+        return str(self._connections[topic][0].msgdef.data)
+
     def messages(self, topic: str) -> list[Message]:
         """Returns all messages of a topic."""
         found = []

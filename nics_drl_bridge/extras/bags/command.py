@@ -1,4 +1,4 @@
-"""`nics bag record|info|replay|salvage`."""
+"""`nics bag record|info|replay|export|salvage`."""
 
 import json
 from dataclasses import asdict
@@ -12,9 +12,10 @@ from typer import Argument, Option
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands.console import SalvageOption, intact, needs_ros, one_sentence
 
-bag = typer.Typer(help="Records, describes, replays and saves bags.", no_args_is_help=True)
+bag = typer.Typer(help="Records, describes, replays, exports and saves bags.", no_args_is_help=True)
 
 STORAGES = ("mcap", "sqlite3")
+TASK = "Drive to the goal without touching anything."
 BagArgument = Annotated[Path, Argument(help="Folder or file of a rosbag2.")]
 StorageOption = Annotated[str, Option(help="mcap (checksums) or sqlite3.", metavar="mcap|sqlite3")]
 NamespaceOption = Annotated[str, Option(help="Namespace of the robot's topics.")]
@@ -115,6 +116,64 @@ def replay(
 
 
 @bag.command()
+def export(
+    path: BagArgument,
+    lerobot: Annotated[
+        Path | None, Option(metavar="FOLDER", help="Write a LeRobot dataset, format v3.0.")
+    ] = None,
+    mcap: Annotated[
+        Path | None, Option(metavar="FOLDER", help="Write a bag in MCAP, as Foxglove opens it.")
+    ] = None,
+    model: Annotated[
+        str | None,
+        Option(help="A model's folder, or a shipped robot: its commands, its lidar and its mount."),
+    ] = None,
+    topic: Annotated[
+        list[str] | None,
+        Option(metavar="ROLE=TOPIC", help="As odom=/car/odom. Roles: scan, odom, cmd_vel, pose."),
+    ] = None,
+    fps: Annotated[
+        int | None, Option(min=1, help="Frames per second; the commands' rate by default.")
+    ] = None,
+    gap: Annotated[float, Option(help="Data older than this end an episode [s].")] = 0.5,
+    task: Annotated[str, Option(help="What the robot was to do, in words.")] = TASK,
+    succeeded: Annotated[
+        str | None,
+        Option(metavar="all|none|NUMBERS", help="Episodes that succeeded, as 0,2,5; if known."),
+    ] = None,
+    salvage: SalvageOption = False,
+) -> None:
+    """Writes a bag for others: as a dataset to learn from, or as MCAP to look at."""
+    with one_sentence(), intact(path, salvage) as whole:
+        from nics_drl_bridge.errors import ConfigError
+        from nics_drl_bridge.generator import open_model
+
+        if lerobot is None and mcap is None:
+            raise ConfigError("nothing to write; say --lerobot FOLDER or --mcap FOLDER.")
+        known = None if model is None else open_model(model)
+        if mcap is not None:
+            from nics_drl_bridge.extras.bags.convert import convert
+
+            added = convert(whole, mcap, known)
+            also = f", with {' and '.join(added)} added" if added else ""
+            typer.echo(f"bag written to {mcap}{also}")
+        if lerobot is None:
+            return
+        from nics_drl_bridge.extras.bags.frames import frames_of
+        from nics_drl_bridge.extras.bags.lerobot import check_output, write_dataset
+
+        check_output(lerobot)
+        frames = frames_of(whole, console.roles_of(topic or []), known, fps, gap)
+        episodes = len(frames.lengths)
+        reached = _numbers(succeeded, episodes)
+        write_dataset(frames, lerobot, task, known.robot.name if known else None, reached)
+        if frames.dropped:
+            typer.echo(f"left out: {frames.dropped} episodes of a single frame", err=True)
+        total = int(frames.lengths.sum())
+        typer.echo(f"{episodes} episodes, {total} frames at {frames.fps} Hz, written to {lerobot}")
+
+
+@bag.command()
 def salvage(
     path: BagArgument,
     out: Annotated[Path, Argument(help="Folder of the bag to write.")],
@@ -138,6 +197,19 @@ def _storage(name: str) -> Any:
     if name not in STORAGES:
         raise ConfigError(f"--storage {name!r}: {nearest(name, STORAGES)}")
     return name
+
+
+def _numbers(given: str | None, episodes: int) -> set[int] | None:
+    from nics_drl_bridge.errors import ConfigError
+
+    if given is None:
+        return None
+    if given in ("all", "none"):
+        return set(range(episodes)) if given == "all" else set()
+    words = [word.strip() for word in given.split(",")]
+    if not all(word.isdecimal() for word in words):
+        raise ConfigError(f"--succeeded {given!r}: must be all, none, or numbers as in 0,2,5.")
+    return {int(word) for word in words}
 
 
 def _row(each: Any) -> tuple[str, ...]:

@@ -1,0 +1,76 @@
+"""Any bag as MCAP that Foxglove shows at once: with its types' definitions, and with transforms."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.middleware.measurement import ODOM, SCAN
+from nics_drl_bridge.middleware.playback import SCAN_TYPE
+from nics_drl_bridge.recording import topic_roles
+from nics_drl_bridge.recording.bag_file import BagFile, Message, opened
+from nics_drl_bridge.recording.messages import Offer
+from nics_drl_bridge.recording.write import FRAMES, bag_sink
+
+MOVING, FIXED = "/tf", "/tf_static"
+OFFERS = {FIXED: (Offer(1, transient_local=True),)}
+Row = tuple[str, int, bytes]
+"""Topic, time of receipt [ns] and bytes of a message."""
+
+
+def convert(path: str | Path, out: str | Path, model: SimulatorModel | None = None) -> list[str]:
+    """Writes a bag of ROS 2 or 1 as MCAP, and returns the topics that were added to it.
+
+    A bag without transforms gets those of its odometry and, with a model, of the lidar's mount:
+    without them a viewer can't tell where a scan lies. Raises RecordingError.
+    """
+    with opened(path) as bag, bag_sink(out) as sink:
+        rows = list[Row]()
+        for topic, kind in bag.types.items():
+            sink.add_topic(topic, kind, bag.offers(topic), definition=bag.definition(topic))
+            rows += ((topic, ns, data) for ns, data in bag.serialized(topic))
+        made = [*_moving(bag, sink.store), *_fixed(bag, sink.store, model)]
+        added = list(dict.fromkeys(topic for topic, _, _ in made))
+        for topic in added:
+            sink.add_topic(topic, topic_roles.TRANSFORMS, OFFERS.get(topic, ()))
+        for row in sorted(rows + made, key=lambda row: row[1]):
+            sink.write(*row)
+    return added
+
+
+def _moving(bag: BagFile, store: Any) -> Iterator[Row]:
+    for message in [] if MOVING in bag.types else _messages(bag, f"/{ODOM}", topic_roles.ODOMETRY):
+        told = message.content
+        where = told.pose.pose
+        place = where.position.x, where.position.y, where.position.z
+        made = _transform(store, told.header, told.child_frame_id, place, where.orientation)
+        yield MOVING, message.receive_ns, made
+
+
+def _fixed(bag: BagFile, store: Any, model: SimulatorModel | None) -> Iterator[Row]:
+    scans = _messages(bag, f"/{SCAN}", SCAN_TYPE)
+    if model is None or FIXED in bag.types or not scans:
+        return
+    x, y, heading = model.lidar.mount
+    half = heading / 2.0
+    turned = store.types["geometry_msgs/msg/Quaternion"](0.0, 0.0, np.sin(half), np.cos(half))
+    bases = [m.content.child_frame_id for m in _messages(bag, f"/{ODOM}", topic_roles.ODOMETRY)]
+    scan = scans[0].content.header
+    header = type(scan)(scan.stamp, (*bases, FRAMES[1])[0])
+    yield FIXED, bag.span_ns[0], _transform(store, header, scan.frame_id, (x, y, 0.0), turned)
+
+
+def _messages(bag: BagFile, topic: str, kind: str) -> list[Message]:
+    return bag.messages(topic) if bag.types.get(topic) == kind else []
+
+
+def _transform(
+    store: Any, header: Any, child: str, place: tuple[float, float, float], turned: Any
+) -> bytes:
+    types = store.types
+    moved = types["geometry_msgs/msg/Transform"](types["geometry_msgs/msg/Vector3"](*place), turned)
+    single = types[topic_roles.TRANSFORM](header, child, moved)
+    message = types[topic_roles.TRANSFORMS]([single])
+    return bytes(store.serialize_cdr(message, topic_roles.TRANSFORMS))
