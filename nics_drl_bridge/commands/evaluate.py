@@ -62,14 +62,8 @@ def evaluate(
             raise ConfigError(f"--hardware and --backend dds {reason}")
         if hardware and (shadow is not None or places):
             raise ConfigError("--hardware drives a vehicle: leave out --in and --shadow.")
-        conditions = {"lidar": lidar, "randomisation": randomisation, "gate": gate}
-        named = [f"--{name}" for name, value in conditions.items() if value is not None]
-        if named and (hardware or shadow is not None):
-            where = "a vehicle has its own" if hardware else "a bag was recorded under its own"
-            raise ConfigError(f"{', '.join(named)}: {where}; leave out {', '.join(named)}.")
-        if fallback and shadow is not None:
-            reason = "is driven, and --shadow compares the policy alone; leave it out"
-            raise ConfigError(f"--fallback {fallback}: {reason}.")
+        given = {"lidar": lidar, "randomisation": randomisation, "gate": gate}
+        _check(given, fallback, hardware, shadow is not None)
         if hardware and len(policies) > 1:
             raise ConfigError(f"--hardware drives one policy at a time, not {', '.join(policies)}.")
         if shadow is not None:
@@ -96,6 +90,17 @@ def evaluate(
         for one in evaluated:
             typer.echo(driving.line_of(one))
         typer.echo(f"pictures and evaluation.json: {out}")
+
+
+def _check(given: dict[str, str | None], fallback: str, hardware: bool, shadow: bool) -> None:
+    """Raises ConfigError for conditions of a simulator where none drives."""
+    named = [f"--{name}" for name, value in given.items() if value is not None]
+    if named and (hardware or shadow):
+        where = "a vehicle has its own" if hardware else "a bag was recorded under its own"
+        raise ConfigError(f"{', '.join(named)}: {where}; leave out {', '.join(named)}.")
+    if fallback and shadow:
+        reason = "is driven, and --shadow compares the policy alone; leave it out"
+        raise ConfigError(f"--fallback {fallback}: {reason}.")
 
 
 def _ask(yes: bool, question: str) -> None:

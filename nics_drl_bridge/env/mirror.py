@@ -2,36 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from nics_drl_bridge.env.task import Mirror, Sight, Task
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import wrap_angle
 from nics_drl_bridge.robot.mirror import mirrored_commands
 
-if TYPE_CHECKING:
-    from nics_drl_bridge.env.task import Sight, Task
-
 Array = NDArray[np.float64]
 Places = NDArray[np.intp]
 NEAR_RAD, NEAR_M = 1e-4, 1e-6  # by which a scan may be off its mirror image: angles are float32
-
-
-@dataclass(frozen=True)
-class Mirror:
-    """Mirror images of observations (..., O) and actions (..., C), or discrete ones (...).
-
-    They are seen[..., places] * signs, and actions[..., acted] * scale + offset, or acted[actions].
-    """
-
-    places: Places  # (O,)
-    signs: Array  # (O,)
-    acted: Places  # (C,), or (A,) the mirror images of discrete actions
-    scale: Array  # (C,), or empty
-    offset: Array  # (C,), not 0 where the limits of a command are not their own mirror image
 
 
 def mirror_of(task: Task, signs: ArrayLike) -> Mirror:

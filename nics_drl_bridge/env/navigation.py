@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.env import kernels
 from nics_drl_bridge.env.kernels import LIMIT
-from nics_drl_bridge.env.mirror import Mirror, mirror_of
-from nics_drl_bridge.env.task import Episodes, Flags, Memory, Observation, Outcome, Task
+from nics_drl_bridge.env.mirror import mirror_of
+from nics_drl_bridge.env.task import Episodes, Flags, Memory, Mirror, Observation, Outcome, Task
 from nics_drl_bridge.interface import RobotView
 
 Array = NDArray[np.float64]

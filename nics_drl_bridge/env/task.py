@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.env import kernels
 from nics_drl_bridge.env.kernels import LIMIT, ScanScale
-from nics_drl_bridge.env.mirror import Mirror
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan
@@ -31,6 +30,20 @@ DRIVES = ((0, 0, 0), (1, 0, 0), (1, 0, 1), (1, 0, -1), (-1, 0, 0), (-1, 0, 1), (
 """Stop; ahead, to the left, to the right; and back: signs of linear.x, linear.y, angular.z, as in
 the authors' code (efc-robot/MultiVehicleEnv). What can't reverse stays, and turns if it can."""
 SIDEWAYS = ((0, 1, 0), (0, -1, 0))  # Two more for a robot that moves sideways
+
+
+@dataclass(frozen=True)
+class Mirror:
+    """Mirror images of observations (..., O) and actions (..., C), or discrete ones (...).
+
+    They are seen[..., places] * signs, and actions[..., acted] * scale + offset, or acted[actions].
+    """
+
+    places: NDArray[np.intp]  # (O,)
+    signs: Array  # (O,)
+    acted: NDArray[np.intp]  # (C,), or (A,) the mirror images of discrete actions
+    scale: Array  # (C,), or empty
+    offset: Array  # (C,), not 0 where the limits of a command are not their own mirror image
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ class Curriculum(Schema):
 
 
 class Teaching(Schema):
-    """What only the simulator knows, repetition, and easy starts; nothing by default."""
+    """Rewards by what only the simulator knows, repetition, easy starts; nothing by default."""
 
     # reward of a contact that the task does not notice, e.g. behind a lidar of 270 deg, and its end
     contact: float | None = None

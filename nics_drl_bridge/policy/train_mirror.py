@@ -8,16 +8,12 @@ is no measure: where it is not symmetric yet, ratios to that grow without bound.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nics_drl_bridge.env.mirror import Mirror
-
-if TYPE_CHECKING:
-    from nics_drl_bridge.policy.train_ppo import Transitions
+from nics_drl_bridge.env.task import Mirror
+from nics_drl_bridge.policy.train_rollout import Transitions
 
 Array = NDArray[np.float64]
 

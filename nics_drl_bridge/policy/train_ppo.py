@@ -11,9 +11,9 @@ from __future__ import annotations
 import copy
 import math
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -32,6 +32,7 @@ from nics_drl_bridge.policy.train_algorithms import (
 from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch
 from nics_drl_bridge.policy.train_memory import memory_of
 from nics_drl_bridge.policy.train_mirror import Reflection
+from nics_drl_bridge.policy.train_rollout import Transitions
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import PpoSettings, TrainingSettings
 from nics_drl_bridge.threads import run_parts
@@ -42,31 +43,6 @@ Seen = tuple[torch.Tensor, torch.Tensor]  # features and state
 VALUE_WEIGHT, GRADIENT_LIMIT = 0.5, 0.5  # of the loss, and of the norm of its gradient
 ADAM_EPSILON = 1e-5
 LOG_NORM = 0.5 * math.log(2.0 * math.pi)  # of the normal distribution
-
-
-class Transitions(NamedTuple):
-    """R transitions, T steps of N worlds, step after step; the last two for a learnt memory."""
-
-    seen: torch.Tensor  # (R, O) normalised observations, with what a memory adds
-    actions: torch.Tensor  # (R, C), or (R,) discrete
-    log_probs: torch.Tensor  # (R,) of the actions when they were drawn
-    advantages: torch.Tensor  # (R,)
-    returns: torch.Tensor  # (R,) targets of the critic
-    state: torch.Tensor | None = None  # (N, S) at the first step
-    done: torch.Tensor | None = None  # (T, N) ends of episodes, which are 1
-
-    def batches(self, size: int, generator: torch.Generator) -> Iterator[Transitions]:
-        """Parts of about `size` transitions in random order; for a memory, all of some worlds."""
-        if self.state is None or self.done is None:
-            for rows in torch.randperm(len(self.seen), generator=generator).split(size):
-                yield Transitions(*(each[rows] for each in self[:5]))
-            return
-        steps, worlds = self.done.shape
-        firsts = worlds * torch.arange(steps)[:, None]
-        for some in torch.randperm(worlds, generator=generator).split(max(1, size // steps)):
-            rows = (firsts + some).flatten()
-            part = Transitions(*(each[rows] for each in self[:5]))
-            yield part._replace(state=self.state[some], done=self.done[:, some])
 
 
 class Layers:

@@ -45,7 +45,7 @@ class Feature:
 
 
 @dataclass(frozen=True)
-class Frames:
+class BagFrames:
     """T frames of E episodes, one after the other."""
 
     features: Mapping[str, Feature]
@@ -61,7 +61,7 @@ def frames_of(
     model: SimulatorModel | None = None,
     fps: int | None = None,
     gap_s: float = 0.5,
-) -> Frames:
+) -> BagFrames:
     """Reads a bag as frames at `fps`, by default the rate of its commands in whole hertz.
 
     A frame has the newest datum of each topic that was received by its time, none older than
@@ -91,7 +91,7 @@ def frames_of(
     kept = np.isin(episode, numbers[long_enough])
     made = _features(str(path), messages, {role: row[kept] for role, row in rows.items()}, model)
     left_out = int((~long_enough).sum())
-    return Frames(made, lengths[long_enough].astype(np.int64), fps, ticks[kept], left_out)
+    return BagFrames(made, lengths[long_enough].astype(np.int64), fps, ticks[kept], left_out)
 
 
 def _received(messages: Sequence[Message]) -> Nanoseconds:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.extras.bags.frames import Feature, Frames
+from nics_drl_bridge.extras.bags.frames import BagFrames, Feature
 from nics_drl_bridge.files import check_folder, whole_folder
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def check_output(folder: str | Path) -> None:
 
 
 def write_dataset(
-    frames: Frames,
+    frames: BagFrames,
     folder: str | Path,
     task: str,
     robot: str | None = None,
@@ -68,7 +68,7 @@ def write_dataset(
         _write_json(_stats(columns), root / STATS)
 
 
-def _columns(frames: Frames, succeeded: Collection[int] | None) -> Columns:
+def _columns(frames: BagFrames, succeeded: Collection[int] | None) -> Columns:
     """The columns of all frames: features (T, D), and flags and indices (T,)."""
     lengths, total = frames.lengths, int(frames.lengths.sum())
     episode = np.repeat(np.arange(len(lengths)), lengths)
@@ -88,7 +88,7 @@ def _columns(frames: Frames, succeeded: Collection[int] | None) -> Columns:
     }  # fmt: skip
 
 
-def _files(frames: Frames) -> list[int]:
+def _files(frames: BagFrames) -> list[int]:
     """The number of the file of each episode; one that is too large has a file for itself."""
     width = sum(4 * feature.values.shape[1] for feature in frames.features.values()) + 40
     numbers, number, filled = [], 0, 0
@@ -137,7 +137,7 @@ def _flat(stats: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, Any]]:
         yield from ((f"stats/{name}/{key}", values) for key, values in told.items())
 
 
-def _info(frames: Frames, columns: Columns, robot: str | None) -> dict[str, Any]:
+def _info(frames: BagFrames, columns: Columns, robot: str | None) -> dict[str, Any]:
     episodes = len(frames.lengths)
     return {
         "codebase_version": VERSION, "robot_type": robot, "total_episodes": episodes,
