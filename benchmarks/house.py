@@ -30,9 +30,9 @@ BARS = {
     # named its lidar and skidded in MuJoCo, training had an engine of its own, and bodies lay in
     # cells; 204 and 42,400 until evaluations had a gate, a lidar and a randomisation, the shield
     # knew the ground where a lidar never looks, trainings the ways around obstacles, policies had
-    # a memory, and planners mapped a scan, rolled out a model and were imitated; 217 and 45,200 until
-    # trainings stopped by themselves, mirrored and began easily, planners stood behind policies, and
-    # bags became data sets.
+    # a memory, and planners mapped a scan, rolled out a model and were imitated; 217 and 45,200
+    # until trainings stopped by themselves, mirrored and began easily, planners stood behind
+    # policies, and bags became data sets.
     "modules": 226,
     "lines": 46_100,
     "single_importers": 51,
