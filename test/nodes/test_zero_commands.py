@@ -150,8 +150,8 @@ from nics_drl_bridge.nodes import policy_node
 
 open_policy, acted = policy_node.open_policy, []
 
-def opened(name, model):
-    policy, task = open_policy(name, model)
+def opened(*given):
+    policy, task = open_policy(*given)
 
     def act(observation):
         acted.append(observation)
