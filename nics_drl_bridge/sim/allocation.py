@@ -19,7 +19,7 @@ from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.robot.kernels import SERIES, scratch, term_arrays
 from nics_drl_bridge.sim import state as arrays
 from nics_drl_bridge.sim.contact_kernels import SEVERAL
-from nics_drl_bridge.sim.impact_kernels import EVENT, FLIGHT, HOLD, MOST_HOLDS
+from nics_drl_bridge.sim.impact_kernels import EVENT, FLIGHT
 from nics_drl_bridge.sim.obstacles import Motion, plan_arrays
 from nics_drl_bridge.sim.sensing_kernels import PAST
 from nics_drl_bridge.sim.separation_kernels import FIRST, MARK, PLAN
@@ -168,7 +168,6 @@ def _scratch(
             x=x, dq=dq, trial=np.zeros(BODY), spare=np.zeros((corners, 2)),
             start=np.zeros((count, 3)), began=np.zeros((count, 3)),
             flights=np.zeros((bodies, FLIGHT)), events=np.zeros((robots, EVENT)),
-            holds=np.zeros((robots, MOST_HOLDS, HOLD)),
         ),
         nearby=arrays.Nearby(
             near=np.zeros((robots, 1 + SEVERAL), np.int64), meets=np.zeros(robots, np.int64),

@@ -213,9 +213,7 @@ def move_carefully(
     """
     events, touched, dt = single.events, state.collided[n], motion.dt
     first, meets = state.velocity.shape[1], nearby.meets
-    moving = Moving(
-        state.bodies[n], single.flights, first, single.holds, scene.outlines, motion.series
-    )
+    moving = Moving(state.bodies[n], single.flights, first, scene.outlines, motion.series)
     for m in range(meets.shape[0]):
         single.flights[first + m, :] = 0.0
         if meets[m] != contacts.FREE:
@@ -285,7 +283,7 @@ def drift_carefully(
     """Lets the robots of one world drift, one after the other, up to their contacts."""
     pose, collided, meets = state.pose, state.collided, nearby.meets
     flights, events, first = single.flights, single.events, state.velocity.shape[1]
-    moving = Moving(state.bodies[n], flights, first, single.holds, scene.outlines, motion.series)
+    moving = Moving(state.bodies[n], flights, first, scene.outlines, motion.series)
     stood = False
     for m in range(pose.shape[1]):
         if collided[n, m] != 0:

@@ -21,14 +21,15 @@ from nics_drl_bridge.robot.kernels import move
 from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim.state import Array, MapField
 
-VX, VY, TURN, STOP, FROM, WISH_X, WISH_Y, WISH_TURN, HOLDS, FLIGHT = range(10)
+VX, VY, TURN, STOP, FROM, WISH_X, WISH_Y, WISH_TURN, HOLDS, FIRST_HOLD = range(10)
 """Columns of `flights`: velocity [m/s, m/s, rad/s]; time of its stop in the substep [s]; time at
 which the body is where `world` says [s]; the velocity that a robot would have if nothing held it;
-and the number of its `holds`, with which both are in the map frame, too."""
+and the number of its holds, with which both are in the map frame, too; then the holds."""
 HOLD_X, HOLD_Y, ARM, PUSH, HOLD = range(5)
-"""Columns of `holds`: direction away from what holds a robot; lever arm of its point there [m]; and
+"""Columns of a hold: direction away from what holds a robot; lever arm of its point there [m]; and
 the speed that it is given [m/s]."""
 MOST_HOLDS = 8  # Of a robot in a substep; then it stops: it is wedged in
+FLIGHT = FIRST_HOLD + MOST_HOLDS * HOLD
 SWEEPS = 30  # Through the holds, to find the speeds with which they agree
 (
     TIME, WITH, OWN, OTHERS, NX, NY, OWN_X, OWN_Y, OTHERS_X, OTHERS_Y, DEPTH, AFTER, PRESSED, EVENT,
@@ -49,7 +50,6 @@ class Moving(NamedTuple):
     world: Array  # (K + M, 7) obstacles, then robots, as the substep begins
     flights: Array  # (K + M, FLIGHT) their motion; robots in their own frame, all else in the map
     first: int  # index of the first robot
-    holds: Array  # (M, MOST_HOLDS, HOLD) contacts that the robots may not come nearer to
     outlines: OutlineArrays
     series: Array  # see `robot.kernels`
 
@@ -61,20 +61,6 @@ class Edge(NamedTuple):
     ay: float
     bx: float
     by: float
-
-
-class Contact(NamedTuple):
-    """The first contact of two edges; its fields are columns of `events`."""
-
-    time: float
-    own: float
-    others: float
-    nx: float
-    ny: float
-    own_x: float
-    own_y: float
-    others_x: float
-    others_y: float
 
 
 class Placed(NamedTuple):
@@ -184,11 +170,8 @@ def _rate(nx: float, ny: float, body: Placed, x: float, y: float) -> float:
 @kernel
 def _free_time(
     p: Placed, q: Placed, nx: float, ny: float, gap: float, bend: float
-) -> tuple[float, float, float, bool, bool]:
-    """Time in which edges `gap` [m] apart along n (q to p) cannot meet.
-
-    With it come the rates of the corners that would meet first, and True for the first ends.
-    """
+) -> tuple[float, float, float]:
+    """Time in which edges `gap` [m] apart along n (q to p) cannot meet, with its corners' rates."""
     far, far2 = nx * p.edge.ax + ny * p.edge.ay, nx * p.edge.bx + ny * p.edge.by
     near, near2 = nx * q.edge.ax + ny * q.edge.ay, nx * q.edge.bx + ny * q.edge.by
     rate_p, rate_p2 = _rate(nx, ny, p, p.edge.ax, p.edge.ay), _rate(nx, ny, p, p.edge.bx, p.edge.by)
@@ -196,25 +179,43 @@ def _free_time(
     rate_q2 = -_rate(nx, ny, q, q.edge.bx, q.edge.by)
     front, beyond = min(far, far2), max(near, near2)
     keep = 0.5 * SLACK if gap > SLACK else 0.25 * gap
-    free, own, others, first_p, first_q = np.inf, 0.0, 0.0, True, True
-    for ahead, u, of_p in ((far, rate_p, True), (far2, rate_p2, False)):
-        for behind, v, of_q in ((near, rate_q, True), (near2, rate_q2, False)):
+    free, own, others = np.inf, 0.0, 0.0
+    for ahead, u in ((far, rate_p), (far2, rate_p2)):
+        for behind, v in ((near, rate_q), (near2, rate_q2)):
             root = _root(gap - keep + (ahead - front) + (beyond - behind), u + v, bend)
             if root < free:
-                free, own, others, first_p, first_q = root, u, v, of_p, of_q
-    return free, own, others, first_p, first_q
+                free, own, others = root, u, v
+    return free, own, others
+
+
+@kernel
+def _note(event: Array, nx: float, ny: float, p: Placed, q: Placed) -> None:
+    """Writes where the edges of a contact met: at the corners whose rates it has, or the nearer."""
+    event[NX], event[NY] = nx, ny
+    event[OWN_X], event[OWN_Y] = _corner(nx, ny, p, event[OWN])
+    event[OTHERS_X], event[OTHERS_Y] = _corner(-nx, -ny, q, event[OTHERS])
+
+
+@kernel
+def _corner(nx: float, ny: float, body: Placed, rate: float) -> tuple[float, float]:
+    edge = body.edge
+    first = _rate(nx, ny, body, edge.ax, edge.ay) == rate
+    second = _rate(nx, ny, body, edge.bx, edge.by) == rate
+    nearer = nx * edge.bx + ny * edge.by < nx * edge.ax + ny * edge.ay
+    return (edge.bx, edge.by) if second and (nearer or not first) else (edge.ax, edge.ay)
 
 
 @kernel
 def touch(
-    a: int, edge: Edge, round_a: float, b: int, other: Edge, round_b: float,
-    begin: float, until: float, moving: Moving,
-) -> Contact:  # fmt: skip
-    """Returns the first contact of an edge of body a with one of body b; its time is inf if none.
+    event: Array, a: int, edge: Edge, round_a: float, b: int, other: Edge, round_b: float,
+    begin: float, moving: Moving,
+) -> None:  # fmt: skip
+    """Makes `event` (EVENT,) the first contact of an edge of body a with one of body b, if earlier.
 
     The edges are in the bodies' frames, with a radius [m] around each.
     """
     reach_a, reach_b, time, flights = _reach(edge), _reach(other), begin, moving.flights
+    until = event[TIME]
     for _ in range(MOST_LOOKS):
         p, q = _placed_at(a, edge, time, moving), _placed_at(b, other, time, moving)
         nx, ny = _between(p.edge, q.edge)
@@ -223,21 +224,24 @@ def touch(
             break
         gap, nx, ny = max(away - round_a - round_b, NOTHING), nx / away, ny / away
         bend = p.bend + q.bend + p.turn * p.turn * reach_a + q.turn * q.turn * reach_b
-        free, own, others, first_p, first_q = _free_time(p, q, nx, ny, gap, bend)
+        free, own, others = _free_time(p, q, nx, ny, gap, bend)
         rest = _next_stop(b, time, _next_stop(a, time, until, flights), flights) - time
         if free >= rest:
             if time + rest >= until:
-                return Contact(np.inf, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+                return
             time += rest
             continue
         # Nearer than half the slack not even a creep is let through: it would end in an overlap.
         least = 0.5 * gap if gap > 0.5 * SLACK else NOTHING
         if gap <= SLACK and -(own + others) * rest >= least:
-            ax, ay = (p.edge.ax, p.edge.ay) if first_p else (p.edge.bx, p.edge.by)
-            bx, by = (q.edge.ax, q.edge.ay) if first_q else (q.edge.bx, q.edge.by)
-            return Contact(time, own, others, nx, ny, ax, ay, bx, by)
+            if time < until:
+                event[TIME], event[WITH], event[OWN], event[OTHERS] = time, b, own, others
+                _note(event, nx, ny, p, q)
+            return
         time += free
-    return Contact(time, -1.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    if time < until:
+        event[TIME], event[WITH], event[OWN], event[OTHERS] = time, b, -1.0, -1.0
+        event[NX] = event[NY] = 0.0
 
 
 @kernel
@@ -250,7 +254,8 @@ def hold(
     ring: it slides without friction, and a corner that is held turns it aside. The speeds
     that the holds give are found by projected Gauss-Seidel sweeps.
     """
-    flight, body, holds = moving.flights[b], moving.world[b], moving.holds[b - moving.first]
+    flight, body = moving.flights[b], moving.world[b]
+    holds = flight[FIRST_HOLD:FLIGHT].reshape(MOST_HOLDS, HOLD)
     count, inertia = int(flight[HOLDS]), body[RADIUS] * body[RADIUS]
     x, y, c, s = pose_at(b, time, moving)
     if count == 0:
@@ -312,17 +317,7 @@ def touch_edge(
     round_a = world[a, RADIUS] if outline.begin == outline.end else 0.0
     for v in range(_edges(outline)):
         edge = _edge_of(v, outline)
-        found = touch(a, edge, round_a, b, other, round_b, begin, event[TIME], moving)
-        if found.time < event[TIME]:
-            event[TIME], event[WITH], event[OWN], event[OTHERS] = (
-                found.time,
-                b,
-                found.own,
-                found.others,
-            )
-            event[NX], event[NY] = found.nx, found.ny
-            event[OWN_X], event[OWN_Y] = found.own_x, found.own_y
-            event[OTHERS_X], event[OTHERS_Y] = found.others_x, found.others_y
+        touch(event, a, edge, round_a, b, other, round_b, begin, moving)
 
 
 @kernel

@@ -124,7 +124,6 @@ class Single(NamedTuple):
     began: Array  # (K, 3) their poses at the start of the period
     flights: Array  # (K + M, FLIGHT) see `impact_kernels`
     events: Array  # (M, EVENT) see `impact_kernels`
-    holds: Array  # (M, MOST_HOLDS, HOLD) see `impact_kernels`
 
 
 class Nearby(NamedTuple):
