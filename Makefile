@@ -55,7 +55,7 @@ DESCRIBED_BY := setup.py setup.cfg package.xml pyproject.toml constraints.txt Ma
 
 OTHER_PYTHON := name another interpreter, as in: make setup PYTHON=python3.12
 
-.PHONY: help setup demo test test-quick test-all test-jazzy test-ray test-messages test-clients test-lerobot ros-status lint format types pytest benchmark tables clean distclean
+.PHONY: help setup demo test test-quick test-all test-jazzy test-ray test-messages test-upstream test-clients test-lerobot ros-status lint format types pytest benchmark tables clean distclean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 15
@@ -125,7 +125,7 @@ test-quick: setup ## under a minute, after each edit: no processes, no training
 
 test-all: test ## before a release: the long campaigns, other distributions, clients and Ray too
 	$(BIN)/python -m pytest $(PARALLEL) -m campaign $(PYTEST_ARGS)
-	$(MAKE) test-jazzy test-messages test-clients test-lerobot test-ray
+	$(MAKE) test-jazzy test-messages test-clients test-lerobot test-ray $(if $(UPSTREAM_LIES_THERE),test-upstream)
 
 ros-status:
 ifeq ($(ROS),system)
@@ -190,22 +190,41 @@ $(RAY)/.ready: $(DESCRIBED_BY) constraints-ray.txt
 	$(call BUILD_APART,$(RAY),(grep -v '^gymnasium==' constraints.txt; cat constraints-ray.txt),\
 		'.[$(RAY_EXTRAS)]')
 
-# Message packages that have no wheels are built from the few fields that they have.
-MESSAGES := .venv-messages
+# Archives of repositories of which there are no wheels; what needs them is left out without them.
+UPSTREAM ?= ../shared/upstream
+UPSTREAM_LIES_THERE := $(wildcard $(UPSTREAM)/launch_ros.tar.gz)
 
-test-messages: setup $(MESSAGES)/.ready ## the tests that need tf2_msgs and ackermann_msgs, built here
+# Message packages that have no wheels are built from their files.
+MESSAGES := .venv-messages
+MESSAGE_TESTS := test/nodes/test_device_node.py
+
+test-messages: setup $(MESSAGES)/.ready ## the tests that need tf2_msgs, ackermann_msgs, simulation_interfaces, nav2_msgs, built here
 	source $(MESSAGES)/setup.bash && $(CLEAN_ENV) PYTHONPATH="$$PYTHONPATH" \
 		LD_LIBRARY_PATH="$$LD_LIBRARY_PATH" \
-		$(BIN)/python -m pytest test/nodes/test_device_node.py $(PYTEST_ARGS)
+		$(BIN)/python -m pytest $(MESSAGE_TESTS) $(PYTEST_ARGS)
 
-$(MESSAGES)/.ready: test/build_messages.sh $(wildcard test/messages/*/msg/*.msg)
+$(MESSAGES)/.ready: test/build_messages.sh constraints.txt $(wildcard test/messages/*/msg/*.msg $(UPSTREAM)/*_interfaces.tar.gz)
 	@if [ "$(ROS)" != wheels ]; then \
 		echo "make test-messages: needs Linux on x86-64 and a shell without a sourced ROS 2." >&2; \
 		exit 1; fi
-	@echo "Building $(MESSAGES); it takes some minutes."
-	@rm -rf $(MESSAGES)
-	@$(CLEAN_ENV) test/build_messages.sh $(BASE) $(MESSAGES) constraints.txt
+	@echo "Building $(MESSAGES); the first time takes some minutes."
+	@$(CLEAN_ENV) test/build_messages.sh $(BASE) $(MESSAGES) constraints.txt $(UPSTREAM)
 	@touch $@
+
+# The real tools over the wheels, and this package as colcon installs it.
+TOOLS := .venv-upstream
+TOOLS_EXTRAS := bags,deploy,mujoco,multi,ros,test
+
+test-upstream: $(MESSAGES)/.ready $(TOOLS)/.ready ## ours by the real `ros2 run`, `ros2 launch` and more, in .venv-upstream
+	@$(CLEAN_ENV) test/install_upstream_tools.sh $(TOOLS) $(UPSTREAM) $(MESSAGES)
+	source $(TOOLS)/setup.bash && python -m pytest test/upstream $(PYTEST_ARGS)
+
+$(TOOLS)/.ready: $(DESCRIBED_BY) test/install_upstream_tools.sh
+	@if [ "$(ROS)" != wheels ] || [ -z "$(UPSTREAM_LIES_THERE)" ]; then \
+		echo "make test-upstream: needs Linux on x86-64, a shell without a sourced ROS 2 and the sources" \
+			"of launch, launch_ros and ros2cli in $(UPSTREAM) (or UPSTREAM=folder)." >&2; exit 1; fi
+	$(call BUILD_APART,$(TOOLS),cat constraints.txt,'.[$(TOOLS_EXTRAS)]' osrf-pycommon psutil)
+	@$(TOOLS)/bin/python -m pip uninstall -qq -y nics_drl_bridge  # it comes by colcon
 
 # Clients that speak DDS without ROS 2, apart from the wheels, whose libraries they must not load.
 CLIENTS := .venv-clients
@@ -254,4 +273,4 @@ clean: ## remove what building and testing left behind
 	find . -name __pycache__ -not -path './.venv*' -prune -exec rm -rf {} +
 
 distclean: clean ## the same, and all environments (.venv and those of test-...) and runs/
-	rm -rf $(VENV) $(JAZZY) $(RAY) $(MESSAGES) $(CLIENTS) $(LEROBOT) runs
+	rm -rf $(VENV) $(JAZZY) $(RAY) $(MESSAGES) $(TOOLS) $(CLIENTS) $(LEROBOT) runs
