@@ -55,7 +55,7 @@ DESCRIBED_BY := setup.py setup.cfg package.xml pyproject.toml constraints.txt Ma
 
 OTHER_PYTHON := name another interpreter, as in: make setup PYTHON=python3.12
 
-.PHONY: help setup demo test test-quick test-all test-jazzy test-ray test-messages test-upstream test-clients test-lerobot ros-status lint format types pytest benchmark tables clean distclean
+.PHONY: help setup demo test test-quick test-all test-jazzy test-ray test-messages test-upstream test-clients test-lerobot test-ament ros-status lint format types pytest benchmark tables clean distclean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 15
@@ -125,7 +125,7 @@ test-quick: setup ## under a minute, after each edit: no processes, no training
 
 test-all: test ## before a release: the long campaigns, other distributions, clients and Ray too
 	$(BIN)/python -m pytest $(PARALLEL) -m campaign $(PYTEST_ARGS)
-	$(MAKE) test-jazzy test-messages test-clients test-lerobot test-ray $(if $(UPSTREAM_LIES_THERE),test-upstream)
+	$(MAKE) test-jazzy test-messages test-clients test-lerobot test-ament test-ray $(if $(UPSTREAM_LIES_THERE),test-upstream)
 
 ros-status:
 ifeq ($(ROS),system)
@@ -260,6 +260,22 @@ $(LEROBOT)/.ready: Makefile
 		$(CLEAN_ENV) $(LEROBOT)/bin/python -m pip install -qq $(LEROBOT_LIBRARIES)
 	@touch $@
 
+# The linters of ament, with the plugins that it looks for.
+AMENT := .venv-ament
+AMENT_LIBRARIES := flake8 flake8-blind-except flake8-builtins flake8-class-newline flake8-comprehensions \
+	flake8-deprecated flake8-docstrings flake8-import-order flake8-quotes
+
+test-ament: $(AMENT)/.ready ## ament_flake8, with the rules of setup.cfg
+	$(CLEAN_ENV) $(AMENT)/bin/ament_flake8 --config setup.cfg
+
+$(AMENT)/.ready: Makefile
+	@echo "Building $(AMENT) with Python $(VERSION)."
+	@test -x $(AMENT)/bin/python || $(CLEAN_ENV) $(BASE) -m venv $(AMENT)
+	@export PIP_DISABLE_PIP_VERSION_CHECK=1; \
+		$(CLEAN_ENV) $(AMENT)/bin/python -m pip install -qq --no-deps ros-ament-flake8 ros-ament-lint; \
+		$(CLEAN_ENV) $(AMENT)/bin/python -m pip install -qq $(AMENT_LIBRARIES)
+	@touch $@
+
 # To its end whatever one of them says; each is told with machine, commit and load.
 benchmark: setup ## run every benchmark, write benchmarks/results.json: make benchmark [BENCHMARKS="parity files"] [QUICK=1] [OUT=file]
 	@cd benchmarks && ../$(BIN)/python -m measuring.run_all \
@@ -273,4 +289,4 @@ clean: ## remove what building and testing left behind
 	find . -name __pycache__ -not -path './.venv*' -prune -exec rm -rf {} +
 
 distclean: clean ## the same, and all environments (.venv and those of test-...) and runs/
-	rm -rf $(VENV) $(JAZZY) $(RAY) $(MESSAGES) $(TOOLS) $(CLIENTS) $(LEROBOT) runs
+	rm -rf $(VENV) $(JAZZY) $(RAY) $(MESSAGES) $(TOOLS) $(CLIENTS) $(LEROBOT) $(AMENT) runs

@@ -113,7 +113,7 @@ setup(
     extras_require=EXTRAS,
     entry_points={
         "console_scripts": [
-            f"nics = {PACKAGE}.commands.cli:main",
+            f"nics = {PACKAGE}.commands.start:main",
             f"simulator_node = {PACKAGE}.nodes.start:simulator_node",
             f"mujoco_node = {PACKAGE}.nodes.start:mujoco_node",
             f"middleware_node = {PACKAGE}.nodes.start:middleware_node",

@@ -55,7 +55,14 @@ _HOMES = {name: home for home, names in _NAMES.items() for name in names}
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    try:
+        return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    except ImportError as error:
+        from nics_drl_bridge.extensions import unmet
+
+        if (clause := unmet(error)) is None:
+            raise
+        raise type(error)(f"{__name__}.{name} {clause}", name=error.name) from error
 
 
 def __dir__() -> list[str]:

@@ -1,10 +1,12 @@
 """Extensions by name, in groups of entry points `nics_drl_bridge.GROUP`: `docs/extensions.md`."""
 
 import hashlib
+import re
 import sys
+from collections.abc import Iterator
 from functools import cache
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, requires, version
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from traceback import extract_tb
@@ -47,6 +49,43 @@ def missing(module: str) -> str:
     if library in INSTALL:
         return f"needs the module {module!r}; pip install '{PACKAGE}[{INSTALL[library]}]'."
     return f"needs the module {module!r}; install it."
+
+
+def unmet(error: ImportError) -> str | None:
+    """A clause about the libraries for whose lack or age an import failed; None if not for these.
+
+    A system's own packages are often older than what this one needs, and pip was not asked.
+    """
+    if (error.name or "").partition(".")[0] == PACKAGE and isinstance(error, ModuleNotFoundError):
+        return None
+    if wrong := dict(_wrong()):
+        told = ", ".join(f"{needed} ({found or 'missing'})" for needed, found in wrong.items())
+        return f"needs {told}; pip install {' '.join(map(repr, wrong))}."
+    return missing(error.name or "") if isinstance(error, ModuleNotFoundError) else None
+
+
+def _wrong() -> Iterator[tuple[str, str]]:
+    """Yields each required library that is not there in a fitting version, and the version."""
+    try:
+        required = requires(PACKAGE) or []
+    except PackageNotFoundError:  # a source tree that was never installed
+        return
+    for needed in (one.replace(" ", "") for one in required if ";" not in one):
+        name, bounds = re.match(r"([\w.-]*)(.*)", needed).groups()  # type: ignore[union-attr]
+        try:
+            found = version(name)
+        except PackageNotFoundError:
+            found = ""
+        numbers = _numbers(found)
+        for sign, bound in re.findall(r"(>=|<)([\d.]+)", bounds):
+            fits = numbers >= _numbers(bound) if sign == ">=" else numbers < _numbers(bound)
+            if not (found and fits):
+                yield needed, found
+                break
+
+
+def _numbers(release: str) -> tuple[int, ...]:
+    return tuple(int(part) for part in re.findall(r"\d+", release.partition("+")[0])[:3])
 
 
 def module_at(place: str, what: str) -> Any:

@@ -97,8 +97,7 @@ def watch(
     motions, places, radii, half=(3.0, 3.0), steps=2000, seed=1, walls=None, grid=NO_FIELD,
     robots=None,
 ):  # fmt: skip
-    """Lets the first K of the bodies move, see `Watched`; `robots` (T, M, 2) velocities move the
-    others."""
+    """Lets the first K of the bodies move, see `Watched`, and `robots` (T, M, 2) the others."""
     count = len(motions)
     poses = np.concatenate([places, np.zeros((len(places), 1))], axis=1)[None]
     bodies = place(poses, np.asarray(radii)[None], np.zeros((1, len(places))))

@@ -189,10 +189,10 @@ def test_the_estimator_knows_how_drag_and_back_emf_dampen_an_error_of_the_speed(
 
 
 def test_the_estimator_expects_the_twist_of_a_command_in_effect(model):
-    sent = replace(
-        model, kinematics=replace(motors(), powers=np.eye(4, dtype=np.int64)[[0, 2]],
-        coefficients=np.array([[0.0, 1.0], [0, 0], [0, 0], [0, 0], [0, 0]]))
-    )  # fmt: skip
+    powers = np.eye(4, dtype=np.int64)[[0, 2]]
+    coefficients = np.array([[0.0, 1.0], [0, 0], [0, 0], [0, 0], [0, 0]])
+    kinematics = replace(motors(), powers=powers, coefficients=coefficients)
+    sent = replace(model, kinematics=kinematics)
     estimator = Estimator(sent)
     estimator.reset(0, np.zeros(3))
     estimator.command(0, np.array([0.3, 0.0]))

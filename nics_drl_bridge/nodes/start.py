@@ -19,12 +19,12 @@ def start(node: str, args: list[str] | None = None) -> None:
     name = f"nics_drl_bridge.nodes.{node}"
     try:
         main = import_module(name).main if find_spec(name) else extensions.load("nodes", node)
-    except (ConfigError, ModuleNotFoundError) as error:
+    except (ConfigError, ImportError) as error:
         sentence = str(error)
-        if isinstance(error, ModuleNotFoundError):
-            if (error.name or "").startswith("nics_drl_bridge"):
+        if isinstance(error, ImportError):
+            if (clause := extensions.unmet(error)) is None:
                 raise
-            sentence = f"{node}: {extensions.missing(error.name or '')}"
+            sentence = f"{node}: {clause}"
         sys.stderr.write(f"{sentence}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
     main(args)

@@ -60,7 +60,7 @@ class FakeRobot:
     @property
     def driven(self):
         """Whether it was told to drive."""
-        return bool(self.heard) and self.heard[-1] != type(self.heard[-1])()
+        return bool(self.heard) and self.heard[-1] != self.heard[-1].__class__()
 
 
 def said(node):
