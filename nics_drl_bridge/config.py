@@ -60,6 +60,7 @@ def _coerced_to_numbers(given: Any, found: Any, place: str = "") -> Iterator[tup
 
 
 _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")  # keys of a model, of a dataclass
+_NO_KEYS = ("model_type", "dict_type", "dataclass_type")
 _SHORT = reprlib.Repr()  # a value made of YAML aliases may not fit into memory in full
 _SHORT.maxstring = _SHORT.maxother = 80
 
@@ -79,6 +80,8 @@ def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
         return f"the key '{key}.kind' is missing; add it."
     if first["type"] == "missing":
         return f"the key {key!r} is missing; add it."
+    if first["type"] in _NO_KEYS:
+        return f"key {key!r}: must hold `key: value` pairs, not {_SHORT.repr(first['input'])}."
     message = first["msg"].removeprefix("Value error, ").rstrip(".")
     message = message[0].lower() + message[1:]
     if not key:  # an error of several keys, which the message names

@@ -95,6 +95,12 @@ def test_deep_nesting_is_refused_before_it_is_built(opening):
         parse_yaml("key: " + opening * 100_000, "a.yaml")
 
 
+@pytest.mark.parametrize("key", ["spare", "extras"])
+def test_a_value_in_place_of_keys_is_told_without_the_words_of_a_library(key):
+    sentence = refusal(f"name: a\n{key}: [1, 2]\n")
+    assert sentence == f"cart.yaml: key '{key}': must hold `key: value` pairs, not [1, 2]."
+
+
 def test_thirty_levels_are_allowed():
     assert parse_yaml("key: " + "[" * 30 + "]" * 30, "a.yaml")
 

@@ -204,6 +204,8 @@ def read_contract(text: str, source: str) -> Contract:
         contract = validate(data, Contract, source)
     except ConfigError as error:
         reason = str(error).removeprefix(f"{source}: ")
+        # What is missing can't be added to a file that is signed.
+        reason = reason.replace("is missing; add it.", "is missing; export the policy anew.")
         quoted = reason.split("'")
         key = quoted[1] if len(quoted) > 2 and "key" in quoted[0] else "metadata"
         raise PolicyError(source, key, reason) from None

@@ -67,8 +67,12 @@ def read_sdf(
         more = f" (as {len(left_out) - 1} more models)" if len(left_out) > 1 else ""
         fix = "leave it out by --skip-unknown or --without MODEL, or put a box in its place"
         raise ConfigError(f"{path}: {left_out[0]}{more}, which is no shape of a world; {fix}.")
+    shapes = seen - sum(map(len, unknown.values()))
+    if left_out and not shapes:
+        reason = f"holds nothing but what is no shape of a world ({left_out[0]})"
+        raise ConfigError(f"{path}: {reason}; put a box in its place.")
     if not placed:
-        reason = f"none of its {seen} collision geometries stands at a height of {height:g} m"
+        reason = f"none of its {shapes} collision geometries stands at a height of {height:g} m"
         raise ConfigError(f"{path}: {reason}; choose another --height.")
     return Standing(tuple(placed), left_out)
 

@@ -377,7 +377,8 @@ def forgetful(proto):
 
 REFUSED_STATES = {
     "none": (stateless, "state", "is missing, although the graph takes one"),
-    "no shape": (shapeless, "state.size", "the key 'state.size' is missing"),
+    "no shape": (shapeless, "state.size", "is missing; export the policy anew"),
+    "a list": (changed(["state"], [6, 0.0], True), "state", "must hold `key: value` pairs, not [6"),
     "another shape": (changed(["state", "size"], 5, True), "graph.state_in", "5] is needed"),
     "another start": (changed(["state", "start"], 0.5, True), "golden.actions", "differ by"),
     "unsigned": (changed(["state", "start"], 0.5, False), "state.start", "was changed"),

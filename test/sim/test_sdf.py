@@ -188,6 +188,15 @@ def test_what_is_no_shape_is_named_in_one_sentence_or_left_out_and_listed(write,
     assert left_out in sentence
 
 
+def test_a_file_of_which_all_would_be_left_out_is_refused_for_that_and_not_for_the_height(write):
+    sentence = r"holds nothing but what is no shape .*'table' has a mesh"
+    with pytest.raises(ConfigError, match=sentence):
+        read_sdf(write(model(MESH, "table")), HEIGHT, skip_unknown=True)
+    low = write(model(MESH, "table") + model(DISC, "disc"))
+    with pytest.raises(ConfigError, match="none of its 1 collision geometries stands at a height"):
+        read_sdf(low, 99.0, skip_unknown=True)
+
+
 def test_one_sentence_tells_all_of_a_model_and_how_many_more_there_are(write):
     leg = MESH.replace("table.dae", "leg.stl")
     more = f"<collision name='d'><geometry>{leg}</geometry></collision></link>"
