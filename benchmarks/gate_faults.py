@@ -125,6 +125,7 @@ class Bench:
         self.folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         given: dict[str, Any] = {"model": ROBOT, "limits": ROBOT, "e_stop_required": True}
         given["black_box"] = str(self.folder / "black_box")
+        given["enable_stamped_cmd_vel"] = False
         given |= AGES if control == "slow_gate" else {}
         self.gate = None
         if control != "no_gate":

@@ -39,12 +39,13 @@ from std_msgs.msg import Bool
 from nics_drl_bridge.gate.black_box import replay
 from nics_drl_bridge.nodes import command_gate, gate_log, qos
 from nics_drl_bridge.nodes.processes import free_domain_id
+from nics_drl_bridge.nodes.start import start
 
 CONTROLS = {
     "busy": "the gate reads each message and decides ten times",
     "slow_disk": "the gate waits for a disk that does not answer, at its end",
 }
-TICK_HZ = 50
+GATE, TICK_HZ = "command_gate", 50
 MOST_RATIO = 1.1
 """Of the gate's share of a core to that of a bare node that hears the same."""
 LONGEST_GAP_S = 0.2
@@ -82,7 +83,7 @@ def ill_gate(control: str, arguments: list[str]) -> None:
     else:
         gate_log.write = lambda *_: time.sleep(10 * HUNG_S)
         gate_log.CLOSING_S = HUNG_S
-    command_gate.main([sys.argv[0], *arguments])
+    start(GATE, [GATE, *arguments])
 
 
 def _often(call: Callable[..., Any]) -> Callable[..., Any]:
@@ -116,6 +117,7 @@ def gate(domain_id: int, folder: Path, control: str) -> Any:
     parameters = {
         "model": ROBOT, "limits": ROBOT, "e_stop_required": "true", "odom_rate": float(ODOM_HZ),
         "black_box": str(folder), "rate_tolerance": 0.6, "shield": "false",
+        "enable_stamped_cmd_vel": "false",
     }  # fmt: skip
     given = [f"{name}:={value}" for name, value in parameters.items()]
     return started(
@@ -226,7 +228,7 @@ def main() -> None:
     if given.part == "bare":
         bare_node()
     elif given.part == "gate":
-        command_gate.main([sys.argv[0], *rest])
+        start(GATE, [GATE, *rest])
     elif given.part is not None:
         ill_gate(given.part, rest)
     if given.part is not None:

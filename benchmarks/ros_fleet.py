@@ -201,6 +201,7 @@ def measure(robots: int, seconds: float, patience_s: float, control: str | None)
             "robots": robots,
             "scan_rate": SCAN_HZ,
             "odom_rate": ODOM_HZ,
+            "enable_stamped_cmd_vel": False,
         }
         fleet, driven = str(robots), str(0 if control == "standing" else robots)
         heard = str(robots - 1 if control == "deaf" else robots)

@@ -227,6 +227,10 @@ def imports_of(file: Path) -> tuple[Path, ...]:
     return tuple(file for file in files if file.is_file())
 
 
+def _say(text: str) -> None:
+    sys.stderr.write(f"nics_drl_bridge: {text}\n")
+
+
 class _Compiling(event.Listener):  # type: ignore[misc]
     """Counts what this process compiles, and says so once to whoever waits for it."""
 
@@ -234,6 +238,7 @@ class _Compiling(event.Listener):  # type: ignore[misc]
         self.count = 0  # specialisations of kernels, and of what they call
         self.cpu_s = 0.0  # CPU time that compiling took
         self.quiet = False  # True: nothing is to be said
+        self.patience_s, self.tell = PATIENCE_S, _say
         self._told = -math.inf
         self._lock, self._depth, self._collects = threading.Lock(), 0, True
         self._begun = self._begun_cpu = self._spent = 0.0
@@ -247,14 +252,11 @@ class _Compiling(event.Listener):  # type: ignore[misc]
             self._depth += 1
             spent = self._spent + time.monotonic() - self._begun
             silent = time.monotonic() - self._told
-            if spent > PATIENCE_S and silent > REPEATED_S and not self.quiet:
+            if spent >= self.patience_s and silent > REPEATED_S and not self.quiet:
                 self._told = time.monotonic()
                 left = sum(not each.is_warm for each in KERNELS)
-                seconds = left * SECONDS_EACH
-                sys.stderr.write(
-                    f"nics_drl_bridge: compiling up to {left} kernels, once on this machine: about "
-                    f"{seconds:.0f} s\n"
-                )
+                seconds = f"about {left * SECONDS_EACH:.0f} s"
+                self.tell(f"compiling, once on this machine, up to {left} kernels: {seconds}")
 
     def on_end(self, event: event.Event) -> None:
         with self._lock:

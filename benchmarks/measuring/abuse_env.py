@@ -309,6 +309,7 @@ def campaign(seed: int, rounds: int, control: str | None = None) -> Score:
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         parameters = {"world": "empty", "mode": "realtime", "command_timeout": 3600.0}
+        parameters["enable_stamped_cmd_vel"] = False
         node = stack.enter_context(NodeProcess("simulator_node", folder, parameters, domain_id))
         watcher = Watcher(domain_id)
         stack.callback(watcher.close)

@@ -227,7 +227,8 @@ def drive(
         for index, (place, some) in enumerate(zip(places, jobs, strict=True)):
             name, logs = f"robot{index + 1}", folder / f"robot{index + 1}"
             given = {"model": place.robot, "limits": place.robot, "e_stop_required": True}
-            given |= {"black_box": str(logs / "black_box"), **parameters}
+            given |= {"black_box": str(logs / "black_box"), "enable_stamped_cmd_vel": False}
+            given |= parameters
             gates.append(stack.enter_context(NodeProcess(GATE, logs, given, domain_id, name)))
             lanes.append(Lane(node, name, place, some))
         held_up = _run(lanes, gates, executor, tell)

@@ -26,7 +26,7 @@ def record(
     namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
     remap: Annotated[list[str] | None, Option(help="A topic's other name: odom:=/wheels.")] = None,
     topics: Annotated[Path | None, Option(help="YAML file of the state's, wheels' joints.")] = None,
-    stamped: Annotated[bool, Option(help="Send cmd_vel as TwistStamped.")] = False,
+    stamped: Annotated[bool | None, Option(help="Send cmd_vel as TwistStamped.")] = None,
     use_sim_time: Annotated[bool, Option("--use-sim-time", help="Take time from /clock.")] = False,
     preview: Annotated[bool, Option("--preview", help="Show the drive's plan, and stop.")] = False,
     yes: Annotated[bool, Option("--yes", help="Do not ask before the robot moves.")] = False,
@@ -36,9 +36,8 @@ def record(
         arguments = node_arguments(namespace, remap or ())
         given = {
             "robot": robot, "out": str(out), "bound": bound, "duration": duration, "speed": speed,
-            "seed": seed, "topics": str(topics or ""), "stamped": stamped,
-            "use_sim_time": use_sim_time,
-        }  # fmt: skip
+            "seed": seed, "topics": str(topics or ""), "use_sim_time": use_sim_time,
+        } | ({} if stamped is None else {"stamped": stamped})  # fmt: skip
         if not preview:
             with needs_ros("nics record"):  # first: with ROS 2 from wheels it restarts Python
                 from nics_drl_bridge.nodes.record_node import record as drive

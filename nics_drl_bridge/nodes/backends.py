@@ -106,7 +106,8 @@ class DdsBackend:
     """One robot behind `cmd_vel`, `scan` and `odom`, in lock-step with a simulator node.
 
     `truth` adds the true pose to `info`; `timeout_s` bounds each wait; the simulator must draw by
-    the same `randomisation`. Raises BackendError if no
+    the same `randomisation`; `stamped` says whether `cmd_vel` is a TwistStamped, by default as the
+    simulator hears it. Raises BackendError if no
     simulator is there, it refuses, is not in lock-step, or another node moved it; ModelError if it
     runs another model or world; StaleDataError if its data do not arrive.
     """
@@ -115,6 +116,7 @@ class DdsBackend:
         self, model: SimulatorModel, world: AnyWorld, namespace: str = "",
         simulator: str = "simulator_node", timeout_s: float = 30.0, truth: bool = False,
         domain_id: int | None = None, randomisation: Randomisation | None = None,
+        stamped: bool | None = None,
     ) -> None:  # fmt: skip
         self._robot, self._lidar = model.robot, model.lidar
         self._robot.require_cmd_vel()
@@ -130,7 +132,7 @@ class DdsBackend:
         if randomisation is not None:
             sampler = EpisodeSampler(model, world, randomisation=randomisation)
             self._known["scenes"] = lambda seeds: sampler.draw(seeds)[0]
-        self._link = Link(namespace, domain_id)
+        self._link = Link(namespace, domain_id, stamped=stamped, patience_s=timeout_s)
         for topic in self._topics:
             kind = LaserScan if topic == SCAN else Odometry
             if topic in self._sensors:

@@ -3,7 +3,6 @@
 import contextlib
 import math
 import os
-import sys
 import time
 from collections.abc import Callable
 from functools import partial
@@ -25,17 +24,27 @@ from nics_drl_bridge.gate.limits import PERIOD_S, Limits, load_limits
 from nics_drl_bridge.gate.state import Decision, GateConfig, ShieldConfig, begin
 from nics_drl_bridge.gate.stopping import doubtful, gate_config, require_possible, shield_config
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
 from nics_drl_bridge.nodes import qos, runner, wire
 from nics_drl_bridge.nodes.conversions import is_rotation, sensor_from_ros, sensor_type
 from nics_drl_bridge.nodes.gate_log import GateLog
+from nics_drl_bridge.nodes.parameters import (
+    BLACK_BOX,
+    LIMITS,
+    PRIORITY,
+    RULES_IN_SECONDS,
+    SHIELD,
+    SHIELD_NUMBERS,
+    gate_rules,
+    stamped,
+)
 
 STALE_S = 0.05  # a motion that was decided on longer ago than this is decided on again [s]
 SCAN_PERIODS = 1.75  # for a slow lidar, default age limit of a command's scan, in its periods
 ROTATION = slice(3, 7)  # position of an odometry's quaternion among its numbers
 VARIANCES = [wire.POSE_COVARIANCE + k for k in (0, 7, 35)]  # positions: of x, y and heading
-HIGHEST = 99
 REFUSED = (
     "parameter 'priority': the system does not allow a real-time priority of {priority} ({error}); "
     "allow it by `ulimit -r {priority}`, `LimitRTPRIO={priority}` in its systemd unit or the "
@@ -45,8 +54,7 @@ REFUSED = (
 
 def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
     """Declares and reads a gate's parameters, logs doubts; ConfigError if one can't be used."""
-    about = "Limits of the robot: a shipped file, or a YAML file; no default."
-    file = str(runner.declare(node, "limits", "", about, read_only=True))
+    file = str(runner.declare_row(node, LIMITS))
     limits = load_limits(file, model.robot) if file else None
     config = gate_config(
         model, limits, _declare_shield(node, model, limits, file),
@@ -60,30 +68,15 @@ def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
 
 def _declare_rules(node: Node, model: SimulatorModel) -> dict[str, Any]:
     scan_age = max(GateConfig.scan_age_s, SCAN_PERIODS / model.lidar.rate)
-    heard = "Whether e_stop must have been heard before arming; false in simulations alone."
-    default, seconds = GateConfig, (0.01, 10.0)
-    rows: tuple[tuple[str, float | bool, str, tuple[float, float] | None], ...] = (
-        ("odom_rate", 1.0 / model.control_period, "Of odom [Hz].", (0.1, 1e4)),
-        ("scan_age_s", scan_age, "Oldest scan, and behind a command [s].", seconds),
-        ("odom_age_s", default.odom_age_s, "Oldest odometry [s].", seconds),
-        ("command_age_s", default.command_age_s, "Oldest command [s].", seconds),
-        ("rate_tolerance", default.rate_tolerance, "Of both rates.", (0.01, 0.9)),
-        ("clock_rate", 1.0, "Of stamps: simulated seconds per second.", (0.01, 100.0)),
-        ("e_stop_required", True, heard, None),
-        ("e_stop_silence_s", default.e_stop_silence_s, "Silence of e_stop [s].", seconds),
-        ("estimate_required", True, "Whether arming needs odometry/filtered.", None),
-        ("estimate_std", default.estimate_std, "Greatest [m, rad].", (1e-3, 1e3)),
-    )
     return {
-        field: runner.declare(node, field.removesuffix("_s"), value, about, span, read_only=True)
-        for field, value, about, span in rows
+        f"{row.name}_s" if row.name in RULES_IN_SECONDS else row.name: runner.declare_row(node, row)
+        for row in gate_rules(1.0 / model.control_period, scan_age)
     }
 
 
 def declare_black_box(node: Node) -> Path:
     """Declares the folder of the recordings of stops, and returns that of the node's namespace."""
-    about = "Where a stop's last 30 s are written, by namespace; ~/.ros/black_box if empty."
-    given = str(runner.declare(node, "black_box", "", about, read_only=True))
+    given = str(runner.declare_row(node, BLACK_BOX))
     home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
     # So that no gate of another namespace removes its files.
     namespace = str(node.get_namespace()).strip("/")
@@ -93,16 +86,10 @@ def declare_black_box(node: Node) -> Path:
 def _declare_shield(
     node: Node, model: SimulatorModel, limits: Limits | None, file: str
 ) -> ShieldConfig | None:
-    on = runner.declare(node, "shield", True, "Whether to stop before obstacles.", read_only=True)
+    on = runner.declare_row(node, SHIELD)
     values = {}
-    for name, about in (
-        ("latency", "Until the robot has taken up a command, measured [s]"),
-        ("deceleration", "Of the robot, measured [m/s^2]"),
-        ("margin", "Kept free around the footprint [m]"),
-        ("obstacle_speed", "At which what moves may come on [m/s]"),
-    ):
-        about = f"{about}; .nan: by the limits' file, or derived from the model."
-        value = float(runner.declare(node, f"shield_{name}", math.nan, about, read_only=True))
+    for row in SHIELD_NUMBERS:
+        value, name = float(runner.declare_row(node, row)), row.name.removeprefix("shield_")
         if not math.isnan(value):
             values[name] = value
     if not on:
@@ -180,13 +167,13 @@ class CommandGate(qos.QosWatch):
             logger.warning(f"e_stop_required is false: {risk}; set it on a vehicle.")
         if self._config.shield is not None:
             shield.rehearse()
-        self._out = self.create_publisher(Twist, "cmd_vel", qos.COMMAND)
-        self._zero = wire.twist_to_bytes(np.zeros(3))
+        self._stamped = bool(runner.declare_row(self, stamped("cmd_vel")))
+        kind = TwistStamped if self._stamped else Twist
+        self._out = self.create_publisher(kind, "cmd_vel", qos.COMMAND)
         self._listen()
         runner.steadily(self, PERIOD_S, lambda: self._decide(inputs.Tick()))
         runner.diagnose(self, "gate", self._look)
-        about = "Real-time priority (SCHED_FIFO) of its process, 1 to 99; 0 for none."
-        priority = runner.declare(self, "priority", 0, about, (0, HIGHEST), read_only=True)
+        priority = runner.declare_row(self, PRIORITY)
         if refused := take_priority(priority):  # once all threads exist
             logger.warning(refused)
 
@@ -242,15 +229,20 @@ class CommandGate(qos.QosWatch):
     def _say(self, decision: Decision, now: float) -> inputs.Input | None:
         # The only path to the robot except `stop`. A motion that was decided on too long ago, in a
         # process frozen since, is not sent; so the clock is read immediately before.
-        content = wire.twist_to_bytes(decision.twist)
+        content = self._message(decision.twist)
         if not np.isfinite(decision.twist).all():
-            self._out.publish(self._zero)
+            self._out.publish(self._message(np.zeros(3)))
             self._log.no_number(decision.twist.tolist())
             return inputs.Press()
         if decision.cause is None and time.monotonic() - now > STALE_S:
             return inputs.Tick()
         self._out.publish(content)
         return None
+
+    def _message(self, twist: Array) -> bytes:
+        if not self._stamped:
+            return wire.twist_to_bytes(twist)
+        return wire.stamped_twist_to_bytes(twist, int(self.get_clock().now().nanoseconds))
 
     def _look(self) -> runner.Condition:
         found = self._log.finding(self._state)
@@ -263,13 +255,8 @@ class CommandGate(qos.QosWatch):
 
     def stop(self) -> None:
         """Leaves a zero command behind."""
-        runner.last_word(self._out, self._zero)
+        runner.last_word(self._out, self._message(np.zeros(3)))
         self._log.close()
 
 
-def main(args: list[str] | None = None) -> None:
-    """Entry point of the executable."""
-    runner.run_node(CommandGate, args, "command_gate")
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(0)  # all is closed; to tear down the interpreter, too, takes seconds on a busy machine
+main = partial(runner.run_node, CommandGate, sole_name="command_gate")

@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,13 +15,13 @@ from rclpy.parameter import Parameter
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.nodes.runner import declare
+from nics_drl_bridge.nodes.parameters import MODES, ROBOTS, device
+from nics_drl_bridge.nodes.runner import declare_row, given_values
 from nics_drl_bridge.robot.noise import Delay
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 
 LOCKSTEP = "lockstep"
-MODES = ("realtime", LOCKSTEP, "as_fast_as_possible")
-OWN = -1.0  # as in the model
+START, GIVEN = "episode_start", "episode_start_given"
 GREATEST_FLEET = 256
 NAMESPACE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*)*")
 SLACK = 0.1  # a step may be early by this share of it, because timers are no more precise
@@ -57,46 +58,13 @@ class Frames(NamedTuple):
 def declare_device(node: Node, laser_frame: str) -> None:
     """Declares all but the parameters of one kind of simulator, and checks later changes."""
     # First, so that it also checks the values that the node is started with.
-    node.add_on_set_parameters_callback(_check_episode)
-    about = "How many robots, named robot1, robot2, ..., or their namespaces; 1 has none."
-    fleet = ParameterDescriptor(description=about, read_only=True, dynamic_typing=True)
-    node.declare_parameter("robots", 1, fleet)
-    for name, fixed, about in (
-        ("world", "arena", "World file, or the name of a shipped world."),
-        ("randomisation", "", "Draws in each episode: a file, mild or strong; none if empty."),
-        ("mode", "realtime", f"How time runs: {', '.join(MODES)}."),
-        ("enable_stamped_cmd_vel", False, "Whether cmd_vel is a TwistStamped; a Twist otherwise."),
-        ("frame_prefix", "", "Put before the robot's frames; in a fleet before its namespace."),
-        ("map_frame", "map", "Frame id of map."),
-        ("odom_frame", "odom", "Frame id of odom."),
-        ("base_frame", "base_link", "Frame id of base_link."),
-        ("laser_frame", laser_frame, f"Frame id of {laser_frame}."),
-        ("publish_map_to_odom", False,
-         "Whether to publish the true map -> odom on /tf, in place of a localiser."),
-    ):  # fmt: skip
-        declare(node, name, fixed, about, read_only=True)
-    for name, value, low, high, about in (
-        ("rate", 1.0, 0.01, 1000.0, "Simulated seconds per second in realtime."),
-        ("odom_rate", 0.0, 0.0, 1000.0, "Of odom [Hz]; 0 for one per control period."),
-        ("scan_rate", 0.0, 0.0, 1000.0, "Of scan [Hz]; 0 for the lidar's own."),
-        ("scan_latency", OWN, OWN, 10.0,
-         "From the end of a scan to its publication [s]; -1 for the measured one of the model."),
-        ("odom_latency", OWN, OWN, 10.0,
-         "From the stamp of odom to its publication [s]; -1 for the measured one of the model."),
-        ("latency_jitter", OWN, OWN, 10.0,
-         "Greatest further delay of both, drawn evenly [s]; -1 for the measured ones."),
-        ("command_latency", OWN, OWN, 10.0,
-         "From a command to its effect [s]; -1 for the measured one of the model."),
-    ):  # fmt: skip
-        declare(node, name, value, about, (low, high), read_only=True)
-    silence = "Stops after this silence on cmd_vel [simulated s]; not in lockstep."
-    declare(node, "command_timeout", 0.5, silence, span=(0.0, 3600.0))
-    for name, default, about in (
-        ("episode_seed", 0, "Seed of the episode that ~/reset begins."),
-        ("episode_start", [0.0, 0.0, 0.0], "Start x, y, heading of that episode, of each robot."),
-        ("episode_start_given", False, "Whether episode_start holds, or the seed's own."),
-    ):
-        declare(node, name, default, about)
+    node.add_on_set_parameters_callback(partial(_check_episode, node))
+    fleet = ParameterDescriptor(description=ROBOTS.about, read_only=True, dynamic_typing=True)
+    node.declare_parameter(ROBOTS.name, ROBOTS.default, fleet)
+    for row in device(laser_frame):
+        if row.name == GIVEN:
+            row = row._replace(default=START in given_values(node))
+        declare_row(node, row)
 
 
 def number(node: Node, name: str) -> float:
@@ -176,15 +144,19 @@ def frames(node: Node, namespace: str) -> Frames:
     return Frames(world, odom, base, laser, prefix)
 
 
-def _check_episode(parameters: list[Parameter]) -> SetParametersResult:
+def _check_episode(node: Node, parameters: list[Parameter]) -> SetParametersResult:
     reason = ""
     for parameter in parameters:
-        if parameter.name == "episode_start":
+        if parameter.name == START:
             values = np.array(parameter.value, dtype=np.float64)
             if not values.size or values.size % 3 or not np.isfinite(values).all():
                 reason = "episode_start must be three finite numbers: x, y, heading; of each robot."
         elif parameter.name == "episode_seed" and parameter.value < 0:
             reason = "episode_seed must be 0 or more."
+    names = {parameter.name for parameter in parameters}
+    # A start that is set alone holds; when they are declared, it comes first.
+    if not reason and START in names and GIVEN not in names and node.has_parameter(GIVEN):
+        node.set_parameters([Parameter(GIVEN, value=True)])
     return SetParametersResult(successful=not reason, reason=reason)
 
 

@@ -22,6 +22,7 @@ from nics_drl_bridge.nodes.runner import Condition
 FILES_KEPT = 20
 BURST_S = 3.0  # for which commands must pass before a stop is not of the same burst
 LINE_S = 2.0  # time between two log lines of a kind [s]; those in between are counted
+LONGEST_LINE_S = 64.0  # the same for a kind that does not cease: each time it is doubled [s]
 CLOSING_S = 0.7  # longest wait at the end for files that are being written [s]
 MOST_AT_WORK = 3  # greatest number of writers at work; each keeps a copy of this process's memory
 PATIENCE_S = 20.0  # a writer that takes longer gives up [s]
@@ -43,7 +44,8 @@ class GateLog:
         self._now = self._since = float("-inf")
         self._rule: str | None = None  # that stops the robot; "" while commands pass, None at first
         self._burst: set[str] = set()  # with a written stop since commands last passed for long
-        self._said: dict[str, float] = {}  # time of the last line of a kind
+        # Of each kind: time of the last line, and least time until the next [s].
+        self._said: dict[str, tuple[float, float]] = {}
         self._kept: Counter[str] = Counter()  # events of a kind since then
         self._owed, self._writer = False, BoxWriter()
         self._names: list[str] = []
@@ -61,7 +63,8 @@ class GateLog:
         if rule != self._rule:
             self._changed(rule)
         self._cause = cause
-        if self._owed and (more := self._due(rule)) is not None:  # else it is told later
+        lasts = entry.now - self._since >= LINE_S  # what does not alternate is told in any case
+        if self._owed and (more := self._due(rule, lasts)) is not None:  # else it is told later
             self._owed = False
             if cause is None:
                 self._logger.info(f"commands pass{more}")
@@ -86,11 +89,13 @@ class GateLog:
         self._kept[kind] += 1
         return self._due(kind)
 
-    def _due(self, kind: str) -> str | None:
-        """Returns what to append to a line; None if one of its kind was logged within `LINE_S`."""
-        if self._now - self._said.get(kind, float("-inf")) < LINE_S:
+    def _due(self, kind: str, certainly: bool = False) -> str | None:
+        """Returns what to append to a line; None if one of its kind was logged a moment ago."""
+        said, wait_s = self._said.get(kind, (float("-inf"), LINE_S))
+        if not certainly and self._now - said < wait_s:
             return None
-        kept, self._said[kind] = self._kept.pop(kind, 1) - 1, self._now
+        kept = self._kept.pop(kind, 1) - 1
+        self._said[kind] = self._now, min(2.0 * wait_s, LONGEST_LINE_S) if kept else LINE_S
         return f" ({kept} more since the last such line)" if kept else ""
 
     def _changed(self, rule: str) -> None:

@@ -11,10 +11,11 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 
 from nics_drl_bridge.errors import BridgeError
+from nics_drl_bridge.nodes.ending import at_once
+from nics_drl_bridge.nodes.parameters import managed
 from nics_drl_bridge.nodes.qos import QosWatch
-from nics_drl_bridge.nodes.runner import declare
+from nics_drl_bridge.nodes.runner import ACTIVE, INACTIVE, UNCONFIGURED, declare_row
 
-UNCONFIGURED, INACTIVE, ACTIVE = "unconfigured", "inactive", "active"
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
 
@@ -25,8 +26,7 @@ class ManagedNode(QosWatch, LifecycleNode):
         super().__init__(name, context=context)
         self.fixed: set[str] = set()
         self.undo = ExitStack()
-        about = "Whether it configures and activates itself, without a lifecycle manager."
-        self._autostart = bool(declare(self, "autostart", True, about, read_only=True))
+        self._autostart = bool(declare_row(self, managed()[0]))
         self.state, self._starting = UNCONFIGURED, False  # `state`: the last primary one
         self._failure: Exception | None = None
         self.add_on_set_parameters_callback(self._check_fixed)
@@ -74,7 +74,8 @@ class ManagedNode(QosWatch, LifecycleNode):
 
     def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Configures; a failure leaves it unconfigured."""
-        done = self._attempt(self.configure, INACTIVE)
+        with at_once():  # to open a policy may compile; nothing has been commanded yet
+            done = self._attempt(self.configure, INACTIVE)
         if done == FAILURE:
             self.undo.close()
         return done
@@ -116,4 +117,6 @@ class ManagedNode(QosWatch, LifecycleNode):
                 raise
             return FAILURE
         self.state = reached
+        if not self._starting:
+            self.get_logger().info("running" if reached == ACTIVE else reached)
         return SUCCESS

@@ -29,10 +29,12 @@ from nics_drl_bridge.env.guard import uninterrupted
 from nics_drl_bridge.errors import BackendError, ModelError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Start
-from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.executor import StandingExecutor
+from nics_drl_bridge.nodes.parameters import stamped_by_default
+from nics_drl_bridge.nodes.robot_topics import heard_stamped
 from nics_drl_bridge.nodes.runner import holds, last_word, open_context
-from nics_drl_bridge.nodes.wire import twist_to_bytes
+from nics_drl_bridge.nodes.wire import stamped_twist_to_bytes, twist_to_bytes
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world_set import AnyWorld
 
@@ -46,8 +48,8 @@ class Link:
 
     def __init__(
         self, namespace: str = "", domain_id: int | None = None, command_topic: str = "cmd_vel",
-        stamped: bool = False, parameters: Mapping[str, Any] | None = None,
-        command_timeout_s: float = math.inf,
+        stamped: bool | None = None, parameters: Mapping[str, Any] | None = None,
+        command_timeout_s: float = math.inf, patience_s: float = 0.0,
     ) -> None:  # fmt: skip
         # SIGTERM ends Python like an exception, unless the program handles it itself.
         in_main = threading.current_thread() is threading.main_thread()
@@ -59,10 +61,20 @@ class Link:
             "bridge_env", namespace=namespace, context=self._context,
             start_parameter_services=False, parameter_overrides=overrides,
         )  # fmt: skip
-        self._kind = TwistStamped if stamped else Twist
+        self._began_s = time.monotonic()
+        if stamped is None:
+            stamped = self.hears_stamped(command_topic, patience_s)
+        self.stamped, self._kind = stamped, TwistStamped if stamped else Twist
         self.commands = self.node.create_publisher(self._kind, command_topic, qos.COMMAND)
         self._timeout = CommandTimeout(self.commands, self._kind, command_timeout_s)
         self._closing: weakref.finalize[Any, Any] | None = None
+
+    def hears_stamped(self, topic: str, patience_s: float) -> bool:
+        """Waits for who hears commands on a topic; True if stamped ones, or by default."""
+        name = self.node.resolve_topic_name(topic)
+        holds(lambda: self.node.count_subscribers(name) > 0, patience_s, POLL_S)
+        heard = heard_stamped(self.node, topic)
+        return stamped_by_default() if heard is None else heard
 
     def begin(self) -> None:
         """Starts the executor's thread; call it once all subscriptions exist."""
@@ -81,7 +93,7 @@ class Link:
         if self._kind is Twist:
             self.commands.publish(twist_to_bytes(twist))
         else:
-            self.commands.publish(conversions.stamped_to_ros(twist, stamp_ns, "base_link"))
+            self.commands.publish(stamped_twist_to_bytes(twist, stamp_ns))
 
     def halt(self) -> None:
         """Publishes a zero command."""
@@ -133,8 +145,9 @@ class Link:
         for client in clients:
             service = node.resolve_service_name(client.srv_name)
             needed[f"service {service}"] = client.service_is_ready
-        deadline = time.monotonic() + patience_s
-        if not holds(lambda: all(there() for there in needed.values()), patience_s, POLL_S):
+        deadline = self._began_s + patience_s
+        left_s = deadline - time.monotonic()
+        if not holds(lambda: all(there() for there in needed.values()), left_s, POLL_S):
             missing = ", no ".join(name for name, there in needed.items() if not there())
             raise BackendError(f"after {patience_s:g} s there is still no {missing}; {advice}")
         # A publisher that was killed stays in the graph for a while.

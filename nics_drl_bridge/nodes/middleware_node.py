@@ -11,8 +11,10 @@ from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.middleware.measurement import Health
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos, runner
-from nics_drl_bridge.nodes.lifecycle import ACTIVE, UNCONFIGURED, ManagedNode
+from nics_drl_bridge.nodes.lifecycle import ManagedNode
+from nics_drl_bridge.nodes.parameters import middleware
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
+from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED
 
 SILENCE_S = 5.0  # diagnostics warn of a topic that has been silent for this long [s]
 
@@ -24,8 +26,8 @@ class MiddlewareNode(ManagedNode):
         super().__init__("middleware_node", context)
         runner.declare_model_name(self)
         declare_sensors(self)
-        runner.declare(self, "map_frame", "map", "Frame id of the estimate.")
-        runner.declare(self, "base_frame", "base_link", "Frame id of the robot.")
+        for row in middleware():
+            runner.declare_row(self, row)
         runner.serve(self, "~/reset", self._reset)
         runner.diagnose(self, "topics", self._look)
 

@@ -1,6 +1,5 @@
 """policy_node: runs a policy on a robot's topics."""
 
-import math
 import time
 import traceback
 from dataclasses import replace
@@ -17,8 +16,11 @@ from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos, runner
-from nics_drl_bridge.nodes.lifecycle import ACTIVE, UNCONFIGURED, ManagedNode
+from nics_drl_bridge.nodes.goal_frames import GoalFrames
+from nics_drl_bridge.nodes.lifecycle import ManagedNode
+from nics_drl_bridge.nodes.parameters import policy
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
+from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED
 from nics_drl_bridge.policy.fallback import acted
 from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
 from nics_drl_bridge.policy.policies import open_policy
@@ -35,23 +37,8 @@ class PolicyNode(ManagedNode):
         super().__init__("policy_node", context)
         runner.declare_model_name(self)
         declare_sensors(self)
-        runner.declare(self, "base_frame", "base_link", "Frame id of the robot.")
-        for name, default, about in (
-            ("policy", "dynamic_window",
-             "A policy file (*.onnx), or the name of a shipped one or of a baseline."),
-            ("fallback", "",
-             "A planner (dynamic_window, mppi) that acts where the policy asks for what can't be "
-             "stopped before a touch; empty for none."),
-            ("goal", [math.nan] * 2, "x, y in map [m]; NaN waits for goal_pose."),
-            ("rate", math.nan,
-             "Actions per second of the steady clock; NaN: of the control period; 0: one for each "
-             "scan, for a simulator that is not in real time."),
-            ("deadline", math.nan,
-             "Longest time of an inference [s]; NaN: half the control period."),
-        ):  # fmt: skip
-            runner.declare(self, name, default, about, read_only=True)
-        about = "So many late inferences in a row command zero."
-        runner.declare(self, "late_limit", 3, about, span=(1, 1000), read_only=True)
+        for row in policy():
+            runner.declare_row(self, row)
         self._acted_ns = 0
         runner.diagnose(self, "policy", self._look)
 
@@ -69,6 +56,8 @@ class PolicyNode(ManagedNode):
         self.undo.callback(self.destroy_subscription, goals)
         self._topics = RobotTopics(self, model, self._act, self._act, self._on_lidar)
         self.undo.callback(self._topics.close)
+        self._frames = GoalFrames(self, self._topics)
+        self.undo.callback(self._frames.close)
         timer = runner.steadily(self, POLLS * model.control_period, self._act)
         self.undo.callback(self.destroy_timer, timer)
 
@@ -106,7 +95,11 @@ class PolicyNode(ManagedNode):
         self.get_logger().info(f"scans of {lidar.beams} beams {span} are {done}")
 
     def _on_goal(self, message: PoseStamped) -> None:
-        goal = np.array([message.pose.position.x, message.pose.position.y])
+        try:
+            goal = self._frames.in_map(message)
+        except ConfigError as error:
+            self.get_logger().error(f"{error} The goal before it stays.")
+            return
         if not np.array_equal(goal, self._goal):
             begin(self._policy)
         self._goal = goal

@@ -13,7 +13,7 @@ from nics_drl_bridge.env.guard import halts_on_error
 from nics_drl_bridge.errors import BackendError, StaleDataError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array, BackendFacts, RobotView, Start
-from nics_drl_bridge.middleware.measurement import SCAN
+from nics_drl_bridge.middleware.measurement import CMD_VEL, SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes.link import EpisodeServices, Link
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, data_facts, declare_sensors
@@ -49,7 +49,7 @@ class RealtimeOptions(Schema):
     # `cmd_vel_raw` leads through `command_gate`: then each command is a TwistStamped with the stamp
     # of the scan that it answers.
     command_topic: str = Field("cmd_vel", min_length=1)
-    stamped: bool = False  # `cmd_vel` is a TwistStamped
+    stamped: bool | None = None  # `cmd_vel` is a TwistStamped; None: as the robot hears it
     pose_type: str = "none"  # of `pose`, a pose sensor in `map`
     use_imu: bool = False  # the yaw rate of `imu`
 
@@ -76,17 +76,14 @@ class RealtimeBackend:
         self._simulated = False
         self._link = Link(
             chosen.namespace, chosen.domain_id, chosen.command_topic,
-            stamped=chosen.stamped or chosen.gated,
-            parameters={
-                "pose_type": chosen.pose_type, "use_imu": chosen.use_imu,
-                "enable_stamped_cmd_vel": chosen.stamped,
-            },
+            stamped=True if chosen.gated else chosen.stamped, patience_s=chosen.timeout_s,
+            parameters={"pose_type": chosen.pose_type, "use_imu": chosen.use_imu},
             command_timeout_s=math.inf  # a gate has its own timeout
             if chosen.gated
             else max(COMMAND_S, PERIODS * self._period_ns / NS_PER_S),
         )  # fmt: skip
         try:
-            declare_sensors(self._link.node)
+            declare_sensors(self._link.node, self._commands_are_stamped())
             self._topics = RobotTopics(self._link.node, model, now_ns=time.monotonic_ns)
             self._episodes = EpisodeServices(self._link, chosen.simulator, model, world)
             self._link.begin()
@@ -98,6 +95,13 @@ class RealtimeBackend:
         except BaseException:
             self.close()
             raise
+
+    def _commands_are_stamped(self) -> bool:
+        if self._options.stamped is not None:
+            return self._options.stamped
+        if not self._options.gated:
+            return self._link.stamped
+        return self._link.hears_stamped(CMD_VEL, self._options.timeout_s)
 
     @halts_on_error
     def reset(self, start: Start) -> RobotView:
@@ -175,7 +179,7 @@ class RealtimeBackend:
         """Publishes a command, waits for the end of the period; see `interface.Backend`."""
         self._link.check_open()
         stamp_ns = 0
-        if self._options.stamped or self._options.gated:
+        if self._link.stamped:
             with self._topics.lock:
                 stamp_ns = self._topics.middleware.cache.newest[SCAN].stamp_ns
         self._link.send(self._robot.to_cmd_vel(command), stamp_ns)

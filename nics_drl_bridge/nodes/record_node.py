@@ -16,13 +16,23 @@ from numpy.typing import ArrayLike
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
 from sensor_msgs.msg import Imu, JointState
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, BridgeError, RecordingError
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.runner import EXIT_BAD_INPUT, declare, last_word, run_node, steadily
+from nics_drl_bridge.nodes.parameters import drive
+from nics_drl_bridge.nodes.robot_topics import heard_stamped
+from nics_drl_bridge.nodes.runner import (
+    EXIT_BAD_INPUT,
+    declare_row,
+    given_values,
+    last_word,
+    run_node,
+    steadily,
+)
 from nics_drl_bridge.recording.bag_file import Message
 from nics_drl_bridge.recording.bag_reader import joint_streams
 from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S, DrivePlan
@@ -49,24 +59,18 @@ class DriveParameters:
     plan: DrivePlan
     out: Path  # of the recording
     odom_timeout: float  # silence of odometry that stops the robot [s]
-    stamped: bool  # `cmd_vel` is a TwistStamped
+    stamped: bool  # `cmd_vel` is a TwistStamped, if chosen; else as the robot hears it
     roles: TopicRoles  # may name the joints of state and wheels
 
 
 def declare_drive(node: Node) -> DriveParameters:
     """Declares the parameters of a drive, and reads them. Raises ConfigError."""
-    get = partial(declare, node, read_only=True)
-    robot = load_robot(get("robot", "ackermann", "A shipped robot, or its YAML file."))
+    get = {row.name: partial(declare_row, node, row) for row in drive()}
+    robot = load_robot(get["robot"]())
     robot.require_cmd_vel()
-    about = "File *.npz of the recording, or folder of a rosbag2."
-    out = check_out(Path(get("out", "drive.npz", about)))
-    bound = get("bound", 2.0, "Radius of the circle around the start to keep within [m].")
-    duration = get("duration", 60.0, "Of the drive [s].")
-    speed = get("speed", 1.0, "Share of the greatest speeds to use.")
-    plan = DrivePlan(robot, bound, duration, speed, get("seed", 0, "Of the pattern."))
-    topics = get("topics", "", "YAML file that names joints; none if empty.")
-    silence = get("odom_timeout", 0.5, "Stops after this silence of odom [s].", span=(0.05, 10.0))
-    stamped = get("stamped", False, "Whether cmd_vel is a TwistStamped.")
+    out = check_out(Path(get["out"]()))
+    plan = DrivePlan(robot, *(get[name]() for name in ("bound", "duration", "speed", "seed")))
+    topics, silence, stamped = (get[name]() for name in ("topics", "odom_timeout", "stamped"))
     return DriveParameters(plan, out, silence, stamped, topic_roles(topics or None))
 
 
@@ -174,8 +178,10 @@ class RecordNode(qos.QosWatch):
         self._sim_time = bool(self.get_parameter("use_sim_time").value)
         self._steady_origin_ns = time.time_ns() - time.monotonic_ns()
         self._log = DriveLog(self._order.plan.robot, self._order.roles, self._now_ns)
-        command = TwistStamped if self._order.stamped else Twist
-        self._topic = self.create_publisher(command, "cmd_vel", qos.COMMAND)
+        self._chosen = "stamped" in given_values(self)
+        self._topic: Publisher | None = None
+        if self._chosen:
+            self._speak(self._order.stamped)
         self.create_subscription(Odometry, "odom", self._on_odometry, qos.SENSOR)
         self.create_subscription(JointState, "joint_states", self._log.joints, qos.SENSOR)
         for each, topic, row in ((PoseStamped, "pose", pose_row), (Imu, "imu", imu_row)):
@@ -186,6 +192,11 @@ class RecordNode(qos.QosWatch):
         self._start: Array = np.zeros(3)
         # Steady: the robot's guard must not depend on the time source of the node.
         steadily(self, POLL_S, self._on_time)
+
+    def _speak(self, stamped: bool) -> None:
+        self._stamped = stamped
+        command = TwistStamped if stamped else Twist
+        self._topic = self.create_publisher(command, "cmd_vel", qos.COMMAND)
 
     def _now_ns(self) -> int:
         if self._sim_time:
@@ -219,8 +230,16 @@ class RecordNode(qos.QosWatch):
                 self._end(None, complete=True)
 
     def _ready(self) -> bool:
-        listeners = self._topic.get_subscription_count()
-        if self._pose is not None and listeners > 0 and self._now_ns() > 0:
+        if self._topic is None and self.count_subscribers(self.resolve_topic_name("cmd_vel")):
+            heard = heard_stamped(self, "cmd_vel")
+            self._speak(self._order.stamped if heard is None else heard)
+        listeners = 0 if self._topic is None else self._topic.get_subscription_count()
+        if (
+            self._topic is not None
+            and self._pose is not None
+            and listeners > 0
+            and self._now_ns() > 0
+        ):
             others = self.count_publishers(self._topic.topic_name) - 1
             if others > 0:
                 reason = f"{others} other publisher(s) would drive the robot too; end them, or"
@@ -266,12 +285,13 @@ class RecordNode(qos.QosWatch):
 
     def _send(self, command: Array) -> None:
         robot = self._order.plan.robot
-        self._topic.publish(self._message(robot.to_cmd_vel(command)))
+        if self._topic is not None:
+            self._topic.publish(self._message(robot.to_cmd_vel(command)))
         self._log.add("cmd_vel", 0, robot.through_cmd_vel(command))
 
     def _message(self, twist: Array) -> Twist | TwistStamped:
         stamped = conversions.stamped_to_ros(twist, self._now_ns(), "")
-        return stamped if self._order.stamped else stamped.twist
+        return stamped if self._stamped else stamped.twist
 
     def stop(self) -> None:
         """Leaves the robot at rest, and saves what was recorded."""
@@ -296,7 +316,8 @@ class RecordNode(qos.QosWatch):
         while time.monotonic() < until:
             self._send(zero)
             time.sleep(PERIOD_S)
-        last_word(self._topic, self._message(np.zeros(3)))
+        if self._topic is not None:
+            last_word(self._topic, self._message(np.zeros(3)))
 
     def _save(self) -> tuple[Recording | None, str]:
         try:

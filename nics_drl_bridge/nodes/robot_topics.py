@@ -21,23 +21,26 @@ from nics_drl_bridge.middleware.ekf import ANYWHERE
 from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCAN
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.runner import declare
+from nics_drl_bridge.nodes.parameters import NO_POSE, POSE_TYPES, STAMPED, sensors
+from nics_drl_bridge.nodes.runner import declare_row
 
-NO_POSE = "none"
-POSE_TYPES = {each.__name__: each for each in (PoseStamped, PoseWithCovarianceStamped)}
+TWIST, TWIST_STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+KINDS_OF_POSE = {each.__name__: each for each in (PoseStamped, PoseWithCovarianceStamped)}
 
 
-def declare_sensors(node: Node) -> None:
-    """Declares the sensors that a robot has in addition to scan and odometry."""
-    upside_down = "Whether the lidar hangs with its z axis down, so that its beams come clockwise."
-    for name, default, about in (
-        ("pose_type", NO_POSE,
-         f"Type of `{POSE}`, in the map frame: {NO_POSE}, {', '.join(POSE_TYPES)}."),
-        ("lidar_upside_down", False, upside_down),
-        ("use_imu", False, "Whether to use the yaw rate of `imu`."),
-        ("enable_stamped_cmd_vel", False, f"Whether `{CMD_VEL}` is a TwistStamped."),
-    ):  # fmt: skip
-        declare(node, name, default, about, read_only=True)
+def heard_stamped(node: Node, topic: str) -> bool | None:
+    """True if who hears commands on a topic hears a TwistStamped; None if nobody, or both."""
+    ends = node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic))
+    kinds = {end.topic_type for end in ends} & {TWIST, TWIST_STAMPED}
+    return kinds == {TWIST_STAMPED} if len(kinds) == 1 else None
+
+
+def declare_sensors(node: Node, stamped: bool | None = None) -> None:
+    """Declares a robot's sensors but scan and odometry, and the type of its commands, if known."""
+    for row in sensors():
+        if row.name == STAMPED and stamped is not None:
+            row = row._replace(default=stamped)
+        declare_row(node, row)
 
 
 class RobotTopics:
@@ -65,10 +68,10 @@ class RobotTopics:
         self._reader: Reader | None = Reader(model.lidar, backwards=False)
         self._header, self._told = b"", ""
         self._subscriptions: list[Any] = []
-        stamped = bool(node.get_parameter("enable_stamped_cmd_vel").value)
+        stamped = bool(node.get_parameter(STAMPED).value)
         command = TwistStamped if stamped else Twist
         self._subscribe(CMD_VEL, command, self._take_command, qos.COMMAND)
-        sensors: dict[str, tuple[Any, Callable[[Any], None]]] = {
+        heard: dict[str, tuple[Any, Callable[[Any], None]]] = {
             SCAN: (LaserScan, self._take_scan),
             ODOM: (Odometry, self._take_odometry),
         }
@@ -78,15 +81,15 @@ class RobotTopics:
             if pose_type not in POSE_TYPES:
                 fix = nearest(pose_type, (NO_POSE, *POSE_TYPES))
                 raise ConfigError(f"parameter 'pose_type': there is no {pose_type!r}; {fix}")
-            sensors[POSE] = (POSE_TYPES[pose_type], self._take_pose)
+            heard[POSE] = (KINDS_OF_POSE[pose_type], self._take_pose)
         if node.get_parameter("use_imu").value:
-            sensors[IMU] = (Imu, self._take_imu)
+            heard[IMU] = (Imu, self._take_imu)
         for sensor in model.sensors:
             take_reading = partial(self._take_reading, sensor)
-            sensors[sensor.name] = (conversions.sensor_type(sensor), take_reading)
-        for topic, (kind, take) in sensors.items():
+            heard[sensor.name] = (conversions.sensor_type(sensor), take_reading)
+        for topic, (kind, take) in heard.items():
             self._subscribe(topic, kind, take, qos.SENSOR)
-        self.expected = tuple(sensors)
+        self.expected = tuple(heard)
 
     def _subscribe(self, topic: str, kind: Any, take: Callable[[Any], None], quality: Any) -> None:
         def locked(message: Any) -> None:
@@ -103,6 +106,7 @@ class RobotTopics:
     def restart(self) -> None:
         """Clears all state; the next odometry starts anew."""
         self._started, self._since_ns = False, 0
+        self.frames = ("", "")  # of the newest odometry: its own, and the robot's
         self.middleware.reset(0, np.zeros(3))
 
     def begin(self, stamp_ns: int, pose: Array) -> None:
@@ -160,6 +164,7 @@ class RobotTopics:
     def _take_odometry(self, message: Odometry) -> None:
         stamp = conversions.stamp_from_ros(message.header.stamp)
         pose, twist = conversions.odometry_from_ros(message)
+        self.frames = message.header.frame_id, message.child_frame_id
         if not self._started and np.isfinite(pose).all():
             self.middleware.reset(stamp, pose, *((ANYWHERE,) if self._posed else ()))
             self._started = True

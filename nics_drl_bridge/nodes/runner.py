@@ -27,10 +27,14 @@ from std_srvs.srv import Trigger
 from nics_drl_bridge.errors import BackendError, BridgeError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.nodes import qos
+from nics_drl_bridge.nodes.ending import ENDING, at_once
 from nics_drl_bridge.nodes.executor import StandingExecutor
+from nics_drl_bridge.nodes.parameters import MODEL, Row
 from nics_drl_bridge.nodes.transport import OF_THIS_PROCESS
 
 SPIN_S = 0.1
+UNKNOWN = "UnknownROSArgsError"  # of rclpy, which exports it nowhere
+UNCONFIGURED, INACTIVE, ACTIVE = "unconfigured", "inactive", "active"
 DELIVERY_S = 0.5
 EXIT_BAD_INPUT = 2
 SETTLE_S, POLL_S = 0.3, 0.02  # time until the graph shows all nodes [s]
@@ -52,6 +56,9 @@ def open_context(args: Sequence[str] | None = None, domain_id: int | None = None
     try:
         return OF_THIS_PROCESS.open(make)
     except RuntimeError as error:
+        if type(error).__name__ == UNKNOWN:
+            fix = "as in `--ros-args -p NAME:=VALUE -r FROM:=TO --params-file FILE`"
+            raise BackendError(f"ROS 2 knows no argument {error}; write them {fix}.") from None
         raise BackendError(f"ROS 2 does not start: {' '.join(str(error).split())}") from None
 
 
@@ -69,23 +76,26 @@ def run_node(
 
     def end(*_: Any) -> None:
         stopping.set()
-        if not started.is_set():  # it may be compiling, which can take longer than a launch waits
+        if not started.is_set():
             started.set()
             raise SystemExit(0)
 
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in ENDING:
         signal.signal(number, end)
     context, node, alone = None, None, contextlib.ExitStack()
     try:
-        context = open_context(sys.argv if args is None else args)
-        if sole_name:
-            alone.enter_context(sole(context, sole_name))
-        node = make(context)
-        if hasattr(node, "start"):
-            node.start()
+        with at_once():
+            context = open_context(sys.argv if args is None else args)
+            if sole_name:
+                alone.enter_context(sole(context, sole_name))
+            node = make(context)
+            if hasattr(node, "start"):
+                node.start()
         for sentence in unknown(node):  # rclpy ignores them silently
             node.get_logger().warning(sentence)
         started.set()
+        if getattr(node, "state", ACTIVE) == ACTIVE:
+            node.get_logger().info("running")
         spin(node, stopping)
     except (BridgeError, ParameterException, OSError) as error:
         sentence = " ".join(str(error).split())
@@ -196,8 +206,12 @@ def declare_model(node: Node) -> SimulatorModel:
 
 def declare_model_name(node: Node) -> str:
     """Declares the parameter `model`; the model itself is opened later."""
-    about = "Folder of a SimulatorModel, or a shipped robot."
-    return str(declare(node, "model", "ackermann", about, read_only=True))
+    return str(declare_row(node, MODEL))
+
+
+def declare_row(node: Node, row: Row) -> Any:
+    """Declares a parameter, and returns its value."""
+    return declare(node, row.name, row.default, row.about, row.span, row.fixed)
 
 
 def declare(
@@ -212,7 +226,7 @@ def declare(
     if span is not None:
         kind, field = RANGES[type(default)]
         setattr(descriptor, field, [kind(from_value=span[0], to_value=span[1])])
-    given, many = _given_values(node), isinstance(default, list)
+    given, many = given_values(node), isinstance(default, list)
     # rclpy itself refuses an integer, as in `rate:=2`, for a floating-point parameter.
     if name in given and isinstance(default[0] if many else default, float):
         types, value = Parameter.Type, given[name].value
@@ -222,7 +236,7 @@ def declare(
     return node.declare_parameter(name, default, descriptor).value
 
 
-def _given_values(node: Node) -> dict[str, Parameter]:
+def given_values(node: Node) -> dict[str, Parameter]:
     """Returns the node's own dictionary of initial values, to which rclpy has no public access."""
     found: dict[str, Parameter] = getattr(node, "_parameter_overrides", {})
     return found
@@ -233,7 +247,7 @@ def unknown(node: Node) -> list[str]:
     known = [name for name in node._parameters if not name.startswith(QOS)]
     return [
         f"there is no parameter {name!r}, its value is ignored; {nearest(name, known)}"
-        for name in sorted(_given_values(node))
+        for name in sorted(given_values(node))
         if name not in (*known, SHARED) and not name.startswith(QOS)
     ]
 

@@ -29,9 +29,10 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.scanner import RENDERERS, Renderer
 from nics_drl_bridge.lidar.spec import to_device
-from nics_drl_bridge.nodes import conversions, device_parameters, qos, runner, wire
+from nics_drl_bridge.nodes import conversions, device_parameters, parameters, qos, runner, wire
 from nics_drl_bridge.nodes.conversions import sensor_to_ros, sensor_type
 from nics_drl_bridge.nodes.link import identity
+from nics_drl_bridge.nodes.robot_topics import TWIST, TWIST_STAMPED
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, variances
 from nics_drl_bridge.sim.simulator import FastSimulator
@@ -44,9 +45,8 @@ LONGEST_TICK_S = 0.005  # longest time between two checks for delayed data that 
 # Makes the simulator of some robots; may declare its own parameters at the node. Its control
 # period is that of the given model.
 MakeSimulator = Callable[[Node, SimulatorModel, AnyWorld, int], FastSimulator]
-TWIST, STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 # The setting that selects the other type.
-SWITCH = {STAMPED: "enable_stamped_cmd_vel:=false", TWIST: "enable_stamped_cmd_vel:=true"}
+SWITCH = {TWIST_STAMPED: "enable_stamped_cmd_vel:=false", TWIST: "enable_stamped_cmd_vel:=true"}
 
 
 class Outbox:
@@ -162,10 +162,10 @@ class CommandInlet:
     ) -> None:  # fmt: skip
         self._node, self._robot, self._take, self._too_old = node, robot, take, too_old
         stamped = bool(node.get_parameter("enable_stamped_cmd_vel").value)
-        self._kind = STAMPED if stamped else TWIST
+        self._kind = TWIST_STAMPED if stamped else TWIST
         kind, hear = (TwistStamped, self._on_stamped) if stamped else (Twist, self._on_bytes)
         self._topic: str = node.create_subscription(
-            kind, f"{namespace}cmd_vel", hear, quality, raw=not stamped
+            kind, f"{namespace}cmd_vel", hear, quality, raw=True
         ).topic_name
         self._warned: set[str] = set()
         kind = conversions.message_type("ackermann_msgs/msg/AckermannDriveStamped")
@@ -186,17 +186,21 @@ class CommandInlet:
         else:
             self._complain("NaN or inf ignored")
 
-    def _on_stamped(self, message: TwistStamped) -> None:
-        if self._is_fresh(message.header.stamp):
-            self._obey(conversions.twist_from_ros(message).tolist())
+    def _on_stamped(self, content: bytes) -> None:
+        try:
+            stamp_ns, twist = wire.stamp_of(content), wire.stamped_twist_of(content)
+        except wire.UNREADABLE as error:
+            self._complain(f"a message that can't be read ({error}) is ignored")
+            return
+        if self._is_fresh(stamp_ns):
+            self._obey(twist)
 
     def _on_ackermann(self, message: Any) -> None:
-        if self._is_fresh(message.header.stamp):
+        if self._is_fresh(conversions.stamp_from_ros(message.header.stamp)):
             angle = message.drive.steering_angle
             self._obey((message.drive.speed, 0.0, angle), self._robot.of_fields)
 
-    def _is_fresh(self, stamp: Any) -> bool:
-        stamp_ns = conversions.stamp_from_ros(stamp)
+    def _is_fresh(self, stamp_ns: int) -> bool:
         if not stamp_ns or not self._too_old(stamp_ns):
             return True
         why = "its stamp is older than command_timeout; do both ends use one clock (use_sim_time)?"
@@ -433,7 +437,7 @@ class DeviceNode(qos.QosWatch):
 
 def declare_renderer(node: Node, default: Renderer) -> Renderer:
     """Declares the parameter `renderer`, and returns its value."""
-    runner.declare(node, "renderer", default, "Lidar: baked or exact.", read_only=True)
+    runner.declare_row(node, parameters.renderer(default))
     return cast(Renderer, device_parameters.choice(node, "renderer", RENDERERS))
 
 

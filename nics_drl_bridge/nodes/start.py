@@ -1,24 +1,63 @@
 """Entry points of the nodes: one sentence, not a traceback, where ROS 2 is missing."""
 
+import os
 import signal
 import sys
+import time
+import traceback
 from functools import partial
-from importlib import import_module
-from importlib.util import find_spec
-
-from nics_drl_bridge import extensions
-from nics_drl_bridge.errors import ConfigError
+from typing import Any
 
 EXIT_BAD_INPUT = 2
 
 
 def start(node: str, args: list[str] | None = None) -> None:
-    """Runs a node by its name until it ends; a missing library is one sentence and exit code 2."""
+    """Runs a node by its name and ends the process; what can't be used is one sentence, and 2."""
     for number in (signal.SIGINT, signal.SIGTERM):  # to import takes seconds
-        signal.signal(number, lambda *_: sys.exit(0))
+        signal.signal(number, lambda *_: os._exit(0))
+    from nics_drl_bridge.nodes import ending, usage
+
+    words = sys.argv[1:] if args is None else args[1:]
+    if any(word in usage.HELP for word in words):
+        sys.stdout.write(usage.help_of(node))
+        ending.leave(0)
+    if sentence := usage.wrong_with(node, words):
+        sys.stderr.write(f"{sentence}\n")
+        ending.leave(EXIT_BAD_INPUT)
+    say_first(node)
+    code: Any = 0
+    try:
+        ending.own_process()
+        with ending.at_once():
+            main = _main_of(node)
+        main(args)
+    except SystemExit as end:
+        code = end.code
+    except BaseException:  # noqa: BLE001  (it is told, and the process ends)
+        traceback.print_exc()
+        code = 1
+    ending.leave(code if isinstance(code, int) else 0 if code is None else 1)
+
+
+def say_first(node: str) -> None:
+    """Says that a node starts, as the log of ROS 2 would, which is there seconds later."""
+    sys.stderr.write(f"[INFO] [{time.time():.9f}] [{node}]: starting\n")
+    sys.stderr.flush()
+
+
+def _main_of(node: str) -> Any:
+    from importlib import import_module
+    from importlib.util import find_spec
+
+    from nics_drl_bridge import extensions
+    from nics_drl_bridge.errors import ConfigError
+
     name = f"nics_drl_bridge.nodes.{node}"
     try:
         main = import_module(name).main if find_spec(name) else extensions.load("nodes", node)
+        from rclpy.logging import get_logger
+
+        from nics_drl_bridge.kernels import COMPILING
     except (ConfigError, ImportError) as error:
         sentence = str(error)
         if isinstance(error, ImportError):
@@ -27,7 +66,8 @@ def start(node: str, args: list[str] | None = None) -> None:
             sentence = f"{node}: {clause}"
         sys.stderr.write(f"{sentence}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
-    main(args)
+    COMPILING.patience_s, COMPILING.tell = 0.0, get_logger(node).info
+    return main
 
 
 simulator_node = partial(start, "simulator_node")

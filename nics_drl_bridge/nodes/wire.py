@@ -21,6 +21,7 @@ PLAIN = (0, 1)  # big-endian and little-endian plain CDR
 NATIVE = bytes((0, PLAIN[sys.byteorder == "little"], 0, 0))  # header of this machine
 # Numbers of an odometry before each: pose, its covariance, twist, its covariance.
 POSE_COVARIANCE, TWIST, DOUBLES = 7, 7 + 36, 7 + 36 + 6 + 36
+STAMPED = struct.Struct("=iII10s2x6d")  # stamp, length and text of the frame, twist
 SCAN_FIELDS = 7  # floats of a scan between its header and its ranges
 
 
@@ -133,6 +134,13 @@ class ScanWriter:
         self._stamp.pack_into(self._content, STAMP, *divmod(stamp_ns, NS_PER_S))
         self._ranges[:] = ranges
         return bytes(self._content)
+
+
+def stamped_twist_to_bytes(twist: ArrayLike, stamp_ns: int) -> bytes:
+    """Serialises linear.x, linear.y, angular.z (3,) as a TwistStamped in `base_link`."""
+    x, y, w = np.asarray(twist, np.float64).tolist()
+    seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
+    return NATIVE + STAMPED.pack(seconds, nanoseconds, 10, b"base_link", x, y, 0.0, 0.0, 0.0, w)
 
 
 def twist_to_bytes(twist: ArrayLike) -> bytes:

@@ -13,6 +13,8 @@ from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.generator import SimulatorModel, builtin_model, save_model
 
 LOG_CHARACTERS = 2000
+# Nodes are started with `cmd_vel` as a Twist, whatever the distribution, unless a test asks for
+# the other type or for the default: `test_stamped_commands.py` is about these.
 LAUNCHED: list[Any] = []
 """The processes of the test that runs, and of the others of its module."""
 
@@ -79,7 +81,8 @@ def starter(
             **parameters: Any,
         ) -> Any:
             folder: Path = tmp_path_factory.mktemp(f"{node}_{next(numbers)}")
-            parameters = {"model": model_folder} | parameters
+            stamped = "stamped" if node == "record_node" else "enable_stamped_cmd_vel"
+            parameters = {"model": model_folder, stamped: False} | parameters
             LAUNCHED.append(kind(node, folder, parameters, domain_id, namespace, remap))
             return started.enter_context(LAUNCHED[-1])
 

@@ -15,7 +15,6 @@ from rclpy.impl import rcutils_logger
 
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.nodes import runner
-from nics_drl_bridge.nodes.command_gate import CommandGate
 
 ENDS_S = 30.0
 MODULES = {"mujoco_node": "nics_drl_bridge.extras.mujoco.node"}
@@ -53,11 +52,8 @@ class NodeThread(AbstractContextManager["NodeThread", None]):
     def _run(self) -> None:
         RUNNING[threading.get_ident()] = self
         try:
-            if self.node == "command_gate":  # whose `main` ends the process
-                runner.run_node(CommandGate, self.arguments, "command_gate")
-            else:
-                module = MODULES.get(self.node, f"nics_drl_bridge.nodes.{self.node}")
-                import_module(module).main(self.arguments)
+            module = MODULES.get(self.node, f"nics_drl_bridge.nodes.{self.node}")
+            import_module(module).main(self.arguments)
             self.returncode = 0
         except SystemExit as error:
             self.returncode = int(error.code or 0)

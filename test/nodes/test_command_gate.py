@@ -28,7 +28,7 @@ from nics_drl_bridge.gate.inputs import Press, Tick
 from nics_drl_bridge.generator import save_model
 from nics_drl_bridge.nodes import command_gate, conversions, qos
 from nics_drl_bridge.nodes.runner import open_context
-from nics_drl_bridge.nodes.wire import twist_to_bytes
+from nics_drl_bridge.nodes.wire import stamped_twist_of
 from nodes.peer import DEADLINE_S
 
 pytestmark = pytest.mark.ros
@@ -215,7 +215,7 @@ def test_a_motion_that_was_decided_on_before_a_freeze_is_never_published(
     monkeypatch.undo()
     node.destroy_node()
     node.context.try_shutdown()
-    assert [deserialize_message(one, Twist) for one in said] == [Twist()]
+    assert [deserialize_message(one, TwistStamped).twist for one in said] == [Twist()]
 
 
 def test_a_decision_that_is_no_number_leaves_as_zero_and_latches(domain_id, tmp_path, monkeypatch):
@@ -237,13 +237,13 @@ def test_a_decision_that_is_no_number_leaves_as_zero_and_latches(domain_id, tmp_
 
         monkeypatch.setattr(command_gate, "decide", mad)
         node._decide(Tick())
-        assert sent == [twist_to_bytes(np.zeros(3))]
+        assert list(map(stamped_twist_of, sent)) == [(0.0, 0.0, 0.0)]
         found = node._look()
         assert found.message.startswith("e_stop_pressed")
         assert found.facts["not finite, sent as zero"] == 1
         wrong[:] = math.inf
         node._decide(Tick())
-        assert set(sent) == {twist_to_bytes(np.zeros(3))}
+        assert set(map(stamped_twist_of, sent)) == {(0.0, 0.0, 0.0)}
     finally:
         monkeypatch.undo()
         node.stop()

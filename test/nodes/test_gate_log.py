@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import time
 import tracemalloc
@@ -176,6 +177,19 @@ def test_a_burst_does_not_flood_the_log_and_each_line_says_how_many_it_stands_fo
     assert 2 <= len(stops) <= lasted / LINE_S + 1
     assert len(logger.warnings) <= 2 * len(stops)
     assert " more since the last such line)" in stops[1]
+
+
+def test_stops_that_alternate_for_long_are_told_of_ever_more_rarely(log, logger):
+    rig = Recorded(log).drive()
+    logger.warnings.clear()
+    for _ in range(600):  # three minutes
+        rig.stop_by_nonsense()
+        rig.wish = np.array(MOTION)
+        rig.run(0.1)
+    lines = [*logger.warnings, *logger.info_lines]
+    assert 6 <= len(lines) <= 30
+    told = [int(found[1]) for line in lines if (found := re.search(r"\((\d+) more", line))]
+    assert max(told) > 8 * min(told)
 
 
 def test_what_is_the_case_is_said_in_the_end_though_it_was_kept_back_at_first(log, logger):

@@ -10,7 +10,8 @@ from nics_drl_bridge.extras.mujoco.machines import Physics
 from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.nodes.device_parameters import randomisation
-from nics_drl_bridge.nodes.runner import declare, run_node
+from nics_drl_bridge.nodes.parameters import FRICTION
+from nics_drl_bridge.nodes.runner import declare_row, run_node
 from nics_drl_bridge.nodes.simulator_node import DeviceNode, declare_renderer
 from nics_drl_bridge.sim.world_set import AnyWorld
 
@@ -20,10 +21,8 @@ def mujoco_simulator(
 ) -> MujocoSimulator:
     """Makes robots in MuJoCo, with the lidar and the floor that the parameters name."""
     renderer = declare_renderer(node, "exact")
-    floor = "Friction between tyres and floor; ice has 0.1."
-    friction = declare(node, "friction", 1.0, floor, span=(0.01, 2.0), read_only=True)
-    physics, drawn = replace(Physics(), friction=friction), randomisation(node)
-    return MujocoSimulator(model, world, robots, renderer, physics, drawn)
+    physics = replace(Physics(), friction=declare_row(node, FRICTION))
+    return MujocoSimulator(model, world, robots, renderer, physics, randomisation(node))
 
 
 def mujoco_node(context: Context) -> DeviceNode:

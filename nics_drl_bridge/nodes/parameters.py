@@ -1,0 +1,261 @@
+"""The parameters of every node in one place that needs no ROS 2, for `declare` and `--help`."""
+
+import math
+import os
+from collections.abc import Callable, Sequence
+from importlib.metadata import PackageNotFoundError, distribution
+from typing import Any, NamedTuple
+
+MODES = ("realtime", "lockstep", "as_fast_as_possible")
+NO_POSE, POSE_TYPES = "none", ("PoseStamped", "PoseWithCovarianceStamped")
+OWN = -1.0  # of a delay: as in the model
+HIGHEST_PRIORITY = 99
+PLAIN_TWISTS = ("humble", "iron", "jazzy")  # distributions whose robots are driven by a Twist
+STAMPED = "enable_stamped_cmd_vel"
+
+
+class Row(NamedTuple):
+    """A parameter; its type is that of the default."""
+
+    name: str
+    default: Any
+    about: str
+    span: tuple[float, float] | None = None  # in which a number lies
+    fixed: bool = True  # it is read once
+    shown: str = ""  # the default in words, where it follows from others
+
+
+def stamped_by_default() -> bool:
+    """True if commands are a TwistStamped in this ROS 2 distribution, as they are since Kilted."""
+    named = os.environ.get("ROS_DISTRO", "")
+    return not any(named == each if named else _is_wheel(each) for each in PLAIN_TWISTS)
+
+
+def _is_wheel(name: str) -> bool:
+    try:
+        return bool(distribution(f"ros-{name}-rclpy"))
+    except PackageNotFoundError:
+        return False
+
+
+def stamped(what: str) -> Row:
+    """Returns the parameter that chooses the type of `cmd_vel`."""
+    about = f"Whether {what} is a TwistStamped, as since Kilted, or a Twist."
+    return Row(STAMPED, stamped_by_default(), about)
+
+
+MODEL = Row("model", "ackermann", "Folder of a SimulatorModel, or a shipped robot.")
+BASE_FRAME = Row("base_frame", "base_link", "Frame id of the robot.", fixed=False)
+
+
+def managed() -> list[Row]:
+    """Returns the parameters of a managed node."""
+    about = "Whether it configures and activates itself, without a lifecycle manager."
+    return [Row("autostart", True, about), MODEL]
+
+
+def sensors() -> list[Row]:
+    """Returns the parameters of the sensors that a robot has beside scan and odometry."""
+    upside_down = "Whether the lidar hangs with its z axis down, so that its beams come clockwise."
+    types = ", ".join((NO_POSE, *POSE_TYPES))
+    return [
+        Row("pose_type", NO_POSE, f"Type of `pose`, in the map frame: {types}."),
+        Row("lidar_upside_down", False, upside_down),
+        Row("use_imu", False, "Whether to use the yaw rate of `imu`."),
+        stamped("cmd_vel"),
+    ]
+
+
+def middleware() -> list[Row]:
+    """Returns the parameters of `middleware_node` alone."""
+    return [Row("map_frame", "map", "Frame id of the estimate.", fixed=False), BASE_FRAME]
+
+
+def policy() -> list[Row]:
+    """Returns the parameters of `policy_node` alone."""
+    return [
+        BASE_FRAME,
+        Row("map_frame", "map", "Frame id of the estimate, in which goals are.", fixed=False),
+        Row("policy", "dynamic_window",
+            "A policy file (*.onnx), or the name of a shipped one or of a baseline."),
+        Row("fallback", "",
+            "A planner (dynamic_window, mppi) that acts where the policy asks for what can't be "
+            "stopped before a touch; empty for none."),
+        Row("goal", [math.nan] * 2, "x, y in map [m]; NaN waits for goal_pose."),
+        Row("rate", math.nan,
+            "Actions per second of the steady clock; NaN: of the control period; 0: one for each "
+            "scan, for a simulator that is not in real time."),
+        Row("deadline", math.nan,
+            "Longest time of an inference [s]; NaN: half the control period."),
+        Row("late_limit", 3, "So many late inferences in a row command zero.", (1, 1000)),
+    ]  # fmt: skip
+
+
+def device(laser_frame: str = "") -> list[Row]:
+    """Returns the parameters of all simulators, but `robots`, which is a count or names."""
+    return [
+        Row("world", "arena", "World file, or the name of a shipped world."),
+        Row("randomisation", "", "Draws in each episode: a file, mild or strong; none if empty."),
+        Row("mode", MODES[0], f"How time runs: {', '.join(MODES)}."),
+        stamped("cmd_vel"),
+        Row("frame_prefix", "", "Put before the robot's frames; in a fleet before its namespace."),
+        Row("map_frame", "map", "Frame id of map."),
+        Row("odom_frame", "odom", "Frame id of odom."),
+        Row("base_frame", "base_link", "Frame id of base_link."),
+        Row("laser_frame", laser_frame, "Frame id of the lidar.", shown="that of the model"),
+        Row("publish_map_to_odom", False,
+            "Whether to publish the true map -> odom on /tf, in place of a localiser."),
+        Row("rate", 1.0, "Simulated seconds per second in realtime.", (0.01, 1000.0)),
+        Row("odom_rate", 0.0, "Of odom [Hz]; 0 for one per control period.", (0.0, 1000.0)),
+        Row("scan_rate", 0.0, "Of scan [Hz]; 0 for the lidar's own.", (0.0, 1000.0)),
+        Row("scan_latency", OWN,
+            "From the end of a scan to its publication [s]; -1 for the measured one of the model.",
+            (OWN, 10.0)),
+        Row("odom_latency", OWN,
+            "From the stamp of odom to its publication [s]; -1 for the measured one of the model.",
+            (OWN, 10.0)),
+        Row("latency_jitter", OWN,
+            "Greatest further delay of both, drawn evenly [s]; -1 for the measured ones.",
+            (OWN, 10.0)),
+        Row("command_latency", OWN,
+            "From a command to its effect [s]; -1 for the measured one of the model.", (OWN, 10.0)),
+        Row("command_timeout", 0.5,
+            "Stops after this silence on cmd_vel [simulated s]; not in lockstep.", (0.0, 3600.0),
+            fixed=False),
+        Row("episode_seed", 0, "Seed of the episode that ~/reset begins.", fixed=False),
+        Row("episode_start", [0.0, 0.0, 0.0],
+            "Start x, y, heading of the episodes, of each robot; once it is set.", fixed=False),
+        Row("episode_start_given", False,
+            "Whether episode_start holds, or the seed's own start; true once episode_start is set.",
+            fixed=False),
+    ]  # fmt: skip
+
+
+ROBOTS = Row(
+    "robots", 1, "How many robots, named robot1, robot2, ..., or their namespaces; 1 has none."
+)
+FRICTION = Row("friction", 1.0, "Friction between tyres and floor; ice has 0.1.", span=(0.01, 2.0))
+
+
+def renderer(default: str) -> Row:
+    """Returns the parameter of a simulator's lidar."""
+    return Row("renderer", default, "Lidar: baked or exact.")
+
+
+LIMITS = Row("limits", "", "Limits of the robot: a shipped file, or a YAML file; no default.")
+SHIELD = Row("shield", True, "Whether to stop before obstacles.")
+SHIELD_NUMBERS = [
+    Row(f"shield_{name}", math.nan, f"{about}; NaN: by the limits' file, or from the model.")
+    for name, about in (
+        ("latency", "Until the robot has taken up a command, measured [s]"),
+        ("deceleration", "Of the robot, measured [m/s^2]"),
+        ("margin", "Kept free around the footprint [m]"),
+        ("obstacle_speed", "At which what moves may come on [m/s]"),
+    )
+]
+BLACK_BOX = Row(
+    "black_box", "",
+    "Where a stop's last 30 s are written, by namespace; ~/.ros/black_box if empty.",
+)  # fmt: skip
+PRIORITY = Row(
+    "priority", 0, "Real-time priority (SCHED_FIFO) of its process, 1 to 99; 0 for none.",
+    (0, HIGHEST_PRIORITY),
+)  # fmt: skip
+
+
+def gate_rules(odom_rate: float = math.nan, scan_age: float = math.nan) -> list[Row]:
+    """Returns the parameters of a gate's rules; `RULES_IN_SECONDS` are fields that end in _s."""
+    from nics_drl_bridge.gate.state import GateConfig as Default
+
+    seconds = (0.01, 10.0)
+    heard = "Whether e_stop must have been heard before arming; false in simulations alone."
+    return [
+        Row("odom_rate", odom_rate, "Of odom [Hz].", (0.1, 1e4), shown="1 per control period"),
+        Row("scan_age", scan_age, "Oldest scan, and behind a command [s].", seconds,
+            shown=f"{Default.scan_age_s:g}, or more for a slow lidar"),
+        Row("odom_age", Default.odom_age_s, "Oldest odometry [s].", seconds),
+        Row("command_age", Default.command_age_s, "Oldest command [s].", seconds),
+        Row("rate_tolerance", Default.rate_tolerance, "Of both rates.", (0.01, 0.9)),
+        Row("clock_rate", 1.0, "Of stamps: simulated seconds per second.", (0.01, 100.0)),
+        Row("e_stop_required", True, heard),
+        Row("e_stop_silence", Default.e_stop_silence_s, "Silence of e_stop [s].", seconds),
+        Row("estimate_required", True, "Whether arming needs odometry/filtered."),
+        Row("estimate_std", Default.estimate_std,
+            "Greatest standard deviation of the estimate for arming [m, rad].", (1e-3, 1e3)),
+    ]  # fmt: skip
+
+
+RULES_IN_SECONDS = ("scan_age", "odom_age", "command_age", "e_stop_silence")
+
+
+def gate() -> list[Row]:
+    """Returns all parameters of `command_gate`."""
+    shield = [SHIELD, *SHIELD_NUMBERS]
+    return [MODEL, LIMITS, *shield, *gate_rules(), stamped("cmd_vel"), BLACK_BOX, PRIORITY]
+
+
+def drive() -> list[Row]:
+    """Returns the parameters of `record_node`."""
+    return [
+        Row("robot", "ackermann", "A shipped robot, or its YAML file."),
+        Row("out", "drive.npz", "File *.npz of the recording, or folder of a rosbag2."),
+        Row("bound", 2.0, "Radius of the circle around the start to keep within [m]."),
+        Row("duration", 60.0, "Of the drive [s]."),
+        Row("speed", 1.0, "Share of the greatest speeds to use."),
+        Row("seed", 0, "Of the pattern."),
+        Row("topics", "", "YAML file that names joints; none if empty."),
+        Row("odom_timeout", 0.5, "Stops after this silence of odom [s].", (0.05, 10.0)),
+        stamped("cmd_vel")._replace(name="stamped"),
+    ]
+
+
+class NodeFacts(NamedTuple):
+    """All that a user has to know of a node."""
+
+    about: str
+    subscribes: Sequence[str]
+    publishes: Sequence[str]
+    services: Sequence[str]
+    parameters: Sequence[Row]
+    example: str  # after `--ros-args`
+
+
+DRIVEN_BY = ("cmd_vel", "ackermann_cmd (of a robot that steers, with ackermann_msgs)")
+TOLD = ("scan", "odom", "the model's further sensors", "joint_states", "ground_truth", "/clock",
+        "/tf, /tf_static (with tf2_msgs)", "/diagnostics")  # fmt: skip
+SERVED = ("~/reset", "~/pause", "~/repeat", "~/touched")
+HEARD = ("scan", "odom", "the model's further sensors", "cmd_vel", "pose (with pose_type)",
+         "imu (with use_imu)")  # fmt: skip
+NODES: dict[str, Callable[[], NodeFacts]] = {
+    "simulator_node": lambda: NodeFacts(
+        "A simulator behind the topics of the hardware.", DRIVEN_BY, TOLD, SERVED,
+        [MODEL, ROBOTS, *device(), renderer("baked")], "-p world:=corridor -p odom_rate:=50.0",
+    ),
+    "mujoco_node": lambda: NodeFacts(
+        "Robots in MuJoCo behind the topics of the hardware.", DRIVEN_BY, TOLD, SERVED,
+        [MODEL, ROBOTS, *device(), renderer("exact"), FRICTION],
+        "-p model:=differential -p world:=empty",
+    ),
+    "middleware_node": lambda: NodeFacts(
+        "Caches a robot's topics and publishes the estimate of its state; a managed node.",
+        HEARD, ("odometry/filtered", "/diagnostics"), ("~/reset",),
+        [*managed(), *sensors(), *middleware()], "-p use_imu:=true -r __ns:=/car",
+    ),
+    "policy_node": lambda: NodeFacts(
+        "Drives a robot to goals by a policy, which answers each scan; a managed node.",
+        (*HEARD, "goal_pose", "/tf_static (with tf2_msgs)"), ("cmd_vel_raw", "/diagnostics"), (),
+        [*managed(), *sensors(), *policy()], '-p policy:=my_policy.onnx -p "goal:=[1.0, 2.0]"',
+    ),
+    "command_gate": lambda: NodeFacts(
+        "Passes a policy's commands on while they can be trusted; it starts disarmed.",
+        ("cmd_vel_raw", "scan", "odom", "odometry/filtered", "e_stop",
+         "the model's further sensors"),
+        ("cmd_vel", "/diagnostics"), ("~/arm", "~/reset", "~/e_stop"), gate(),
+        "-p limits:=ackermann",
+    ),
+    "record_node": lambda: NodeFacts(
+        "Drives a robot so that it shows its whole motion, and records it; the robot moves.",
+        ("odom", "joint_states", "imu", "pose"), ("cmd_vel",), (), drive(),
+        "-p bound:=3.0 -p out:=drive.npz",
+    ),
+}  # fmt: skip

@@ -1,0 +1,65 @@
+"""`--help` of the nodes, and what is wrong with their arguments; without ROS 2."""
+
+import textwrap
+from collections.abc import Sequence
+from typing import Any
+
+from nics_drl_bridge.nodes.parameters import NODES, Row
+
+HELP = ("-h", "--help")
+ROS, END = "--ros-args", "--"
+WIDTH, INDENT = 100, 4
+
+
+def help_of(node: str) -> str:
+    """Returns the help of a node by the name of its executable."""
+    if node not in NODES:
+        return f"usage: {node} [{ROS} -p NAME:=VALUE -r FROM:=TO ...]\n"
+    facts = NODES[node]()
+    topics = [
+        _hanging(f"{title}: {', '.join(names)}", INDENT)
+        for title, names in (
+            ("subscribes to", facts.subscribes), ("publishes", facts.publishes),
+            ("services", facts.services),
+        ) if names
+    ]  # fmt: skip
+    parts = [
+        f"usage: {node} [{ROS} -p NAME:=VALUE -r FROM:=TO --params-file FILE ...]",
+        facts.about, "\n".join(topics), "parameters, with their defaults:",
+        "\n".join(map(_line, facts.parameters)),
+        "and `use_sim_time`, as every node of ROS 2. `ros2 param describe` tells the ranges, too.",
+        f"example:\n    ros2 run nics_drl_bridge {node} {ROS} {facts.example}",
+    ]  # fmt: skip
+    return "\n\n".join(parts) + "\n"
+
+
+def _line(row: Row) -> str:
+    default = row.shown or _words(row.default)
+    return _hanging(f"    {row.name} = {default}: {row.about}", 2 * INDENT)
+
+
+def _words(value: Any) -> str:
+    """Returns a value as it is written after `:=`."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return f"[{', '.join(map(_words, value))}]"
+    text = str(value) if value != "" else "''"
+    return f".{text}" if text == "nan" else text
+
+
+def _hanging(text: str, indent: int) -> str:
+    return textwrap.fill(text, WIDTH, subsequent_indent=" " * indent)
+
+
+def wrong_with(node: str, words: Sequence[str]) -> str:
+    """Returns a sentence about the first word that is no argument of a node, or ""."""
+    ours = True  # not for ROS 2, which tells what is wrong with its own
+    for word in words:
+        if word in (ROS, END):
+            ours = word == END
+        elif ours:
+            given = f"-p {word}" if ":=" in word else "-p NAME:=VALUE"
+            fix = f"write parameters and remappings behind {ROS}, as in `{node} {ROS} {given}`"
+            return f"{node}: there is no argument {word!r}; {fix}, or see `{node} --help`."
+    return ""

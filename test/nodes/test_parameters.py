@@ -1,0 +1,87 @@
+"""What `--help` tells of a node is what the node has."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+
+from nics_drl_bridge.nodes import parameters
+from nics_drl_bridge.nodes.parameters import NODES, stamped_by_default
+from nics_drl_bridge.nodes.record_node import RecordNode
+from nics_drl_bridge.nodes.runner import open_context
+from nodes.test_parameter_files import MAKERS
+
+pytestmark = pytest.mark.ros
+
+RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides")
+RCLPY_TOPICS = ("/rosout", "/parameter_events", "/transition_event")
+
+
+@pytest.fixture(params=NODES)
+def node(request, domain_id, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    context = open_context(["node"], domain_id)
+    make = RecordNode if request.param == "record_node" else MAKERS[request.param]
+    made = make(context)
+    if hasattr(made, "start"):
+        made.start()
+    yield request.param, made
+    made.destroy_node()
+    context.try_shutdown()
+
+
+def same(value, default):
+    """Whether two values are equal, or both NaN."""
+    if isinstance(default, list):
+        return len(value) == len(default) and all(map(same, value, default))
+    return value == default or (math.isnan(value) and math.isnan(default))
+
+
+def test_help_tells_the_parameters_of_a_node(node):
+    name, made = node
+    facts = NODES[name]()
+    own = {each for each in made._parameters if not each.startswith(RCLPY)}
+    assert own == {row.name for row in facts.parameters}
+    for row in facts.parameters:
+        assert made.describe_parameter(row.name).description == row.about
+        assert row.shown or same(made.get_parameter(row.name).value, row.default), row
+
+
+def test_help_tells_the_topics_and_services_of_a_node(node):
+    name, made = node
+    facts, place = NODES[name](), (made.get_name(), "/")
+    for told, there in (
+        (facts.publishes, made.get_publisher_names_and_types_by_node(*place)),
+        (facts.subscribes, made.get_subscriber_names_and_types_by_node(*place)),
+    ):
+        words = {f"/{word.strip('/,')}" for each in told for word in each.partition("(")[0].split()}
+        topics = {topic for topic, _ in there if not topic.endswith(RCLPY_TOPICS)}
+        assert topics <= words
+        # A drive speaks once somebody listens.
+        assert topics or (name, told) == ("record_node", facts.publishes)
+    services = {service for service, _ in made.get_service_names_and_types_by_node(*place)}
+    assert {each.replace("~", f"/{made.get_name()}") for each in facts.services} <= services
+
+
+@pytest.mark.parametrize(
+    ("distribution", "stamped"),
+    [("humble", False), ("jazzy", False), ("kilted", True), ("lyrical", True), ("rolling", True)],
+)
+def test_commands_are_stamped_since_kilted(monkeypatch, distribution, stamped):
+    monkeypatch.setenv("ROS_DISTRO", distribution)
+    assert stamped_by_default() is stamped
+    for node in NODES:
+        rows = {row.name: row.default for row in NODES[node]().parameters}
+        name = "stamped" if node == "record_node" else "enable_stamped_cmd_vel"
+        assert rows[name] is stamped
+
+
+def test_without_a_sourced_distribution_its_wheels_tell_which_it_is(monkeypatch):
+    monkeypatch.delenv("ROS_DISTRO", raising=False)
+    monkeypatch.setattr(parameters, "_is_wheel", lambda name: name == "jazzy")
+    assert not stamped_by_default()
+    monkeypatch.setattr(parameters, "_is_wheel", lambda name: False)
+    assert stamped_by_default()

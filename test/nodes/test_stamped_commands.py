@@ -1,0 +1,76 @@
+"""`cmd_vel` is a TwistStamped by default since Kilted, and who speaks to a node follows it."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+
+from geometry_msgs.msg import Twist, TwistStamped
+from nav_msgs.msg import Odometry
+
+from nics_drl_bridge.nodes import qos
+from nics_drl_bridge.nodes.backends import DdsBackend
+from nics_drl_bridge.nodes.link import Link
+from nics_drl_bridge.nodes.parameters import stamped_by_default
+from nics_drl_bridge.sim.world import load_world
+from nodes.peer import stamp_ns
+
+pytestmark = pytest.mark.ros
+
+KINDS = {True: TwistStamped, False: Twist}
+
+
+@pytest.mark.parametrize("stamped", [True, False])
+def test_the_gate_sends_the_type_that_is_asked_for(launch, meet, domain_id, stamped):
+    peer = meet(domain_id)
+    heard = peer.listen(KINDS[stamped], "cmd_vel", qos.COMMAND)
+    gate = launch("command_gate", domain_id, enable_stamped_cmd_vel=stamped)
+    peer.until(lambda: heard, "a zero")
+    if stamped:
+        before = stamp_ns(heard[-1])
+        assert before > 0
+        assert heard[-1].header.frame_id == "base_link"
+        assert stamp_ns(peer.another(heard, "zero")) > before
+    heard.clear()
+    assert gate.close() == 0
+    peer.until(lambda: heard, "a zero command")
+    twist = heard[-1].twist if stamped else heard[-1]
+    assert twist == Twist()
+
+
+@pytest.mark.parametrize("stamped", [True, False])
+def test_an_env_follows_the_type_that_a_simulator_hears(
+    launch, meet, module_domain_id, model, stamped
+):
+    name = f"stamped_{stamped}".lower()
+    simulator = launch(
+        "simulator_node", module_domain_id, name,
+        enable_stamped_cmd_vel=stamped, mode="lockstep", world="empty",
+    )  # fmt: skip
+    meet(module_domain_id, name).until(lambda: simulator.handler is not None, "its start")
+    backend = DdsBackend(model, load_world("empty"), name, domain_id=module_domain_id)
+    try:
+        assert backend._link.stamped is stamped
+    finally:
+        backend.close()
+
+
+def test_without_anybody_who_listens_it_is_the_distributions_type(domain_id):
+    link = Link(domain_id=domain_id)
+    assert link.stamped is stamped_by_default()
+    link.begin()
+    link.close()
+
+
+def test_a_drive_keeps_the_type_that_was_chosen(launch, meet, domain_id, tmp_path):
+    peer = meet(domain_id)
+    other = not stamped_by_default()
+    heard = peer.listen(KINDS[other], "cmd_vel", qos.COMMAND)
+    odom = peer.node.create_publisher(Odometry, "odom", qos.SENSOR_RELIABLE)
+    node = launch(
+        "record_node", domain_id, out=str(tmp_path / "d.npz"), stamped=stamped_by_default()
+    )
+    peer.node.create_timer(0.02, lambda: odom.publish(Odometry()))
+    peer.until(lambda: "nobody listened" in node.read_text(), "the chosen type is kept")
+    assert not heard

@@ -1,0 +1,73 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from nics_drl_bridge.nodes.parameters import NODES
+from nics_drl_bridge.nodes.usage import help_of, wrong_with
+
+# As where no ROS 2 is installed: what is imported in vain is missed.
+WITHOUT = """
+import sys
+for name in ("rclpy", "numba", "matplotlib"):
+    sys.modules[name] = None
+from nics_drl_bridge.nodes import start
+start.start(sys.argv[1], sys.argv[1:])
+"""
+
+
+def run(*words):
+    return subprocess.run(
+        [sys.executable, "-c", WITHOUT, *words], capture_output=True, text=True, timeout=100
+    )
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("node", NODES)
+def test_help_is_told_without_ros_and_ends_well(node):
+    done = run(node, "--ros-args", "-p", "rate:=2.0", "--help")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout == help_of(node)
+
+
+@pytest.mark.parametrize("node", NODES)
+def test_help_names_each_parameter_with_its_default_and_an_example(node):
+    text = help_of(node)
+    for row in NODES[node]().parameters:
+        assert f"\n    {row.name} = " in text
+    assert f"ros2 run nics_drl_bridge {node} --ros-args -p " in text
+    assert max(map(len, text.splitlines())) <= 100
+
+
+def test_defaults_are_written_as_they_are_given():
+    assert "\n    rate = .nan: " in help_of("policy_node")
+    assert "\n    goal = [.nan, .nan]: " in help_of("policy_node")
+    assert "\n    limits = '': " in help_of("command_gate")
+    assert "\n    autostart = true: " in help_of("middleware_node")
+
+
+@pytest.mark.process
+def test_a_parameter_without_ros_args_is_one_sentence():
+    done = run("policy_node", "policy:=mppi")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == (
+        "policy_node: there is no argument 'policy:=mppi'; write parameters and remappings behind "
+        "--ros-args, as in `policy_node --ros-args -p policy:=mppi`, or see `policy_node --help`.\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "wrong"),
+    [
+        ([], ""),
+        (["--ros-args", "-p", "rate:=2.0"], ""),
+        (["--ros-args", "-p", "rate:=2.0", "--", "--verbose"], "'--verbose'"),
+        (["--rate", "2"], "'--rate'"),
+        (["-v", "--ros-args", "-r", "__ns:=/car"], "'-v'"),
+    ],
+)
+def test_the_first_word_that_is_not_for_ros_is_named(words, wrong):
+    assert (f"there is no argument {wrong};" in wrong_with("policy_node", words)) == bool(wrong)
+    assert bool(wrong_with("policy_node", words)) == bool(wrong)
