@@ -98,11 +98,7 @@ def run_node(
             node.get_logger().info("running")
         spin(node, stopping)
     except (BridgeError, ParameterException, OSError) as error:
-        sentence = " ".join(str(error).split())
-        if isinstance(error, OSError):
-            place = f"{error.filename}: " if error.filename else ""
-            sentence = f"{place}{error.strerror or error}; choose another place."
-        sys.stderr.write(f"{sentence}\n")
+        sys.stderr.write(f"{_sentence(error)}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
     finally:
         started.set()
@@ -114,6 +110,13 @@ def run_node(
             context.try_shutdown()
         alone.close()
     return node
+
+
+def _sentence(error: Exception) -> str:
+    if isinstance(error, OSError):
+        place = f"{error.filename}: " if error.filename else ""
+        return f"{place}{error.strerror or error}; choose another place."
+    return " ".join(str(error).split())
 
 
 def holds(condition: Callable[[], Any], seconds: float, poll_s: float) -> bool:
