@@ -87,7 +87,8 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
         code = self._process.poll()
         if code is not None:
             lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-            last = " | ".join(lines[-LOG_LINES:]) or "no output"
+            told = [line for line in lines if not line.startswith("[INFO]")] or lines
+            last = " | ".join(told[-LOG_LINES:]) or "no output"
             reason = f"ended with code {code}: {last} (its log is {self.log})."
             raise BackendError(f"{self.node} {reason}")
 
