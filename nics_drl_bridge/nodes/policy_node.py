@@ -36,7 +36,8 @@ class PolicyNode(ManagedNode):
         runner.declare(self, "base_frame", "base_link", "Frame id of the robot.")
         for name, default, about in (
             ("policy", "dynamic_window",
-             "A policy file (*.onnx), or the name of a shipped one or of a baseline."),
+             "A policy file (*.onnx), the mapping of a foreign one (*.yaml), or the name of a "
+             "shipped one or of a baseline."),
             ("goal", [math.nan] * 2, "x, y in map [m]; NaN waits for goal_pose."),
             ("rate", math.nan,
              "Actions per second of the steady clock; NaN: of the control period; 0: one for each "

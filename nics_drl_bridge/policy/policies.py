@@ -15,7 +15,7 @@ from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError, PolicyError, nearest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy import dynamic_window_kernels as kernels
-from nics_drl_bridge.policy.contract import SUFFIX, shipped
+from nics_drl_bridge.policy.contract import MAPPINGS, SUFFIX, shipped
 from nics_drl_bridge.policy.local_map import outline_of, rays_of, scratch_of
 from nics_drl_bridge.policy.local_map_kernels import Clearance, FootprintDiscs, MapScratch, ScanRays
 from nics_drl_bridge.policy.mppi import Mppi
@@ -266,9 +266,12 @@ def shipped_policies() -> list[str]:
 
 
 def is_policy_file(name: str) -> bool:
-    """True for a policy file or the name of a shipped one. Raises ConfigError if unknown."""
+    """True for a policy file, the name of a shipped one, or the mapping of a foreign policy.
+
+    Raises ConfigError if unknown.
+    """
     files = shipped_policies()
-    if name not in POLICIES and not name.endswith(SUFFIX) and name not in files:
+    if name not in POLICIES and not name.endswith((SUFFIX, *MAPPINGS)) and name not in files:
         raise ConfigError(f"unknown policy {name!r}; {nearest(name, (*POLICIES, *files))}")
     return name not in POLICIES
 
@@ -279,7 +282,7 @@ def make_policy(name: str, task: Navigation, model: SimulatorModel | None = None
         return POLICIES[name](task, model)
     from nics_drl_bridge.policy.policy_file import load_policy  # the others need no onnxruntime
 
-    policy = load_policy(name)
+    policy = load_policy(name, model)
     policy.check_fits(model, task)
     return _acting(policy)
 
@@ -291,7 +294,7 @@ def open_policy(name: str, model: SimulatorModel) -> tuple[Policy, Navigation]:
         return POLICIES[name](task, model), task
     from nics_drl_bridge.policy.policy_file import load_policy
 
-    policy = load_policy(name)
+    policy = load_policy(name, model)
     found = policy.make_task(model)
     if not isinstance(found, Navigation):
         reason = f"is {policy.contract.task.name!r}; this drives policies of 'navigation'."

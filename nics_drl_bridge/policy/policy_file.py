@@ -142,9 +142,16 @@ class PolicyFile:
                     raise PolicyError(str(self.path), path, reason)
 
 
-def load_policy(path: str | Path) -> PolicyFile:
-    """Loads a policy file, by path or shipped name, with all checks; PolicyError has the field."""
+def load_policy(path: str | Path, model: SimulatorModel | None = None) -> PolicyFile:
+    """Loads a policy file, by path or shipped name, with all checks; PolicyError has the field.
+
+    The YAML file of a foreign policy makes one for the robot of a model, see `load_foreign`.
+    """
     file, suffix = Path(path), contracts.SUFFIX
+    if str(path).endswith(contracts.MAPPINGS):
+        from nics_drl_bridge.policy.foreign import load_foreign  # which makes policy files
+
+        return load_foreign(file, model)
     if not (str(path).endswith(suffix) or file.is_file()):
         file = contracts.shipped() / f"{path}{suffix}"
     source = str(file)
@@ -174,11 +181,11 @@ def policy_of(data: bytes, path: Path) -> PolicyFile:
     }  # fmt: skip
     if contract.state is not None:
         widths |= dict.fromkeys((onnx_graph.STATE_IN, onnx_graph.STATE_OUT), contract.state.size)
-    onnx_graph.check_ends(model, widths, source)
+    onnx_graph.check_ends(model, widths, source, contract.batch)
     if onnx_graph.graph_hash(model) != contract.graph_sha256:
         reason = "does not belong to the graph, which was changed after the export."
         raise PolicyError(source, "graph_sha256", reason)
-    rows = onnx_graph.rows_at_once(model, source)
+    rows = onnx_graph.rows_at_once(model, source, contract.batch)
     del model  # the runtime parses the bytes itself
     policy = PolicyFile(path, contract, open_session(data, source), rows)
     _check_golden(policy, source)
