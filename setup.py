@@ -50,6 +50,9 @@ EXTRAS = {
     # builds one, and no part of `dev`.
     "distributed": ["ray[rllib]>=2.60,<2.61"],
     "deploy": ["onnx>=1.16", "onnxruntime>=1.18"],
+    # Isaac's runner of policy bundles, which the tests hold ours against; reading and writing them
+    # needs `deploy` alone. A library of its pictures has wheels for this platform only.
+    "leapp": [f"leapp>=0.7.2; {ROS_WHEELS_EXIST}"],
     "test": [
         "build",
         "colcon-bash",

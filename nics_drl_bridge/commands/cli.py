@@ -13,7 +13,8 @@ from nics_drl_bridge.commands.demo import demo
 from nics_drl_bridge.commands.doctor import doctor, replay
 from nics_drl_bridge.commands.evaluate import evaluate
 from nics_drl_bridge.commands.model import generate, import_, inspect, record, urdf
-from nics_drl_bridge.commands.train import policy, train
+from nics_drl_bridge.commands.policy import policy
+from nics_drl_bridge.commands.train import train
 from nics_drl_bridge.commands.warmup import warmup
 from nics_drl_bridge.commands.world import world
 from nics_drl_bridge.errors import LONGEST, shortened

@@ -29,7 +29,7 @@ def doctor(
     """Tells what of a robot or a bag does not fit a model or a policy; it sends nothing."""
     with one_sentence():
         from nics_drl_bridge.generator import open_model
-        from nics_drl_bridge.policy.policy_file import load_policy
+        from nics_drl_bridge.policy.foreign import load_any
         from nics_drl_bridge.report.doctor import examine
         from nics_drl_bridge.report.doctor_facts import expected_of, facts_of_bag
 
@@ -38,7 +38,7 @@ def doctor(
         elif model is not None:
             raise ConfigError("--model and --policy: give one of them, what the robot must fit.")
         else:
-            contract = load_policy(policy).contract
+            contract = load_any(policy).contract
             expected = expected_of(contract, contract.scan)
         if bag is not None:
             facts = facts_of_bag(bag, namespace)

@@ -113,9 +113,9 @@ def robot_of(policy: str) -> str:
     """The robot that a policy file was trained for; for a baseline the default robot."""
     if not is_policy_file(policy):
         return DEFAULT_ROBOT
-    from nics_drl_bridge.policy.policy_file import load_policy  # needs onnx, baselines do not
+    from nics_drl_bridge.policy.foreign import load_any  # needs onnx, baselines do not
 
-    return str(load_policy(policy).contract.robot.name)
+    return str(load_any(policy).contract.robot.name)
 
 
 @dataclass(frozen=True)

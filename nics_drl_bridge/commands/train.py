@@ -1,6 +1,5 @@
-"""`nics train` and `nics policy`."""
+"""`nics train`."""
 
-import json
 import math
 import shlex
 import sys
@@ -17,7 +16,6 @@ from nics_drl_bridge.commands.console import one_sentence, progress_bar
 from nics_drl_bridge.errors import ConfigError, nearest
 
 OWN = ("lean", "sb3")  # the engines of PPO in this process, see `training_settings.Engine`
-policy = typer.Typer(help="Policy files.", no_args_is_help=True)
 
 
 def train(
@@ -113,48 +111,3 @@ def _run(train_run: Any, order: Any, learn: Any) -> None:
         train_run.run(order, told, done, learn)
     folder = order.out
     typer.echo(f"policy files, checkpoints and logs: {folder}; tensorboard --logdir {folder}")
-
-
-@policy.callback()
-def _group() -> None:
-    """Policy files."""
-
-
-@policy.command()
-def info(
-    file: Annotated[str, Argument(help="A policy file, or the name of a shipped one.")],
-    as_json: Annotated[bool, Option("--json", help="One JSON object instead.")] = False,
-) -> None:
-    """Checks a policy file and tells what it was trained on and needs."""
-    with one_sentence():
-        from nics_drl_bridge.policy.policy_file import load_policy, summary
-
-        facts = summary(load_policy(file))
-        lines = (f"{name:<18} {value}" for name, value in _lines(facts))
-        typer.echo(json.dumps(facts) if as_json else "\n".join(lines))
-
-
-def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
-    lidar, scan, seen = facts["lidar"], facts["scan"], facts["observation"]
-    limits = "{name} {min:g} to {max:g} {unit}"
-    commands = [limits.format(**command) for command in facts["robot"]["command"]]
-    observed = "the beams of this lidar"
-    if scan is not None:
-        observed = (
-            f"{scan['sectors']} sectors from {math.degrees(scan['angle_min']):.4g} to "
-            f"{math.degrees(scan['angle_max']):.4g} deg, {scan['range_max']:g} m"
-        )
-    lines = {
-        "file": f"{facts['file']}, {facts['bytes'] / 1024:.0f} kB, all checks passed",
-        "robot": f"{facts['robot']['name']}: {', '.join(commands)}",
-        "task": facts["task"]["name"],
-        "actions": facts["actions"],
-        "scan": observed,
-        "lidar": f"{lidar['name']}: {lidar['beams']} beams, {lidar['range_max']:g} m",
-        "observation": f"{seen['size']} parts, {seen['scan_parts']} of them the scan",
-        "control period": f"{facts['control_period']:g} s",
-        "model": facts["model_fingerprint"],
-        "graph": facts["graph_sha256"][:16],
-    }
-    provenance = {name: str(value) for name, value in facts["provenance"].items()}
-    return [*lines.items(), *provenance.items()]

@@ -77,7 +77,8 @@ def policy() -> list[Row]:
         BASE_FRAME,
         Row("map_frame", "map", "Frame id of the estimate, in which goals are.", fixed=False),
         Row("policy", "dynamic_window",
-            "A policy file (*.onnx), or the name of a shipped one or of a baseline."),
+            "A policy file (*.onnx), the mapping of a foreign one (*.yaml), or the name of a "
+            "shipped one or of a baseline."),
         Row("fallback", "",
             "A planner (dynamic_window, mppi) that acts where the policy asks for what can't be "
             "stopped before a touch; empty for none."),

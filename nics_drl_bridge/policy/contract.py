@@ -25,7 +25,10 @@ from nics_drl_bridge.robot.spec import RobotSpec
 
 FORMAT = "nics_drl_bridge/policy/1"
 SUFFIX = ".onnx"
+MAPPINGS = (".yaml", ".yml")  # suffixes of the mapping of a foreign policy
 GOLDEN = 16
+GOLDEN_SEED = 0
+GOLDEN_SPREAD = 3.0  # distance from zero of golden observations, if their limits are wider
 GAP_PERIODS = 5  # control periods without an observation after which a state is reset
 MOST_ENTRIES = 20_000
 CHECKSUM = 8  # hexadecimal digits of a field's checksum, which detects mistakes but is no signature
@@ -89,6 +92,7 @@ class Contract(Schema):
     task: TaskEntry
     observation: ObservationEntry
     state: StateEntry | None = None  # None: each action follows from one observation alone
+    batch: Literal[1] | None = None  # greatest number of observations in one run; None: any
     actions: Literal["continuous", "discrete"]
     control_period: float = Field(gt=0.0, le=10.0)  # time between commands [s]
     model_fingerprint: str = Field(pattern="^[0-9a-f]{16}$")
@@ -108,6 +112,7 @@ class Contract(Schema):
 def contract_of(
     task: Task, model: SimulatorModel, golden: Mapping[str, Rows], graph_sha256: str,
     provenance: Mapping[str, Any], state: tuple[int, float] | None = None,
+    batch: Literal[1] | None = None,
 ) -> str:  # fmt: skip
     """Writes the contract of a policy as JSON; the state is its size and start value.
 
@@ -136,9 +141,19 @@ def contract_of(
     if state is not None:
         gap = GAP_PERIODS * model.control_period
         data["state"] = {"size": state[0], "start": state[1], "longest_gap": gap}
+    if batch is not None:
+        data["batch"] = batch
     data["checksums"] = checksums(data)
     validate(data, Contract, "policy")
     return json.dumps(data, allow_nan=False)
+
+
+def golden_observations(task: Task) -> Rows:
+    """Observations (16, O) within the limits of a task's, always the same ones."""
+    space = task.observation_space
+    low, high = np.maximum(space.low, -GOLDEN_SPREAD), np.minimum(space.high, GOLDEN_SPREAD)
+    rng = np.random.default_rng(GOLDEN_SEED)
+    return rng.uniform(low, high, (GOLDEN, len(low))).astype(np.float32)
 
 
 def task_entry(task: Task) -> dict[str, Any]:

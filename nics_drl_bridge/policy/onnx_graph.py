@@ -31,15 +31,17 @@ GREATEST_SETTING = 65_536  # maximum size, stride, padding or dilation of a kern
 MOST_AXES = 256  # axes that all nodes together may add to their arrays; each makes inference longer
 INPUT, ACTION, COMMAND = "observation", "action", "command"
 STATE_IN, STATE_OUT = "state_in", "state_out"  # of a policy with a state
-OPERATORS = frozenset({
-    "Abs", "Add", "ArgMax", "AveragePool", "Cast", "Clip", "Concat", "Constant", "Conv", "Div",
-    "Elu", "Erf", "Exp", "Flatten", "Gather", "Gelu", "Gemm", "GlobalAveragePool", "HardSigmoid",
-    "HardSwish", "Identity", "LayerNormalization", "LeakyRelu", "Log", "LogSoftmax", "MatMul",
-    "Max", "MaxPool", "Min", "Mish", "Mul", "Neg", "Pow", "PRelu", "ReduceMean", "ReduceSum",
-    "Relu", "Reshape", "Selu", "Shape", "Sigmoid", "Slice", "Softmax", "Softplus", "Softsign",
-    "Split", "Sqrt", "Squeeze", "Sub", "Tanh", "Transpose", "Unsqueeze",
+RECURRENT = frozenset({"GRU", "LSTM", "RNN"})  # over sequences whose length the graph tells
+OPERATORS = RECURRENT | frozenset({
+    "Abs", "Add", "ArgMax", "Atan", "AveragePool", "BatchNormalization", "Cast", "Clip", "Concat",
+    "Constant", "Conv", "Cos", "Div", "Elu", "Erf", "Exp", "Flatten", "Gather", "Gelu", "Gemm",
+    "GlobalAveragePool", "HardSigmoid", "HardSwish", "Identity", "LayerNormalization", "LeakyRelu",
+    "Log", "LogSoftmax", "MatMul", "Max", "MaxPool", "Min", "Mish", "Mul", "Neg", "Pow", "PRelu",
+    "ReduceMax", "ReduceMean", "ReduceMin", "ReduceSum", "Reciprocal", "Relu", "Reshape", "Selu",
+    "Shape", "Sigmoid", "Sign", "Sin", "Slice", "Softmax", "Softplus", "Softsign", "Split", "Sqrt",
+    "Squeeze", "Sub", "Tanh", "Transpose", "Unsqueeze",
 })  # fmt: skip
-"""Operators of feed-forward networks: no loops, branches, random draws or data-dependent sizes."""
+"""Operators of networks: no loops, branches, random draws or data-dependent sizes."""
 FLOATS = frozenset({TensorProto.FLOAT, TensorProto.DOUBLE, TensorProto.FLOAT16})
 INTEGERS = frozenset({TensorProto.INT64, TensorProto.INT32})
 NUMBERS = FLOATS | INTEGERS | {TensorProto.BOOL}  # types as large in memory as in the file
@@ -61,6 +63,14 @@ Fault = tuple[str, str]  # faulty field, and the reason
 
 def parse(data: bytes, source: str) -> Any:
     """Parses and checks a policy file's ModelProto; PolicyError if it is not one to be run."""
+    model = parsed(data, source)
+    metadata(model, source)
+    check_graph(model, source)
+    return model
+
+
+def parsed(data: bytes, source: str) -> Any:
+    """Parses a ModelProto, of anyone, and checks its form alone. Raises PolicyError."""
     for start, kind in OTHER_FORMATS:
         if data.startswith(start):
             reason = f"is {kind}, which is never opened; export the policy with `export_policy`."
@@ -74,8 +84,6 @@ def parse(data: bytes, source: str) -> Any:
         what = str(error) if isinstance(error, WireError) else "is no ONNX model, or is cut off"
         reason = f"{what}, which no policy is; export or copy it again."
         raise PolicyError(source, "file", reason) from None
-    metadata(model, source)
-    check_graph(model, source)
     return model
 
 
@@ -238,8 +246,13 @@ def _tensors(graph: Any) -> Iterator[Any]:
         yield from attribute.tensors
 
 
-def check_ends(model: Any, widths: dict[str, int | None], source: str) -> None:
-    """Raises PolicyError unless inputs and outputs have their widths; None: integers (n,)."""
+def check_ends(
+    model: Any, widths: dict[str, int | None], source: str, batch: int | None = None
+) -> None:
+    """Raises PolicyError unless inputs and outputs have their widths; None: integers (n,).
+
+    Their first dimension is the number of observations; None: any.
+    """
     weights = {tensor.name for tensor in model.graph.initializer}
     inputs = [one for one in model.graph.input if one.name not in weights]
     if STATE_IN not in widths and STATE_IN in [one.name for one in inputs]:
@@ -257,23 +270,29 @@ def check_ends(model: Any, widths: dict[str, int | None], source: str) -> None:
         tensor, width = end.type.tensor_type, widths[end.name]
         kind = TensorProto.INT64 if width is None else TensorProto.FLOAT
         sizes = [d.dim_value if d.HasField("dim_value") else None for d in tensor.shape.dim]
-        wanted = [None] if width is None else [None, width]
+        wanted = [batch] if width is None else [batch, width]
         if tensor.elem_type != kind or sizes != wanted:
             name = TensorProto.DataType.Name(tensor.elem_type)
             reason = f"is {name} of shape {sizes}, where {wanted} is needed; export anew."
             raise PolicyError(source, f"graph.{end.name}", reason)
 
 
-def rows_at_once(model: Any, source: str) -> int:
-    """Number of observations for one run; PolicyError if a size is unknown or far too large."""
-    faults = itertools.chain(_setting_faults(model.graph), _integer_faults(model, source))
+def rows_at_once(model: Any, source: str, batch: int | None = None) -> int:
+    """Number of observations for one run, at most `batch`.
+
+    Raises PolicyError if a size is unknown or far too large.
+    """
+    rows = batch or ROWS
+    faults = itertools.chain(_setting_faults(model.graph), _integer_faults(model, rows, source))
     for field, reason in faults:
         raise PolicyError(source, field, reason)
-    numbers, work = _costs(model, ROWS, source)
-    if max(numbers / MOST_NUMBERS, work / MOST_WORK) > ROWS:
-        needs = f"needs {numbers / ROWS:.3g} numbers and {work / ROWS:.3g} multiplications"
+    numbers, work = _costs(model, rows, source)
+    if max(numbers / MOST_NUMBERS, work / MOST_WORK) > rows:
+        needs = f"needs {numbers / rows:.3g} numbers and {work / rows:.3g} multiplications"
         limits = f"for an observation, where a policy has {MOST_NUMBERS:.0e} and {MOST_WORK:.0e}"
         raise PolicyError(source, "graph", f"{needs} {limits}; not run.")
+    if batch is not None:
+        return batch
     more_numbers, more_work = _costs(model, 2 * ROWS, source)
     if more_numbers > 2 * numbers or more_work > 2 * work:
         reason = "grows faster than the number of its observations; not run."
@@ -302,15 +321,15 @@ def _setting_faults(graph: Any) -> Iterator[Fault]:
         yield "graph.node", reason
 
 
-def _integer_faults(model: Any, source: str) -> Iterator[Fault]:
+def _integer_faults(model: Any, rows: int, source: str) -> Iterator[Fault]:
     """Integers that are divided, or that grow while shapes are inferred."""
-    kinds, shapes = _sizes(model, ROWS, source, values=False)
+    kinds, shapes = _sizes(model, rows, source, values=False)
     for node in model.graph.node:
         if node.op_type in DIVIDING and kinds.get(node.input[0]) not in FLOATS:
             yield "graph.node", f"{node.op_type} of whole numbers may end the process; use float32."
         if node.op_type in ("Concat", "Gather") and kinds.get(node.output[0]) not in FLOATS:
             size = math.prod(shapes.get(node.output[0], (0,)))
-            if size > SMALL * ROWS:
+            if size > SMALL * rows:
                 reason = f"of {size} whole numbers is no shape and no index; not run."
                 yield "graph.node", f"{node.op_type} {reason}"
 
@@ -341,6 +360,9 @@ def _work(node: Any, given: list[Shape], made: list[Shape]) -> tuple[int, int]:
         groups = int(settings["group"].i) if "group" in settings else 1
         kernel = math.prod(given[1][1:])
         return math.prod(made[0][2:]) * kernel * max(groups, 1), math.prod(made[0]) * kernel
+    if node.op_type in RECURRENT:  # given: a sequence (T, n, I), weights (D, G H, I), (D, G H, H)
+        steps = math.prod(given[0][:2])
+        return steps * math.prod(given[1][:2]), steps * sum(map(math.prod, given[1:3]))
     if "kernel_shape" in settings:  # of a pool
         return 0, math.prod(made[0]) * int(math.prod(settings["kernel_shape"].ints))
     return 0, 0

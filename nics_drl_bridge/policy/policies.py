@@ -15,7 +15,7 @@ from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError, PolicyError, nearest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy import dynamic_window_kernels as kernels
-from nics_drl_bridge.policy.contract import SUFFIX, shipped
+from nics_drl_bridge.policy.contract import MAPPINGS, SUFFIX, shipped
 from nics_drl_bridge.policy.fallback import Fallback, check_readable
 from nics_drl_bridge.policy.local_map import outline_of, rays_of, scratch_of
 from nics_drl_bridge.policy.local_map_kernels import Clearance, FootprintDiscs, MapScratch, ScanRays
@@ -209,9 +209,12 @@ def shipped_policies() -> list[str]:
 
 
 def is_policy_file(name: str) -> bool:
-    """True for a policy file or the name of a shipped one. Raises ConfigError if unknown."""
+    """True for a policy file, the name of a shipped one, or the mapping of a foreign policy.
+
+    Raises ConfigError if unknown.
+    """
     files = shipped_policies()
-    if name not in POLICIES and not name.endswith(SUFFIX) and name not in files:
+    if name not in POLICIES and not name.endswith((SUFFIX, *MAPPINGS)) and name not in files:
         raise ConfigError(f"unknown policy {name!r}; {nearest(name, (*POLICIES, *files))}")
     return name not in POLICIES
 
@@ -225,9 +228,9 @@ def make_policy(
     """
     if not is_policy_file(name):
         return _backed(POLICIES[name](task, model), name, fallback, task, model)
-    from nics_drl_bridge.policy.policy_file import load_policy  # the others need no onnxruntime
+    from nics_drl_bridge.policy.foreign import load_any  # the others need no onnxruntime
 
-    policy = load_policy(name)
+    policy = load_any(name, model)
     policy.check_fits(model, task)
     return _backed(_acting(policy), name, fallback, task, model)
 
@@ -240,9 +243,9 @@ def open_policy(name: str, model: SimulatorModel, fallback: str = "") -> tuple[P
     if not is_policy_file(name):
         task = Navigation(model.robot, model.lidar)
         return _backed(POLICIES[name](task, model), name, fallback, task, model), task
-    from nics_drl_bridge.policy.policy_file import load_policy
+    from nics_drl_bridge.policy.foreign import load_any
 
-    policy = load_policy(name)
+    policy = load_any(name, model)
     found = policy.make_task(model)
     if not isinstance(found, Navigation):
         reason = f"is {policy.contract.task.name!r}; this drives policies of 'navigation'."

@@ -174,11 +174,11 @@ def policy_of(data: bytes, path: Path) -> PolicyFile:
     }  # fmt: skip
     if contract.state is not None:
         widths |= dict.fromkeys((onnx_graph.STATE_IN, onnx_graph.STATE_OUT), contract.state.size)
-    onnx_graph.check_ends(model, widths, source)
+    onnx_graph.check_ends(model, widths, source, contract.batch)
     if onnx_graph.graph_hash(model) != contract.graph_sha256:
         reason = "does not belong to the graph, which was changed after the export."
         raise PolicyError(source, "graph_sha256", reason)
-    rows = onnx_graph.rows_at_once(model, source)
+    rows = onnx_graph.rows_at_once(model, source, contract.batch)
     del model  # the runtime parses the bytes itself
     policy = PolicyFile(path, contract, open_session(data, source), rows)
     _check_golden(policy, source)

@@ -16,7 +16,7 @@ from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy import onnx_graph
-from nics_drl_bridge.policy.contract import GOLDEN, SUFFIX, contract_of
+from nics_drl_bridge.policy.contract import GOLDEN, SUFFIX, contract_of, golden_observations
 from nics_drl_bridge.policy.policy_file import (
     GOLDEN_TOLERANCE,
     PolicyFile,
@@ -29,8 +29,6 @@ from nics_drl_bridge.policy.train_memory import Memory
 Rows = NDArray[np.float32]
 Normaliser = tuple[ArrayLike, ArrayLike, float]
 OPSET = 17
-GOLDEN_SEED = 0
-GOLDEN_SPREAD = 3.0  # distance from zero of golden observations, if their limits are wider
 
 
 class Deployed(torch.nn.Module):  # type: ignore[misc]
@@ -118,11 +116,7 @@ def export_policy(
 
 
 def _golden(deployed: Deployed, graph: Any, task: Task, source: str) -> dict[str, Rows]:
-    space = task.observation_space
-    low = np.maximum(space.low, -GOLDEN_SPREAD)
-    high = np.minimum(space.high, GOLDEN_SPREAD)
-    rng = np.random.default_rng(GOLDEN_SEED)
-    seen = rng.uniform(low, high, (GOLDEN, len(low))).astype(np.float32)
+    seen = golden_observations(task)
     session = open_session(graph.SerializeToString(), source)
     inputs, kept = (onnx_graph.INPUT, onnx_graph.STATE_IN), deployed.state
     start = None if kept is None else np.full(kept[0], kept[1], np.float32)

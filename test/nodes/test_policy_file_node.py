@@ -16,6 +16,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, TwistStamped
 from lifecycle_msgs.srv import ChangeState
 from nav_msgs.msg import Odometry
+from policy import foreign_nets
 from policy.policy_rig import MEMORIES, export_remembering, network
 from sensor_msgs.msg import LaserScan
 
@@ -158,6 +159,18 @@ def facts(robot):
     mine = "policy_node: policy"
     found = [s for m in robot.told for s in m.status if s.name.endswith(mine)]
     return {value.key: value.value for value in found[-1].values} if found else {}
+
+
+def test_a_foreign_policy_commands_what_it_does_in_process(
+    launch, meet, domain_id, model, tmp_path
+):
+    foreign = foreign_nets.write(tmp_path, "three", robot=None)
+    node = launch("policy_node", domain_id, policy=str(foreign), goal=GOAL, deadline=5.0)
+    command = Robot(meet(domain_id)).hears(scan_of(model.lidar.angles))
+    (expected,) = driven_in_process(foreign, model, [0.0], GOAL[0])
+    assert np.abs(expected[[0, 2]]).min() > 0.01
+    assert command == pytest.approx(expected, abs=1e-4)
+    node.check()
 
 
 def test_its_diagnostics_count_inferences(driving):

@@ -1,0 +1,101 @@
+"""`nics policy`."""
+
+import json
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer import Argument, Option
+
+from nics_drl_bridge.commands.console import one_sentence
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.files import write_bytes
+
+policy = typer.Typer(help="Policy files.", no_args_is_help=True)
+
+
+@policy.callback()
+def _group() -> None:
+    """Policy files."""
+
+
+@policy.command()
+def info(
+    file: Annotated[
+        str, Argument(help="A policy file, the name of a shipped one, or a foreign one's mapping.")
+    ],
+    as_json: Annotated[bool, Option("--json", help="One JSON object instead.")] = False,
+) -> None:
+    """Checks a policy file and tells what it was trained on and needs."""
+    with one_sentence():
+        from nics_drl_bridge.policy.foreign import load_any
+        from nics_drl_bridge.policy.policy_file import summary
+
+        facts = summary(load_any(file))
+        lines = (f"{name:<18} {value}" for name, value in _lines(facts))
+        typer.echo(json.dumps(facts) if as_json else "\n".join(lines))
+
+
+@policy.command()
+def export(
+    file: Annotated[str, Argument(help="A policy file, or the name of a shipped one.")],
+    leapp: Annotated[Path, Option(help="Folder of the bundle: network, YAML file, start values.")],
+) -> None:
+    """Writes a policy file in the format of others: LEAPP, of Isaac's deployment."""
+    with one_sentence():
+        from nics_drl_bridge.policy.foreign import load_any
+        from nics_drl_bridge.policy.leapp import export_bundle
+
+        typer.echo(f"wrote {export_bundle(load_any(file), leapp)}")
+
+
+@policy.command(name="import")
+def import_(
+    source: Annotated[
+        Path, Argument(help="A LEAPP bundle, or the mapping (YAML) of a foreign policy.")
+    ],
+    out: Annotated[Path, Option("--out", "-o", help="The policy file to write (*.onnx).")],
+    robot: Annotated[
+        str | None, Option("--robot", "--model", help="A shipped robot, or the folder of a model.")
+    ] = None,
+) -> None:
+    """Makes a policy file of somebody else's policy; one of ours comes back as it was."""
+    with one_sentence():
+        from nics_drl_bridge.generator import open_model
+        from nics_drl_bridge.policy.contract import SUFFIX
+        from nics_drl_bridge.policy.foreign import import_policy
+        from nics_drl_bridge.policy.policy_file import policy_of
+
+        if out.suffix != SUFFIX:
+            raise ConfigError(f"--out {out}: a policy file ends with {SUFFIX!r}; change the name.")
+        data = import_policy(source, None if robot is None else open_model(robot))
+        contract = policy_of(data, out).contract  # what can't be loaded is not written
+        write_bytes(out, data)
+        typer.echo(f"wrote {out}, a policy of {contract.robot.name!r}; see nics policy info {out}")
+
+
+def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
+    lidar, scan, seen = facts["lidar"], facts["scan"], facts["observation"]
+    limits = "{name} {min:g} to {max:g} {unit}"
+    commands = [limits.format(**command) for command in facts["robot"]["command"]]
+    observed = "the beams of this lidar"
+    if scan is not None:
+        observed = (
+            f"{scan['sectors']} sectors from {math.degrees(scan['angle_min']):.4g} to "
+            f"{math.degrees(scan['angle_max']):.4g} deg, {scan['range_max']:g} m"
+        )
+    lines = {
+        "file": f"{facts['file']}, {facts['bytes'] / 1024:.0f} kB, all checks passed",
+        "robot": f"{facts['robot']['name']}: {', '.join(commands)}",
+        "task": facts["task"]["name"],
+        "actions": facts["actions"],
+        "scan": observed,
+        "lidar": f"{lidar['name']}: {lidar['beams']} beams, {lidar['range_max']:g} m",
+        "observation": f"{seen['size']} parts, {seen['scan_parts']} of them the scan",
+        "control period": f"{facts['control_period']:g} s",
+        "model": facts["model_fingerprint"],
+        "graph": facts["graph_sha256"][:16],
+    }
+    provenance = {name: str(value) for name, value in facts["provenance"].items()}
+    return [*lines.items(), *provenance.items()]

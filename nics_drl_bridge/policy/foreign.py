@@ -1,0 +1,155 @@
+"""Policies of others: a network with a mapping, or a bundle, as a policy file of ours."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+
+from nics_drl_bridge.config import parse_yaml, read_text, validate
+from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.errors import ConfigError, PolicyError
+from nics_drl_bridge.files import sha256
+from nics_drl_bridge.generator import SimulatorModel, open_model
+from nics_drl_bridge.lidar.sectors import layout_of
+from nics_drl_bridge.policy import leapp_bundle, onnx_graph
+from nics_drl_bridge.policy.contract import (
+    MAPPINGS,
+    SUFFIX,
+    Rows,
+    contract_of,
+    golden_observations,
+)
+from nics_drl_bridge.policy.foreign_graph import Composer, Network
+from nics_drl_bridge.policy.foreign_mapping import ForeignPolicy
+from nics_drl_bridge.policy.policy_file import (
+    PERIOD_TOLERANCE,
+    PolicyFile,
+    in_turn,
+    load_policy,
+    open_session,
+    policy_of,
+)
+
+
+@dataclass(frozen=True)
+class Order:
+    """A policy of somebody else: its mapping, its network, and the file that names them."""
+
+    mapping: ForeignPolicy
+    network: Network
+    path: Path
+    sha256: str  # of the network's files
+
+
+def load_foreign(path: str | Path, model: SimulatorModel | None = None) -> PolicyFile:
+    """Opens a foreign policy by its mapping, for a robot; None: the one that the mapping names.
+
+    Raises ConfigError for a wrong mapping, PolicyError for what does not fit together.
+    """
+    return policy_of(_content(_ordered(Path(path), model), model), Path(path))
+
+
+def load_any(path: str | Path, model: SimulatorModel | None = None) -> PolicyFile:
+    """Loads a policy file, see `load_policy`, or makes one of the YAML file of a foreign policy."""
+    if str(path).endswith(MAPPINGS):
+        return load_foreign(Path(path), model)
+    return load_policy(path)
+
+
+def import_policy(source: str | Path, model: SimulatorModel | None = None) -> bytes:
+    """A policy file of ours of a LEAPP bundle or a mapping; ours again if it was exported.
+
+    Raises ConfigError or PolicyError, which says what can't be expressed.
+    """
+    path = leapp_bundle.description_of(Path(source))
+    if path is None:
+        order = _ordered(Path(source), model)
+        return _content(order, model)
+    bundle = leapp_bundle.read_bundle(path)
+    if (ours := bundle.ours) is not None:
+        return ours
+    if model is None:
+        raise ConfigError(f"{path}: a bundle of others names no robot; say which with --robot.")
+    mapping = validate(leapp_bundle.mapping_of(bundle, model), ForeignPolicy, str(path))
+    return _content(Order(mapping, bundle.network, path, bundle.sha256), model)
+
+
+def _ordered(path: Path, model: SimulatorModel | None) -> Order:
+    data = parse_yaml(read_text(path), str(path))
+    if data.get("kind") != "foreign policy":
+        reason = "it is no mapping of a foreign policy, whose first line is `kind: foreign policy`"
+        raise ConfigError(f"{path}: {reason}.")
+    mapping = validate(data, ForeignPolicy, str(path))
+    file = path.parent / mapping.network
+    if file.is_dir() or file.suffix in MAPPINGS:
+        description = leapp_bundle.description_of(file)
+        if description is not None:
+            made = leapp_bundle.read_bundle(description)
+            return Order(mapping, made.network, path, made.sha256)
+    if file.suffix != SUFFIX:
+        known = f"must be an {SUFFIX} file or a LEAPP bundle"
+        raise PolicyError(str(path), "network", f"{known}, not {mapping.network!r}.")
+    try:
+        if file.stat().st_size > onnx_graph.SIZE_LIMIT:
+            most = f"{onnx_graph.SIZE_LIMIT // 2**20} MB, as no policy is; not opened."
+            raise PolicyError(str(path), "network", f"{mapping.network!r} has more than {most}")
+        content = file.read_bytes()
+    except OSError as error:
+        reason = f"{mapping.network!r} can't be read ({error.strerror}); it is beside the mapping."
+        raise PolicyError(str(path), "network", reason) from None
+    network = onnx_graph.parsed(content, str(file))
+    onnx_graph.check_graph(network, str(file))
+    return Order(mapping, Network(network), path, sha256(content))
+
+
+def _content(order: Order, model: SimulatorModel | None) -> bytes:
+    mapping, source = order.mapping, str(order.path)
+    if model is None:
+        if mapping.robot is None:
+            fix = "add `robot:`, or say which it drives with --model or --robot."
+            raise ConfigError(f"{source}: names no robot; {fix}")
+        model = open_model(mapping.robot)
+    period = model.control_period
+    if abs((mapping.control_period or period) - period) > PERIOD_TOLERANCE:
+        reason = f"is {mapping.control_period:g} s, but the robot's is {period:g} s"
+        raise PolicyError(source, "control_period", f"{reason}; use a model with that period.")
+    try:
+        layout = layout_of(mapping.scan, model.lidar)
+        task = Navigation(model.robot, model.lidar, scan=layout)
+    except ConfigError as error:
+        raise ConfigError(f"{source}: key 'scan': {error}") from None
+    graph, size = Composer(order.network, mapping, task, source).compose()
+    state = (size, 0.0) if size else None
+    golden = _golden(graph, golden_observations(task), size, source)
+    provenance = {"network": mapping.network, "network_sha256": order.sha256}
+    digest = onnx_graph.graph_hash(graph)
+    text = contract_of(task, model, golden, digest, provenance, state, batch=1)
+    onnx.helper.set_model_props(graph, {onnx_graph.KEY: text})
+    return onnx_graph.sealed(graph.SerializeToString(deterministic=True))
+
+
+def _golden(graph: Any, seen: Rows, size: int, source: str) -> dict[str, Rows]:
+    onnx_graph.rows_at_once(graph, source, 1)  # before anything of it runs
+    session = open_session(graph.SerializeToString(), source)
+    names = (onnx_graph.INPUT, onnx_graph.STATE_IN)
+    start = np.zeros(size, np.float32)
+
+    def run(*given: Rows) -> list[Rows]:
+        try:
+            return list(session.run(None, dict(zip(names, given, strict=False))))
+        except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
+            words = " ".join(str(error).split())[:120]
+            raise PolicyError(source, "network", f"onnxruntime can't run it ({words}).") from None
+
+    rows = in_turn(run, seen, start) if size else _one_by_one(run, seen)
+    if not all(np.isfinite(part).all() for part in rows):
+        reason = "gives NaN or inf for ordinary observations; check scaling and weights."
+        raise PolicyError(source, "network", reason)
+    return {"observations": seen, "actions": rows[0], "commands": rows[1]}
+
+
+def _one_by_one(run: Any, seen: Rows) -> list[Rows]:
+    rows = [run(seen[k : k + 1]) for k in range(len(seen))]
+    return [np.concatenate(parts) for parts in zip(*rows, strict=True)]

@@ -1,0 +1,418 @@
+"""Puts a foreign network between the observation of a task and the commands of a robot."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import onnx
+from onnx import TensorProto
+
+from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.errors import PolicyError, nearest
+from nics_drl_bridge.policy import onnx_graph
+from nics_drl_bridge.policy.foreign_mapping import (
+    TWIST,
+    Choices,
+    ForeignPolicy,
+    ForeignState,
+    InputPart,
+    OutputCommand,
+    Scaled,
+)
+from nics_drl_bridge.policy.graph_builder import Builder
+from nics_drl_bridge.robot.spec import RobotSpec
+
+THEIRS = "network/"  # before every name of the foreign graph
+OLDEST_OPSET = 8  # from which on the operators used here broadcast
+SLOWEST = 1e-6  # speed below which a steering angle is 0 [m/s]
+FIELDS = dict(zip(TWIST, ("linear.x", "linear.y", "angular.z"), strict=True))
+
+
+@dataclass(frozen=True)
+class Network:
+    """A foreign network, and its states as far as its own files tell them."""
+
+    model: Any  # onnx.ModelProto
+    states: Mapping[str, ForeignState] = field(default_factory=dict)  # by input
+
+    @property
+    def inputs(self) -> dict[str, Any]:
+        """Inputs by name, as onnx.ValueInfoProto; weights may be listed among them."""
+        held = {tensor.name for tensor in self.model.graph.initializer}
+        return {one.name: one for one in self.model.graph.input if one.name not in held}
+
+    @property
+    def outputs(self) -> dict[str, Any]:
+        """Outputs by name, as onnx.ValueInfoProto."""
+        return {one.name: one for one in self.model.graph.output}
+
+
+class Composer:
+    """Builds the graph of a policy file around a foreign network, for one observation at once."""
+
+    def __init__(
+        self, network: Network, mapping: ForeignPolicy, task: Navigation, source: str
+    ) -> None:
+        self._network, self._mapping, self._task, self._source = network, mapping, task, source
+        self._states = {**network.states, **mapping.states}
+        self._build = Builder()
+        self._past: dict[str, str] = {}  # rows of the state by what they keep
+        self._next: dict[str, str] = {}  # rows of the state that follows
+        self._check_names()
+
+    def compose(self) -> tuple[Any, int]:
+        """Returns the ModelProto, and the size of its state."""
+        build, theirs = self._build, self._theirs()
+        sizes = self._state_sizes()
+        ends = np.cumsum([0, *sizes.values()])
+        if sizes:
+            ranges = zip(sizes, ends[:-1], ends[1:], strict=True)
+            self._past = {
+                key: build.pick(onnx_graph.STATE_IN, range(k, end)) for key, k, end in ranges
+            }
+        self._feed(theirs)
+        build.nodes += theirs.graph.node
+        build.weights += theirs.graph.initializer
+        command = self._command()
+        low, high = self._task.command_limits
+        command = build.cut(command, (low, high))
+        build.add("Identity", command, name=onnx_graph.COMMAND)
+        action = build.affine(command, 2.0 / (high - low), -1.0 - 2.0 * low / (high - low))
+        build.add("Identity", build.cut(action, (-1.0, 1.0)), name=onnx_graph.ACTION)
+        if sizes:
+            self._remember()
+            build.join([self._next[key] for key in sizes], name=onnx_graph.STATE_OUT)
+        return self._model(theirs, int(ends[-1])), int(ends[-1])
+
+    def _fault(self, place: str, reason: str) -> PolicyError:
+        return PolicyError(self._source, place, reason)
+
+    def _check_names(self) -> None:
+        mapping, taken, given = self._mapping, self._network.inputs, self._network.outputs
+        for name in (*mapping.inputs, *self._states):
+            if name not in taken:
+                where = "inputs" if name in mapping.inputs else "states"
+                fix = nearest(name, taken)
+                raise self._fault(f"{where}.{name}", f"the network has no such input; {fix}")
+        for name in taken:
+            if name not in mapping.inputs and name not in self._states:
+                reason = "the network takes this input, and nothing says what it is; add it."
+                raise self._fault(f"inputs.{name}", reason)
+            if name in mapping.inputs and name in self._states:
+                raise self._fault(f"states.{name}", "is an input as well; keep one of them.")
+        commands = mapping.outputs.items()
+        named = [(f"outputs.{key}.of", one.of) for key, one in commands if one.of is not None]
+        named += [(f"states.{key}.next", one.next) for key, one in self._states.items()]
+        named += [] if mapping.choices is None else [("choices.of", mapping.choices.of)]
+        named += [
+            (f"inputs.{key}.parts.{k}.output", part.output)
+            for key, one in mapping.inputs.items()
+            for k, part in enumerate(one.parts)
+            if part.output is not None
+        ]
+        for place, name in named:
+            if name not in given:
+                fix = nearest(name, given)
+                raise self._fault(place, f"the network has no output {name!r}; {fix}")
+
+    # Shapes. One observation at once: what was left open in the first place is 1.
+
+    def _theirs(self) -> Any:
+        """The foreign graph with names of its own, fixed shapes, and inputs that are fed here."""
+        model = onnx.ModelProto()
+        model.CopyFrom(self._network.model)
+        versions = [one.version for one in model.opset_import if one.domain in ("", "ai.onnx")]
+        if not versions or max(versions) < OLDEST_OPSET:
+            reason = f"is {max(versions, default=0)}, needed is {OLDEST_OPSET} or newer."
+            raise self._fault("network.opset", reason)
+        del model.graph.value_info[:]  # their shapes may be open
+        for one in model.graph.input:
+            if one.name in self._network.inputs:
+                shape = one.type.tensor_type.shape
+                for place, size in zip(shape.dim, self._shape(one.name), strict=True):
+                    place.dim_value = size
+        for one in model.graph.output:
+            one.type.tensor_type.ClearField("shape")  # follow from those of the inputs
+        try:
+            model = onnx.compose.add_prefix(model, THEIRS)
+            found = onnx.shape_inference.infer_shapes(model, strict_mode=True)
+        except Exception as error:  # noqa: BLE001 - a damaged graph raises anything
+            words = " ".join(str(error).split())[:120]
+            raise self._fault("network", f"its shapes do not fit ({words}).") from None
+        self._made = {
+            one.name: tuple(d.dim_value for d in one.type.tensor_type.shape.dim)
+            for one in found.graph.output
+        }
+        return model
+
+    def _shape(self, name: str) -> tuple[int, ...]:
+        """The shape of an input; of what it leaves open, the first is 1, another as it must be."""
+        one = self._network.inputs[name].type.tensor_type
+        sizes = [d.dim_value if d.HasField("dim_value") else 0 for d in one.shape.dim]
+        if sizes and sizes[0] == 0:
+            sizes[0] = 1
+        needed = self._given_size(name)
+        if needed is not None and sizes.count(0) == 1:
+            sizes[sizes.index(0)] = max(needed // max(math.prod(s for s in sizes if s), 1), 1)
+        sizes = [size or 1 for size in sizes]
+        if needed is not None and math.prod(sizes) != needed:
+            parts = self._mapping.inputs[name].parts
+            each = ", ".join(f"{part.of} {self._part_size(part)}" for part in parts)
+            reason = f"the network takes {tuple(sizes)}, and the parts give {needed} ({each})."
+            raise self._fault(f"inputs.{name}", reason)
+        return tuple(sizes)
+
+    def _given_size(self, name: str) -> int | None:
+        """Number of elements that the parts of an input give; None for a state."""
+        if name not in self._mapping.inputs:
+            return None
+        return sum(map(self._part_size, self._mapping.inputs[name].parts))
+
+    def _part_size(self, part: InputPart) -> int:
+        size = 1
+        if part.of == "scan":
+            size = self._task.scan_parts
+        elif part.of == "constant":
+            size = len(part.value) if isinstance(part.value, tuple) else 1
+        elif part.output is not None:
+            size = self._output_size(part.output)
+        return size * part.history
+
+    def _output_size(self, name: str) -> int:
+        """Elements of an output; what it leaves open is 1."""
+        if hasattr(self, "_made"):
+            sizes: Sequence[int] = self._made[THEIRS + name]
+        else:
+            dims = self._network.outputs[name].type.tensor_type.shape.dim
+            sizes = [d.dim_value for d in dims]
+        return math.prod(size or 1 for size in sizes)
+
+    def _state_sizes(self) -> dict[str, int]:
+        """Number of elements of each thing that the state keeps."""
+        sizes = {f"state {name}": math.prod(self._shape(name)) for name in self._states}
+        for name, one in self._mapping.inputs.items():
+            for k, part in enumerate(one.parts):
+                if part.of.startswith("last.") and part.output is None:
+                    sizes["twist"] = len(TWIST)
+                if part.output is not None:
+                    sizes[f"output {part.output}"] = self._output_size(part.output)
+                if part.history > 1:
+                    kept = self._part_size(part) // part.history * (part.history - 1)
+                    sizes[f"history {name} {k}"] = kept
+        return {"begun": 1, **sizes} if sizes else {}  # begun: 0 in the first step, then 1
+
+    # Inputs.
+
+    def _feed(self, theirs: Any) -> None:
+        build = self._build
+        taken = {one.name: one.type.tensor_type.elem_type for one in theirs.graph.input}
+        for name in self._network.inputs:
+            if name in self._states:
+                row = self._begun(f"state {name}", self._states[name].start, f"states.{name}.start")
+            else:
+                one = self._mapping.inputs[name]
+                parts = [self._part(name, k, part) for k, part in enumerate(one.parts)]
+                size = self._given_size(name)
+                self._check_scaled(one, size or 0, f"inputs.{name}")
+                row = build.scale(parts[0] if len(parts) == 1 else build.join(parts), one)
+            shape = build.constant(self._shape(name), np.int64)
+            row = build.add("Reshape", row, shape)
+            build.add("Cast", row, name=THEIRS + name, to=taken[THEIRS + name])
+
+    def _check_scaled(self, scaled: Scaled, size: int, place: str) -> None:
+        for key in ("subtract", "divide"):
+            values = getattr(scaled, key)
+            if isinstance(values, tuple) and len(values) != size:
+                reason = f"has {len(values)} numbers, where {size} are scaled."
+                raise self._fault(f"{place}.{key}", reason)
+
+    def _begun(self, key: str, start: Any, place: str = "") -> str:
+        """Returns the name of what the state keeps, or of its start in the first step."""
+        past = self._past[key]
+        if isinstance(start, tuple) and len(start) != (size := self._state_sizes()[key]):
+            raise self._fault(place, f"has {len(start)} numbers, the state {size}.")
+        if not np.any(start):
+            return past
+        return self._build.blend(self._past["begun"], past, self._build.constant([start]))
+
+    def _part(self, name: str, k: int, part: InputPart) -> str:
+        build, size = self._build, self._part_size(part) // part.history
+        self._check_scaled(part, size, f"inputs.{name}.parts.{k}")
+        row = build.scale(self._quantity(name, part), part)
+        if part.history == 1:
+            return row
+        key = f"history {name} {k}"
+        first = build.join([row] * (part.history - 1))
+        past = build.blend(self._past["begun"], self._past[key], first)  # the oldest first
+        rows = build.join([past, row])
+        self._next[key] = build.pick(rows, range(size, size * part.history))
+        if part.newest_first:
+            places = np.arange(size * part.history).reshape(part.history, size)[::-1].ravel()
+            rows = build.pick(rows, places.tolist())
+        return rows
+
+    def _quantity(self, name: str, part: InputPart) -> str:
+        """A row of a quantity in SI units."""
+        build, scan = self._build, self._task.scan_parts
+        of, _, which = part.of.partition(".")
+        if of == "scan":
+            places = range(scan)[::-1] if part.clockwise else range(scan)
+            shares = build.pick(onnx_graph.INPUT, places)
+            return build.affine(shares, self._task.sight.range_max, 0.0)
+        if of == "constant":
+            return build.constant(np.reshape(np.asarray(part.value, np.float32), (1, -1)))
+        if of == "velocity":
+            return build.pick(onnx_graph.INPUT, [scan + 3 + TWIST.index(which)])
+        if part.output is not None:
+            return self._past[f"output {part.output}"]
+        if of == "last":
+            if not self._commands_twist():
+                reason = "is known of policies that command forward, left and turn alone."
+                raise self._fault(f"inputs.{name}", f"{part.of} {reason}")
+            return build.pick(self._past["twist"], [TWIST.index(which)])
+        distance, cosine, sine = (build.pick(onnx_graph.INPUT, [scan + k]) for k in range(3))
+        if which == "bearing":
+            return build.angle(cosine, sine)
+        if which in ("x", "y"):
+            return build.add("Mul", distance, cosine if which == "x" else sine)
+        return {"distance": distance, "cosine": cosine, "sine": sine}[which]
+
+    # Outputs.
+
+    def _commands_twist(self) -> bool:
+        choices = self._mapping.choices
+        rows = [self._mapping.outputs] if choices is None else choices.commands
+        return all(name in TWIST for row in rows for name in row)
+
+    def _flat(self, name: str) -> str:
+        """An output as a row of float32."""
+        made = self._made[THEIRS + name]
+        if not all(made):
+            reason = f"gives {name!r} of shape {made}, which can't be known before it runs."
+            raise self._fault("network", reason)
+        flat = self._build.add("Reshape", THEIRS + name, self._build.constant([1, -1], np.int64))
+        return self._build.add("Cast", flat, to=TensorProto.FLOAT)
+
+    def _command(self) -> str:
+        """The row of the robot's command (1, C)."""
+        if self._mapping.choices is not None:
+            return self._chosen(self._mapping.choices)
+        outputs, robot = self._mapping.outputs, self._task.robot
+        names = self._names(outputs, "outputs")
+        if names == TWIST:
+            self._check_twist(outputs)
+        rows = [self._element(name, outputs.get(name, OutputCommand())) for name in names]
+        if names != TWIST:
+            return self._build.join(rows)
+        self._next["twist"] = self._build.join(rows)
+        return self._of_twist(rows, robot)
+
+    def _names(self, given: Mapping[str, Any], place: str) -> tuple[str, ...]:
+        """The names of commands among which the given ones are: of a twist, or the robot's own."""
+        robot = self._task.robot
+        own = tuple(command.name for command in robot.command)
+        if all(name in TWIST for name in given):
+            if not robot.takes_cmd_vel:
+                reason = f"the robot {robot.name!r} is not driven by cmd_vel; map {', '.join(own)}."
+                raise self._fault(place, reason)
+            return TWIST
+        for name in given:
+            if name not in own:
+                fix = nearest(name, (*TWIST, *own))
+                raise self._fault(f"{place}.{name}", f"the robot has no such command; {fix}")
+        for name in own:
+            if name not in given and place == "outputs":
+                raise self._fault(f"{place}.{name}", "is missing; say which output it is.")
+        return own
+
+    def _check_twist(self, outputs: Mapping[str, OutputCommand]) -> None:
+        fields = [command.cmd_vel for command in self._task.robot.command]
+        for name in ("forward", "turn"):
+            if name not in outputs:
+                raise self._fault(f"outputs.{name}", "is missing; say which output it is.")
+        for name in outputs:
+            if FIELDS[name] not in fields:
+                reason = f"the robot {self._task.robot.name!r} has no command for it; remove it."
+                raise self._fault(f"outputs.{name}", reason)
+
+    def _element(self, name: str, command: OutputCommand) -> str:
+        build = self._build
+        if command.of is None:
+            return build.cut(build.constant([[command.add]]), command.clip)
+        size = self._output_size(command.of)
+        if command.index >= size:
+            reason = f"is {command.index}, but the output {command.of!r} has {size} elements."
+            raise self._fault(f"outputs.{name}.index", reason)
+        row = build.cut(build.pick(self._flat(command.of), [command.index]), command.limits)
+        return build.cut(build.affine(row, command.multiply, command.add), command.clip)
+
+    def _of_twist(self, twist: Sequence[str], robot: RobotSpec) -> str:
+        """Commands for forward, left and turn; see `geometry.Bicycle.command`."""
+        build = self._build
+        rows = dict(zip(FIELDS.values(), twist, strict=True))
+        if robot.steers:
+            forward = rows["linear.x"]
+            across = build.affine(rows["angular.z"], robot.bicycle.wheelbase, 0.0)
+            size = build.add("Max", build.add("Abs", forward), build.constant(SLOWEST))
+            sign = build.add("Div", forward, size)
+            slope = build.add("Div", build.add("Mul", across, sign), size)
+            rows["angular.z"] = build.add("Atan", slope)
+            if robot.bicycle.front_drive:
+                squares = [build.add("Mul", row, row) for row in (forward, across)]
+                speed = build.add("Sqrt", build.add("Add", *squares))
+                rows["linear.x"] = build.add("Mul", speed, sign)
+        return build.join([rows[str(command.cmd_vel)] for command in robot.command])
+
+    def _chosen(self, choices: Choices) -> str:
+        """The command by the greatest element of an output, or by a whole number."""
+        build, robot = self._build, self._task.robot
+        known = {name: 0.0 for row in choices.commands for name in row}
+        names = self._names(known, "choices")
+        rows = np.array([[row.get(name, 0.0) for name in names] for row in choices.commands])
+        size = self._output_size(choices.of)
+        kind = self._network.outputs[choices.of].type.tensor_type.elem_type
+        if kind in onnx_graph.INTEGERS and size == 1:
+            one = build.constant([1], np.int64)
+            index = build.add("Reshape", THEIRS + choices.of, one)
+        elif size == len(rows):
+            index = build.add("ArgMax", self._flat(choices.of), axis=1, keepdims=0)
+        else:
+            reason = f"are {len(rows)}, but the output {choices.of!r} has {size} elements."
+            raise self._fault("choices.commands", reason)
+        commands = rows
+        if names == TWIST:
+            self._next["twist"] = build.add("Gather", build.constant(rows), index, axis=0)
+            if robot.steers:
+                speed, angle = robot.bicycle.command(rows)
+                commands = np.stack([speed, rows[:, 1], angle], axis=-1)
+            commands = robot.of_fields(commands)
+        return build.add("Gather", build.constant(commands), index, axis=0)
+
+    def _remember(self) -> None:
+        self._next["begun"] = self._build.constant([[1.0]])
+        for name, state in self._states.items():
+            size, made = math.prod(self._shape(name)), self._output_size(state.next)
+            if size != made:
+                reason = f"{state.next!r} has {made} elements, the state {size}."
+                raise self._fault(f"states.{name}.next", reason)
+            self._next[f"state {name}"] = self._flat(state.next)
+        for key in self._past:
+            if key.startswith("output "):
+                self._next[key] = self._flat(key.removeprefix("output "))
+
+    def _model(self, theirs: Any, state: int) -> Any:
+        width, commands = self._task.observation_space.shape[0], len(self._task.robot.command)
+        inputs, outputs = {onnx_graph.INPUT: width}, {
+            onnx_graph.ACTION: commands, onnx_graph.COMMAND: commands,
+        }  # fmt: skip
+        if state:
+            inputs[onnx_graph.STATE_IN] = outputs[onnx_graph.STATE_OUT] = state
+        made = [
+            [onnx.helper.make_tensor_value_info(n, TensorProto.FLOAT, [1, w]) for n, w in ends]
+            for ends in (inputs.items(), outputs.items())
+        ]
+        graph = onnx.helper.make_graph(self._build.nodes, "foreign", *made, self._build.weights)
+        imports = [one for one in theirs.opset_import if one.domain in ("", "ai.onnx")]
+        return onnx.helper.make_model(graph, opset_imports=imports, ir_version=theirs.ir_version)

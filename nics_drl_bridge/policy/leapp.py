@@ -1,0 +1,211 @@
+"""Policy files as bundles of LEAPP, Isaac's format of deployment: a network and a YAML file.
+
+Written without the package `leapp`, which only runs them. The one node takes scan, goal and
+velocities by inputs of their own, gives action and command; a state is a feedback connection.
+"""
+
+import base64
+import hashlib
+import json
+import struct
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import onnx
+from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
+from numpy.typing import NDArray
+from onnx import TensorProto
+
+from nics_drl_bridge.config import dump_yaml
+from nics_drl_bridge.errors import PolicyError
+from nics_drl_bridge.files import sha256, whole_folder, write_bytes, write_text
+from nics_drl_bridge.policy import onnx_graph
+from nics_drl_bridge.policy.contract import Contract
+from nics_drl_bridge.policy.graph_builder import Builder
+from nics_drl_bridge.policy.policy_file import PolicyFile
+
+NODE = "policy"
+CONFIG_VERSION = "1.3"  # of the format
+OURS = "leapp/"  # before the names of nodes and weights that an export adds
+TAKEN = "nics_drl_bridge_observation"  # metadata: the input that an export replaces
+VELOCITIES = ("x", "y", "z")
+SECTORS, BEAMS = "state/lidar/sectors", "state/lidar/beams"
+Data = dict[str, Any]
+
+
+class Piece(NamedTuple):
+    """An input of a bundle, and which of its elements stand in the observation."""
+
+    name: str
+    width: int
+    kept: tuple[int, ...]
+    facts: Data
+
+
+def export_bundle(policy: PolicyFile, folder: str | Path) -> Path:
+    """Writes a policy file as a bundle; returns its YAML file. See `whole_folder` for errors."""
+    content, place = policy.path.read_bytes(), Path(folder)
+    marker = f"{place.resolve().name}.yaml"
+    model = onnx.load_model_from_string(content)
+    pieces = _pieces(policy)
+    _split(model, pieces)
+    made = model.SerializeToString(deterministic=True)
+    if restored(model) != content:
+        reason = "was not written by `export_policy`, so that it could not be restored."
+        raise PolicyError(str(policy.path), "file", reason)
+    with whole_folder(place, marker) as temporary:
+        write_bytes(temporary / f"{NODE}.onnx", made)
+        state = policy.contract.state
+        if state is not None:
+            start = np.full((1, state.size), state.start, np.float32)
+            data = _safetensors({f"{NODE}/{onnx_graph.STATE_IN}": start})
+            write_bytes(temporary / f"{place.resolve().name}_initial_values.safetensors", data)
+        write_text(temporary / marker, dump_yaml(_described(policy, pieces, made, place)))
+    return place / marker
+
+
+def _pieces(policy: PolicyFile) -> list[Piece]:
+    """Inputs of a bundle in the order of the observation."""
+    contract = policy.contract
+    parts, rest = contract.observation.scan_parts, len(contract.observation.rest_low)
+    layout, lidar = contract.scan, contract.lidar
+    seen: Data = {"kind": BEAMS, "lidar": lidar.model_dump(mode="json")}
+    if layout is not None:
+        seen = {"kind": SECTORS, "scan": layout.model_dump(mode="json")}
+    seen["unit"] = "share of range_max; 1 free, 0 too close or unknown"
+    pieces = [Piece("scan", parts, tuple(range(parts)), seen)]
+    if contract.task.name != "navigation":
+        low, high = contract.observation.rest_low, contract.observation.rest_high
+        limits = [list(pair) for pair in zip(low, high, strict=True)]
+        facts: Data = {"kind": f"state/task/{contract.task.name}", "limits": limits}
+        return [*pieces, Piece("rest", rest, tuple(range(rest)), facts)]
+    goal: Data = {"kind": "command/goal/polar", "unit": "m"}
+    names = [["goal.distance", "goal.cosine", "goal.sine"]]
+    linear: Data = {"kind": "state/body/linear_velocity", "element_names": [[*VELOCITIES]]}
+    angular: Data = {"kind": "state/body/angular_velocity", "element_names": [[*VELOCITIES]]}
+    pieces += [
+        Piece("goal", 3, (0, 1, 2), {**goal, "element_names": names}),
+        Piece("linear_velocity", 3, (1, 0), {**linear, "unit": "m/s"}),
+        Piece("angular_velocity", 3, (2,), {**angular, "unit": "rad/s"}),
+    ]
+    for sensor in contract.sensors:
+        facts = {"kind": f"state/{sensor.kind}", "sensor": sensor.model_dump(mode="json")}
+        pieces.append(Piece(sensor.name, sensor.parts, tuple(range(sensor.parts)), facts))
+    return pieces
+
+
+def _split(model: Any, pieces: Iterable[Piece]) -> None:
+    """Replaces the observation of a graph by inputs that it is joined of."""
+    build, batch = Builder(OURS), model.graph.input[0].type.tensor_type.shape.dim[0]
+    entry = model.metadata_props.add()
+    entry.key = TAKEN
+    entry.value = base64.b64encode(model.graph.input[0].SerializeToString()).decode()
+    rows, infos, others = [], [], list(model.graph.input)[1:]
+    for piece in pieces:
+        infos.append(onnx.helper.make_tensor_value_info(piece.name, TensorProto.FLOAT, [1, 1]))
+        infos[-1].type.tensor_type.shape.dim[0].CopyFrom(batch)
+        infos[-1].type.tensor_type.shape.dim[1].dim_value = piece.width
+        whole = len(piece.kept) == piece.width
+        rows.append(piece.name if whole else build.pick(piece.name, piece.kept))
+    build.join(rows, name=onnx_graph.INPUT)
+    nodes, weights = list(model.graph.node), list(model.graph.initializer)
+    for held, values in (
+        (model.graph.input, [*infos, *others]),
+        (model.graph.node, [*build.nodes, *nodes]),
+        (model.graph.initializer, [*build.weights, *weights]),
+    ):
+        del held[:]
+        held.extend(values)
+
+
+def restored(model: Any) -> bytes | None:
+    """The policy file of which an export made a ModelProto, bit for bit; None if it was no export.
+
+    Whether it is whole is told by its own seal.
+    """
+    found = [entry for entry in model.metadata_props if entry.key == TAKEN]
+    if len(found) != 1:
+        return None
+    taken, ours = onnx.ValueInfoProto(), onnx.ModelProto()
+    try:
+        taken.ParseFromString(base64.b64decode(found[0].value))
+    except (ValueError, DecodeError):
+        return None
+    ours.CopyFrom(model)
+    ours.metadata_props.remove(found[0])
+    first = next((k for k, n in enumerate(ours.graph.node) if onnx_graph.INPUT in n.output), -1)
+    del ours.graph.node[: first + 1]
+    weights = [one for one in ours.graph.initializer if not one.name.startswith(OURS)]
+    states = [one for one in model.graph.input if one.name == onnx_graph.STATE_IN]
+    for held, values in ((ours.graph.initializer, weights), (ours.graph.input, [taken, *states])):
+        del held[:]
+        held.extend(values)
+    return bytes(ours.SerializeToString(deterministic=True))
+
+
+def _described(policy: PolicyFile, pieces: Iterable[Piece], made: bytes, place: Path) -> Data:
+    contract, name = policy.contract, place.resolve().name
+    inputs = [_tensor(piece.name, [1, piece.width], **piece.facts) for piece in pieces]
+    outputs = _outputs(contract)
+    pipeline: Data = {
+        "configs": {
+            "frequency": 1.0 / contract.control_period, "control_period": contract.control_period,
+            "robot": contract.robot.name, "task": contract.task.name,
+        },
+        "data_flow": {}, "feedback_flow": {},
+        "inputs": {NODE: [piece.name for piece in pieces]},
+        "outputs": {NODE: [onnx_graph.ACTION, onnx_graph.COMMAND]},
+    }  # fmt: skip
+    if (state := contract.state) is not None:
+        one, other = (f"{NODE}/{end}" for end in (onnx_graph.STATE_OUT, onnx_graph.STATE_IN))
+        pipeline["feedback_flow"] = {one: [other]}
+        pipeline["initial_values"] = f"{name}_initial_values.safetensors"
+        pipeline["configs"]["longest_gap"] = state.longest_gap
+        inputs.append(_tensor(onnx_graph.STATE_IN, [1, state.size]))
+        outputs.append(_tensor(onnx_graph.STATE_OUT, [1, state.size]))
+    md5 = hashlib.md5(made, usedforsecurity=False).hexdigest()
+    parameters = {
+        "model_path": f"{NODE}.onnx", "md5sum": md5, "sha256sum": sha256(made), "backend": "onnx",
+    }  # fmt: skip
+    node = {"inputs": inputs, "outputs": outputs, "parameters": parameters}
+    system = {"leapp config version": CONFIG_VERSION, "made by": onnx_graph.KEY}
+    return {"models": {NODE: node}, "pipeline": pipeline, "system information": system}
+
+
+def _outputs(contract: Contract) -> list[Data]:
+    """The action, and the command that it means, in the robot's units."""
+    commands = contract.robot.command
+    limits = [[command.min, command.max] for command in commands]
+    discrete, size = contract.actions == "discrete", len(commands)
+    of_twist = all(command.is_twist for command in commands)
+    names = [str(command.cmd_vel) if of_twist else command.name for command in commands]
+    return [
+        _tensor(
+            onnx_graph.ACTION, [1] if discrete else [1, size],
+            dtype="int64" if discrete else "float32", kind="target/action",
+            **({} if discrete else {"limits": [[-1.0, 1.0] for _ in commands]}),
+        ),
+        _tensor(
+            onnx_graph.COMMAND, [1, size],
+            kind="target/body/velocity" if of_twist else "target/command",
+            element_names=[names], units=[command.unit for command in commands], limits=limits,
+        ),
+    ]  # fmt: skip
+
+
+def _tensor(name: str, shape: list[int], dtype: str = "float32", **facts: Any) -> Data:
+    return {"name": name, "dtype": dtype, "shape": shape, "type": "tensor", **facts}
+
+
+def _safetensors(arrays: Mapping[str, NDArray[np.float32]]) -> bytes:
+    """Arrays in the format of safetensors: length of the head, JSON head, numbers."""
+    head, body = {}, b""
+    for name, array in arrays.items():
+        ends = [len(body), len(body) + array.nbytes]
+        head[name] = {"dtype": "F32", "shape": list(array.shape), "data_offsets": ends}
+        body += array.astype("<f4").tobytes()
+    text = json.dumps(head).encode()
+    text += b" " * (-len(text) % 8)
+    return struct.pack("<Q", len(text)) + text + body

@@ -1,0 +1,345 @@
+"""Reads bundles of LEAPP, ours and others': joins their networks, and derives what they mean."""
+
+import json
+import math
+import struct
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+from pydantic import BaseModel, ConfigDict, Field
+
+from nics_drl_bridge.config import parse_yaml, read_text, validate
+from nics_drl_bridge.errors import PolicyError, nearest
+from nics_drl_bridge.files import sha256
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.policy import onnx_graph
+from nics_drl_bridge.policy.foreign_graph import Network
+from nics_drl_bridge.policy.foreign_mapping import ForeignState
+from nics_drl_bridge.policy.leapp import BEAMS, SECTORS, restored
+
+Data = dict[str, Any]
+ZERO = "constant"  # of what a robot in the plane does not have
+LINEAR = {"x": "velocity.forward", "y": "velocity.left", "z": ZERO}
+ANGULAR = {"x": ZERO, "y": ZERO, "z": "velocity.turn"}
+BOTH = {f"linear.{k}": v for k, v in LINEAR.items()}
+BOTH |= {f"angular.{k}": v for k, v in ANGULAR.items()}
+GOAL = {f"goal.{name}": f"goal.{name}" for name in
+        ("distance", "bearing", "cosine", "sine", "x", "y")}  # fmt: skip
+SEEN = {  # meaning of elements by kind and name; without names they are in this order
+    "state/body/linear_velocity": LINEAR, "state/body/angular_velocity": ANGULAR,
+    "state/body/velocity": BOTH, "command/goal/polar": GOAL, "command/goal": GOAL,
+}  # fmt: skip
+DONE = {  # the same of outputs
+    "target/body/linear_velocity": LINEAR, "target/body/angular_velocity": ANGULAR,
+    "target/body/velocity": BOTH,
+}  # fmt: skip
+MAPPING = "say what it is in a mapping of your own (docs/foreign_policies.md)"
+
+
+class Open(BaseModel):
+    """Base of the entries of a bundle, to which everyone may add."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+
+class Tensor(Open):
+    """An input or output of a node."""
+
+    name: str
+    shape: Any = None
+    kind: str | None = None
+    element_names: Any = None
+
+    @property
+    def names(self) -> list[str]:
+        """Names of its elements, or none."""
+        given = self.element_names
+        while isinstance(given, list) and given and isinstance(given[-1], list):
+            given = given[-1]
+        return [str(name) for name in given] if isinstance(given, list) else []
+
+
+class Parameters(Open):
+    """The network of a node."""
+
+    model_path: str
+    sha256sum: str
+    backend: str
+
+
+class Node(Open):
+    """A network with its inputs and outputs."""
+
+    inputs: list[Tensor]
+    outputs: list[Tensor]
+    parameters: Parameters
+
+
+class Pipeline(Open):
+    """Connections of nodes, as `node/output: [node/input]`, and what comes from outside."""
+
+    inputs: dict[str, list[str]]
+    outputs: dict[str, list[str]]
+    data_flow: dict[str, list[str]] = Field(default_factory=dict)
+    feedback_flow: dict[str, list[str]] = Field(default_factory=dict)
+    initial_values: str | None = None
+    configs: dict[str, Any] = Field(default_factory=dict)
+
+
+class Description(Open):
+    """The YAML file of a bundle."""
+
+    models: dict[str, Node] = Field(min_length=1)
+    pipeline: Pipeline
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A bundle that was read; names are those of inputs and outputs, with their node if shared."""
+
+    path: Path  # of the YAML file
+    description: Description
+    models: dict[str, Any]  # onnx.ModelProto of each node
+    sha256: str  # of all of them
+
+    @cached_property
+    def ours(self) -> bytes | None:
+        """The policy file that was exported as this bundle, or None if it was none of ours."""
+        models = list(self.models.values())
+        return restored(models[0]) if len(models) == 1 else None
+
+    @cached_property
+    def network(self) -> Network:
+        """Its networks as one. Raises PolicyError if they do not fit together."""
+        return Network(_merged(self), self._states())
+
+    @cached_property
+    def inputs(self) -> dict[str, Tensor]:
+        """Entries of the inputs from outside."""
+        return self._entries("inputs", self.description.pipeline.inputs)
+
+    @cached_property
+    def outputs(self) -> dict[str, Tensor]:
+        """Entries of the outputs."""
+        return self._entries("outputs", self.description.pipeline.outputs)
+
+    def name_of(self, end: str) -> str:
+        """The name of `node/output` or `node/input` in the network of all nodes."""
+        pipeline = self.description.pipeline
+        ends = [f"{node}/{name}" for some in (pipeline.inputs, pipeline.outputs)
+                for node, names in some.items() for name in names]  # fmt: skip
+        ends += [one for some in pipeline.feedback_flow.items() for one in (some[0], *some[1])]
+        short = end.partition("/")[2]
+        return end if sum(one.endswith(f"/{short}") for one in set(ends)) > 1 else short
+
+    def _entries(self, side: str, ends: dict[str, list[str]]) -> dict[str, Tensor]:
+        found = {}
+        for node, names in ends.items():
+            if node not in self.description.models:
+                fix = nearest(node, self.description.models)
+                raise self.fault(f"pipeline.{side}", f"names no node {node!r}; {fix}")
+            known = {one.name: one for one in getattr(self.description.models[node], side)}
+            for name in names:
+                if name not in known:
+                    fix = nearest(name, known)
+                    raise self.fault(f"pipeline.{side}.{node}", f"has no {name!r}; {fix}")
+                found[self.name_of(f"{node}/{name}")] = known[name]
+        return found
+
+    def _states(self) -> dict[str, ForeignState]:
+        pipeline = self.description.pipeline
+        start = {} if pipeline.initial_values is None else self._initial(pipeline.initial_values)
+        return {
+            self.name_of(target): ForeignState(
+                next=self.name_of(output), start=start.get(target, 0.0)
+            )
+            for output, targets in pipeline.feedback_flow.items()
+            for target in targets
+        }
+
+    def _initial(self, name: str) -> dict[str, tuple[float, ...]]:
+        """Arrays of a file of safetensors, flat, by `node/input`."""
+        data = _read(self, name, "pipeline.initial_values")
+        try:
+            (size,) = struct.unpack_from("<Q", data)
+            head = json.loads(data[8 : 8 + size])
+            kinds = {"F32": "<f4", "F64": "<f8", "I64": "<i8", "I32": "<i4"}
+            found = {}
+            for key, entry in head.items():
+                if key != "__metadata__":
+                    begin, end = entry["data_offsets"]
+                    part = data[8 + size :][begin:end]
+                    values = np.frombuffer(part, kinds[entry["dtype"]])
+                    found[key] = tuple(values.astype(float).tolist())
+        except (struct.error, ValueError, KeyError, TypeError, AttributeError):
+            reason = f"{name!r} is no file of safetensors with numbers; export the bundle anew."
+            raise self.fault("pipeline.initial_values", reason) from None
+        return found
+
+    def fault(self, place: str, reason: str) -> PolicyError:
+        """The error for a place in the YAML file."""
+        return PolicyError(str(self.path), place, reason)
+
+
+def description_of(place: Path) -> Path | None:
+    """The YAML file of a bundle, by it or by its folder; None for another YAML file.
+
+    Raises PolicyError if a folder holds none or several, ConfigError if it can't be read.
+    """
+    if place.is_file() and place.suffix not in (".yaml", ".yml"):
+        reason = "is no YAML file; give a LEAPP bundle, or the mapping of a foreign policy."
+        raise PolicyError(str(place), "file", reason)
+    files = sorted(place.glob("*.yaml")) if place.is_dir() else [place]
+    found = [file for file in files if "models" in parse_yaml(read_text(file), str(file))]
+    if place.is_dir() and len(found) != 1:
+        reason = f"holds {len(found)} descriptions of a bundle; give the path of a YAML file."
+        raise PolicyError(str(place), "file", reason)
+    return found[0] if found else None
+
+
+def read_bundle(path: Path) -> Bundle:
+    """Reads a bundle and checks its networks. Raises ConfigError or PolicyError."""
+    description = validate(parse_yaml(read_text(path), str(path)), Description, str(path))
+    models: dict[str, Any] = {}
+    bundle = Bundle(path, description, models, "")
+    digests = []
+    for name, node in description.models.items():
+        place, given = f"models.{name}.parameters", node.parameters
+        if given.backend != "onnx":
+            reason = f"is {given.backend!r}, which is never opened here; export it with 'onnx'."
+            raise bundle.fault(f"{place}.backend", reason)
+        data = _read(bundle, given.model_path, f"{place}.model_path")
+        digests.append(sha256(data))
+        if digests[-1] != given.sha256sum:
+            reason = f"does not fit {given.model_path!r}, which was changed or damaged."
+            raise bundle.fault(f"{place}.sha256sum", reason)
+        models[name] = onnx_graph.parsed(data, str(path.parent / given.model_path))
+        onnx_graph.check_graph(models[name], str(path.parent / given.model_path))
+    return Bundle(path, description, models, sha256("".join(digests).encode()))
+
+
+def _read(bundle: Bundle, name: str, place: str) -> bytes:
+    """A file of a bundle, which lies in its folder."""
+    folder = bundle.path.parent.resolve()
+    file = (folder / name).resolve()
+    if not file.is_relative_to(folder):
+        raise bundle.fault(place, f"{name!r} lies outside the bundle; not opened.")
+    try:
+        if file.stat().st_size > onnx_graph.SIZE_LIMIT:
+            most = onnx_graph.SIZE_LIMIT // 2**20
+            raise bundle.fault(place, f"{name!r} has more than {most} MB; not opened.")
+        return file.read_bytes()
+    except OSError as error:
+        raise bundle.fault(place, f"{name!r} can't be read ({error.strerror}).") from None
+
+
+def _merged(bundle: Bundle) -> Any:
+    """One graph of all nodes in their order: connections are nodes that copy."""
+    description, pipeline = bundle.description, bundle.description.pipeline
+    graph, newest = onnx.GraphProto(name="bundle"), 0
+    opsets: dict[int, Any] = {}
+    ready: set[str] = set()
+    infos: dict[str, Any] = {}
+    source_of = {t: source for source, targets in pipeline.data_flow.items() for t in targets}
+    outside = {f"{node}/{name}" for node, names in pipeline.inputs.items() for name in names}
+    outside |= {target for targets in pipeline.feedback_flow.values() for target in targets}
+    for name in description.models:
+        model = onnx.compose.add_prefix(bundle.models[name], f"{name}/")
+        held = {tensor.name for tensor in model.graph.initializer}
+        for one in (each for each in model.graph.input if each.name not in held):
+            if one.name in outside:
+                own = onnx.ValueInfoProto()
+                own.CopyFrom(one)
+                own.name = source = bundle.name_of(one.name)
+                graph.input.append(own)
+            elif (source := source_of.get(one.name, "")) not in ready:
+                reason = f"nothing before the node gives {one.name!r}; connect it."
+                raise bundle.fault("pipeline.data_flow", reason)
+            graph.node.append(onnx.helper.make_node("Identity", [source], [one.name]))
+        graph.node.extend(model.graph.node)
+        graph.initializer.extend(model.graph.initializer)
+        infos |= {one.name: one for one in model.graph.output}
+        ready |= infos.keys()
+        opsets |= {one.version: one for one in model.opset_import if one.domain in ("", "ai.onnx")}
+        newest = max(newest, model.ir_version)
+    if len(opsets) != 1:
+        reason = f"have opsets {sorted(opsets)}; export them with the same one."
+        raise bundle.fault("models", reason)
+    given = {f"{node}/{name}" for node, names in pipeline.outputs.items() for name in names}
+    for end in sorted(given | pipeline.feedback_flow.keys()):
+        if end not in infos:
+            raise bundle.fault("pipeline.outputs", f"no network gives {end!r}.")
+        infos[end].name = bundle.name_of(end)
+        graph.output.append(infos[end])
+        graph.node.append(onnx.helper.make_node("Identity", [end], [infos[end].name]))
+    return onnx.helper.make_model(graph, opset_imports=list(opsets.values()), ir_version=newest)
+
+
+# What a bundle of others means, as far as it says so.
+
+
+def mapping_of(bundle: Bundle, model: SimulatorModel) -> Data:
+    """The mapping of a bundle by the kinds and names of its elements, as `ForeignPolicy` has it.
+
+    Raises PolicyError for an input whose meaning is not told.
+    """
+    configs = bundle.description.pipeline.configs
+    frequency = configs.get("frequency")
+    period = 1.0 / frequency if isinstance(frequency, int | float) and frequency > 0 else None
+    data: Data = {
+        "kind": "foreign policy", "network": bundle.path.name,
+        "control_period": None if period is None else round(period, 9),
+        "inputs": {}, "outputs": {},
+    }  # fmt: skip
+    for name, entry in bundle.inputs.items():
+        if name in bundle.network.states:
+            continue
+        data["inputs"][name] = {"parts": _parts(bundle, name, entry, data)}
+    for name, entry in bundle.outputs.items():
+        _add_commands(data["outputs"], name, entry, model)
+    missing = [] if data["outputs"].keys() >= {"forward", "turn"} else ["forward", "turn"]
+    own = {command.name for command in model.robot.command}
+    if missing and data["outputs"].keys() != own:
+        kinds = ", ".join(f"{name!r} of kind {one.kind!r}" for name, one in bundle.outputs.items())
+        reason = f"{kinds}: none is told to be the robot's velocity; {MAPPING}."
+        raise bundle.fault("pipeline.outputs", reason)
+    return data
+
+
+def _parts(bundle: Bundle, name: str, entry: Tensor, data: Data) -> list[Data]:
+    kind, extra = entry.kind or "", entry.model_extra or {}
+    if kind == BEAMS or (kind == SECTORS and isinstance(extra.get("scan"), dict)):
+        layout = extra.get("scan")
+        data["scan"] = layout
+        share = str(extra.get("unit", "")).startswith("share")
+        far = (extra.get("lidar") if layout is None else layout) or {}
+        return [{"of": "scan", "divide": far.get("range_max", 1.0) if share else 1.0}]
+    size = math.prod(entry.shape) if isinstance(entry.shape, list) else 0
+    meanings, names = SEEN.get(kind, {}), entry.names
+    if not names and len(meanings) == size:
+        names = list(meanings)
+    if not names or len(names) != size or not all(one in meanings for one in names):
+        told = f"kind {entry.kind!r}" + (f" with elements {names}" if names else "")
+        reason = f"{told} is not known as scan, goal or velocity of a robot; {MAPPING}."
+        raise bundle.fault(f"pipeline.inputs.{name}", reason)
+    zero = {"of": ZERO, "value": 0.0}
+    return [zero if meanings[one] == ZERO else {"of": meanings[one]} for one in names]
+
+
+def _add_commands(outputs: Data, name: str, entry: Tensor, model: SimulatorModel) -> None:
+    meanings, size = DONE.get(entry.kind or "", {}), math.prod(entry.shape or [0])
+    names = entry.names or (list(meanings) if len(meanings) == size else [])
+    own = {command.name for command in model.robot.command}
+    fields = {command.cmd_vel for command in model.robot.command}
+    for index, one in enumerate(names):
+        word = meanings.get(one, "").removeprefix("velocity.")
+        if entry.kind == "target/command" and one in own:
+            outputs[one] = {"of": name, "index": index}
+        elif word == "left" and "linear.y" not in fields:
+            continue
+        elif word and word != ZERO:
+            outputs[word] = {"of": name, "index": index}
