@@ -87,7 +87,7 @@ def _pieces(policy: PolicyFile) -> list[Piece]:
     angular: Data = {"kind": "state/body/angular_velocity", "element_names": [[*VELOCITIES]]}
     pieces += [
         Piece("goal", 3, (0, 1, 2), {**goal, "element_names": names}),
-        Piece("linear_velocity", 3, (1, 0), {**linear, "unit": "m/s"}),
+        Piece("linear_velocity", 3, (0, 1), {**linear, "unit": "m/s"}),
         Piece("angular_velocity", 3, (2,), {**angular, "unit": "rad/s"}),
     ]
     for sensor in contract.sensors:

@@ -334,12 +334,11 @@ def _add_commands(outputs: Data, name: str, entry: Tensor, model: SimulatorModel
     meanings, size = DONE.get(entry.kind or "", {}), math.prod(entry.shape or [0])
     names = entry.names or (list(meanings) if len(meanings) == size else [])
     own = {command.name for command in model.robot.command}
-    fields = {command.cmd_vel for command in model.robot.command}
     for index, one in enumerate(names):
         word = meanings.get(one, "").removeprefix("velocity.")
         if entry.kind == "target/command" and one in own:
             outputs[one] = {"of": name, "index": index}
-        elif word == "left" and "linear.y" not in fields:
+        elif word == "left" and not model.robot.moves_sideways:
             continue
         elif word and word != ZERO:
             outputs[word] = {"of": name, "index": index}
