@@ -17,7 +17,7 @@ SERIES = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, SKY, BLACK)
 MEASURED, MODEL, GOAL = BLUE, VERMILION, ORANGE
 OTHER, DARK, EDGE = "#8d99ae", "#333333", "#c5cbd3"
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")  # of `SERIES`, as told apart without colours
-RC: dict[str, Any] = {
+RC: dict[Any, Any] = {
     "axes.axisbelow": True, "axes.edgecolor": OTHER, "axes.grid": True,
     "axes.labelcolor": DARK, "axes.labelsize": 9.5,
     "axes.prop_cycle": cycler(color=SERIES), "axes.spines.right": False, "axes.spines.top": False,
@@ -61,8 +61,8 @@ def png(figure: Figure, legend: Axes | None = None) -> bytes:
             axes.set_title("\n".join(title))
     if legend is not None:
         handles, labels = legend.get_legend_handles_labels()
-        letters = int(LETTERS_PER_IN * figure.get_figwidth())
-        columns = max(1, min(len(labels), letters // (max(map(len, labels), default=1) + 6)))
+        room, each = LETTERS_PER_IN * figure.get_figwidth(), [len(label) + 5 for label in labels]
+        columns = len(labels) if sum(each) <= room else max(1, int(room / max(each)))
         figure.legend(handles, labels, loc="outside upper center", ncols=columns)
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png")

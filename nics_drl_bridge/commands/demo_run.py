@@ -277,8 +277,8 @@ def _verdict(
     ]
     given = f"{learned.policy} --model {plan.model} --world {plan.world}"
     return verdict_blocks(
-        tiles, conclude(identified), f"Drive more episodes: nics evaluate {given}",
-        "Take your own robot: nics demo --recording DRIVE --robot ROBOT.yaml",
+        tiles, conclude(identified), f"nics evaluate {given}",
+        "nics demo --recording DRIVE --robot ROBOT.yaml  # of your own robot",
     )  # fmt: skip
 
 

@@ -8,6 +8,7 @@ from nics_drl_bridge.identify.judgement import shortfall, usual
 from nics_drl_bridge.identify.verdict import doubts
 from nics_drl_bridge.robot.taylor import EndErrors
 
+OF_PATH = " of the path"
 UNTRIED = "The drive was too short to try the model on data that it had not seen."
 
 
@@ -32,7 +33,7 @@ def conclude(identified: Identified) -> Conclusion:
     if about or not identified.judgement:
         advice = "drive once more, for 60 s or longer, and generate anew before a policy is trained"
     elif gaps:
-        advice = "drive once more as said above, or train only where the drive has been"
+        advice = "train a policy in the simulator, or first drive once more as said above"
     else:
         advice = "train a policy in the simulator"
     return Conclusion(accuracy(identified), about, gaps, f"Next: {advice}.")
@@ -44,12 +45,10 @@ def accuracy(identified: Identified) -> str:
         if not isfinite(at.model.position_m):
             return f"On unseen data the predictions run away within {at.horizon_s:g} s."
         named = {"a fitted textbook": at.textbook, "a kept twist": at.kept_twist}
-        beside = " and ".join(
-            f"{end_of(errors, at.path_m)} by {name}" for name, errors in named.items() if errors
-        )
-        found = f"On unseen data the predictions end {at.model.position_m:.3g} m"
-        share = f", {end_of(at.model, at.path_m)}," if at.path_m > 0.0 else ""
-        return f"{found}{share} off after {at.horizon_s:g} s; {beside}."
+        beside = (f"{name} {end_of(each, at.path_m)}" for name, each in named.items() if each)
+        found = f"On unseen data the predictions end {at.model.position_m:.3g} m off"
+        share = f" ({end_of(at.model, at.path_m)})" if at.path_m > 0.0 else ""
+        return f"{found} after {at.horizon_s:g} s{share}; {', '.join(beside)}."
     return UNTRIED
 
 
@@ -57,5 +56,5 @@ def end_of(errors: EndErrors, path: float) -> str:
     """Formats an error of position as a share of the path [m], or in metres if there is none."""
     if path > 0.0 and isfinite(errors.position_m):
         share = 100.0 * errors.position_m / path
-        return f"{f'{share:.1f}' if share >= 0.1 else 'less than 0.1'} % of the path"
+        return f"{f'{share:.1f}' if share >= 0.1 else '< 0.1'} %{OF_PATH}"
     return f"{errors.position_m:.3g} m"

@@ -101,7 +101,7 @@ def about_mounting(
         yield f"The tracked point lies at x {x:.4f} m, y {y:.4f} m of base_link."
     if y_hidden and not x_hidden and not drive.spec.moves_sideways:
         why = f"since {y_hidden}; it is taken as zero"
-        yield Gap(f"The tracked point's place along y could not be learnt, {why}.")
+        yield f"The tracked point's place along y could not be learnt, {why}."
 
 
 def about_responses(

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from nics_drl_bridge.files import write_text
-from nics_drl_bridge.identify.conclusion import Conclusion, conclude, end_of
+from nics_drl_bridge.identify.conclusion import OF_PATH, Conclusion, conclude, end_of
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.judgement import shortfall, usual
 from nics_drl_bridge.identify.report import (
@@ -33,25 +33,26 @@ def fit_tile(identified: Identified) -> Tile:
     """Returns the accuracy of a fit as a figure, its meaning, and false if it is doubtful."""
     doubtful = [*shortfall(identified.judgement), *doubts(identified.held_out)]
     for at in usual(identified.judgement):
-        beside = {"fitted textbook": at.textbook, "twist kept": at.kept_twist}
-        told = ", ".join(f"{name} {end_of(e, at.path_m)}" for name, e in beside.items() if e)
-        figure = end_of(at.model, at.path_m)
-        meaning = f"off on unseen data after {at.horizon_s:g} s; {told}"
+        beside = {"": at.model, "fitted textbook ": at.textbook, "twist kept ": at.kept_twist}
+        told = [name + end_of(each, at.path_m) for name, each in beside.items() if each]
+        figure, *others = (text.removesuffix(OF_PATH) for text in told)
+        off = f"{OF_PATH} off".lstrip() if told[0] != figure else "off"
+        meaning = f"{off} after {at.horizon_s:g} s, on unseen data; {', '.join(others)}"
         return figure, meaning, not doubtful
     return "untried", "on data that it had not seen, as the drive is too short", False
 
 
-def verdict_blocks(tiles: Sequence[Tile], conclusion: Conclusion, *advice: str) -> Blocks:
+def verdict_blocks(tiles: Sequence[Tile], conclusion: Conclusion, *commands: str) -> Blocks:
     """Figures in large type, doubts, what could not be learnt, and what to do next."""
     blocks = [html.tiles(tiles)]
     if conclusion.doubts:
         blocks.append(html.bullets(conclusion.doubts))
     if conclusion.gaps:
-        blocks += [html.paragraph("Not learnt:"), html.bullets(conclusion.gaps)]
+        blocks += [html.paragraph("The drive could not teach all:"), html.bullets(conclusion.gaps)]
     else:
-        blocks.append(html.paragraph("Nothing that this drive could have taught is missing."))
-    steps = [conclusion.advice.removeprefix("Next: ").capitalize(), *advice]
-    return [*blocks, html.paragraph("Next:"), html.bullets(steps)]
+        blocks.append(html.paragraph("The drive taught all that the model needs."))
+    blocks.append(html.paragraph(conclusion.advice))
+    return [*blocks, html.code("\n".join(commands))] if commands else blocks
 
 
 def path_blocks(identified: Identified) -> Blocks:
@@ -59,18 +60,22 @@ def path_blocks(identified: Identified) -> Blocks:
     if identified.held_out is None or not identified.judgement:
         return [html.paragraph("The drive is too short to hold data out.")]
     drawn = [(each, "") for each in unseen_paths(identified.trial, PATHS_SHOWN)]
-    caption = "Mean errors of predictions of unseen data, below the yardsticks if the model is good"
+    caption = (
+        "Mean errors of predictions of unseen data: of a good model they are below the others."
+    )
+    if any(at.band_m for at in identified.judgement):
+        caption += " Bars: distances within which 95 % of its ends are expected."
     rows = html.table(HEADS, judgement_rows(identified.judgement))
     return [
         html.gallery(drawn),
-        html.picture(yardsticks(identified), f"{caption}; 95 % of its ends are expected within."),
+        html.picture(yardsticks(identified), caption),
         html.details("The same in figures", [html.paragraph(COMPARED), rows]),
     ]
 
 
 def model_blocks(spec: RobotSpec, identified: Identified, report: str) -> Blocks:
     """The equations, and folded all figures and pictures of fit and calibration."""
-    fit = {name: png for name, png in fit_pictures(spec, identified).items() if name in CAPTIONS}
+    fit = fit_pictures(spec, identified, paths=False)
     drawn = {**fit, **calibration_pictures(spec, identified)}
     pictures = [html.picture(png, CAPTIONS[name]) for name, png in drawn.items()]
     equations = "\n".join(equations_with_errors(identified.model))
@@ -94,9 +99,9 @@ def write_fit_page(
     if assumed:
         figures.append((str(assumed), "of the terms are assumed from the textbook", False))
     train = f"nics train --robot {folder} --world arena --seeds 0 --out runs/first"
-    advice = () if conclusion.doubts else (train,)
+    commands = () if conclusion.doubts else (train,)
     sections = [
-        ("Verdict", verdict_blocks(figures, conclusion, *advice)),
+        ("Verdict", verdict_blocks(figures, conclusion, *commands)),
         ("Paths", path_blocks(identified)),
         ("Model", model_blocks(spec, identified, report)),
     ]

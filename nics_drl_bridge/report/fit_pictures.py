@@ -65,11 +65,11 @@ def write_pictures(spec: RobotSpec, identified: Identified, folder: str | Path) 
     return tuple(files)
 
 
-def fit_pictures(spec: RobotSpec, identified: Identified) -> dict[str, bytes]:
+def fit_pictures(spec: RobotSpec, identified: Identified, paths: bool = True) -> dict[str, bytes]:
     """The pictures of a fit by name, as far as the recording shows them, each a PNG."""
     by_motion = identified.findings.width is not None  # pruning did not choose its terms
     pictures = {} if by_motion else {"accuracy": accuracy(identified)}
-    if identified.held_out is not None:
+    if paths and identified.held_out is not None:
         pictures["paths"] = held_out_paths(identified.trial)
     if identified.unseen is not None and np.abs(identified.unseen.dq).max() > LEAST_RATE:
         pictures["residuals"] = residuals(identified.trial, identified.unseen)
@@ -138,13 +138,13 @@ def _unseen_path(axes: Axes, paths: tuple[Array, Array, float]) -> None:
     axes.plot(*path[:, :2].T, color=MODEL, linestyle="--", label="predicted")
     axes.plot(*truth[0, :2], "o", color=DARK, markersize=5, label="start")
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_title(f"{apart:.3f} m apart after {HORIZON_S:g} s")
+    axes.set_title(f"{apart:.2g} m apart after {HORIZON_S:g} s")
     axes.set(xlabel="x [m]", ylabel="y [m]")
 
 
 def yardsticks(identified: Identified) -> bytes:
     """Draws mean errors on unseen data over the horizon, beside those of the yardsticks."""
-    figure, (axes,) = panels(1, 1, (6.3, 3.8))
+    figure, (axes,) = panels(1, 1, (5.0, 3.6))
     judgement = identified.judgement
     for name, label, colour, line in (
         ("model", "model", MODEL, "o-"), ("textbook", "fitted textbook", MEASURED, "s--"),

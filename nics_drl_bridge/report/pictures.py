@@ -91,7 +91,7 @@ class Point(NamedTuple):
 
 def training_curve(points: Sequence[Point]) -> bytes:
     """Draws success and collisions [%] over the environment steps."""
-    figure, (axes,) = panels(1, 1, (7.5, 3.8))
+    figure, (axes,) = panels(1, 1, (5.2, 3.6))
     steps, *shares = np.array(points, np.float64).T
     for name, share, line in zip(("success", "collision"), shares, ("-", "--"), strict=True):
         axes.plot(steps / 1e3, 100.0 * share, line, linewidth=2.0, label=name)
