@@ -32,6 +32,8 @@ def conclude(identified: Identified) -> Conclusion:
     gaps = identified.gaps
     if about or not identified.judgement:
         advice = "drive once more, for 60 s or longer, and generate anew before a policy is trained"
+    elif identified.fit.unmoved or identified.model.assumed:
+        advice = "drive once more as said above: a policy would act by what was not learnt"
     elif gaps:
         advice = "train a policy in the simulator, or first drive once more as said above"
     else:
@@ -45,7 +47,8 @@ def accuracy(identified: Identified) -> str:
         if not isfinite(at.model.position_m):
             return f"On unseen data the predictions run away within {at.horizon_s:g} s."
         named = {"a fitted textbook": at.textbook, "a kept twist": at.kept_twist}
-        beside = (f"{name} {end_of(each, at.path_m)}" for name, each in named.items() if each)
+        ends = {name: end_of(each, at.path_m) for name, each in named.items() if each}
+        beside = (f"{name} {end.removesuffix(OF_PATH)}" for name, end in ends.items())
         found = f"On unseen data the predictions end {at.model.position_m:.3g} m off"
         share = f" ({end_of(at.model, at.path_m)})" if at.path_m > 0.0 else ""
         return f"{found} after {at.horizon_s:g} s{share}; {', '.join(beside)}."

@@ -7,8 +7,9 @@ from html import escape
 STYLE = """
 :root { color-scheme: light dark; --ink: #1f2328; --soft: #57606a; --line: #d9dee4;
   --paper: #fff; --card: #f6f7f9; --good: #00704f; --bad: #b04a00 }
-@media (prefers-color-scheme: dark) { :root { --ink: #e6e9ed; --soft: #9aa5b1; --line: #343b44;
-  --paper: #14171a; --card: #1e2328; --good: #3fc79c; --bad: #ff9a55 }
+@media screen and (prefers-color-scheme: dark) {
+  :root { --ink: #e6e9ed; --soft: #9aa5b1; --line: #343b44; --paper: #14171a;
+    --card: #1e2328; --good: #3fc79c; --bad: #ff9a55 }
   img { filter: invert(.91) hue-rotate(180deg) } }
 * { box-sizing: border-box }
 body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 68rem;
@@ -32,8 +33,9 @@ summary { cursor: pointer; font-weight: 600; padding: .7rem 0 }
 figure { margin: 1rem 0; break-inside: avoid } .gallery figure { margin: 0 }
 img { max-width: 100%; height: auto }
 @media (max-width: 40rem) { figure.wide img { max-width: none; width: 44rem } }
-@media print { body { margin: 0; max-width: none; color: #000; background: #fff }
-  img { filter: none } pre { white-space: pre-wrap; font-size: 8pt } th, td { padding: .2rem .5rem }
+@media print { body { margin: 0; max-width: none }
+  .gallery { grid-template-columns: repeat(3, 1fr) }
+  pre { white-space: pre-wrap; font-size: 8pt } th, td { padding: .2rem .5rem }
   details::details-content { content-visibility: visible; height: auto; display: block }
   figure.wide img { max-width: 100%; width: auto } h2 { break-after: avoid } }
 """
