@@ -54,6 +54,8 @@ def png(figure: Figure, legend: Axes | None = None) -> bytes:
     for axes in figure.axes:
         if not axes.has_data():
             axes.set_axis_off()
+        if (own := axes.get_legend()) is not None:
+            own.set_frame_on(False)
         if (cell := axes.get_subplotspec()) is not None:
             share = len(cell.colspan) / cell.get_gridspec().ncols
             letters = int(LETTERS_PER_IN * share * figure.get_figwidth())

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
@@ -160,7 +160,8 @@ def yardsticks(identified: Identified) -> bytes:
     axes.set(xscale="log", yscale="log", xlabel="horizon [s]", ylabel="error of position [m]")
     ticks = [at.horizon_s for at in judgement]
     axes.set_xticks(ticks, [f"{s:g}" for s in ticks])
-    axes.minorticks_off()
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_formatter("{x:g}")
     return png(figure, axes)
 
 

@@ -11,8 +11,8 @@ import pytest
 from identify.drives import drive
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import FitError, RecordingError
-from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.conclusion import conclude
+from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.repair import check_axes
 from nics_drl_bridge.recording.recording import Recording, Stream

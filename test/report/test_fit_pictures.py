@@ -41,7 +41,7 @@ def test_a_page_of_a_fit_begins_with_its_verdict_and_folds_all_figures(found, tm
     figure, meaning, good = fit_tile(identified)
     assert html.index(figure.replace("<", "&lt;")) < html.index(meaning) < html.index("Paths")
     assert good
-    shown = re.sub("<details>.*?</details>", "", html)
+    shown = re.sub("(?s)<details>.*?</details>", "", html)
     assert "Cross-validated error" in html
     assert "Cross-validated error" not in shown
     assert shown.count("<img") == 4  # three paths, and the yardsticks

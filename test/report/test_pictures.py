@@ -121,7 +121,7 @@ def test_obstacles_that_move_are_marked_with_the_ways_of_those_that_patrol():
     for motion in (None, {"kind": "wander", "speed": [0.1, 0.2]}, patrol):
         world = field(count=1, obstacles=[circles(1) | {"motion": motion}])
         image = decoded(world_picture(world, 0.2, 0))
-        rings.append(len(pixels_of(image, MODEL, off=60)))
+        rings.append(len(pixels_of(image, MODEL, off=30)))
     assert rings[0] < 20
     assert rings[0] + 100 < rings[1] < rings[2] - 20
 
