@@ -72,6 +72,16 @@ class Learned:
     curve: Sequence[pictures.Point] = ()
 
 
+@dataclass(frozen=True)
+class Episodes:
+    """Episodes of the demo: of the evaluation, and the same ones in process and over DDS."""
+
+    summary: Summary
+    here: Sequence[Episode]  # in process
+    there: Sequence[Episode]  # over DDS
+    live: Episode  # deployed
+
+
 def run(plan: DemoPlan, say: Say) -> str:
     """Runs all parts, whose processes have then ended; returns the last line. BridgeError."""
     if find_spec("rclpy") is None:
@@ -93,20 +103,15 @@ def run(plan: DemoPlan, say: Say) -> str:
     arrived = (episode.seed for episode in there if episode.result == "success")
     live = timed("deploying", _deploy, model, learned.policy, next(arrived, 0))
     times = [(part, f"{s:.0f}") for part, s in {**took, "all": sum(took.values())}.items()]
-    sections: list[tuple[str, Sequence[str]]] = [
-        ("Verdict", _verdict(plan, learned, identified, summary, here, there, live)),
-        ("Paths in the world", _episodes(plan, model, here, there, live)),
-        ("The policy", _policy(plan, learned, summary)),
-        ("Paths of the model", path_blocks(identified)),
-        ("The model", model_blocks(model.robot, identified, model.report)),
-        ("Time", [html.details("Wall time", [html.table(("part", "wall time [s]"), times)])]),
-    ]
+    episodes = Episodes(summary, here, there, live)
+    sections = sections_of(plan, model, identified, learned, episodes)
+    folded = html.details("Wall time", [html.table(("part", "wall time [s]"), times)])
     file = plan.out / "report.html"
     lead = (
         f"Robot {model.robot.name!r} in the world {plan.world!r}, policy {learned.policy!r}, "
         f"simulator generated from {plan.recording or 'a textbook drive'}."
     )
-    write_text(file, html.page("nics_drl_bridge: demo", lead, sections))
+    write_text(file, html.page("nics_drl_bridge: demo", lead, [*sections, ("Time", [folded])]))
     return (
         f"demo: in process {successes(here)}/{plan.episodes}, "
         f"over DDS {successes(there)}/{plan.episodes}, report {file}"
@@ -255,11 +260,24 @@ def _write_limits(robot: RobotSpec, path: Path) -> Path:
     return path
 
 
+def sections_of(
+    plan: DemoPlan, model: SimulatorModel, identified: Identified, learned: Learned, of: Episodes
+) -> list[tuple[str, Sequence[str]]]:
+    """Sections of the report, the verdict first, each a heading and HTML blocks."""
+    return [
+        ("Verdict", _verdict(plan, learned, identified, of)),
+        ("Paths in the world", _episodes(plan, model, of)),
+        ("The policy", _policy(plan, learned, of.summary)),
+        ("Paths of the model", path_blocks(identified)),
+        ("The model", model_blocks(model.robot, identified, model.report)),
+    ]
+
+
 def _verdict(
-    plan: DemoPlan, learned: Learned, identified: Identified, summary: Summary,
-    here: Sequence[Episode], there: Sequence[Episode], live: Episode,
-) -> Sequence[str]:  # fmt: skip
-    share, same, arrived = summary.success, successes(there), live.result == "success"
+    plan: DemoPlan, learned: Learned, identified: Identified, of: Episodes
+) -> Sequence[str]:
+    summary, here, there = of.summary, of.here, of.there
+    share, same, arrived = summary.success, successes(there), of.live.result == "success"
     between = f"95 % confidence: {100 * share.low:.1f} to {100 * share.high:.1f} %"
     tiles = [
         fit_tile(identified),
@@ -300,10 +318,8 @@ def _policy(plan: DemoPlan, learned: Learned, summary: Summary) -> list[str]:
     return [*blocks, html.paragraph(text), table]
 
 
-def _episodes(
-    plan: DemoPlan, model: SimulatorModel, here: Sequence[Episode], there: Sequence[Episode],
-    live: Episode,
-) -> list[str]:  # fmt: skip
+def _episodes(plan: DemoPlan, model: SimulatorModel, of: Episodes) -> list[str]:
+    here, there, live = of.here, of.there, of.live
     both, each = (LABELS[FAST], LABELS[DDS]), ("steps", "path [m]")
     rows = [
         (
