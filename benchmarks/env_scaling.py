@@ -23,8 +23,10 @@ from measuring.fields import field, side_of
 from measuring.rates import interleaved, medians
 from measuring.verdict import answer, parser_of
 
+from nics_drl_bridge import style
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.sim.scenes import sample_scene
@@ -216,17 +218,14 @@ def judge(result: dict[str, Any]) -> list[str]:
 
 def draw(result: dict[str, Any], file: Path) -> None:
     """The curves side by side, on logarithmic axes."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12, 3.2), layout="constrained")
-    for axes, name in zip(figure.subplots(1, len(SWEEPS), sharey=True), SWEEPS, strict=True):
+    figure, grid = style.panels(1, len(SWEEPS), (12.0, 3.2), sharey=True)
+    for axes, name in zip(grid, SWEEPS, strict=True):
         costs = result["robots_us_per_robot" if name == "robots" else f"{name}_us"]
         axes.loglog(result[name], costs, "o-")
         axes.set_xlabel(name)
         axes.set_ylabel("us per robot and step" if name == "robots" else "us per env step")
-        axes.grid(visible=True, which="both", alpha=0.3)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=100)
+        axes.grid(visible=True, which="both")
+    write_bytes(file, style.png(figure))
 
 
 def table_of(result: dict[str, Any]) -> str:

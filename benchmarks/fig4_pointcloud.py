@@ -26,7 +26,7 @@ from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.lidar.scanner import Scanner, make_scanner
 from nics_drl_bridge.lidar.shapes import Circle, Polygon, Rectangle, Shape
 from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
-from nics_drl_bridge.report.pictures import DARK, MEASURED, MODEL, OTHER, png
+from nics_drl_bridge.style import DARK, MEASURED, MODEL, OTHER, panels, png
 
 CONTROLS = {
     "shifted": "the baked scans are taken 0.1 m beside",
@@ -135,13 +135,12 @@ def outline(shape: Shape, pose: Array) -> Array:
 
 def panel(axes: Axes, title: str, truth: Array) -> None:
     """What all four have in common."""
-    axes.set_title(title, fontsize=10, loc="left")
+    axes.set_title(title)
     axes.set_aspect("equal")
     axes.set_xlim(-4.3, 4.3)
     axes.set_ylim(-3.3, 3.3)
     axes.plot(*truth[:, :2].T, color=MODEL, lw=1.2, label="path")
     axes.plot(*truth[0, :2], "o", color=MODEL, ms=4)
-    axes.tick_params(labelsize=8)
 
 
 def draw_cloud(axes: Axes, points: Array) -> None:
@@ -172,8 +171,7 @@ def picture(
     truth: Array, clouds: dict[str, Array | None], titles: dict[str, str], mapped: Any
 ) -> Figure:
     """Four panels."""
-    figure = Figure(figsize=(11, 8.6), layout="constrained")
-    grid = figure.subplots(2, 2, sharex=True, sharey=True).ravel()
+    figure, grid = panels(2, 2, (11.0, 8.6), sharex=True, sharey=True)
     for axes, (name, points) in zip(grid, clouds.items(), strict=False):
         panel(axes, titles[name], truth)
         if points is not None:
@@ -184,11 +182,11 @@ def picture(
     for axes in grid:
         for shape, pose in zip(OBSTACLES, POSES, strict=True):
             axes.plot(*outline(shape, pose).T, color=DARK, lw=0.5, alpha=0.5, zorder=1)
-    grid[3].legend(loc="lower right", bbox_to_anchor=(0.95, 0.08), fontsize=8)
+    grid[3].legend(loc="lower right", bbox_to_anchor=(0.95, 0.08))
     for axes in grid[2:]:
-        axes.set_xlabel("x [m]", fontsize=9)
+        axes.set_xlabel("x [m]")
     for axes in grid[::2]:
-        axes.set_ylabel("y [m]", fontsize=9)
+        axes.set_ylabel("y [m]")
     return figure
 
 

@@ -17,7 +17,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import product
+from itertools import cycle, product
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -27,8 +27,10 @@ import numpy as np
 from measuring.standing import Standing
 from measuring.verdict import answer, parser_of
 
+from nics_drl_bridge import style
 from nics_drl_bridge.commands.episodes import NAVIGATION
 from nics_drl_bridge.env.sim_backend import SimBackend
+from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.gate.gated_backend import GatedBackend
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.lidar.bake import bake
@@ -225,30 +227,25 @@ def worst(lost: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
 
 def draw(success: Mapping[str, Mapping[str, Sequence[float]]], file: Path) -> None:
     """One panel for each perturbation: success over multiples of the declared range, by robot."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10, 5.6), layout="constrained")
     amounts = [declared(of_training(robot)) for robot in success]
     perturbations = list(dict.fromkeys(each for own in success.values() for each in own))
     rows, where = -(-len(perturbations) // 3), [0.0, *MULTIPLES]
-    panels = figure.subplots(rows, 3, sharex=True, sharey=True, squeeze=False)
-    for axes, each in zip(panels.flat, perturbations, strict=False):
-        for robot, own in success.items():
-            axes.plot(where, 100.0 * np.array(own[each]), "o-", markersize=4, label=robot)
-        axes.axvline(DECLARED, color="0.6", linestyle="--", linewidth=1.0)
+    figure, grid = style.panels(rows, 3, (10.0, 2.8 * rows), sharex=True, sharey=True)
+    for axes, each in zip(grid, perturbations, strict=False):
+        for (robot, own), marker in zip(success.items(), cycle(style.MARKERS)):
+            share = 100.0 * np.array(own[each])
+            axes.plot(where, share, marker=marker, markersize=4, label=robot)
+        axes.axvline(DECLARED, color=style.OTHER, linestyle="--", linewidth=1.0)
         told = " / ".join(dict.fromkeys(some[each] for some in amounts))
-        axes.set_title(f"{each}\n{told}", fontsize=9)
-        axes.grid(visible=True, alpha=0.3)
-    for axes in panels[-1]:
+        axes.set_title(f"{each}\n{told}")
+    for axes in grid[-3:]:
         axes.set_xlabel("multiple of the declared range")
         axes.set_xticks(where)
-    for row in panels:
-        row[0].set_ylabel("success [%]")
+    for axes in grid[::3]:
+        axes.set_ylabel("success [%]")
     least = 100.0 * min(min(some) for own in success.values() for some in own.values())
-    panels[0, 0].set_ylim(max(0.0, 5.0 * np.floor(least / 5.0) - 5.0), 102.0)
-    panels[0, 0].legend(fontsize=8, loc="lower left")
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=100)
+    grid[0].set_ylim(max(0.0, 5.0 * np.floor(least / 5.0) - 5.0), 102.0)
+    write_bytes(file, style.png(figure, grid[0]))
 
 
 def table_of(success: Mapping[str, Mapping[str, Sequence[float]]], wall_s: float) -> str:

@@ -14,11 +14,12 @@ from command_line import nics
 from nics_drl_bridge import __version__
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.generator import load_model
+from nics_drl_bridge.identify.report import opening
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.recording import save_recording
 from nics_drl_bridge.robot.spec import load_robot
 
-MODEL_FILES = {"model.yaml", "lidar_table", "report.txt", "SHA256SUMS"}
+MODEL_FILES = {"model.yaml", "lidar_table", "report.txt", "report.html", "SHA256SUMS"}
 
 
 def started(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -100,7 +101,8 @@ def test_generate_makes_a_model_of_a_recording_and_replaces_it(drive, tmp_path):
     assert names(tmp_path / "models" / "car") == MODEL_FILES
     model = load_model(tmp_path / "models" / "car")
     assert model.robot.name == "ackermann"
-    assert model.report.rstrip() in first.stdout
+    assert opening(model.report) in first.stdout
+    assert "models/car/report.html" in first.stdout
     again = nics("generate", drive, "--out", "models/car", "--alpha", "0.9", cwd=tmp_path)
     assert again.returncode == 0, again.stderr
     assert names(tmp_path / "models") == {"car"}

@@ -19,7 +19,7 @@ PACKAGE = "nics_drl_bridge"
 LAYERS = (
     ("errors", "geometry", "interface", "kernels"),
     ("extensions", "random_kernels", "seeds"),
-    ("config", "files", "threads"),
+    ("config", "files", "style", "threads"),
     ("robot",),
     ("recording",),
     ("identify",),
@@ -48,7 +48,7 @@ HOMES = {
     "builtin_interfaces": ("nodes/*", "extras/*"),
     "ament_index_python": ("nodes/*", "extras/*"),
     "filterpy": ("middleware/ekf.py",),
-    "matplotlib": ("report/*", "env/rendering.py"),
+    "matplotlib": ("report/*", "env/rendering.py", "style.py"),
     "yaml": ("config.py",),
     "typer": ("commands/*", "extras/*"),
     "gymnasium": ("env/*", "policy/*", "commands/*", "extras/*"),

@@ -17,9 +17,9 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, PolicyError
 from nics_drl_bridge.files import write_text
 from nics_drl_bridge.generator import SimulatorModel, generate, save_model, usual_lidar
+from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.identify import Identified
-from nics_drl_bridge.identify.judgement import shortfall
-from nics_drl_bridge.identify.report import COMPARED, HEADS, judgement_rows
+from nics_drl_bridge.identify.report import opening
 from nics_drl_bridge.policy import evaluation
 from nics_drl_bridge.policy.evaluation import FIRST_SEED, Episode, Summary, deviation, successes
 from nics_drl_bridge.policy.policies import open_policy, shipped_policies
@@ -27,8 +27,8 @@ from nics_drl_bridge.policy.training_settings import TrainingSettings, load_trai
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import save_recording
-from nics_drl_bridge.report import pictures
-from nics_drl_bridge.report.fit_pictures import CAPTIONS, accuracy, calibration_pictures
+from nics_drl_bridge.report import html, pictures
+from nics_drl_bridge.report.fit_page import fit_tile, model_blocks, path_blocks, verdict_blocks
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.world import load_world
@@ -40,6 +40,7 @@ BASELINE = "dynamic_window"
 LINES = 10  # number of progress reports of a training
 START_S, ARRIVE_S = 60.0, 40.0  # time that a node may take to start, and the robot to arrive
 FULL_COMMAND_S, FULL_RATE_S = 0.3, 0.05  # of the demo's gate, from zero to greatest command, rate
+GOOD = 0.9  # share of successes below which the verdict doubts a policy
 PANELS = 9  # maximum number of episodes that are drawn
 R = TypeVar("R")
 
@@ -71,6 +72,16 @@ class Learned:
     curve: Sequence[pictures.Point] = ()
 
 
+@dataclass(frozen=True)
+class Episodes:
+    """Episodes of the demo: of the evaluation, and the same ones in process and over DDS."""
+
+    summary: Summary
+    here: Sequence[Episode]  # in process
+    there: Sequence[Episode]  # over DDS
+    live: Episode  # deployed
+
+
 def run(plan: DemoPlan, say: Say) -> str:
     """Runs all parts, whose processes have then ended; returns the last line. BridgeError."""
     if find_spec("rclpy") is None:
@@ -92,17 +103,15 @@ def run(plan: DemoPlan, say: Say) -> str:
     arrived = (episode.seed for episode in there if episode.result == "success")
     live = timed("deploying", _deploy, model, learned.policy, next(arrived, 0))
     times = [(part, f"{s:.0f}") for part, s in {**took, "all": sum(took.values())}.items()]
-    sections: list[tuple[str, Sequence[str]]] = [
-        ("The model", _model(plan, model, identified)),
-        ("The policy", _policy(plan, learned, summary)),
-        ("The same episodes, in process and over DDS", _episodes(plan, model, here, there)),
-        ("Deployed", _deployed(plan, model.robot, here, live)),
-        ("Time", [pictures.table(("part", "wall time [s]"), times)]),
-    ]
-    name, file = model.robot.name, plan.out / "report.html"
-    lead = f"Robot {name!r} in the world {plan.world!r}, policy {learned.policy!r}."
-    lead = " ".join([*shortfall(identified.judgement), lead])
-    write_text(file, pictures.page("nics_drl_bridge: demo", lead, sections))
+    episodes = Episodes(summary, here, there, live)
+    sections = sections_of(plan, model, identified, learned, episodes)
+    folded = html.details("Wall time", [html.table(("part", "wall time [s]"), times)])
+    file = plan.out / "report.html"
+    lead = (
+        f"Robot {model.robot.name!r} in the world {plan.world!r}, policy {learned.policy!r}, "
+        f"simulator generated from {plan.recording or 'a textbook drive'}."
+    )
+    write_text(file, html.page("nics_drl_bridge: demo", lead, [*sections, ("Time", [folded])]))
     return (
         f"demo: in process {successes(here)}/{plan.episodes}, "
         f"over DDS {successes(there)}/{plan.episodes}, report {file}"
@@ -120,7 +129,7 @@ def _generate(plan: DemoPlan, say: Say) -> tuple[SimulatorModel, Identified]:
     # The demo has to steer even if the drive never did; the report names the assumptions.
     model, identified = generate(recording, robot, usual_lidar(robot), world.shapes, assume=True)
     save_model(model, plan.model)
-    say(model.report.rstrip())
+    say(opening(model.report))
     return model, identified
 
 
@@ -251,24 +260,51 @@ def _write_limits(robot: RobotSpec, path: Path) -> Path:
     return path
 
 
-def _model(plan: DemoPlan, model: SimulatorModel, identified: Identified) -> list[str]:
-    calibrated = calibration_pictures(model.robot, identified)
-    caption = "What each further term is worth; circles mark how many are kept."
+def sections_of(
+    plan: DemoPlan, model: SimulatorModel, identified: Identified, learned: Learned, of: Episodes
+) -> list[tuple[str, Sequence[str]]]:
+    """Sections of the report, the verdict first, each a heading and HTML blocks."""
     return [
-        pictures.paragraph(f"Generated from {plan.recording or 'a textbook drive'}."),
-        pictures.paragraph(COMPARED),
-        pictures.table(HEADS, judgement_rows(identified.judgement)),
-        pictures.code(model.report),
-        pictures.picture(accuracy(identified), caption),
-        *(pictures.picture(png, CAPTIONS[name]) for name, png in calibrated.items()),
+        ("Verdict", _verdict(plan, learned, identified, of)),
+        ("Paths in the world", _episodes(plan, model, of)),
+        ("The policy", _policy(plan, learned, of.summary)),
+        ("Paths of the model", path_blocks(identified)),
+        ("The model", model_blocks(model.robot, identified, model.report)),
     ]
 
 
+def _verdict(
+    plan: DemoPlan, learned: Learned, identified: Identified, of: Episodes
+) -> Sequence[str]:
+    summary, here, there = of.summary, of.here, of.there
+    share, same, arrived = summary.success, successes(there), of.live.result == "success"
+    between = f"95 % confidence: {100 * share.low:.1f} to {100 * share.high:.1f} %"
+    tiles = [
+        fit_tile(identified),
+        (
+            f"{100 * share.value:.1f} %",
+            f"of {summary.episodes} unseen episodes succeed in the fast simulator ({between})",
+            share.value >= GOOD,
+        ),
+        (
+            f"{same} of {len(there)}",
+            f"episodes succeed over DDS; of the same in process, {successes(here)} of {len(here)}",
+            same >= GOOD * len(there),
+        ),
+        ("arrived" if arrived else "did not arrive", "deployed, in real time", arrived),
+    ]
+    given = f"{learned.policy} --model {plan.model} --world {plan.world}"
+    return verdict_blocks(
+        tiles, conclude(identified), f"nics evaluate {given}",
+        "nics demo --recording DRIVE --robot ROBOT.yaml  # of your own robot",
+    )  # fmt: skip
+
+
 def _policy(plan: DemoPlan, learned: Learned, summary: Summary) -> list[str]:
-    blocks = [pictures.paragraph(learned.how)]
+    blocks = [html.paragraph(learned.how)]
     if learned.curve:
         caption = "Success and collisions while it explores; all episodes are new ones."
-        blocks.append(pictures.picture(pictures.training_curve(learned.curve), caption))
+        blocks.append(html.picture(pictures.training_curve(learned.curve), caption))
     rows = []
     for name, share in summary.shares.items():
         rows.append((name, *(f"{100 * value:.1f} %" for value in astuple(share))))
@@ -278,13 +314,12 @@ def _policy(plan: DemoPlan, learned: Learned, summary: Summary) -> list[str]:
         f"{summary.episodes} unseen episodes in the world {plan.world!r}, side by side in the fast "
         "simulator, the policy at its best; path and time are means of the successful ones."
     )
-    table = pictures.table(("", "value", "95 % from", "to"), rows)
-    return [*blocks, pictures.paragraph(text), table]
+    table = html.table(("", "value", "95 % from", "to"), rows)
+    return [*blocks, html.paragraph(text), table]
 
 
-def _episodes(
-    plan: DemoPlan, model: SimulatorModel, here: Sequence[Episode], there: Sequence[Episode]
-) -> list[str]:
+def _episodes(plan: DemoPlan, model: SimulatorModel, of: Episodes) -> list[str]:
+    here, there, live = of.here, of.there, of.live
     both, each = (LABELS[FAST], LABELS[DDS]), ("steps", "path [m]")
     rows = [
         (
@@ -293,28 +328,23 @@ def _episodes(
         )
         for a, b in zip(here, there, strict=True)
     ]  # fmt: skip
-    runs = {both[0]: here[:PANELS], both[1]: there[:PANELS]}
-    drawn = pictures.trajectories(runs, load_world(plan.world), model.robot.footprint_radius)
+    world, radius = load_world(plan.world), model.robot.footprint_radius
+    drawn = []
+    for a, b in list(zip(here, there, strict=True))[:PANELS]:
+        runs = {both[0]: [a], both[1]: [b]}
+        if a.seed == live.seed:
+            runs["deployed in real time"] = [live]
+        drawn.append((pictures.trajectories(runs, world, radius), ""))
     text = (
         f"{successes(here)} of {len(here)} episodes reached the goal in process, "
-        f"{successes(there)} of {len(there)} over DDS in lock-step. Deviation is the "
-        "greatest distance between the two true paths at the same step."
+        f"{successes(there)} of {len(there)} over DDS in lock-step. Then simulator_node in real "
+        "time, middleware_node, policy_node and command_gate ran as processes of their own; nobody "
+        f"stepped them. The robot {'reached' if live.result == 'success' else 'did not reach'} "
+        f"its goal, that of seed {live.seed}."
     )
+    about = "Deviation is the greatest distance between the two true paths at the same step."
+    table = html.table(("seed", both[0], *each, both[1], *each, "deviation [m]"), rows)
     return [
-        pictures.paragraph(text),
-        pictures.table(("seed", both[0], *each, both[1], *each, "deviation [m]"), rows),
-        pictures.picture(drawn, "Blue: in process. Red, dashed: over DDS."),
-    ]
-
-
-def _deployed(plan: DemoPlan, robot: RobotSpec, here: list[Episode], live: Episode) -> list[str]:
-    beside = [episode for episode in here if episode.seed == live.seed]
-    runs = {LABELS[FAST]: beside, "deployed": [live]}
-    drawn = pictures.trajectories(runs, load_world(plan.world), robot.footprint_radius)
-    text = (
-        "simulator_node in real time, middleware_node, policy_node and command_gate ran as "
-        "processes of their own; nobody stepped them. The robot "
-        f"{'reached' if live.result == 'success' else 'did not reach'} its goal."
-    )
-    caption = "The true path of the deployed robot beside the lock-step one."
-    return [pictures.paragraph(text), pictures.picture(drawn, caption)]
+        html.paragraph(text), html.gallery(drawn),
+        html.details("Episode by episode", [html.paragraph(about), table]),
+    ]  # fmt: skip

@@ -229,11 +229,16 @@ def generate(
             strict, anyway, further,
         )  # fmt: skip
         save_model(model, out)
-        if pictures:
-            from nics_drl_bridge.report.fit_pictures import write_pictures
+        from nics_drl_bridge.identify.report import opening
+        from nics_drl_bridge.report.fit_page import write_fit_page
+        from nics_drl_bridge.report.fit_pictures import write_pictures
 
+        page = out / "report.html"
+        write_fit_page(page, str(recording), spec, identified, model.report)
+        if pictures:
             write_pictures(spec, identified, out / "pictures")
-        typer.echo(model.report.rstrip())
+        typer.echo(opening(model.report))
+        typer.echo(f"\nall figures: {out / 'report.txt'}, with pictures: {page}")
         typer.echo(f"model written to {out}")
 
 

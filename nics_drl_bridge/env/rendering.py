@@ -15,12 +15,12 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE
 from nics_drl_bridge.sim.world_set import AnyWorld
+from nics_drl_bridge.style import DARK, EDGE, GOAL, OTHER, SERIES, VERMILION
 
 Array = NDArray[np.float64]
 SIZE_IN, DPI, MARGIN = 5.0, 100, 0.05
-WALL, STANDING, GOAL, SCAN = "#333333", "#8d99ae", "#f2c14e", "#d1495b"
-EDGE = "#c5cbd3"  # of a field without walls
-ROBOTS = ("#1f6fb2", "#2f855a", "#7a4fa3", "#b7791f", "#0f766e", "#9d174d")
+WALL, STANDING, SCAN = DARK, OTHER, VERMILION
+ROBOTS = tuple(colour for colour in SERIES if colour != SCAN)
 
 
 class WorldPicture:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from nics_drl_bridge.identify.verdict import Gap
 from nics_drl_bridge.identify.yardstick import structure_of
 from nics_drl_bridge.robot.kinds import Textbook, reach, textbook
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
@@ -64,10 +65,9 @@ class _Completion:
                     continue
                 self.rows[dof][product] = coefficient
                 self.assumed.append((dof, product))
-                self.notes.append(
-                    f"Assumed, not learnt: {dof} = {coefficient:.4g}*{product} ({source}), since "
-                    f"{name} never moved; to learn it, drive with {name} over its whole range."
-                )
+                found = f"{dof} = {coefficient:.4g}*{product} ({source}), since {name} never moved"
+                advice = f"to learn it, drive with {name} over its whole range"
+                self.notes.append(Gap(f"Assumed, not learnt: {found}; {advice}."))
 
     def _slope(self, d: int, product: str) -> float:
         """Returns the coefficient of a product of state variables in the textbook twist, at 0."""
@@ -114,7 +114,7 @@ class _Completion:
         self.assumed.extend((f"d_{name}", term) for term in added)
         follows = ", ".join(term for term in added if term != name)
         self.notes.append(
-            f"Assumed, not learnt: {name} follows {follows} with a lag of {lag:.3g} s{source}."
+            Gap(f"Assumed, not learnt: {name} follows {follows} with a lag of {lag:.3g} s{source}.")
         )
 
     def _following(self, i: int, row: dict[str, float], rate: float) -> dict[str, float]:

@@ -354,7 +354,7 @@ def judge(drive: Drive, findings: Findings) -> Findings:
     rated = verdict.with_quality(model, linear, unseen, held_out, judgement, spec)
     findings = replace(
         findings, model=rated, unseen=unseen, held_out=held_out, judgement=judgement,
-        calibration=replace(calibration, notes=_sentences(findings)),
+        calibration=replace(calibration, notes=_plain(findings)),
         noise=motion_noise(findings.noise, whole, calibration, model, samples),
         linear=replace(linear, model=rated) if model is linear.model else linear,
         structure=structure(findings),
@@ -370,7 +370,7 @@ def _notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
         *shortfall(findings.judgement),
         *drive.recording.repairs,
         *findings.repairs,
-        *calibration.notes,
+        *_sentences(findings),
         *findings.refinement,
         *verdict.mirror_note(known(findings.samples, "the training part", "fit"), spec),
         *verdict.unlearnt(linear, calibration, spec),
@@ -443,10 +443,14 @@ def refit(drive: Drive, findings: Findings) -> Findings:
         return replace(findings, notes=_notes(drive, findings))
     final = replace(
         final, refinement=(*final.refinement, sentence),
-        calibration=replace(final.calibration, notes=_sentences(final)),
+        calibration=replace(final.calibration, notes=_plain(final)),
         model=replace(_fitted(final)[1], quality=_fitted(findings)[1].quality),
     )  # fmt: skip
     return replace(findings, refit=replace(final, notes=_notes(drive, final)))
+
+
+def _plain(found: Findings) -> tuple[str, ...]:
+    return tuple(map(str, _sentences(found)))  # of a file, which knows no kinds of sentences
 
 
 def _sentences(found: Findings) -> tuple[str, ...]:
@@ -508,6 +512,11 @@ class Identified:
     def recording(self) -> Recording:
         """The whole recording, repaired."""
         return self.drive.recording
+
+    @property
+    def gaps(self) -> tuple[str, ...]:
+        """The notes on what the drive could not teach."""
+        return tuple(str(note) for note in self.notes if isinstance(note, verdict.Gap))
 
     @property
     def train_until_s(self) -> float:

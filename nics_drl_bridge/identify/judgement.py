@@ -70,9 +70,14 @@ def errors_of_ends(ends: Array, chosen: Windows) -> EndErrors:
     return EndErrors(float(np.hypot(*apart[:, :2].T).mean()), float(heading))
 
 
+def usual(judgement: tuple[HorizonErrors, ...]) -> list[HorizonErrors]:
+    """Returns the errors after 5 s, or the most that was held out; none if nothing was."""
+    return [each for each in judgement if each.horizon_s <= HORIZON_S][-1:]
+
+
 def shortfall(judgement: tuple[HorizonErrors, ...]) -> Iterator[str]:
     """Says which yardsticks a model does not beat after 5 s, or the most that was held out."""
-    for at in [each for each in judgement if each.horizon_s <= HORIZON_S][-1:]:
+    for at in usual(judgement):
         named = {"the fitted textbook": at.textbook, "a robot that keeps its twist": at.kept_twist}
         better = {name: errors.position_m for name, errors in named.items() if errors is not None}
         better = {name: m for name, m in better.items() if not at.model.position_m < m}

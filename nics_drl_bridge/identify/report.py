@@ -6,9 +6,9 @@ from textwrap import fill
 
 import numpy as np
 
+from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.fit import Alpha
 from nics_drl_bridge.identify.identify import Identified
-from nics_drl_bridge.identify.judgement import shortfall
 from nics_drl_bridge.identify.statistics import Curve
 from nics_drl_bridge.identify.verdict import FAR_OFF
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -31,8 +31,8 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
     notes = identified.notes or ("Nothing had to be corrected.",)
     sections: dict[str, Iterable[str]] = {
         f"Fit report: robot {spec.name!r} from {source}": (
-            fill(warning, WIDTH - 2, subsequent_indent="  ")
-            for warning in shortfall(identified.judgement)
+            fill(line, WIDTH - 2, initial_indent="- ", subsequent_indent="    ")
+            for line in conclude(identified).lines
         ),
         f"Kept {_count(identified)}, step {model.dt:g} s "
         f"(X = {', '.join(model.variables)}), with standard errors:": equations_with_errors(model),
@@ -56,6 +56,11 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
     }
     paragraphs = ([head, *(f"  {line}" for line in lines)] for head, lines in sections.items())
     return "\n\n".join("\n".join(lines) for lines in paragraphs) + "\n"
+
+
+def opening(report: str) -> str:
+    """Returns the conclusion and the model of a fit report: what is read first."""
+    return "\n\n".join(report.split("\n\n")[:2])
 
 
 def equations_with_errors(model: TaylorModel) -> list[str]:

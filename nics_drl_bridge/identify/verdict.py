@@ -32,6 +32,12 @@ MANY_OUTLIERS = 0.001
 MIRRORED = -0.5  # correlation of yaw rate and steering below which the robot turns the wrong way
 
 
+class Gap(str):
+    """A sentence on something that a drive could not teach."""
+
+    __slots__ = ()
+
+
 def about_stamps(drive: Drive) -> Iterator[str]:
     """Tells of the stamps and the noise of the poses."""
     if (bursts := drive.bursts) is not None:
@@ -39,7 +45,9 @@ def about_stamps(drive: Drive) -> Iterator[str]:
         spread = "the samples of a burst were spread over the time since the one before"
         yield f"{finding}: their stamps are arrival times; {spread}."
     if drive.pose_noise is None:
-        yield "The noise of the pose was not measured; let the robot stand still for 2 s at first."
+        yield Gap(
+            "The noise of the pose was not measured; let the robot stand still for 2 s at first."
+        )
 
 
 def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate) -> Iterator[str]:
@@ -55,11 +63,13 @@ def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate)
         cause = "the pose is stamped by another clock; give it a `clock:` of its own in the mapping"
         yield f"{finding}: {cause}."
     if not moved_commands(recording.command).any():
-        yield "No command ever changed, so clock offset and latency could not be learnt."
+        yield Gap("No command ever changed, so clock offset and latency could not be learnt.")
     elif not timing.separated and clocks_differ:
         why = "since nothing measured on the commands' clock follows them"
         advice = "the latency is taken as zero. Record the wheels or the state to tell them apart"
-        yield f"Only the sum of clock offset and command latency can be known, {why}; {advice}."
+        yield Gap(
+            f"Only the sum of clock offset and command latency can be known, {why}; {advice}."
+        )
     latency, spread = calibration.command_latency_s, sigma.get("command_latency_s", np.inf)
     if timing.separated and latency > CERTAIN * spread:
         late = f"{latency:.4f} s (+- {spread:.4f} s)"
@@ -72,7 +82,7 @@ def about_mounting(
     """Tells where and how the tracked body sits on the robot."""
     if mounting is None:
         taken = "is taken to be exactly at base_link; drive in every direction and turn"
-        yield f"How the tracked body sits on the robot could not be learnt, and {taken}."
+        yield Gap(f"How the tracked body sits on the robot could not be learnt, and {taken}.")
         return
     x, y = calibration.lever_arm_m
     names = "lever_arm_x_m", "lever_arm_y_m"  # of which predictions may have told one later
@@ -86,7 +96,7 @@ def about_mounting(
         finding = f"Where the tracked point lies on the robot could not be learnt, since {x_hidden}"
         advice = "it is taken as base_link, and the rotation holds for this curvature"
         drive_so = "drive left, right and straight on, forwards and backwards, to learn it"
-        yield f"{finding}: {advice}; {drive_so}."
+        yield Gap(f"{finding}: {advice}; {drive_so}.")
     elif (x, y) != (0.0, 0.0):
         yield f"The tracked point lies at x {x:.4f} m, y {y:.4f} m of base_link."
     if y_hidden and not x_hidden and not drive.spec.moves_sideways:
@@ -104,7 +114,7 @@ def about_responses(
         state, command = response.state, response.command
         if command not in names:
             finding = f"{command} never changed, so how {state} follows it could not be learnt"
-            yield f"{finding}; drive with {command} changing over its whole range."
+            yield Gap(f"{finding}; drive with {command} changing over its whole range.")
         else:
             lag = f"{response.lag_s:.4f} s" + ("" if np.isnan(sigma) else f" (+- {sigma:.4f} s)")
             taken = f"with a lag of {lag} and a gain of {response.gain:.4f}"
@@ -140,22 +150,24 @@ def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> Iterator
     excitation = linear.regression.excitation
     if unmoved := ", ".join(excitation.unmoved):
         finding = f"The model has no terms of {unmoved}, which never moved"
-        yield f"{finding}: it holds for this drive's constant value only."
+        yield Gap(f"{finding}: it holds for this drive's constant value only.")
     still = _commands(excitation.unmoved, spec)
     if missing := ", ".join(name for name in still if name not in already):
-        yield f"Drive with {missing} changing over the whole range to learn them."
+        yield Gap(f"Drive with {missing} changing over the whole range to learn them.")
     if together := _list(excitation.together):
         units = {c.unit for c in spec.command if c.name in excitation.together}
         shares = "all have a share of what they did" if len(units) == 1 else "one has all of it"
         holds = f"{shares}, and the model holds where they move so; drive each on its own to learn"
-        yield f"{together} always moved together, so their effects can't be told apart: {holds}."
+        yield Gap(
+            f"{together} always moved together, so their effects can't be told apart: {holds}."
+        )
     if copies := _list([v.name for v in spec.state if v.name in linear.regression.dependent]):
         why = "always followed from the other variables, so their effects can't be told apart"
-        yield f"{copies} {why}: the model does without, and holds for as long as that is so."
+        yield Gap(f"{copies} {why}: the model does without, and holds for as long as that is so.")
     levels = {n: v for n, v in excitation.levels.items() if n not in excitation.unmoved}
     if coarse := _list([name for name, count in levels.items() if count == FEW_LEVELS]):
         finding = "between them the model is a straight line, whatever the robot does"
-        yield f"{coarse} took two values only: {finding}; drive with values in between."
+        yield Gap(f"{coarse} took two values only: {finding}; drive with values in between.")
 
 
 def doubts_of_fit(linear: Fit, exact: bool) -> Iterator[str]:
@@ -220,7 +232,7 @@ def untried(drive: Drive, held_out: OpenLoop | None) -> Iterator[str]:
     """Tells of a drive too short to try a model on unseen data."""
     if held_out is None:
         left = max(drive.duration_s - drive.settings.train_until_s, 0.0)
-        yield (
+        yield Gap(
             f"The last {left:.1f} s, held out of the fit, are too short for a prediction over "
             f"{HORIZON_S:g} s: the model was not tried on unseen data; record 20 s or more."
         )

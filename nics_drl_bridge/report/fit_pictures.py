@@ -3,12 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from textwrap import fill
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, NullLocator
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
@@ -23,11 +22,11 @@ from nics_drl_bridge.identify.open_loop import HORIZON_S, Windows, predict, wind
 from nics_drl_bridge.identify.report import CalibratedValue, estimates
 from nics_drl_bridge.identify.signals import DIFFERENCE, held, moved_commands, nominal_lags
 from nics_drl_bridge.recording.recording import Samples
-from nics_drl_bridge.report.pictures import DARK, MEASURED, MODEL, OTHER, panels, png
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.curve import delays as delays_of
 from nics_drl_bridge.robot.noise import Level
 from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.style import DARK, MARKERS, MEASURED, MODEL, OTHER, panels, png
 from nics_drl_bridge.threads import one_blas_thread
 
 SHOWN_S = 8.0
@@ -38,10 +37,13 @@ LEAST_RATE = 1e-6
 BURSTS_SHOWN = 12
 MOST_POINTS = 3000
 BINS = 60
-CURVE_POINTS, TITLE = 400, 44  # of an input curve; letters in a line above a picture
+CURVE_POINTS = 400  # of an input curve
 REACH = 5.0  # histograms end at this many standard deviations
 REACH_S, TRIALS = 0.5, 81  # largest shift in time of a curve, and number of its points
 CAPTIONS = {
+    "accuracy": "The error by the number of terms; circles mark how many are kept.",
+    "residuals": "Rates on unseen data, those of the model, and what is left.",
+    "alignment": "Commands as stamped and as they take effect, and the response of the robot.",
     "timing": "What each shift in time leaves unexplained; the estimate lies at the least.",
     "bursts": "Poses that arrive in bursts, and the times that they were taken to be of.",
     "mounting": "Velocities before and after correction: base_link of a robot that can't move "
@@ -63,11 +65,11 @@ def write_pictures(spec: RobotSpec, identified: Identified, folder: str | Path) 
     return tuple(files)
 
 
-def fit_pictures(spec: RobotSpec, identified: Identified) -> dict[str, bytes]:
+def fit_pictures(spec: RobotSpec, identified: Identified, paths: bool = True) -> dict[str, bytes]:
     """The pictures of a fit by name, as far as the recording shows them, each a PNG."""
     by_motion = identified.findings.width is not None  # pruning did not choose its terms
     pictures = {} if by_motion else {"accuracy": accuracy(identified)}
-    if identified.held_out is not None:
+    if paths and identified.held_out is not None:
         pictures["paths"] = held_out_paths(identified.trial)
     if identified.unseen is not None and np.abs(identified.unseen.dq).max() > LEAST_RATE:
         pictures["residuals"] = residuals(identified.trial, identified.unseen)
@@ -82,7 +84,7 @@ def accuracy(identified: Identified) -> bytes:
     circle: dict[str, Any] = {"markersize": 10, "fillstyle": "none"}
     for n, curve in enumerate(identified.fit.curves):
         share = np.maximum(curve.share, LEAST_SHARE)
-        line = axes.plot(share, marker=".", color=f"C{n}", label=curve.dof)[0]
+        line = axes.plot(share, marker=MARKERS[n % len(MARKERS)], markersize=4, label=curve.dof)[0]
         axes.plot(curve.kept, share[curve.kept], "o", color=line.get_color(), **circle)
     axes.plot([], [], "o", color=DARK, label="kept", **circle)
     axes.set_yscale("log")
@@ -92,32 +94,75 @@ def accuracy(identified: Identified) -> bytes:
         ylabel="cross-validated error / size of the rates", xlim=(-0.3, longest - 0.7),
     )  # fmt: skip
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    axes.grid(alpha=0.3)
-    axes.legend(frameon=False, fontsize=9)
+    axes.legend()
     return png(figure)
 
 
 def held_out_paths(identified: Identified) -> bytes:
     """Draws open-loop predictions on unseen data and the measured paths, from the same start."""
+    paths = _unseen_paths(identified)
+    rows, columns = -(-len(paths) // 3), min(len(paths), 3)
+    figure, grid = panels(rows, columns, (3.4 * columns, 3.4 * rows + 0.4))
+    for axes, path in zip(grid, paths, strict=False):
+        _unseen_path(axes, path)
+    return png(figure, grid[0])
+
+
+def unseen_paths(identified: Identified, most: int) -> list[bytes]:
+    """Draws some of the panels of `held_out_paths`, each as a PNG of its own."""
+    drawn = []
+    for path in _unseen_paths(identified)[:most]:
+        figure, (axes,) = panels(1, 1, (4.0, 4.2))
+        _unseen_path(axes, path)
+        drawn.append(png(figure, axes))
+    return drawn
+
+
+def _unseen_paths(identified: Identified) -> list[tuple[Array, Array, float]]:
+    """Returns measured and predicted paths, and the distance between their ends [m]."""
     drive, calibration, pose = identified.drive, identified.calibration, identified.recording.pose
     free = max(drive.duration_s - identified.train_until_s - HORIZON_S, 0.0)
     span = identified.train_until_s, drive.duration_s
     chosen = windows(drive, calibration, *span, HORIZON_S, free / PATHS)
-    predicted = _predicted(identified, chosen)
-    count = min(len(predicted), PATHS)
-    rows, columns = -(-count // 3), min(count, 3)
-    figure, grid = panels(rows, columns, (3.4 * columns, 3.4 * rows + 0.4))
-    for n, (axes, path) in enumerate(zip(grid, predicted[:count], strict=False)):
+    paths = []
+    for n, path in enumerate(_predicted(identified, chosen)[:PATHS]):
         during = (pose.t >= chosen.start_t[n]) & (pose.t <= chosen.end_t[n])
-        truth = pose.values[during]
-        axes.plot(*truth[:, :2].T, color=MEASURED, linewidth=3.5, alpha=0.55, label="measured")
-        axes.plot(*path[:, :2].T, color=MODEL, linestyle="--", label="predicted")
-        axes.plot(*truth[0, :2], "o", color=DARK, markersize=5, label="start")
-        axes.set_aspect("equal", adjustable="datalim")
         apart = float(np.hypot(*(path[-1] - chosen.end[n])[:2]))
-        axes.set_title(f"{apart:.3f} m apart after {HORIZON_S:g} s", fontsize=10)
-        axes.set(xlabel="x [m]", ylabel="y [m]")
-    return png(figure, grid[0])
+        paths.append((pose.values[during], path, apart))
+    return paths
+
+
+def _unseen_path(axes: Axes, paths: tuple[Array, Array, float]) -> None:
+    truth, path, apart = paths
+    axes.plot(*truth[:, :2].T, color=MEASURED, linewidth=3.5, alpha=0.55, label="measured")
+    axes.plot(*path[:, :2].T, color=MODEL, linestyle="--", label="predicted")
+    axes.plot(*truth[0, :2], "o", color=DARK, markersize=5, label="start")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_title(f"{apart:.2g} m apart after {HORIZON_S:g} s")
+    axes.set(xlabel="x [m]", ylabel="y [m]")
+
+
+def yardsticks(identified: Identified) -> bytes:
+    """Draws mean errors on unseen data over the horizon, beside those of the yardsticks."""
+    figure, (axes,) = panels(1, 1, (5.0, 3.6))
+    judgement = identified.judgement
+    for name, label, colour, line in (
+        ("model", "model", MODEL, "o-"), ("textbook", "fitted textbook", MEASURED, "s--"),
+        ("kept_twist", "twist kept", OTHER, "^:"),
+    ):  # fmt: skip
+        known = [(at.horizon_s, each) for at in judgement if (each := getattr(at, name))]
+        if known:
+            error = [max(each.position_m, LEAST_SHARE) for _, each in known]
+            axes.plot([s for s, _ in known], error, line, color=colour, markersize=5, label=label)
+    band = [(at.horizon_s, at.band_m) for at in judgement if at.band_m]
+    if band:
+        axes.plot(*zip(*band, strict=True), "_", color=DARK, markersize=14, label="95 % within")
+    axes.set(xscale="log", yscale="log", xlabel="horizon [s]", ylabel="error of position [m]")
+    ticks = [at.horizon_s for at in judgement]
+    axes.set_xticks(ticks, [f"{s:g}" for s in ticks])
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_formatter("{x:g}")
+    return png(figure, axes)
 
 
 def residuals(identified: Identified, unseen: Samples) -> bytes:
@@ -132,8 +177,7 @@ def residuals(identified: Identified, unseen: Samples) -> bytes:
         axes.plot(t[shown], unseen.dq[shown, d], color=MEASURED, linewidth=2.5, alpha=0.55)
         axes.plot(t[shown], predicted[shown, d], color=MODEL, linestyle="--", linewidth=1.2)
         axes.plot(t[shown], rest[shown], color=OTHER, linewidth=0.8)
-        axes.set_ylabel(f"{model.dofs[d]} [{model.dof_units[d]}]", fontsize=8)
-        axes.grid(alpha=0.3)
+        axes.set_ylabel(f"{model.dofs[d]} [{model.dof_units[d]}]")
     grid[-1].set_xlabel("time since the end of the training part [s]")
     for color, label in ((MEASURED, "measured"), (MODEL, "model"), (OTHER, "residual")):
         grid[0].plot([], [], color=color, label=label)
@@ -156,12 +200,12 @@ def alignment(spec: RobotSpec, identified: Identified) -> bytes:
         for late, style, label in ((0.0, ":", "as stamped"), (acts, "-", "as it takes effect")):
             value = held(command, spec, t - late, t - late + samples.dt)[:, c]
             axes.plot(t - begin, value, style, color=MODEL, linewidth=1.4, label=label)
-        axes.set_ylabel(f"{name} [{unit}]", fontsize=9, color=MODEL)
+        axes.set_ylabel(f"{name} [{unit}]", color=MODEL)
         _response(axes, samples, shown, len(spec.state) + int(c), identified)
     grid[-1].set_xlabel("time on the commands' clock [s]")
     grid[0].plot([], [], color=MEASURED, linewidth=2.5, alpha=0.55, label="response")
     title = f"clock offset {calibration.clock_offset_s:.4g} s, command latency {latency:.4g} s"
-    grid[0].set_title(title, fontsize=10)
+    grid[0].set_title(title)
     return png(figure, grid[0])
 
 
@@ -173,12 +217,13 @@ def _response(
         alike = np.abs([np.corrcoef(twist[:, d], wanted)[0, 1] for d in range(3)])
     d = int(np.argmax(np.nan_to_num(alike)))
     other = axes.twinx()
+    other.grid(visible=False)
     other.plot(
         samples.t[shown] - samples.t[0] - SETTLED_S, twist[shown, d],
         color=MEASURED, linewidth=2.5, alpha=0.55,
     )  # fmt: skip
     model = identified.model
-    other.set_ylabel(f"{model.dofs[d]} [{model.dof_units[d]}]", fontsize=9, color=MEASURED)
+    other.set_ylabel(f"{model.dofs[d]} [{model.dof_units[d]}]", color=MEASURED)
 
 
 def _predicted(identified: Identified, chosen: Windows) -> Array:
@@ -337,10 +382,8 @@ def _restraint(axes: Axes, identified: Identified, dof: str) -> None:
 
 
 def _finish(axes: Axes, title: str) -> None:
-    lines = [fill(line, TITLE) for line in title.replace("+-", "±").splitlines()]
-    axes.set_title("\n".join(lines), fontsize=10, color=DARK)
-    axes.grid(alpha=0.3)
-    axes.legend(frameon=False, fontsize=9)
+    axes.set_title(title.replace("+-", "±"))
+    axes.legend()
 
 
 def noise(identified: Identified) -> bytes | None:
@@ -380,7 +423,7 @@ def _histogram(axes: Axes, name: str, level: Level, rest: Array) -> None:
     axes.plot(edges, normal, "--", color=MODEL)
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.set(xlabel=f"residual [{level.unit}]", ylabel="density")
-    axes.set_title(f"noise of the {name}\n{_value(level)}", fontsize=10, color=DARK)
+    axes.set_title(f"noise of the {name}\n{_value(level)}")
 
 
 def _growth(axes: Axes, horizon: Array, name: str, level: Level, error: Array, unit: str) -> None:

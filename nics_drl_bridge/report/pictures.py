@@ -1,9 +1,6 @@
-"""The HTML report in one file, and its pictures of trajectories, drives, trainings and policies."""
+"""Pictures of trajectories, drives, trainings, policies and worlds, each a PNG."""
 
-import base64
-import io
 from collections.abc import Mapping, Sequence
-from html import escape
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,90 +20,16 @@ from nics_drl_bridge.sim.obstacles import Motion, Patrol
 from nics_drl_bridge.sim.scenes import Scene, SceneSampler, member_of
 from nics_drl_bridge.sim.world import Places, World
 from nics_drl_bridge.sim.world_set import AnyWorld
+from nics_drl_bridge.style import DARK, GOAL, GREEN, MEASURED, MODEL, OTHER, panels, png, styled
 
 Array = NDArray[np.float64]
-MEASURED, MODEL, OTHER, DARK = "#1f6fb2", "#d1495b", "#8d99ae", "#333333"
-STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 64rem;
-  padding: 0 1rem; color: #222; background: #fff }
-h1 { margin-bottom: 0 } h2 { margin-top: 2.2rem; border-bottom: 1px solid #ddd }
-table { border-collapse: collapse; margin: 1rem 0 }
-th, td { padding: .3rem .9rem; text-align: right;
-  border-bottom: 1px solid #e5e5e5 } th:first-child, td:first-child { text-align: left }
-pre { background: #f6f7f9; padding: 1rem; overflow-x: auto; font-size: 14px }
-img { max-width: 100% }
-.lead { color: #555; font-size: 1.1rem }
-"""
-GREEN = "#2f855a"
 LINES: tuple[dict[str, Any], ...] = (
-    {"color": MEASURED, "linewidth": 3.5, "alpha": 0.55},
+    {"color": MEASURED, "linewidth": 3.5, "alpha": 0.55, "linestyle": "-"},
     {"color": MODEL, "linewidth": 1.4, "linestyle": "--"},
     {"color": GREEN, "linewidth": 1.4, "linestyle": ":"},
 )
 LEAST_WIDTH = 5.5
-GOAL = "#f2c14e"
 WORLD_SIDE = 7.5  # the longer side of a world's picture [inch]
-
-
-def page(title: str, lead: str, sections: Sequence[tuple[str, Sequence[str]]]) -> str:
-    """Builds an HTML page of sections, each a heading and HTML blocks, below a lead sentence."""
-    body = "".join(f"<h2>{escape(heading)}</h2>{''.join(blocks)}" for heading, blocks in sections)
-    return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'
-        f"<style>{STYLE}</style></head><body><h1>{escape(title)}</h1>"
-        f'<p class="lead">{escape(lead)}</p>{body}</body></html>\n'
-    )
-
-
-def paragraph(text: str) -> str:
-    """Returns a paragraph as HTML, as the next three."""
-    return f"<p>{escape(text)}</p>"
-
-
-def code(text: str) -> str:
-    """Preformatted text."""
-    return f"<pre>{escape(text)}</pre>"
-
-
-def picture(png: bytes, caption: str) -> str:
-    """A PNG with its caption."""
-    data, caption = base64.b64encode(png).decode(), escape(caption)
-    return (
-        f'<figure><img src="data:image/png;base64,{data}" alt="{caption}">'
-        f"<figcaption>{caption}</figcaption></figure>"
-    )
-
-
-def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Rows of text under a heading row."""
-
-    def cells(kind: str, row: Sequence[str]) -> str:
-        return "<tr>" + "".join(f"<{kind}>{escape(cell)}</{kind}>" for cell in row) + "</tr>"
-
-    body = "".join(cells("td", row) for row in rows)
-    return f"<table><thead>{cells('th', head)}</thead><tbody>{body}</tbody></table>"
-
-
-def panels(
-    rows: int, columns: int, size: tuple[float, float], **options: Any
-) -> tuple[Figure, list[Axes]]:
-    """Returns a figure of a size [inch], and its axes in rows."""
-    figure = Figure(figsize=size, layout="constrained")
-    return figure, list(figure.subplots(rows, columns, squeeze=False, **options).ravel())
-
-
-def png(figure: Figure, legend: Axes | None = None) -> bytes:
-    """Renders a figure as a PNG, without empty axes, with the legend of one of them above."""
-    for axes in figure.axes:
-        if not axes.has_data():
-            axes.set_axis_off()
-    if legend is not None:
-        handles, labels = legend.get_legend_handles_labels()
-        columns = max(3, len(labels))
-        figure.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()
 
 
 def trajectories(runs: Mapping[str, Sequence[Episode]], world: AnyWorld, footprint: float) -> bytes:
@@ -129,10 +52,11 @@ def _panel(axes: Axes, episodes: Mapping[str, Episode], world: AnyWorld, footpri
     for line, (name, episode) in zip(LINES, episodes.items(), strict=False):
         axes.plot(episode.path[:, 0], episode.path[:, 1], label=name, **line)
     results = ", ".join(dict.fromkeys(episode.result for episode in episodes.values()))
-    axes.set_title(f"seed {first.seed}: {results}", fontsize=10)
+    axes.set_title(f"seed {first.seed}: {results}")
     axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
 
 
+@styled()
 def drive_picture(pattern: Pattern, spec: RobotSpec) -> bytes:
     """Draws the expected path within its bounding circle, and each command over time."""
     rows = len(spec.command)
@@ -145,14 +69,14 @@ def drive_picture(pattern: Pattern, spec: RobotSpec) -> bytes:
     path.add_patch(Circle((0.0, 0.0), pattern.footprint, **robot))
     path.plot(pattern.pose[:, 0], pattern.pose[:, 1], color=MEASURED, linewidth=1.0, label="path")
     path.set(aspect="equal", xlabel="x, ahead of the robot [m]", ylabel="y, to its left [m]")
-    path.legend(fontsize=8, loc="upper right")
+    path.legend(loc="upper right")
     t = pattern.period * np.arange(len(pattern.command))
     for row, command in enumerate(spec.command):
         axes = figure.add_subplot(grid[row, 1])
         axes.step(t, pattern.command[:, row], where="post", color=MEASURED, linewidth=1.0)
         for limit in (command.min, command.max):
             axes.axhline(limit, color=MODEL, linewidth=0.8, linestyle="--")
-        axes.set_ylabel(f"{command.name}\n[{command.unit}]", fontsize=8)
+        axes.set_ylabel(f"{command.name}\n[{command.unit}]")
     axes.set_xlabel("time [s]")
     return png(figure)
 
@@ -167,15 +91,14 @@ class Point(NamedTuple):
 
 def training_curve(points: Sequence[Point]) -> bytes:
     """Draws success and collisions [%] over the environment steps."""
-    figure, (axes,) = panels(1, 1, (7.5, 3.8))
+    figure, (axes,) = panels(1, 1, (5.2, 3.6))
     steps, *shares = np.array(points, np.float64).T
-    for name, share, color in zip(("success", "collision"), shares, (MEASURED, MODEL), strict=True):
-        axes.plot(steps / 1e3, 100.0 * share, color=color, linewidth=2.0, label=name)
+    for name, share, line in zip(("success", "collision"), shares, ("-", "--"), strict=True):
+        axes.plot(steps / 1e3, 100.0 * share, line, linewidth=2.0, label=name)
     axes.set(xlabel="environment steps [thousands]", ylabel="of the last 1000 episodes [%]")
     axes.set_ylim(0.0, 100.0)
     axes.set_xlim(left=0.0)
-    axes.grid(alpha=0.3)
-    axes.legend(frameon=False)
+    axes.legend()
     return png(figure)
 
 
@@ -214,9 +137,6 @@ def world_picture(
     size = high - low
     width, depth = WORLD_SIDE * size / size.max()
     figure, (axes,) = panels(1, 1, (max(width, LEAST_WIDTH) + 0.8, max(depth, 1.6) + 1.3))
-    axes.set_axisbelow(True)
-    axes.grid(alpha=0.25, linewidth=0.6)
-    axes.spines[:].set_color("#cccccc")
     draw_world(axes, world, scene.bodies)
     for kind, places, colour in (("starts", world.starts, GREEN), ("goals", world.goals, GOAL)):
         _regions(axes, places, colour, kind)
@@ -229,7 +149,7 @@ def world_picture(
     axes.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
     count = np.count_nonzero(scene.bodies[:, RADIUS])
     about = f"{size[0]:.3g} m x {size[1]:.3g} m, {count} obstacles, seed {seed}"
-    axes.set_title(f"{world.name}: {about}", fontsize=10)
+    axes.set_title(f"{world.name}: {about}")
     return png(figure, axes)
 
 

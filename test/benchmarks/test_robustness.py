@@ -4,6 +4,7 @@ import math
 from importlib import import_module
 
 import pytest
+from PIL import Image
 
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.policy.policies import shipped_policies
@@ -90,6 +91,16 @@ def test_a_larger_footprint_is_the_same_outline_scaled(robustness, robot):
     assert larger.robot.footprint_radius == pytest.approx(1.1 * model.robot.footprint_radius)
     assert (larger.robot.footprint is None) == (model.robot.footprint is None)
     assert larger.kinematics is model.kinematics
+
+
+def test_the_picture_has_a_panel_for_each_perturbation(robustness, tmp_path):
+    if not shipped_policies():
+        pytest.skip("no policy is shipped")
+    robots = {robot: curves() for robot in shipped_policies()}
+    robustness.draw(robots, tmp_path / "new" / "curves.png")
+    with Image.open(tmp_path / "new" / "curves.png") as picture:
+        assert picture.width == 1100
+        assert 550 < picture.height < 700  # two rows of three
 
 
 ONE = ("--episodes", "2", "--robots", "differential", "--worlds", "circles")

@@ -1,15 +1,27 @@
 from __future__ import annotations
 
+import re
 from importlib.util import find_spec
 
+import numpy as np
 import pytest
 from robots import direct_model
 
 from nics_drl_bridge.commands import demo_run as learning
-from nics_drl_bridge.commands.demo_run import DemoPlan, learn, settings_of
+from nics_drl_bridge.commands.demo_run import (
+    DemoPlan,
+    Episodes,
+    Learned,
+    learn,
+    sections_of,
+    settings_of,
+)
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.generator import builtin_model, generate, usual_lidar
+from nics_drl_bridge.policy.evaluation import ConfidenceInterval, Episode, Summary, rate
+from nics_drl_bridge.recording.textbook import record
+from nics_drl_bridge.report.pictures import Point
 from nics_drl_bridge.robot.spec import load_robot
 
 
@@ -54,6 +66,40 @@ def test_a_named_policy_is_taken_and_a_misspelt_one_refused(tmp_path):
     assert learned.policy == "straight"
     with pytest.raises(ConfigError, match="unknown policy 'strait'; did you mean 'straight'"):
         learn(DemoPlan(tmp_path, policy="strait"), model, pytest.fail)
+
+
+def episode(seed, result="success"):
+    t = np.linspace(0.0, 2.0, 40)
+    path = np.stack([t, np.sin(t + seed), t], axis=1)
+    return Episode(seed, result, path, path, path[-1, :2], np.zeros((0, 7)), 1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("share", "arrived"), [(0.986, True), (0.42, False)])
+def test_the_report_begins_with_success_in_three_worlds_and_folds_the_figures(
+    tmp_path, share, arrived
+):
+    robot = load_robot("differential")
+    drive = record(robot, np.random.default_rng(0), 30.0)
+    model, identified = generate(drive, robot, usual_lidar(robot), ())
+    arrivals = int(500 * share)
+    rates = [rate(count, 500) for count in (arrivals, 500 - arrivals, 0)]
+    length = ConfidenceInterval(3.0, 2.9, 3.1)
+    summary = Summary(500, *rates, length, length)
+    live = episode(0, "success" if arrived else "time-out")
+    points = [Point(8192, 0.1, 0.8), Point(80_000, 0.9, 0.1)]
+    learned = Learned("policy.onnx", "PPO learned it.", points)
+    of = Episodes(summary, [episode(0), episode(1)], [episode(0), episode(1)], live)
+    sections = dict(sections_of(DemoPlan(tmp_path), model, identified, learned, of))
+    assert next(iter(sections)) == "Verdict"
+    verdict = "".join(sections["Verdict"])
+    for words in (f"{100 * share:.1f} %", "2 of 2", "arrived" if arrived else "did not arrive"):
+        assert words in verdict
+    assert verdict.count("⚠") == (0 if arrived else 2)
+    assert "".join(sections["Paths in the world"]).count("<img") == 2
+    everything = "".join("".join(blocks) for blocks in sections.values())
+    assert "Cross-validated" in everything
+    assert "Cross-validated" not in re.sub("(?s)<details>.*?</details>", "", everything)
 
 
 def test_it_trains_in_the_world_and_simulator_of_the_plan(tmp_path):

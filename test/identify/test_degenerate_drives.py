@@ -11,6 +11,7 @@ import pytest
 from identify.drives import drive
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import FitError, RecordingError
+from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.repair import check_axes
@@ -70,6 +71,8 @@ def test_straight_only_gives_a_model_without_turning_and_says_so(car, noise):
     found = identify(recording, car)
     assert {"steering", "steering_command"} <= set(found.fit.unmoved)
     assert said(found, "Drive with steering_command changing")
+    assert any("steering_command changing" in gap for gap in found.gaps)
+    assert "drive once more" in conclude(found).advice
     assert not found.model.powers[:, [1, 3]].any()
     assert harmless(found, car)
     with pytest.raises(FitError, match="steering_command never moved"):

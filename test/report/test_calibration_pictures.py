@@ -12,9 +12,9 @@ from nics_drl_bridge.identify.report import estimates, fit_report
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.report import fit_pictures
 from nics_drl_bridge.report.fit_pictures import CAPTIONS, calibration_pictures, timing_curves
-from nics_drl_bridge.report.pictures import png
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
+from nics_drl_bridge.style import png
 
 Found = tuple[RobotSpec, Identified]
 PNG = b"\x89PNG"
@@ -55,7 +55,8 @@ def listed(found: Found):
 def test_every_estimate_of_a_disturbed_drive_has_its_picture(disturbed):
     pictures = calibration_pictures(*disturbed)
     assert set(pictures) == {"timing", "bursts", "mounting", "wheels", "noise"}
-    assert set(CAPTIONS) == {*pictures, "inputs"}  # its motors have no curves
+    of_fit = {"accuracy", "residuals", "alignment"}
+    assert set(CAPTIONS) == {*pictures, *of_fit, "inputs"}  # its motors have no curves
     assert all(picture.startswith(PNG) for picture in pictures.values())
 
 

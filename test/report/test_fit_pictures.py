@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -8,8 +9,10 @@ import pytest
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.report import fit_report, with_error
 from nics_drl_bridge.recording.textbook import record
+from nics_drl_bridge.report.fit_page import fit_tile, write_fit_page
 from nics_drl_bridge.report.fit_pictures import fit_pictures, write_pictures
 from nics_drl_bridge.robot.spec import load_robot
+from nics_drl_bridge.robot.taylor import EndErrors
 
 PNG = b"\x89PNG"
 slow = pytest.mark.slow
@@ -26,6 +29,32 @@ def test_every_picture_of_a_fit_is_drawn(found, tmp_path):
     files = write_pictures(*found, tmp_path / "pictures")
     assert {f.stem for f in files} >= {"accuracy", "alignment", "paths", "residuals", "timing"}
     assert all(f.read_bytes().startswith(PNG) for f in files)
+
+
+@slow
+def test_a_page_of_a_fit_begins_with_its_verdict_and_folds_all_figures(found, tmp_path):
+    spec, identified = found
+    text = fit_report("here", spec, identified)
+    write_fit_page(tmp_path / "report.html", "here", spec, identified, text)
+    html = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert re.findall("<h2>(.*?)</h2>", html) == ["Verdict", "Paths", "Model"]
+    figure, meaning, good = fit_tile(identified)
+    assert html.index(figure.replace("<", "&lt;")) < html.index(meaning) < html.index("Paths")
+    assert good
+    shown = re.sub("(?s)<details>.*?</details>", "", html)
+    assert "Cross-validated error" in html
+    assert "Cross-validated error" not in shown
+    assert shown.count("<img") == 4  # three paths, and the yardsticks
+
+
+@slow
+def test_a_figure_that_a_yardstick_beats_is_doubtful(found):
+    _, identified = found
+    at = replace(identified.judgement[3], kept_twist=EndErrors(1e-9, 0.1))
+    beaten = replace(identified, findings=replace(identified.findings, judgement=(at,)))
+    assert fit_tile(beaten)[2] is False
+    untried = replace(identified, findings=replace(identified.findings, judgement=()))
+    assert fit_tile(untried)[0] == "untried"
 
 
 @slow

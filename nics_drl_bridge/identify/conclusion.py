@@ -1,0 +1,63 @@
+"""Conclusion of a fit, to be read first: how well it predicts, its gaps, and the next step."""
+
+from math import isfinite
+from typing import NamedTuple
+
+from nics_drl_bridge.identify.identify import Identified
+from nics_drl_bridge.identify.judgement import shortfall, usual
+from nics_drl_bridge.identify.verdict import doubts
+from nics_drl_bridge.robot.taylor import EndErrors
+
+OF_PATH = " of the path"
+UNTRIED = "The drive was too short to try the model on data that it had not seen."
+
+
+class Conclusion(NamedTuple):
+    """Sentences on a fit."""
+
+    accuracy: str
+    doubts: tuple[str, ...]  # reasons not to trust it
+    gaps: tuple[str, ...]  # what the drive could not teach
+    advice: str  # the next step
+
+    @property
+    def lines(self) -> tuple[str, ...]:
+        """All sentences, in the order in which they are to be read."""
+        return (self.accuracy, *self.doubts, *self.gaps, self.advice)
+
+
+def conclude(identified: Identified) -> Conclusion:
+    """Draws the conclusion of a fit."""
+    about = *shortfall(identified.judgement), *doubts(identified.held_out)
+    gaps = identified.gaps
+    if about or not identified.judgement:
+        advice = "drive once more, for 60 s or longer, and generate anew before a policy is trained"
+    elif identified.fit.unmoved or identified.model.assumed:
+        advice = "drive once more as said above: a policy would act by what was not learnt"
+    elif gaps:
+        advice = "train a policy in the simulator, or first drive once more as said above"
+    else:
+        advice = "train a policy in the simulator"
+    return Conclusion(accuracy(identified), about, gaps, f"Next: {advice}.")
+
+
+def accuracy(identified: Identified) -> str:
+    """Says how far off predictions of unseen data are, beside those of the yardsticks."""
+    for at in usual(identified.judgement):
+        if not isfinite(at.model.position_m):
+            return f"On unseen data the predictions run away within {at.horizon_s:g} s."
+        named = {"a fitted textbook": at.textbook, "a kept twist": at.kept_twist}
+        ends = {name: end_of(each, at.path_m) for name, each in named.items() if each}
+        beside = (f"{name} {end.removesuffix(OF_PATH)}" for name, end in ends.items())
+        found = f"On unseen data the predictions end {at.model.position_m:.3g} m off"
+        share = f" ({end_of(at.model, at.path_m)})" if at.path_m > 0.0 else ""
+        return f"{found} after {at.horizon_s:g} s{share}; {', '.join(beside)}."
+    return UNTRIED
+
+
+def end_of(errors: EndErrors, path: float) -> str:
+    """Formats an error of position as a share of the path [m], or in metres if there is none."""
+    if path > 0.0 and isfinite(errors.position_m):
+        share = 100.0 * errors.position_m / path
+        return f"{f'{share:.1f}' if share >= 0.1 else '< 0.1'} %{OF_PATH}"
+    return f"{errors.position_m:.3g} m"

@@ -1,0 +1,109 @@
+"""Blocks of a page on a fit: the conclusion first, then paths and yardsticks, and all figures."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from nics_drl_bridge.files import write_text
+from nics_drl_bridge.identify.conclusion import OF_PATH, Conclusion, conclude, end_of
+from nics_drl_bridge.identify.identify import Identified
+from nics_drl_bridge.identify.judgement import shortfall, usual
+from nics_drl_bridge.identify.report import (
+    COMPARED,
+    HEADS,
+    equations_with_errors,
+    judgement_rows,
+)
+from nics_drl_bridge.identify.verdict import doubts
+from nics_drl_bridge.report import html
+from nics_drl_bridge.report.fit_pictures import (
+    CAPTIONS,
+    calibration_pictures,
+    fit_pictures,
+    unseen_paths,
+    yardsticks,
+)
+from nics_drl_bridge.robot.spec import RobotSpec
+
+PATHS_SHOWN = 3
+Blocks = Sequence[str]
+Tile = tuple[str, str, bool]
+
+
+def fit_tile(identified: Identified) -> Tile:
+    """Returns the accuracy of a fit as a figure, its meaning, and false if it is doubtful."""
+    doubtful = [*shortfall(identified.judgement), *doubts(identified.held_out)]
+    for at in usual(identified.judgement):
+        beside = {"": at.model, "fitted textbook ": at.textbook, "twist kept ": at.kept_twist}
+        told = [name + end_of(each, at.path_m) for name, each in beside.items() if each]
+        figure, *others = (text.removesuffix(OF_PATH) for text in told)
+        off = f"{OF_PATH} off".lstrip() if told[0] != figure else "off"
+        meaning = f"{off} after {at.horizon_s:g} s, on unseen data; {', '.join(others)}"
+        return figure, meaning, not doubtful
+    return "untried", "on data that it had not seen, as the drive is too short", False
+
+
+def verdict_blocks(tiles: Sequence[Tile], conclusion: Conclusion, *commands: str) -> Blocks:
+    """Figures in large type, doubts, what could not be learnt, and what to do next."""
+    blocks = [html.tiles(tiles)]
+    if conclusion.doubts:
+        blocks.append(html.bullets(conclusion.doubts))
+    if conclusion.gaps:
+        blocks += [html.paragraph("The drive could not teach all:"), html.bullets(conclusion.gaps)]
+    else:
+        blocks.append(html.paragraph("The drive taught all that the model needs."))
+    blocks.append(html.paragraph(conclusion.advice))
+    return [*blocks, html.code("\n".join(commands))] if commands else blocks
+
+
+def path_blocks(identified: Identified) -> Blocks:
+    """Predicted paths beside the measured ones, and errors beside those of the yardsticks."""
+    if identified.held_out is None or not identified.judgement:
+        return [html.paragraph("The drive is too short to hold data out.")]
+    drawn = [(each, "") for each in unseen_paths(identified.trial, PATHS_SHOWN)]
+    caption = (
+        "Mean errors of predictions of unseen data: of a good model they are below the others."
+    )
+    if any(at.band_m for at in identified.judgement):
+        caption += " Bars: distances within which 95 % of its ends are expected."
+    rows = html.table(HEADS, judgement_rows(identified.judgement))
+    return [
+        html.gallery(drawn),
+        html.picture(yardsticks(identified), caption),
+        html.details("The same in figures", [html.paragraph(COMPARED), rows]),
+    ]
+
+
+def model_blocks(spec: RobotSpec, identified: Identified, report: str) -> Blocks:
+    """The equations, and folded all figures and pictures of fit and calibration."""
+    fit = fit_pictures(spec, identified, paths=False)
+    drawn = {**fit, **calibration_pictures(spec, identified)}
+    pictures = [html.picture(png, CAPTIONS[name]) for name, png in drawn.items()]
+    equations = "\n".join(equations_with_errors(identified.model))
+    return [
+        html.code(equations),
+        html.details("All figures of the fit", [html.code(report)]),
+        html.details("Pictures of the fit and of the calibration", pictures),
+    ]
+
+
+def write_fit_page(
+    file: Path, source: str, spec: RobotSpec, identified: Identified, report: str
+) -> None:
+    """Writes the page of a fit to a recording from a source, with the fit report as text."""
+    conclusion, folder = conclude(identified), file.parent
+    tile, model = fit_tile(identified), identified.model
+    terms = str(model.terms_kept), f"terms of a model with a step of {model.dt:g} s", True
+    assumed = len(model.assumed)
+    gaps = str(len(conclusion.gaps)), "things that the drive could not teach", not conclusion.gaps
+    figures = [tile, gaps, terms]
+    if assumed:
+        figures.append((str(assumed), "of the terms are assumed from the textbook", False))
+    train = f"nics train --robot {folder} --world arena --seeds 0 --out runs/first"
+    commands = () if conclusion.doubts else (train,)
+    sections = [
+        ("Verdict", verdict_blocks(figures, conclusion, *commands)),
+        ("Paths", path_blocks(identified)),
+        ("Model", model_blocks(spec, identified, report)),
+    ]
+    lead = f"Robot {spec.name!r}, from {source}."
+    write_text(file, html.page("nics_drl_bridge: fit", lead, sections))

@@ -1,0 +1,79 @@
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from nics_drl_bridge.identify.conclusion import UNTRIED, accuracy, conclude, end_of
+from nics_drl_bridge.identify.identify import identify
+from nics_drl_bridge.identify.report import fit_report, opening
+from nics_drl_bridge.identify.verdict import Gap
+from nics_drl_bridge.recording.textbook import record
+from nics_drl_bridge.robot.spec import load_robot
+from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors
+
+CAR = load_robot("ackermann")
+
+
+@pytest.fixture(scope="module")
+def found():
+    return identify(record(CAR, np.random.default_rng(0), 30.0), CAR)
+
+
+def judged(found, position, path=2.0):
+    ends = EndErrors(position, 0.1), EndErrors(1.0, 0.1), EndErrors(0.5, 0.1)
+    at = HorizonErrors(5.0, 9, path, ends[0], ends[1], ends[2])
+    return replace(found, findings=replace(found.findings, judgement=(at,)))
+
+
+@pytest.mark.parametrize(
+    ("position", "path", "text"),
+    [
+        (0.0228, 2.0, "end 0.0228 m off after 5 s (1.1 % of the path); a fitted textbook 25.0 %"),
+        (1e-5, 2.0, "(< 0.1 % of the path)"),
+        (0.02, 0.0, "end 0.02 m off after 5 s; a fitted textbook 0.5 m, a kept twist 1 m."),
+        (math.inf, 2.0, "the predictions run away within 5 s."),
+        (math.nan, 2.0, "the predictions run away within 5 s."),
+    ],
+)
+def test_the_accuracy_is_a_share_of_the_path_beside_those_of_the_yardsticks(
+    found, position, path, text
+):
+    assert text in accuracy(judged(found, position, path))
+
+
+def test_a_model_that_was_not_tried_says_so(found):
+    untried = replace(found, findings=replace(found.findings, judgement=()))
+    assert accuracy(untried) == UNTRIED
+    assert "generate anew" in conclude(untried).advice
+
+
+def test_a_model_that_is_beaten_is_not_to_be_trained_with(found):
+    assert conclude(found).doubts == ()
+    beaten = conclude(judged(found, 2.0))
+    assert any("does not beat" in doubt for doubt in beaten.doubts)
+    assert "before a policy is trained" in beaten.advice
+
+
+def test_the_report_opens_with_the_conclusion_and_the_model(found):
+    report = fit_report("here", CAR, found)
+    first = opening(report)
+    assert report.startswith(first)
+    assert conclude(found).advice in " ".join(first.split())
+    assert "d_speed = " in first
+    assert len(first.splitlines()) < 20 < len(report.splitlines())
+
+
+def test_an_error_without_a_path_is_in_metres():
+    assert end_of(EndErrors(0.5, 0.0), 0.0) == "0.5 m"
+
+
+def test_gaps_are_those_notes_that_tell_what_the_drive_could_not_teach(found):
+    assert conclude(found).gaps == ()
+    gap = "turn_command never moved."
+    told = conclude(replace(found, notes=("Poses arrive in bursts.", Gap(gap))))
+    assert told.gaps == (gap,)
+    assert "drive once more as said above" in told.advice
+    assert type(told.gaps[0]) is str  # a file takes no other

@@ -1,0 +1,107 @@
+from __future__ import annotations
+
+import base64
+import re
+from html.parser import HTMLParser
+
+import pytest
+
+from nics_drl_bridge.report.html import (
+    bullets,
+    code,
+    details,
+    gallery,
+    page,
+    paragraph,
+    picture,
+    table,
+    tiles,
+)
+
+VOID = {"meta", "img", "br"}
+
+
+class Checker(HTMLParser):
+    """Collects text and makes sure that every tag is closed in order."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.tags, self.text = [], [], ""
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def parsed(html):
+    checker = Checker()
+    checker.feed(html)
+    checker.close()
+    assert not checker.open
+    return checker
+
+
+def test_a_page_is_well_formed_and_holds_what_it_was_given():
+    blocks = [
+        paragraph("a paragraph"),
+        table(["name", "value"], [["speed", "1.5"]]),
+        code("x = 1\ny = 2"),
+    ]
+    found = parsed(page("Title", "a lead", [("First", blocks), ("Second", [])]))
+    for text in ("Title", "a lead", "First", "a paragraph", "speed", "1.5", "x = 1\ny = 2"):
+        assert text in found.text
+    assert found.tags.count("h2") == 2
+    assert found.tags.count("tr") == 2
+
+
+def test_text_is_never_taken_for_markup():
+    evil = "<script>alert('1 & 2')</script>"
+    blocks = [paragraph(evil), code(evil), table([evil], [[evil]]), picture(b"png", evil + '"')]
+    blocks += [bullets([evil]), tiles([(evil, evil, True)]), details(evil, [])]
+    html = page(evil, evil, [(evil, blocks)])
+    found = parsed(html)
+    assert "script" not in found.tags
+    assert found.text.count(evil) == 13  # title, heading, lead, section, caption, and the blocks
+    assert html.count('alt="') == 1
+
+
+def test_a_page_needs_no_other_file():
+    html = page("t", "l", [("s", [picture(b"\x89PNG", "c")])])
+    source = re.search(r'src="data:image/png;base64,([^"]+)"', html)
+    assert base64.b64decode(source[1]) == b"\x89PNG"
+    assert "http" not in html
+    assert "<link" not in html
+
+
+def test_what_is_folded_is_open_in_print():
+    html = page("t", "l", [("s", [details("All figures", [code("1 2 3")])])])
+    found = parsed(html)
+    assert found.tags.count("details") == found.tags.count("summary") == 1
+    assert "<details open" not in html
+    in_print = html.partition("@media print")[2]
+    assert "details::details-content { content-visibility: visible" in in_print
+
+
+@pytest.mark.parametrize(("good", "sign"), [(True, False), (False, True)])
+def test_a_doubtful_figure_is_told_by_a_sign_and_not_by_its_colour_alone(good, sign):
+    assert ("⚠" in parsed(tiles([("93 %", "of the episodes", good)])).text) is sign
+
+
+def test_a_page_is_as_wide_as_a_phone_and_light_or_dark_as_its_reader_wants():
+    html = page("t", "l", [])
+    assert 'name="viewport" content="width=device-width' in html
+    assert "screen and (prefers-color-scheme: dark)" in html
+
+
+@pytest.mark.parametrize(("width", "wide"), [(700, False), (701, True)])
+def test_a_phone_scrolls_a_picture_that_it_can_not_show_in_whole(width, wide):
+    png = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + width.to_bytes(4, "big") + bytes(9)
+    assert ('<figure class="wide">' in picture(png, "c")) is wide
+    assert gallery([(png, "one"), (png, "two")]).count("<img") == 2
