@@ -141,9 +141,14 @@ def footprint_shape(robot: RobotSpec) -> Circle | Polygon:
     return Polygon(points=robot.footprint)
 
 
-def usual_lidar(robot: RobotSpec) -> LidarSpec:
-    """The lidar that a robot's file names, else that of the paper. Raises ConfigError."""
-    return load_lidar(robot.lidar or DEFAULT_LIDAR)
+def lidar_of(robot: RobotSpec, name: str | None = None) -> LidarSpec:
+    """A lidar by name or file where the robot has it mounted; by default the robot's usual one.
+
+    That is the one that its file names, else that of the paper. Raises ConfigError.
+    """
+    spec = load_lidar(name or robot.lidar or DEFAULT_LIDAR)
+    mount = robot.lidar_mount
+    return spec if mount is None else spec.model_copy(update={"mount": mount})
 
 
 @lru_cache(maxsize=8)
@@ -151,7 +156,7 @@ def builtin_model(robot: str) -> SimulatorModel:
     """The model of a shipped robot, generated from a drive of its textbook kinematics."""
     spec = load_robot(robot)
     drive = textbook.record(spec, np.random.default_rng(BUILTIN_SEED))
-    return generate(drive, spec, usual_lidar(spec), ())[0]
+    return generate(drive, spec, lidar_of(spec), ())[0]
 
 
 def open_model(name: str | Path, lidar: str | None = None) -> SimulatorModel:
@@ -160,7 +165,8 @@ def open_model(name: str | Path, lidar: str | None = None) -> SimulatorModel:
     A `lidar`, shipped or a YAML file, takes the place of the model's own.
     """
     if lidar is not None:
-        model, spec = open_model(name), load_lidar(lidar)
+        model = open_model(name)
+        spec = lidar_of(model.robot, lidar)
         return replace(model, lidar=spec, table=bake(spec, model.table.shapes))
     name = str(name)
     if Path(name).is_dir():

@@ -12,7 +12,8 @@ from nics_drl_bridge.commands.console import EXIT_BAD_INPUT
 from nics_drl_bridge.commands.demo import demo
 from nics_drl_bridge.commands.doctor import doctor, replay
 from nics_drl_bridge.commands.evaluate import evaluate
-from nics_drl_bridge.commands.model import generate, import_, inspect, record, urdf
+from nics_drl_bridge.commands.listing import list_
+from nics_drl_bridge.commands.model import drive, generate, import_, inspect, record, urdf
 from nics_drl_bridge.commands.policy import policy
 from nics_drl_bridge.commands.train import train
 from nics_drl_bridge.commands.warmup import warmup
@@ -43,6 +44,8 @@ def _options(
 
 
 for command in (
+    list_,
+    drive,
     generate,
     inspect,
     import_,

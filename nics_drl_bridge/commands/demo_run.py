@@ -16,14 +16,15 @@ from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, PolicyError
 from nics_drl_bridge.files import write_text
-from nics_drl_bridge.generator import SimulatorModel, generate, save_model, usual_lidar
+from nics_drl_bridge.generator import SimulatorModel, generate, lidar_of, save_model
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.judgement import shortfall
 from nics_drl_bridge.identify.report import COMPARED, HEADS, judgement_rows
 from nics_drl_bridge.policy import evaluation
 from nics_drl_bridge.policy.evaluation import FIRST_SEED, Episode, Summary, deviation, successes
+from nics_drl_bridge.policy.pace import Fitted, fitted, pace_of
 from nics_drl_bridge.policy.policies import open_policy, shipped_policies
-from nics_drl_bridge.policy.training_settings import TrainingSettings, load_training
+from nics_drl_bridge.policy.training_settings import load_training
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import save_recording
@@ -118,7 +119,7 @@ def _generate(plan: DemoPlan, say: Say) -> tuple[SimulatorModel, Identified]:
     say(f"generating a simulator of the robot {robot.name!r} from {source}")
     recording = read_recording(source, robot)
     # The demo has to steer even if the drive never did; the report names the assumptions.
-    model, identified = generate(recording, robot, usual_lidar(robot), world.shapes, assume=True)
+    model, identified = generate(recording, robot, lidar_of(robot), world.shapes, assume=True)
     save_model(model, plan.model)
     say(model.report.rstrip())
     return model, identified
@@ -131,7 +132,7 @@ def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
         return Learned(plan.policy, f"The policy {plan.policy!r} was given; none was trained.")
     missing = next((module for module in NEEDED if find_spec(module) is None), None)
     if missing is None:
-        return _trained(plan, say)
+        return _trained(plan, model, say)
     policy = BASELINE
     if model.robot.name in shipped_policies() and find_spec("onnxruntime") and find_spec("onnx"):
         with suppress(PolicyError):  # a shipped one may not fit
@@ -144,17 +145,20 @@ def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
     return Learned(policy, f"None was trained, as {missing!r} is not installed: {policy!r} drives.")
 
 
-def settings_of(plan: DemoPlan) -> TrainingSettings:
+def settings_of(plan: DemoPlan, model: SimulatorModel) -> Fitted:
     """Settings of the demo's training, in the plan's simulator and world."""
     chosen = load_training("demo")
     worlds, steps = {plan.world: chosen.num_envs}, plan.train_steps or chosen.steps
-    return chosen.model_copy(update={"robot": str(plan.model), "worlds": worlds, "steps": steps})
+    changes = {"robot": str(plan.model), "worlds": worlds, "steps": steps}
+    return fitted(chosen.model_copy(update=changes), model, inherited=True)
 
 
-def _trained(plan: DemoPlan, say: Say) -> Learned:
+def _trained(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
     from nics_drl_bridge.policy.train import SeedResult, export, train  # needs torch
 
-    settings, curve = settings_of(plan), list[pictures.Point]()
+    (settings, told), curve = settings_of(plan, model), list[pictures.Point]()
+    for line in told:
+        say(line)
     say(f"training a policy for {settings.steps:,} steps in {settings.num_envs} worlds at once")
 
     def tell(progress: Any) -> None:
@@ -175,7 +179,8 @@ def _trained(plan: DemoPlan, say: Say) -> Learned:
 def _evaluate(plan: DemoPlan, model: SimulatorModel, name: str, say: Say) -> Summary:
     say(f"evaluating {name} in {MANY} unseen episodes, all at once")
     policy, task = open_policy(name, model)
-    env = BridgeVectorEnv(MANY, model, plan.world, task)
+    limit = pace_of(model, [load_world(plan.world)]).steps
+    env = BridgeVectorEnv(MANY, model, plan.world, task, max_episode_steps=limit)
     outcomes = evaluation.drive_worlds(env, policy.act, range(FIRST_SEED, FIRST_SEED + MANY))
     summary = evaluation.summarise(outcomes, model.control_period)
     rates = (f"{name} {100 * share.value:.1f} %" for name, share in summary.shares.items())

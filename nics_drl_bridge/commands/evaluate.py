@@ -125,7 +125,7 @@ def _shadow(
     bag: Path, policies: list[str], model: str | None, topics: list[str],
     goal: tuple[float, float] | None, ahead: float, out: Path,
 ) -> None:  # fmt: skip
-    from nics_drl_bridge.commands.episodes import robot_of
+    from nics_drl_bridge.commands.episodes import contracts_of, model_name
     from nics_drl_bridge.files import write_bytes, write_text
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.policy.shadow import PERCENTILES, shadow
@@ -133,7 +133,7 @@ def _shadow(
 
     rows, lines = list[tuple[str, ...]](), list[str]()
     for policy in policies:
-        name = model or robot_of(policy)
+        name = model_name(model, contracts_of([policy], model))
         made = shadow(bag, open_model(name), policy, roles_of(topics), goal, ahead)
         place, differences = out / f"shadow_{Path(policy).stem}", made.differences()
         write_bytes(place.with_suffix(".png"), shadow_picture(made))

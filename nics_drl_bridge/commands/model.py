@@ -15,6 +15,10 @@ from nics_drl_bridge.errors import BackendError, ConfigError
 if TYPE_CHECKING:
     from nics_drl_bridge.recording.recording import Recording
 
+LidarOption = Annotated[
+    str | None, Option(help="A shipped lidar or a YAML file; else the robot's own, or paper.")
+]
+
 
 def record(
     out: Annotated[Path, Option(help="An .npz file, or the folder of a rosbag2, to write.")],
@@ -185,9 +189,7 @@ def generate(
     topics: console.TopicsOption = None,
     topic: console.TopicOption = None,
     world: console.WorldOption = "arena",
-    lidar: Annotated[
-        str | None, Option(help="A shipped lidar or a YAML file; else the robot's own, or paper.")
-    ] = None,
+    lidar: LidarOption = None,
     sensor: Annotated[
         list[Path] | None, Option(help="YAML of a further sensor, docs/sensors.md; repeatable.")
     ] = None,
@@ -205,7 +207,7 @@ def generate(
 ) -> None:
     """Generates a simulator from a recording and writes it as a folder."""
     with one_sentence():
-        from nics_drl_bridge.generator import check_place, save_model, usual_lidar
+        from nics_drl_bridge.generator import check_place, lidar_of, save_model
         from nics_drl_bridge.generator import generate as generate_model
         from nics_drl_bridge.identify.fit import parse_alpha, parse_order
         from nics_drl_bridge.lidar.sensor import load_sensor
@@ -215,9 +217,9 @@ def generate(
         from nics_drl_bridge.sim.world import load_world
 
         check_place(out)
-        own, threshold, terms = None, parse_alpha(alpha), parse_order(order)
-        if lidar is not None:  # first: a wrong name is told before the drive is read
-            own = load_lidar(lidar)
+        threshold, terms = parse_alpha(alpha), parse_order(order)
+        if lidar is not None:  # a wrong name is told before the drive is read
+            load_lidar(lidar)
         further = tuple(load_sensor(file) for file in sensor or ())
         shapes = load_world(world).shapes
         with intact(recording, salvage) as whole:
@@ -225,7 +227,7 @@ def generate(
             spec, drive = robot_and_drive(whole, robot, roles, mapping)
         drive = replace(drive, source=str(recording))
         model, identified = generate_model(
-            drive, spec, own or usual_lidar(spec), shapes, terms, threshold, assume_textbook,
+            drive, spec, lidar_of(spec, lidar), shapes, terms, threshold, assume_textbook,
             strict, anyway, further,
         )  # fmt: skip
         save_model(model, out)
@@ -235,6 +237,45 @@ def generate(
             write_pictures(spec, identified, out / "pictures")
         typer.echo(model.report.rstrip())
         typer.echo(f"model written to {out}")
+
+
+def drive(
+    robot: Annotated[str, Option(help="A robot's YAML file, or a shipped robot.")],
+    out: Annotated[Path, Option(help="Folder of the model to write.")],
+    recording: Annotated[
+        Path | None, Option(help="An .npz to keep the drive in, as one of a real robot.")
+    ] = None,
+    lidar: LidarOption = None,
+    duration: Annotated[float, Option(min=5.0, max=3600.0, help="Of the drive [s].")] = 60.0,
+    seed: Annotated[int, Option(min=0, help="Of the commands, which are random.")] = 0,
+) -> None:
+    """Drives the textbook model of a robot, and generates a simulator from that drive.
+
+    For training before there is a recording; with one, `nics generate` makes a truer simulator.
+    """
+    with one_sentence():
+        import numpy as np
+
+        from nics_drl_bridge.generator import check_place, generate, lidar_of, save_model
+        from nics_drl_bridge.recording.recording import save_recording
+        from nics_drl_bridge.recording.textbook import record as record_textbook
+        from nics_drl_bridge.recording.write import check_out
+        from nics_drl_bridge.robot.spec import load_robot
+
+        check_place(out)
+        spec = load_robot(robot)
+        seen = lidar_of(spec, lidar)
+        if recording is not None and recording.suffix != ".npz":
+            raise ConfigError(f"--recording {recording}: must end in .npz.")
+        driven = record_textbook(spec, np.random.default_rng(seed), duration)
+        if recording is not None:
+            save_recording(driven, check_out(recording))
+            typer.echo(f"recording written to {recording}")
+        model, _ = generate(driven, spec, seen, ())
+        save_model(model, out)
+        typer.echo(model.report.rstrip())
+        typer.echo(f"model of the textbook {spec.name!r} with the lidar {seen.name!r}: {out}")
+        typer.echo(f"next: nics train --robot {out}")
 
 
 def urdf(

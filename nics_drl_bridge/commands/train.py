@@ -49,8 +49,6 @@ def train(
 ) -> None:
     """Trains policies in the fast simulator, and evaluates them."""
     with one_sentence():
-        from nics_drl_bridge.policy.training_settings import chosen_settings
-
         given = {"robot": robot, "algorithm": algorithm, "steps": steps, "world": world}
         given["engine"] = engine if engine in OWN else None
         named = {name: value for name, value in given.items() if value}
@@ -65,13 +63,23 @@ def train(
             fix = "pip install 'nics_drl_bridge[train]'."
             raise ConfigError(f"training needs the module {error.name!r}; {fix}") from None
         resumed = train_run.settings_of(out) if resume and out is not None else None
-        chosen = resumed or chosen_settings(task, settings, named)
+        chosen = resumed or _told(task, settings, named)
         folder = out or Path("runs") / chosen.title
         command = shlex.join(["nics", *sys.argv[1:]])
         every = [*(seeds or [0]), *(more_seeds or [])]
         order = train_run.TrainOrder(chosen, every, folder, episodes, resume, command)
         with _learner(engine, address, env_runners, chosen.num_envs) as learn:
             _run(train_run, order, learn)
+
+
+def _told(task: str, settings: str | None, named: dict[str, Any]) -> Any:
+    """The settings of a training, after telling what was adapted to the robot."""
+    from nics_drl_bridge.policy.pace import settings_for
+
+    chosen = settings_for(task, settings, named)
+    for line in chosen.told:
+        typer.echo(line, err=True)
+    return chosen.settings
 
 
 @contextmanager

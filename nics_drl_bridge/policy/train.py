@@ -209,7 +209,10 @@ def export(settings: TrainingSettings, result: SeedResult, command: str, path: P
     task = make_task(settings.task, model, settings.task_options)
     rates = {f"success in {world}": one.success.value for world, one in result.summaries.items()}
     provenance = {"command": command, "seed": result.seed, "steps": result.trained.steps, **rates}
-    export_policy(result.trained.algorithm, task, model, path, provenance=provenance)
+    if Path(settings.robot).exists():  # where an evaluation finds the robot, if it is not shipped
+        provenance["model"] = str(Path(settings.robot).resolve())
+    limit = settings.max_episode_steps
+    export_policy(result.trained.algorithm, task, model, path, None, provenance, limit)
 
 
 def _check(seeds: Sequence[int], out: Path, resumed: bool) -> None:

@@ -57,7 +57,9 @@ def test_a_named_policy_is_taken_and_a_misspelt_one_refused(tmp_path):
 
 
 def test_it_trains_in_the_world_and_simulator_of_the_plan(tmp_path):
-    settings = settings_of(DemoPlan(tmp_path, world="circles", train_steps=7))
+    plan = DemoPlan(tmp_path, world="circles", train_steps=7)
+    settings, told = settings_of(plan, direct_model())
+    assert told == ()
     assert settings.robot == str(tmp_path / "model")
     assert settings.worlds == {"circles": 512}
     assert settings.steps == 7
