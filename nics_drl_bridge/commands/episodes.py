@@ -39,6 +39,7 @@ NODES = {DDS: "simulator_node", MUJOCO: "mujoco_node"}
 PLACES = (FAST, *NODES)
 LABELS = {FAST: "in process", DDS: "over DDS", MUJOCO: "MuJoCo over DDS", VEHICLE: "on the vehicle"}
 DEFAULT_ROBOT = "ackermann"
+EVALUATION = "evaluation.json"
 GATE, RAW = "command_gate", "cmd_vel_raw"
 LISTEN_S, ARM_S = 5.0, 60.0
 START_S = 180.0  # time that a node may take to start [s]; its kernels may have to be compiled
@@ -260,7 +261,7 @@ def write_evaluation(
         "world": order.world, "seed": order.seed, "conditions": asdict(order.conditions),
         "policies": policies,
     }  # fmt: skip
-    write_text(order.out / "evaluation.json", json.dumps(data) + "\n")
+    write_text(order.out / EVALUATION, json.dumps(data) + "\n")
 
 
 def rows_of(evaluated: Sequence[Evaluated]) -> list[tuple[str, ...]]:

@@ -6,9 +6,9 @@ from enum import Enum
 from typing import Annotated, Any
 
 import typer
-from typer import Argument, Option
+from typer import Argument
 
-from nics_drl_bridge.commands.console import one_sentence, table
+from nics_drl_bridge.commands.console import JsonOption, one_sentence, table
 from nics_drl_bridge.config import shipped_names
 
 Row = dict[str, Any]
@@ -25,13 +25,13 @@ class Listed(str, Enum):
 
 def list_(
     what: Annotated[Listed, Argument(help="What to list.")],
-    as_json: Annotated[bool, Option("--json", help="Print one JSON list.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Lists the robots, worlds, lidars or policies that come with the package."""
     with one_sentence():
         rows = ROWS[what]()
         if as_json:
-            typer.echo(json.dumps(rows))
+            typer.echo(json.dumps({what.value: rows}))
         else:
             cells = [tuple(map(str, row.values())) for row in rows]
             typer.echo(table(tuple(rows[0]), cells))
@@ -45,10 +45,10 @@ def robots() -> list[Row]:
     return [
         {
             "name": name,
-            "commands": ", ".join(f"{c.name} {c.min:g} to {c.max:g} {c.unit}" for c in spec.command),
-            "lidar": lidar_of(spec).name, "description": spec.description,
+            "commands": ", ".join(f"{c.name} {c.min:g} to {c.max:g} {c.unit}" for c in one.command),
+            "lidar": lidar_of(one).name, "description": one.description,
         }
-        for name, spec in ((name, load_robot(name)) for name in shipped_names("robots"))
+        for name, one in ((name, load_robot(name)) for name in shipped_names("robots"))
     ]  # fmt: skip
 
 

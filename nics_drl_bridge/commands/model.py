@@ -1,7 +1,8 @@
 """`nics record`, `inspect`, `import`, `generate` and `urdf`: from a robot to its model."""
 
+import json
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,15 +10,17 @@ import typer
 from typer import Argument, Option
 
 from nics_drl_bridge.commands import console
-from nics_drl_bridge.commands.console import RobotOption, intact, needs_ros, one_sentence
+from nics_drl_bridge.commands.console import (
+    LidarOption,
+    RobotOption,
+    intact,
+    needs_ros,
+    one_sentence,
+)
 from nics_drl_bridge.errors import BackendError, ConfigError
 
 if TYPE_CHECKING:
     from nics_drl_bridge.recording.recording import Recording
-
-LidarOption = Annotated[
-    str | None, Option(help="A shipped lidar or a YAML file; else the robot's own, or paper.")
-]
 
 
 def record(
@@ -112,6 +115,7 @@ def inspect(
     mapping: Annotated[
         Path | None, Option("--map", help="YAML file to begin: a first mapping, with guesses.")
     ] = None,
+    as_json: console.JsonOption = False,
 ) -> None:
     """Lists what a recording of any form holds, and begins the mapping that says what is what."""
     with one_sentence():
@@ -122,8 +126,11 @@ def inspect(
 
         if mapping is not None and mapping.exists():
             raise ConfigError(f"--map {mapping}: is there already; give another name.")
-        with open_source(source) as opened:
+        with open_source(source) as opened, console.progress_bar(f"reading {source}"):
             tables = survey(opened)
+        if as_json:
+            typer.echo(json.dumps({"tables": [asdict(table) for table in tables]}, default=str))
+            return
         for table in tables:
             found = "".join(f"\n  {finding}" for finding in table.regularity + table.findings)
             typer.echo(f"{table.name}: {table.rows} rows{found}")
@@ -155,8 +162,9 @@ def import_(
         if out.suffix != ".npz":
             raise ConfigError(f"--out {out}: must end in .npz.")
         check_out(out)
-        drive = read_recording(source, mapping=mapping)
-        save_recording(drive, out)
+        with console.progress_bar(f"reading {source}"):
+            drive = read_recording(source, mapping=mapping)
+            save_recording(drive, out)
         for line in stream_lines(drive):
             typer.echo(line)
         typer.echo(f"recording written to {out}")
@@ -222,15 +230,16 @@ def generate(
             load_lidar(lidar)
         further = tuple(load_sensor(file) for file in sensor or ())
         shapes = load_world(world).shapes
-        with intact(recording, salvage) as whole:
+        with intact(recording, salvage) as whole, console.progress_bar(f"reading {recording}"):
             roles = topic_roles(topics, topic or ())
             spec, drive = robot_and_drive(whole, robot, roles, mapping)
         drive = replace(drive, source=str(recording))
-        model, identified = generate_model(
-            drive, spec, lidar_of(spec, lidar), shapes, terms, threshold, assume_textbook,
-            strict, anyway, further,
-        )  # fmt: skip
-        save_model(model, out)
+        with console.progress_bar("generating"):
+            model, identified = generate_model(
+                drive, spec, lidar_of(spec, lidar), shapes, terms, threshold, assume_textbook,
+                strict, anyway, further,
+            )  # fmt: skip
+            save_model(model, out)
         if pictures:
             from nics_drl_bridge.report.fit_pictures import write_pictures
 
@@ -267,13 +276,15 @@ def drive(
         seen = lidar_of(spec, lidar)
         if recording is not None and recording.suffix != ".npz":
             raise ConfigError(f"--recording {recording}: must end in .npz.")
-        driven = record_textbook(spec, np.random.default_rng(seed), duration)
-        if recording is not None:
-            save_recording(driven, check_out(recording))
-            typer.echo(f"recording written to {recording}")
-        model, _ = generate(driven, spec, seen, ())
+        with console.progress_bar(f"driving and generating {spec.name!r}"):
+            driven = record_textbook(spec, np.random.default_rng(seed), duration)
+            if recording is not None:
+                save_recording(driven, check_out(recording))
+            model, _ = generate(driven, spec, seen, ())
         save_model(model, out)
         typer.echo(model.report.rstrip())
+        if recording is not None:
+            typer.echo(f"recording written to {recording}")
         typer.echo(f"model of the textbook {spec.name!r} with the lidar {seen.name!r}: {out}")
         typer.echo(f"next: nics train --robot {out}")
 

@@ -147,10 +147,9 @@ def _check(lidar: LidarSpec, layout: ScanLayout, angles: Array) -> None:
     gap = np.minimum(place - ordered[after - 1], ordered[after] - place)
     if (gap > apart + BORDER_RAD).any():
         limits = np.degrees([angles[0], angles[-1], layout.angle_min, layout.angle_max])
-        raise ConfigError(
-            "the lidar {!r} looks from {:.4g} to {:.4g} deg in base_link, the scan layout needs "
-            "{:.4g} to {:.4g}; {}.".format(lidar.name, *limits, _narrower(lidar, layout))
-        )
+        a, b, c, d = (f"{limit:.4g}" for limit in limits)
+        reason = f"looks from {a} to {b} deg in base_link, the scan layout needs {c} to {d}"
+        raise ConfigError(f"the lidar {lidar.name!r} {reason}; {_narrower(lidar, layout)}.")
 
 
 def _narrower(lidar: LidarSpec, layout: ScanLayout) -> str:

@@ -179,6 +179,7 @@ class TrainOrder:
 def run(
     order: TrainOrder, tell: Tell = lambda _: None,
     done: Callable[[SeedResult], None] = lambda _: None, learn: Learn = train,
+    evaluating: Callable[[str], None] = lambda _: None,
 ) -> list[SeedResult]:  # fmt: skip
     """Trains and evaluates seed after seed; ConfigError for a run in the folder, or none there."""
     _check(order.seeds, order.out, order.resumed)
@@ -191,6 +192,7 @@ def run(
         trained = learn(settings, seed, folder, tell, order.resumed and begun)
         summaries = {}
         for world in settings.worlds:
+            evaluating(world)
             driven = evaluate(trained.algorithm, settings, world, order.episodes, model)
             summaries[world] = summarise(driven, model.control_period)
         result = SeedResult(seed, trained, summaries)
