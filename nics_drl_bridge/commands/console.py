@@ -91,6 +91,11 @@ def one_sentence() -> Iterator[None]:
     except BridgeError as error:
         typer.echo(f"nics: {error}", err=True)
         raise typer.Exit(EXIT_BAD_INPUT) from None
+    except ImportError as error:
+        if (clause := extensions.unmet(error)) is None:
+            raise
+        typer.echo(f"nics: {clause}", err=True)
+        raise typer.Exit(EXIT_BAD_INPUT) from None
     except BrokenPipeError:
         raise
     except OSError as error:

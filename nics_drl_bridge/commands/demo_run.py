@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS, Say, drive_in
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.env.navigation import Navigation
@@ -36,7 +37,6 @@ from nics_drl_bridge.sim.world import load_world
 
 RECORDING_SEED, TRAINING_SEED = 1, 0
 MANY = 500  # episodes of the evaluation in the fast simulator
-NEEDED = ("torch", "stable_baselines3", "tensorboard", "onnx", "onnxruntime")
 BASELINE = "dynamic_window"
 LINES = 10  # number of progress reports of a training
 START_S, ARRIVE_S = 60.0, 40.0  # time that a node may take to start, and the robot to arrive
@@ -130,7 +130,7 @@ def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
     if plan.policy is not None:
         open_policy(plan.policy, model)
         return Learned(plan.policy, f"The policy {plan.policy!r} was given; none was trained.")
-    missing = next((module for module in NEEDED if find_spec(module) is None), None)
+    missing = extensions.lacking(extensions.TRAINING)
     if missing is None:
         return _trained(plan, model, say)
     policy = BASELINE

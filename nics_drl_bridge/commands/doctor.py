@@ -30,10 +30,16 @@ def doctor(
     policy: Annotated[str | None, Option(help="What it must fit instead: a policy file.")] = None,
     namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
     duration: Annotated[float, Option(min=1.0, help="How long to listen to a robot [s].")] = 5.0,
+    install: Annotated[
+        bool, Option("--install", help="Look at this machine instead: what works here.")
+    ] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Tells what of a robot or a bag does not fit a model or a policy; it sends nothing."""
     with one_sentence():
+        if install:
+            _tell_installation(as_json)
+            return
         from nics_drl_bridge.generator import open_model
         from nics_drl_bridge.policy.foreign import load_any
         from nics_drl_bridge.report.doctor import examine
@@ -65,6 +71,18 @@ def doctor(
             typer.echo(f"{facts.source}: all fits {policy or model or DEFAULT}.")
         if findings:
             raise typer.Exit(EXIT_FINDINGS)
+
+
+def _tell_installation(as_json: bool) -> None:
+    from nics_drl_bridge.commands.installation import checks
+
+    found = checks()
+    if as_json:
+        typer.echo(json.dumps({"checks": [each._asdict() for each in found]}))
+        return
+    heads = ("", "part", "what there is", "what to do")
+    rows = [("+" if c.works else "-", c.part, c.found, "" if c.works else c.fix) for c in found]
+    typer.echo(table(heads, rows))
 
 
 def explain(

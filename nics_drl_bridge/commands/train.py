@@ -73,11 +73,9 @@ def train(
             raise ConfigError(f"--{option}: a resumed run has its own settings; leave it out.")
         if resume and out is None:
             raise ConfigError("--resume needs --out, the folder of the run to go on with.")
-        try:
-            from nics_drl_bridge.policy import train as train_run
-        except ModuleNotFoundError as error:
-            fix = "pip install 'nics_drl_bridge[train]'."
-            raise ConfigError(f"training needs the module {error.name!r}; {fix}") from None
+        extensions.require("training", *extensions.TRAINING)
+        from nics_drl_bridge.policy import train as train_run
+
         resumed = train_run.settings_of(out) if resume and out is not None else None
         chosen = resumed or _told(task, settings, named)
         folder = out or Path("runs") / chosen.title
