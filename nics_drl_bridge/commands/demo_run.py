@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import astuple, dataclass
 from importlib.util import find_spec
+from math import isfinite
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -278,7 +279,8 @@ def _policy(plan: DemoPlan, learned: Learned, summary: Summary) -> list[str]:
     for name, share in summary.shares.items():
         rows.append((name, *(f"{100 * value:.1f} %" for value in astuple(share))))
     for name, amount in (("path [m]", summary.length), ("time [s]", summary.time)):
-        rows.append((name, *(f"{value:.2f}" for value in astuple(amount))))
+        known = (f"{value:.2f}" if isfinite(value) else "-" for value in astuple(amount))
+        rows.append((name, *known))
     text = (
         f"{summary.episodes} unseen episodes in the world {plan.world!r}, side by side in the fast "
         "simulator, the policy at its best; path and time are means of the successful ones."

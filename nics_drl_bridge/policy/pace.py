@@ -22,6 +22,7 @@ from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
+OWN_TASK = "navigation"  # for which there are settings for robots of one's own
 LEAST_S = 30.0  # least time limit [s]
 ROOM = 1.8  # of the time on the straight line: for ways around, turns, and being slow at times
 
@@ -99,11 +100,9 @@ def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted
     """
     robot, told, shipped = changes.get("robot"), list[str](), shipped_names("training")
     own = f"{task}_{robot}" in shipped
-    if name is None and robot is not None and not own:
-        like = f"{task}_{kin(open_model(robot).robot)}"
-        if like in shipped:
-            name = like
-            told.append(f"robot {robot!r} has no training settings; taken from {name!r}")
+    if name is None and robot is not None and not own and task == OWN_TASK:
+        name = f"own_{kin(open_model(robot).robot)}"
+        told.append(f"settings {name!r}, as the robot {robot!r} has none of its own")
     settings = chosen_settings(task, name, changes)
     inherited = name in shipped and load_training(str(name)).robot != settings.robot
     made = fitted(settings, open_model(settings.robot, settings.lidar), inherited)

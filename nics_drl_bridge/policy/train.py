@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -182,7 +183,7 @@ def run(
     evaluating: Callable[[str], None] = lambda _: None,
 ) -> list[SeedResult]:  # fmt: skip
     """Trains and evaluates seed after seed; ConfigError for a run in the folder, or none there."""
-    _check(order.seeds, order.out, order.resumed)
+    _check(order.settings, order.seeds, order.out, order.resumed)
     settings, model = order.settings, open_model(order.settings.robot, order.settings.lidar)
     write_text(order.out / SETTINGS, dump_yaml(settings.model_dump(mode="json")))
     results = []
@@ -217,7 +218,7 @@ def export(settings: TrainingSettings, result: SeedResult, command: str, path: P
     export_policy(result.trained.algorithm, task, model, path, None, provenance, limit)
 
 
-def _check(seeds: Sequence[int], out: Path, resumed: bool) -> None:
+def _check(settings: TrainingSettings, seeds: Sequence[int], out: Path, resumed: bool) -> None:
     checked_seeds(seeds, GREATEST_SEED)
     if not seeds or len(set(seeds)) < len(seeds):
         raise ConfigError(f"seeds {list(seeds)}: give one or more, none twice.")
@@ -225,6 +226,9 @@ def _check(seeds: Sequence[int], out: Path, resumed: bool) -> None:
     if begun and not resumed:
         fix = "add --resume, or choose another --out."
         raise ConfigError(f"{out}: holds checkpoints of these seeds; {fix}")
+    if (out / SETTINGS).is_file() and not resumed and settings_of(out) != settings:
+        fix = "choose another --out, or remove it."
+        raise ConfigError(f"{out}: holds a run with other settings; {fix}")
     if resumed and not begun:
         raise ConfigError(f"{out}: holds no checkpoint of these seeds; leave out --resume.")
 
@@ -242,8 +246,6 @@ def line_of(summary: Summary) -> str:
         f"{name} {100 * share.value:.1f} % ({100 * share.low:.1f} to {100 * share.high:.1f})"
         for name, share in summary.shares.items()
     )
-    length, time = (
-        f"{one.value:.2f} {unit} ({one.low:.2f} to {one.high:.2f})"
-        for one, unit in ((summary.length, "m"), (summary.time, "s"))
-    )
-    return f"{rates}, path {length}, time {time} of {summary.episodes} episodes"
+    path = f", path {summary.length.text('m')}, time {summary.time.text('s')}"
+    some = "" if math.isnan(summary.time.value) else path
+    return f"{rates}{some} of {summary.episodes} episodes"
