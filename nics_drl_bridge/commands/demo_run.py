@@ -166,8 +166,7 @@ def _trained(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
         before = curve[-1].steps if curve else 0
         curve.append(pictures.Point(progress.steps, progress.success, progress.collision))
         if progress.steps * LINES // settings.steps > before * LINES // settings.steps:
-            speed = f"{progress.steps_per_s:,.0f} steps/s"
-            say(f"  {progress.steps:,} steps: success {100 * progress.success:.1f} %, {speed}")
+            say(f"  {progress.steps:,} steps: {progress.line}")
 
     trained = train(settings, TRAINING_SEED, plan.out / "training", tell)
     result, file = SeedResult(TRAINING_SEED, trained, {}), plan.out / "policy.onnx"

@@ -125,8 +125,7 @@ def _learner(
 
 def _run(train_run: Any, order: Any, learn: Any, as_json: bool) -> None:
     def told(progress: Any) -> None:
-        success, speed = 100 * progress.success, progress.steps_per_s
-        what = f"seed {progress.seed}: success {success:.1f} %, {speed:,.0f} steps/s"
+        what = f"seed {progress.seed}: {progress.line}"
         if not math.isnan(progress.held_out):
             what += f", held out {100 * progress.held_out:.1f} %"
         tell(what, progress.steps, progress.total)

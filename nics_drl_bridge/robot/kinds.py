@@ -7,6 +7,7 @@ speed and steering angle in the state by their units. An actuator is of first or
 Robots, ch. 3; the paper's reference for Table I.
 """
 
+import difflib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -199,7 +200,9 @@ def _made(spec: RobotSpec, make: Callable[[RobotKind], T]) -> T:
         return make(kind)
     except KeyError as error:
         needed = f"the {spec.textbook} kinematics need the parameter {error}"
-        raise ConfigError(f"{robot}: {needed}; add it under `parameters:`.") from None
+        near = difflib.get_close_matches(str(error.args[0]), spec.parameters, n=1)
+        fix = f"is {near[0]!r} it?" if near else "add it under `parameters:`."
+        raise ConfigError(f"{robot}: {needed}; {fix}") from None
 
 
 def require_textbook(spec: RobotSpec) -> str:
