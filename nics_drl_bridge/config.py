@@ -160,16 +160,20 @@ def share_folder() -> Path:
     raise ConfigError("the package's config folder was not found; install it with pip or colcon.")
 
 
+def shipped_names(kind: str) -> list[str]:
+    """Names of the YAML files in `config/KIND`, sorted."""
+    return sorted(file.stem for file in (share_folder() / "config" / kind).glob("*.yaml"))
+
+
 def find_config(name: str | Path, kind: str) -> Path:
     """Finds `arena` in `config/KIND`, or a YAML file by its path; ConfigError names the nearest."""
     name = str(name)
     if name.endswith((".yaml", ".yml")):
         return Path(name)
-    folder = share_folder() / "config" / kind
-    path = folder / f"{name}.yaml"
+    path = share_folder() / "config" / kind / f"{name}.yaml"
     if path.is_file():
         return path
-    hint = nearest(name, (file.stem for file in folder.glob("*.yaml")))
+    hint = nearest(name, shipped_names(kind))
     unknown = f"unknown {kind.removesuffix('s')} {name!r}"
     raise ConfigError(f"{unknown}; {hint} (or give the path of a YAML file).")
 

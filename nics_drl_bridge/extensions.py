@@ -3,11 +3,11 @@
 import hashlib
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, requires, version
-from importlib.util import module_from_spec, spec_from_file_location
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from traceback import extract_tb
 from typing import Any
@@ -17,9 +17,11 @@ from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
 PACKAGE = "nics_drl_bridge"
 ROS = ("rclpy", "_msgs", "std_srvs", "builtin_interfaces")
 INSTALL = {  # libraries, and the extra of this package that brings each
-    "mcap": "bags", "mujoco": "mujoco", "ray": "train,distributed", "rosbags": "bags",
-    "torch": "train",
+    "leapp": "leapp", "mcap": "bags", "mujoco": "mujoco", "onnx": "deploy", "onnxruntime": "deploy",
+    "onnxscript": "train", "pettingzoo": "multi", "ray": "train,distributed", "rosbags": "bags",
+    "stable_baselines3": "train", "tensorboard": "train", "torch": "train",
 }  # fmt: skip
+TRAINING = ("torch", "stable_baselines3", "tensorboard", "onnx", "onnxruntime")
 
 
 @cache
@@ -49,6 +51,20 @@ def missing(module: str) -> str:
     if library in INSTALL:
         return f"needs the module {module!r}; pip install '{PACKAGE}[{INSTALL[library]}]'."
     return f"needs the module {module!r}; install it."
+
+
+def lacking(modules: Iterable[str]) -> str | None:
+    """The first of some modules that is not installed."""
+    return next((module for module in modules if find_spec(module) is None), None)
+
+
+def require(what: str, *modules: str) -> None:
+    """Raises ConfigError, with the command to mend it, if a module that something needs is missing.
+
+    To be asked before long work, and before an import that would fail.
+    """
+    if (module := lacking(modules)) is not None:
+        raise ConfigError(f"{what} {missing(module)}")
 
 
 def unmet(error: ImportError) -> str | None:

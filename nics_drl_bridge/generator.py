@@ -13,6 +13,7 @@ from nics_drl_bridge.config import Schema, dump_yaml, parse_yaml, read_text, val
 from nics_drl_bridge.errors import ConfigError, FitError, ModelError
 from nics_drl_bridge.identify import fit
 from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.excitation import narrow
 from nics_drl_bridge.identify.identify import Identified, identify
 from nics_drl_bridge.identify.report import fit_report, why_useless
 from nics_drl_bridge.lidar.bake import bake
@@ -22,6 +23,7 @@ from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 from nics_drl_bridge.lidar.table import TABLE_FILES, LidarTable
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.recording import Recording
+from nics_drl_bridge.robot.kinds import overdriven
 from nics_drl_bridge.robot.noise import Latency, Noise
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.robot.taylor import NamedTaylorModel, TaylorModel
@@ -125,11 +127,16 @@ def generate(
     identified = identify(recording, robot, order=order, alpha=alpha, assume=assume, strict=strict)
     if (reason := why_useless(identified, robot)) and not anyway:
         raise FitError(reason)
+    found = narrow(recording, robot)
+    if (wheels := overdriven(robot)) is not None:
+        found.append(wheels)
+    report = fit_report(recording.source, robot, identified)
+    if found:
+        report = "\n".join([report.rstrip(), "", "Mind:", *(f"  - {one}" for one in found), ""])
     model = SimulatorModel(
         robot, identified.model, replace(identified.calibration, inputs=(), limits={}), lidar,
         bake(lidar, (*shapes, footprint_shape(robot))), identified.noise,
-        report=fit_report(recording.source, robot, identified), latency=recording.latency,
-        sensors=tuple(sensors),
+        report=report, latency=recording.latency, sensors=tuple(sensors),
     )  # fmt: skip
     return model, identified
 
@@ -141,9 +148,14 @@ def footprint_shape(robot: RobotSpec) -> Circle | Polygon:
     return Polygon(points=robot.footprint)
 
 
-def usual_lidar(robot: RobotSpec) -> LidarSpec:
-    """The lidar that a robot's file names, else that of the paper. Raises ConfigError."""
-    return load_lidar(robot.lidar or DEFAULT_LIDAR)
+def lidar_of(robot: RobotSpec, name: str | None = None) -> LidarSpec:
+    """A lidar by name or file where the robot has it mounted; by default the robot's usual one.
+
+    That is the one that its file names, else that of the paper. Raises ConfigError.
+    """
+    spec = load_lidar(name or robot.lidar or DEFAULT_LIDAR)
+    mount = robot.lidar_mount
+    return spec if mount is None else spec.model_copy(update={"mount": mount})
 
 
 @lru_cache(maxsize=8)
@@ -151,7 +163,7 @@ def builtin_model(robot: str) -> SimulatorModel:
     """The model of a shipped robot, generated from a drive of its textbook kinematics."""
     spec = load_robot(robot)
     drive = textbook.record(spec, np.random.default_rng(BUILTIN_SEED))
-    return generate(drive, spec, usual_lidar(spec), ())[0]
+    return generate(drive, spec, lidar_of(spec), ())[0]
 
 
 def open_model(name: str | Path, lidar: str | None = None) -> SimulatorModel:
@@ -160,7 +172,8 @@ def open_model(name: str | Path, lidar: str | None = None) -> SimulatorModel:
     A `lidar`, shipped or a YAML file, takes the place of the model's own.
     """
     if lidar is not None:
-        model, spec = open_model(name), load_lidar(lidar)
+        model = open_model(name)
+        spec = lidar_of(model.robot, lidar)
         return replace(model, lidar=spec, table=bake(spec, model.table.shapes))
     name = str(name)
     if Path(name).is_dir():

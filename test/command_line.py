@@ -10,7 +10,10 @@ import sys
 from pathlib import Path
 from unittest import mock
 
+from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands.cli import main
+
+PATIENT_S = 1e6  # no line about long work between what a test reads
 
 
 def nics(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -20,6 +23,7 @@ def nics(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
     try:
         with (
             mock.patch.object(sys, "argv", argv),
+            mock.patch.object(console, "PATIENCE_S", PATIENT_S),
             contextlib.redirect_stdout(out),
             contextlib.redirect_stderr(err),
         ):

@@ -63,7 +63,7 @@ def csv_folder(path: Path, bad_row: str = "") -> Path:
 
 
 COMMANDS = {
-    "generate", "record", "replay", "doctor", "urdf", "train", "evaluate", "demo", "policy", "bag",
+    "generate", "record", "explain", "doctor", "urdf", "train", "evaluate", "demo", "policy", "bag",
     "world",
 }  # fmt: skip
 
@@ -145,8 +145,8 @@ def test_a_recording_too_coarse_for_a_useful_model_is_one_sentence(tmp_path):
 
 def test_replay_of_something_else_is_one_sentence(tmp_path):
     (tmp_path / "stop.jsonl").write_text("{}", encoding="utf-8")
-    assert "is no black box" in refused(nics("replay", "stop.jsonl", cwd=tmp_path))
-    assert "no such file" in refused(nics("replay", "none.jsonl", cwd=tmp_path))
+    assert "is no black box" in refused(nics("explain", "stop.jsonl", cwd=tmp_path))
+    assert "no such file" in refused(nics("explain", "none.jsonl", cwd=tmp_path))
 
 
 @pytest.mark.slow

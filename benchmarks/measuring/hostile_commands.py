@@ -58,8 +58,9 @@ def _seed(rng: Rng, folder: Path, simulator: FastSimulator) -> Attempt:
 def _path(rng: Rng, folder: Path) -> Attempt:
     """What is no file, in the place of one."""
     commands: tuple[tuple[str, ...], ...] = (
-        ("policy", "info"), ("replay",), ("bag", "info"), ("bake", "--world"), ("bake", "--shapes"),
-        ("bake", "--lidar"), ("bake", "--robot"), ("generate", "--out", "model", "--robot"),
+        ("policy", "info"), ("explain",), ("bag", "info"), ("bake", "--world"),
+        ("bake", "--shapes"), ("bake", "--lidar"), ("bake", "--robot"),
+        ("generate", "--out", "model", "--robot"),
         ("generate", "--out", "model"), ("train", "--settings"), ("doctor",),
         ("evaluate", "--in", "fast", "--out", "evaluated"), ("urdf",),
         ("evaluate", "straight", "--in", "fast", "--out", "evaluated", "--world"),

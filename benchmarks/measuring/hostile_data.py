@@ -254,7 +254,7 @@ def _box(rng: Rng, folder: Path, whole: Whole) -> Attempt:
     path = folder / "stop.jsonl"
     path.write_text(text + json.dumps({"sha256": sha256(text.encode())}) + "\n")
     verdict = "any" if way in (2, 3, 5) else "bad"
-    act = nics("replay", path) if rng.random() < 0.3 else lambda: black_box.replay(path)
+    act = nics("explain", path) if rng.random() < 0.3 else lambda: black_box.replay(path)
     return Attempt("black box", f"way {way}, {size}", act, verdict)
 
 

@@ -10,9 +10,11 @@ from typer import Option
 from nics_drl_bridge import __version__, extensions
 from nics_drl_bridge.commands.console import EXIT_BAD_INPUT
 from nics_drl_bridge.commands.demo import demo
-from nics_drl_bridge.commands.doctor import doctor, replay
+from nics_drl_bridge.commands.doctor import doctor, explain
 from nics_drl_bridge.commands.evaluate import evaluate
-from nics_drl_bridge.commands.model import generate, import_, inspect, record, urdf
+from nics_drl_bridge.commands.examples import give_examples
+from nics_drl_bridge.commands.listing import list_
+from nics_drl_bridge.commands.model import drive, generate, import_, inspect, record, urdf
 from nics_drl_bridge.commands.policy import policy
 from nics_drl_bridge.commands.train import train
 from nics_drl_bridge.commands.warmup import warmup
@@ -22,8 +24,8 @@ from nics_drl_bridge.errors import LONGEST, shortened
 app = typer.Typer(
     help="From a recording of a robot to a fast simulator, and back to the robot over ROS 2.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # which takes units such as [m/s] for markup
 )
 
 
@@ -43,11 +45,13 @@ def _options(
 
 
 for command in (
+    list_,
+    drive,
     generate,
     inspect,
     import_,
     record,
-    replay,
+    explain,
     doctor,
     urdf,
     train,
@@ -60,6 +64,7 @@ app.add_typer(policy, name="policy")
 app.add_typer(world, name="world")
 for name, extension in extensions.known("commands").items():
     app.add_typer(extension.load(), name=name)
+give_examples(app)
 
 
 def main() -> None:

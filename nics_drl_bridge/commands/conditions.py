@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS
 from nics_drl_bridge.generator import SimulatorModel, open_model, save_model
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 
@@ -18,7 +17,7 @@ class Conditions:
     randomisation: str | None = None  # shipped one or file, which draws each episode's numbers
     gate: str | None = None  # limits, shipped or a file, of a gate between policy and robot
     fallback: str = ""  # planner behind the policy, none by default
-    steps: int = MAX_EPISODE_STEPS  # greatest number of an episode
+    steps: int | None = None  # time limit of an episode; None: that of policies, robot and world
     task: Mapping[str, Any] = field(default_factory=dict)  # options, instead of the policy's own
 
     @property

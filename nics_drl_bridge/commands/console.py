@@ -1,7 +1,10 @@
 """Shared parts of the commands: options, one-sentence errors, a table, a progress bar."""
 
+import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from glob import glob
 from pathlib import Path
 from typing import Annotated
 
@@ -14,11 +17,45 @@ from nics_drl_bridge.errors import MISSING_ROS, BridgeError, ConfigError, neares
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 WIDEST = 10_000
+PATIENCE_S, REPEATED_S = 2.0, 10.0  # silence before the first line about work, and between lines
+Tell = Callable[[str, int, int], None]  # what is done, how much of it, of how much (0: unknown)
 
-RobotOption = Annotated[str, Option(help="A shipped robot (ackermann) or a YAML file.")]
-WorldOption = Annotated[
-    str, Option("--world", "--scene", help="A shipped world (arena) or a YAML file.")
+
+def completing(kind: str) -> Callable[[str], list[str]]:
+    """Completion of a shell for an option that takes a name in `config/KIND`, or a path."""
+
+    def complete(incomplete: str) -> list[str]:
+        from nics_drl_bridge.config import shipped_names
+
+        places = (Path(one) for one in sorted(glob(f"{incomplete}*")))
+        paths = [str(one) for one in places if one.is_dir() or one.suffix in (".yaml", ".onnx")]
+        return [name for name in shipped_names(kind) if name.startswith(incomplete)] + paths
+
+    return complete
+
+
+RobotOption = Annotated[
+    str,
+    Option(
+        help="A shipped robot (see nics list robots) or a YAML file.",
+        autocompletion=completing("robots"),
+    ),
 ]
+LidarOption = Annotated[
+    str | None,
+    Option(
+        help="A shipped lidar or a YAML file; else the robot's own, or paper.",
+        autocompletion=completing("lidars"),
+    ),
+]
+WorldOption = Annotated[
+    str,
+    Option(
+        "--world", "--scene", help="A shipped world (arena) or a YAML file.",
+        autocompletion=completing("worlds"),
+    ),
+]  # fmt: skip
+JsonOption = Annotated[bool, Option("--json", help="Print one JSON object instead.")]
 TopicsOption = Annotated[Path | None, Option(help="YAML file: a bag's topic for each role.")]
 SalvageOption = Annotated[
     bool, Option("--salvage", help="Take what is intact of a damaged bag, and tell the rest.")
@@ -53,6 +90,11 @@ def one_sentence() -> Iterator[None]:
         yield
     except BridgeError as error:
         typer.echo(f"nics: {error}", err=True)
+        raise typer.Exit(EXIT_BAD_INPUT) from None
+    except ImportError as error:
+        if (clause := extensions.unmet(error)) is None:
+            raise
+        typer.echo(f"nics: {clause}", err=True)
         raise typer.Exit(EXIT_BAD_INPUT) from None
     except BrokenPipeError:
         raise
@@ -111,16 +153,41 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 @contextmanager
-def progress_bar() -> Iterator[Callable[[str, int, int], None]]:
-    """Yields an updater of a bar on a terminal: description, done, total (0 means unknown)."""
+def progress_bar(begin: str = "starting") -> Iterator[Tell]:
+    """Yields an updater of a bar on a terminal, of a line now and then on standard error else."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     console = Console(stderr=True)
+    if not console.is_terminal:
+        with _lines(begin) as tell:
+            yield tell
+        return
     columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()
-    bar = Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
-    with bar as progress:
-        task = progress.add_task("", total=None)
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task(begin, total=None)
         yield lambda what, done, total: progress.update(
             task, description=what, completed=done, total=total or None
         )
+
+
+@contextmanager
+def _lines(begin: str) -> Iterator[Tell]:
+    now, over, since = [begin], threading.Event(), time.monotonic()
+
+    def tell(what: str, done: int, total: int) -> None:
+        now[0] = f"{what}, {done:,} of {total:,}" if total else what
+
+    def speak() -> None:
+        patience = PATIENCE_S
+        while not over.wait(patience):
+            patience = REPEATED_S
+            typer.echo(f"{now[0]} ({time.monotonic() - since:.0f} s)", err=True)
+
+    thread = threading.Thread(target=speak, daemon=True)
+    thread.start()
+    try:
+        yield tell
+    finally:
+        over.set()
+        thread.join()

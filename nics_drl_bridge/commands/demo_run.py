@@ -5,25 +5,28 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import astuple, dataclass
 from importlib.util import find_spec
+from math import isfinite
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS, Say, drive_in
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, PolicyError
 from nics_drl_bridge.files import write_text
-from nics_drl_bridge.generator import SimulatorModel, generate, save_model, usual_lidar
+from nics_drl_bridge.generator import SimulatorModel, generate, lidar_of, save_model
 from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.report import opening
 from nics_drl_bridge.policy import evaluation
 from nics_drl_bridge.policy.evaluation import FIRST_SEED, Episode, Summary, deviation, successes
+from nics_drl_bridge.policy.pace import Fitted, fitted, pace_of
 from nics_drl_bridge.policy.policies import open_policy, shipped_policies
-from nics_drl_bridge.policy.training_settings import TrainingSettings, load_training
+from nics_drl_bridge.policy.training_settings import load_training
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import save_recording
@@ -35,7 +38,6 @@ from nics_drl_bridge.sim.world import load_world
 
 RECORDING_SEED, TRAINING_SEED = 1, 0
 MANY = 500  # episodes of the evaluation in the fast simulator
-NEEDED = ("torch", "stable_baselines3", "tensorboard", "onnx", "onnxruntime")
 BASELINE = "dynamic_window"
 LINES = 10  # number of progress reports of a training
 START_S, ARRIVE_S = 60.0, 40.0  # time that a node may take to start, and the robot to arrive
@@ -127,7 +129,7 @@ def _generate(plan: DemoPlan, say: Say) -> tuple[SimulatorModel, Identified]:
     say(f"generating a simulator of the robot {robot.name!r} from {source}")
     recording = read_recording(source, robot)
     # The demo has to steer even if the drive never did; the report names the assumptions.
-    model, identified = generate(recording, robot, usual_lidar(robot), world.shapes, assume=True)
+    model, identified = generate(recording, robot, lidar_of(robot), world.shapes, assume=True)
     save_model(model, plan.model)
     say(opening(model.report))
     return model, identified
@@ -138,9 +140,9 @@ def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
     if plan.policy is not None:
         open_policy(plan.policy, model)
         return Learned(plan.policy, f"The policy {plan.policy!r} was given; none was trained.")
-    missing = next((module for module in NEEDED if find_spec(module) is None), None)
+    missing = extensions.lacking(extensions.TRAINING)
     if missing is None:
-        return _trained(plan, say)
+        return _trained(plan, model, say)
     policy = BASELINE
     if model.robot.name in shipped_policies() and find_spec("onnxruntime") and find_spec("onnx"):
         with suppress(PolicyError):  # a shipped one may not fit
@@ -153,25 +155,27 @@ def learn(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
     return Learned(policy, f"None was trained, as {missing!r} is not installed: {policy!r} drives.")
 
 
-def settings_of(plan: DemoPlan) -> TrainingSettings:
+def settings_of(plan: DemoPlan, model: SimulatorModel) -> Fitted:
     """Settings of the demo's training, in the plan's simulator and world."""
     chosen = load_training("demo")
     worlds, steps = {plan.world: chosen.num_envs}, plan.train_steps or chosen.steps
-    return chosen.model_copy(update={"robot": str(plan.model), "worlds": worlds, "steps": steps})
+    changes = {"robot": str(plan.model), "worlds": worlds, "steps": steps}
+    return fitted(chosen.model_copy(update=changes), model, inherited=True)
 
 
-def _trained(plan: DemoPlan, say: Say) -> Learned:
+def _trained(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
     from nics_drl_bridge.policy.train import SeedResult, export, train  # needs torch
 
-    settings, curve = settings_of(plan), list[pictures.Point]()
+    (settings, told), curve = settings_of(plan, model), list[pictures.Point]()
+    for line in told:
+        say(line)
     say(f"training a policy for {settings.steps:,} steps in {settings.num_envs} worlds at once")
 
     def tell(progress: Any) -> None:
         before = curve[-1].steps if curve else 0
         curve.append(pictures.Point(progress.steps, progress.success, progress.collision))
         if progress.steps * LINES // settings.steps > before * LINES // settings.steps:
-            speed = f"{progress.steps_per_s:,.0f} steps/s"
-            say(f"  {progress.steps:,} steps: success {100 * progress.success:.1f} %, {speed}")
+            say(f"  {progress.steps:,} steps: {progress.line}")
 
     trained = train(settings, TRAINING_SEED, plan.out / "training", tell)
     result, file = SeedResult(TRAINING_SEED, trained, {}), plan.out / "policy.onnx"
@@ -184,7 +188,8 @@ def _trained(plan: DemoPlan, say: Say) -> Learned:
 def _evaluate(plan: DemoPlan, model: SimulatorModel, name: str, say: Say) -> Summary:
     say(f"evaluating {name} in {MANY} unseen episodes, all at once")
     policy, task = open_policy(name, model)
-    env = BridgeVectorEnv(MANY, model, plan.world, task)
+    limit = pace_of(model, [load_world(plan.world)]).steps
+    env = BridgeVectorEnv(MANY, model, plan.world, task, max_episode_steps=limit)
     outcomes = evaluation.drive_worlds(env, policy.act, range(FIRST_SEED, FIRST_SEED + MANY))
     summary = evaluation.summarise(outcomes, model.control_period)
     rates = (f"{name} {100 * share.value:.1f} %" for name, share in summary.shares.items())
@@ -309,7 +314,8 @@ def _policy(plan: DemoPlan, learned: Learned, summary: Summary) -> list[str]:
     for name, share in summary.shares.items():
         rows.append((name, *(f"{100 * value:.1f} %" for value in astuple(share))))
     for name, amount in (("path [m]", summary.length), ("time [s]", summary.time)):
-        rows.append((name, *(f"{value:.2f}" for value in astuple(amount))))
+        known = (f"{value:.2f}" if isfinite(value) else "-" for value in astuple(amount))
+        rows.append((name, *known))
     text = (
         f"{summary.episodes} unseen episodes in the world {plan.world!r}, side by side in the fast "
         "simulator, the policy at its best; path and time are means of the successful ones."

@@ -1,4 +1,4 @@
-"""`nics doctor` and `nics replay`: what is wrong with a robot, and why its gate stopped it."""
+"""`nics doctor` and `nics explain`: what is wrong with a robot, and why its gate stopped it."""
 
 import json
 from dataclasses import asdict
@@ -8,7 +8,13 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge.commands.console import needs_ros, one_sentence, table
+from nics_drl_bridge.commands.console import (
+    JsonOption,
+    needs_ros,
+    one_sentence,
+    progress_bar,
+    table,
+)
 from nics_drl_bridge.errors import ConfigError
 
 EXIT_FINDINGS = 1
@@ -24,10 +30,16 @@ def doctor(
     policy: Annotated[str | None, Option(help="What it must fit instead: a policy file.")] = None,
     namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
     duration: Annotated[float, Option(min=1.0, help="How long to listen to a robot [s].")] = 5.0,
-    as_json: Annotated[bool, Option("--json", help="Print one JSON object.")] = False,
+    install: Annotated[
+        bool, Option("--install", help="Look at this machine instead: what works here.")
+    ] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Tells what of a robot or a bag does not fit a model or a policy; it sends nothing."""
     with one_sentence():
+        if install:
+            _tell_installation(as_json)
+            return
         from nics_drl_bridge.generator import open_model
         from nics_drl_bridge.policy.foreign import load_any
         from nics_drl_bridge.report.doctor import examine
@@ -45,7 +57,8 @@ def doctor(
         else:
             with needs_ros("nics doctor"):
                 from nics_drl_bridge.nodes.listen import listen
-            facts = listen(duration, namespace)
+            with progress_bar(f"listening for {duration:g} s"):
+                facts = listen(duration, namespace)
         findings = examine(facts, expected)
         if as_json:
             plain = {"source": facts.source, "findings": [asdict(each) for each in findings]}
@@ -60,15 +73,30 @@ def doctor(
             raise typer.Exit(EXIT_FINDINGS)
 
 
-def replay(
+def _tell_installation(as_json: bool) -> None:
+    from nics_drl_bridge.commands.installation import checks
+
+    found = checks()
+    if as_json:
+        typer.echo(json.dumps({"checks": [each._asdict() for each in found]}))
+        return
+    heads = ("", "part", "what there is", "what to do")
+    rows = [("+" if c.works else "-", c.part, c.found, "" if c.works else c.fix) for c in found]
+    typer.echo(table(heads, rows))
+
+
+def explain(
     file: Annotated[Path, Argument(help="What command_gate wrote at a stop, *.jsonl.")],
+    as_json: JsonOption = False,
 ) -> None:
-    """Decides anew on what led to a stop of the gate, and tells the stops in it."""
+    """Tells why command_gate stopped a robot, by deciding anew on what it wrote down."""
     with one_sentence():
         from nics_drl_bridge.gate import black_box
 
         again = black_box.replay(file)
-        for line in again.story:
-            typer.echo(line)
+        if as_json:
+            typer.echo(json.dumps({"story": list(again.story), "differing": again.differing}))
+        else:
+            typer.echo("\n".join(again.story))
         if again.differing:
             raise typer.Exit(EXIT_FINDINGS)

@@ -14,6 +14,7 @@ import gymnasium
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.conditions import NO_CONDITIONS, Conditions
+from nics_drl_bridge.config import shipped_names
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.env.sim_backend import make_backend
 from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, nearest
@@ -21,7 +22,9 @@ from nics_drl_bridge.files import write_bytes, write_text
 from nics_drl_bridge.gate.gated_backend import GatedBackend
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.policy import evaluation
+from nics_drl_bridge.policy.contract import Contract
 from nics_drl_bridge.policy.evaluation import Episode, Tally, drive, drive_all
+from nics_drl_bridge.policy.pace import pace_of
 from nics_drl_bridge.policy.policies import check_fallback, is_policy_file, open_policy
 from nics_drl_bridge.policy.stateful import Policy
 from nics_drl_bridge.report.doctor import examine
@@ -36,6 +39,7 @@ NODES = {DDS: "simulator_node", MUJOCO: "mujoco_node"}
 PLACES = (FAST, *NODES)
 LABELS = {FAST: "in process", DDS: "over DDS", MUJOCO: "MuJoCo over DDS", VEHICLE: "on the vehicle"}
 DEFAULT_ROBOT = "ackermann"
+EVALUATION = "evaluation.json"
 GATE, RAW = "command_gate", "cmd_vel_raw"
 LISTEN_S, ARM_S = 5.0, 60.0
 START_S = 180.0  # time that a node may take to start [s]; its kernels may have to be compiled
@@ -96,7 +100,8 @@ def env_of(
     if conditions.gate is not None:
         made = GatedBackend(made, model, conditions.gate)
     given = {"backend": made, "model": model, "world": field, "task": task}
-    return gymnasium.make(NAVIGATION, max_episode_steps=conditions.steps, **given), opened
+    limit = conditions.steps or pace_of(model, [field]).steps
+    return gymnasium.make(NAVIGATION, max_episode_steps=limit, **given), opened
 
 
 def check_place(place: str) -> None:
@@ -109,13 +114,27 @@ def check_place(place: str) -> None:
         extensions.load("nodes", NODES[MUJOCO])
 
 
-def robot_of(policy: str) -> str:
-    """The robot that a policy file was trained for; for a baseline the default robot."""
-    if not is_policy_file(policy):
-        return DEFAULT_ROBOT
+def robot_of(policy: str, contract: Contract) -> str:
+    """The robot that a policy was trained for: its model's folder or file, or a shipped one."""
+    place, name = str(contract.provenance.get("model", "")), contract.robot.name
+    if place and Path(place).exists():
+        return place
+    if name in shipped_names("robots"):
+        return name
+    where = f"; its model was {place}, which is gone" if place else ""
+    fix = "say where its model is with --model"
+    raise ConfigError(f"{policy}: is of the robot {name!r}, which is not shipped{where}; {fix}.")
+
+
+def contracts_of(policies: Sequence[str], model: str | None = None) -> dict[str, Contract]:
+    """The contracts of those policies that are files, by policy; baselines have none."""
+    files = [policy for policy in policies if is_policy_file(policy)]
+    if not files:
+        return {}
     from nics_drl_bridge.policy.foreign import load_any  # needs onnx, baselines do not
 
-    return str(load_any(policy).contract.robot.name)
+    opened = None if model is None else open_model(model)
+    return {policy: load_any(policy, opened).contract for policy in files}
 
 
 @dataclass(frozen=True)
@@ -153,8 +172,10 @@ def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
     seeds, logs = order.seeds, order.out / "logs"
     for policy in order.policies:
         check_fallback(order.conditions.fallback, policy)
-    model, name = order.conditions.model(_model_name(order), order.out)
+    contracts = contracts_of(order.policies, order.model)
+    model, name = order.conditions.model(model_name(order.model, contracts), order.out)
     world = load_worlds(order.world)
+    under = limited(order.conditions, contracts, model, world, say)
     places, evaluated = _places(order, model, say), []
     for policy in order.policies:
         runs = {}
@@ -166,10 +187,23 @@ def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
                 tell(what, episode.seed - order.seed + 1, order.episodes)
 
             given = place, policy, name, order.world, seeds, logs
-            runs[place] = drive_in(*given, on_episode, say, order.conditions)
+            runs[place] = drive_in(*given, on_episode, say, under)
         evaluated.append(judged(policy, runs, model, world, order.out, PANELS))
     write_evaluation(order, name, model, evaluated)
     return evaluated
+
+
+def limited(
+    conditions: Conditions, contracts: Mapping[str, Contract], model: SimulatorModel,
+    world: AnyWorld, say: Say,
+) -> Conditions:  # fmt: skip
+    """Conditions with a time limit, the policies' own or one for robot and world; tells it."""
+    pace = pace_of(model, [world])
+    known = [one.max_episode_steps for one in contracts.values() if one.max_episode_steps]
+    steps = conditions.steps or max(known, default=pace.steps)
+    if (short := pace.shortfall(steps)) is not None:
+        say(short)
+    return replace(conditions, steps=steps)
 
 
 def _places(order: EvaluationOrder, model: SimulatorModel, say: Say) -> Sequence[str]:
@@ -198,12 +232,13 @@ def judged(
     return Evaluated(policy, runs, evaluation.tallies(runs, model.control_period))
 
 
-def _model_name(order: EvaluationOrder) -> str:
-    if order.model is not None:
-        for policy in order.policies:
-            is_policy_file(policy)
-        return order.model
-    robots = {policy: robot_of(policy) for policy in order.policies}
+def model_name(model: str | None, contracts: Mapping[str, Contract]) -> str:
+    """The model to drive: the given one, or that of all policy files; baselines drive any."""
+    if model is not None:
+        return model
+    robots = {policy: robot_of(policy, contract) for policy, contract in contracts.items()}
+    if not robots:
+        return DEFAULT_ROBOT
     if len(set(robots.values())) > 1:
         of_each = ", ".join(f"{policy!r} is of {robot!r}" for policy, robot in robots.items())
         raise ConfigError(f"{of_each}: evaluate them one by one, or say which with --model.")
@@ -226,7 +261,7 @@ def write_evaluation(
         "world": order.world, "seed": order.seed, "conditions": asdict(order.conditions),
         "policies": policies,
     }  # fmt: skip
-    write_text(order.out / "evaluation.json", json.dumps(data) + "\n")
+    write_text(order.out / EVALUATION, json.dumps(data) + "\n")
 
 
 def rows_of(evaluated: Sequence[Evaluated]) -> list[tuple[str, ...]]:
@@ -269,8 +304,10 @@ def drive_vehicle(
     returns when it may begin. Raises BackendError if the vehicle does not fit its model or answer.
     """
     policy = order.policies[0]
-    name, namespace = order.model or robot_of(policy), options.get("namespace", "")
+    contracts = contracts_of(order.policies, order.model)
+    name, namespace = model_name(order.model, contracts), options.get("namespace", "")
     model, world = open_model(name), load_worlds(order.world)
+    under = limited(order.conditions, contracts, model, world, say)
     # A misfit is an error before anything moves.
     open_policy(policy, model, order.conditions.fallback)
     from nics_drl_bridge.nodes.listen import listen
@@ -284,7 +321,7 @@ def drive_vehicle(
     if errors:
         raise BackendError(f"the vehicle is not driven: {errors[0]}; see nics doctor for the rest.")
     given = {"mode": "realtime", "vehicle": True, "command_topic": RAW, "say": say, **options}
-    env, driver = env_of(policy, model, order.world, "dds", order.conditions, **given)
+    env, driver = env_of(policy, model, order.world, "dds", under, **given)
     episodes, chosen = list[Episode](), {} if goal is None else {"goal": goal}
     with closing(env):
         for count, seed in enumerate(order.seeds, 1):
@@ -295,7 +332,7 @@ def drive_vehicle(
             # The vehicle's own estimate is all that is known of its path.
             episodes.append(replace(driven, path=driven.estimate))
             say(f"  {driven.result}, {driven.steps} steps, {episodes[-1].length:.2f} m")
-    env, driver = env_of(policy, model, order.world, "sim", order.conditions, estimator=True)
+    env, driver = env_of(policy, model, order.world, "sim", under, estimator=True)
     with closing(env):
         starts = [(one.seed, {"start": one.path[0], "goal": one.goal}) for one in episodes]
         again = [drive(env, driver, *each) for each in starts]

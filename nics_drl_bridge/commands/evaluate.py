@@ -8,7 +8,15 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge.commands.console import needs_ros, one_sentence, progress_bar, roles_of, table
+from nics_drl_bridge.commands.console import (
+    JsonOption,
+    completing,
+    needs_ros,
+    one_sentence,
+    progress_bar,
+    roles_of,
+    table,
+)
 from nics_drl_bridge.errors import ConfigError
 
 
@@ -17,10 +25,11 @@ def evaluate(
         metavar="POLICY...", help="Policy files, shipped policies (differential), or baselines "
         "(dynamic_window, mppi, straight, random).")],
     model: Annotated[str | None, Option(
-        "--model", "--robot", help="A model's folder, or a shipped robot; else the policy's own.")
-    ] = None,
+        "--model", "--robot", help="A model's folder, or a shipped robot; else the policy's own.",
+        autocompletion=completing("robots"))] = None,
     world: Annotated[str, Option(
-        "--world", "--scene", help="A shipped world (circles) or a YAML file.")] = "circles",
+        "--world", "--scene", help="A shipped world (circles) or a YAML file.",
+        autocompletion=completing("worlds"))] = "circles",
     places: Annotated[list[str] | None, Option(
         "--in", help="fast, dds or mujoco_dds; several times; all by default.")] = None,
     episodes: Annotated[int | None, Option(min=1, help="How many; 20, or 1 on a vehicle.")] = None,
@@ -51,6 +60,7 @@ def evaluate(
     pose_type: Annotated[str, Option(help="For --hardware: type of `pose`, in map.")] = "none",
     yes: Annotated[bool, Option("--yes", help="For --hardware: ask no questions.")] = False,
     arm: Annotated[bool, Option("--arm", help="For --hardware: arm command_gate.")] = False,
+    as_json: JsonOption = False,
 ) -> None:  # fmt: skip
     """Drives policies through the same episodes in several worlds, and compares."""
     with one_sentence():
@@ -84,8 +94,11 @@ def evaluate(
                 ask = partial(_ask, yes)
                 evaluated = [driving.drive_vehicle(order, place, arm, tell, ask, **options)]
         else:
-            with progress_bar() as advance:
+            with progress_bar("opening robot and policies") as advance:
                 evaluated = driving.evaluate(order, tell, advance)
+        if as_json:
+            typer.echo((out / driving.EVALUATION).read_text().rstrip())
+            return
         typer.echo(table(driving.HEADS, driving.rows_of(evaluated)))
         for one in evaluated:
             typer.echo(driving.line_of(one))
@@ -125,7 +138,7 @@ def _shadow(
     bag: Path, policies: list[str], model: str | None, topics: list[str],
     goal: tuple[float, float] | None, ahead: float, out: Path,
 ) -> None:  # fmt: skip
-    from nics_drl_bridge.commands.episodes import robot_of
+    from nics_drl_bridge.commands.episodes import contracts_of, model_name
     from nics_drl_bridge.files import write_bytes, write_text
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.policy.shadow import PERCENTILES, shadow
@@ -133,7 +146,7 @@ def _shadow(
 
     rows, lines = list[tuple[str, ...]](), list[str]()
     for policy in policies:
-        name = model or robot_of(policy)
+        name = model_name(model, contracts_of([policy], model))
         made = shadow(bag, open_model(name), policy, roles_of(topics), goal, ahead)
         place, differences = out / f"shadow_{Path(policy).stem}", made.differences()
         write_bytes(place.with_suffix(".png"), shadow_picture(made))

@@ -1,7 +1,8 @@
 """`nics record`, `inspect`, `import`, `generate` and `urdf`: from a robot to its model."""
 
+import json
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,7 +10,13 @@ import typer
 from typer import Argument, Option
 
 from nics_drl_bridge.commands import console
-from nics_drl_bridge.commands.console import RobotOption, intact, needs_ros, one_sentence
+from nics_drl_bridge.commands.console import (
+    LidarOption,
+    RobotOption,
+    intact,
+    needs_ros,
+    one_sentence,
+)
 from nics_drl_bridge.errors import BackendError, ConfigError
 
 if TYPE_CHECKING:
@@ -108,6 +115,7 @@ def inspect(
     mapping: Annotated[
         Path | None, Option("--map", help="YAML file to begin: a first mapping, with guesses.")
     ] = None,
+    as_json: console.JsonOption = False,
 ) -> None:
     """Lists what a recording of any form holds, and begins the mapping that says what is what."""
     with one_sentence():
@@ -118,8 +126,11 @@ def inspect(
 
         if mapping is not None and mapping.exists():
             raise ConfigError(f"--map {mapping}: is there already; give another name.")
-        with open_source(source) as opened:
+        with open_source(source) as opened, console.progress_bar(f"reading {source}"):
             tables = survey(opened)
+        if as_json:
+            typer.echo(json.dumps({"tables": [asdict(table) for table in tables]}, default=str))
+            return
         for table in tables:
             found = "".join(f"\n  {finding}" for finding in table.regularity + table.findings)
             typer.echo(f"{table.name}: {table.rows} rows{found}")
@@ -151,8 +162,9 @@ def import_(
         if out.suffix != ".npz":
             raise ConfigError(f"--out {out}: must end in .npz.")
         check_out(out)
-        drive = read_recording(source, mapping=mapping)
-        save_recording(drive, out)
+        with console.progress_bar(f"reading {source}"):
+            drive = read_recording(source, mapping=mapping)
+            save_recording(drive, out)
         for line in stream_lines(drive):
             typer.echo(line)
         typer.echo(f"recording written to {out}")
@@ -185,9 +197,7 @@ def generate(
     topics: console.TopicsOption = None,
     topic: console.TopicOption = None,
     world: console.WorldOption = "arena",
-    lidar: Annotated[
-        str | None, Option(help="A shipped lidar or a YAML file; else the robot's own, or paper.")
-    ] = None,
+    lidar: LidarOption = None,
     sensor: Annotated[
         list[Path] | None, Option(help="YAML of a further sensor, docs/sensors.md; repeatable.")
     ] = None,
@@ -205,7 +215,7 @@ def generate(
 ) -> None:
     """Generates a simulator from a recording and writes it as a folder."""
     with one_sentence():
-        from nics_drl_bridge.generator import check_place, save_model, usual_lidar
+        from nics_drl_bridge.generator import check_place, lidar_of, save_model
         from nics_drl_bridge.generator import generate as generate_model
         from nics_drl_bridge.identify.fit import parse_alpha, parse_order
         from nics_drl_bridge.lidar.sensor import load_sensor
@@ -215,23 +225,25 @@ def generate(
         from nics_drl_bridge.sim.world import load_world
 
         check_place(out)
-        own, threshold, terms = None, parse_alpha(alpha), parse_order(order)
-        if lidar is not None:  # first: a wrong name is told before the drive is read
-            own = load_lidar(lidar)
+        threshold, terms = parse_alpha(alpha), parse_order(order)
+        if lidar is not None:  # a wrong name is told before the drive is read
+            load_lidar(lidar)
         further = tuple(load_sensor(file) for file in sensor or ())
         shapes = load_world(world).shapes
-        with intact(recording, salvage) as whole:
+        with intact(recording, salvage) as whole, console.progress_bar(f"reading {recording}"):
             roles = topic_roles(topics, topic or ())
             spec, drive = robot_and_drive(whole, robot, roles, mapping)
         drive = replace(drive, source=str(recording))
-        model, identified = generate_model(
-            drive, spec, own or usual_lidar(spec), shapes, terms, threshold, assume_textbook,
-            strict, anyway, further,
-        )  # fmt: skip
-        save_model(model, out)
+        with console.progress_bar("generating"):
+            model, identified = generate_model(
+                drive, spec, lidar_of(spec, lidar), shapes, terms, threshold, assume_textbook,
+                strict, anyway, further,
+            )  # fmt: skip
+            save_model(model, out)
         from nics_drl_bridge.identify.report import opening
         from nics_drl_bridge.report.fit_page import write_fit_page
         from nics_drl_bridge.report.fit_pictures import write_pictures
+
 
         page = out / "report.html"
         write_fit_page(page, str(recording), spec, identified, model.report)
@@ -240,6 +252,47 @@ def generate(
         typer.echo(opening(model.report))
         typer.echo(f"\nall figures: {out / 'report.txt'}, with pictures: {page}")
         typer.echo(f"model written to {out}")
+
+
+def drive(
+    robot: Annotated[str, Option(help="A robot's YAML file, or a shipped robot.")],
+    out: Annotated[Path, Option(help="Folder of the model to write.")],
+    recording: Annotated[
+        Path | None, Option(help="An .npz to keep the drive in, as one of a real robot.")
+    ] = None,
+    lidar: LidarOption = None,
+    duration: Annotated[float, Option(min=5.0, max=3600.0, help="Of the drive [s].")] = 60.0,
+    seed: Annotated[int, Option(min=0, help="Of the commands, which are random.")] = 0,
+) -> None:
+    """Drives the textbook model of a robot, and generates a simulator from that drive.
+
+    For training before there is a recording; with one, `nics generate` makes a truer simulator.
+    """
+    with one_sentence():
+        import numpy as np
+
+        from nics_drl_bridge.generator import check_place, generate, lidar_of, save_model
+        from nics_drl_bridge.recording.recording import save_recording
+        from nics_drl_bridge.recording.textbook import record as record_textbook
+        from nics_drl_bridge.recording.write import check_out
+        from nics_drl_bridge.robot.spec import load_robot
+
+        check_place(out)
+        spec = load_robot(robot)
+        seen = lidar_of(spec, lidar)
+        if recording is not None and recording.suffix != ".npz":
+            raise ConfigError(f"--recording {recording}: must end in .npz.")
+        with console.progress_bar(f"driving and generating {spec.name!r}"):
+            driven = record_textbook(spec, np.random.default_rng(seed), duration)
+            if recording is not None:
+                save_recording(driven, check_out(recording))
+            model, _ = generate(driven, spec, seen, ())
+        save_model(model, out)
+        typer.echo(model.report.rstrip())
+        if recording is not None:
+            typer.echo(f"recording written to {recording}")
+        typer.echo(f"model of the textbook {spec.name!r} with the lidar {seen.name!r}: {out}")
+        typer.echo(f"next: nics train --robot {out}")
 
 
 def urdf(

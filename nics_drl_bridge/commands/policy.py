@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge.commands.console import one_sentence
+from nics_drl_bridge.commands.console import JsonOption, one_sentence
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import write_bytes
 
@@ -25,7 +25,7 @@ def info(
     file: Annotated[
         str, Argument(help="A policy file, the name of a shipped one, or a foreign one's mapping.")
     ],
-    as_json: Annotated[bool, Option("--json", help="One JSON object instead.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Checks a policy file and tells what it was trained on and needs."""
     with one_sentence():

@@ -1,10 +1,12 @@
 """`nics train`."""
 
+import json
 import math
 import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,7 +14,7 @@ import typer
 from typer import Argument, Option
 
 from nics_drl_bridge import extensions
-from nics_drl_bridge.commands.console import one_sentence, progress_bar
+from nics_drl_bridge.commands.console import JsonOption, completing, one_sentence, progress_bar
 from nics_drl_bridge.errors import ConfigError, nearest
 
 OWN = ("lean", "sb3")  # the engines of PPO in this process, see `training_settings.Engine`
@@ -22,13 +24,26 @@ def train(
     more_seeds: Annotated[list[int] | None, Argument(hidden=True)] = None,
     task: Annotated[str, Option(help="A task, or path/to/file.py:ClassName.")] = "navigation",
     robot: Annotated[
-        str | None, Option(help="A shipped robot (differential), or the folder of a model.")
+        str | None,
+        Option(
+            help="A shipped robot (differential), a YAML file, or the folder of a model.",
+            autocompletion=completing("robots"),
+        ),
     ] = None,
     settings: Annotated[
-        str | None, Option(help="Shipped settings (navigation_differential), or a YAML file.")
+        str | None,
+        Option(
+            help="Shipped settings (navigation_differential), or a YAML file; else those of the "
+            "robot, or of the shipped robot that moves like it.",
+            autocompletion=completing("training"),
+        ),
     ] = None,
     world: Annotated[
-        list[str] | None, Option(help="Train in this world only; several times: in all of them.")
+        list[str] | None,
+        Option(
+            help="Train in this world only; several times: in all of them.",
+            autocompletion=completing("worlds"),
+        ),
     ] = None,
     algorithm: Annotated[str | None, Option(help="ppo or sac.")] = None,
     seeds: Annotated[list[int] | None, Option(help="One or more, as --seeds 0 1 2.")] = None,
@@ -46,11 +61,10 @@ def train(
     env_runners: Annotated[
         int | None, Option(min=1, help="Ray processes that share the worlds; default: one per CPU.")
     ] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Trains policies in the fast simulator, and evaluates them."""
     with one_sentence():
-        from nics_drl_bridge.policy.training_settings import chosen_settings
-
         given = {"robot": robot, "algorithm": algorithm, "steps": steps, "world": world}
         given["engine"] = engine if engine in OWN else None
         named = {name: value for name, value in given.items() if value}
@@ -59,19 +73,35 @@ def train(
             raise ConfigError(f"--{option}: a resumed run has its own settings; leave it out.")
         if resume and out is None:
             raise ConfigError("--resume needs --out, the folder of the run to go on with.")
-        try:
-            from nics_drl_bridge.policy import train as train_run
-        except ModuleNotFoundError as error:
-            fix = "pip install 'nics_drl_bridge[train]'."
-            raise ConfigError(f"training needs the module {error.name!r}; {fix}") from None
+        extensions.require("training", *extensions.TRAINING)
+        from nics_drl_bridge.policy import train as train_run
+
         resumed = train_run.settings_of(out) if resume and out is not None else None
-        chosen = resumed or chosen_settings(task, settings, named)
+        chosen = resumed or _told(task, settings, named)
         folder = out or Path("runs") / chosen.title
         command = shlex.join(["nics", *sys.argv[1:]])
         every = [*(seeds or [0]), *(more_seeds or [])]
         order = train_run.TrainOrder(chosen, every, folder, episodes, resume, command)
         with _learner(engine, address, env_runners, chosen.num_envs) as learn:
-            _run(train_run, order, learn)
+            _run(train_run, order, learn, as_json)
+
+
+def _plain(result: Any) -> dict[str, Any]:
+    worlds = {world: asdict(summary) for world, summary in result.summaries.items()}
+    trained = result.trained
+    return {
+        "seed": result.seed, "steps": trained.steps, "seconds": trained.wall_s, "worlds": worlds,
+    }  # fmt: skip
+
+
+def _told(task: str, settings: str | None, named: dict[str, Any]) -> Any:
+    """The settings of a training, after telling what was adapted to the robot."""
+    from nics_drl_bridge.policy.pace import settings_for
+
+    chosen = settings_for(task, settings, named)
+    for line in chosen.told:
+        typer.echo(line, err=True)
+    return chosen.settings
 
 
 @contextmanager
@@ -93,21 +123,29 @@ def _learner(
             yield learn
 
 
-def _run(train_run: Any, order: Any, learn: Any) -> None:
+def _run(train_run: Any, order: Any, learn: Any, as_json: bool) -> None:
     def told(progress: Any) -> None:
-        success, speed = 100 * progress.success, progress.steps_per_s
-        what = f"seed {progress.seed}: success {success:.1f} %, {speed:,.0f} steps/s"
+        what = f"seed {progress.seed}: {progress.line}"
         if not math.isnan(progress.held_out):
             what += f", held out {100 * progress.held_out:.1f} %"
         tell(what, progress.steps, progress.total)
 
     def done(result: Any) -> None:
         trained = result.trained
+        if as_json:
+            return
         typer.echo(f"seed {result.seed}: {trained.steps:,} steps in {trained.wall_s:.0f} s")
         for world, summary in result.summaries.items():
             typer.echo(f"  {world}: {train_run.line_of(summary)}")
 
-    with progress_bar() as tell:
-        train_run.run(order, told, done, learn)
+    with progress_bar("starting the worlds") as tell:
+
+        def evaluating(world: str) -> None:
+            tell(f"evaluating in {world}", 0, 0)
+
+        results = train_run.run(order, told, done, learn, evaluating)
     folder = order.out
+    if as_json:
+        typer.echo(json.dumps({"out": str(folder), "seeds": list(map(_plain, results))}))
+        return
     typer.echo(f"policy files, checkpoints and logs: {folder}; tensorboard --logdir {folder}")

@@ -5,24 +5,27 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
-from nics_drl_bridge.commands.console import one_sentence
+from nics_drl_bridge.commands.console import JsonOption, one_sentence, progress_bar
 
 ROBOT, WORLD = "differential", "arena"
 
 
 def warmup(
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Compiles what generating, training and driving need, on two cores, once on a machine."""
     with one_sentence():
         begin = time.monotonic()
         typer.echo("compiling the kernels: about a minute, once on this machine", err=True)
         # Fresh processes: what a fork shares with its parent's threads may be locked for ever.
-        with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        with (
+            progress_bar("compiling"),
+            ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool,
+        ):
             *first, model = pool.submit(_compiled_by, _model).result()
             others = [pool.submit(_compiled_by, part, model) for part in (_simulate, _drive)]
             done = [first, *(each.result()[:2] for each in others)]

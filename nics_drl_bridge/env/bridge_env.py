@@ -143,6 +143,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         starts = np.array(self.scene.starts)
         if options and "start" in options:
             give(starts[None], "start", options["start"])
+            guard.check_starts(starts, self.world, self.model.robot.footprint_radius)
         episodes = Episodes(np.array([episode]), starts[None], self.scene.goals[None])
         if not self._rehearsed:
             self._rehearse(episodes)

@@ -14,6 +14,10 @@ from numpy.typing import NDArray
 from nics_drl_bridge.env import kernels
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.seeds import GREATEST_SEED, checked_seeds
+from nics_drl_bridge.sim.world import room_at
+from nics_drl_bridge.sim.world_set import AnyWorld
+
+INSIDE = 0.5  # a wall nearer than this share of the footprint's radius is in the robot
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -86,6 +90,19 @@ def give(rows: NDArray[Any], name: str, value: Any) -> None:
     rows[...] = given
     if not np.isfinite(rows).all():
         raise ConfigError(f"{option}: must be finite.")
+
+
+def check_starts(starts: NDArray[np.float64], world: AnyWorld, radius: float) -> None:
+    """Raises ConfigError for a start (..., 3) outside the world, or that is in a wall."""
+    if len(world.members) > 1:  # each episode draws one of them
+        return
+    for x, y, _ in starts.reshape(-1, 3).tolist():
+        room = room_at(world.members[0], x, y)
+        if room < INSIDE * radius:
+            reason = "lies outside the world" if room < 0.0 else "stands in a wall"
+            x1, y1, x2, y2 = world.extent
+            field = f"the field is {x1:g} to {x2:g} m by {y1:g} to {y2:g} m"
+            raise ConfigError(f"reset option 'start': ({x:g}, {y:g}) m {reason}; {field}.")
 
 
 def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray[Any]:

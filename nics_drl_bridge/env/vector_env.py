@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
-from nics_drl_bridge.env.guard import check_action, check_reset, give, override
+from nics_drl_bridge.env.guard import check_action, check_reset, check_starts, give, override
 from nics_drl_bridge.env.kernels import episode_seeds
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task, still, team_space, total
@@ -165,6 +165,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         if options and "start" in options:
             starts = np.empty((len(worlds), self.robots, 3))
             give(starts, "start", options["start"])
+            check_starts(starts, self.world, self.model.robot.footprint_radius)
 
         def places(scenes: Scenes) -> Array | None:
             moved = None if self._teacher is None else self._teacher.places(worlds, scenes)

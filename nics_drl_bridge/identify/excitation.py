@@ -32,6 +32,7 @@ BEYOND = 0.5  # a value beyond its limits by this share of its range is a sensor
 BULK_PERCENTILE, GAUSSIAN_BULK = 90.0, 1.645
 GRID_S = 0.05
 ENDS = (2.0, 98.0)  # percentiles that bound the range of a command
+NARROW = 0.4  # a drive over a smaller share of a command's range says little about the rest
 
 
 @dataclass(frozen=True)
@@ -203,6 +204,17 @@ class CommandCoverage:
         moved = f"from {self.low:.2f} to {self.high:.2f} {self.unit}"
         share = f"{100.0 * self.share:.0f} % of its range"
         return f"{self.name}: moved {moved} ({share}), {100.0 * self.own:.0f} % of it on its own"
+
+
+def narrow(recording: Recording, spec: RobotSpec) -> list[str]:
+    """A sentence for each command of which a drive covers a small part."""
+    return [
+        f"{c.name} covers {100.0 * c.share:.0f} % of its range, {c.low:.3g} to {c.high:.3g} "
+        f"{c.unit}: beyond that the simulator guesses; drive over the whole range, or narrow it in "
+        "the robot's file."
+        for c in coverage(recording, spec)
+        if not c.fault and c.share < NARROW
+    ]
 
 
 def coverage(recording: Recording, spec: RobotSpec) -> tuple[CommandCoverage, ...]:

@@ -84,6 +84,15 @@ def layout_of(given: Any, lidar: LidarSpec) -> ScanLayout | None:
     return validate(dict(given), ScanLayout, "task option scan")
 
 
+def covers(lidar: LidarSpec, layout: str) -> bool:
+    """True if a lidar can fill a layout of `LAYOUTS`."""
+    try:
+        plan_of(lidar, LAYOUTS[layout])
+    except ConfigError:
+        return False
+    return True
+
+
 NO_PLAN = SectorPlan(  # for policies that observe the beams themselves
     np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 2)), np.zeros(2),
     angle_min=0.0, width=0.0, range_min=0.0, range_max=0.0, closed=False,
@@ -138,10 +147,15 @@ def _check(lidar: LidarSpec, layout: ScanLayout, angles: Array) -> None:
     gap = np.minimum(place - ordered[after - 1], ordered[after] - place)
     if (gap > apart + BORDER_RAD).any():
         limits = np.degrees([angles[0], angles[-1], layout.angle_min, layout.angle_max])
-        raise ConfigError(
-            "the lidar {!r} looks from {:.4g} to {:.4g} deg in base_link, the scan layout needs "
-            "{:.4g} to {:.4g}; use a wider lidar, or another layout.".format(lidar.name, *limits)
-        )
+        a, b, c, d = (f"{limit:.4g}" for limit in limits)
+        reason = f"looks from {a} to {b} deg in base_link, the scan layout needs {c} to {d}"
+        raise ConfigError(f"the lidar {lidar.name!r} {reason}; {_narrower(lidar, layout)}.")
+
+
+def _narrower(lidar: LidarSpec, layout: ScanLayout) -> str:
+    if layout == LAYOUTS["around"] and covers(lidar, "front"):
+        return "say `scan: front`, its 270 deg"
+    return "use a wider lidar, or another layout"
 
 
 @dataclass(frozen=True)

@@ -95,6 +95,8 @@ class Contract(Schema):
     batch: Literal[1] | None = None  # greatest number of observations in one run; None: any
     actions: Literal["continuous", "discrete"]
     control_period: float = Field(gt=0.0, le=10.0)  # time between commands [s]
+    # time limit of the episodes that it learnt in; older files do not tell it
+    max_episode_steps: int | None = Field(default=None, ge=1)
     model_fingerprint: str = Field(pattern="^[0-9a-f]{16}$")
     provenance: dict[str, Any]  # command, seed and versions of its making
     graph_sha256: str = Field(pattern="^[0-9a-f]{64}$")  # of the graph, including the weights
@@ -112,7 +114,7 @@ class Contract(Schema):
 def contract_of(
     task: Task, model: SimulatorModel, golden: Mapping[str, Rows], graph_sha256: str,
     provenance: Mapping[str, Any], state: tuple[int, float] | None = None,
-    batch: Literal[1] | None = None,
+    batch: Literal[1] | None = None, max_episode_steps: int | None = None,
 ) -> str:  # fmt: skip
     """Writes the contract of a policy as JSON; the state is its size and start value.
 
@@ -143,6 +145,8 @@ def contract_of(
         data["state"] = {"size": state[0], "start": state[1], "longest_gap": gap}
     if batch is not None:
         data["batch"] = batch
+    if max_episode_steps is not None:
+        data["max_episode_steps"] = max_episode_steps
     data["checksums"] = checksums(data)
     validate(data, Contract, "policy")
     return json.dumps(data, allow_nan=False)

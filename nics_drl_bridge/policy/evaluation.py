@@ -227,6 +227,13 @@ class ConfidenceInterval:
     low: float
     high: float
 
+    def text(self, unit: str) -> str:
+        """The figure with its interval, or what of them is known."""
+        if math.isnan(self.value):
+            return "unknown"
+        known = f"{self.value:.2f} {unit}"
+        return known + (f" ({self.low:.2f} to {self.high:.2f})" if math.isfinite(self.low) else "")
+
 
 def rate(hits: int, trials: int) -> ConfidenceInterval:
     """A share of trials with Wilson's score interval (1927), valid for few trials too."""

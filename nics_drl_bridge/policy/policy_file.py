@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.env.registry import TASKS, make_task
 from nics_drl_bridge.env.task import Task
-from nics_drl_bridge.errors import ConfigError, PolicyError
+from nics_drl_bridge.errors import ConfigError, PolicyError, nearest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.sectors import plan_of
 from nics_drl_bridge.lidar.spec import LidarSpec
@@ -147,6 +147,10 @@ def load_policy(path: str | Path) -> PolicyFile:
     file, suffix = Path(path), contracts.SUFFIX
     if not (str(path).endswith(suffix) or file.is_file()):
         file = contracts.shipped() / f"{path}{suffix}"
+        if not file.is_file():
+            hint = nearest(str(path), (each.stem for each in file.parent.glob(f"*{suffix}")))
+            reason = f"is neither a file nor a shipped policy; {hint}"
+            raise PolicyError(str(path), "file", reason)
     source = str(file)
     try:
         size, limit = file.stat().st_size, onnx_graph.SIZE_LIMIT

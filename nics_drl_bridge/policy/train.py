@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -179,9 +180,10 @@ class TrainOrder:
 def run(
     order: TrainOrder, tell: Tell = lambda _: None,
     done: Callable[[SeedResult], None] = lambda _: None, learn: Learn = train,
+    evaluating: Callable[[str], None] = lambda _: None,
 ) -> list[SeedResult]:  # fmt: skip
     """Trains and evaluates seed after seed; ConfigError for a run in the folder, or none there."""
-    _check(order.seeds, order.out, order.resumed)
+    _check(order.settings, order.seeds, order.out, order.resumed)
     settings, model = order.settings, open_model(order.settings.robot, order.settings.lidar)
     write_text(order.out / SETTINGS, dump_yaml(settings.model_dump(mode="json")))
     results = []
@@ -191,6 +193,7 @@ def run(
         trained = learn(settings, seed, folder, tell, order.resumed and begun)
         summaries = {}
         for world in settings.worlds:
+            evaluating(world)
             driven = evaluate(trained.algorithm, settings, world, order.episodes, model)
             summaries[world] = summarise(driven, model.control_period)
         result = SeedResult(seed, trained, summaries)
@@ -209,10 +212,13 @@ def export(settings: TrainingSettings, result: SeedResult, command: str, path: P
     task = make_task(settings.task, model, settings.task_options)
     rates = {f"success in {world}": one.success.value for world, one in result.summaries.items()}
     provenance = {"command": command, "seed": result.seed, "steps": result.trained.steps, **rates}
-    export_policy(result.trained.algorithm, task, model, path, provenance=provenance)
+    if Path(settings.robot).exists():  # where an evaluation finds the robot, if it is not shipped
+        provenance["model"] = str(Path(settings.robot).resolve())
+    limit = settings.max_episode_steps
+    export_policy(result.trained.algorithm, task, model, path, None, provenance, limit)
 
 
-def _check(seeds: Sequence[int], out: Path, resumed: bool) -> None:
+def _check(settings: TrainingSettings, seeds: Sequence[int], out: Path, resumed: bool) -> None:
     checked_seeds(seeds, GREATEST_SEED)
     if not seeds or len(set(seeds)) < len(seeds):
         raise ConfigError(f"seeds {list(seeds)}: give one or more, none twice.")
@@ -220,6 +226,9 @@ def _check(seeds: Sequence[int], out: Path, resumed: bool) -> None:
     if begun and not resumed:
         fix = "add --resume, or choose another --out."
         raise ConfigError(f"{out}: holds checkpoints of these seeds; {fix}")
+    if (out / SETTINGS).is_file() and not resumed and settings_of(out) != settings:
+        fix = "choose another --out, or remove it."
+        raise ConfigError(f"{out}: holds a run with other settings; {fix}")
     if resumed and not begun:
         raise ConfigError(f"{out}: holds no checkpoint of these seeds; leave out --resume.")
 
@@ -237,8 +246,6 @@ def line_of(summary: Summary) -> str:
         f"{name} {100 * share.value:.1f} % ({100 * share.low:.1f} to {100 * share.high:.1f})"
         for name, share in summary.shares.items()
     )
-    length, time = (
-        f"{one.value:.2f} {unit} ({one.low:.2f} to {one.high:.2f})"
-        for one, unit in ((summary.length, "m"), (summary.time, "s"))
-    )
-    return f"{rates}, path {length}, time {time} of {summary.episodes} episodes"
+    path = f", path {summary.length.text('m')}, time {summary.time.text('s')}"
+    some = "" if math.isnan(summary.time.value) else path
+    return f"{rates}{some} of {summary.episodes} episodes"

@@ -107,6 +107,13 @@ class Progress:
     env_share: float  # share of the wall time that went to the simulator
     held_out: float = math.nan  # least success of a world in the latest evaluation of `stop`
 
+    @property
+    def line(self) -> str:
+        """Success, as far as any is known, and speed, for people."""
+        unknown = math.isnan(self.success)
+        known = "no episode has ended yet" if unknown else f"success {100 * self.success:.1f} %"
+        return f"{known}, {self.steps_per_s:,.0f} steps/s"
+
 
 Save = Callable[[], None]
 Tell = Callable[[Progress], None]

@@ -94,6 +94,7 @@ def actor_of(model: Any) -> torch.nn.Module:
 def export_policy(
     model: Any, task: Task, simulator_model: SimulatorModel, path: str | Path,
     normaliser: Normaliser | None = None, provenance: Mapping[str, Any] | None = None,
+    max_episode_steps: int | None = None,
 ) -> PolicyFile:  # fmt: skip
     """Writes a trained model as a policy file, and loads it as a robot would.
 
@@ -107,7 +108,10 @@ def export_policy(
     graph = _graph(deployed, task)
     golden = _golden(deployed, graph, task, str(file))
     sha256 = onnx_graph.graph_hash(graph)
-    text = contract_of(task, simulator_model, golden, sha256, provenance or {}, deployed.state)
+    text = contract_of(
+        task, simulator_model, golden, sha256, provenance or {}, deployed.state,
+        max_episode_steps=max_episode_steps,
+    )  # fmt: skip
     onnx.helper.set_model_props(graph, {onnx_graph.KEY: text})
     data = onnx_graph.sealed(graph.SerializeToString(deterministic=True))
     policy = policy_of(data, file)

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from nics_drl_bridge.config import Schema, find_config, load_yaml, share_folder, validate
+from nics_drl_bridge.config import Schema, find_config, load_yaml, shipped_names, validate
 from nics_drl_bridge.env.teaching import Teaching
 from nics_drl_bridge.errors import ConfigError
 
@@ -166,17 +166,16 @@ def load_training(name: str | Path) -> TrainingSettings:
 def chosen_settings(task: str, name: str | None, changes: dict[str, Any]) -> TrainingSettings:
     """Settings by name or file, else those shipped for task and robot, with changes by the user."""
     robot = str(changes.get("robot", "differential"))
-    shipped = {path.stem for path in (share_folder() / "config" / "training").glob("*.yaml")}
-    if name is None and f"{task}_{robot}" not in shipped:
+    if name is None and f"{task}_{robot}" not in shipped_names("training"):
         base = TrainingSettings(task=task, robot=robot)
     else:
         base = load_training(name or f"{task}_{robot}")
-    changed = base.model_dump(mode="json") | changes
+    changed = base.model_dump(mode="json", exclude_unset=True) | changes
     if worlds := changed.pop("world", None):
         changed["worlds"] = dict.fromkeys(worlds, max(1, base.num_envs // len(worlds)))
     if engine := changed.pop("engine", None):
-        if engine == "lean" and changed["algorithm"] != "ppo":
-            given = changed["algorithm"]
+        given = changed.get("algorithm", base.algorithm)
+        if engine == "lean" and given != "ppo":
             raise ConfigError(f"--engine lean learns with ppo, not {given!r}; leave it out.")
-        changed["ppo"] |= {"engine": engine}
+        changed["ppo"] = changed.get("ppo", {}) | {"engine": engine}
     return validate(changed, TrainingSettings, "training settings")

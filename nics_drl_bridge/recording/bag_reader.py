@@ -14,7 +14,7 @@ from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.recording import messages as msgs
 from nics_drl_bridge.recording import topic_roles as roles
 from nics_drl_bridge.recording.bag_file import BagFile, Message, opened, times_of
-from nics_drl_bridge.recording.recording import Recording, check
+from nics_drl_bridge.recording.recording import W_FIRST, Recording, check, w_first
 from nics_drl_bridge.recording.stamping import SAME_CLOCK_S, Nanoseconds, TopicData, streams
 from nics_drl_bridge.recording.topic_roles import JointSource, TopicRoles
 from nics_drl_bridge.robot.noise import Delay, Latency
@@ -86,6 +86,8 @@ def _pose(bag: BagFile, topic: str, mapping: TopicRoles) -> TopicData:
         fault = f"message {k}: the quaternion has the length {length[k]:.3f} and not 1"
         advice = "check its publisher, or choose another topic"
         raise RecordingError(f"{bag.place}: topic {topic!r}: {fault}; {advice}.")
+    if w_first(quaternions):
+        raise RecordingError(f"{bag.place}: topic {topic!r}: {W_FIRST}.")
     return _table(bag, topic, msgs.pose_row, messages)
 
 

@@ -23,7 +23,14 @@ from nics_drl_bridge.recording.mapping import (
     Reference,
     Value,
 )
-from nics_drl_bridge.recording.recording import Recording, Stream, check_streams, implausible_pose
+from nics_drl_bridge.recording.recording import (
+    W_FIRST,
+    Recording,
+    Stream,
+    check_streams,
+    implausible_pose,
+    w_first,
+)
 from nics_drl_bridge.recording.table import Source
 from nics_drl_bridge.recording.values import MappedReader, Series, together, unit_of
 
@@ -140,6 +147,8 @@ def _heading(reader: MappedReader, pose: PoseSource, given: str | Sequence[Refer
         where = f"{reader.source.place}: pose: {made.t[k] - made.t[0]:.3f} s from the start"
         fault = f"{where} the quaternion has the length {norm[k]:.3f} and not 1"
         raise RecordingError(f"{fault}; list its columns in the order x, y, z, w.")
+    if w_first(made.values):
+        raise RecordingError(f"{reader.source.place}: pose: {W_FIRST}.")
     x, y, z, w = made.values.T
     tilt = np.degrees(np.median(np.arccos(np.clip(np.abs(1.0 - 2.0 * (x * x + y * y)), 0.0, 1.0))))
     if tilt > MOST_TILT_DEG:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge import files, geometry
 from nics_drl_bridge.config import no_device
@@ -44,6 +44,9 @@ ALONG, LESS_ALONG, ALONG_BY_CHANCE = 0.9, 0.2, 0.05
 MIN_DIRECTIONS = 30  # a reversed axis shows in a path of more pieces than this,
 MIN_TURN = 1.0  # that turns by this [rad],
 MIRRORED, BETTER = 0.9, 0.15  # and leads along mirrored headings, by so much more than as given
+# Squares of what a level body has none of, x and y, in quaternions in another order than read.
+TILTED, LEVEL = 0.05, 0.01
+W_FIRST = "its quaternions look like w, x, y, z of a level body; list them in the order x, y, z, w"
 WEIGHTS = 0.01, 100.0  # bounds of what variances may weigh
 UNITS_OF_STEP = {"ms": "milliseconds", "us": "microseconds", "ns": "nanoseconds"}
 
@@ -395,3 +398,9 @@ def _too_slow(t: Array) -> Implausible | None:
     reason = f"there are {np.median(np.diff(t)):.3g} s between samples"
     cause = f"stamps must be in seconds ({UNITS_OF_STEP[unit]} look like this)"
     return Implausible(reason, cause, f"time: {{from: ..., unit: {unit}}}")
+
+
+def w_first(quaternions: ArrayLike) -> bool:
+    """True if quaternions (T, 4), read as x, y, z, w, look like w, x, y, z of a level body."""
+    size = np.mean(np.square(np.asarray(quaternions).reshape(-1, 4)), axis=0)
+    return bool(size[0] + size[1] > TILTED and size[1] + size[2] < LEVEL)

@@ -7,6 +7,7 @@ speed and steering angle in the state by their units. An actuator is of first or
 Robots, ch. 3; the paper's reference for Table I.
 """
 
+import difflib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
@@ -28,6 +29,7 @@ from nics_drl_bridge.robot.spec import (
 )
 from nics_drl_bridge.robot.template import Template
 
+BEYOND = 0.01  # share of a limit by which rounded figures may lie beyond it
 MOST_VARIED = 6
 AT_ONCE_S = 1e-9  # lag of a robot whose commands are what its wheels do
 T = TypeVar("T")
@@ -198,7 +200,9 @@ def _made(spec: RobotSpec, make: Callable[[RobotKind], T]) -> T:
         return make(kind)
     except KeyError as error:
         needed = f"the {spec.textbook} kinematics need the parameter {error}"
-        raise ConfigError(f"{robot}: {needed}; add it under `parameters:`.") from None
+        near = difflib.get_close_matches(str(error.args[0]), spec.parameters, n=1)
+        fix = f"is {near[0]!r} it?" if near else "add it under `parameters:`."
+        raise ConfigError(f"{robot}: {needed}; {fix}") from None
 
 
 def require_textbook(spec: RobotSpec) -> str:
@@ -242,11 +246,29 @@ def command_for(spec: RobotSpec, twist: ArrayLike) -> Array:
 
 def reach(spec: RobotSpec) -> Array:
     """Returns the greatest steady twist (3,) of a robot's commands; ConfigError: see there."""
+    return np.asarray(np.abs(steady_twist(spec, _corners(spec))).max(axis=0))
+
+
+def _corners(spec: RobotSpec) -> Array:
+    """All combinations (K, C) of least, nearest to zero, and greatest commands."""
     ends = np.stack([spec.command_low, np.zeros(len(spec.command)), spec.command_high])
     ends[1] = np.clip(ends[1], ends[0], ends[2])
     # No kind uses more; if there are more, they are not varied one by one.
-    corners = np.array(list(product(*ends.T))) if ends.shape[1] <= MOST_VARIED else ends
-    return np.asarray(np.abs(steady_twist(spec, corners)).max(axis=0))
+    return np.array(list(product(*ends.T))) if ends.shape[1] <= MOST_VARIED else ends
+
+
+def overdriven(spec: RobotSpec) -> str | None:
+    """A sentence if a robot's commands ask for more than a wheel's or a steering's own limit."""
+    if not (has_textbook(spec) and spec.state and _own_state(spec)):
+        return None
+    asked = textbook(spec).target(_corners(spec))
+    for values, one in zip(asked.T, spec.state, strict=True):
+        worst = float(values[np.abs(values).argmax()])
+        if not one.min - BEYOND * abs(one.min) <= worst <= one.max + BEYOND * abs(one.max):
+            limits = f"beyond its limits {one.min:g} and {one.max:g}"
+            fix = "narrow the commands, or widen the limits of the state"
+            return f"the commands ask for {one.name} at {worst:.3g} {one.unit}, {limits}; {fix}."
+    return None
 
 
 def _by_turn_rate(spec: RobotSpec) -> RobotSpec:

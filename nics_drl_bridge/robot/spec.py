@@ -138,6 +138,8 @@ class RobotSpec(Schema):
     )
     # its usual lidar, a shipped one or a YAML file, where none is given; None: that of the paper
     lidar: str | None = Field(default=None, min_length=1)
+    # where that is, x, y [m] and heading [rad] in `base_link`; None: as the lidar's own file says
+    lidar_mount: tuple[float, float, float] | None = None
     # S and C components, in the order of every state and command vector
     state: tuple[StateVariable, ...] = Field(default=(), max_length=MOST_VARIABLES)
     command: tuple[CommandVariable, ...] = Field(min_length=1, max_length=MOST_VARIABLES)
@@ -158,7 +160,8 @@ class RobotSpec(Schema):
     def _without_none(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
         # Models and policies are known by what is written: a key that says nothing is left out.
         data: dict[str, Any] = dump(self)
-        return data if self.lidar else {k: v for k, v in data.items() if k != "lidar"}
+        silent = [name for name in ("lidar", "lidar_mount") if getattr(self, name) is None]
+        return {key: value for key, value in data.items() if key not in silent}
 
     @model_validator(mode="after")
     def _consistent(self) -> RobotSpec:

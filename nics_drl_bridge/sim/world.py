@@ -197,7 +197,7 @@ def check_places(world: World) -> None:
         radius = max(shape.radius for shape in group.shapes)
         waypoints = group.motion.waypoints if isinstance(group.motion, Patrol) else ()
         for n, point in enumerate(waypoints):
-            if _room_at(world, *point) < radius:
+            if room_at(world, *point) < radius:
                 reason = f"an obstacle of radius {radius:g} m does not fit there, at {list(point)}"
                 raise ConfigError(f"{where}.motion.waypoints.{n}': {reason}; move it.")
 
@@ -207,7 +207,7 @@ def _inside(world: World, x: float, y: float) -> bool:
     return x1 <= x <= x2 and y1 <= y <= y2
 
 
-def _room_at(world: World, x: float, y: float) -> float:
+def room_at(world: World, x: float, y: float) -> float:
     """Free space around a point among walls and map [m], negative outside the world."""
     if not _inside(world, x, y):
         return -1.0

@@ -103,7 +103,9 @@ def test_the_report_begins_with_success_in_three_worlds_and_folds_the_figures(
 
 
 def test_it_trains_in_the_world_and_simulator_of_the_plan(tmp_path):
-    settings = settings_of(DemoPlan(tmp_path, world="circles", train_steps=7))
+    plan = DemoPlan(tmp_path, world="circles", train_steps=7)
+    settings, told = settings_of(plan, direct_model())
+    assert told == ()
     assert settings.robot == str(tmp_path / "model")
     assert settings.worlds == {"circles": 512}
     assert settings.steps == 7

@@ -11,6 +11,7 @@ from nics_drl_bridge.policy.training_settings import (
     load_training,
 )
 
+PARTS = {"jackal": 96, "f1tenth": 60}  # of an observation, where it sees less than a circle
 SHIPPED = sorted(path.stem for path in (share_folder() / "config" / "training").glob("*.yaml"))
 
 
@@ -20,7 +21,7 @@ def test_shipped_settings_name_worlds_and_a_task_that_there_are(name):
     settings = load_training(name)
     for world in settings.worlds:
         env = BridgeVectorEnv(1, settings.robot, world, settings.task, settings.task_options)
-        assert env.single_observation_space.shape == (96 if settings.robot == "jackal" else 78,)
+        assert env.single_observation_space.shape == (PARTS.get(settings.robot, 78),)
     assert settings.ppo.rollout * settings.num_envs >= settings.ppo.batch
 
 

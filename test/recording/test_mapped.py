@@ -312,7 +312,7 @@ MAPPED = {"robot": "ackermann", "pose": {"x": 0, "y": 1, "heading": 2}, "command
                 "w": lambda d: np.cos(d["t"]), "x": lambda d: 0.0 * d["t"],
                 "y": lambda d: 0.0 * d["t"], "z": lambda d: np.sin(d["t"]),
             },
-            "the body is tilted by 46 deg; list its columns in the order x, y, z, w",
+            "look like w, x, y, z of a level body; list them in the order x, y, z, w",
         ),
         (
             {"command": {"v": {"from": "v", "unit": "rpm"}}},

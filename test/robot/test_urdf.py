@@ -6,7 +6,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from nics_drl_bridge.generator import usual_lidar
+from nics_drl_bridge.generator import lidar_of
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.robot.urdf import urdf_of
 
@@ -41,7 +41,7 @@ def wheels(text: str) -> dict[str, float]:
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_the_shipped_files_are_those_of_the_shipped_robots(name: str) -> None:
-    lidar = usual_lidar(load_robot(name))
+    lidar = lidar_of(load_robot(name))
     file = ROOT / "urdf" / f"{name}.urdf"
     assert file.read_text(encoding="utf-8") == urdf_of(load_robot(name), lidar.mount, lidar.frame)
 

@@ -48,7 +48,7 @@ def record(
 @bag.command()
 def info(
     path: BagArgument,
-    as_json: Annotated[bool, Option("--json", help="Print one JSON object.")] = False,
+    as_json: console.JsonOption = False,
     salvage: SalvageOption = False,
 ) -> None:
     """Tells what is in a bag: topics, rates, gaps, and whose clock stamped them."""

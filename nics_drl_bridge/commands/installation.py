@@ -1,0 +1,99 @@
+"""What works on this machine: Python, ROS 2, extras, cores, compiled kernels."""
+
+import os
+import sys
+from contextlib import suppress
+from importlib import import_module
+from importlib.metadata import PackageNotFoundError, metadata, version
+from importlib.util import find_spec
+from typing import NamedTuple
+
+from nics_drl_bridge.errors import MISSING_ROS
+from nics_drl_bridge.extensions import PACKAGE, TRAINING, lacking
+
+EXTRAS = {  # what each brings, by the modules that it needs
+    "bags": ("reading and writing rosbags", ("rosbags", "mcap")),
+    "deploy": ("driving by policy files", ("onnx", "onnxruntime")),
+    "train": ("training", TRAINING),
+    "multi": ("teams, as PettingZoo environments", ("pettingzoo",)),
+    "mujoco": ("robots with real wheels, in MuJoCo", ("mujoco",)),
+    "distributed": ("training on a Ray cluster", ("ray",)),
+}
+MESSAGES = {  # message packages that have no wheels, and what is left out without them
+    "tf2_msgs": "/tf and /tf_static", "ackermann_msgs": "recordings of AckermannDrive",
+    "simulation_interfaces": "the standard services of simulators",
+}  # fmt: skip
+COMPILED = ("env.vector_env", "env.bridge_env", "policy.policies", "gate.shield", "middleware.ekf")
+
+
+class Check(NamedTuple):
+    """A part of an installation."""
+
+    part: str
+    works: bool
+    found: str
+    fix: str = ""
+
+
+def checks() -> list[Check]:
+    """Checks all parts; compiles nothing and starts nothing."""
+    return [_python(), *_extras(), *_ros(), _cores(), _kernels()]
+
+
+def _python() -> Check:
+    needed = ">=3.10,<3.15"
+    with suppress(PackageNotFoundError):  # a source tree that was never installed
+        needed = metadata(PACKAGE)["Requires-Python"] or needed
+    low, high = (tuple(map(int, part.split(".")[:2])) for part in _bounds(needed))
+    found = sys.version_info[:2]
+    fix = f"use a Python {needed}"
+    return Check("Python", low <= found < high, ".".join(map(str, sys.version_info[:3])), fix)
+
+
+def _bounds(needed: str) -> tuple[str, str]:
+    parts = sorted(needed.replace(" ", "").split(","), key=lambda part: not part.startswith(">="))
+    return parts[0].lstrip(">="), parts[1].lstrip("<")
+
+
+def _extras() -> list[Check]:
+    found = []
+    for extra, (what, modules) in EXTRAS.items():
+        missing = lacking(modules)
+        told = what if missing is None else f"{what}: the module {missing!r} is missing"
+        fix = f"pip install '{PACKAGE}[{extra}]'"
+        found.append(Check(f"extra {extra}", missing is None, told, fix))
+    return found
+
+
+def _ros() -> list[Check]:
+    if find_spec("rclpy") is None:
+        reason = MISSING_ROS.format(module="rclpy").partition("; ")[2].rstrip(".")
+        return [Check("ROS 2", False, "driving over topics: none is sourced or installed", reason)]
+    try:
+        release = version("rclpy")
+    except PackageNotFoundError:
+        release = "of unknown version"
+    distribution = os.environ.get("ROS_DISTRO") or "from wheels"
+    domain = os.environ.get("ROS_DOMAIN_ID", "0")
+    told = f"{distribution}, rclpy {release}, ROS_DOMAIN_ID {domain}"
+    fix = "it comes with a ROS 2 installation; there is no wheel"
+    return [
+        Check("ROS 2", True, told),
+        *(Check(name, find_spec(name) is not None, what, fix) for name, what in MESSAGES.items()),
+    ]
+
+
+def _cores() -> Check:
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return Check("cores", (usable or 1) > 1, f"{usable} of {os.cpu_count()} may be used", "")
+
+
+def _kernels() -> Check:
+    for name in COMPILED:
+        import_module(f"{PACKAGE}.{name}")
+    from nics_drl_bridge.kernels import KERNELS, SECONDS_EACH
+
+    cold = sum(not each.is_warm for each in KERNELS)
+    told = f"{len(KERNELS) - cold} of {len(KERNELS)} are compiled"
+    fix = f"nics warmup, about {cold * SECONDS_EACH:.0f} s; else each is compiled at its first use"
+    return Check("kernels", cold == 0, told, fix)

@@ -1,0 +1,104 @@
+"""`nics list`: what comes with the package, by the names that commands take."""
+
+import json
+from collections.abc import Callable
+from enum import Enum
+from typing import Annotated, Any
+
+import typer
+from typer import Argument
+
+from nics_drl_bridge.commands.console import JsonOption, one_sentence, table
+from nics_drl_bridge.config import shipped_names
+
+Row = dict[str, Any]
+
+
+class Listed(str, Enum):
+    """Things of which several come with the package."""
+
+    ROBOTS = "robots"
+    WORLDS = "worlds"
+    LIDARS = "lidars"
+    POLICIES = "policies"
+
+
+def list_(
+    what: Annotated[Listed, Argument(help="What to list.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Lists the robots, worlds, lidars or policies that come with the package."""
+    with one_sentence():
+        rows = ROWS[what]()
+        if as_json:
+            typer.echo(json.dumps({what.value: rows}))
+        else:
+            cells = [tuple(map(str, row.values())) for row in rows]
+            typer.echo(table(tuple(rows[0]), cells))
+
+
+def robots() -> list[Row]:
+    """The shipped robots: name, commands with their ranges, lidar, and what they are."""
+    from nics_drl_bridge.generator import lidar_of
+    from nics_drl_bridge.robot.spec import load_robot
+
+    return [
+        {
+            "name": name,
+            "commands": ", ".join(f"{c.name} {c.min:g} to {c.max:g} {c.unit}" for c in one.command),
+            "lidar": lidar_of(one).name, "description": one.description,
+        }
+        for name, one in ((name, load_robot(name)) for name in shipped_names("robots"))
+    ]  # fmt: skip
+
+
+def worlds() -> list[Row]:
+    """The shipped worlds, and sets of worlds: name, size, distance of goals, obstacles."""
+    from nics_drl_bridge.sim.barn import barn_numbers
+    from nics_drl_bridge.sim.world import load_world
+    from nics_drl_bridge.sim.world_set import BARN
+
+    rows = []
+    for name in shipped_names("worlds"):
+        world = load_world(name)
+        x1, y1, x2, y2 = world.extent
+        counts = [group.counts for group in world.obstacles]
+        low, high = sum(least for least, _ in counts), sum(most for _, most in counts)
+        obstacles = f"{low}" if low == high else f"{low} to {high}"
+        rows.append(_world(name, f"{x2 - x1:g} x {y2 - y1:g}", world.goal_distance, obstacles))
+    rows.append(_world(BARN, f"a set of {len(barn_numbers())} worlds, as barn/7", (), ""))
+    return rows + [_world(name, "a set of worlds", (), "") for name in shipped_names("world_sets")]
+
+
+def _world(name: str, size: str, distance: tuple[float, ...], obstacles: str) -> Row:
+    far = " to ".join(f"{value:g}" for value in distance)
+    return {"name": name, "size [m]": size, "goal_distance [m]": far, "obstacles": obstacles}
+
+
+def lidars() -> list[Row]:
+    """The shipped lidars: name, beams, view and range."""
+    from math import degrees
+
+    from nics_drl_bridge.lidar.spec import load_lidar
+
+    return [
+        {
+            "name": name, "beams": spec.beams,
+            "view [deg]": round(degrees(spec.angle_max - spec.angle_min)),
+            "range [m]": f"{spec.range_min:g} to {spec.range_max:g}", "scans [Hz]": spec.rate,
+        }
+        for name, spec in ((name, load_lidar(name)) for name in shipped_names("lidars"))
+    ]  # fmt: skip
+
+
+def policies() -> list[Row]:
+    """The shipped policy files, and the baselines that need none."""
+    from nics_drl_bridge.policy.policies import POLICIES, shipped_policies
+
+    trained = [{"name": name, "kind": "policy file"} for name in shipped_policies()]
+    return trained + [{"name": name, "kind": "baseline, any robot"} for name in sorted(POLICIES)]
+
+
+ROWS: dict[Listed, Callable[[], list[Row]]] = {
+    Listed.ROBOTS: robots, Listed.WORLDS: worlds, Listed.LIDARS: lidars, Listed.POLICIES: policies,
+}  # fmt: skip

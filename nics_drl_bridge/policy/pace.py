@@ -1,0 +1,147 @@
+"""Time limit of an episode, and what a reward or discount per step means to a slower robot."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from nics_drl_bridge.config import shipped_names
+from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.generator import SimulatorModel, open_model
+from nics_drl_bridge.lidar.sectors import covers
+from nics_drl_bridge.policy.training_settings import (
+    TrainingSettings,
+    chosen_settings,
+    load_training,
+)
+from nics_drl_bridge.robot.kinds import has_textbook, reach
+from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.sim.world import World
+from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
+
+OWN_TASK = "navigation"  # for which there are settings for robots of one's own
+LEAST_S = 30.0  # least time limit [s]
+ROOM = 1.8  # of the time on the straight line: for ways around, turns, and being slow at times
+
+
+@dataclass(frozen=True)
+class Pace:
+    """Pace of a robot in worlds: least and greatest distance from start to goal, and its speed."""
+
+    world: str  # that of the greatest distance
+    near: float  # least distance in any world [m]
+    far: float  # greatest distance [m]
+    speed: float  # greatest speed of the robot; inf if it is not known [m/s]
+    period: float  # between commands [s]
+
+    @property
+    def steps(self) -> int:
+        """Suitable time limit [steps]."""
+        return math.ceil(max(LEAST_S, ROOM * self.far / self.speed) / self.period - 1e-9)
+
+    def shortfall(self, steps: int) -> str | None:
+        """A sentence if a goal can't be reached in time; ConfigError if none can."""
+        limit = steps * self.period
+        if self.far <= limit * self.speed:
+            return None
+        reason = (
+            f"world {self.world!r}: a goal may lie {self.far:g} m away, which takes "
+            f"{self.far / self.speed:.0f} s at {self.speed:g} m/s, and an episode ends after "
+            f"{limit:g} s; set max_episode_steps to {self.steps}."
+        )
+        if self.near > limit * self.speed:
+            raise ConfigError(f"no goal can be reached in time: {reason}")
+        return reason
+
+
+def pace_of(model: SimulatorModel, worlds: Iterable[AnyWorld], top: float | None = None) -> Pace:
+    """The pace of a robot, at most of a top speed [m/s], in worlds."""
+    members = [member for world in worlds for member in world.members]
+    far, name = max((_farthest(member), member.name) for member in members)
+    near = min(member.goal_distance[0] for member in members)
+    speed = min(top or math.inf, top_speed(model.robot))
+    return Pace(name, near, far, speed, model.control_period)
+
+
+def top_speed(robot: RobotSpec) -> float:
+    """Greatest speed along one axis of a robot [m/s]; inf if neither kind nor commands tell."""
+    if has_textbook(robot):
+        return float(reach(robot)[:2].max())
+    told = [max(abs(one.min), abs(one.max)) for one in robot.command if one.unit == "m/s"]
+    return max(told, default=math.inf)
+
+
+def _farthest(world: World) -> float:
+    x1, y1, x2, y2 = world.extent
+    return min(world.goal_distance[1], math.hypot(x2 - x1, y2 - y1))
+
+
+def kin(robot: RobotSpec) -> str:
+    """Name of the shipped robot whose motion a robot's is like."""
+    if robot.steers:
+        return "ackermann"
+    return "mecanum" if robot.moves_sideways else "differential"
+
+
+class Fitted(NamedTuple):
+    """Settings of a training that fit robot and worlds, and a sentence for each thing adapted."""
+
+    settings: TrainingSettings
+    told: tuple[str, ...]
+
+
+def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted:
+    """Settings of a training as `chosen_settings`; a robot without own ones gets those of its kin.
+
+    Raises ConfigError, and ModelError if there is no such robot.
+    """
+    robot, told, shipped = changes.get("robot"), list[str](), shipped_names("training")
+    own = f"{task}_{robot}" in shipped
+    if name is None and robot is not None and not own and task == OWN_TASK:
+        name = f"own_{kin(open_model(robot).robot)}"
+        told.append(f"settings {name!r}, as the robot {robot!r} has none of its own")
+    settings = chosen_settings(task, name, changes)
+    inherited = name in shipped and load_training(str(name)).robot != settings.robot
+    made = fitted(settings, open_model(settings.robot, settings.lidar), inherited)
+    return Fitted(made.settings, (*told, *made.told))
+
+
+def fitted(settings: TrainingSettings, model: SimulatorModel, inherited: bool) -> Fitted:
+    """Settings with a time limit for robot and worlds, unless they have one; ConfigError if short.
+
+    Those inherited from another robot get its lidar's layout of a scan, and a time reward and a
+    discount that come to the same over an episode.
+    """
+    options, told = dict(settings.task_options), list[str]()
+    worlds = [load_worlds(world) for world in settings.worlds]
+    pace = pace_of(model, worlds, options.get("top_speed"))
+    changed: dict[str, Any] = {}
+    if inherited and options.get("scan") == "around" and not covers(model.lidar, "around"):
+        options["scan"] = "front"
+        told.append(f"the lidar {model.lidar.name!r} does not see all around: scan: front")
+    if "max_episode_steps" not in settings.model_fields_set and pace.steps != MAX_EPISODE_STEPS:
+        changed["max_episode_steps"] = pace.steps
+        limit = f"{pace.steps * pace.period:g} s ({pace.steps} steps)"
+        told.append(f"time limit {limit}, for {pace.far:g} m at {pace.speed:g} m/s")
+        if inherited:
+            changed |= _stretched(settings, options, pace.steps / MAX_EPISODE_STEPS, told)
+    made = settings.model_copy(update={**changed, "task_options": options})
+    short = pace.shortfall(made.max_episode_steps)
+    return Fitted(made, tuple(told) if short is None else (*told, short))
+
+
+def _stretched(
+    settings: TrainingSettings, options: dict[str, Any], factor: float, told: list[str]
+) -> dict[str, Any]:
+    """What changes for episodes longer by a factor; `options` in place."""
+    if reward := options.get("time_reward"):
+        options["time_reward"] = round(reward / factor, 6)
+        told.append(f"time_reward {options['time_reward']:g}, was {reward:g}")
+    name = settings.algorithm
+    learner = settings.ppo if name == "ppo" else settings.sac
+    discount = round(1.0 - (1.0 - learner.discount) / factor, 6)
+    told.append(f"{name}.discount {discount:g}, was {learner.discount:g}")
+    return {name: learner.model_copy(update={"discount": discount})}

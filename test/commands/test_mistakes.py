@@ -1,0 +1,199 @@
+"""Typical mistakes, each told in one sentence: a wrong name, key, shape, unit, place, or module."""
+
+from __future__ import annotations
+
+import errno
+import re
+import sys
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import pytest
+from command_line import nics
+
+from nics_drl_bridge.config import share_folder
+from nics_drl_bridge.recording import textbook
+from nics_drl_bridge.recording.recording import save_recording
+from nics_drl_bridge.robot.spec import load_robot
+
+ROBOT = (share_folder() / "config" / "robots" / "differential.yaml").read_text(encoding="utf-8")
+FILES = {
+    "text.txt": "hello\n",
+    "text.onnx": "hello\n",
+    "empty.csv": "",
+    "table.csv": "t,x\n0.0,1.0\n0.1,1.1\n0.2,1.2\n",
+    "begun.yaml": "robot: differential\n",
+    "misspelt.yaml": ROBOT.replace(
+        "wheel_radius", "need the parameter 'wheel_radius'; is 'wheel_radus' it?"
+    ),
+    "no_command.yaml": ROBOT.partition("command:")[0],
+    "turned.yaml": ROBOT.replace("min: -2.0, max: 2.0", "min: 2.0, max: -2.0"),
+    "with_unit.yaml": ROBOT.replace("footprint_radius: 0.15", "footprint_radius: 0.15 m"),
+    "twice.yaml": ROBOT + "footprint_radius: 0.2\n",
+    "listed.yaml": "- name: differential\n",
+    "kind.yaml": "name: mine\nkind: diferential\nfootprint_radius: 0.2\n",
+    "far.yaml": ROBOT.replace("min: 0.0, max: 1.0", "min: 0.0, max: 0.01"),
+    "settings.yaml": "tsak: navigation\n",
+    "hurried.yaml": "robot: differential\nworlds: {corridor: 4}\nmax_episode_steps: 30\n",
+    "stop.jsonl": "no black box\n",
+    "taken/note.txt": "mine\n",
+}
+MISTAKES = {
+    # Names of commands, and of options.
+    "genrate": "No such command 'genrate'",
+    "generate drive.npz": "Missing option '--out'",
+    "generate drive.npz --output m": "No such option: --output",
+    "evaluate": "Missing argument 'POLICY...'",
+    "list robot": "'robot' is not one of 'robots', 'worlds'",
+    "train --steps 0": "'--(steps|episodes)'",
+    "train --steps many": "'--steps': ",
+    "drive --robot differential --out m --duration 1": "'--duration': ",
+    # What is shipped, by its name.
+    "drive --robot akermann --out m": "unknown robot 'akermann'; did you mean 'ackermann'?",
+    "drive --robot differential --out m --lidar hokuyo": "unknown lidar 'hokuyo'; did you mean",
+    "generate drive.npz --out m --robot diferential": "did you mean 'differential'?",
+    "generate drive.npz --out m --world arenna": "unknown world 'arenna'; did you mean 'arena'?",
+    "train --robot diferential": "unknown robot 'diferential'; did you mean 'differential'?",
+    "train --robot differential --world corridr": "did you mean 'corridor'?",
+    "train --settings navigation_diferential": "did you mean 'navigation_differential'?",
+    "train --task navigate": "unknown task 'navigate'; did you mean 'navigation'?",
+    "train --algorithm dqn": "input should be 'ppo' or 'sac', not 'dqn'",
+    "train --engine sb4": "unknown engine 'sb4'; did you mean 'sb3'?",
+    "evaluate diferential": "unknown policy 'diferential'; did you mean 'differential'?",
+    "evaluate differential --in fasst": "there is no such world; did you mean 'fast'?",
+    "evaluate differential --in fast --world circels": "did you mean 'circles'?",
+    "evaluate differential --in fast --gate mechanum": "did you mean 'mecanum'?",
+    "evaluate differential --in fast --fallback dynamic": "no such planner; did you mean",
+    "evaluate differential --in fast --lidar rplidar": "unknown lidar 'rplidar'; did you mean",
+    "evaluate differential --in fast --randomisation milt": "did you mean 'mild'?",
+    "policy info diferential": "neither a file nor a shipped policy; did you mean 'differential'?",
+    "world draw cluter": "unknown world 'cluter'; did you mean 'clutter'?",
+    "urdf nobody": "unknown robot 'nobody'",
+    "demo --policy strait": "unknown policy 'strait'; did you mean 'straight'?",
+    # Keys, values and units of files.
+    "drive --robot misspelt.yaml --out m": "need the parameter 'wheel_radius'; is 'wheel_radus' it?",
+    "drive --robot no_command.yaml --out m": "misses|missing|must",
+    "drive --robot turned.yaml --out m": "turned.yaml: .*min",
+    "drive --robot with_unit.yaml --out m": "key 'footprint_radius': .*'0.15 m'",
+    "drive --robot twice.yaml --out m": "the key 'footprint_radius' stands twice; keep one",
+    "drive --robot listed.yaml --out m": "the top level must be `key: value` lines",
+    "drive --robot kind.yaml --out m": "there is no 'diferential'; did you mean 'differential'?",
+    "drive --robot nowhere.yaml --out m": "nowhere.yaml: no such file",
+    "train --settings settings.yaml": "unknown key 'tsak'; did you mean 'task'",
+    "train --settings hurried.yaml": "no goal can be reached in time: world 'corridor'",
+    "generate drive.npz --out m --order five": "order is 'five'; it must be 1, 2, 3 or 4",
+    "generate drive.npz --out m --alpha 2": "alpha",
+    "generate drive.npz --out m --topic odom": "must be ROLE=TOPIC",
+    "evaluate differential --goal 1;2": "--goal '1;2': must be X,Y in metres",
+    "evaluate differential --episodes 0": "'--(steps|episodes)'",
+    "world draw clutter --footprint -1": "--footprint -1: must be above 0 m",
+    "record --out d.npz --preview --bound -1": "bound",
+    "record --out d.npz --preview --speed 3": "speed",
+    # Files that are not there, or are something else.
+    "generate nothing.npz --out m": "nothing.npz: no such file",
+    "generate text.txt --out m": "text.txt",
+    "generate empty.csv --out m": "empty.csv",
+    "generate table.csv --out m": "table.csv: .*map",
+    "inspect nothing.csv": "nothing.csv: no such file",
+    "inspect table.csv --map begun.yaml": "is there already; give another name",
+    "import table.csv --map begun.yaml --out d.csv": "must end in .npz",
+    "evaluate nothing.onnx": "nothing.onnx",
+    "evaluate text.onnx": "text.onnx",
+    "explain nothing.jsonl": "no such file",
+    "explain stop.jsonl": "stop.jsonl: is no JSON, line by line",
+    "doctor nothing": "nothing",
+    "bag info nothing": "nothing",
+    "policy import text.txt --robot differential --out p.bin": "a policy file ends with '.onnx'",
+    "world draw clutter --out clutter.jpg": "must end in .png",
+    "drive --robot differential --out m --recording d.csv": "must end in .npz",
+    # Places that are taken, or can't be written to.
+    "drive --robot differential --out text.txt": "text.txt",
+    "drive --robot differential --out taken": "taken",
+    "generate drive.npz --out taken": "taken",
+    "world draw clutter --out /proc/clutter.png": "/proc",
+    # Options that do not go together.
+    "train --resume": "--resume needs --out",
+    "train --address auto": "belongs to --engine ray",
+    "evaluate differential --hardware": "--hardware and --backend dds belong together",
+    "evaluate differential ackermann": "evaluate them one by one",
+    "doctor --model differential --policy differential": "give one of them",
+    "record --out d.npz --preview --remap odom": "must be NAME:=OTHER",
+}
+MODULES = {
+    (
+        "train",
+        "torch",
+    ): r"training needs the module 'torch'; pip install 'nics_drl_bridge\[train\]'",
+    ("train", "onnx"): r"training needs the module 'onnx'; pip install 'nics_drl_bridge\[deploy\]'",
+    ("train", "onnxruntime"): r"pip install 'nics_drl_bridge\[deploy\]'",
+    ("evaluate straight --in dds", "rclpy"): r"pip install 'nics_drl_bridge\[ros\]'",
+    ("demo", "rclpy"): r"pip install 'nics_drl_bridge\[ros\]'",
+    ("train --engine ray", "ray"): r"pip install 'nics_drl_bridge\[train,distributed\]'",
+}
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    path = tmp_path_factory.mktemp("drive") / "drive.npz"
+    car = load_robot("differential")
+    save_recording(textbook.record(car, np.random.default_rng(0), duration=10.0), path)
+    return path
+
+
+@pytest.fixture
+def folder(drive, tmp_path):
+    """A folder of files with which mistakes are made."""
+    for name, text in FILES.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    (tmp_path / "drive.npz").write_bytes(drive.read_bytes())
+    return tmp_path
+
+
+def sentence_of(done, code=2):
+    """The one sentence that a command ended with."""
+    assert done.returncode == code, done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    *_, sentence = done.stderr.splitlines()
+    assert sentence.startswith("nics: ")
+    return sentence
+
+
+@pytest.mark.parametrize("words", MISTAKES)
+def test_a_mistake_is_one_sentence(words, folder):
+    before = {path for path in folder.rglob("*") if path.is_file()}
+    sentence = sentence_of(nics(*words.split(), cwd=folder))
+    assert re.search(MISTAKES[words], sentence), sentence
+    assert {path for path in folder.rglob("*") if path.is_file()} >= before
+
+
+@pytest.mark.parametrize("given", MODULES, ids=" without ".join)
+def test_a_missing_module_is_one_sentence_with_what_to_install(given, folder):
+    words, module = given
+    with mock.patch.dict(sys.modules, {module: None}):
+        sentence = sentence_of(nics(*words.split(), cwd=folder))
+    assert re.search(MODULES[given], sentence), sentence
+
+
+def test_a_full_disk_is_one_sentence_and_leaves_nothing(folder):
+    full = OSError(errno.ENOSPC, "No space left on device", "m/model.yaml")
+    with mock.patch("nics_drl_bridge.files.write_text", side_effect=full):
+        done = nics("drive", "--robot", "differential", "--out", "m", cwd=folder)
+    assert "m/model.yaml: No space left on device; choose another place" in sentence_of(done)
+    assert not (folder / "m").exists()
+
+
+@pytest.mark.parametrize("where", ["recording.textbook.record", "generator.save_model"])
+def test_ctrl_c_at_any_time_is_one_sentence(where, folder):
+    with mock.patch(f"nics_drl_bridge.{where}", side_effect=KeyboardInterrupt):
+        done = nics("drive", "--robot", "differential", "--out", "m", cwd=folder)
+    assert "interrupted" in sentence_of(done, code=130)
+    assert not Path(folder / "m").exists()
+
+
+def test_a_run_with_other_settings_is_not_overwritten(folder):
+    (folder / "run").mkdir()
+    (folder / "run" / "settings.yaml").write_text("robot: ackermann\n", encoding="utf-8")
+    done = nics("train", "--robot", "differential", "--out", "run", cwd=folder)
+    assert "run: holds a run with other settings; choose another --out" in sentence_of(done)
