@@ -35,8 +35,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     documents observation, reward and end: `Navigation` (`NicsBridge/Navigation-v0`),
     `CooperativeReaching` and `PursuitEvasion` for teams, or your own (`NicsBridge/Task-v0`). The
     robot is either simulated in this process (`backend="sim"`) or whatever is behind the ROS 2
-    topics `cmd_vel`, `scan` and `odom` (`backend="dds"`, or `"ros"`): a simulator node or the vehicle. Task,
-    spaces and numbers are the same.
+    topics `cmd_vel`, `scan` and `odom` (`backend="dds"` or `"ros"`): a simulator node or the
+    vehicle. Task, spaces and numbers are the same.
 
     ## Action Space
 

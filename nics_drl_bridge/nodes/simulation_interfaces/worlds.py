@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -122,8 +121,7 @@ class Worlds:
         tags_match(request.filter, ())
         folder, failed = share_folder() / "config", list[str]()
         names = [each.stem for each in sorted((folder / "worlds").glob("*.yaml"))]
-        names += [each.stem for each in sorted((folder / "world_sets").glob("*.yaml"))]
-        found = [(name, load_worlds(name)) for name in (*names, BARN)]
+        found = [(name, load_worlds(name)) for name in names]
         for source in request.additional_sources:
             try:
                 found += _in_source(source)
@@ -131,7 +129,9 @@ class Worlds:
                 failed.append(f"{source!r}: {error}")
         if failed and not request.continue_on_error:
             raise RefusalError(Result.RESULT_NOT_FOUND, f"a source can't be read, {failed[0]}")
-        told = (told_of(world, Resource(uri=uri)) for uri, world in found)
+        sets = [BARN, *(each.stem for each in sorted((folder / "world_sets").glob("*.yaml")))]
+        told = [told_of(world, Resource(uri=uri)) for uri, world in found]
+        told += [_set_of(name) for name in sets]
         response.worlds = [each for each in told if tags_match(request.filter, each.tags)]
         if failed:
             response.result.result = Result.RESULT_OK
@@ -151,12 +151,19 @@ def _in_source(source: str) -> list[tuple[str, AnyWorld]]:
     return found
 
 
+def _set_of(name: str) -> WorldResource:
+    """A shipped set, whose many worlds would take long to read."""
+    about = f"the worlds of {name}, of which every episode draws one"
+    uri = Resource(uri=name)
+    return WorldResource(name=name, world_resource=uri, description=about, tags=["set"])
+
+
 def told_of(world: AnyWorld, resource: Resource) -> WorldResource:
     """Returns a world as the standard tells of it, with tags of what is in it."""
     members = world.members
     groups = [group for member in members for group in member.obstacles]
     about = {
-        "set": len(members) > 1 or isinstance(world, Sequence),
+        "set": len(members) > 1,
         "map": any(member.map is not None for member in members),
         "walled": any(member.size is not None or member.walls for member in members),
         "obstacles": bool(groups),
