@@ -134,6 +134,7 @@ setup(
         f"{PACKAGE}.backends": [
             f"sim = {PACKAGE}.env.sim_backend:SimBackend",
             f"dds = {PACKAGE}.nodes.backends:dds_backend",
+            f"ros = {PACKAGE}.nodes.backends:dds_backend",
         ],
         f"{PACKAGE}.commands": [f"bag = {PACKAGE}.extras.bags.command:bag"],
         f"{PACKAGE}.engines": [f"ray = {PACKAGE}.extras.ray.engine:learner"],

@@ -35,8 +35,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     documents observation, reward and end: `Navigation` (`NicsBridge/Navigation-v0`),
     `CooperativeReaching` and `PursuitEvasion` for teams, or your own (`NicsBridge/Task-v0`). The
     robot is either simulated in this process (`backend="sim"`) or whatever is behind the ROS 2
-    topics `cmd_vel`, `scan` and `odom` (`backend="dds"`): a simulator node or the vehicle. Task,
-    spaces and numbers are the same.
+    topics `cmd_vel`, `scan` and `odom` (`backend="dds"` or `"ros"`): a simulator node or the
+    vehicle. Task, spaces and numbers are the same.
 
     ## Action Space
 
@@ -84,6 +84,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         randomisation: quantities drawn in each episode: the name of a shipped one, a YAML file, or
             a Randomisation; the drawn values are in `info["randomisation"]` of a reset.
         render_mode: `rgb_array`, `human` or None.
+        simulator: name of the node behind `dds`; `simulation_interfaces` for any simulator that
+            serves these, such as Gazebo or Isaac, see `docs/dds_backend.md`.
 
     Raises:
         ConfigError, ModelError: an unknown name or a wrong file.
@@ -99,6 +101,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         task_options: dict[str, Any] | None = None, estimator: bool | None = None,
         backend_options: dict[str, Any] | None = None,
         randomisation: str | Randomisation | None = None, render_mode: str | None = None,
+        simulator: str | None = None,
     ) -> None:  # fmt: skip
         check_render_mode(render_mode, self.metadata)
         self.render_mode = render_mode
@@ -120,7 +123,10 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self._picture: Any = None
         if isinstance(backend, str):
             robots = self.robots if self.robots > 1 else None
-            own = {"estimator": estimator, "robots": robots, "randomisation": randomisation}
+            own = {
+                "estimator": estimator, "robots": robots, "randomisation": randomisation,
+                "simulator": simulator,
+            }  # fmt: skip
             given = {name: value for name, value in own.items() if value is not None}
             options = {**(backend_options or {}), **given}
             backend = make_backend(backend, self.model, self.world, **options)

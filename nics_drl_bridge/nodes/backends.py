@@ -13,6 +13,7 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import LaserScan
 
 from nics_drl_bridge import interface
+from nics_drl_bridge.config import validate
 from nics_drl_bridge.env.guard import halts_on_error
 from nics_drl_bridge.errors import BackendError, ConfigError, StaleDataError, nearest
 from nics_drl_bridge.generator import SimulatorModel
@@ -24,8 +25,10 @@ from nics_drl_bridge.nodes.conversions import sensor_from_ros, sensor_type
 from nics_drl_bridge.nodes.device_parameters import default_namespaces
 from nics_drl_bridge.nodes.executor import HANDED_OVER
 from nics_drl_bridge.nodes.link import EpisodeServices, Link
+from nics_drl_bridge.nodes.parameters import STANDARD
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.nodes.robot_topics import data_facts
+from nics_drl_bridge.nodes.simulation_interfaces.client import StandardEpisodes, StandardOptions
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 from nics_drl_bridge.sim.simulator import EpisodeSampler
 from nics_drl_bridge.sim.world_set import AnyWorld
@@ -45,7 +48,10 @@ class _Mail(NamedTuple):
 class _Mailbox:
     # The caller is woken once, when all its topics are there: each wake-up costs a good part of a
     # step. The executor's thread gives awaited odometry to `work` while the scan is in transit.
-    def __init__(self, topics: tuple[str, ...], work: Callable[[int, int, bytes], None]) -> None:
+    def __init__(
+        self, topics: tuple[str, ...], work: Callable[[int, int, bytes], None], slack_ns: int
+    ) -> None:
+        self._slack_ns = slack_ns  # data may be so much older than what is awaited
         self._mail, self._work = dict.fromkeys(topics, _Mail()), work
         self._lock, self._awaiting = threading.Lock(), threading.Lock()
         self._awaited_ns, self._worked_ns = -1, -1
@@ -66,13 +72,13 @@ class _Mailbox:
         return None
 
     def _work_in(self) -> None:
-        if self._mail[ODOM].stamp_ns == self._awaited_ns != self._worked_ns:
+        if self._worked_ns != self._awaited_ns <= self._mail[ODOM].stamp_ns + self._slack_ns:
             self._worked_ns = self._awaited_ns
             self._work(*self._mail[ODOM])
 
     def _late(self, stamp_ns: int) -> str | None:
         for topic, mail in self._mail.items():
-            if mail.stamp_ns < stamp_ns:
+            if mail.stamp_ns + self._slack_ns < stamp_ns:
                 return topic
         return None
 
@@ -107,7 +113,8 @@ class DdsBackend:
 
     `truth` adds the true pose to `info`; `timeout_s` bounds each wait; the simulator must draw by
     the same `randomisation`; `stamped` says whether `cmd_vel` is a TwistStamped, by default as the
-    simulator hears it. Raises BackendError if no
+    simulator hears it. The `simulator` of the name `simulation_interfaces` is any that serves
+    these; `standard` are options of them, see `StandardOptions`. Raises BackendError if no
     simulator is there, it refuses, is not in lock-step, or another node moved it; ModelError if it
     runs another model or world; StaleDataError if its data do not arrive.
     """
@@ -116,7 +123,7 @@ class DdsBackend:
         self, model: SimulatorModel, world: AnyWorld, namespace: str = "",
         simulator: str = "simulator_node", timeout_s: float = 30.0, truth: bool = False,
         domain_id: int | None = None, randomisation: Randomisation | None = None,
-        stamped: bool | None = None,
+        stamped: bool | None = None, standard: Mapping[str, Any] | None = None,
     ) -> None:  # fmt: skip
         self._robot, self._lidar = model.robot, model.lidar
         self._robot.require_cmd_vel()
@@ -127,7 +134,9 @@ class DdsBackend:
         self.timeout_s, self._topics = timeout_s, (ODOM, SCAN, *further)
         # No reference to the backend, which may be garbage.
         take = partial(_take_odometry, self._middleware)
-        self._now_ns, self._mail = 0, _Mailbox(self._topics, take)
+        options = validate(dict(standard or {}), StandardOptions, "standard")
+        self._slack_ns = round(options.slack_s * NS_PER_S)
+        self._now_ns, self._mail = 0, _Mailbox(self._topics, take, self._slack_ns)
         self._known: BackendFacts = {}
         if randomisation is not None:
             sampler = EpisodeSampler(model, world, randomisation=randomisation)
@@ -139,10 +148,15 @@ class DdsBackend:
                 kind = sensor_type(self._sensors[topic])
             put = partial(_put, self._mail, topic)
             self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
-        self._episodes = EpisodeServices(self._link, simulator, model, world, randomisation)
+        self._episodes: EpisodeServices | StandardEpisodes
+        if simulator == STANDARD.name:
+            self._episodes = StandardEpisodes(self._link, model, world, options)
+        else:
+            self._episodes = EpisodeServices(self._link, simulator, model, world, randomisation)
         self._link.begin()
         try:
             self._link.wait_for_peers(self._topics, self._episodes.clients, timeout_s, ADVICE)
+            self._episodes.open(timeout_s)
         except BaseException:
             self.close()
             raise
@@ -177,6 +191,7 @@ class DdsBackend:
         self._check_stamps()
         twist = self._robot.to_cmd_vel(command)
         self._link.send(twist)
+        self._episodes.advance()
         self._link.check_alone()  # while the simulator is at work
         self._middleware.command(self._now_ns, self._robot.from_cmd_vel(twist))
         self._now_ns += self._period_ns
@@ -184,7 +199,8 @@ class DdsBackend:
 
     def _check_stamps(self) -> None:
         for topic in self._topics:
-            if off_ns := self._mail.stamp_ns(topic) - self._now_ns:
+            off_ns = self._mail.stamp_ns(topic) - self._now_ns
+            if not -self._slack_ns <= off_ns <= 0:
                 self._link.check_alone()
                 off = f"stamped {off_ns / NS_PER_S:+.3f} s off the step"
                 fix = "start the simulator with mode:=lockstep, and move it from here alone."
@@ -319,6 +335,11 @@ def dds_backend(
         if not isinstance(randomisation, Randomisation):
             randomisation = load_randomisation(randomisation)
         options["randomisation"] = randomisation
+    if options.get("simulator") == STANDARD.name and (
+        randomisation is not None or mode != "lockstep" or robots > 1
+    ):
+        needed = "one robot in mode 'lockstep', without randomisation"
+        raise ConfigError(f"simulator {STANDARD.name!r}: drives {needed}; leave out the rest.")
     if mode not in MODES:
         raise ConfigError(f"backend_options: there is no mode {mode!r}; {nearest(mode, MODES)}")
     if robots > 1:

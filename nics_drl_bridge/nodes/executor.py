@@ -8,6 +8,7 @@ import itertools
 import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
+from functools import partial
 from typing import Any
 
 from rclpy.context import Context
@@ -28,7 +29,7 @@ MOST_AT_ONCE = 32  # a timer without a period is always ready, and the thread ha
 
 
 class StandingExecutor(SingleThreadedExecutor):
-    """Handles subscriptions, whose callbacks may return `HANDED_OVER`, and timers, not the rest."""
+    """Handles all that is frequent; callbacks of subscriptions may return `HANDED_OVER`."""
 
     def __init__(self, context: Context) -> None:
         super().__init__(context=context)
@@ -47,19 +48,23 @@ class StandingExecutor(SingleThreadedExecutor):
             return
         # Before anything else: a peer may be waiting for the answer to a message.
         self._call(received)
-        due: list[Any] = []
+        due, asked = list[Any](), list[Callable[[], object]]()
         left = False
         try:
             if self._entities is not None and self.context.ok():  # a callback may have shut it down
+                asked = self._entities.asked()
                 woken, others = self._entities.others_ready(self._guard)
                 self._changed |= woken or others  # adding an entity to a node wakes the executor
                 # So does rclpy itself, after each callback; then there is nothing to handle.
                 due, left = self._entities.due(), others or (woken and bool(self._tasks))
         except PARTS_MISSING as error:
             self._fall_back(error)
-        if received and self._entities is not None and self.context.ok():
-            # To take what arrived while callbacks ran costs less than to wait for it.
+        if (received or asked) and self._entities is not None and self.context.ok():
+            # To take what arrived while callbacks ran costs less than to wait for it. A message
+            # that was sent before a request is handled before it, too.
             self._call(self._entities.come())
+        for answer in asked:
+            answer()
         for timer in due:
             self._tick(timer)
         if left:
@@ -141,7 +146,14 @@ class _Entities:
             for i, one in enumerate(timers)
             if _takes(one.callback) and not inspect.iscoroutinefunction(one.callback)
         ]
-        self._own = {one.handle.pointer for _, one in self._timers}
+        self._services = [
+            (i, one)
+            for i, one in enumerate(services)
+            if not inspect.iscoroutinefunction(one.callback)
+        ]
+        self._clients = list(enumerate(clients))
+        direct = (*self._timers, *self._services, *self._clients)
+        self._own = {one.handle.pointer for _, one in direct}
         kinds = subscriptions, (*guards, *others), timers, clients, services
         self.opened = ExitStack()
         handles = (one.handle for one in itertools.chain(*kinds))
@@ -177,6 +189,23 @@ class _Entities:
     def come(self) -> list[Received]:
         return _take(self._subscriptions)
 
+    def asked(self) -> list[Callable[[], object]]:
+        """Takes requests to services and answers to clients; returns how each is handled."""
+        is_ready = self._wait_set.is_ready
+        found = list[Callable[[], object]]()
+        for i, service in self._services:
+            if is_ready("service", i):
+                request, header = service.handle.service_take_request(service.srv_type.Request)
+                if header is not None:
+                    found.append(partial(_serve, service, request, header))
+        for i, client in self._clients:
+            if is_ready("client", i):
+                header, response = client.handle.take_response(client.srv_type.Response)
+                if header is not None:
+                    number = header.request_id.sequence_number
+                    found.append(partial(_answer, client, number, response))
+        return found
+
     def due(self) -> list[Any]:
         is_ready = self._wait_set.is_ready
         return [timer for i, timer in self._timers if is_ready("timer", i)]
@@ -190,9 +219,19 @@ class _Entities:
         woken = own is not None and own.handle.pointer in triggered
         if woken:
             triggered.remove(own.handle.pointer)
-        others = bool(triggered or ready("client") or ready("service"))
-        others = others or any(timer not in self._own for timer in ready("timer"))
+        others = bool(triggered) or any(
+            one not in self._own for kind in ("client", "service", "timer") for one in ready(kind)
+        )
         return woken, others or any(each.is_ready(self._wait_set) for each in self._waitables)
+
+
+def _serve(service: Any, request: Any, header: Any) -> None:
+    service.send_response(service.callback(request, service.srv_type.Response()), header)
+
+
+def _answer(client: Any, number: int, response: Any) -> None:
+    with contextlib.suppress(KeyError):  # nobody waits for it any more
+        client.get_pending_request(number).set_result(response)
 
 
 def _take(subscriptions: Iterable[tuple[Any, int]]) -> list[Received]:

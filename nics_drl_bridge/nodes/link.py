@@ -238,6 +238,12 @@ class EpisodeServices:
         self._asked_s = 0.0
         self.clients = [self._reset, self._parameters]
 
+    def open(self, timeout_s: float) -> None:
+        """Does nothing: what a simulator runs is checked when an episode begins."""
+
+    def advance(self) -> None:
+        """Does nothing: the world moves when it has a command."""
+
     @property
     def there(self) -> bool:
         """True if a simulator offers them."""

@@ -135,6 +135,10 @@ def device(laser_frame: str = "") -> list[Row]:
 ROBOTS = Row(
     "robots", 1, "How many robots, named robot1, robot2, ..., or their namespaces; 1 has none."
 )
+STANDARD = Row(
+    "simulation_interfaces", True,
+    "Whether to offer the services of simulation_interfaces, where that package is installed.",
+)  # fmt: skip
 FRICTION = Row("friction", 1.0, "Friction between tyres and floor; ice has 0.1.", span=(0.01, 2.0))
 
 

@@ -213,7 +213,9 @@ def declare_model_name(node: Node) -> str:
 
 
 def declare_row(node: Node, row: Row) -> Any:
-    """Declares a parameter, and returns its value."""
+    """Declares a parameter unless the node has it, and returns its value."""
+    if node.has_parameter(row.name):
+        return node.get_parameter(row.name).value
     return declare(node, row.name, row.default, row.about, row.span, row.fixed)
 
 

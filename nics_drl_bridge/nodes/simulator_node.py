@@ -24,7 +24,7 @@ from sensor_msgs.msg import JointState, LaserScan
 from std_srvs.srv import SetBool
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.errors import BridgeError
+from nics_drl_bridge.errors import BackendError, BridgeError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.scanner import RENDERERS, Renderer
@@ -33,6 +33,7 @@ from nics_drl_bridge.nodes import conversions, device_parameters, parameters, qo
 from nics_drl_bridge.nodes.conversions import sensor_to_ros, sensor_type
 from nics_drl_bridge.nodes.link import identity
 from nics_drl_bridge.nodes.robot_topics import TWIST, TWIST_STAMPED
+from nics_drl_bridge.nodes.simulation_interfaces import open_services
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, variances
 from nics_drl_bridge.sim.simulator import FastSimulator
@@ -90,12 +91,15 @@ class RobotPort:
         self, node: Node, namespace: str, model: SimulatorModel, frames: device_parameters.Frames,
         time: device_parameters.DeviceTiming, outbox: Outbox,
     ) -> None:  # fmt: skip
-        self._model, self.frames = model, frames
+        self._node, self._model, self.frames = node, model, frames
+        self._publishers: list[Publisher] = []
         self._send = partial(outbox.send, late=time.odom_late_ns)
         self._send_scan = partial(outbox.send, late=time.scan_late_ns)
 
         def publisher(kind: Any, topic: str) -> Publisher:
-            return node.create_publisher(kind, f"{namespace}{topic}", qos.SENSOR_RELIABLE)
+            made = node.create_publisher(kind, f"{namespace}{topic}", qos.SENSOR_RELIABLE)
+            self._publishers.append(made)
+            return made
 
         self._scans = publisher(LaserScan, "scan")
         self._odoms, self._truths = publisher(Odometry, "odom"), publisher(Odometry, "ground_truth")
@@ -117,6 +121,11 @@ class RobotPort:
         self._odom = wire.OdometryWriter(at_rest((frames.odom, frames.base), odom))
         self._truth = wire.OdometryWriter(at_rest((frames.map, frames.base), truth))
         self._locates = bool(node.get_parameter("publish_map_to_odom").value)
+
+    def close(self) -> None:
+        """Ends its topics."""
+        for each in self._publishers:
+            self._node.destroy_publisher(each)
 
     def mounts(self) -> list[TransformStamped]:
         """Returns the transforms base_link -> laser, and to each further sensor."""
@@ -164,13 +173,18 @@ class CommandInlet:
         stamped = bool(node.get_parameter("enable_stamped_cmd_vel").value)
         self._kind = TWIST_STAMPED if stamped else TWIST
         kind, hear = (TwistStamped, self._on_stamped) if stamped else (Twist, self._on_bytes)
-        self._topic: str = node.create_subscription(
-            kind, f"{namespace}cmd_vel", hear, quality, raw=True
-        ).topic_name
+        heard = node.create_subscription(kind, f"{namespace}cmd_vel", hear, quality, raw=True)
+        self._topic, self._heard = heard.topic_name, [heard]
         self._warned: set[str] = set()
         kind = conversions.message_type("ackermann_msgs/msg/AckermannDriveStamped")
         if robot.steers and kind is not None:  # its package is optional
-            node.create_subscription(kind, f"{namespace}ackermann_cmd", self._on_ackermann, quality)
+            given = kind, f"{namespace}ackermann_cmd", self._on_ackermann, quality
+            self._heard.append(node.create_subscription(*given))
+
+    def close(self) -> None:
+        """Listens no more."""
+        for each in self._heard:
+            self._node.destroy_subscription(each)
 
     def _on_bytes(self, content: bytes) -> None:
         try:
@@ -248,37 +262,102 @@ class DeviceNode(qos.QosWatch):
         device_parameters.declare_device(self, model.lidar.frame)
         self._time = device_parameters.timing(self, model)
         self._names = device_parameters.namespaces(self)
-        world = load_worlds(str(self.get_parameter("world").value))
-        self._identity = identity(model, world, device_parameters.randomisation(self))
-        model = device_parameters.timed_model(self, model, self._time)
-        simulator = make(self, model, world, len(self._names))
-        self._world = DeviceWorld(simulator, model, len(self._names))
-        self._command_ns = np.zeros(len(self._names), np.int64)
-        self._heard = np.zeros(len(self._names), np.bool_)
-        self._paused, self._lags, self._hardware = False, 0, model.robot.name
-        self._world.advance()  # compiles before anything waits for it
-        self._now_ns = time.time_ns() // self._time.step_ns * self._time.step_ns
-        self._open_topics(model)
+        self._given = model
+        self.model = device_parameters.timed_model(self, model, self._time)
+        self._make = make
+        self.use_world(load_worlds(str(self.get_parameter("world").value)))
+        self.paused, self._lags, self._hardware = False, 0, model.robot.name
+        self.device.advance()  # compiles before anything waits for it
+        self._first_ns = time.time_ns() // self._time.step_ns * self._time.step_ns
+        self.now_ns = self._first_ns
+        self._open_topics()
         self._start_time()
-        self._begin()
+        self.begin()
+        self.standard = open_services(self)
 
-    def _open_topics(self, model: SimulatorModel) -> None:
+    def use_world(self, world: AnyWorld) -> None:
+        """Simulates a world with the robots that it was started with; `begin` an episode next."""
+        simulator = self.make_simulator(world, len(self._names))
+        self.world, self.device = world, DeviceWorld(simulator, self.model, len(self._names))
+        drawn = device_parameters.randomisation(self)
+        self._identity = identity(self._given, world, drawn)
+        self._size(range(len(self._names)))
+
+    def make_simulator(self, world: AnyWorld, robots: int) -> FastSimulator:
+        """Makes a simulator of a world for M robots. Raises ConfigError."""
+        return self._make(self, self.model, world, robots)
+
+    def _size(self, kept: Sequence[int]) -> None:
+        """Keeps what was heard by some robots, and makes room for those beyond them."""
+        count = self.device.robots
+        before = getattr(self, "_command_ns", np.zeros(0, np.int64))
+        self._command_ns, self._heard = np.zeros(count, np.int64), np.zeros(count, np.bool_)
+        known = [k for k in kept if k < len(before)]
+        self._command_ns[: len(known)] = before[known]
+
+    @property
+    def robot_names(self) -> tuple[str, ...]:
+        """Namespace of each robot that it was started with; for a single one the robot's name."""
+        return tuple(name or self.model.robot.name for name in self._names)
+
+    @property
+    def map_frame(self) -> str:
+        """Frame of the world."""
+        return str(self.get_parameter("map_frame").value)
+
+    @property
+    def frames(self) -> list[device_parameters.Frames]:
+        """Frames of each robot."""
+        return [port.frames for port in self._ports]
+
+    def _open_topics(self) -> None:
         self._outbox = Outbox()
         self._clock_topic = self.create_publisher(Clock, CLOCK, qos.SENSOR_RELIABLE)
         self._clocks = {self.get_fully_qualified_name()}
-        self._ports, self._inlets = [], []
-        commands = qos.EVERY_COMMAND if self._time.lockstep else qos.COMMAND
-        for k, name in enumerate(self._names):
-            space, frames = f"{name}/" if name else "", device_parameters.frames(self, name)
-            self._ports.append(RobotPort(self, space, model, frames, self._time, self._outbox))
-            given = model.robot, commands, partial(self._on_command, k), self._too_old
-            self._inlets.append(CommandInlet(self, space, *given))
+        self._ports: list[RobotPort] = []
+        self._inlets: list[CommandInlet] = []
+        for name in self._names:
+            self._open_robot(name)
         self._open_transforms()
         runner.serve(self, "~/reset", self._reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
         runner.serve(self, "~/repeat", self._repeat)
-        runner.serve(self, "~/touched", lambda: (True, json.dumps(self._world.touched)))
+        runner.serve(self, "~/touched", lambda: (True, json.dumps(self.device.touched)))
         runner.diagnose(self, "simulator", self._look)
+
+    def _open_robot(self, name: str) -> None:
+        space = f"{name}/" if name else ""
+        frames = device_parameters.frames(self, name.strip("/"))
+        port = RobotPort(self, space, self.model, frames, self._time, self._outbox)
+        commands = qos.EVERY_COMMAND if self._time.lockstep else qos.COMMAND
+        given = self.model.robot, commands, partial(self._on_command, port), self._too_old
+        self._inlets.append(CommandInlet(self, space, *given))
+        self._ports.append(port)
+
+    def add_robot(self, namespace: str) -> None:
+        """Opens the topics of a robot that the device has now, its last one."""
+        self._open_robot(namespace)
+        self._size(range(self.device.robots - 1))
+        self._publish_mounts()
+
+    def reopen_robots(self) -> None:
+        """Opens the topics of the robots that it was started with, and of no other."""
+        self.remove_robots(range(len(self._ports)))
+        for name in self._names:
+            self._open_robot(name)
+        self._size(())
+        self._publish_mounts()
+
+    def remove_robots(self, gone: Sequence[int]) -> None:
+        """Closes the topics of robots that the device has no more."""
+        kept = [k for k in range(len(self._ports)) if k not in gone]
+        for k in gone:
+            self._ports[k].close()
+            self._inlets[k].close()
+        self._outbox.clear()
+        self._ports = [self._ports[k] for k in kept]
+        self._inlets = [self._inlets[k] for k in kept]
+        self._size(kept)
 
     def _open_transforms(self) -> None:
         self._transforms: Any = conversions.message_type("tf2_msgs/msg/TFMessage")
@@ -288,9 +367,13 @@ class DeviceNode(qos.QosWatch):
             self.get_logger().warning(f"the package tf2_msgs is not installed, {silent}; {fix}")
             return
         self._moving = self.create_publisher(self._transforms, "/tf", qos.TRANSFORMS)
-        fixed = self.create_publisher(self._transforms, "/tf_static", qos.FIXED_TRANSFORMS)
-        mounts = [each for port in self._ports for each in port.mounts()]
-        fixed.publish(self._transforms(transforms=mounts))
+        self._fixed = self.create_publisher(self._transforms, "/tf_static", qos.FIXED_TRANSFORMS)
+        self._publish_mounts()
+
+    def _publish_mounts(self) -> None:
+        if self._transforms is not None:
+            mounts = [each for port in self._ports for each in port.mounts()]
+            self._fixed.publish(self._transforms(transforms=mounts))
 
     def _start_time(self) -> None:
         # Steady: with use_sim_time the node's clock would wait for this very node.
@@ -325,86 +408,119 @@ class DeviceNode(qos.QosWatch):
     def _look(self) -> runner.Condition:
         facts = {
             "mode": self._time.mode, "rate": self._time.rate, "robots": len(self._names),
-            "simulated time [s]": f"{self._now_ns / NS_PER_S:.3f}",
+            "simulated time [s]": f"{self.now_ns / NS_PER_S:.3f}",
             "times it fell behind real time": self._lags, **self._identity,
         }  # fmt: skip
-        message = "paused" if self._paused else "running"
+        message = "paused" if self.paused else "running"
         return runner.Condition(message, False, facts, self._hardware)
 
     def _timeout_ns(self) -> int:
         return int(device_parameters.number(self, "command_timeout") * NS_PER_S)
 
     def _too_old(self, stamp_ns: int) -> bool:
-        return not self._time.lockstep and self._now_ns - stamp_ns > self._timeout_ns()
+        return not self._time.lockstep and self.now_ns - stamp_ns > self._timeout_ns()
 
-    def _on_command(self, robot: int, command: Array) -> None:
-        self._world.commands[robot], self._command_ns[robot] = command, self._now_ns
-        if self._time.lockstep and not self._paused:
+    def _on_command(self, port: RobotPort, command: Array) -> None:
+        robot = self._ports.index(port)
+        self.device.commands[robot], self._command_ns[robot] = command, self.now_ns
+        if self._time.lockstep and not self.paused:
             self._heard[robot] = True
             if self._heard.all():
-                self._advance()
+                self.advance()
 
     def _on_time(self) -> None:
-        if self._paused:
+        if self.paused:
             return
         steady_ns = time.monotonic_ns()
-        if self._real_time.lost(steady_ns, self._now_ns):
+        if self._real_time.lost(steady_ns, self.now_ns):
             self._lags += 1
             fix = "ask for a smaller rate, scan_rate or odom_rate, or fewer robots"
             told = f"this machine does not keep up with real time; {fix}"
             self.get_logger().warning(told, throttle_duration_sec=5.0)
-            self._real_time.begin(steady_ns, self._now_ns + self._time.step_ns)
-        behind = self._real_time.behind(steady_ns, self._now_ns)
+            self._real_time.begin(steady_ns, self.now_ns + self._time.step_ns)
+        behind = self._real_time.behind(steady_ns, self.now_ns)
         if behind:
-            self._advance()
+            self.advance()
         if behind > 1:
             self._soon.trigger()  # not here: commands that have arrived are for the next step
-        self._outbox.flush(max(self._now_ns, self._real_time.time_at(steady_ns)))
+        self._outbox.flush(max(self.now_ns, self._real_time.time_at(steady_ns)))
 
     def _on_free_time(self) -> None:
-        if not self._paused:
-            self._advance()
-            self._outbox.flush(self._now_ns)
+        if not self.paused:
+            self.advance()
+            self._outbox.flush(self.now_ns)
 
-    def _advance(self) -> None:
+    def advance(self) -> None:
+        """Moves the world by one step, and publishes what is due."""
         if not self._time.lockstep:  # those that have been silent stop
-            self._world.commands[self._now_ns - self._command_ns > self._timeout_ns()] = 0.0
-        self._world.advance()
+            self.device.commands[self.now_ns - self._command_ns > self._timeout_ns()] = 0.0
+        self.device.advance()
         self._heard[:] = False
-        self._now_ns += self._time.step_ns
+        self.now_ns += self._time.step_ns
         self._publish()
 
-    def _begin(self) -> None:
+    def begin(self, rewind: bool = False) -> None:
+        """Begins the episode of the parameters, with time at its start if it is to be rewound."""
+        if rewind:
+            self.now_ns = self._first_ns
         given = bool(self.get_parameter("episode_start_given").value)
         start = np.array(self.get_parameter("episode_start").value, dtype=np.float64)
         seed = int(device_parameters.number(self, "episode_seed"))
-        self._world.begin(seed, start if given else None)
+        self.device.begin(seed, start if given else None)
         self._outbox.clear()
         self._heard[:] = False
-        self._now_ns += self._time.step_ns
-        self._odom_pace.begin(self._now_ns)
-        self._scan_pace.begin(self._now_ns)
+        self.now_ns += self._time.step_ns
+        self._odom_pace.begin(self.now_ns)
+        self._scan_pace.begin(self.now_ns)
         self._go_on()
         self._publish()
 
+    def rewind(self) -> None:
+        """Puts the time back to its start, while everything stays where it is."""
+        self.now_ns = self._first_ns
+        self._outbox.clear()
+        self._odom_pace.begin(self.now_ns)
+        self._scan_pace.begin(self.now_ns)
+        self._go_on()
+        self._publish()
+
+    def step(self) -> None:
+        """Moves the world by one step while it is paused."""
+        self.advance()
+        self._outbox.flush(self.now_ns)
+
+    def pause(self, paused: bool) -> None:
+        """Holds time, or lets it go on."""
+        self.paused = paused
+        if not paused:
+            self._go_on()
+
     def _go_on(self) -> None:
-        self._real_time.begin(time.monotonic_ns(), self._now_ns)
+        self._real_time.begin(time.monotonic_ns(), self.now_ns)
         if self._timer is not None:
             self._timer.reset()
 
     def _reset(self) -> tuple[bool, str]:
         try:
-            self._begin()
+            self._require_world()
+            self.begin()
         except BridgeError as error:
             return False, str(error)
-        return True, json.dumps({"stamp_ns": self._now_ns, **self._identity})
+        return True, json.dumps({"stamp_ns": self.now_ns, **self._identity})
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        self._paused = bool(request.data)
-        if not self._paused:
-            self._go_on()
-        response.success, response.message = True, "paused" if self._paused else "running"
+        try:
+            self._require_world()
+        except BridgeError as error:
+            response.success, response.message = False, str(error)
+            return response
+        self.pause(bool(request.data))
+        response.success, response.message = True, "paused" if self.paused else "running"
         return response
+
+    def _require_world(self) -> None:
+        if self.standard is not None and not self.standard.has_world:
+            raise BackendError("no world is loaded; load one by the service load_world.")
 
     def _repeat(self) -> tuple[bool, str]:
         if not self._time.lockstep:
@@ -413,7 +529,7 @@ class DeviceNode(qos.QosWatch):
         return True, ""
 
     def _publish(self) -> None:
-        now_ns = self._now_ns
+        now_ns = self.now_ns
         if self._clock_topic.get_subscription_count():
             self._clock_topic.publish(Clock(clock=conversions.stamp_to_ros(now_ns)))
         odom_due, scan_due = self._odom_pace.due(now_ns), self._scan_pace.due(now_ns)
@@ -421,9 +537,9 @@ class DeviceNode(qos.QosWatch):
             self._publish_data(odom_due, scan_due)
 
     def _publish_data(self, odom_due: bool, scan_due: bool) -> None:
-        now_ns, moving = self._now_ns, []
+        now_ns, moving = self.now_ns, []
         for k, port in enumerate(self._ports):
-            sensed = self._world.sensed(k)
+            sensed = self.device.sensed(k)
             if odom_due:
                 port.publish_odometry(sensed, now_ns)
                 if self._transforms is not None:

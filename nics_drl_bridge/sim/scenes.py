@@ -188,8 +188,15 @@ class SetSampler:
         room = tuple(max(each) for each in zip(*rooms, strict=True))
         for each in self.samplers:
             each.room, each.scratches = room, scratches
-        self.robots, self.count = robots, max(each.count for each in self.samplers)
-        self.shapes = known.shapes
+        drawn = max(each.count for each in self.samplers)
+        self.robots, self.count = robots, drawn + len(world.spare)
+        self.shapes = (*known.shapes, *world.spare)  # those that are spare come last
+
+    @property
+    def motions(self) -> list[tuple[Motion | None, ...]]:
+        """(P, K) the motions of all obstacles of each member."""
+        each = [sampler.motions for sampler in self.samplers]
+        return [(*own, *(None,) * (self.count - len(own))) for own in each]
 
     def draw(
         self, seeds: ArrayLike, count: ArrayLike | None = None, size: ArrayLike | None = None

@@ -29,10 +29,25 @@ MOST_BYTES = 2**24  # of a file; the largest saved worlds have some megabytes
 MOST_MODELS = 20_000  # with all that are included
 OLDEST, NEWEST = (1, 4), (1, 12)  # versions of SDF
 PATHS = "GZ_SIM_RESOURCE_PATH", "IGN_GAZEBO_RESOURCE_PATH", "GAZEBO_MODEL_PATH"
+ABSENT = "which is neither"
 HARMLESS = "sun", "ground_plane"  # included by most worlds, and nothing to run into
 MOVING = {"actor": "an actor, which moves by a script", "population": "a population of models"}
 POSE = {"relative_to", "frame", "degrees", "rotation_format"}  # attributes
 NUMBERS = {"euler_rpy": 6, "quat_xyzw": 7}  # of a pose, by its rotation_format
+
+
+class AssetsError(ConfigError):
+    """An SDF file holds what is no shape of a world, or what is not there."""
+
+    @property
+    def missing(self) -> bool:
+        """True if a file is not there."""
+        return ABSENT in str(self)
+
+
+def tags_in(path: str | Path) -> set[str]:
+    """Returns the tags of all elements of an SDF file. Raises ConfigError, as `read_sdf`."""
+    return {element.tag for element in _root(Path(path)).iter()}
 
 
 def read_sdf(
@@ -66,11 +81,11 @@ def read_sdf(
     if left_out and not skip_unknown:
         more = f" (as {len(left_out) - 1} more models)" if len(left_out) > 1 else ""
         fix = "leave it out by --skip-unknown or --without MODEL, or put a box in its place"
-        raise ConfigError(f"{path}: {left_out[0]}{more}, which is no shape of a world; {fix}.")
+        raise AssetsError(f"{path}: {left_out[0]}{more}, which is no shape of a world; {fix}.")
     shapes = seen - sum(map(len, unknown.values()))
     if left_out and not shapes:
         reason = f"holds nothing but what is no shape of a world ({left_out[0]})"
-        raise ConfigError(f"{path}: {reason}; put a box in its place.")
+        raise AssetsError(f"{path}: {reason}; put a box in its place.")
     if not placed:
         reason = f"none of its {shapes} collision geometries stands at a height of {height:g} m"
         raise ConfigError(f"{path}: {reason}; choose another --height.")
@@ -142,7 +157,7 @@ class _Scope:
                         model, file, _text(child, "name") or model.get("name", ""), child
                     )
             elif name not in HARMLESS and self._order.takes(name):
-                folders = f"{uri!r}, which is neither beside the file nor on {PATHS[0]}"
+                folders = f"{uri!r}, {ABSENT} beside the file nor on {PATHS[0]}"
                 self.strange.append((name, folders))
 
     def _add_model(

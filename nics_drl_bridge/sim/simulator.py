@@ -44,6 +44,11 @@ MOST_ROBOTS = 1_000  # Greatest number of robots in one world; each is tested ag
 MOST_NUMBERS = 2**30  # Most values in all worlds, some GB: beams of robots, states of obstacles
 PER_BODY = 64
 TOLERANCE = 0.05  # Beyond the range of commands that was recorded, as a share of their limits
+# Arrays of the state with a row for each robot.
+OF_ROBOT = (
+    "pose", "state", "history", "odom", "twist", "ranges", "collided", "faults", "coefficient",
+    "delay", "age", "noise", "past",
+)  # fmt: skip
 EVERY = 16  # Commands are checked in the first step after a reset and then at this interval [steps]
 
 
@@ -182,9 +187,9 @@ class FastSimulator:
         self.goals: Array = np.zeros((worlds, robots, 2))  # of the episodes [m]
         # Draws of the randomisation for the running episodes, (N, M) per robot or (N,) per scene.
         self.drawn: dict[str, NDArray[Any]] = {}
-        self._footprint = footprint_shape(model.robot)
+        self.footprint = footprint_shape(model.robot)
         self.sampler = self._episodes.scenes
-        shapes = (*self.sampler.shapes, self._footprint)
+        shapes = (*self.sampler.shapes, self.footprint)
         table = with_shapes(model.lidar, model.table, shapes)
         self._in_table = np.array([table.outlines.index_of(shape) for shape in shapes])
         self._scanner = Scanner(model.lidar, table, renderer)
@@ -198,9 +203,14 @@ class FastSimulator:
 
     @cached_property
     def _members(self) -> Members:
-        motions = [each.motions for each in self.sampler.samplers]
+        motions = self.sampler.motions
         outlines = self._scanner.table.outlines.arguments
         return members_of(self.world.members, motions, outlines, self._sizes, self.data.member)
+
+    @property
+    def moves(self) -> bool:
+        """True if an obstacle of any world moves; `data` then has them in the order of scenes."""
+        return self._members.moves
 
     @cached_property
     def packed(self) -> dict[int, Any]:
@@ -216,6 +226,37 @@ class FastSimulator:
         """Sorts bodies into cells anew, after obstacles in `data` were put elsewhere."""
         for part in self.parts:
             step_kernels.sort_worlds(self.packed[part.start], part.start, part.stop)
+
+    def put_bodies(self, bodies: Array) -> None:
+        """Puts the obstacles of the first world at (K, 7), in the format of scenes."""
+        obstacles = self.data.bodies[0, : self.sampler.count]
+        obstacles[:] = bodies
+        obstacles[:, SHAPE] = self._in_table[bodies[:, SHAPE].astype(np.int64)]
+        self.sort_bodies()
+
+    def put_robot(self, robot: int, pose: Array, state: Array) -> None:
+        """Puts a robot of the first world at a pose (3,) with a state (S,); odometry stays."""
+        self.data.pose[0, robot], self.data.state[0, robot] = pose, state
+        body = place(pose, self.footprint.radius, self._in_table[-1])
+        self.data.bodies[0, self.sampler.count + robot] = body
+        self.sort_bodies()
+
+    def take_over(self, other: "FastSimulator", robots: Indices, obstacles: Indices) -> None:
+        """Goes on with the episode of another simulator of this model, in its first world.
+
+        `robots` are indices of the other's robots, which become the first ones here, `obstacles`
+        (K,) those of its obstacles; -1 is none of them. Obstacles are put by `put_bodies`.
+        """
+        mine, theirs = self.data, other.data
+        for name in OF_ROBOT:
+            getattr(mine, name)[0, : len(robots)] = getattr(theirs, name)[0, robots]
+        for name in ("steps", "seeds", "member"):
+            getattr(mine, name)[0] = getattr(theirs, name)[0]
+        kept = obstacles >= 0
+        for name in ("velocity", "marks"):
+            getattr(mine, name)[0, kept] = getattr(theirs, name)[0, obstacles[kept]]
+        for m, (pose, state) in enumerate(zip(mine.pose[0].copy(), mine.state[0], strict=True)):
+            self.put_robot(m, pose, state)
 
     def __getstate__(self) -> dict[str, Any]:  # a copy rebuilds the rest
         rebuilt = ("_members", "packed", "_renders")
@@ -291,7 +332,7 @@ class FastSimulator:
         count, shapes = self.sampler.count, scenes.bodies[..., SHAPE].astype(np.int64)
         data.bodies[chosen, :count] = scenes.bodies
         data.bodies[chosen, :count, SHAPE] = self._in_table[shapes]
-        data.bodies[chosen, count:] = place(starts, self._footprint.radius, self._in_table[-1])
+        data.bodies[chosen, count:] = place(starts, self.footprint.radius, self._in_table[-1])
         self.goals[chosen] = scenes.goals
 
     def _assign(self, chosen: Indices, draws: Draws) -> None:

@@ -104,6 +104,7 @@ class World(Schema):
     starts: Starts | None = None  # `starts`, `goals`: by default anywhere
     goals: Goals | None = None
     _file: str | None = PrivateAttr(default=None)
+    _spare: tuple[Shape, ...] = PrivateAttr(default=())
 
     @model_validator(mode="after")
     def _consistent(self) -> World:
@@ -124,6 +125,17 @@ class World(Schema):
     def members(self) -> tuple[World, ...]:
         """The world itself, as the only one of its set."""
         return (self,)
+
+    @property
+    def spare(self) -> tuple[Shape, ...]:
+        """Shapes for which a simulator keeps room, one body each; scenes are drawn without them."""
+        return self._spare
+
+    def with_spare(self, shapes: tuple[Shape, ...]) -> World:
+        """Returns the world with room for further bodies of some shapes."""
+        copy = self.model_copy()
+        copy._spare = shapes
+        return copy
 
     @property
     def source(self) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from glob import glob
 from pathlib import Path
@@ -43,6 +43,11 @@ class WorldSet:
 
     name: str
     members: tuple[World, ...]
+    spare: tuple[Shape, ...] = ()  # see `World.spare`
+
+    def with_spare(self, shapes: tuple[Shape, ...]) -> WorldSet:
+        """Returns the set with room for further bodies of some shapes."""
+        return replace(self, spare=shapes)
 
     @property
     def source(self) -> str:

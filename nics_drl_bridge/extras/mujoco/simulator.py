@@ -1,6 +1,7 @@
 """Robots in MuJoCo: one on an infinite floor, or several in a world as in FastSimulator."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -21,7 +22,7 @@ from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import DrivenSimulator
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.scenes import Scenes
-from nics_drl_bridge.sim.simulator import Starts
+from nics_drl_bridge.sim.simulator import FastSimulator, Indices, Starts
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 ENCODER_PERIOD_S = 0.01  # approximate period of encoder readings and of updates of moving obstacles
@@ -61,6 +62,23 @@ class Rig:
         own[:] = rest
         own[:2] = x, y
         own[3:7] = np.cos(0.5 * heading), 0.0, 0.0, np.sin(0.5 * heading)
+
+    def launch(self, data: Any, rest: Array, twist: Array, heading: float) -> None:
+        """Gives the body a twist (3,), and all its parts no speed of their own."""
+        own = data.qvel[self._drift : self._drift + len(rest) - 1]
+        own[:] = 0.0
+        own[:2], own[5] = geometry.rotate(twist[:2], heading), twist[2]
+
+    def motion(self, data: Any, rest: Array) -> tuple[Array, Array]:
+        """Returns copies of positions (nq,) and speeds (nq - 1,) of the body and all its parts."""
+        positions = data.qpos[self._place : self._place + len(rest)]
+        return positions.copy(), data.qvel[self._drift : self._drift + len(rest) - 1].copy()
+
+    def resume(self, data: Any, motion: tuple[Array, Array]) -> None:
+        """Goes on with the motion that another rig of this machine had."""
+        positions, speeds = motion
+        data.qpos[self._place : self._place + len(positions)] = positions
+        data.qvel[self._drift : self._drift + len(speeds)] = speeds
 
     def command(self, data: Any, command: ArrayLike) -> None:
         """Gives the motors a command (C,), clipped to its limits. Raises BackendError for NaN."""
@@ -163,11 +181,45 @@ class MujocoSimulator(DrivenSimulator):
     ) -> Scenes:
         """Begins the episode of a seed (1,), at poses (1, M, 3); see `FastSimulator.reset`."""
         scenes = super().reset(seeds, worlds, starts)
-        spec, robots, bodies = self.model.robot, self.data.pose.shape[1], scenes.bodies[0]
-        member = int(self.data.member[0])
+        self._compile(scenes.bodies[0])
+        for rig, pose in zip(self._rigs, self.data.pose[0], strict=True):
+            rig.put(self._data, self._rest, pose)
+        self._mujoco.mj_forward(self._simulation, self._data)
+        return scenes
+
+    def put_bodies(self, bodies: Array) -> None:
+        """Puts the obstacles, see `FastSimulator.put_bodies`, and compiles the scene anew."""
+        super().put_bodies(bodies)
+        motions = [rig.motion(self._data, self._rest) for rig in self._rigs]
+        self._compile(bodies)
+        self._resume(motions)
+
+    def put_robot(self, robot: int, pose: Array, state: Array) -> None:
+        """Puts a robot, see `FastSimulator.put_robot`; its wheels follow from their motors."""
+        super().put_robot(robot, pose, state)
+        rig = self._rigs[robot]
+        rig.put(self._data, self._rest, pose)
+        rig.launch(self._data, self._rest, self._twist(state), pose[2])
+        self._mujoco.mj_forward(self._simulation, self._data)
+
+    def take_over(self, other: FastSimulator, robots: Indices, obstacles: Indices) -> None:
+        """Goes on with another's episode; see `FastSimulator.take_over`."""
+        super().take_over(other, robots, obstacles)
+        if isinstance(other, MujocoSimulator):
+            self.wheels[: len(robots)] = other.wheels[robots]
+            self._resume([other._rigs[r].motion(other._data, self._rest) for r in robots])
+
+    def _resume(self, motions: Sequence[tuple[Array, Array]]) -> None:
+        for rig, motion in zip(self._rigs, motions, strict=False):
+            rig.resume(self._data, motion)
+        self._mujoco.mj_forward(self._simulation, self._data)
+
+    def _compile(self, bodies: Array) -> None:
+        """Compiles the scene with obstacles (K, 7), whose robots are then to be put."""
+        spec, robots, member = self.model.robot, self.data.pose.shape[1], int(self.data.member[0])
         compiled = self._simulation = scenery.compile_scene(
             self._mujoco, self._machine, self._physics, footprint_shape(spec), robots,
-            self.world.members[member], self.sampler.samplers[member].motions,
+            self.world.members[member], self.sampler.motions[member],
             self.sampler.shapes, bodies,
         )  # fmt: skip
         self._data = self._mujoco.MjData(compiled)
@@ -176,10 +228,6 @@ class MujocoSimulator(DrivenSimulator):
         ids = [int(compiled.body(f"{scenery.OBSTACLE_NAME}{k}").mocapid[0]) for k in there]
         self._mocap = [(k, one) for k, one in zip(there, ids, strict=True) if one >= 0]
         self._bumper_of = scenery.bumpers(compiled, robots)
-        for rig, pose in zip(self._rigs, self.data.pose[0], strict=True):
-            rig.put(self._data, self._rest, pose)
-        self._mujoco.mj_forward(compiled, self._data)
-        return scenes
 
     def step(self, commands: ArrayLike) -> None:
         """Moves one control period by commands (1, M, C), clipped. ConfigError, BackendError."""

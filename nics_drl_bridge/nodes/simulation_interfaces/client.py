@@ -1,0 +1,200 @@
+"""The client: episodes and steps of any simulator that serves simulation_interfaces."""
+
+from __future__ import annotations
+
+import time
+from importlib import import_module
+from typing import Any
+
+from geometry_msgs.msg import Pose
+from pydantic import Field, PositiveFloat
+from rosgraph_msgs.msg import Clock
+
+from nics_drl_bridge.config import Schema
+from nics_drl_bridge.errors import BackendError, ConfigError
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.interface import NS_PER_S, Array, Start
+from nics_drl_bridge.lidar.exact_kernels import RADIUS
+from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.link import POLL_S, Link
+from nics_drl_bridge.nodes.runner import holds
+from nics_drl_bridge.sim.entities import OBSTACLE
+from nics_drl_bridge.sim.scenes import sample_scene
+from nics_drl_bridge.sim.world_set import AnyWorld
+
+PACKAGE = "simulation_interfaces"
+# Feature -> the service behind it, all of which a client needs.
+NEEDED = {
+    "SIMULATION_STATE_SETTING": "SetSimulationState", "SIMULATION_STATE_PAUSE": "",
+    "SIMULATION_RESET": "ResetSimulation", "STEP_SIMULATION_SINGLE": "StepSimulation",
+    "ENTITY_STATE_SETTING": "SetEntityState", "ENTITY_STATE_GETTING": "GetEntityState",
+}  # fmt: skip
+TOLERANCE = 1e-3  # of a control period, as a share of a step
+
+
+class StandardOptions(Schema):
+    """Options of a simulator behind the standard's services."""
+
+    services: str = ""  # what their names begin with: `/gzserver` for Gazebo
+    entity: str = ""  # name of the robot's entity; that of the model's robot by default
+    step_s: PositiveFloat | None = None  # of a step of the simulator; None: measured on /clock
+    slack_s: float = Field(0.0, ge=0.0)  # by which data may be older than the end of a period
+    obstacles: bool = True  # puts those of the episode's scene, where entities have their names
+
+
+def module(kind: str) -> Any:
+    """Returns the module `srv` or `msg` of the messages. Raises ConfigError if they are missing."""
+    try:
+        return import_module(f"{PACKAGE}.{kind}")
+    except ModuleNotFoundError:
+        fix = f"install {PACKAGE} with your ROS 2 distribution, and source it"
+        told = f"simulator {PACKAGE!r} needs the messages of that name"
+        raise ConfigError(f"{told}; {fix}.") from None
+
+
+class StandardEpisodes:
+    """Episodes and steps by the standard's services alone, as `EpisodeServices` are by our own.
+
+    A seed is nothing to the standard: an episode is a reset, after which robot and obstacles are
+    put where they start. Raises BackendError for a feature that the simulator lacks.
+    """
+
+    def __init__(
+        self, link: Link, model: SimulatorModel, world: AnyWorld, options: StandardOptions
+    ) -> None:
+        self._link, self._model, self._world, self._options = link, model, world, options
+        self._types, self._messages = module("srv"), module("msg")
+        self._entity = options.entity or model.robot.name
+        self._features = self._client("GetSimulatorFeatures")
+        names = [name for name in NEEDED.values() if name]
+        self._services = {name: self._client(name) for name in names}
+        self._entities = self._client("GetEntities")
+        self.clients = [self._features]  # the one that all simulators have
+        self._known: frozenset[int] = frozenset()
+        self._steps, self._period_ns = 0, round(model.control_period * NS_PER_S)
+        self._pending: list[Any] = []
+        self._clock: list[Any] = []
+        if options.step_s is None:  # before the executor runs
+            self._listening = link.node.create_subscription(
+                Clock, "/clock", self._clock.append, qos.SENSOR
+            )
+
+    def _client(self, name: str) -> Any:
+        words = "".join(f"_{c.lower()}" if c.isupper() else c for c in name).removeprefix("_")
+        prefix = f"{self._options.services.rstrip('/')}/" if self._options.services else ""
+        return self._link.node.create_client(getattr(self._types, name), f"{prefix}{words}")
+
+    def _call(self, name: str, timeout_s: float, *fine: int, **fields: Any) -> Any:
+        """Calls a service. Raises BackendError for a result that is neither OK nor `fine`."""
+        kind = getattr(self._types, name)
+        response = self._link.call(self._services[name], kind.Request(**fields), timeout_s)
+        if response.result.result not in (self._messages.Result.RESULT_OK, *fine):
+            told = response.result.error_message or f"result {response.result.result}"
+            raise BackendError(f"the simulator refused {name}: {told}")
+        return response
+
+    def open(self, timeout_s: float) -> None:
+        """Checks the features, and measures a step. Raises BackendError naming what is missing."""
+        request, kinds = self._types.GetSimulatorFeatures.Request(), self._messages
+        told = self._link.call(self._features, request, timeout_s).features
+        self._known = frozenset(told.features)
+        for feature, service in NEEDED.items():
+            self._require(feature, f", which {service} serves" if service else "")
+        self.clients += self._services.values()
+        paused = kinds.SimulationState(state=kinds.SimulationState.STATE_PAUSED)
+        self._paused = {"state": paused}
+        self._pause(timeout_s)
+        step_ns = self._measured(timeout_s) if self._options.step_s is None else round(
+            self._options.step_s * NS_PER_S
+        )  # fmt: skip
+        self._steps = max(1, round(self._period_ns / step_ns))
+        if abs(self._steps * step_ns - self._period_ns) > TOLERANCE * step_ns:
+            parts = f"a control period of {self._period_ns / NS_PER_S:g} s is no whole number of"
+            fix = "give the simulator a step that divides it"
+            raise BackendError(f"{parts} the simulator's steps of {step_ns / NS_PER_S:g} s; {fix}.")
+        if self._steps > 1:
+            self._require("STEP_SIMULATION_MULTIPLE", ", as a control period is several steps")
+
+    def _require(self, feature: str, clause: str) -> None:
+        if getattr(self._messages.SimulatorFeatures, feature) not in self._known:
+            lacks = f"the simulator does not have the feature {feature}{clause}"
+            raise BackendError(f"{lacks}; choose one that has, or another backend.")
+
+    def _pause(self, timeout_s: float) -> None:
+        already = self._types.SetSimulationState.Response.ALREADY_IN_TARGET_STATE
+        self._call("SetSimulationState", timeout_s, already, **self._paused)
+
+    def _measured(self, timeout_s: float) -> int:
+        stamps = list[int]()
+        for _ in range(2):
+            self._clock.clear()
+            self._call("StepSimulation", timeout_s, steps=1)
+            if not holds(lambda: self._clock, timeout_s, POLL_S):
+                told = f"no message on /clock within {timeout_s:g} s, which tells how long a step"
+                raise BackendError(f"{told} is; give its seconds as the option step_s.")
+            time.sleep(POLL_S)  # of several that a step publishes the last
+            stamps.append(conversions.stamp_from_ros(self._clock[-1].clock))
+        self._link.node.destroy_subscription(self._listening)
+        if stamps[1] <= stamps[0]:
+            raise BackendError("time does not pass in a step; give its seconds as option step_s.")
+        return stamps[1] - stamps[0]
+
+    def begin(self, start: Start, timeout_s: float) -> int:
+        """Begins an episode; returns the stamp of its first data [ns]. Raises BackendError."""
+        if not self._steps:
+            self.open(timeout_s)
+        self._await_steps(timeout_s)
+        self._pause(timeout_s)
+        scopes, known = self._types.ResetSimulation.Request, self._messages.SimulatorFeatures
+        of_state = known.SIMULATION_RESET_STATE in self._known
+        scope = scopes.SCOPE_STATE if of_state else scopes.SCOPE_ALL
+        self._call("ResetSimulation", timeout_s, scope=scope)
+        self._pause(timeout_s)  # some play on after a reset
+        self._put_obstacles(start, timeout_s)
+        self._put(self._entity, start.pose.reshape(3), timeout_s)
+        found = self._call("GetEntityState", timeout_s, entity=self._entity)
+        stamp_ns = conversions.stamp_from_ros(found.state.header.stamp) + self._period_ns
+        self._link.halt()
+        self.advance()
+        return stamp_ns
+
+    def _put_obstacles(self, start: Start, timeout_s: float) -> None:
+        if not self._options.obstacles or not self._entities.service_is_ready():
+            return
+        request = self._types.GetEntities.Request()
+        there = set(self._link.call(self._entities, request, timeout_s).entities)
+        scene = sample_scene(self._world, self._model.robot.footprint_radius, int(start.seed))
+        for k, body in enumerate(scene.bodies):
+            if body[RADIUS] > 0.0 and f"{OBSTACLE}{k}" in there:
+                self._put(f"{OBSTACLE}{k}", body[:3], timeout_s)
+
+    def _put(self, entity: str, pose: Array, timeout_s: float) -> None:
+        placed, state = Pose(), self._messages.EntityState()
+        placed.position.x, placed.position.y = float(pose[0]), float(pose[1])
+        placed.orientation = conversions.heading_to_ros(float(pose[2]))
+        state.pose = placed
+        flags = {"set_pose": True, "set_twist": not entity.startswith(OBSTACLE)}
+        self._call("SetEntityState", timeout_s, entity=entity, state=state, **flags)
+
+    def advance(self) -> None:
+        """Asks for the steps of one control period, without waiting: the data tell of them."""
+        self._look()
+        request = self._types.StepSimulation.Request(steps=self._steps)
+        self._pending.append(self._services["StepSimulation"].call_async(request))
+
+    def repeat(self) -> None:
+        """Raises BackendError if the steps were refused; the standard can't repeat data."""
+        self._look()
+
+    def _look(self) -> None:
+        for future in [each for each in self._pending if each.done()]:
+            self._pending.remove(future)
+            result = future.result().result
+            if result.result != self._messages.Result.RESULT_OK:
+                self._pending.clear()
+                told = result.error_message or f"result {result.result}"
+                raise BackendError(f"the simulator refused StepSimulation: {told}")
+
+    def _await_steps(self, timeout_s: float) -> None:
+        holds(lambda: all(each.done() for each in self._pending), timeout_s, POLL_S)
+        self._pending.clear()

@@ -1,0 +1,189 @@
+"""Entities: their names by filters, their states, what they are, and their bounds."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from geometry_msgs.msg import Twist
+from simulation_interfaces.msg import (
+    EntityCategory,
+    EntityInfo,
+    EntityState,
+    Result,
+    TagsFilter,
+)
+from simulation_interfaces.srv import SetEntityState
+
+from nics_drl_bridge import geometry as planar
+from nics_drl_bridge.nodes import conversions
+from nics_drl_bridge.nodes.simulation_interfaces import plane
+from nics_drl_bridge.nodes.simulation_interfaces.host import Host, RefusalError
+from nics_drl_bridge.nodes.simulation_interfaces.state import Simulation
+from nics_drl_bridge.sim.entities import Entity, OutsideError
+from nics_drl_bridge.sim.obstacles import Pedestrian
+
+FAILED = Result.RESULT_OPERATION_FAILED
+INVALID_POSE = SetEntityState.Response.INVALID_POSE
+CATEGORIES = {
+    getattr(EntityCategory, name)
+    for name in ("OBJECT", "ROBOT", "HUMAN", "DYNAMIC_OBJECT", "STATIC_OBJECT")
+    for name in (f"CATEGORY_{name}",)
+}
+# Classes of POSIX's bracket expressions, which Python writes otherwise.
+CLASSES = {
+    "alpha": "A-Za-z", "digit": "0-9", "alnum": "A-Za-z0-9", "upper": "A-Z", "lower": "a-z",
+    "space": r"\s", "blank": r" \t", "punct": r"!-/:-@\[-`{-~", "xdigit": "0-9A-Fa-f",
+    "word": r"\w", "print": " -~", "graph": "!-~", "cntrl": r"\x00-\x1f",
+}  # fmt: skip
+
+
+def pattern_of(expression: str) -> re.Pattern[str]:
+    """Compiles a POSIX extended regular expression. Raises RefusalError for none."""
+    text = re.sub(r"\[:(\w+):\]", lambda one: CLASSES.get(one[1], one[0]), expression)
+    try:
+        return re.compile(text)
+    except (re.error, OverflowError, RecursionError) as error:
+        told = f"the filter {expression!r} is no regular expression ({error}); mend it."
+        raise RefusalError(FAILED, told) from None
+
+
+def tags_match(wanted: Any, tags: Any) -> bool:
+    """True if tags pass a TagsFilter; one without tags lets all pass. Raises RefusalError."""
+    if wanted.filter_mode not in (TagsFilter.FILTER_MODE_ANY, TagsFilter.FILTER_MODE_ALL):
+        told = f"filter_mode {wanted.filter_mode} of the tags is none; give 0 (any) or 1 (all)."
+        raise RefusalError(FAILED, told)
+    if not wanted.tags:
+        return True
+    match = any if wanted.filter_mode == TagsFilter.FILTER_MODE_ANY else all
+    return match(tag in tags for tag in wanted.tags)
+
+
+class EntityServices:
+    """Answers what the standard asks about entities."""
+
+    def __init__(self, host: Host, simulation: Simulation) -> None:
+        self._host, self._simulation = host, simulation
+        self.told: dict[str, EntityInfo] = {}  # of the names whose information was set
+
+    def info(self, entity: Entity) -> EntityInfo:
+        """Returns what an entity is."""
+        if entity.name in self.told:
+            return self.told[entity.name]
+        kinds = EntityCategory
+        if entity.robot >= 0:
+            spec = self._host.model.robot
+            return _info(kinds.CATEGORY_ROBOT, f"the robot {spec.name}", (spec.kind,))
+        kind = kinds.CATEGORY_STATIC_OBJECT
+        if entity.motion is not None:
+            walks = isinstance(entity.motion, Pedestrian)
+            kind = kinds.CATEGORY_HUMAN if walks else kinds.CATEGORY_DYNAMIC_OBJECT
+        shapes = tuple(dict.fromkeys(shape.kind for shape, _ in entity.parts))
+        return _info(kind, f"an obstacle: {', '.join(shapes)}", shapes)
+
+    def _matching(self, filters: Any) -> list[Entity]:
+        self._simulation.require_world()
+        pattern = pattern_of(filters.filter)
+        categories = {one.category for one in filters.categories}
+        if unknown := categories - CATEGORIES:
+            told = f"category {min(unknown)} is none of the standard"
+            raise RefusalError(FAILED, f"{told}; give 0 to 5 but 3.")
+        tags_match(filters.tags, ())
+        region, entities = plane.Region(filters.bounds), self._simulation.entities
+        found = []
+        for entity in entities:
+            info, pose = self.info(entity), entities.pose(entity)
+            outlines = (
+                planar.rotate(each, pose[2]) + pose[:2] for each in entities.outlines(entity)
+            )
+            if (
+                pattern.search(entity.name)
+                and (not categories or info.category.category in categories)
+                and tags_match(filters.tags, info.tags)
+                and (region.empty or any(map(region.touches, outlines)))
+            ):
+                found.append(entity)
+        return found
+
+    def state(self, entity: Entity) -> EntityState:
+        """Returns where an entity is and how it moves, in the frame of the map."""
+        entities, state = self._simulation.entities, EntityState()
+        x, y, heading = entities.pose(entity).tolist()
+        state.header.frame_id = self._host.map_frame
+        state.header.stamp = conversions.stamp_to_ros(self._host.now_ns)
+        state.pose.position.x, state.pose.position.y = x, y
+        state.pose.orientation = conversions.heading_to_ros(heading)
+        state.twist = conversions.twist_to_ros(entities.twist(entity))
+        return state
+
+    def list_names(self, request: Any, response: Any) -> None:
+        """Answers GetEntities."""
+        response.entities = [entity.name for entity in self._matching(request.filters)]
+
+    def list_states(self, request: Any, response: Any) -> None:
+        """Answers GetEntitiesStates."""
+        found = self._matching(request.filters)
+        response.entities = [entity.name for entity in found]
+        response.states = [self.state(entity) for entity in found]
+
+    def find(self, name: str) -> Entity:
+        """Returns the entity of a name. Raises RefusalError, UnknownEntityError."""
+        self._simulation.require_world()
+        return self._simulation.entities.find(name)
+
+    def get_info(self, request: Any, response: Any) -> None:
+        """Answers GetEntityInfo."""
+        response.info = self.info(self.find(request.entity))
+
+    def set_info(self, request: Any, _: Any) -> None:
+        """Answers SetEntityInfo."""
+        name, kind = self.find(request.entity).name, request.info.category.category
+        if kind not in CATEGORIES:
+            raise RefusalError(
+                FAILED, f"category {kind} is none of the standard; give 0 to 5 but 3."
+            )
+        self.told[name] = request.info
+
+    def get_state(self, request: Any, response: Any) -> None:
+        """Answers GetEntityState."""
+        response.state = self.state(self.find(request.entity))
+
+    def get_bounds(self, request: Any, response: Any) -> None:
+        """Answers GetEntityBounds."""
+        entity = self.find(request.entity)
+        response.bounds = plane.box_to_ros(self._simulation.entities.outlines(entity))
+
+    def set_state(self, request: Any, _: Any) -> None:
+        """Answers SetEntityState."""
+        entity, asked = self.find(request.entity), request.state
+        entities, frames = self._simulation.entities, self._host.frames
+        base = plane.frame_pose(asked.header.frame_id, entities, frames, INVALID_POSE)
+        pose = twist = None
+        if request.set_pose:
+            pose = plane.pose_from_ros(asked.pose, base, INVALID_POSE)
+        if request.set_twist:
+            twist = plane.twist_from_ros(asked.twist, base[2], FAILED)
+        still = entity.robot < 0 and entity.motion is None
+        pushed = asked.acceleration
+        if request.set_acceleration and still and pushed != type(pushed)():
+            told = f"{entity.name!r} stands still and takes no acceleration; leave it out."
+            raise RefusalError(FAILED, told)
+        if twist is not None and still and asked.twist != Twist():
+            raise RefusalError(
+                FAILED, f"{entity.name!r} stands still and takes no twist; leave it out."
+            )
+        try:
+            entities.move(entity, pose, twist)
+        except OutsideError as error:
+            raise RefusalError(INVALID_POSE, str(error)) from None
+
+    def delete(self, request: Any, _: Any) -> None:
+        """Answers DeleteEntity."""
+        name = self.find(request.entity).name
+        self._simulation.remove(name)
+        self.told.pop(name, None)
+
+
+def _info(kind: int, description: str, tags: tuple[str, ...]) -> EntityInfo:
+    category = EntityCategory(category=kind)
+    return EntityInfo(category=category, description=description, tags=list(tags))

@@ -1,0 +1,132 @@
+"""Poses, twists and bounds of the standard's messages, in the plane of a world."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import Vector3
+from simulation_interfaces.msg import Bounds, Result
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.interface import Array
+from nics_drl_bridge.lidar.shapes import convex_hull
+from nics_drl_bridge.nodes import conversions
+from nics_drl_bridge.nodes.simulation_interfaces.host import RefusalError
+from nics_drl_bridge.sim.entities import Entities, overlap
+
+HEIGHT = 0.5  # of whatever stands in a plane world, as in MuJoCo [m]
+LEAN = 0.02  # greatest angle of what stands upright [rad]
+SIZES = {Bounds.TYPE_BOX: "two", Bounds.TYPE_SPHERE: "two", Bounds.TYPE_CONVEX_HULL: "three"}
+
+
+def pose_from_ros(pose: Any, base: Array, code: int) -> Array:
+    """Returns x, y, heading (3,) in `map` of a pose in a frame that has a pose (3,) there.
+
+    Raises RefusalError with a code for what is no pose in the plane; z is not looked at.
+    """
+    place, turn = pose.position, pose.orientation
+    quaternion = turn.x, turn.y, turn.z, turn.w
+    given = f"quaternion x {turn.x:g}, y {turn.y:g}, z {turn.z:g}, w {turn.w:g}"
+    if not all(map(math.isfinite, (place.x, place.y, place.z, *quaternion))):
+        raise RefusalError(code, "the pose holds NaN or inf; give finite numbers.")
+    if not conversions.is_rotation(*quaternion):
+        raise RefusalError(code, f"the {given} is no rotation; give one of unit length.")
+    if 1.0 - 2.0 * (turn.x**2 + turn.y**2) < math.cos(LEAN):
+        raise RefusalError(code, f"the {given} leans, but the world is flat; turn about z alone.")
+    local = np.array([place.x, place.y, conversions.heading_of(*quaternion)])
+    found: Array = geometry.compose(base, local)
+    return found
+
+
+def frame_pose(frame: str, entities: Entities, frames: Sequence[Any], code: int) -> Array:
+    """Returns the pose (3,) of a frame in `map`: itself, or an entity's; RefusalError."""
+    known = {"", "world", *(each.map for each in frames)}
+    if frame in known:
+        return np.zeros(3)
+    bases = {each.base: name for each, name in zip(frames, entities.robot_names, strict=False)}
+    name = bases.get(frame, frame)
+    found = next((entity for entity in entities if entity.name == name), None)
+    if found is None:
+        fix = "leave it empty for the world, or name an entity"
+        raise RefusalError(code, f"the frame {frame!r} is not known here; {fix}.")
+    return entities.pose(found)
+
+
+def twist_from_ros(twist: Any, heading: float, code: int) -> Array:
+    """Returns vx, vy, wz (3,) along the axes of `map`, of a twist in a frame of a heading there."""
+    values = np.array([twist.linear.x, twist.linear.y, twist.angular.z])
+    if not np.isfinite(values).all():
+        raise RefusalError(code, "the twist holds NaN or inf; give finite numbers.")
+    return np.array([*geometry.rotate(values[:2], heading), values[2]])
+
+
+def box_to_ros(outlines: Sequence[Array]) -> Bounds:
+    """Returns the box around outlines (V, 2): its upper right corner, then its lower left one."""
+    points = np.concatenate([np.zeros((0, 2)), *outlines])
+    high, low = points.max(axis=0).tolist(), points.min(axis=0).tolist()
+    corners = [Vector3(x=high[0], y=high[1], z=HEIGHT), Vector3(x=low[0], y=low[1], z=0.0)]
+    return Bounds(type=Bounds.TYPE_BOX, points=corners)
+
+
+class Region:
+    """Bounds of a filter. Raises RefusalError for what bounds nothing."""
+
+    def __init__(self, bounds: Any) -> None:
+        kind = bounds.type
+        self._points = np.array([[p.x, p.y, p.z] for p in bounds.points]).reshape(-1, 3)
+        self.empty = kind == Bounds.TYPE_EMPTY
+        if kind not in (Bounds.TYPE_EMPTY, *SIZES):
+            told = f"bounds of type {kind} are none of the standard"
+            raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, f"{told}; give 0 to 3.")
+        self._sphere, count = kind == Bounds.TYPE_SPHERE, len(self._points)
+        hull = kind == Bounds.TYPE_CONVEX_HULL
+        if not (count == 0 if self.empty else count >= 3 if hull else count == 2):
+            needed = SIZES.get(kind, "no") + (" points or more" if hull else " points")
+            raise RefusalError(
+                Result.RESULT_OPERATION_FAILED,
+                f"bounds of type {kind} have {count} points; give {needed}.",
+            )
+        radius = self._points[1, 0] if self._sphere else 1.0
+        if not (np.isfinite(self._points).all() and radius > 0.0):
+            told = "bounds must have finite points, and a sphere a radius (x of the second) above 0"
+            raise RefusalError(Result.RESULT_OPERATION_FAILED, f"{told}; mend them.")
+        self._corners = self._outline(kind)
+
+    def _outline(self, kind: int) -> Array:
+        flat = self._points[:, :2]
+        if kind == Bounds.TYPE_BOX:
+            (x1, y1), (x2, y2) = flat.min(axis=0), flat.max(axis=0)
+            return np.array([(x1, y1), (x2, y1), (x2, y2), (x1, y2)])
+        if kind == Bounds.TYPE_CONVEX_HULL:
+            corners = convex_hull(flat)
+            if len(corners) < 3:
+                told = "the points of the convex hull lie on one line; give one beside it."
+                raise RefusalError(Result.RESULT_OPERATION_FAILED, told)
+            return corners
+        return flat
+
+    def touches(self, outline: Array) -> bool:
+        """True if what stands on an outline (V, 2) in `map` has a point in common with it."""
+        if self.empty:
+            return True
+        low, high = self._points[:, 2].min(), self._points[:, 2].max()
+        if not self._sphere:
+            return bool(low <= HEIGHT and high >= 0.0 and overlap(self._corners, outline))
+        x, y, z = self._points[0]
+        above = max(-z, z - HEIGHT, 0.0)
+        room = self._points[1, 0] ** 2 - above**2
+        return bool(room >= 0.0 and distance(np.array([x, y]), outline) <= math.sqrt(room))
+
+
+def distance(point: Array, outline: Array) -> float:
+    """Returns the distance of a point (2,) from a convex polygon (V, 2), 0 inside [m]."""
+    nxt = np.roll(outline, -1, axis=0)
+    along, to = nxt - outline, point - outline
+    inside = along[:, 0] * to[:, 1] - along[:, 1] * to[:, 0] >= 0.0
+    if len(outline) > 2 and inside.all():
+        return 0.0
+    share = np.clip((along * to).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-300), 0, 1)
+    return float(np.hypot(*(to - share[:, None] * along).T).min())

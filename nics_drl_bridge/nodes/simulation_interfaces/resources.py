@@ -1,0 +1,91 @@
+"""Resources of the standard: what a URI or a text is, and where it is read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+from urllib.parse import unquote, urlsplit
+
+from simulation_interfaces.msg import Result
+
+from nics_drl_bridge.config import read_text
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.nodes.simulation_interfaces.host import RefusalError
+
+SDF, YAML = "sdf", "yaml"
+SUFFIXES = {".sdf": SDF, ".world": SDF, ".yaml": YAML, ".yml": YAML}
+MOST_BYTES = 2**24
+
+
+class Codes(NamedTuple):
+    """Codes of a service for resources that it can't use; each service has its own."""
+
+    unsupported_format: int
+    no_resource: int
+    parse_error: int
+    missing_assets: int
+    unsupported_assets: int
+
+    @classmethod
+    def of(cls, response: Any) -> Codes:
+        """Returns the codes that are constants of a response's class."""
+        return cls(
+            response.UNSUPPORTED_FORMAT, response.NO_RESOURCE, response.RESOURCE_PARSE_ERROR,
+            response.MISSING_ASSETS, response.UNSUPPORTED_ASSETS,
+        )  # fmt: skip
+
+
+class Found(NamedTuple):
+    """A resource that is there."""
+
+    form: str  # SDF or YAML; empty for a name
+    text: str  # empty for a name
+    source: str  # a path, a name, or `resource_string`
+    path: Path | None = None
+
+
+def local(uri: str) -> Path | None:
+    """Returns the path that a URI or a plain path means; None if it is elsewhere."""
+    parts = urlsplit(uri)
+    if parts.scheme == "file" and parts.netloc in ("", "localhost"):
+        return Path(unquote(parts.path))
+    return None if "://" in uri else Path(uri)
+
+
+def find(resource: Any, codes: Codes) -> Found:
+    """Returns a resource, whose URI goes before its text. Raises RefusalError."""
+    if resource.uri:
+        return _of_uri(resource.uri, codes)
+    text = resource.resource_string
+    if not text.strip():
+        told = "both uri and resource_string are empty; give one of them."
+        raise RefusalError(codes.no_resource, told)
+    start = text.lstrip("\ufeff \t\r\n")
+    if start.startswith(("<", "#usda")):
+        if "<sdf" not in text:
+            told = "the resource_string is XML or USD, but no SDF; give SDF or YAML."
+            raise RefusalError(codes.unsupported_format, told)
+        return Found(SDF, text, "resource_string")
+    return Found(YAML, text, "resource_string")
+
+
+def _of_uri(uri: str, codes: Codes) -> Found:
+    path = local(uri)
+    if path is None:
+        told = f"uri {uri!r}: is not on this machine; give file:// or a path."
+        raise RefusalError(codes.unsupported_format, told)
+    suffix = path.suffix.lower()
+    if suffix and suffix not in SUFFIXES and not path.is_dir():
+        known = ", ".join(SUFFIXES)
+        raise RefusalError(
+            codes.unsupported_format, f"uri {uri!r}: is none of {known}; convert it."
+        )
+    if not suffix or path.is_dir():
+        return Found("", "", str(path), path)
+    if not path.is_file():
+        told = f"uri {uri!r}: no such file; check the path on the simulator's machine."
+        raise RefusalError(Result.RESULT_NOT_FOUND, told)
+    try:
+        return Found(SUFFIXES[suffix], read_text(path, MOST_BYTES), str(path), path)
+    except ConfigError as error:
+        raise RefusalError(codes.parse_error, str(error)) from None

@@ -1,0 +1,168 @@
+"""Spawning: shapes of YAML and SDF, and robots of the simulator's kind."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from simulation_interfaces.msg import EntityInfo, Resource, Result, Spawnable, SpawnResult
+from simulation_interfaces.srv import SpawnEntities
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.config import find_config, read_text, share_folder
+from nics_drl_bridge.errors import BridgeError, ConfigError
+from nics_drl_bridge.nodes.simulation_interfaces import plane, resources
+from nics_drl_bridge.nodes.simulation_interfaces.entities import EntityServices
+from nics_drl_bridge.nodes.simulation_interfaces.host import Host, RefusalError, outcome
+from nics_drl_bridge.nodes.simulation_interfaces.state import Simulation
+from nics_drl_bridge.sim.entities import NAME, OutsideError, hull_of
+from nics_drl_bridge.sim.models import Model, model_of_sdf, model_of_yaml
+from nics_drl_bridge.sim.sdf import AssetsError
+
+NAMESPACE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+FORMATS = ["sdf", "yaml"]
+FOLDER = "entities"  # of the shipped ones, in config/
+
+
+class Spawning:
+    """Answers SpawnEntity, SpawnEntities and GetSpawnables."""
+
+    def __init__(self, host: Host, simulation: Simulation, entities: EntityServices) -> None:
+        self._host, self._simulation, self._entities = host, simulation, entities
+        self._codes = resources.Codes.of(SpawnResult)
+
+    def spawn(self, request: Any, response: Any) -> None:
+        """Answers SpawnEntity, and one part of SpawnEntities. Raises RefusalError, BridgeError."""
+        self._simulation.require_world()
+        model = self._model(request)
+        wanted = request.name or ("" if model is None else model.name)
+        name = self._name(wanted, request.allow_renaming)
+        space = self._namespace(request.entity_namespace)
+        entities, code = self._simulation.entities, SpawnResult.INVALID_POSE
+        posed = request.initial_pose
+        base = plane.frame_pose(posed.header.frame_id, entities, self._host.frames, code)
+        pose = plane.pose_from_ros(posed.pose, base, code)
+        try:
+            if model is None:
+                entities.spawn_robot(name, pose)
+                self._host.add_robot(space or re.sub(r"\W", "_", name))
+            else:
+                entities.spawn(name, model.parts, pose)
+                self._describe(name, model)
+        except OutsideError as error:
+            raise RefusalError(code, str(error)) from None
+        response.entity_name = name
+
+    def _describe(self, name: str, model: Model) -> None:
+        info = self._entities.info(self._entities.find(name))
+        tags = list(dict.fromkeys((*info.tags, *model.tags)))
+        told = EntityInfo(category=info.category, tags=tags)
+        told.description = model.description or info.description
+        self._entities.told[name] = told
+
+    def _model(self, request: Any) -> Model | None:
+        """The entity of a request; None for a robot. Raises RefusalError."""
+        codes, found = self._codes, resources.find(request.entity_resource, self._codes)
+        if not found.form:
+            if found.source == self._host.model.robot.name:
+                return None
+            try:
+                path = find_config(found.source, FOLDER)
+            except ConfigError as error:
+                held = f"robots here are {self._host.model.robot.name!r}"
+                told = str(error).replace("entitie ", "entity ")
+                raise RefusalError(Result.RESULT_NOT_FOUND, f"{told} {held}.") from None
+            found = resources.Found(resources.YAML, read_text(path), path.stem, path)
+        try:
+            if found.form == resources.SDF:
+                z = request.initial_pose.pose.position.z
+                return model_of_sdf(found.text, z if np.isfinite(z) else 0.0, found.source)
+            model = model_of_yaml(found.text, found.source)
+            return model if found.path is None or model.name else model._replace(
+                name=found.path.stem
+            )  # fmt: skip
+        except AssetsError as error:
+            code = codes.missing_assets if error.missing else codes.unsupported_assets
+            raise RefusalError(code, str(error)) from None
+        except ConfigError as error:
+            raise RefusalError(codes.parse_error, str(error)) from None
+
+    def _name(self, wanted: str, may_rename: bool) -> str:
+        entities = self._simulation.entities
+        if not wanted:
+            if may_rename:
+                return entities.free_name("entity")
+            told = "the name is empty; give one, or set allow_renaming."
+            raise RefusalError(SpawnResult.NAME_INVALID, told)
+        if not NAME.fullmatch(wanted):
+            fix = "use letters, digits, and _ . / - between them"
+            raise RefusalError(
+                SpawnResult.NAME_INVALID, f"the name {wanted!r} is not valid; {fix}."
+            )
+        free = entities.free_name(wanted)
+        if free != wanted and not may_rename:
+            fix = "give another, or set allow_renaming"
+            raise RefusalError(SpawnResult.NAME_NOT_UNIQUE, f"the name {wanted!r} is taken; {fix}.")
+        return free
+
+    def _namespace(self, given: str) -> str:
+        if given and not NAMESPACE.fullmatch(given):
+            told = f"entity_namespace {given!r} is no namespace of ROS; write it as in 'robot_1'."
+            raise RefusalError(SpawnResult.NAMESPACE_INVALID, told)
+        return given
+
+    def spawn_all(self, request: Any, response: Any) -> None:
+        """Answers SpawnEntities."""
+        failed = []
+        for k, each in enumerate(request.spawn_requests):
+            one = SpawnResult()
+            given = lambda each=each, one=one: self.spawn(each, one)  # noqa: E731
+            one.result.result, one.result.error_message = outcome(given, self._host)
+            response.results.append(one)
+            if one.result.result != Result.RESULT_OK:
+                failed.append(f"request {k}: {one.result.error_message}")
+        if failed:
+            code = SpawnEntities.Response.ENTITIES_SPAWN_FAILED
+            more = f"{len(failed)} of {len(request.spawn_requests)} failed"
+            raise RefusalError(code, f"{more}; {failed[0]}")
+
+    def list_spawnables(self, request: Any, response: Any) -> None:
+        """Answers GetSpawnables."""
+        robot, unknown = self._host.model.robot, list[str]()
+        hull = hull_of(self._simulation.entities.simulator.footprint)
+        response.spawnables.append(_spawnable(robot.name, f"another robot {robot.name}", [hull]))
+        folders = [share_folder() / "config" / FOLDER]
+        for source in request.sources:
+            path = resources.local(source)
+            if path is None or not path.exists():
+                unknown.append(source)
+            else:
+                folders.append(path)
+        for folder in folders:
+            files = [folder] if folder.is_file() else sorted(folder.iterdir())
+            for file in files:
+                if file.suffix.lower() in resources.SUFFIXES:
+                    self._list(file, file.stem if folder == folders[0] else str(file), response)
+        if unknown:
+            response.result.result = Result.RESULT_OK
+            told = f"sources that are not known: {', '.join(map(repr, unknown))}"
+            response.result.error_message = f"{told}; give folders or files of this machine."
+
+    def _list(self, file: Path, uri: str, response: Any) -> None:
+        read = model_of_sdf if resources.SUFFIXES[file.suffix.lower()] == resources.SDF else None
+        try:
+            text = read_text(file, resources.MOST_BYTES)
+            model = model_of_yaml(text, str(file)) if read is None else read(text, 0.0, str(file))
+        except BridgeError:
+            return  # a world, or something else that is no entity
+        hulls = [geometry.rotate(hull_of(shape), at[2]) + at[:2] for shape, at in model.parts]
+        response.spawnables.append(_spawnable(uri, model.description or model.name, hulls))
+
+
+def _spawnable(uri: str, description: str, hulls: list[Any]) -> Spawnable:
+    bounds = plane.box_to_ros(hulls)
+    return Spawnable(
+        entity_resource=Resource(uri=uri), description=description, spawn_bounds=bounds
+    )

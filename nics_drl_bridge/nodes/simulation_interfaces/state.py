@@ -1,0 +1,199 @@
+"""State of the simulation: playing, paused, stopped; steps, and resets."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import Any
+
+from rclpy.action import CancelResponse
+from simulation_interfaces.action import SimulateSteps
+from simulation_interfaces.msg import Result, SimulationState
+from simulation_interfaces.srv import ResetSimulation, SetSimulationState
+
+from nics_drl_bridge.errors import BridgeError
+from nics_drl_bridge.nodes import runner
+from nics_drl_bridge.nodes.simulation_interfaces.host import NO_WORLD, Host, RefusalError
+from nics_drl_bridge.sim.entities import Entities
+
+STOPPED, PLAYING, PAUSED = (
+    SimulationState.STATE_STOPPED, SimulationState.STATE_PLAYING, SimulationState.STATE_PAUSED,
+)  # fmt: skip
+QUITTING, WITHOUT_WORLD = SimulationState.STATE_QUITTING, SimulationState.STATE_NO_WORLD
+NAMES = {STOPPED: "stopped", PLAYING: "playing", PAUSED: "paused", QUITTING: "quitting"}
+MOST_STEPS = 100_000  # of one call of a service, which answers nothing else meanwhile
+GOODBYE_S = 0.2  # until the answer to who ended the simulation has left
+SCOPES = ResetSimulation.Request
+EVERY_SCOPE = SCOPES.SCOPE_TIME | SCOPES.SCOPE_STATE | SCOPES.SCOPE_SPAWNED
+
+
+class Turn:
+    """Lets the executor handle all else before a coroutine goes on."""
+
+    def __await__(self) -> Generator[None, None, None]:
+        yield
+
+
+class Simulation:
+    """The state of a device node's simulation, and the services around it."""
+
+    def __init__(self, host: Host) -> None:
+        self._host, self._stepping = host, False
+        self._halted = STOPPED  # or paused, or without a world, while the host is paused
+        self._turn: Any = host.create_guard_condition(lambda: None)  # type: ignore[attr-defined]
+        self.renew()
+
+    def renew(self) -> None:
+        """Lists the entities of a world that the host simulates anew."""
+        host = self._host
+        self.entities = Entities(host.device, host.world, host.robot_names, host.make_simulator)
+
+    @property
+    def state(self) -> int:
+        """Constant of SimulationState; who pauses the node by its own service pauses it too."""
+        if not self._host.paused:
+            self._halted = PAUSED
+            return int(PLAYING)
+        return int(self._halted)
+
+    def halt(self, state: int) -> None:
+        """Holds the simulation in a state other than playing."""
+        self._host.pause(True)
+        self._halted = state
+
+    def require_world(self) -> None:
+        """Raises RefusalError if no world is loaded."""
+        if self.state in (WITHOUT_WORLD, QUITTING):
+            raise RefusalError(Result.RESULT_INCORRECT_STATE, NO_WORLD)
+
+    def get_state(self, _: Any, response: Any) -> None:
+        """Answers GetSimulationState."""
+        response.state.state = self.state
+
+    def set_state(self, request: Any, _: Any) -> None:
+        """Answers SetSimulationState."""
+        codes, wanted, state = SetSimulationState.Response, request.state.state, self.state
+        if wanted == state:
+            already = f"the simulation is {NAMES.get(state, 'without a world')} already."
+            raise RefusalError(codes.ALREADY_IN_TARGET_STATE, already)
+        if wanted not in NAMES:
+            known = ", ".join(f"{value} ({name})" for value, name in NAMES.items())
+            told = f"state {wanted} can't be set; choose one of {known}"
+            raise RefusalError(codes.INCORRECT_TRANSITION, f"{told}, or load or unload a world.")
+        if wanted == QUITTING:
+            self.halt(QUITTING)
+            runner.steadily(self._host, GOODBYE_S, self._host.context.try_shutdown)  # type: ignore[arg-type]
+            return
+        if state in (WITHOUT_WORLD, QUITTING):
+            raise RefusalError(codes.INCORRECT_TRANSITION, NO_WORLD)
+        if wanted == STOPPED:
+            try:
+                self._reset_all()
+            except BridgeError as error:
+                self.halt(PAUSED)
+                raise RefusalError(
+                    codes.STATE_TRANSITION_ERROR, f"it did not stop: {error}"
+                ) from None
+        self._stepping = False
+        if wanted == PLAYING:
+            self._host.pause(False)
+        else:
+            self.halt(wanted)
+
+    def require_paused(self, steps: int) -> None:
+        """Raises RefusalError unless so many steps can be made now."""
+        problem = ""
+        if self.state != PAUSED:
+            problem = "the simulation is not paused; set its state to paused first."
+        elif self._stepping:
+            problem = "steps of simulate_steps are being made; wait for their end, or cancel them."
+        elif steps < 1:
+            problem = "steps is 0; ask for 1 or more."
+        if problem:
+            raise RefusalError(Result.RESULT_OPERATION_FAILED, problem)
+
+    def step(self, request: Any, _: Any) -> None:
+        """Answers StepSimulation."""
+        self.require_paused(request.steps)
+        if request.steps > MOST_STEPS:
+            told = f"steps is {request.steps}, and {MOST_STEPS} are the most of one call"
+            raise RefusalError(Result.RESULT_OPERATION_FAILED, f"{told}; use simulate_steps.")
+        for _ in range(request.steps):
+            self._host.step()
+
+    def cancel(self, _: Any) -> CancelResponse:
+        """Accepts to cancel SimulateSteps."""
+        return CancelResponse.ACCEPT
+
+    async def simulate(self, goal: Any) -> Any:
+        """Executes SimulateSteps: one step at a turn, so that all else is answered meanwhile."""
+        steps, result = goal.request.steps, SimulateSteps.Result()
+        result.result.result = Result.RESULT_OPERATION_FAILED
+        try:
+            self.require_paused(steps)
+        except RefusalError as error:
+            result.result.error_message = str(error)
+            goal.abort()
+            return result
+        self._stepping, done, why = True, 0, ""
+        try:
+            while done < steps and not why:
+                self._host.step()
+                done += 1
+                goal.publish_feedback(
+                    SimulateSteps.Feedback(completed_steps=done, remaining_steps=steps - done)
+                )
+                self._turn.trigger()
+                await Turn()
+                why = self._interrupted(goal, done, steps)
+        finally:
+            self._stepping = False
+        result.result.error_message = why
+        if done == steps:
+            result.result.result, result.result.error_message = Result.RESULT_OK, ""
+            goal.succeed()
+        elif goal.is_cancel_requested:
+            goal.canceled()
+        else:
+            goal.abort()
+        return result
+
+    def _interrupted(self, goal: Any, done: int, steps: int) -> str:
+        if goal.is_cancel_requested:
+            return f"cancelled after {done} of {steps} steps."
+        if self.state != PAUSED or not self._stepping:
+            return f"the simulation was changed after {done} of {steps} steps; ask again."
+        return ""
+
+    def reset(self, request: Any, _: Any) -> None:
+        """Answers ResetSimulation."""
+        self.require_world()
+        scope = request.scope or SCOPES.SCOPE_ALL
+        if not scope & EVERY_SCOPE or (scope & ~EVERY_SCOPE and scope != SCOPES.SCOPE_ALL):
+            known = "1 (time), 2 (state) and 4 (spawned)"
+            told = f"scope {scope} has bits that mean nothing; add up {known}, or give 0 for all."
+            raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, told)
+        self._stepping = False
+        if scope & EVERY_SCOPE == EVERY_SCOPE:
+            self._reset_all()
+            return
+        if scope & SCOPES.SCOPE_SPAWNED:
+            self.remove(*self.entities.spawned)
+        if scope & SCOPES.SCOPE_STATE:
+            self._host.begin(rewind=bool(scope & SCOPES.SCOPE_TIME))
+        elif scope & SCOPES.SCOPE_TIME:
+            self._host.rewind()
+
+    def _reset_all(self) -> None:
+        changed = self.entities.robot_names != list(self._host.robot_names)
+        self.entities.restore()
+        if changed:
+            self._host.reopen_robots()
+        self._host.begin(rewind=True)
+
+    def remove(self, *names: str) -> None:
+        """Removes entities, and the topics of robots among them."""
+        for name in names:
+            entity = self.entities.find(name)
+            self.entities.delete(entity)
+            if entity.robot >= 0:
+                self._host.remove_robots([entity.robot])

@@ -1,0 +1,190 @@
+"""Worlds: the one that is loaded, those that may be, loading and unloading."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+from simulation_interfaces.msg import Resource, Result, WorldResource
+from simulation_interfaces.srv import GetCurrentWorld, LoadWorld, UnloadWorld
+
+from nics_drl_bridge.config import parse_yaml, share_folder, validate
+from nics_drl_bridge.errors import BridgeError, ConfigError
+from nics_drl_bridge.nodes.simulation_interfaces import resources
+from nics_drl_bridge.nodes.simulation_interfaces.entities import EntityServices, tags_match
+from nics_drl_bridge.nodes.simulation_interfaces.host import Host, RefusalError
+from nics_drl_bridge.nodes.simulation_interfaces.state import STOPPED, WITHOUT_WORLD, Simulation
+from nics_drl_bridge.sim.models import HEIGHT, file_of
+from nics_drl_bridge.sim.sdf import ABSENT, AssetsError, read_sdf, tags_in
+from nics_drl_bridge.sim.sections import Standing
+from nics_drl_bridge.sim.world import World, check_places
+from nics_drl_bridge.sim.world_set import BARN, AnyWorld, load_worlds
+
+CODES = LoadWorld.Response
+CLEARANCE, NEAREST = 0.1, 2.0  # of worlds of SDF, as with `nics world import` [m]
+# Tags of SDF that are read, or say nothing of what stands in a plane.
+READ = {
+    "sdf", "world", "model", "include", "uri", "name", "pose", "placement_frame", "frame", "link",
+    "joint", "parent", "child", "collision", "geometry", "box", "size", "cylinder", "radius",
+    "length", "sphere", "capsule", "plane", "normal", "polyline", "point", "height", "static",
+    "state", "visual", "inertial", "mass", "inertia", "mesh", "scale",
+}  # fmt: skip
+
+
+class Worlds:
+    """Answers LoadWorld, UnloadWorld, GetCurrentWorld and GetAvailableWorlds."""
+
+    def __init__(self, host: Host, simulation: Simulation, entities: EntityServices) -> None:
+        self._host, self._simulation, self._entities = host, simulation, entities
+        name = host.world.source
+        self._resource = Resource(uri=name if Path(name).is_file() else host.world.name)
+        self._codes = resources.Codes.of(CODES)
+
+    def current(self, _: Any, response: Any) -> None:
+        """Answers GetCurrentWorld."""
+        if self._simulation.state == WITHOUT_WORLD:
+            told = "no world is loaded; load one by load_world."
+            raise RefusalError(GetCurrentWorld.Response.NO_WORLD_LOADED, told)
+        response.world = told_of(self._host.world, self._resource)
+
+    def unload(self, _: Any, __: Any) -> None:
+        """Answers UnloadWorld."""
+        if self._simulation.state == WITHOUT_WORLD:
+            told = "no world is loaded, so that none can be unloaded."
+            raise RefusalError(UnloadWorld.Response.NO_WORLD_LOADED, told)
+        self._unload()
+
+    def _unload(self) -> None:
+        self._simulation.halt(WITHOUT_WORLD)
+        self._entities.told.clear()
+
+    def load(self, request: Any, response: Any) -> None:
+        """Answers LoadWorld: the present world is unloaded, even if the other can't be read."""
+        found = resources.find(request.world_resource, self._codes)
+        self._unload()
+        world = self._read(found, request)
+        host, simulation = self._host, self._simulation
+        changed = simulation.entities.robot_names != list(host.robot_names)
+        host.use_world(world)
+        if changed:
+            host.reopen_robots()
+        simulation.renew()
+        host.begin(rewind=True)
+        simulation.halt(STOPPED)
+        self._resource = request.world_resource
+        response.world = told_of(world, self._resource)
+
+    def _read(self, found: resources.Found, request: Any) -> AnyWorld:
+        codes = self._codes
+        try:
+            if found.form == resources.SDF:
+                return self._of_sdf(found, request)
+            if found.path is not None:
+                return load_worlds(str(found.path))
+            world = validate(parse_yaml(found.text, found.source), World, found.source)
+            check_places(world)
+            _ = world.grid
+            return world
+        except AssetsError as error:
+            code = codes.missing_assets if error.missing else codes.unsupported_assets
+            raise RefusalError(code, str(error)) from None
+        except ConfigError as error:
+            if not found.form and "unknown world" in str(error):
+                raise RefusalError(Result.RESULT_NOT_FOUND, str(error)) from None
+            code = codes.missing_assets if "no such file" in str(error) else codes.parse_error
+            raise RefusalError(code, str(error)) from None
+
+    def _of_sdf(self, found: resources.Found, request: Any) -> World:
+        if found.path is None:
+            with file_of(found.text) as file:
+                return self._standing(file, "resource_string", request)
+        return self._standing(found.path, found.path.stem, request)
+
+    def _standing(self, file: Path, name: str, request: Any) -> World:
+        skip = bool(request.ignore_missing_or_unsupported_assets)
+        strange = sorted(tag for tag in tags_in(file) - READ if ":" not in tag)
+        if request.fail_on_unsupported_element and strange:
+            told = f"{name}: holds <{strange[0]}>, which is not simulated"
+            fix = "remove it, or do not ask for fail_on_unsupported_element"
+            raise RefusalError(CODES.UNSUPPORTED_ELEMENTS, f"{told}; {fix}.")
+        standing = read_sdf(file, HEIGHT, skip_unknown=True)
+        if standing.left_out and not skip:
+            missing = any(ABSENT in each for each in standing.left_out)
+            code = self._codes.missing_assets if missing else self._codes.unsupported_assets
+            told = f"{name}: {standing.left_out[0]}, which is no shape of a world"
+            raise RefusalError(code, f"{told}; put a box in its place, or ignore such assets.")
+        return world_of(standing, name)
+
+    def available(self, request: Any, response: Any) -> None:
+        """Answers GetAvailableWorlds."""
+        tags_match(request.filter, ())
+        folder, failed = share_folder() / "config", list[str]()
+        names = [each.stem for each in sorted((folder / "worlds").glob("*.yaml"))]
+        found = [(name, load_worlds(name)) for name in names]
+        for source in request.additional_sources:
+            try:
+                found += _in_source(source)
+            except BridgeError as error:
+                failed.append(f"{source!r}: {error}")
+        if failed and not request.continue_on_error:
+            raise RefusalError(Result.RESULT_NOT_FOUND, f"a source can't be read, {failed[0]}")
+        sets = [BARN, *(each.stem for each in sorted((folder / "world_sets").glob("*.yaml")))]
+        told = [told_of(world, Resource(uri=uri)) for uri, world in found]
+        told += [_set_of(name) for name in sets]
+        response.worlds = [each for each in told if tags_match(request.filter, each.tags)]
+        if failed:
+            response.result.result = Result.RESULT_OK
+            response.result.error_message = f"left out: {'; '.join(failed)}"
+
+
+def _in_source(source: str) -> list[tuple[str, AnyWorld]]:
+    """Worlds of a folder, a file, a glob or a name. Raises BridgeError."""
+    path = resources.local(source)
+    if path is None:
+        raise ConfigError("is not on this machine; give a folder or file.")
+    if not path.is_dir():
+        return [(str(path), load_worlds(path))]
+    found = []
+    for file in sorted((*path.glob("*.yaml"), *path.glob("*.yml"))):
+        found.append((str(file), load_worlds(file)))
+    return found
+
+
+def _set_of(name: str) -> WorldResource:
+    """A shipped set, whose many worlds would take long to read."""
+    about = f"the worlds of {name}, of which every episode draws one"
+    uri = Resource(uri=name)
+    return WorldResource(name=name, world_resource=uri, description=about, tags=["set"])
+
+
+def told_of(world: AnyWorld, resource: Resource) -> WorldResource:
+    """Returns a world as the standard tells of it, with tags of what is in it."""
+    members = world.members
+    groups = [group for member in members for group in member.obstacles]
+    about = {
+        "set": len(members) > 1,
+        "map": any(member.map is not None for member in members),
+        "walled": any(member.size is not None or member.walls for member in members),
+        "obstacles": bool(groups),
+        "random": any(group.count is not None for group in groups),
+        "moving": any(group.motion is not None for group in groups),
+    }
+    x1, y1, x2, y2 = world.extent
+    size = f"{x2 - x1:.3g} m x {y2 - y1:.3g} m"
+    description = f"{len(members)} worlds in {size}" if len(members) > 1 else f"a field of {size}"
+    tags = [tag for tag, holds in about.items() if holds]
+    return WorldResource(
+        name=world.name, world_resource=resource, description=description, tags=tags
+    )
+
+
+def world_of(standing: Standing, name: str) -> World:
+    """Returns the world of what stands in an SDF file, with a field around it."""
+    x1, y1, x2, y2 = bounds = standing.bounds()
+    far = round(math.hypot(x2 - x1, y2 - y1), 3)
+    content = {
+        "name": name, "bounds": bounds, "obstacles": standing.obstacles, "clearance": CLEARANCE,
+        "goal_distance": (min(NEAREST, round(far / 4.0, 3)), far),
+    }  # fmt: skip
+    return World.model_validate(content)

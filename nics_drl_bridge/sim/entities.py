@@ -1,0 +1,329 @@
+"""Entities of one world by their names: what stands there, is put elsewhere, comes and goes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import BridgeError, ConfigError, nearest
+from nics_drl_bridge.interface import Array
+from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
+from nics_drl_bridge.lidar.shapes import Shape, convex_hull, place
+from nics_drl_bridge.robot.kinds import textbook
+from nics_drl_bridge.sim.device import DeviceWorld
+from nics_drl_bridge.sim.obstacles import Motion
+from nics_drl_bridge.sim.scenes import Scenes
+from nics_drl_bridge.sim.sections import Placed
+from nics_drl_bridge.sim.simulator import FastSimulator
+from nics_drl_bridge.sim.world_set import AnyWorld
+
+OBSTACLE = "obstacle_"  # and its number: the name of an obstacle of the world
+NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_./-]*")
+CORNERS = 32  # of the outline that stands for a circle
+
+# Makes the simulator of a world for a number of robots.
+Make = Callable[[AnyWorld, int], FastSimulator]
+
+
+class UnknownEntityError(BridgeError):
+    """There is no entity of that name."""
+
+
+class StillError(BridgeError):
+    """A twist was asked of an entity that stands still."""
+
+
+class OutsideError(BridgeError):
+    """A pose lies outside the world."""
+
+
+@dataclass(eq=False)
+class Entity:
+    """A robot, or one or several shapes that move as one."""
+
+    name: str
+    robot: int = -1  # index of the robot; -1 for shapes
+    slots: tuple[int, ...] = ()  # indices of the bodies of its shapes
+    parts: tuple[Placed, ...] = ()  # its shapes and their poses in the entity's own frame
+    start: Array | None = None  # (3,) where it was spawned; None for what the world came with
+    motion: Motion | None = None
+
+
+@dataclass
+class Entities:
+    """All entities of the world of a device; those of the world itself may be removed, too.
+
+    `make` makes another simulator where shapes come that it has no room for, or robots come and
+    go; the episode goes on in it.
+    """
+
+    device: DeviceWorld
+    world: AnyWorld
+    robots: tuple[str, ...]  # names of those that the simulator began with
+    make: Make
+    removed: set[int] = field(default_factory=set)  # slots of the world's own obstacles
+    spawned: dict[str, Entity] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._own = self.device.simulator.sampler.count
+        self._launched, self._spare = list(self.robots), list[Shape]()
+        self._table: Array = np.zeros((self._own, 7))  # the bodies, in the order of slots
+        self.device.arrange = self._arrange
+
+    @property
+    def simulator(self) -> FastSimulator:
+        """The simulator that holds them at present."""
+        return self.device.simulator
+
+    def _arrange(self, scenes: Scenes, starts: Array | None) -> Array:
+        """Completes the scene of an episode; returns the starts (1, M, 3) of all robots."""
+        bodies = scenes.bodies[0]
+        bodies[sorted(self.removed), RADIUS] = 0.0
+        found = scenes.starts.copy()
+        if starts is not None:
+            found[:, : starts.shape[1]] = starts
+        for entity in self.spawned.values():
+            if entity.robot >= 0:
+                found[0, entity.robot] = entity.start
+            else:
+                self._put(bodies, entity, entity.start)
+        self._table = bodies.copy()
+        return found
+
+    def _put(self, bodies: Array, entity: Entity, pose: Array | None) -> None:
+        first = len(self.simulator.sampler.shapes) - len(self._spare)
+        for slot, (shape, part) in zip(entity.slots, entity.parts, strict=True):
+            index = first + slot - self._own if slot >= self._own else bodies[slot, SHAPE]
+            at = geometry.compose(np.asarray(pose), np.asarray(part))
+            bodies[slot] = place(at, shape.radius, index)
+
+    def bodies(self) -> Array:
+        """Returns (K, 7) all obstacles as they stand, by their slots."""
+        if self.simulator.moves:  # in the order of the slots
+            self._table = self.simulator.obstacles[0]
+        return self._table
+
+    def __iter__(self) -> Iterator[Entity]:
+        yield from (Entity(name, robot=m) for m, name in enumerate(self._launched))
+        sampler, bodies = self.simulator.sampler, self.bodies()
+        motions = sampler.motions[int(self.simulator.data.member[0])]
+        for k in np.flatnonzero(bodies[: self._own, RADIUS] > 0.0).tolist():
+            shape = sampler.shapes[int(bodies[k, SHAPE])]
+            part = ((shape, (0.0, 0.0, 0.0)),)
+            yield Entity(f"{OBSTACLE}{k}", slots=(k,), parts=part, motion=motions[k])
+        yield from self.spawned.values()
+
+    def find(self, name: str) -> Entity:
+        """Returns the entity of a name. Raises UnknownEntityError."""
+        known = {entity.name: entity for entity in self}
+        if name not in known:
+            raise UnknownEntityError(f"there is no entity {name!r}; {nearest(name, known)}")
+        return known[name]
+
+    def pose(self, entity: Entity) -> Array:
+        """Returns x, y, heading (3,) of an entity in `map`."""
+        if entity.robot >= 0:
+            return self.simulator.data.pose[0, entity.robot].copy()
+        part = np.array(entity.parts[0][1])
+        return geometry.compose(
+            self.bodies()[entity.slots[0], :3], geometry.between(part, np.zeros(3))
+        )
+
+    def twist(self, entity: Entity) -> Array:
+        """Returns vx, vy [m/s], wz [rad/s] (3,) of an entity along the axes of `map`."""
+        if entity.robot >= 0:
+            sensed = self.device.sensed(entity.robot)
+            body = textbook_twist(self.simulator, sensed.state)
+            return np.array([*geometry.rotate(body[:2], sensed.pose[2]), body[2]])
+        if entity.motion is None:
+            return np.zeros(3)
+        return self.simulator.data.velocity[0, entity.slots[0]].copy()
+
+    def outlines(self, entity: Entity) -> list[Array]:
+        """Returns the convex hulls (V, 2) of an entity's shapes in its own frame [m]."""
+        if entity.robot >= 0:
+            return [hull_of(self.simulator.footprint)]
+        return [geometry.rotate(hull_of(shape), part[2]) + part[:2] for shape, part in entity.parts]
+
+    def require_inside(self, pose: Array) -> None:
+        """Raises OutsideError for a pose (3,) outside the world."""
+        x1, y1, x2, y2 = self.world.members[int(self.simulator.data.member[0])].extent
+        if not (x1 <= pose[0] <= x2 and y1 <= pose[1] <= y2):
+            held = f"x {x1:g} to {x2:g} m, y {y1:g} to {y2:g} m"
+            told = f"x {pose[0]:g} m, y {pose[1]:g} m is outside the world"
+            raise OutsideError(f"{told}, which has {held}; move it.")
+
+    def move(self, entity: Entity, pose: Array | None, twist: Array | None) -> None:
+        """Puts an entity at a pose (3,), or gives it a twist (3,) along the axes of `map`.
+
+        Raises StillError for a twist of what stands still, OutsideError for a pose outside.
+        """
+        if twist is not None and twist.any() and entity.robot < 0 and entity.motion is None:
+            fix = "set its pose alone, or a twist of zeros"
+            raise StillError(f"{entity.name!r} stands still and takes no twist; {fix}.")
+        if pose is not None:
+            self.require_inside(pose)
+        if entity.robot >= 0:
+            self._move_robot(entity.robot, pose, twist)
+            return
+        if pose is not None:
+            bodies = self.bodies().copy()
+            self._put(bodies, entity, pose)
+            self._show(bodies)
+        if twist is not None and entity.motion is not None:
+            self.simulator.data.velocity[0, entity.slots[0]] = twist
+
+    def _move_robot(self, robot: int, pose: Array | None, twist: Array | None) -> None:
+        simulator = self.simulator
+        at = simulator.data.pose[0, robot] if pose is None else pose
+        state = simulator.data.state[0, robot]
+        if twist is not None:
+            ahead, aside = geometry.rotate(twist[:2], -at[2])
+            spec = simulator.model.robot
+            state = textbook(spec).target(spec.from_cmd_vel([ahead, aside, twist[2]]))
+        simulator.put_robot(robot, np.array(at), np.array(state))
+        self.device.put(robot)
+
+    def _show(self, bodies: Array) -> None:
+        self._table = bodies
+        self.simulator.put_bodies(bodies)
+
+    def free_name(self, name: str) -> str:
+        """Returns a name that no entity has: the given one, or that and a number."""
+        taken = {entity.name for entity in self}
+        # A name of the world's own obstacles may come back with the next episode.
+        taken |= {f"{OBSTACLE}{k}" for k in range(self._own)}
+        free, number = name, 1
+        while free in taken:
+            free, number = f"{name}_{number}", number + 1
+        return free
+
+    def spawn(self, name: str, parts: Sequence[Placed], pose: Array) -> Entity:
+        """Adds shapes, at poses (3,) in the frame of an entity that is put at a pose (3,).
+
+        Raises OutsideError, and ConfigError for what the simulator can't hold.
+        """
+        self.require_inside(pose)
+        used = {slot for entity in self.spawned.values() for slot in entity.slots}
+        spare, slots = list(self._spare), list[int]()
+        for shape, _ in parts:
+            free = (k for k, one in enumerate(spare) if one == shape and self._own + k not in used)
+            k = next(free, len(spare))
+            if k == len(spare):
+                spare.append(shape)
+            used.add(self._own + k)
+            slots.append(self._own + k)
+        if len(spare) > len(self._spare):
+            self._remake(spare, list(range(len(self.robot_names))))
+        entity = Entity(name, slots=tuple(slots), parts=tuple(parts), start=np.array(pose))
+        self.spawned[name] = entity
+        bodies = self.bodies().copy()
+        self._put(bodies, entity, pose)
+        self._show(bodies)
+        return entity
+
+    def spawn_robot(self, name: str, pose: Array) -> Entity:
+        """Adds a robot of the simulator's kind at a pose (3,). Raises OutsideError, ConfigError."""
+        self.require_inside(pose)
+        count = len(self.robot_names)
+        entity = Entity(name, robot=count, start=np.array(pose))
+        self._remake(self._spare, list(range(count)), count + 1)
+        self.spawned[name] = entity
+        self._move_robot(count, pose, np.zeros(3))
+        return entity
+
+    @property
+    def robot_names(self) -> list[str]:
+        """Names of all robots, by their numbers."""
+        found = {each.robot: each.name for each in self.spawned.values() if each.robot >= 0}
+        return [*self._launched, *(found[m] for m in sorted(found))]
+
+    def delete(self, entity: Entity) -> None:
+        """Removes an entity. Raises ConfigError for the last robot."""
+        self.spawned.pop(entity.name, None)
+        if entity.robot < 0:
+            self.removed |= {slot for slot in entity.slots if slot < self._own}
+            bodies = self.bodies().copy()
+            bodies[list(entity.slots), RADIUS] = 0.0
+            self._show(bodies)
+            return
+        kept = [m for m in range(self.device.robots) if m != entity.robot]
+        if not kept:
+            raise ConfigError(f"{entity.name!r} is the last robot, which a simulator needs.")
+        if entity.robot < len(self._launched):
+            self._launched.pop(entity.robot)
+        self._renumber(entity.robot)
+        self._remake(self._spare, kept)
+
+    def _renumber(self, gone: int) -> None:
+        for each in self.spawned.values():
+            each.robot -= int(each.robot > gone)
+
+    def despawn(self) -> None:
+        """Removes all that was spawned."""
+        for entity in list(self.spawned.values()):
+            self.delete(entity)
+
+    def restore(self) -> None:
+        """Removes all that was spawned; from the next episode on all that was removed is back."""
+        there = [each for each in self.spawned.values() if each.robot < 0]
+        for entity in there:
+            self.delete(entity)
+        if self.spawned or self._launched != list(self.robots):
+            kept = list(range(len(self._launched)))
+            self.spawned.clear()
+            self._remake(self._spare, kept, len(self.robots))
+            self._launched = list(self.robots)
+        self.removed.clear()
+
+    def _remake(self, spare: Sequence[Shape], robots: Sequence[int], count: int = 0) -> None:
+        """Makes a simulator for robots of these numbers here, and so many in all; goes on in it."""
+        old, bodies = self.simulator, self.bodies().copy()
+        # An own world, as the simulator of the present one goes on if this one can't be made.
+        new = self.make(self.world.with_spare(tuple(spare)), count or len(robots))
+        slots = np.full(new.sampler.count, -1)
+        slots[: len(bodies)] = np.arange(len(bodies))
+        table = np.zeros((len(slots), 7))
+        table[: len(bodies)] = bodies
+        # The shapes that are spare come last, and each of them has a slot of its own.
+        new.take_over(old, np.array(robots, np.int64), slots)
+        new.put_bodies(table)
+        self._spare, self._table = list(spare), table
+        self.device.exchange(new, np.array(robots, np.int64))
+
+
+def textbook_twist(simulator: FastSimulator, state: Array) -> Array:
+    """Returns the body twist (3,) of a robot whose state is (S,)."""
+    twist: Array = np.asarray(textbook(simulator.model.robot).twist(state))
+    return twist
+
+
+def hull_of(shape: Shape) -> Array:
+    """Returns the convex hull (V, 2) of a shape [m], counter-clockwise; a circle has 32 corners."""
+    if len(shape.outline):
+        return convex_hull(shape.outline)
+    angles = np.arange(CORNERS) * (2.0 * np.pi / CORNERS)
+    return np.column_stack([np.cos(angles), np.sin(angles)]) * shape.radius
+
+
+def overlap(one: Array, other: Array) -> bool:
+    """True if two convex polygons (V, 2) have a point in common: no edge of either divides them."""
+    for corners in (one, other):
+        edges = np.roll(corners, -1, axis=0) - corners
+        axes = np.column_stack([-edges[:, 1], edges[:, 0]])
+        if len(corners) == 2:  # a segment: also along itself
+            axes = np.concatenate([axes[:1], edges[:1]])
+        mine, theirs = one @ axes.T, other @ axes.T
+        apart = (mine.max(axis=0) < theirs.min(axis=0)) | (theirs.max(axis=0) < mine.min(axis=0))
+        if apart.any():
+            return False
+    return True
+
+
+__all__ = [
+    "Entities", "Entity", "OutsideError", "StillError", "UnknownEntityError", "overlap",
+]  # fmt: skip

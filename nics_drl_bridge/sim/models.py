@@ -1,0 +1,94 @@
+"""Models of entities to spawn: shapes and where they are in the entity, of YAML or SDF."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree import ElementTree
+
+from pydantic import Field, model_validator
+
+from nics_drl_bridge.config import Schema, parse_yaml, validate
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.lidar.shapes import Shape
+from nics_drl_bridge.sim.sdf import AssetsError, read_sdf, tags_in
+from nics_drl_bridge.sim.sections import Placed
+from nics_drl_bridge.sim.world import Pose
+
+HEIGHT = 0.2  # of what counts in SDF, as with `nics world import` [m]
+MOST_PARTS = 100
+TEXT = "resource_string"  # the place that errors in a text name
+
+
+class ModelFile(Schema):
+    """The keys of a YAML file of an entity; a single shape may stand alone, without them."""
+
+    name: str = ""
+    description: str = ""
+    tags: tuple[str, ...] = ()
+    shapes: tuple[Shape, ...] = Field(min_length=1, max_length=MOST_PARTS)
+    at: tuple[Pose, ...] = ()  # of each shape in the entity [m, m, rad]; at its origin by default
+
+    @model_validator(mode="after")
+    def _one_each(self) -> ModelFile:
+        if self.at and len(self.at) != len(self.shapes):
+            raise ValueError(f"at must hold {len(self.shapes)} poses, one of each shape")
+        return self
+
+
+class Model(NamedTuple):
+    """An entity to spawn."""
+
+    name: str
+    description: str
+    tags: tuple[str, ...]
+    parts: tuple[Placed, ...]
+
+
+def model_of_yaml(text: str, source: str = TEXT) -> Model:
+    """Reads an entity of YAML: the keys of `ModelFile`, or those of one shape. ConfigError."""
+    content = parse_yaml(text, source)
+    if "kind" in content:
+        content = {"shapes": [content]}
+    file = validate(content, ModelFile, source)
+    at = file.at or ((0.0, 0.0, 0.0),) * len(file.shapes)
+    return Model(file.name, file.description, file.tags, tuple(zip(file.shapes, at, strict=True)))
+
+
+def model_of_sdf(text: str, z: float, source: str = TEXT) -> Model:
+    """Reads an entity of SDF, whose origin is spawned at a height z [m].
+
+    Raises ConfigError for no SDF, more than one model, or what is no shape; `AssetsError` of it
+    where that is a mesh, or a file that is not there.
+    """
+    with file_of(text, source) as file:
+        tags_in(file)  # refuses XML entities that grow, before anything else reads it
+    root = ElementTree.fromstring(text.encode())  # noqa: S314 (see above)
+    models = root.findall("model")
+    if len(models) != 1 or root.find("world") is not None:
+        raise ConfigError(f"{source}: holds {len(models)} models; give one <model>, no <world>.")
+    if (pose := models[0].find("pose")) is not None:
+        models[0].remove(pose)  # it is spawned where the request says
+    with file_of(ElementTree.tostring(root, encoding="unicode"), source) as file:
+        try:
+            standing = read_sdf(file, HEIGHT - z)
+        except AssetsError:
+            raise
+        except ConfigError:  # it is lower than that: at the height of its own origin
+            standing = read_sdf(file, 0.0)
+    return Model(models[0].get("name", ""), "", (), standing.placed)
+
+
+@contextmanager
+def file_of(text: str, source: str = TEXT) -> Iterator[Path]:
+    """Gives a file with a text, in errors about which `source` takes the place of its path."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "text.sdf"
+        file.write_text(text, encoding="utf-8")
+        try:
+            yield file
+        except ConfigError as error:
+            raise type(error)(str(error).replace(str(file), source)) from None

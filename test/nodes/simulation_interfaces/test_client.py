@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+pytest.importorskip("simulation_interfaces", reason="needs what `make test-messages` builds")
+
+from simulation_interfaces import msg
+
+from nics_drl_bridge.env.registry import NAVIGATION, register_envs
+from nics_drl_bridge.errors import BackendError, ConfigError
+from nics_drl_bridge.nodes.simulation_interfaces import server
+
+pytestmark = pytest.mark.ros
+STEPS, TIMEOUT_S = 8, 60.0
+
+
+@pytest.fixture
+def make(model):
+    """Makes envs over the standard alone; all are closed with the test."""
+    register_envs()
+    made = []
+
+    def env_of(domain_id, world="circles", **options):
+        given = {"domain_id": domain_id, "timeout_s": TIMEOUT_S, **options}
+        made.append(
+            gymnasium.make(
+                NAVIGATION, backend="ros", simulator="simulation_interfaces", model=model,
+                world=world, backend_options=given,
+            )
+        )  # fmt: skip
+        return made[-1]
+
+    yield env_of
+    for each in made:
+        each.close()
+
+
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+def test_an_env_places_and_steps_a_simulator_by_the_standard_alone(
+    launch, domain_id, make, client_of, mode
+):
+    launch("simulator_node", domain_id, world="circles", mode=mode, scan_rate=10.0)
+    env = make(domain_id, truth=True, standard={} if mode == "lockstep" else {"slack_s": 0.05})
+    ours = gymnasium.make(NAVIGATION, model=env.unwrapped.model, world="circles", estimator=True)
+    action = np.array([0.6, 0.3], np.float32)
+    for seed in (3, 4):
+        first, info = env.reset(seed=seed)
+        assert info["pose"] == pytest.approx(info["start"], abs=1e-6)
+        expected, _ = ours.reset(seed=seed)
+        assert first == pytest.approx(expected, abs=0.05)  # the obstacles are those of the seed
+        for _ in range(STEPS):
+            _, _, _, _, info = env.step(action)
+            _, _, _, _, known = ours.step(action)
+        # A robot that begins a period later, with noise of its own.
+        assert info["pose"] == pytest.approx(known["pose"], abs=0.05)
+        assert info["true_pose"] == pytest.approx(known["true_pose"], abs=0.05)
+    assert int(client_of(domain_id)("GetSimulationState").state.state) == 2
+
+
+def test_a_feature_that_is_missing_is_named_when_the_env_is_made(
+    launch, domain_id, make, monkeypatch
+):
+    fewer = tuple(name for name in server.FEATURES if name != "ENTITY_STATE_SETTING")
+    monkeypatch.setattr(server, "FEATURES", fewer)
+    launch("simulator_node", domain_id, world="circles", mode="lockstep")
+    with pytest.raises(BackendError, match="does not have the feature ENTITY_STATE_SETTING"):
+        make(domain_id)
+
+
+def test_steps_that_are_refused_are_told(launch, domain_id, make, client_of):
+    launch("simulator_node", domain_id, world="circles", mode="lockstep")
+    env = make(domain_id)
+    env.reset(seed=0)
+    client_of(domain_id).set_state(msg.SimulationState.STATE_STOPPED)
+    with pytest.raises(BackendError, match=r"refused StepSimulation: .* not paused"):
+        env.step(np.zeros(2, np.float32))
+
+
+def test_the_robot_has_another_name_in_another_simulator(launch, domain_id, make):
+    launch("simulator_node", domain_id, world="circles", mode="lockstep")
+    env = make(domain_id, standard={"entity": "waffle"})
+    with pytest.raises(BackendError, match="refused SetEntityState: there is no entity 'waffle'"):
+        env.reset(seed=0)
+
+
+@pytest.mark.parametrize("options", [{"mode": "realtime"}, {"randomisation": "mild"}])
+def test_what_the_standard_can_not_do_is_refused(make, domain_id, options):
+    with pytest.raises(ConfigError, match="in mode 'lockstep', without randomisation"):
+        make(domain_id, **options)

@@ -1,0 +1,152 @@
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+pytest.importorskip("simulation_interfaces", reason="needs what `make test-messages` builds")
+
+from geometry_msgs.msg import Twist
+from nav_msgs.msg import Odometry
+from sensor_msgs.msg import LaserScan
+from simulation_interfaces import msg, srv
+
+pytestmark = pytest.mark.ros
+STATES, OK = msg.SimulationState, msg.Result.RESULT_OK
+
+
+@pytest.fixture(scope="module")
+def simulator(launch, module_domain_id):
+    process = launch("simulator_node", module_domain_id, world="empty", robots=["left", "right"])
+    yield module_domain_id
+    process.check()
+
+
+@pytest.fixture
+def client(simulator, client_of):
+    made = client_of(simulator)
+    made("LoadWorld", world_resource=msg.Resource(uri="empty"))
+    made.start()
+    return made
+
+
+def test_every_feature_does_what_the_standard_says_and_every_other_is_refused(client):
+    from measuring.conformance import announced, failures
+
+    assert len(announced(client)) == 30
+    assert failures(client, "empty") == []
+
+
+def test_a_feature_that_is_claimed_but_not_there_is_noticed(client):
+    from measuring.conformance import failures
+
+    assert [line.split()[0] for line in failures(client, "empty", {"NAMED_POSES"})][:1]
+
+
+@pytest.mark.slow
+def test_robots_in_mujoco_serve_the_same(launch, domain_id, client_of):
+    pytest.importorskip("mujoco", reason="needs MuJoCo: the extra `mujoco`")
+    from measuring.conformance import failures
+
+    launch("mujoco_node", domain_id, world="empty")
+    assert failures(client_of(domain_id), "empty") == []
+
+
+def test_a_spawned_robot_has_topics_until_it_is_deleted(client, meet, simulator):
+    spawned = client.spawn(
+        "third", 1.0, entity_resource=msg.Resource(uri="ackermann"), entity_namespace="third"
+    )
+    assert spawned.result.result == OK, spawned.result.error_message
+    peer = meet(simulator)
+    scans, odoms = peer.listen(LaserScan, "third/scan"), peer.listen(Odometry, "third/odom")
+    commands = peer.speak(Twist, "third/cmd_vel")
+    command = Twist()
+    command.linear.x = 0.5
+    commands.publish(command)
+    client.set_state(STATES.STATE_PLAYING)
+    peer.until(lambda: scans and odoms and odoms[-1].twist.twist.linear.x > 0.1, "it drives")
+    assert client.code("DeleteEntity", entity="third") == OK
+    peer.until(lambda: peer.node.count_publishers("/third/scan") == 0, "its topics end")
+    assert client.names(categories=[msg.EntityCategory(category=1)]) == ["left", "right"]
+
+
+def test_a_robot_that_was_deleted_comes_back_with_a_reset(client, meet, simulator):
+    assert client.code("DeleteEntity", entity="left") == OK
+    assert "left" not in client.names()
+    assert client.code("ResetSimulation", scope=0) == OK
+    assert {"left", "right"} <= set(client.names())
+    client.set_state(STATES.STATE_PLAYING)
+    peer = meet(simulator)
+    scans = peer.listen(LaserScan, "left/scan")
+    peer.until(lambda: scans, "its scan")
+
+
+def test_poses_may_be_given_in_the_frame_of_an_entity(client):
+    base = msg.EntityState()
+    base.pose.position.x, base.pose.orientation.z, base.pose.orientation.w = 1.0, 1.0, 0.0
+    assert client.code("SetEntityState", entity="left", state=base, set_pose=True) == OK
+    beside = msg.EntityState()
+    beside.header.frame_id, beside.pose.position.x = "left", 0.5
+    assert client.code("SetEntityState", entity="right", state=beside, set_pose=True) == OK
+    found = client("GetEntityState", entity="right").state
+    assert found.pose.position.x == pytest.approx(0.5, abs=1e-6)
+    beside.header.frame_id = "nowhere"
+    wrong = client("SetEntityState", entity="right", state=beside, set_pose=True).result
+    assert wrong.result == srv.SetEntityState.Response.INVALID_POSE
+    assert "'nowhere' is not known" in wrong.error_message
+
+
+@pytest.mark.parametrize(
+    ("name", "fields", "code", "sentence"),
+    [
+        ("GetEntityState", {"entity": "x"}, 2, "there is no entity 'x'"),
+        ("GetEntities", {"filters": msg.EntityFilters(filter="(")}, 4, "no regular expression"),
+        (
+            "GetEntities",
+            {"filters": msg.EntityFilters(categories=[msg.EntityCategory(category=9)])},
+            4,
+            "category 9",
+        ),
+        (
+            "GetEntities",
+            {"filters": msg.EntityFilters(tags=msg.TagsFilter(filter_mode=7))},
+            4,
+            "filter_mode 7",
+        ),
+        ("GetEntities", {"filters": msg.EntityFilters(bounds=msg.Bounds(type=1))}, 4, "0 points"),
+        ("GetEntities", {"filters": msg.EntityFilters(bounds=msg.Bounds(type=9))}, 0, "type 9"),
+        ("StepSimulation", {"steps": 0}, 4, "steps is 0"),
+        ("StepSimulation", {"steps": 2**63}, 4, "are the most of one call"),
+        ("ResetSimulation", {"scope": 8}, 0, "scope 8"),
+        ("LoadWorld", {"world_resource": msg.Resource(uri="nowhere")}, 2, "unknown world"),
+        ("LoadWorld", {"world_resource": msg.Resource(uri="/no/a.yaml")}, 2, "no such file"),
+        ("LoadWorld", {"world_resource": msg.Resource(uri="http://a/b.sdf")}, 101, "this machine"),
+        ("SetSimulationState", {"state": STATES(state=77)}, 103, "state 77 can't be set"),
+    ],
+)
+def test_a_wrong_argument_is_answered_by_a_code_and_one_sentence(
+    client, name, fields, code, sentence
+):
+    result = client(name, **fields).result
+    assert (result.result, sentence in result.error_message) == (code, True), result
+    assert "\n" not in result.error_message
+
+
+def test_names_are_matched_by_posix_expressions(client):
+    client.spawn("disc_1", 1.0), client.spawn("disc_b", 1.5)
+    assert client.names(filter="^disc_[[:digit:]]$") == ["disc_1"]
+    assert client.names(filter="left|right") == ["left", "right"]
+
+
+def test_a_simulator_that_was_asked_to_quit_answers_and_ends(launch, domain_id, client_of):
+    process = launch("simulator_node", domain_id, world="empty")
+    assert client_of(domain_id).set_state(STATES.STATE_QUITTING) == OK
+    assert process.wait() == 0
+
+
+def test_the_services_can_be_turned_off(launch, domain_id, meet):
+    launch("simulator_node", domain_id, world="empty", simulation_interfaces=False)
+    peer = meet(domain_id)
+    peer.be_known_to("simulator_node")
+    found = {name for name, _ in peer.node.get_service_names_and_types()}
+    assert "/simulator_node/reset" in found
+    assert "/get_simulator_features" not in found
