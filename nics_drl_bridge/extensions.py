@@ -17,8 +17,8 @@ from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
 PACKAGE = "nics_drl_bridge"
 ROS = ("rclpy", "_msgs", "std_srvs", "builtin_interfaces")
 INSTALL = {  # libraries, and the extra of this package that brings each
-    "mcap": "bags", "mujoco": "mujoco", "ray": "train,distributed", "rosbags": "bags",
-    "torch": "train",
+    "imageio_ffmpeg": "view", "mcap": "bags", "mujoco": "mujoco", "ray": "train,distributed",
+    "rerun": "view", "rosbags": "bags", "torch": "train", "websockets": "view",
 }  # fmt: skip
 
 

@@ -16,6 +16,7 @@ from nics_drl_bridge.commands.model import generate, import_, inspect, record, u
 from nics_drl_bridge.commands.policy import policy
 from nics_drl_bridge.commands.train import train
 from nics_drl_bridge.commands.warmup import warmup
+from nics_drl_bridge.commands.watch import watch
 from nics_drl_bridge.commands.world import world
 from nics_drl_bridge.errors import LONGEST, shortened
 
@@ -52,6 +53,7 @@ for command in (
     urdf,
     train,
     evaluate,
+    watch,
     demo,
     warmup,
 ):

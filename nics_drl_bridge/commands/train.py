@@ -4,7 +4,8 @@ import math
 import shlex
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -46,6 +47,9 @@ def train(
     env_runners: Annotated[
         int | None, Option(min=1, help="Ray processes that share the worlds; default: one per CPU.")
     ] = None,
+    watch: Annotated[
+        bool, Option("--watch", help="Show some of the worlds on a page, as nics watch does.")
+    ] = False,
 ) -> None:
     """Trains policies in the fast simulator, and evaluates them."""
     with one_sentence():
@@ -71,7 +75,13 @@ def train(
         every = [*(seeds or [0]), *(more_seeds or [])]
         order = train_run.TrainOrder(chosen, every, folder, episodes, resume, command)
         with _learner(engine, address, env_runners, chosen.num_envs) as learn:
-            _run(train_run, order, learn)
+            if not watch:
+                _run(train_run, order, learn)
+            elif engine is None or engine in OWN:
+                _run_watched(train_run, order, learn)
+            else:
+                reason = "worlds on a cluster are not shown; leave out --watch, or --engine"
+                raise ConfigError(f"--watch --engine {engine}: {reason}.")
 
 
 @contextmanager
@@ -91,6 +101,21 @@ def _learner(
     else:
         with extensions.load("engines", engine)(address, runners, worlds) as learn:
             yield learn
+
+
+def _run_watched(train_run: Any, order: Any, learn: Any) -> None:
+    """The same with a page, which costs nothing while it is closed."""
+    from nics_drl_bridge.watch.server import PageServer
+    from nics_drl_bridge.watch.show import open_page
+    from nics_drl_bridge.watch.training import TrainingView
+
+    with closing(PageServer(port=0)) as server:
+        open_page(server.url)
+
+        def on_env(env: Any) -> None:
+            env.on_step = TrainingView(server, env)
+
+        _run(train_run, order, partial(learn, on_env=on_env))
 
 
 def _run(train_run: Any, order: Any, learn: Any) -> None:
