@@ -3,7 +3,7 @@
 import math
 import shlex
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
@@ -112,18 +112,27 @@ def _run_watched(train_run: Any, order: Any, learn: Any) -> None:
     with closing(PageServer(port=0)) as server:
         open_page(server.url)
 
+        views: list[TrainingView] = []  # of the seeds so far
+
         def on_env(env: Any) -> None:
-            env.on_step = TrainingView(server, env)
+            views.append(TrainingView(server, env))
+            env.on_step = views[-1]
 
-        _run(train_run, order, partial(learn, on_env=on_env))
+        def note(what: str) -> None:
+            views[-1].note = what
+
+        _run(train_run, order, partial(learn, on_env=on_env), note)
 
 
-def _run(train_run: Any, order: Any, learn: Any) -> None:
+def _run(
+    train_run: Any, order: Any, learn: Any, note: Callable[[str], None] = lambda _: None
+) -> None:
     def told(progress: Any) -> None:
         success, speed = 100 * progress.success, progress.steps_per_s
         what = f"seed {progress.seed}: success {success:.1f} %, {speed:,.0f} steps/s"
         if not math.isnan(progress.held_out):
             what += f", held out {100 * progress.held_out:.1f} %"
+        note(what)
         tell(what, progress.steps, progress.total)
 
     def done(result: Any) -> None:

@@ -23,16 +23,16 @@ class TrainingView:
     def __init__(self, server: PageServer, training: Envs) -> None:
         self._server, envs = server, training.envs
         each = max(1, MOST_WORLDS // len(envs))
-        chosen = [(env, n) for env in envs for n in range(min(each, env.num_envs))]
-        self._worlds, self._first = chosen[:MOST_WORLDS], dict[int, int]()
-        for env in envs:
-            before = envs[: envs.index(env)]
-            self._first[id(env)] = sum(len(one.world.members) for one in before)
-        self._trails = [Trail() for _ in self._worlds]
-        self._shown_s, self._steps = 0.0, 0
+        sizes = [len(env.world.members) for env in envs]
+        self._worlds = [  # with the place of the first member of their world set
+            (env, n, sum(sizes[:k]), Trail())
+            for k, env in enumerate(envs[:MOST_WORLDS])
+            for n in range(min(each, env.num_envs))
+        ]
+        self._shown_s, self._steps, self.note = 0.0, 0, ""
         names = ", ".join(env.world.name for env in envs)
-        self._stage = Stage(f"training in {names}", envs[0].model, tuple(env.world for env in envs))
-        server.set_stage(self._stage)
+        places = tuple(env.world for env in envs)
+        server.set_stage(Stage(f"training in {names}", envs[0].model, places))
 
     def __call__(self) -> None:
         """Takes a step into account, and shows a frame if it is time to and a page is open."""
@@ -41,7 +41,7 @@ class TrainingView:
             return
         now = time.monotonic()
         due = now - self._shown_s >= PERIOD_S
-        for (env, n), trail in zip(self._worlds, self._trails, strict=True):
+        for env, n, _, trail in self._worlds:
             trail.add(env.simulator.data.pose[n], int(env.simulator.data.steps[n]))
         if due:
             self._shown_s = now
@@ -49,10 +49,8 @@ class TrainingView:
 
     def _frame(self) -> Frame:
         worlds = []
-        for (env, n), trail in zip(self._worlds, self._trails, strict=True):
-            shot = env.shot(n)
-            place = self._first[id(env)] + shot.member
-            name = f"{env.world.name} {n}"
-            worlds.append(WorldFrame(shot, name, place, trail.ways))
+        for env, n, first, trail in self._worlds:
+            shot, name = env.shot(n), f"{env.world.name} {n}"
+            worlds.append(WorldFrame(shot, name, first + shot.member, trail.ways))
         period_s = self._worlds[0][0].model.control_period
-        return Frame(self._steps * period_s, tuple(worlds))
+        return Frame(self._steps * period_s, tuple(worlds), self.note)
