@@ -54,6 +54,8 @@ EXTRAS = {
     # Isaac's runner of policy bundles, which the tests hold ours against; reading and writing them
     # needs `deploy` alone. A library of its pictures has wheels for this platform only.
     "leapp": [f"leapp>=0.7.2; {ROS_WHEELS_EXIST}"],
+    # The page of `nics watch` is websockets alone; files of it need the others.
+    "view": ["imageio-ffmpeg>=0.5", "rerun-sdk>=0.24", "websockets>=14"],
     "test": [
         "build",
         "colcon-bash",
@@ -114,7 +116,7 @@ setup(
     license=text_of("license"),
     python_requires=">=3.10,<3.15",
     packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
-    package_data={PACKAGE: ["py.typed", "nodes/*.xml"]},
+    package_data={PACKAGE: ["py.typed", "nodes/*.xml", "watch/*.html"]},
     data_files=data_files(),
     zip_safe=False,
     install_requires=REQUIRES,
@@ -140,6 +142,7 @@ setup(
         f"{PACKAGE}.engines": [f"ray = {PACKAGE}.extras.ray.engine:learner"],
         f"{PACKAGE}.nodes": [f"mujoco_node = {PACKAGE}.extras.mujoco.node:main"],
         f"{PACKAGE}.sensors": [f"lidar = {PACKAGE}.lidar.further_lidar:FurtherLidar"],
+        f"{PACKAGE}.viewers": [f"human = {PACKAGE}.watch.human:HumanView"],
         f"{PACKAGE}.salvage": [f"bag = {PACKAGE}.extras.bags.salvage:salvaged"],
     },
 )

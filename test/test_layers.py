@@ -31,6 +31,7 @@ LAYERS = (
     ("policy",),
     ("gate",),
     ("report",),
+    ("watch",),
     ("nodes",),
     ("commands",),
     ("extras",),
@@ -51,9 +52,9 @@ HOMES = {
     "matplotlib": ("report/*", "env/rendering.py", "style.py"),
     "yaml": ("config.py",),
     "typer": ("commands/*", "extras/*"),
-    "gymnasium": ("env/*", "policy/*", "commands/*", "extras/*"),
+    "gymnasium": ("env/*", "policy/*", "watch/*", "commands/*", "extras/*"),
     "numba": ("*kernels.py",),
-    "PIL": ("lidar/maps.py",),
+    "PIL": ("lidar/maps.py", "watch/record.py"),
     "llvmlite": ("*kernels.py",),
     "mujoco": ("extras/mujoco/*",),
     "torch": ("policy/train*.py", "extras/ray/*"),
@@ -66,6 +67,9 @@ HOMES = {
     "pyarrow": ("recording/*", "extras/bags/*"),
     "mcap": ("recording/*", "extras/bags/*"),
     "threadpoolctl": ("threads.py",),
+    "websockets": ("watch/server.py",),
+    "rerun": ("watch/record.py",),
+    "imageio_ffmpeg": ("watch/record.py",),
 }
 
 

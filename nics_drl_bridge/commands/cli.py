@@ -18,6 +18,7 @@ from nics_drl_bridge.commands.model import drive, generate, import_, inspect, re
 from nics_drl_bridge.commands.policy import policy
 from nics_drl_bridge.commands.train import train
 from nics_drl_bridge.commands.warmup import warmup
+from nics_drl_bridge.commands.watch import watch
 from nics_drl_bridge.commands.world import world
 from nics_drl_bridge.errors import LONGEST, shortened
 
@@ -56,6 +57,7 @@ for command in (
     urdf,
     train,
     evaluate,
+    watch,
     demo,
     warmup,
 ):

@@ -87,14 +87,14 @@ def drive_in(
 
 
 def env_of(
-    policy: str, model: SimulatorModel, world: str, backend: str,
+    policy: str, model: SimulatorModel, world: str | AnyWorld, backend: str,
     conditions: Conditions = NO_CONDITIONS, **options: Any,
 ) -> tuple[gymnasium.Env[Any, Any], Policy]:  # fmt: skip
     """Makes the env of a policy's task with a backend, behind a gate if any; opens the policy."""
     register_envs()
     opened, task = open_policy(policy, model, conditions.fallback)
     task = replace(task, **conditions.task)
-    field = load_worlds(world)
+    field = load_worlds(world) if isinstance(world, str) else world
     given = {name: value for name, value in options.items() if value is not None}
     made = make_backend(backend, model, field, **given)
     if conditions.gate is not None:

@@ -244,7 +244,6 @@ def generate(
         from nics_drl_bridge.report.fit_page import write_fit_page
         from nics_drl_bridge.report.fit_pictures import write_pictures
 
-
         page = out / "report.html"
         write_fit_page(page, str(recording), spec, identified, model.report)
         if pictures:

@@ -4,9 +4,10 @@ import json
 import math
 import shlex
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -62,6 +63,9 @@ def train(
         int | None, Option(min=1, help="Ray processes that share the worlds; default: one per CPU.")
     ] = None,
     as_json: JsonOption = False,
+    watch: Annotated[
+        bool, Option("--watch", help="Show some of the worlds on a page, as nics watch does.")
+    ] = False,
 ) -> None:
     """Trains policies in the fast simulator, and evaluates them."""
     with one_sentence():
@@ -83,7 +87,13 @@ def train(
         every = [*(seeds or [0]), *(more_seeds or [])]
         order = train_run.TrainOrder(chosen, every, folder, episodes, resume, command)
         with _learner(engine, address, env_runners, chosen.num_envs) as learn:
-            _run(train_run, order, learn, as_json)
+            if not watch:
+                _run(train_run, order, learn, as_json)
+            elif engine is None or engine in OWN:
+                _run_watched(train_run, order, learn, as_json)
+            else:
+                reason = "worlds on a cluster are not shown; leave out --watch, or --engine"
+                raise ConfigError(f"--watch --engine {engine}: {reason}.")
 
 
 def _plain(result: Any) -> dict[str, Any]:
@@ -123,11 +133,35 @@ def _learner(
             yield learn
 
 
-def _run(train_run: Any, order: Any, learn: Any, as_json: bool) -> None:
+def _run_watched(train_run: Any, order: Any, learn: Any, as_json: bool) -> None:
+    """The same with a page, which costs nothing while it is closed."""
+    from nics_drl_bridge.watch.server import PageServer
+    from nics_drl_bridge.watch.show import open_page
+    from nics_drl_bridge.watch.training import TrainingView
+
+    with closing(PageServer(port=0)) as server:
+        open_page(server.url)
+
+        views: list[TrainingView] = []  # of the seeds so far
+
+        def on_env(env: Any) -> None:
+            views.append(TrainingView(server, env))
+            env.on_step = views[-1]
+
+        def note(what: str) -> None:
+            views[-1].note = what
+
+        _run(train_run, order, partial(learn, on_env=on_env), as_json, note)
+
+
+def _run(
+    train_run: Any, order: Any, learn: Any, as_json: bool, note: Callable[[str], None] = lambda _: None
+) -> None:
     def told(progress: Any) -> None:
         what = f"seed {progress.seed}: {progress.line}"
         if not math.isnan(progress.held_out):
             what += f", held out {100 * progress.held_out:.1f} %"
+        note(what)
         tell(what, progress.steps, progress.total)
 
     def done(result: Any) -> None:

@@ -8,9 +8,11 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.env import guard
 from nics_drl_bridge.env.guard import give, halts_on_error
 from nics_drl_bridge.env.registry import make_task
+from nics_drl_bridge.env.shot import Shot, gate_of, goals_of
 from nics_drl_bridge.env.sim_backend import completed, make_backend
 from nics_drl_bridge.env.task import Episodes, Memory, Task, still, team_space
 from nics_drl_bridge.errors import ConfigError, nearest
@@ -83,7 +85,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             `estimator`, `randomisation` and the number of robots if they are given.
         randomisation: quantities drawn in each episode: the name of a shipped one, a YAML file, or
             a Randomisation; the drawn values are in `info["randomisation"]` of a reset.
-        render_mode: `rgb_array`, `human` or None.
+        render_mode: `rgb_array`, `human` (a page in the browser, see `watch`) or None.
         simulator: name of the node behind `dds`; `simulation_interfaces` for any simulator that
             serves these, such as Gazebo or Isaac, see `docs/dds_backend.md`.
 
@@ -121,6 +123,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self._rest = np.tile(self._still, (self.robots, 1))
         self._seed, self._episode, self._rehearsed = 0, -1, False
         self._picture: Any = None
+        # Of the last step, for pictures, and the number of steps in the episode.
+        self._command, self._facts, self._steps = self._rest, dict[str, Any](), 0
         if isinstance(backend, str):
             robots = self.robots if self.robots > 1 else None
             own = {
@@ -157,6 +161,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         guard.override(memory, options, "start")
         self._view = self._lifted(self._backend.reset(Start(episode, self._row(starts))))
         self.memory = memory
+        self._command, self._facts, self._steps = self._rest, {}, 0
         self.ended = np.zeros(self.robots, np.bool_)
         facts: dict[str, Any] = {"episode_seed": episode, "start": self._row(starts)}
         facts["bodies"] = self.scene.bodies.copy()
@@ -215,6 +220,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         if waiting:
             command = np.where(self.ended[:, None], self._still, command)
         seen, facts = self._backend.step(command)
+        self._command, self._facts, self._steps = command, facts, self._steps + 1
         view, out = self._lifted(seen), np.empty(self._shape, np.float32)
         outcome = self.task.step_into(out, before, view, self.memory)
         terms = {name: term[0] for name, term in outcome.terms.items()}
@@ -254,26 +260,40 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         """Draws the current world from above; see Gymnasium."""
         if self.render_mode is None:
             return None
+        if self._picture is None:
+            self._picture = self._make_picture()
+        return self._picture.draw(self.shot())
+
+    def _make_picture(self) -> Any:
+        if self.render_mode == "human":
+            return extensions.load("viewers", "human")(self.model, self.world, RENDER_FPS)
+        from nics_drl_bridge.env.rendering import WorldPicture  # loads matplotlib
+
+        return WorldPicture(self.model, self.world)
+
+    def shot(self) -> Shot:
+        """All that a picture of the world shows now. Raises ResetNeeded before an episode."""
         if self._view is None or self.scene is None:
             raise gymnasium.error.ResetNeeded("call reset() before render().")
-        if self._picture is None:
-            from nics_drl_bridge.env.rendering import WorldPicture  # loads matplotlib
-
-            self._picture = WorldPicture(self.model, self.world, self.render_mode, RENDER_FPS)
-        facts = self._backend.facts()
-        poses = np.reshape(facts.get("true_pose", self._view.pose), (self.robots, 3))
-        bodies = facts.get("bodies", self.scene.bodies)
-        shown = poses, self._view.ranges[0], bodies, self.memory
-        return self._picture.draw(*shown, int(np.asarray(self.scene.member)))
+        facts, told, view = self._backend.facts(), self._facts, self._view
+        covariance = told.get("covariance")
+        return Shot(
+            poses=np.reshape(facts.get("true_pose", view.pose), (self.robots, 3)),
+            ranges=view.ranges[0], bodies=facts.get("bodies", self.scene.bodies),
+            goals=goals_of(self.memory).copy(), member=int(np.asarray(self.scene.member)),
+            step=self._steps, estimates=view.pose[0],
+            covariance=None if covariance is None else np.reshape(covariance, (-1, 3, 3)),
+            commands=np.reshape(self._command, (self.robots, -1)), gate=gate_of(told),
+        )  # fmt: skip
 
     @halts_on_error
     def close(self) -> None:
-        """Stops the robot with a zero command and closes the window."""
+        """Stops the robot with a zero command and closes the page."""
         picture, self._picture = self._picture, None
         try:
             self._backend.close()
         finally:
-            if picture is not None:
+            if self.render_mode == "human" and picture is not None:
                 picture.close()
 
 

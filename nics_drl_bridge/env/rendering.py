@@ -1,6 +1,6 @@
-"""Pictures of a world from above, for `render_mode` `rgb_array` and `human`."""
+"""Pictures of a world from above, for `render_mode="rgb_array"` and for videos."""
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,6 +12,7 @@ from matplotlib.patches import Polygon as Outline
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.env.shot import Shot, hits_of
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE
 from nics_drl_bridge.sim.world_set import AnyWorld
@@ -24,54 +25,38 @@ ROBOTS = tuple(colour for colour in SERIES if colour != SCAN)
 
 
 class WorldPicture:
-    """Picture of a world, redrawn at every step: `rgb_array`, or `human` in a window."""
+    """Picture of a world, redrawn for each shot."""
 
-    def __init__(self, model: SimulatorModel, world: AnyWorld, mode: str, fps: int) -> None:
+    def __init__(self, model: SimulatorModel, world: AnyWorld) -> None:
         self._model, self._world = model, world
-        self._human, self._pause_s = mode == "human", 1.0 / fps
         low, high = np.array(world.extent).reshape(2, 2)
         width, depth = (SIZE_IN * (high - low) / (high - low).max()).tolist()
         self._low, self._high = low - MARGIN * (high - low), high + MARGIN * (high - low)
-        if self._human:
-            import matplotlib.pyplot as plt  # looks for a display, which `rgb_array` does not need
+        figure = Figure(figsize=(width, depth), dpi=DPI)
+        self._canvas = FigureCanvasAgg(figure)
+        self._axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
 
-            self._figure = plt.figure(figsize=(width, depth), dpi=DPI)
-        else:
-            self._figure = Figure(figsize=(width, depth), dpi=DPI)
-            FigureCanvasAgg(self._figure)
-        self._axes = self._figure.add_axes((0.0, 0.0, 1.0, 1.0))
-
-    def draw(
-        self,
-        poses: Array,
-        ranges: NDArray[Any],
-        bodies: Array,
-        memory: dict[str, NDArray[Any]],
-        member: int = 0,
-    ) -> NDArray[np.uint8] | None:
-        """Draws robots (M, 3), scans (M, B), bodies (K, 7), goals; pixels unless `human`.
-
-        All in the world `member` of a set.
-        """
+    def draw(self, shot: Shot, trails: Sequence[Array] = ()) -> NDArray[np.uint8]:
+        """Returns the pixels (H, W, 3) of a shot, with the ways (T, 2) that its robots came."""
         axes = self._axes
         axes.clear()
         axes.set_axis_off()
         axes.set_aspect("equal")
         axes.set_xlim(self._low[0], self._high[0])
         axes.set_ylim(self._low[1], self._high[1])
-        draw_world(axes, self._world, bodies, member)
-        for goal in np.reshape(memory.get("goal", np.zeros((0, 2))), (-1, 2)):
+        draw_world(axes, self._world, shot.bodies, shot.member)
+        for goal in shot.goals:
             axes.plot(*goal, marker="*", color=GOAL, markersize=16, markeredgecolor=WALL)
-        for m, (pose, scan) in enumerate(zip(poses, ranges, strict=True)):
+        for m, trail in enumerate(trails):
+            axes.plot(*np.transpose(trail), color=ROBOTS[m % len(ROBOTS)], linewidth=1.5)
+        for m, (pose, scan) in enumerate(zip(shot.poses, shot.ranges, strict=True)):
             self._robot(axes, pose, scan, ROBOTS[m % len(ROBOTS)])
-        return self._shown()
+        self._canvas.draw()
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
     def _robot(self, axes: Axes, pose: Array, ranges: NDArray[np.float32], colour: str) -> None:
         lidar, robot = self._model.lidar, self._model.robot
-        mount = geometry.compose(pose, lidar.mount)
-        there = np.isfinite(ranges)
-        angles = mount[2] + lidar.angles[there]
-        hits = mount[:2] + ranges[there, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        hits = hits_of(lidar, pose, ranges)
         axes.plot(hits[:, 0], hits[:, 1], ".", color=SCAN, markersize=2.0)
         reach = robot.footprint_radius
         if robot.footprint is None:
@@ -82,26 +67,6 @@ class WorldPicture:
             axes.add_patch(Outline(outline, closed=True, color=colour))
         front = pose[:2] + reach * np.array([np.cos(pose[2]), np.sin(pose[2])])
         axes.plot([pose[0], front[0]], [pose[1], front[1]], color="white", linewidth=2.0)
-
-    def _shown(self) -> NDArray[np.uint8] | None:
-        canvas: Any = self._figure.canvas
-        if not self._human:
-            canvas.draw()
-            return np.asarray(canvas.buffer_rgba())[..., :3].copy()
-        if canvas.required_interactive_framework is None:  # no display: drawn, but not shown
-            canvas.draw()
-        else:
-            canvas.manager.show()
-            canvas.draw_idle()
-            canvas.start_event_loop(self._pause_s)
-        return None
-
-    def close(self) -> None:
-        """Closes the window."""
-        if self._human:
-            import matplotlib.pyplot as plt
-
-            plt.close(self._figure)
 
 
 def draw_world(axes: Axes, world: AnyWorld, bodies: NDArray[np.float64], member: int = 0) -> None:

@@ -57,7 +57,11 @@ class SimBackend:
             middleware.command(self._now_ns, one)
         self.simulator.step(commands[None])
         self._now_ns += self._period_ns
-        return self._measure(), {"stamp_ns": self._now_ns, **self._truth()}
+        told = {"stamp_ns": self._now_ns, **self._truth()}
+        if self._middlewares:
+            every = np.array([each.estimator.covariance[:3, :3] for each in self._middlewares])
+            told["covariance"] = every[0] if len(every) == 1 else every
+        return self._measure(), told
 
     def facts(self) -> BackendFacts:
         """Returns the truth, the obstacles and the draws; see `interface.Backend`."""

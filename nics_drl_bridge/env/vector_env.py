@@ -15,6 +15,7 @@ from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
 from nics_drl_bridge.env.guard import check_action, check_reset, check_starts, give, override
 from nics_drl_bridge.env.kernels import episode_seeds
 from nics_drl_bridge.env.registry import make_task
+from nics_drl_bridge.env.shot import Shot, goals_of
 from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task, still, team_space, total
 from nics_drl_bridge.env.teaching import Teacher, Teaching
 from nics_drl_bridge.errors import ConfigError
@@ -74,7 +75,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP, copy: bool = True, *,
         render_mode: str | None = None, **simulation: Any,
     ) -> None:  # fmt: skip
-        self._pictures: list[Any] = []  # `close` needs it even if the rest raises
+        self._pictures: list[Any] = []
         check_render_mode(render_mode, self.metadata)
         self.num_envs, self.render_mode = num_envs, render_mode
         self._limit, self.copy = max_episode_steps, copy
@@ -299,19 +300,15 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         if not self._pictures:
             from nics_drl_bridge.env.rendering import WorldPicture  # loads matplotlib
 
-            which = (self.model, self.world, self.render_mode, RENDER_FPS)
-            self._pictures = [WorldPicture(*which) for _ in range(self.num_envs)]
-        drawn, data, bodies = [], self.simulator.data, self.simulator.obstacles
-        for n, picture in enumerate(self._pictures):
-            memory = {name: rows[n : n + 1] for name, rows in self.memory.items()}
-            shown = data.pose[n], data.ranges[n], bodies[n], memory, int(data.member[n])
-            drawn.append(picture.draw(*shown))
-        return tuple(drawn)
+            self._pictures = [WorldPicture(self.model, self.world) for _ in range(self.num_envs)]
+        return tuple(picture.draw(self.shot(n)) for n, picture in enumerate(self._pictures))
 
-    def close_extras(self, **kwargs: Any) -> None:
-        """Closes the pictures."""
-        for picture in self._pictures:
-            picture.close()
+    def shot(self, n: int) -> Shot:
+        """All that a picture of world n shows now; `step` does not change its arrays."""
+        data, bodies = self.simulator.data, self.simulator.obstacles_of(n)
+        goals = goals_of({name: rows[n] for name, rows in self.memory.items() if name == "goal"})
+        seen = data.pose[n].copy(), data.ranges[n].copy(), bodies, goals.copy()
+        return Shot(*seen, int(data.member[n]), int(data.steps[n]), data.odom[n].copy())
 
 
 def flat(observations: Observation) -> Observation:

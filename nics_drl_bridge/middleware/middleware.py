@@ -248,6 +248,11 @@ class Middleware:
         self._clock_jumps += 1
 
     @property
+    def commanded(self) -> Array:
+        """(C,) the latest command, whatever its stamp."""
+        return self._commanded
+
+    @property
     def newest_ns(self) -> int | None:
         """Stamp of the newest datum of all topics [ns]; None if there is none."""
         return max((datum.stamp_ns for datum in self.cache.newest.values()), default=None)

@@ -198,8 +198,11 @@ class RobotTopics:
 
 
 def data_facts(middleware: Middleware, now_ns: int) -> dict[str, Any]:
-    """Returns facts for `info`: number, stamp [ns] and silence [s] of each topic's newest datum."""
-    facts: dict[str, Any] = {}
+    """Returns facts for `info`: number, stamp [ns] and silence [s] of each topic's newest datum.
+
+    And the covariance (3, 3) of the estimated pose.
+    """
+    facts: dict[str, Any] = {"covariance": middleware.estimator.covariance[:3, :3].copy()}
     for topic, datum in middleware.cache.newest.items():
         facts[f"{topic}_sequence"] = datum.sequence
         facts[f"{topic}_stamp_ns"] = datum.stamp_ns

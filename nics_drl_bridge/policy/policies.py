@@ -63,9 +63,10 @@ def _settled(task: Navigation, commands: Array, model: SimulatorModel | None) ->
     return geometry.log(moved) / kinematics.dt
 
 
-def _actions(task: Navigation, commands: Array) -> Array:
+def actions_of(task: Navigation, commands: Array) -> NDArray[np.float32]:
+    """Returns the continuous actions (..., C) that give commands (..., C), cut to [-1, 1]."""
     low, high = task.command_limits
-    return np.clip(2.0 * (commands - low) / (high - low) - 1.0, -1.0, 1.0)
+    return np.clip(2.0 * (commands - low) / (high - low) - 1.0, -1.0, 1.0).astype(np.float32)
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ class StraightToGoal:
             wanted = robot.of_fields(shares) * robot.command_high
         else:
             wanted = self._command(shares)
-        return _actions(self.task, wanted).astype(np.float32)
+        return actions_of(self.task, wanted)
 
     def _command(self, shares: Array) -> Array:
         """Returns commands (..., C) for shares (..., 3) of the greatest twist."""
@@ -191,7 +192,7 @@ class DynamicWindow:
 
     @cached_property
     def _scaled(self) -> NDArray[np.float32]:
-        return _actions(self.task, self._commands).astype(np.float32)
+        return actions_of(self.task, self._commands)
 
 
 POLICIES: dict[str, Callable[[Navigation, SimulatorModel | None], Policy]] = {

@@ -49,13 +49,17 @@ class Trained:
 
 def train(
     settings: TrainingSettings, seed: int, folder: Path, tell: Tell = lambda _: None,
-    resumed: bool = False,
+    resumed: bool = False, on_env: Callable[[TrainVecEnv], None] = lambda _: None,
 ) -> Trained:  # fmt: skip
-    """Trains a policy, resumed bit-identically from `folder`. Raises ConfigError if it can't."""
+    """Trains a policy, resumed bit-identically from `folder`. Raises ConfigError if it can't.
+
+    `on_env` gets the worlds before the first step, as to be called by their `on_step`.
+    """
     begin, path = time.perf_counter(), folder / CHECKPOINT
     content = checkpoints.read_checkpoint(path) if resumed else None
     about: dict[str, Any] = {"seed": seed, "settings": settings.model_dump(mode="json")}
     env, stop = make_train_env(settings), _stop_of(settings)
+    on_env(env)
     engine = LeanPpo if settings.lean else Sb3Training
     if content is None:
         rng = np.random.default_rng(seed)

@@ -2,7 +2,7 @@
 
 import itertools
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium
@@ -40,6 +40,7 @@ class TrainVecEnv(VecEnv):
         self._ended: list[int] = []
         self._actions: NDArray[Any] = np.zeros(0)
         self.stepping_s = 0.0  # wall time in the envs [s]
+        self.on_step: Callable[[], None] | None = None  # called after each step of all worlds
 
     def reset(self) -> Observation:
         """Begins an episode in every world, with the seeds given to `seed`."""
@@ -65,6 +66,8 @@ class TrainVecEnv(VecEnv):
         parts = [self._step_env(env, rows) for env, rows in zip(self.envs, self._rows, strict=True)]
         observation, reward, done = (_together(list(each)) for each in zip(*parts, strict=True))
         self.stepping_s += time.perf_counter() - begin
+        if self.on_step is not None:
+            self.on_step()
         return observation, reward.astype(np.float32), done, list(self._infos)
 
     def _step_env(

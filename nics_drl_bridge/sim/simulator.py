@@ -316,6 +316,10 @@ class FastSimulator:
         """(N, K, 7) the obstacles at their present poses, in the format of `scenes`."""
         return self._obstacles(np.arange(len(self.data.steps)))
 
+    def obstacles_of(self, n: int) -> Array:
+        """(K, 7) those of world n."""
+        return self._obstacles(np.array([n]))[0]
+
     def _obstacles(self, worlds: Indices) -> Array:
         bodies = self.data.bodies[worlds, : self.sampler.count]
         index = np.zeros(int(self._in_table.max()) + 1)

@@ -18,7 +18,7 @@ from nics_drl_bridge.commands.demo_run import (
 )
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.generator import builtin_model, generate, usual_lidar
+from nics_drl_bridge.generator import builtin_model, generate, lidar_of
 from nics_drl_bridge.policy.evaluation import ConfidenceInterval, Episode, Summary, rate
 from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.report.pictures import Point
@@ -81,7 +81,7 @@ def test_the_report_begins_with_success_in_three_worlds_and_folds_the_figures(
 ):
     robot = load_robot("differential")
     drive = record(robot, np.random.default_rng(0), 30.0)
-    model, identified = generate(drive, robot, usual_lidar(robot), ())
+    model, identified = generate(drive, robot, lidar_of(robot), ())
     arrivals = int(500 * share)
     rates = [rate(count, 500) for count in (arrivals, 500 - arrivals, 0)]
     length = ConfidenceInterval(3.0, 2.9, 3.1)

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 
 import gymnasium
@@ -8,7 +7,10 @@ import numpy as np
 import pytest
 from robots import direct_model, field
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.env.bridge_env import BridgeEnv
+from nics_drl_bridge.env.shot import gate_of
+from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -48,14 +50,48 @@ def test_every_robot_of_a_team_is_drawn():
         assert (np.abs(picture - colour) < 3).all(axis=-1).sum() > 100
 
 
-def test_a_window_is_drawn_at_each_step_without_a_warning():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        shown = env("human")
-        shown.reset(seed=0)
-        shown.step(np.zeros(3, np.float32))
-        assert shown.render() is None
-        shown.close()
+@pytest.mark.parametrize("method", ["reset", "step"])
+def test_render_mode_human_shows_each_reset_and_step_on_the_viewer(monkeypatch, method):
+    shown, closed = [], []
+
+    class Viewer:
+        def __init__(self, model, world, fps):
+            self.close = lambda: closed.append(fps)
+            self.draw = shown.append
+
+    monkeypatch.setattr(extensions, "load", lambda group, name: Viewer)
+    env_ = env("human", backend=SimBackend(direct_model(), field(count=2)))
+    env_.reset(seed=0)
+    if method == "step":
+        env_.step(np.array([1.0, 0.0, 0.0], np.float32))
+    assert [shot.step for shot in shown] == [0, 1][: 1 + (method == "step")]
+    env_.close()
+    assert closed == [10]
+
+
+def test_a_shot_tells_command_estimate_covariance_and_gate():
+    shown = env(None, estimator=True)
+    shown.reset(seed=0)
+    assert shown.shot().covariance is None
+    shown.step(np.array([1.0, 0.0, 0.0], np.float32))
+    shot = shown.shot()
+    assert shot.commands == pytest.approx(np.array([[2.0, 0.0, 0.0]]))
+    assert np.all(np.linalg.eigvalsh(shot.covariance[0]) > 0.0)
+    assert shot.estimates == pytest.approx(shot.poses, abs=0.05)
+    assert (shot.gate, shot.step) == (None, 1)
+
+
+@pytest.mark.parametrize(
+    ("info", "said"),
+    [
+        ({}, None),
+        ({"stopped_by": "", "shielded": False}, ""),
+        ({"stopped_by": "", "shielded": True}, "shield"),
+        ({"stopped_by": "scan age", "shielded": True}, "scan age"),
+    ],
+)
+def test_a_shot_tells_what_the_gate_did(info, said):
+    assert gate_of(info) == said
 
 
 def test_nothing_is_drawn_without_a_mode_and_nothing_before_a_reset():

@@ -1,0 +1,149 @@
+"""`nics watch`: a page that shows episodes, live topics, or a bag; or a video of them."""
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer import Argument, Option
+
+from nics_drl_bridge.commands.console import TopicOption, needs_ros, one_sentence, roles_of
+from nics_drl_bridge.errors import ConfigError
+
+DEFAULT_POLICY = "differential"
+
+
+def watch(
+    policy: Annotated[str | None, Argument(
+        help="A policy file, a shipped policy (differential, the default) or a baseline "
+        "(dynamic_window).")] = None,
+    model: Annotated[str | None, Option(
+        "--model", "--robot", help="A model's folder, or a shipped robot; else the policy's own.")
+    ] = None,
+    world: Annotated[list[str] | None, Option(
+        "--world", "--scene", help="A shipped world (circles) or a YAML file; several times: side "
+        "by side.")] = None,
+    seed: Annotated[int, Option(min=0, help="Of the first episode.")] = 1_000_000,
+    lidar: Annotated[str | None, Option(
+        help="A shipped lidar (rplidar_a2) or a YAML file, instead of the model's.")] = None,
+    randomisation: Annotated[str | None, Option(
+        help="Drawn in each episode: a shipped one (mild) or a YAML file.")] = None,
+    gate: Annotated[str | None, Option(
+        metavar="LIMITS", help="Drive through the gate and its shield, with these limits: shipped "
+        "ones (differential) or a YAML file.")] = None,
+    ros: Annotated[bool, Option("--ros", help="Show live topics instead.")] = False,
+    namespace: Annotated[str, Option(help="For --ros: of the robot's topics.")] = "",
+    bag: Annotated[Path | None, Option(help="Show a recorded drive instead.")] = None,
+    topic: TopicOption = None,
+    record: Annotated[Path | None, Option(
+        metavar="FILE", help="Write .mp4, .gif or .rrd (Rerun) instead of a page.")] = None,
+    episodes: Annotated[int, Option(min=1, help="For --record: how many.")] = 1,
+    port: Annotated[int | None, Option(
+        min=0, max=65535, help="Of the page; 0 takes any (default 8765).")] = None,
+    browser: Annotated[bool, Option(help="Open the page in a browser.")] = True,
+) -> None:  # fmt: skip
+    """Shows a policy driving, live topics or a bag, on a page served to this machine only."""
+    with one_sentence():
+        given = {"lidar": lidar, "randomisation": randomisation, "gate": gate}
+        _check(given, ros, bag, record, policy)
+        if bag is not None:
+            source: Any = _bag(bag, model, world, roles_of(topic or []))
+        elif ros:
+            source = _ros(model, world, namespace)
+        else:
+            source = _episodes(policy or DEFAULT_POLICY, model, world or ["circles"], seed, given)
+        with closing(source):
+            if record is not None:
+                _record(record, source, episodes)
+            else:
+                _serve(source, port, browser)
+
+
+def _check(
+    given: dict[str, str | None], ros: bool, bag: Path | None, record: Path | None,
+    policy: str | None,
+) -> None:  # fmt: skip
+    """Raises ConfigError for options that do not go together."""
+    if ros and bag is not None:
+        raise ConfigError("--ros shows live topics, --bag recorded ones; leave one of them out.")
+    named = [f"--{name}" for name, value in given.items() if value is not None]
+    named += [repr(policy)] if policy is not None else []
+    if named and (ros or bag is not None):
+        where = "--ros" if ros else "--bag"
+        raise ConfigError(f"{', '.join(named)}: {where} shows what others drive; leave it out.")
+    if ros and record is not None:
+        raise ConfigError("--record: live topics are recorded by nics bag record; show that bag.")
+    if record is not None:
+        from nics_drl_bridge.watch.record import check_file
+
+        check_file(record)
+
+
+def _episodes(
+    policy: str, name: str | None, worlds: list[str], seed: int, given: dict[str, str | None]
+) -> Any:
+    from nics_drl_bridge.commands import episodes as driving
+    from nics_drl_bridge.commands.conditions import Conditions
+    from nics_drl_bridge.generator import open_model
+    from nics_drl_bridge.sim.world_set import load_worlds
+    from nics_drl_bridge.watch.episode import EpisodeSource
+
+    under = Conditions(given["lidar"], given["randomisation"], given["gate"])
+    model = open_model(name or driving.robot_of(policy), under.lidar)
+
+    def make(policy: str, world: Any) -> Any:
+        options = {"estimator": True, "randomisation": under.ranges}
+        return driving.env_of(policy, model, world, "sim", under, **options)
+
+    return EpisodeSource(make, policy, [load_worlds(each) for each in worlds], seed)
+
+
+def _bag(bag: Path, name: str | None, worlds: list[str] | None, topics: dict[str, str]) -> Any:
+    from nics_drl_bridge.generator import open_model
+    from nics_drl_bridge.watch.bag import BagSource
+
+    model = open_model(name or DEFAULT_POLICY)
+    return BagSource(bag, model, topics, _only(worlds))
+
+
+def _ros(name: str | None, worlds: list[str] | None, namespace: str) -> Any:
+    from nics_drl_bridge.generator import open_model
+
+    with needs_ros("nics watch --ros"):
+        from nics_drl_bridge.nodes.watching import RosSource
+    return RosSource(open_model(name or DEFAULT_POLICY), _only(worlds), namespace)
+
+
+def _only(worlds: list[str] | None) -> Any:
+    """The world of a robot that others drive, if it is given."""
+    if worlds is None:
+        return None
+    if len(worlds) > 1:
+        raise ConfigError(f"--world {' '.join(worlds)}: a robot is in one; name that.")
+    from nics_drl_bridge.sim.world_set import load_worlds
+
+    return load_worlds(worlds[0])
+
+
+def _record(path: Path, source: Any, episodes: int) -> None:
+    from nics_drl_bridge.watch.record import write
+
+    def frames() -> Iterator[Any]:
+        yield source.frame()
+        while source.unfinished(episodes):
+            source.advance()
+            yield source.frame()
+
+    write(path, source.stage(), frames(), 1.0 / source.period_s)
+    typer.echo(f"wrote {path}")
+
+
+def _serve(source: Any, port: int | None, browser: bool) -> None:
+    from nics_drl_bridge.watch.server import PORT, PageServer
+    from nics_drl_bridge.watch.show import open_page, show
+
+    with closing(PageServer(PORT if port is None else port)) as server:
+        typer.echo(f"watch: {server.url} (Ctrl-C ends it)", err=True)
+        open_page(server.url, browser)
+        show(source, server)

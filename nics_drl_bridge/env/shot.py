@@ -1,0 +1,49 @@
+"""Shot: all that a picture of one world shows at one time."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.lidar.spec import LidarSpec
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One world with its M robots; what nobody knows is None."""
+
+    poses: Array  # (M, 3) x [m], y [m], heading [rad] in `map`; the truth where it is known
+    ranges: NDArray[np.float32]  # (M, B) [m], REP-117
+    bodies: Array  # (K, 7) obstacles, see `sim.scenes.Scene`
+    goals: Array  # (G, 2) [m]
+    member: int = 0  # of a world set
+    step: int = 0  # number of control periods since the episode began
+    estimates: Array | None = None  # (M, 3) poses that the robots believe in
+    covariance: Array | None = None  # (M, 3, 3) of the estimates [m, rad]
+    commands: Array | None = None  # (M, C) that the robots follow
+    gate: str | None = None  # rule of the gate that stopped the command, `shield`, or "" if none
+
+
+def goals_of(memory: Mapping[str, NDArray[Any]]) -> Array:
+    """The goals (G, 2) in the memory of a task, maybe none."""
+    return np.reshape(memory.get("goal", np.zeros((0, 2))), (-1, 2))
+
+
+def gate_of(info: Mapping[str, Any]) -> str | None:
+    """State of the gate by the `info` of a step, see `Shot.gate`; None without a gate."""
+    if "stopped_by" not in info:
+        return None
+    return str(info["stopped_by"]) or ("shield" if info["shielded"] else "")
+
+
+def hits_of(lidar: LidarSpec, pose: Array, ranges: NDArray[np.float32]) -> Array:
+    """Points (n, 2) that a scan (B,) from a robot's pose (3,) hit, in `map` [m]."""
+    mount, there = geometry.compose(pose, lidar.mount), np.isfinite(ranges)
+    angles = mount[2] + lidar.angles[there]
+    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return np.asarray(mount[:2] + ranges[there, None] * directions)

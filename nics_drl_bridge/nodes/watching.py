@@ -1,0 +1,139 @@
+"""A live robot for the page of `nics watch`: its topics, listened to; a goal is all it sends."""
+
+import threading
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+
+from nics_drl_bridge.env.shot import Shot
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.interface import Array
+from nics_drl_bridge.lidar.shapes import BODY
+from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
+from nics_drl_bridge.nodes.runner import open_context
+from nics_drl_bridge.sim.world import World
+from nics_drl_bridge.sim.world_set import AnyWorld
+from nics_drl_bridge.watch.frame import Frame, Stage, Trail, WorldFrame
+from nics_drl_bridge.watch.server import Request
+
+NAME, GATE = "nics_watch", ": gate"
+PERIOD_S, SPIN_S = 1.0 / 30.0, 0.1
+SIDE_M = 10.0  # of the field that is shown where no world is given
+
+
+class RosSource:
+    """Shows the topics of a robot, with the estimate of its own middleware.
+
+    A goal that is set on the page goes out on `goal_pose`; nothing else is sent. Raises
+    ConfigError, BackendError.
+    """
+
+    def __init__(
+        self, model: SimulatorModel, world: AnyWorld | None, namespace: str = "",
+        domain_id: int | None = None,
+    ) -> None:  # fmt: skip
+        half = SIDE_M / 2.0
+        bounds = (-half, -half, half, half)
+        self._world = world or World(name="map", bounds=bounds, goal_distance=(0.0, 1.0))
+        self._model, self.period_s, self._title = model, PERIOD_S, namespace or "live topics"
+        self._trail, self._goal = Trail(), np.zeros((0, 2))
+        self._gate: str | None = None
+        self._truth: Array | None = None
+        self._new_lidar: LidarSpec | None = None
+        self._drawn_ns = 0
+        self._context = open_context([], domain_id)
+        self._node = Node(NAME, context=self._context, namespace=namespace or None)
+        declare_sensors(self._node)
+        self._topics = RobotTopics(self._node, model, on_lidar=self._take_lidar)
+        self._goals = self._node.create_publisher(PoseStamped, "goal_pose", qos.COMMAND)
+        for kind, topic, take, quality in (
+            (PoseStamped, "goal_pose", self._take_goal, qos.COMMAND),
+            (Odometry, "ground_truth", self._take_truth, qos.SENSOR),
+            (DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.DIAGNOSTICS),
+        ):
+            self._node.create_subscription(kind, topic, take, quality)
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+
+    def _spin(self) -> None:
+        executor = SingleThreadedExecutor(context=self._context)
+        executor.add_node(self._node)
+        with suppress(ExternalShutdownException):
+            while self._context.ok():
+                executor.spin_once(timeout_sec=SPIN_S)
+        executor.shutdown(timeout_sec=1.0)
+
+    def _take_lidar(self, lidar: LidarSpec) -> None:
+        self._new_lidar = lidar
+
+    def _take_goal(self, message: PoseStamped) -> None:
+        position = message.pose.position
+        self._goal = np.array([[position.x, position.y]])
+
+    def _take_truth(self, message: Odometry) -> None:
+        self._truth = conversions.odometry_from_ros(message)[0]
+
+    def _take_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name.endswith(GATE):
+                fine = status.level in (DiagnosticStatus.OK, 0)
+                self._gate = "" if fine else status.message
+
+    def stage(self) -> Stage:
+        """See `show.Source`."""
+        return Stage(self._title, self._model, (self._world,), frozenset({"goal"}))
+
+    def frame(self) -> Frame:
+        """See `show.Source`."""
+        with self._topics.lock:
+            middleware, view = self._topics.middleware, self._topics.view()
+            command = middleware.commanded
+            covariance = middleware.estimator.covariance[None, :3, :3].copy()
+            heard = sorted(middleware.cache.newest)
+        pose = view.pose if self._truth is None else self._truth
+        shot = Shot(
+            pose[None], view.ranges[None], np.zeros((0, BODY)), self._goal,
+            estimates=view.pose[None], covariance=covariance, commands=command[None],
+            gate=self._gate,
+        )  # fmt: skip
+        state = "" if heard else "waiting for topics"
+        world = WorldFrame(shot, self._title, 0, self._trail.ways, state)
+        return Frame(view.stamp_s, (world,), f"hears {', '.join(heard)}" if heard else "")
+
+    def advance(self) -> bool:
+        """Follows the robot's way where there is news; True after scans of another lidar."""
+        with self._topics.lock:
+            lidar, self._new_lidar = self._new_lidar, None
+            newest = self._topics.newest_ns
+            pose = self._topics.view().pose if newest else None
+        if pose is not None and newest != self._drawn_ns:
+            self._trail.add(pose[None], 0 if newest < self._drawn_ns else 1)
+            self._drawn_ns = newest
+        if lidar is not None:
+            self._model = replace(self._model, lidar=lidar)
+        return lidar is not None
+
+    def take(self, request: Request) -> bool:
+        """Sends a goal; ignores all else."""
+        if request.kind == "goal":
+            message = PoseStamped()
+            message.header.stamp = self._node.get_clock().now().to_msg()
+            message.header.frame_id = "map"
+            message.pose.position.x, message.pose.position.y = request.x, request.y
+            message.pose.orientation.w = 1.0
+            self._goals.publish(message)
+        return False
+
+    def close(self) -> None:
+        """Leaves the domain."""
+        self._context.try_shutdown()
+        self._thread.join()
+        self._node.destroy_node()

@@ -1,0 +1,118 @@
+"""A recorded drive, with time to scrub: what the robot's middleware made of a bag."""
+
+from bisect import bisect_right
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nics_drl_bridge.env.shot import Shot, hits_of
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.interface import S_PER_NS, Array
+from nics_drl_bridge.lidar.shapes import BODY
+from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, POSE, SCAN
+from nics_drl_bridge.middleware.playback import Playback, in_order, played
+from nics_drl_bridge.recording.messages import commanded
+from nics_drl_bridge.sim.world import World
+from nics_drl_bridge.sim.world_set import AnyWorld
+from nics_drl_bridge.watch.frame import Frame, Stage, Trail, WorldFrame
+from nics_drl_bridge.watch.server import Request
+
+CAN = frozenset({"pause", "speed", "step", "seek", "restart"})
+MARGIN_M = 1.0  # around what was driven and seen, where no world is given
+WITHIN = 98.0  # percentage of the hits of a scan that belong to the place that is shown
+
+
+class BagSource:
+    """Plays a bag at the pace of its stamps, a frame for each scan, or odometry without scans.
+
+    `topics` are by role, see `playback.chosen`. Without a world the place is what was seen. Raises
+    RecordingError if the bag can't be used.
+    """
+
+    def __init__(
+        self, path: str | Path, model: SimulatorModel, topics: Mapping[str, str],
+        world: AnyWorld | None = None,
+    ) -> None:  # fmt: skip
+        self._times, self._shots, lidar = _read(path, model, topics)
+        self._model = replace(model, lidar=lidar)
+        self._path, self._world = Path(path), world or place_of(self._model, self._shots)
+        self.period_s = float(np.median(np.diff(self._times))) if len(self._times) > 1 else 0.1
+        self._now = 0
+
+    def stage(self) -> Stage:
+        """See `show.Source`."""
+        span = float(self._times[0]), float(self._times[-1])
+        return Stage(self._path.name, self._model, (self._world,), CAN, span_s=span)
+
+    def frame(self) -> Frame:
+        """See `show.Source`."""
+        poses = np.array([shot.poses for shot in self._shots[: self._now + 1]])
+        step = -(-len(poses) // Trail.MOST)
+        ways = tuple(np.concatenate([poses[::step], poses[-1:]])[:, :, :2].transpose(1, 0, 2))
+        state = "the end" if self._now == len(self._shots) - 1 else ""
+        world = WorldFrame(self._shots[self._now], self._path.name, 0, ways, state)
+        return Frame(float(self._times[self._now]), (world,))
+
+    def advance(self) -> bool:
+        """Goes on to the next frame; at the end it stays."""
+        self._now = min(self._now + 1, len(self._shots) - 1)
+        return False
+
+    def take(self, request: Request) -> bool:
+        """See `show.Source`."""
+        seconds = request.value if request.kind == "seek" else 0.0
+        if request.kind in ("seek", "restart"):
+            self._now = max(0, bisect_right(self._times, seconds) - 1)
+        return False
+
+    def unfinished(self, _: int) -> bool:
+        """True until the end has been shown."""
+        return self._now < len(self._shots) - 1
+
+    def close(self) -> None:
+        """Does nothing: the bag has been read."""
+
+
+def _read(
+    path: str | Path, model: SimulatorModel, topics: Mapping[str, str]
+) -> tuple[list[float], list[Shot], Any]:
+    """Times from the first on [s], shots, and the lidar of the bag."""
+    messages = played(path, topics)
+    playback, stamps, shots = Playback(model, POSE in messages, any_lidar=True), [], list[Shot]()
+    middleware, every = playback.middleware, SCAN if SCAN in messages else ODOM
+    command: Array | None = None
+    for role, message in in_order(messages):
+        used = playback.take(role, message)
+        if role == CMD_VEL:
+            command = commanded(message.content, model.robot)
+        if role != every or not used or ODOM not in middleware.cache.newest:
+            continue
+        stamps.append(middleware.newest_ns or 0)
+        view = middleware.view(stamps[-1])
+        shots.append(Shot(
+            view.pose[None], view.ranges[None], np.zeros((0, BODY)), np.zeros((0, 2)),
+            step=len(shots), estimates=view.pose[None],
+            covariance=middleware.estimator.covariance[None, :3, :3].copy(),
+            commands=None if command is None else command[None],
+        ))  # fmt: skip
+    if not shots:
+        reason = "none of its odometry and scans could be used"
+        raise RecordingError(f"{path}: {reason}; see nics bag info.")
+    return [(stamp - stamps[0]) * S_PER_NS for stamp in stamps], shots, playback.lidar
+
+
+def place_of(model: SimulatorModel, shots: list[Shot]) -> World:
+    """A field without walls that holds what was driven, and most of what was seen."""
+    poses = np.concatenate([shot.poses[:, :2] for shot in shots])
+    some = shots[:: max(1, len(shots) // 50)]
+    seen = [hits_of(model.lidar, shot.poses[0], shot.ranges[0]) for shot in some]
+    points = np.concatenate([poses, *seen])
+    ends = np.percentile(points, [100.0 - WITHIN, WITHIN], axis=0)
+    low = np.minimum(ends[0], poses.min(axis=0)) - MARGIN_M
+    high = np.maximum(ends[1], poses.max(axis=0)) + MARGIN_M
+    bounds = (*low.tolist(), *high.tolist())
+    return World(name="bag", bounds=bounds, goal_distance=(0.0, 1.0))

@@ -1,0 +1,260 @@
+"""Episodes in process: a policy, or a person at the keyboard, drives one world or several."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.config import share_folder
+from nics_drl_bridge.env.bridge_env import BridgeEnv
+from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE, X, Y
+from nics_drl_bridge.lidar.shapes import Circle, Rectangle, Shape
+from nics_drl_bridge.policy.policies import POLICIES, actions_of, shipped_policies
+from nics_drl_bridge.policy.stateful import Policy, begin
+from nics_drl_bridge.seeds import checked_seeds
+from nics_drl_bridge.sim.scenes import scaled
+from nics_drl_bridge.sim.world import Obstacles, World
+from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
+from nics_drl_bridge.watch.frame import Frame, Stage, Trail, WorldFrame
+from nics_drl_bridge.watch.server import Request
+
+Env = gymnasium.Env[Any, Any]
+Make = Callable[[str, AnyWorld], tuple[Env, Policy]]  # for a policy and a world, see `env_of`
+HELD_S = 0.5  # without a request of the keyboard for so long, the robot stops [s]
+LINGER_S = 1.0  # of simulated time between the end of an episode and the next one [s]
+CAN = frozenset({
+    "goal", "obstacle", "clear", "policy", "world", "seed", "restart", "pause", "speed", "step",
+})  # fmt: skip
+
+
+class Lane:
+    """One world in which episodes are driven, one after the other."""
+
+    def __init__(self, make: Make, policy: str, world: AnyWorld, seed: int) -> None:
+        self._make, self._policy, self.trail = make, policy, Trail()
+        self.seed, self._native = seed, world
+        self._open(policy, world)
+        self.begin()
+
+    def _open(self, policy: str, world: AnyWorld) -> None:
+        self._env, self._driver = self._make(policy, world)
+        self._policy, self.world = policy, world
+        self.env: BridgeEnv = self._env.unwrapped  # type: ignore[assignment]
+
+    @property
+    def task(self) -> Navigation:
+        """The task of the policy."""
+        return self.env.task  # type: ignore[return-value]
+
+    @property
+    def over(self) -> bool:
+        """True once the end of the episode has been shown for a while."""
+        return self._over_s >= LINGER_S
+
+    def begin(self, **options: Any) -> None:
+        """Begins the episode of the seed, with options of `reset`."""
+        self._seen, _ = self._env.reset(seed=self.seed, options=options)
+        begin(self._driver)
+        self.state, self._over_s = "", 0.0
+        if not options:  # otherwise the way so far is still that of this episode
+            self.time_s, self.trail = 0.0, Trail()
+        self.trail.add(self.env.shot().poses, 1)
+
+    def advance(self, command: NDArray[np.float64] | None) -> bool:
+        """Advances one period under a command (C,), or that of the policy; True in a new env."""
+        if self.over:
+            return self.anew(self.seed + 1)
+        if self.state:
+            self._over_s += self.env.model.control_period
+            return False
+        action = self._driver.act(self._seen) if command is None else self._action(command)
+        self._seen, _, terminated, truncated, info = self._env.step(action)
+        self.time_s += self.env.model.control_period
+        self.trail.add(self.env.shot().poses, 1)
+        if terminated or truncated:
+            touched = "collision" if np.any(info["collision"]) else "time-out"
+            self.state = "success" if np.all(info["is_success"]) else touched
+        return False
+
+    def _action(self, command: NDArray[np.float64]) -> Any:
+        if self.task.actions == "discrete":
+            apart = np.abs(self.task.discrete_commands - command).sum(axis=-1)
+            return int(apart.argmin())
+        return actions_of(self.task, command)
+
+    def anew(self, seed: int) -> bool:
+        """Begins the episode of a seed in the world as it was at first; True in a new env."""
+        self.seed = int(checked_seeds([seed])[0])
+        if changed := self.world is not self._native:
+            self.close()
+            self._open(self._policy, self._native)
+        self.begin()
+        return changed
+
+    def enter(self, world: AnyWorld) -> None:
+        """Begins the episode of the seed in another world."""
+        self.close()
+        self._open(self._policy, world)
+        self._native = world
+        self.begin()
+
+    def follow(self, policy: str) -> None:
+        """Goes on from here with another policy."""
+        self._rebuild(policy)
+
+    def aim(self, x: float, y: float) -> None:
+        """Moves the goal [m]; after a success it goes on from here."""
+        self.env.memory["goal"][...] = x, y
+        if self.state == "success":
+            self._rebuild(self._policy)
+
+    def add(self, shape: Shape, x: float, y: float) -> None:
+        """Adds an obstacle [m]. Raises ConfigError where there is a robot, or no world."""
+        reach = shape.radius + self.env.model.robot.footprint_radius
+        apart = np.linalg.norm(self.env.shot().poses[:, :2] - (x, y), axis=1)
+        if apart.min() <= reach:
+            raise ConfigError(f"an obstacle at ({x:.2f} m, {y:.2f} m) touches the robot; move it.")
+        self._rebuild(self._policy, Obstacles(shapes=(shape,), at=((x, y, 0.0),)))
+
+    def clear(self) -> None:
+        """Takes all obstacles out."""
+        self._rebuild(self._policy, emptied=True)
+
+    def _rebuild(self, policy: str, *more: Obstacles, emptied: bool = False) -> None:
+        """Goes on from here in a new env: with another policy, or other obstacles."""
+        shot, kept = self.env.shot(), dict(vars(self))
+        world = standing(self.env, *more, emptied=emptied)
+        try:
+            self._open(policy, world)
+            self.begin(start=shot.poses[0], goal=shot.goals[0])
+        except BaseException:
+            vars(self).update(kept)
+            raise
+        kept["_env"].close()
+
+    def frame(self, place: int) -> WorldFrame:
+        """The world now; `place` is that of its first member."""
+        shot = self.env.shot()
+        name = f"{self.world.name}, episode {self.seed}"
+        return WorldFrame(shot, name, place + shot.member, self.trail.ways, self.state)
+
+    def close(self) -> None:
+        """Closes the env."""
+        self._env.close()
+
+
+def standing(env: BridgeEnv, *more: Obstacles, emptied: bool = False) -> World:
+    """The world of an env with its obstacles where they are now, or none, and more of them."""
+    shot = env.shot()
+    world, shapes, groups = env.world.members[shot.member], env.world.shapes, list(more)
+    motions = [group.motion for group in world.obstacles for _ in range(group.counts[1])]
+    for body, motion in zip(shot.bodies, motions, strict=False):
+        if body[RADIUS] > 0.0 and not emptied:
+            shape = shapes[int(body[SHAPE]) % len(shapes)]
+            shape = scaled(shape, round(float(body[RADIUS]) / shape.radius, 6))
+            pose = float(body[X]), float(body[Y]), float(body[HEADING])
+            groups.append(Obstacles(shapes=(shape,), at=(pose,), motion=motion))
+    return world.model_copy(update={"obstacles": tuple(groups)})
+
+
+class EpisodeSource:
+    """Drives episodes in one world or several at once. Raises BridgeError."""
+
+    def __init__(self, make: Make, policy: str, worlds: Sequence[AnyWorld], seed: int) -> None:
+        self._first = seed
+        self.lanes = [Lane(make, policy, world, seed) for world in worlds]
+        self.model = self.lanes[0].env.model
+        self.period_s, self._policy = self.model.control_period, policy
+        robot = self.model.robot
+        self._drives = robot.takes_cmd_vel
+        self._command, self._by_hand, self._asked_s = 0.0 * robot.command_low, False, 0.0
+
+    def stage(self) -> Stage:
+        """See `show.Source`."""
+        robot, first = self.model.robot.name, self.lanes[0].world.name
+        fitting = [name for name in shipped_policies() if name == robot]
+        policies = dict.fromkeys([self._policy, *fitting, *POLICIES])
+        worlds = dict.fromkeys([first, *shipped_worlds()])
+        return Stage(
+            f"{self._policy} in {', '.join(lane.world.name for lane in self.lanes)}", self.model,
+            tuple(lane.env.world for lane in self.lanes), CAN | ({"drive"} if self._drives else ()),
+            {"policy": list(policies), "world": list(worlds)},
+            {"policy": self._policy, "world": first},
+        )  # fmt: skip
+
+    def frame(self) -> Frame:
+        """See `show.Source`."""
+        sizes = [len(lane.env.world.members) for lane in self.lanes]
+        worlds = [lane.frame(sum(sizes[:n])) for n, lane in enumerate(self.lanes)]
+        return Frame(self.lanes[0].time_s, tuple(worlds))
+
+    def advance(self) -> bool:
+        """Advances all worlds by one control period; see `show.Source`."""
+        held = time.monotonic() - self._asked_s < HELD_S
+        command = self._command if held else 0.0 * self._command
+        given = command if self._by_hand else None
+        changed = [lane.advance(given) for lane in self.lanes]
+        return any(changed)
+
+    def take(self, request: Request) -> bool:
+        """See `show.Source`."""
+        lane = self.lanes[min(request.world, len(self.lanes) - 1)]
+        if request.kind == "goal":
+            lane.aim(request.x, request.y)
+        elif request.kind == "drive":
+            self._drive(request)
+        elif request.kind == "policy":
+            for each in self.lanes:
+                each.follow(request.name)
+            self._policy = request.name
+        elif request.kind in ("seed", "restart"):
+            for each in self.lanes:
+                each.anew(each.seed if request.kind == "restart" else int(request.value))
+        else:
+            return self._furnish(lane, request)
+        return request.kind in ("policy", "seed", "restart")
+
+    def _furnish(self, lane: Lane, request: Request) -> bool:
+        if request.kind == "obstacle":
+            side = 2.0 * request.size
+            round_ = request.shape == "circle"
+            shape = Circle(radius=request.size) if round_ else Rectangle(size=(side, side))
+            lane.add(shape, request.x, request.y)
+        elif request.kind == "clear":
+            lane.clear()
+        elif request.kind == "world":
+            lane.enter(load_worlds(request.name))
+        else:
+            return False
+        return True
+
+    def unfinished(self, episodes: int) -> bool:
+        """True until so many episodes have been driven and shown to their ends in every world."""
+        last = self._first + episodes
+        return any(lane.seed < last - 1 or not lane.over for lane in self.lanes)
+
+    def _drive(self, request: Request) -> None:
+        """Takes shares of the greatest speed forward, to the left, and turning left."""
+        robot = self.model.robot
+        if not self._drives:
+            raise ConfigError(f"robot {robot.name!r} takes no cmd_vel: no keyboard drives it.")
+        shares = np.clip(np.array(request.twist)[list(robot.cmd_vel_places)], -1.0, 1.0)
+        ends = np.where(shares < 0.0, robot.command_low, robot.command_high)
+        self._command = np.clip(np.abs(shares) * ends, robot.command_low, robot.command_high)
+        self._by_hand, self._asked_s = request.on, time.monotonic()
+
+    def close(self) -> None:
+        """Closes all envs."""
+        for lane in self.lanes:
+            lane.close()
+
+
+def shipped_worlds() -> list[str]:
+    """Names of the worlds that come with the package."""
+    folder = share_folder() / "config" / "worlds"
+    return sorted(file.stem for file in folder.glob("*.yaml"))

@@ -1,0 +1,149 @@
+"""All that the page shows: a stage once, and a frame for each time, as plain data for JSON."""
+
+import base64
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nics_drl_bridge.env.shot import Shot
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE, X, Y
+from nics_drl_bridge.lidar.maps import GridMap
+from nics_drl_bridge.lidar.shapes import Shape
+from nics_drl_bridge.sim.world import World
+from nics_drl_bridge.sim.world_set import AnyWorld
+
+MM = 1000.0  # lengths and angles go over the wire in thousandths, as whole numbers
+NO_RETURN = -1
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """All that stays the same from frame to frame."""
+
+    title: str
+    model: SimulatorModel
+    worlds: tuple[AnyWorld, ...]  # whose members, one after the other, are the places of the frames
+    can: frozenset[str] = frozenset()  # requests that the source takes, see `server.Request`
+    choices: Mapping[str, Sequence[str]] = field(default_factory=dict)  # of policies and worlds
+    chosen: Mapping[str, str] = field(default_factory=dict)
+    span_s: tuple[float, float] | None = None  # of a bag [s]
+
+    def plain(self) -> dict[str, Any]:
+        """The stage as plain data."""
+        robot, lidar = self.model.robot, self.model.lidar
+        commands = [
+            {"name": one.name, "unit": one.unit, "min": one.min, "max": one.max}
+            for one in robot.command
+        ]
+        places = [_place(one, each.shapes) for each in self.worlds for one in each.members]
+        return {
+            "kind": "stage", "title": self.title, "can": sorted(self.can), "commands": commands,
+            "footprint": robot.footprint, "radius": robot.footprint_radius,
+            "lidar": {
+                "mount": lidar.mount, "first": lidar.angle_min, "step": lidar.angle_increment,
+                "far": lidar.range_max,
+            },
+            "places": places, "span": self.span_s, "chosen": dict(self.chosen),
+            "choices": {name: list(some) for name, some in self.choices.items()},
+        }  # fmt: skip
+
+
+def _place(world: World, shapes: Sequence[Shape]) -> dict[str, Any]:
+    outlines = [np.round(shape.outline / shape.radius, 4).tolist() for shape in shapes]
+    return {
+        "name": world.name, "extent": world.extent, "walls": world.all_walls().tolist(),
+        "map": None if world.grid is None else _map(world.grid), "shapes": outlines,
+    }  # fmt: skip
+
+
+def _map(grid: GridMap) -> dict[str, Any]:
+    """Cells of a map, a byte each: 0 free, 1 unknown, 2 blocked."""
+    cells = np.where(grid.free, 0, np.where(grid.blocked, 2, 1)).astype(np.uint8)
+    return {
+        "rows": cells.shape[0], "columns": cells.shape[1], "resolution": grid.resolution,
+        "origin": grid.origin, "cells": base64.b64encode(cells.tobytes()).decode(),
+    }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class WorldFrame:
+    """One world at one time."""
+
+    shot: Shot
+    name: str = ""
+    place: int = 0  # in the `worlds` of the stage, member by member
+    trails: tuple[Array, ...] = ()  # (T, 2) way of each robot in this episode [m]
+    state: str = ""  # how the episode stands, in a word or two
+
+    def plain(self) -> dict[str, Any]:
+        """The world as plain data."""
+        shot = self.shot
+        there = shot.bodies[shot.bodies[:, RADIUS] > 0.0]
+        bodies = there[:, [X, Y, HEADING, RADIUS]]
+        kinds = there[:, SHAPE].astype(int).tolist()
+        ranges = np.where(np.isfinite(shot.ranges), shot.ranges, NO_RETURN / MM)
+        return {
+            "name": self.name, "place": self.place, "state": self.state, "gate": shot.gate,
+            "poses": thousandths(shot.poses), "ranges": thousandths(ranges),
+            "bodies": thousandths(bodies), "kinds": kinds, "goals": thousandths(shot.goals),
+            "trails": [thousandths(trail) for trail in self.trails],
+            "estimates": None if shot.estimates is None else thousandths(shot.estimates),
+            "ellipses": None if shot.covariance is None else [_ellipse(c) for c in shot.covariance],
+            "commands": None if shot.commands is None else np.round(shot.commands, 3).tolist(),
+        }  # fmt: skip
+
+
+def _ellipse(covariance: Array) -> list[float]:
+    """Half axes [m] and turn [rad] of the ellipse that holds the position with 95 %."""
+    values, vectors = np.linalg.eigh(covariance[:2, :2])
+    scale = -2.0 * math.log(0.05)  # quantile of chi squared with two degrees of freedom
+    small, large = np.sqrt(np.maximum(values, 0.0) * scale).tolist()
+    return [round(large, 4), round(small, 4), round(math.atan2(vectors[1, 1], vectors[0, 1]), 4)]
+
+
+def thousandths(values: ArrayLike) -> Any:
+    """Numbers as whole thousandths in lists; what is not finite becomes 0."""
+    scaled = np.nan_to_num(np.asarray(values, np.float64) * MM, posinf=0.0, neginf=0.0)
+    return np.rint(scaled).astype(np.int64).tolist()
+
+
+@dataclass(frozen=True)
+class Frame:
+    """All worlds at one time."""
+
+    time_s: float
+    worlds: tuple[WorldFrame, ...]
+    note: str = ""  # a line about all of them, as how far a training is
+
+    def plain(self) -> dict[str, Any]:
+        """The frame as plain data."""
+        worlds = [world.plain() for world in self.worlds]
+        return {"kind": "frame", "time": self.time_s, "note": self.note, "worlds": worlds}
+
+
+class Trail:
+    """The way of M robots in an episode, at most `MOST` points of each."""
+
+    MOST = 600
+
+    def __init__(self) -> None:
+        self._points: list[Array] = []
+
+    def add(self, poses: Array, step: int) -> None:
+        """Adds where the robots are, (M, 3), after a step of the episode; 0 begins anew."""
+        if step == 0:
+            self._points = []
+        self._points.append(poses[:, :2].copy())
+        if len(self._points) > self.MOST:
+            del self._points[::2]  # every other point: the whole way stays visible
+
+    @property
+    def ways(self) -> tuple[Array, ...]:
+        """(T, 2) the way of each robot."""
+        return tuple(np.array(self._points).transpose(1, 0, 2)) if self._points else ()

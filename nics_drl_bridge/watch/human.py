@@ -1,0 +1,38 @@
+"""The page of one env, for `render_mode="human"`."""
+
+from nics_drl_bridge.env.shot import Shot
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.sim.world_set import AnyWorld
+from nics_drl_bridge.watch.frame import Frame, Stage, Trail, WorldFrame
+from nics_drl_bridge.watch.server import PageServer
+from nics_drl_bridge.watch.show import PACE, Pace, open_page
+
+
+class HumanView:
+    """Shows each shot on a page, which may pause the program that steps the env, or pace it.
+
+    Raises ConfigError if the library of the page is missing.
+    """
+
+    def __init__(self, model: SimulatorModel, world: AnyWorld, fps: int) -> None:
+        self._server, self._pace, self._period_s = PageServer(port=0), Pace(), 1.0 / fps
+        self._trail, self._frames = Trail(), 0
+        self._server.set_stage(Stage(world.name, model, (world,), PACE))
+        open_page(self._server.url)
+
+    def draw(self, shot: Shot) -> None:
+        """Shows a shot, and returns when the next one is due."""
+        self._trail.add(shot.poses, shot.step)
+        self._frames += 1
+        worlds = (WorldFrame(shot, place=shot.member, trails=self._trail.ways),)
+        frame = Frame(self._frames * self._period_s, worlds)
+
+        def show(_: object = None) -> None:
+            self._server.publish(frame, **self._pace.plain())
+
+        show()
+        self._pace.wait(self._server, self._period_s, show)
+
+    def close(self) -> None:
+        """Closes the page."""
+        self._server.close()

@@ -1,0 +1,183 @@
+"""Server of the page on this machine alone: frames to the browsers, requests from them."""
+
+import json
+import queue
+import threading
+from contextlib import suppress
+from importlib.resources import files
+from typing import Any, Literal
+
+from pydantic import Field, ValidationError
+
+from nics_drl_bridge.config import Schema
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.extensions import missing
+from nics_drl_bridge.watch.frame import Frame, Stage
+
+HOST, PORT = "127.0.0.1", 8765
+MOST_REQUESTS, MOST_BYTES = 256, 4096
+POLICY = "; ".join([  # nothing comes from elsewhere, and nothing goes there
+    "default-src 'none'", "script-src 'unsafe-inline'", "style-src 'unsafe-inline'",
+    "img-src data:", "connect-src 'self' ws://{host}", "base-uri 'none'", "form-action 'none'",
+    "frame-ancestors 'none'",
+])  # fmt: skip
+
+
+class Request(Schema):
+    """What a page asks for."""
+
+    kind: Literal[
+        "goal", "obstacle", "clear", "drive", "policy", "world", "seed", "restart", "seek",
+        "pause", "speed", "step",
+    ]  # fmt: skip
+    world: int = Field(default=0, ge=0, le=10_000)  # index of the frame's world that is meant
+    x: float = Field(default=0.0, ge=-1e8, le=1e8)  # place of a goal or an obstacle [m]
+    y: float = Field(default=0.0, ge=-1e8, le=1e8)
+    size: float = Field(default=0.2, ge=0.01, le=10.0)  # radius, or half side of a box [m]
+    shape: Literal["circle", "box"] = "circle"
+    name: str = Field(default="", max_length=500)  # of a policy or a world
+    value: float = 0.0  # speed, seed or time [s]
+    on: bool = True  # of a pause, or of driving by hand
+    twist: tuple[float, float, float] = (0.0, 0.0, 0.0)  # shares forward, left, to the left
+
+
+class PageServer:
+    """Serves the page in threads of its own; frames go to whoever keeps up.
+
+    `url` tells where. Port 0 takes any free one. Raises ConfigError if the port or the library is
+    missing.
+    """
+
+    def __init__(self, port: int = PORT) -> None:
+        try:
+            from websockets.sync.server import serve
+        except ImportError as error:
+            raise ConfigError(f"the page {missing(error.name or 'websockets')}") from None
+        self._requests: queue.Queue[Request] = queue.Queue(MOST_REQUESTS)
+        self._news = threading.Condition()
+        self._texts, self._numbers = ["", "", ""], [0, 0, 0]  # newest stage, frame and notice
+        self._pages: set[Any] = set()
+        self.closed = False
+        try:
+            self._server = serve(
+                self._talk, HOST, port, process_request=self._answer, compression=None,
+                max_size=MOST_BYTES, origins=None,
+            )  # fmt: skip
+        except OSError as error:
+            reason = f"port {port} of {HOST} can't be served ({error.strerror})"
+            raise ConfigError(f"{reason}; take another with --port, 0 for any.") from None
+        address = f"{HOST}:{self._server.socket.getsockname()[1]}"
+        self.url = f"http://{address}/"
+        self._hosts = {address, address.replace(HOST, "localhost")}
+        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        self._thread.start()
+
+    @property
+    def watched(self) -> bool:
+        """True while a page is open."""
+        return bool(self._pages)
+
+    def set_stage(self, stage: Stage) -> None:
+        """Shows another stage."""
+        self._set(0, json.dumps(stage.plain(), separators=(",", ":")))
+
+    def publish(self, frame: Frame, **about: Any) -> None:
+        """Shows a frame, and further facts beside it."""
+        self._set(1, json.dumps(frame.plain() | about, separators=(",", ":")))
+
+    def tell(self, sentence: str) -> None:
+        """Shows a sentence for a while."""
+        self._set(2, json.dumps({"kind": "notice", "text": sentence}))
+
+    def _set(self, part: int, text: str) -> None:
+        with self._news:
+            self._texts[part] = text
+            self._numbers[part] += 1
+            self._news.notify_all()
+
+    def request(self, seconds: float) -> Request | None:
+        """The next request of a page, awaited for at most so long [s]."""
+        try:
+            return self._requests.get(seconds > 0.0, max(seconds, 0.0))
+        except queue.Empty:
+            return None
+
+    def _answer(self, connection: Any, request: Any) -> Any:
+        """The page; None lets a page of ours, or a program, open its socket."""
+        from websockets.datastructures import Headers
+        from websockets.http11 import Response
+
+        host = request.headers.get("Host", "")
+        if host not in self._hosts:  # a foreign name that was made to point here
+            return connection.respond(403, "This page is served to this machine only.\n")
+        if request.path == "/socket":
+            origin = request.headers.get("Origin")  # programs send none
+            if origin is None or origin.removeprefix("http://") in self._hosts:
+                return None
+            return connection.respond(403, "This socket is open to its own page only.\n")
+        if request.path != "/":
+            return connection.respond(404, "There is the page / only.\n")
+        body = files("nics_drl_bridge.watch").joinpath("page.html").read_bytes()
+        about = {
+            "Content-Type": "text/html; charset=utf-8", "Content-Length": str(len(body)),
+            "Content-Security-Policy": POLICY.format(host=host), "Cache-Control": "no-store",
+            "X-Content-Type-Options": "nosniff", "Connection": "close",
+        }  # fmt: skip
+        return Response(200, "OK", Headers(about), body)
+
+    def _talk(self, page: Any) -> None:
+        """Serves one page: a thread of its own sends, this one receives."""
+        from websockets.exceptions import ConnectionClosed
+
+        with self._news:
+            self._pages.add(page)
+        sender = threading.Thread(target=self._send, args=(page,), daemon=True)
+        sender.start()
+        try:
+            for text in page:
+                self._take(text)
+        except ConnectionClosed:
+            pass
+        finally:
+            with self._news:
+                self._pages.discard(page)
+                self._news.notify_all()
+            sender.join()
+
+    def _take(self, text: str | bytes) -> None:
+        try:
+            with suppress(queue.Full):  # nobody listens to what pages ask
+                self._requests.put_nowait(Request.model_validate_json(text))
+        except ValidationError as error:
+            first = error.errors()[0]
+            place = ".".join(map(str, first["loc"])) or "JSON"
+            self.tell(f"a request of the page is not understood: {place}: {first['msg']}.")
+
+    def _send(self, page: Any) -> None:
+        from websockets.exceptions import ConnectionClosed
+
+        seen = [0, 0, self._numbers[2]]
+        with suppress(ConnectionClosed):
+            while texts := self._due(page, seen):
+                for text in texts:
+                    page.send(text)
+
+    def _due(self, page: Any, seen: list[int]) -> list[str]:
+        """Waits for news since the numbers `seen`, which it updates; none once a page is closed."""
+        with self._news:
+            while page in self._pages and self._numbers == seen:
+                self._news.wait()
+            if page not in self._pages:
+                return []
+            each = zip(self._texts, self._numbers, seen, strict=True)
+            texts = [text for text, new, old in each if new > old]
+            seen[:] = self._numbers
+        return texts
+
+    def close(self) -> None:
+        """Ends all pages and frees the port; what waits for a frame ends, too."""
+        self.closed = True
+        self._server.shutdown()
+        for page in tuple(self._pages):
+            page.close()
+        self._thread.join()

@@ -1,0 +1,115 @@
+"""Shows a source on the page, at a pace that the page may change."""
+
+import os
+import sys
+import time
+import webbrowser
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Protocol
+
+from nics_drl_bridge.errors import BridgeError
+from nics_drl_bridge.watch.frame import Frame, Stage
+from nics_drl_bridge.watch.server import PageServer, Request
+
+POLL_S = 0.2
+MOST_FRAMES_PER_S = 60.0
+SLOWEST, FASTEST = 0.05, 64.0
+PACE = frozenset({"pause", "speed", "step"})
+Handle = Callable[[Request], None]
+
+
+class Source(Protocol):
+    """Frames, and what can be done to where they come from."""
+
+    period_s: float  # from one frame to the next, at a speed of 1 [s]
+
+    def stage(self) -> Stage:
+        """All that stays the same for now."""
+
+    def frame(self) -> Frame:
+        """The present frame."""
+
+    def advance(self) -> bool:
+        """Goes on to the next frame; True if the stage is another now. Raises BridgeError."""
+
+    def take(self, request: Request) -> bool:
+        """Does what a page asks for; True if the stage is another now. Raises BridgeError."""
+
+    def close(self) -> None:
+        """Frees all resources."""
+
+
+class Pace:
+    """Tells when the next frame is due: at a speed, after a pause, or one by one."""
+
+    def __init__(self) -> None:
+        self.speed, self.paused = 1.0, False
+        self._single, self._due = False, 0.0
+
+    def take(self, request: Request) -> None:
+        """Changes the pace, if that is what a page asks for."""
+        if request.kind == "speed":
+            self.speed = min(max(request.value, SLOWEST), FASTEST)
+        elif request.kind in ("pause", "step"):
+            self._single = request.kind == "step"
+            self.paused = self._single or request.on
+
+    def wait(self, server: PageServer, period_s: float, handle: Handle) -> bool:
+        """Returns once the next frame is due, with requests handled; False once nobody serves."""
+        while not server.closed:
+            now = time.monotonic()
+            going = self._single or not (self.paused and server.watched)
+            if going and now >= self._due:
+                self._single, period_s = False, period_s / self.speed
+                self._due = max(self._due + period_s, now)
+                return True
+            left = min(POLL_S, self._due - now) if going else POLL_S
+            request = server.request(left)
+            if request is not None:
+                self.take(request)
+                handle(request)
+        return False
+
+    def plain(self) -> dict[str, object]:
+        """The pace as plain data."""
+        return {"speed": self.speed, "paused": self.paused}
+
+
+def show(source: Source, server: PageServer) -> None:
+    """Shows a source until the server is closed."""
+    pace, shown_s = Pace(), 0.0
+
+    def publish() -> None:
+        server.publish(source.frame(), **pace.plain())
+
+    def handle(request: Request) -> None:
+        try:
+            if request.kind not in PACE and source.take(request):
+                server.set_stage(source.stage())
+        except BridgeError as error:
+            server.tell(str(error))
+        publish()
+
+    server.set_stage(source.stage())
+    publish()
+    while pace.wait(server, source.period_s, handle):
+        try:
+            if source.advance():
+                server.set_stage(source.stage())
+        except BridgeError as error:
+            server.tell(str(error))
+            pace.paused = True
+        if time.monotonic() - shown_s > 1.0 / MOST_FRAMES_PER_S or pace.paused:
+            shown_s = time.monotonic()
+            publish()
+
+
+def open_page(url: str, browser: bool = True) -> None:
+    """Opens the page in a browser where there is a display, and else says where it is."""
+    seen = any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+    if browser and (seen or sys.platform in ("darwin", "win32")):
+        with suppress(webbrowser.Error):
+            if webbrowser.open(url):
+                return
+    sys.stderr.write(f"watch: {url}\n")

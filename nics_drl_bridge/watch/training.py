@@ -1,0 +1,56 @@
+"""Some of the worlds of a training, shown now and then; free of cost while nobody looks."""
+
+import time
+from typing import Protocol
+
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.watch.frame import Frame, Stage, Trail, WorldFrame
+from nics_drl_bridge.watch.server import PageServer
+
+MOST_WORLDS = 9
+PERIOD_S = 0.1  # between two frames [s]
+
+
+class Envs(Protocol):
+    """Vector envs that are stepped together, as `TrainVecEnv`."""
+
+    envs: tuple[BridgeVectorEnv, ...]
+
+
+class TrainingView:
+    """Shows the first worlds of each vector env; to be called after each step of them all."""
+
+    def __init__(self, server: PageServer, training: Envs) -> None:
+        self._server, envs = server, training.envs
+        each = max(1, MOST_WORLDS // len(envs))
+        sizes = [len(env.world.members) for env in envs]
+        self._worlds = [  # with the place of the first member of their world set
+            (env, n, sum(sizes[:k]), Trail())
+            for k, env in enumerate(envs[:MOST_WORLDS])
+            for n in range(min(each, env.num_envs))
+        ]
+        self._shown_s, self._steps, self.note = 0.0, 0, ""
+        names = ", ".join(env.world.name for env in envs)
+        places = tuple(env.world for env in envs)
+        server.set_stage(Stage(f"training in {names}", envs[0].model, places))
+
+    def __call__(self) -> None:
+        """Takes a step into account, and shows a frame if it is time to and a page is open."""
+        self._steps += 1
+        if not self._server.watched:
+            return
+        now = time.monotonic()
+        due = now - self._shown_s >= PERIOD_S
+        for env, n, _, trail in self._worlds:
+            trail.add(env.simulator.data.pose[n], int(env.simulator.data.steps[n]))
+        if due:
+            self._shown_s = now
+            self._server.publish(self._frame())
+
+    def _frame(self) -> Frame:
+        worlds = []
+        for env, n, first, trail in self._worlds:
+            shot, name = env.shot(n), f"{env.world.name} {n}"
+            worlds.append(WorldFrame(shot, name, first + shot.member, trail.ways))
+        period_s = self._worlds[0][0].model.control_period
+        return Frame(self._steps * period_s, tuple(worlds), self.note)

@@ -1,0 +1,72 @@
+from __future__ import annotations
+
+import base64
+import json
+
+import numpy as np
+import pytest
+from robots import direct_model, field
+
+from nics_drl_bridge.sim.world_set import load_worlds
+from nics_drl_bridge.watch.frame import Frame, Stage, Trail, WorldFrame, thousandths
+from watch.rig import shot
+
+
+def plain(**changes):
+    return json.loads(json.dumps(Frame(1.5, (WorldFrame(shot(**changes)),)).plain()))
+
+
+def test_a_frame_goes_over_the_wire_in_thousandths():
+    frame = plain()
+    (world,) = frame["worlds"]
+    assert frame["time"] == 1.5
+    assert world["poses"] == [[1000, 0, 1571]]
+    assert world["ranges"] == [[1000] * 72]
+    assert world["goals"] == [[2000, 500]]
+    assert (world["bodies"], world["kinds"]) == ([[1000, 1500, 0, 250]], [0])
+
+
+def test_beams_without_a_return_are_minus_one_and_absent_bodies_are_left_out():
+    ranges = np.array([[0.5, np.inf, -np.inf, np.nan]], np.float32)
+    (world,) = plain(ranges=ranges, bodies=np.zeros((2, 7)))["worlds"]
+    assert world["ranges"] == [[500, -1, -1, -1]]
+    assert world["bodies"] == []
+
+
+def test_what_is_not_finite_never_becomes_text_that_is_no_json():
+    assert thousandths([np.nan, np.inf, -np.inf]) == [0, 0, 0]
+
+
+def test_the_ellipse_holds_95_percent_of_the_positions():
+    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
+    covariance = np.zeros((1, 3, 3))
+    covariance[0, :2, :2] = turn @ np.diag([0.09, 0.01]) @ turn.T
+    large, small, angle = plain(covariance=covariance)["worlds"][0]["ellipses"][0]
+    drawn = np.random.default_rng(0).multivariate_normal([0, 0], covariance[0, :2, :2], 20_000)
+    along = drawn @ np.array([np.cos(angle), np.sin(angle)]) / large
+    across = drawn @ np.array([-np.sin(angle), np.cos(angle)]) / small
+    assert (along**2 + across**2 < 1.0).mean() == pytest.approx(0.95, abs=0.01)
+
+
+def test_a_trail_begins_anew_with_each_episode_and_never_grows_without_end():
+    trail = Trail()
+    for step in range(3 * Trail.MOST):
+        trail.add(np.array([[step * 0.01, 0.0, 0.0]]), step)
+    (way,) = trail.ways
+    assert len(way) <= Trail.MOST
+    assert way[-1, 0] == pytest.approx(0.01 * (3 * Trail.MOST - 1))
+    trail.add(np.zeros((1, 3)), 0)
+    assert len(trail.ways[0]) == 1
+
+
+def test_a_stage_tells_all_that_is_drawn_once():
+    stage = Stage("a title", direct_model(), (field(count=2), load_worlds("room"))).plain()
+    one, room = json.loads(json.dumps(stage))["places"]
+    assert one["extent"] == [-3.0, -3.0, 3.0, 3.0]
+    assert len(one["walls"]) == 4
+    assert one["map"] is None
+    assert one["shapes"] == [[]]  # a disc has no corners
+    cells = base64.b64decode(room["map"]["cells"])
+    assert len(cells) == room["map"]["rows"] * room["map"]["columns"]
+    assert set(cells) <= {0, 1, 2}
+    assert max(np.hypot(*np.transpose(room["shapes"][0]))) == pytest.approx(1.0, abs=1e-3)

@@ -1,0 +1,112 @@
+from __future__ import annotations
+
+import sys
+import urllib.error
+import urllib.request
+from contextlib import closing
+
+import pytest
+from robots import direct_model, field
+
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.watch import server as module
+from nics_drl_bridge.watch.frame import Frame, Stage, WorldFrame
+from nics_drl_bridge.watch.server import PageServer
+from watch.rig import Client, shot, until
+
+STAGE = Stage("a title", direct_model(), (field(count=0),))
+
+
+@pytest.fixture
+def server():
+    with closing(PageServer(port=0)) as running:
+        yield running
+
+
+def get(url, **headers):
+    return urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=30)
+
+
+def status(url, **headers):
+    try:
+        with get(url, **headers) as answer:
+            return answer.status
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def test_the_page_is_one_file_that_may_load_nothing_from_elsewhere(server):
+    with get(server.url) as answer:
+        page = answer.read().decode()
+        rules = answer.headers["Content-Security-Policy"]
+    assert page.startswith("<!doctype html>")
+    assert "http://" not in page
+    assert "https://" not in page
+    assert "default-src 'none'" in rules
+
+
+def test_only_this_machine_is_served(server):
+    assert server._server.socket.getsockname()[0] == "127.0.0.1"
+
+
+def test_a_foreign_name_that_points_here_is_refused(server):
+    assert status(server.url, Host="rebound.example") == 403
+    assert status(server.url) == 200
+    assert status(f"{server.url}else") == 404
+
+
+def test_the_page_of_a_foreign_site_can_not_open_the_socket(server):
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    address = f"{server.url.replace('http', 'ws')}socket"
+    with pytest.raises(InvalidStatus, match="403"):
+        connect(address, origin="https://evil.example")
+    connect(address, origin=server.url.rstrip("/")).close()
+
+
+def test_who_comes_late_sees_the_newest_stage_and_frame(server):
+    server.set_stage(STAGE)
+    for seconds in (1.0, 2.0):
+        server.publish(Frame(seconds, (WorldFrame(shot()),)), paused=True)
+    with closing(Client(server)) as client:
+        assert client.next("stage")["title"] == "a title"
+        frame = client.next("frame")
+        assert (frame["time"], frame["paused"]) == (2.0, True)
+        server.publish(Frame(3.0, (WorldFrame(shot()),)))
+        assert client.next("frame")["time"] == 3.0
+
+
+def test_requests_arrive_and_nonsense_is_told_in_a_sentence(server):
+    with closing(Client(server)) as client:
+        until(lambda: server.watched, "the page")
+        client.ask("goal", x=1.0, y=-2.0)
+        request = server.request(30.0)
+        assert (request.kind, request.x, request.y) == ("goal", 1.0, -2.0)
+        for nonsense in ("no json", '{"kind": "fly"}', '{"kind": "goal", "x": 1e999}', "[]"):
+            client.socket.send(nonsense)
+            assert "is not understood" in client.next("notice")["text"]
+        assert server.request(0.0) is None
+    until(lambda: not server.watched, "the end of the page")
+
+
+def test_a_page_that_floods_the_server_does_not_fill_its_memory(server):
+    with closing(Client(server)) as client:
+        until(lambda: server.watched, "the page")
+        for _ in range(module.MOST_REQUESTS + 50):
+            client.ask("step")
+        client.socket.send("no json")
+        client.next("notice")  # so all before it has been read
+    taken = 0
+    while server.request(0.0):
+        taken += 1
+    assert taken == module.MOST_REQUESTS
+
+
+def test_a_taken_port_and_a_missing_library_are_one_sentence(server, monkeypatch):
+    port = int(server.url.rsplit(":", 1)[1].strip("/"))
+    with pytest.raises(ConfigError, match=r"port \d+ of 127.0.0.1 can't be served .*--port"):
+        PageServer(port)
+    monkeypatch.setitem(sys.modules, "websockets.sync.server", None)
+    with pytest.raises(ConfigError, match=r"pip install 'nics_drl_bridge\[view\]'"):
+        PageServer(port=0)
