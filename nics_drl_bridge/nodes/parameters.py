@@ -68,7 +68,14 @@ def sensors() -> list[Row]:
 
 def middleware() -> list[Row]:
     """Returns the parameters of `middleware_node` alone."""
-    return [Row("map_frame", "map", "Frame id of the estimate.", fixed=False), BASE_FRAME]
+    return [
+        Row("map_frame", "map", "Frame id of the estimate.", fixed=False),
+        BASE_FRAME,
+        Row("publish_map_to_odom", True,
+            "Whether to publish map -> odom on /tf by the estimate, where no other node does."),
+        Row("transform_tolerance", 0.2, "By which the stamp of map -> odom is ahead [s].",
+            (0.0, 10.0)),
+    ]  # fmt: skip
 
 
 def policy() -> list[Row]:
@@ -104,6 +111,9 @@ def device(laser_frame: str = "") -> list[Row]:
         Row("odom_frame", "odom", "Frame id of odom."),
         Row("base_frame", "base_link", "Frame id of base_link."),
         Row("laser_frame", laser_frame, "Frame id of the lidar.", shown="that of the model"),
+        Row("footprint_frame", "",
+            "Frame id of a further frame at base_link, as base_footprint; none if empty."),
+        Row("map_resolution", 0.01, "Greatest side of the cells of map [m].", (0.001, 10.0)),
         Row("publish_map_to_odom", False,
             "Whether to publish the true map -> odom on /tf, in place of a localiser."),
         Row("rate", 1.0, "Simulated seconds per second in realtime.", (0.01, 1000.0)),
@@ -221,9 +231,10 @@ class NodeFacts(NamedTuple):
     example: str  # after `--ros-args`
 
 
-DRIVEN_BY = ("cmd_vel", "ackermann_cmd (of a robot that steers, with ackermann_msgs)")
-TOLD = ("scan", "odom", "the model's further sensors", "joint_states", "ground_truth", "/clock",
-        "/tf, /tf_static (with tf2_msgs)", "/diagnostics")  # fmt: skip
+DRIVEN_BY = ("cmd_vel", "ackermann_cmd (of a robot that steers, with ackermann_msgs)",
+             "initialpose")  # fmt: skip
+TOLD = ("scan", "odom", "the model's further sensors", "joint_states", "ground_truth", "map",
+        "/clock", "/tf, /tf_static (with tf2_msgs)", "/diagnostics")  # fmt: skip
 SERVED = ("~/reset", "~/pause", "~/repeat", "~/touched")
 HEARD = ("scan", "odom", "the model's further sensors", "cmd_vel", "pose (with pose_type)",
          "imu (with use_imu)")  # fmt: skip
@@ -239,12 +250,14 @@ NODES: dict[str, Callable[[], NodeFacts]] = {
     ),
     "middleware_node": lambda: NodeFacts(
         "Caches a robot's topics and publishes the estimate of its state; a managed node.",
-        HEARD, ("odometry/filtered", "/diagnostics"), ("~/reset",),
+        (*HEARD, "initialpose"),
+        ("odometry/filtered", "/tf (with tf2_msgs)", "/diagnostics"), ("~/reset",),
         [*managed(), *sensors(), *middleware()], "-p use_imu:=true -r __ns:=/car",
     ),
     "policy_node": lambda: NodeFacts(
         "Drives a robot to goals by a policy, which answers each scan; a managed node.",
-        (*HEARD, "goal_pose", "/tf_static (with tf2_msgs)"), ("cmd_vel_raw", "/diagnostics"), (),
+        (*HEARD, "initialpose", "goal_pose", "/tf, /tf_static (with tf2_msgs)"),
+        ("cmd_vel_raw", "/diagnostics"), (),
         [*managed(), *sensors(), *policy()], '-p policy:=my_policy.onnx -p "goal:=[1.0, 2.0]"',
     ),
     "command_gate": lambda: NodeFacts(

@@ -40,7 +40,7 @@ class DeviceWorld:
     """Keeps the next command of each of M robots, and the covariance of its odometry."""
 
     def __init__(self, simulator: FastSimulator, model: SimulatorModel, robots: int) -> None:
-        self._simulator, self._period = simulator, model.control_period
+        self.simulator, self._period = simulator, model.control_period
         self._added = step_covariance(model.noise.odometry, self._period)
         self.commands: Array = np.zeros((robots, len(model.robot.command)))
         self._covariance = np.tile(self._added, (robots, 1, 1))
@@ -54,7 +54,7 @@ class DeviceWorld:
     @property
     def touched(self) -> list[bool]:
         """Per robot, true if it has touched something in this episode."""
-        return [bool(one) for one in self._simulator.data.collided[0]]
+        return [bool(one) for one in self.simulator.data.collided[0]]
 
     def begin(self, seed: int, starts: Array | None) -> None:
         """Begins the episode of a seed, at x, y, heading of each robot (3 M,) if given."""
@@ -62,24 +62,28 @@ class DeviceWorld:
             needed = f"{self.robots} robots need {3 * self.robots}: x, y, heading of each."
             raise ConfigError(f"episode_start has {starts.size} numbers; {needed}")
         placed = None if starts is None else starts.reshape(1, self.robots, 3)
-        self._simulator.reset([seed], starts=placed)
+        self.simulator.reset([seed], starts=placed)
         self.commands[:] = 0.0
         self._covariance[:] = self._added
-        self._before[:] = self._simulator.data.pose[0]
+        self._before[:] = self.simulator.data.pose[0]
+
+    def put(self, robot: int) -> None:
+        """Takes note that a robot was put elsewhere, which is no motion."""
+        self._before[robot] = self.simulator.data.pose[0, robot]
 
     def advance(self) -> None:
         """Moves all robots by one step."""
-        data = self._simulator.data
+        data = self.simulator.data
         self._before[:] = data.pose[0]
         odom = data.odom[0].copy()
-        self._simulator.step(self.commands[None])
-        data = self._simulator.data
+        self.simulator.step(self.commands[None])
+        data = self.simulator.data
         self._covariance = propagate(self._covariance, odom, data.odom[0], self._added)
 
     def sensed(self, robot: int) -> Sensed:
         """Returns the present values of one robot; the next step may overwrite them."""
-        data = self._simulator.data
-        readings = {name: each[0, robot] for name, each in self._simulator.readings.items()}
+        data = self.simulator.data
+        readings = {name: each[0, robot] for name, each in self.simulator.readings.items()}
         return Sensed(
             data.odom[0, robot], self._covariance[robot], data.twist[0, robot],
             data.state[0, robot], data.ranges[0, robot], data.pose[0, robot],

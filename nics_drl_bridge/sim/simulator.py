@@ -182,9 +182,9 @@ class FastSimulator:
         self.goals: Array = np.zeros((worlds, robots, 2))  # of the episodes [m]
         # Draws of the randomisation for the running episodes, (N, M) per robot or (N,) per scene.
         self.drawn: dict[str, NDArray[Any]] = {}
-        self._footprint = footprint_shape(model.robot)
+        self.footprint = footprint_shape(model.robot)
         self.sampler = self._episodes.scenes
-        shapes = (*self.sampler.shapes, self._footprint)
+        shapes = (*self.sampler.shapes, self.footprint)
         table = with_shapes(model.lidar, model.table, shapes)
         self._in_table = np.array([table.outlines.index_of(shape) for shape in shapes])
         self._scanner = Scanner(model.lidar, table, renderer)
@@ -216,6 +216,13 @@ class FastSimulator:
         """Sorts bodies into cells anew, after obstacles in `data` were put elsewhere."""
         for part in self.parts:
             step_kernels.sort_worlds(self.packed[part.start], part.start, part.stop)
+
+    def put_robot(self, robot: int, pose: Array, state: Array) -> None:
+        """Puts a robot of the first world at a pose (3,) with a state (S,); odometry stays."""
+        self.data.pose[0, robot], self.data.state[0, robot] = pose, state
+        body = place(pose, self.footprint.radius, self._in_table[-1])
+        self.data.bodies[0, self.sampler.count + robot] = body
+        self.sort_bodies()
 
     def __getstate__(self) -> dict[str, Any]:  # a copy rebuilds the rest
         rebuilt = ("_members", "packed", "_renders")
@@ -291,7 +298,7 @@ class FastSimulator:
         count, shapes = self.sampler.count, scenes.bodies[..., SHAPE].astype(np.int64)
         data.bodies[chosen, :count] = scenes.bodies
         data.bodies[chosen, :count, SHAPE] = self._in_table[shapes]
-        data.bodies[chosen, count:] = place(starts, self._footprint.radius, self._in_table[-1])
+        data.bodies[chosen, count:] = place(starts, self.footprint.radius, self._in_table[-1])
         self.goals[chosen] = scenes.goals
 
     def _assign(self, chosen: Indices, draws: Draws) -> None:

@@ -62,6 +62,12 @@ class Rig:
         own[:2] = x, y
         own[3:7] = np.cos(0.5 * heading), 0.0, 0.0, np.sin(0.5 * heading)
 
+    def launch(self, data: Any, rest: Array, twist: Array, heading: float) -> None:
+        """Gives the body a twist (3,), and all its parts no speed of their own."""
+        own = data.qvel[self._drift : self._drift + len(rest) - 1]
+        own[:] = 0.0
+        own[:2], own[5] = geometry.rotate(twist[:2], heading), twist[2]
+
     def command(self, data: Any, command: ArrayLike) -> None:
         """Gives the motors a command (C,), clipped to its limits. Raises BackendError for NaN."""
         command, count = np.asarray(command, dtype=np.float64), len(self.spec.command)
@@ -180,6 +186,14 @@ class MujocoSimulator(DrivenSimulator):
             rig.put(self._data, self._rest, pose)
         self._mujoco.mj_forward(compiled, self._data)
         return scenes
+
+    def put_robot(self, robot: int, pose: Array, state: Array) -> None:
+        """Puts a robot, see `FastSimulator.put_robot`; its wheels follow from their motors."""
+        super().put_robot(robot, pose, state)
+        rig = self._rigs[robot]
+        rig.put(self._data, self._rest, pose)
+        rig.launch(self._data, self._rest, self._twist(state), pose[2])
+        self._mujoco.mj_forward(self._simulation, self._data)
 
     def step(self, commands: ArrayLike) -> None:
         """Moves one control period by commands (1, M, C), clipped. ConfigError, BackendError."""
