@@ -134,6 +134,16 @@ def pose_from_ros(message: PoseStamped | PoseWithCovarianceStamped) -> tuple[Arr
     return np.array(messages.pose_row(message)), covariance
 
 
+def pose_to_ros(pose: ArrayLike, time_ns: int, frame: str) -> PoseStamped:
+    """Returns a pose (3,) in a frame as a PoseStamped."""
+    x, y, heading = np.asarray(pose, np.float64).tolist()
+    message = PoseStamped()
+    message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
+    message.pose.position.x, message.pose.position.y = x, y
+    message.pose.orientation = heading_to_ros(heading)
+    return message
+
+
 def map_to_ros(grid: GridMap, time_ns: int, frame: str) -> OccupancyGrid:
     """Returns a map as an OccupancyGrid, measured at a time [ns] and in force since."""
     message = OccupancyGrid(data=array.array("b", grid.cells.tobytes()))

@@ -68,25 +68,46 @@ class GoalFrames:
     def in_map(self, goal: PoseStamped) -> Array:
         """Returns x, y (2,) of a goal in the map, as the robot stands now. Raises ConfigError."""
         place = np.array([goal.pose.position.x, goal.pose.position.y, 0.0])
-        frame = asked = goal.header.frame_id.strip("/")
-        known = [str(self._node.get_parameter(f"{name}_frame").value) for name in ("map", "base")]
+        try:
+            frame, place = self.fixed(goal.header.frame_id, place)
+        except ConfigError as error:
+            raise ConfigError(f"goal_pose: {error}") from None
+        if frame == self._map:
+            return self._of_localiser(place)[:2]
+        there: Array = geometry.compose(
+            self._topics.view().pose, geometry.between(self._topics.in_odom(), place)
+        )[:2]
+        return there
+
+    def fixed(self, frame: str, places: Array) -> tuple[str, Array]:
+        """Returns poses (..., 3) of a frame in the map or `odom`, and which of them it is.
+
+        Those of the robot, or of what is mounted on it, are in `odom`, as the robot stands now.
+        Raises ConfigError for a frame that is not known, or as long as the robot's place is not.
+        """
+        asked = frame = frame.strip("/")
         odom, robot = (each.strip("/") for each in self._topics.frames)
-        bases = {known[1], robot} - {""}
+        bases = {str(self._node.get_parameter("base_frame").value), robot} - {""}
         for _ in range(len(self._mounted) + 1):
-            if frame in ("", known[0]):
-                return self._of_localiser(place)[:2]
+            if frame in ("", self._map):
+                return self._map, places
             if frame in bases or (frame == odom and odom):
-                return self._from_robot(place, asked, frame == odom)
+                reported = self._topics.in_odom()
+                if reported is None or not self._topics.located:
+                    why = f"a goal in the frame {asked!r} is refused"
+                    why = f"{why}, as the robot's place is not known yet"
+                    raise ConfigError(f"{why}; give it again when odometry and pose have come.")
+                return odom, places if frame == odom else geometry.compose(reported, places)
             if frame not in self._mounted:
                 break
             frame, mount = self._mounted[frame]
-            place = geometry.compose(mount, place)
-        names = ", ".join(repr(each) for each in sorted({known[0], odom, *bases} - {""}))
+            places = geometry.compose(mount, places)
+        names = ", ".join(repr(each) for each in sorted({self._map, odom, *bases} - {""}))
         heard = "one that /tf_static joins to them"
         if self._transforms is None:
             heard = "install tf2_msgs for those that /tf_static joins to them"
         why = f"a goal in the frame {asked!r} is refused, which is not known here"
-        raise ConfigError(f"goal_pose: {why}; give it in {names}, or {heard}.")
+        raise ConfigError(f"{why}; give it in {names}, or {heard}.")
 
     def _of_localiser(self, place: Array) -> Array:
         """Returns a pose (3,) in the map of a localiser, if there is one, in the estimate's."""
@@ -94,13 +115,3 @@ class GoalFrames:
         if robot is None:
             return place
         return geometry.compose(self._topics.view().pose, geometry.between(robot, place))
-
-    def _from_robot(self, place: Array, frame: str, of_odometry: bool) -> Array:
-        reported = self._topics.in_odom()
-        if reported is None or not self._topics.located:
-            why = f"a goal in the frame {frame!r} is refused, as the robot's place is not known yet"
-            raise ConfigError(f"goal_pose: {why}; give it again when odometry and pose have come.")
-        if of_odometry:
-            place = geometry.between(reported, place)
-        there: Array = geometry.compose(self._topics.view().pose, place)[:2]
-        return there

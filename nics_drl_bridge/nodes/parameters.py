@@ -99,6 +99,44 @@ def policy() -> list[Row]:
     ]  # fmt: skip
 
 
+def nav2() -> list[Row]:
+    """Returns the parameters of Nav2's controller server that `policy_node` knows, too."""
+    return [
+        Row("navigate_to_pose", True,
+            "Whether to serve this action, too, where no other node does."),
+        Row("lookahead", 1.0, "From the robot to the sub-goal on a path [m].", (0.1, 100.0), False),
+        Row("controller_plugins", ["FollowPath"], "Names that goals of follow_path may ask for."),
+        Row("goal_checker_plugins", ["general_goal_checker"], "The same, of the goal's checks."),
+        Row("progress_checker_plugins", ["progress_checker"], "The same, of the progress' checks."),
+        Row("failure_tolerance", 0.3,
+            "So long a robot that touches something waits [s]; -1 for ever.", (-1.0, 1e6), False),
+        Row("costmap_update_timeout", 1.0,
+            "Silence of scan or odom that ends a path [s]; ten control periods at least.",
+            (0.0, 1e6), False),
+        Row("speed_limit_topic", "speed_limit", "Where a SpeedLimit comes from."),
+    ]  # fmt: skip
+
+
+def checkers(goals: Sequence[str], progress: Sequence[str]) -> list[Row]:
+    """Returns the parameters of the checks of these names, as of Nav2's simple checkers."""
+    span = (0.0, 1e6)
+    rows = [
+        ("xy_goal_tolerance", 0.25, "Greatest distance from the goal [m].", span),
+        ("yaw_goal_tolerance", 0.25, "Of the heading there [rad]; not of robots that steer.", span),
+        ("stateful", True, "Whether a place that was reached stays so.", None),
+        ("path_length_tolerance", 1.0, "Greatest way that may be left at the goal [m].", span),
+    ], [
+        ("required_movement_radius", 0.5, "That the robot has to leave [m].", span),
+        ("movement_time_allowance", 10.0, "Within this time [s].", span),
+    ]  # fmt: skip
+    return [
+        Row(f"{name}.{key}", default, about, limits, fixed=False)
+        for names, those in zip((goals, progress), rows, strict=True)
+        for name in names
+        for key, default, about, limits in those
+    ]
+
+
 def device(laser_frame: str = "") -> list[Row]:
     """Returns the parameters of all simulators, but `robots`, which is a count or names."""
     return [
@@ -256,9 +294,12 @@ NODES: dict[str, Callable[[], NodeFacts]] = {
     ),
     "policy_node": lambda: NodeFacts(
         "Drives a robot to goals by a policy, which answers each scan; a managed node.",
-        (*HEARD, "initialpose", "goal_pose", "/tf, /tf_static (with tf2_msgs)"),
-        ("cmd_vel_raw", "/diagnostics"), (),
-        [*managed(), *sensors(), *policy()], '-p policy:=my_policy.onnx -p "goal:=[1.0, 2.0]"',
+        (*HEARD, "initialpose", "goal_pose", "map, speed_limit (with nav2_msgs)",
+         "/tf, /tf_static (with tf2_msgs)"),
+        ("cmd_vel_raw", "/diagnostics"),
+        ("follow_path, navigate_to_pose (actions, with nav2_msgs)",),
+        [*managed(), *sensors(), *policy(), *nav2(),
+         *checkers(("general_goal_checker",), ("progress_checker",))], '-p policy:=my_policy.onnx -p "goal:=[1.0, 2.0]"',
     ),
     "command_gate": lambda: NodeFacts(
         "Passes a policy's commands on while they can be trusted; it starts disarmed.",
