@@ -12,6 +12,7 @@ from rclpy.node import Node
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import S_PER_NS, Array
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
@@ -29,7 +30,6 @@ from nics_drl_bridge.nodes.nav2_parameters import ControllerParameters, chosen
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
 from nics_drl_bridge.policy.follow import GoalChecker, Path, Place, ProgressChecker
 from nics_drl_bridge.policy.route import route
-from nics_drl_bridge.robot.spec import RobotSpec
 
 FOLLOW, NAVIGATE = "follow_path", "navigate_to_pose"
 KINDS = {FOLLOW: "nav2_msgs/action/FollowPath", NAVIGATE: "nav2_msgs/action/NavigateToPose"}
@@ -90,15 +90,15 @@ class PathActions:
     """
 
     def __init__(
-        self, node: Node, topics: RobotTopics, frames: GoalFrames, robot: RobotSpec,
+        self, node: Node, topics: RobotTopics, frames: GoalFrames, model: SimulatorModel,
         parameters: ControllerParameters, drive: Callable[[Array], Drive],
     ) -> None:  # fmt: skip
-        self._node, self._topics, self._frames, self._robot = node, topics, frames, robot
+        self._node, self._topics, self._frames, self._robot = node, topics, frames, model.robot
         self._parameters, self._drive = parameters, drive
         self._run: Run | None = None
         self._map: tuple[str, GridMap] | None = None  # and its frame
         self._limit = math.inf  # of the speed [m/s]
-        self._period_s = 0.1
+        self._period_s = model.control_period
         self._undo: list[Callable[[], Any]] = []
         self._servers: dict[str, HeldActionServer] = {}
         self._kinds = {name: conversions.message_type(kind) for name, kind in KINDS.items()}

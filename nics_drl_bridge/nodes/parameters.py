@@ -237,10 +237,17 @@ def gate_rules(odom_rate: float = math.nan, scan_age: float = math.nan) -> list[
 RULES_IN_SECONDS = ("scan_age", "odom_age", "command_age", "e_stop_silence")
 
 
+FOREIGN = Row(
+    "foreign_commands", "none",
+    "Type of cmd_vel_raw of a controller that does not stamp it with its scan, as Nav2's: Twist or "
+    "TwistStamped; the newest scan's age then counts. none: of the policy.",
+)  # fmt: skip
+
+
 def gate() -> list[Row]:
     """Returns all parameters of `command_gate`."""
     shield = [SHIELD, *SHIELD_NUMBERS]
-    return [MODEL, LIMITS, *shield, *gate_rules(), stamped("cmd_vel"), BLACK_BOX, PRIORITY]
+    return [MODEL, LIMITS, *shield, *gate_rules(), stamped("cmd_vel"), FOREIGN, BLACK_BOX, PRIORITY]
 
 
 def drive() -> list[Row]:
@@ -299,7 +306,8 @@ NODES: dict[str, Callable[[], NodeFacts]] = {
         ("cmd_vel_raw", "/diagnostics"),
         ("follow_path, navigate_to_pose (actions, with nav2_msgs)",),
         [*managed(), *sensors(), *policy(), *nav2(),
-         *checkers(("general_goal_checker",), ("progress_checker",))], '-p policy:=my_policy.onnx -p "goal:=[1.0, 2.0]"',
+         *checkers(("general_goal_checker",), ("progress_checker",))],
+        '-p policy:=my_policy.onnx -p "goal:=[1.0, 2.0]"',
     ),
     "command_gate": lambda: NodeFacts(
         "Passes a policy's commands on while they can be trusted; it starts disarmed.",

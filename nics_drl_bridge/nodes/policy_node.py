@@ -63,7 +63,7 @@ class PolicyNode(ManagedNode):
         self._topics.hear_initial_pose()
         self._frames = GoalFrames(self, self._topics)
         self.undo.callback(self._frames.close)
-        given = self._topics, self._frames, model.robot, self._nav2
+        given = self._topics, self._frames, model, self._nav2
         self._actions = PathActions(self, *given, self._toward)
         self.undo.callback(self._actions.close)
         timer = runner.steadily(self, POLLS * model.control_period, self._act)
