@@ -29,7 +29,9 @@ from nics_drl_bridge.sim.occupancy import occupancy, standing
 from nics_drl_bridge.sim.scenes import SetSampler, sample_scene
 from nics_drl_bridge.sim.world_set import load_worlds
 
-CONTROLS = {"bare": "the map's obstacles, the policy's heed of paths, and all names but the scan's"}
+CONTROLS = {
+    "bare": "the map's obstacles, a controller that is known, and all nodes but the simulator"
+}
 BARS = {"map_agreement": 0.995, "follow_path_success": 0.95, "nav2_names_missing": 0}
 WORLDS = ("arena", "circles", "clutter", "corridor", "doorway", "room", "barn")
 ROBOT, WORLD, LIDAR, POSES = "differential", "room", "rplidar_a2", 100
@@ -74,21 +76,17 @@ def followed(domain_id: int, folder: Path, episodes: int, bare: bool = False) ->
     from nics_drl_bridge.nodes.processes import NodeProcess
 
     radius, worlds = load_robot(ROBOT).footprint_radius, load_worlds(WORLD)
-    simulated = {
-        "model": ROBOT,
-        "world": WORLD,
-        "mode": "lockstep",
-        "enable_stamped_cmd_vel": False,
-    }
-    policy = {"model": ROBOT, "policy": ROBOT, "rate": 0.0, "deadline": 30.0,
-              "costmap_update_timeout": 60.0, "enable_stamped_cmd_vel": False}  # fmt: skip
+    common: dict[str, Any] = {"model": ROBOT, "enable_stamped_cmd_vel": False}
+    simulated = common | {"world": WORLD, "mode": "lockstep"}
+    policy = common | {"policy": ROBOT, "rate": 0.0, "deadline": 30.0}
+    policy |= {"costmap_update_timeout": 60.0}
     why: list[str] = []
     with ExitStack() as opened:
         for name, given in (("simulator_node", simulated), ("policy_node", policy)):
             opened.enter_context(NodeProcess(name, folder, given, domain_id))
-        tree = StandIn(domain_id, FollowPath, relay=not bare)
+        tree = StandIn(domain_id, FollowPath, "Nobody" if bare else "FollowPath")
         opened.callback(tree.close)
-        tree.until(tree.client.server_is_ready, "the action follow_path", kick=not bare)
+        tree.until(tree.client.server_is_ready, "the action follow_path", kick=True)
         tree.until(lambda: tree.poses.get_subscription_count() >= 2, "both ends of initialpose")
         for seed in range(episodes):
             request = SetParametersAtomically.Request()
@@ -98,7 +96,7 @@ def followed(domain_id: int, folder: Path, episodes: int, bare: bool = False) ->
             tree.truths.clear()
             tree.call(Trigger, "simulator_node/reset")
             scene = sample_scene(worlds, radius, seed)
-            tree.until(lambda: tree.maps and tree.truths, "map and truth", kick=not bare)
+            tree.until(lambda: tree.maps and tree.truths, "map and truth", kick=True)
             tree.place(scene.starts[0])
             result = tree.drive(scene.goals[0], radius + ROOM)
             far = math.dist(tree.pose[:2], scene.goals[0])

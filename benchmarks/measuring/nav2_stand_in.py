@@ -29,7 +29,7 @@ REPLAN = 40  # feedbacks after which the path is planned anew
 class StandIn:
     """Speaks to a simulator in lock-step and to a policy; relays the commands of the latter."""
 
-    def __init__(self, domain_id: int, kind: Any, relay: bool = True) -> None:
+    def __init__(self, domain_id: int, kind: Any, controller: str = "FollowPath") -> None:
         self.context = open_context(domain_id=domain_id)
         self.node = node = Node("behaviour_tree", context=self.context)
         self._executor = SingleThreadedExecutor(context=self.context)
@@ -39,8 +39,8 @@ class StandIn:
         self._commands = node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
         self.poses = node.create_publisher(PoseWithCovarianceStamped, "initialpose", qos.COMMAND)
         self._moved_s = time.monotonic()
-        if relay:
-            node.create_subscription(TwistStamped, "cmd_vel_raw", self._relay, qos.COMMAND)
+        self._controller = controller
+        node.create_subscription(TwistStamped, "cmd_vel_raw", self._relay, qos.COMMAND)
         node.create_subscription(OccupancyGrid, "map", self.maps.append, qos.LATCHED)
         node.create_subscription(Odometry, "ground_truth", self.truths.append, qos.SENSOR)
 
@@ -80,11 +80,8 @@ class StandIn:
 
     def place(self, pose: Array) -> None:
         """Says where the robot is to simulator and policy."""
-        message = PoseWithCovarianceStamped()
-        message.header.frame_id, message.pose.pose = (
-            "map",
-            conversions.pose_to_ros(pose, 0, "").pose,
-        )
+        message, placed = PoseWithCovarianceStamped(), conversions.pose_to_ros(pose, 0, "map")
+        message.header, message.pose.pose = placed.header, placed.pose
         self.poses.publish(message)
 
     def plan(self, goal: Array, radius: float) -> Path:
@@ -104,7 +101,7 @@ class StandIn:
 
     def drive(self, goal: Array, radius: float) -> Any:
         """Has the robot driven to a goal (2,), planning anew now and then; returns the result."""
-        handle = self.send(self.plan(goal, radius), controller_id="FollowPath")
+        handle = self.send(self.plan(goal, radius), controller_id=self._controller)
         while True:
             result, known = handle.get_result_async(), len(self.feedback)
             self.until(
@@ -116,7 +113,7 @@ class StandIn:
             if result.done():
                 return result.result()
             if math.dist(self.pose[:2], goal) > 1.0:
-                handle = self.send(self.plan(goal, radius), controller_id="FollowPath")
+                handle = self.send(self.plan(goal, radius), controller_id=self._controller)
 
     def touched(self) -> bool:
         """True if the robot has touched something."""

@@ -25,7 +25,7 @@ def test_a_way_leads_through_doors_and_touches_nothing(room):
 
 
 def test_a_robot_that_fits_through_no_door_gets_one_sentence(room):
-    with pytest.raises(ConfigError, match="radius 0.9 m there is no way to the goal"):
+    with pytest.raises(ConfigError, match="there is no way to the goal on the map"):
         route(room, START, GOAL, 0.9)
 
 
