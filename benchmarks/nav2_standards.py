@@ -26,7 +26,7 @@ from nics_drl_bridge.lidar.scanner import make_scanner
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.robot.spec import load_robot
 from nics_drl_bridge.sim.occupancy import occupancy, standing
-from nics_drl_bridge.sim.scenes import SetSampler, sample_scene
+from nics_drl_bridge.sim.scenes import SetSampler
 from nics_drl_bridge.sim.world_set import load_worlds
 
 CONTROLS = {
@@ -76,6 +76,7 @@ def followed(domain_id: int, folder: Path, episodes: int, bare: bool = False) ->
     from nics_drl_bridge.nodes.processes import NodeProcess
 
     radius, worlds = load_robot(ROBOT).footprint_radius, load_worlds(WORLD)
+    sampler = SetSampler(worlds, radius)
     common: dict[str, Any] = {"model": ROBOT, "enable_stamped_cmd_vel": False}
     simulated = common | {"world": WORLD, "mode": "lockstep"}
     policy = common | {"policy": ROBOT, "rate": 0.0, "deadline": 30.0}
@@ -92,11 +93,11 @@ def followed(domain_id: int, folder: Path, episodes: int, bare: bool = False) ->
             request = SetParametersAtomically.Request()
             request.parameters = [Parameter("episode_seed", value=seed).to_parameter_msg()]
             tree.call(SetParametersAtomically, "simulator_node/set_parameters_atomically", request)
-            tree.maps.clear()
             tree.truths.clear()
             tree.call(Trigger, "simulator_node/reset")
-            scene = sample_scene(worlds, radius, seed)
-            tree.until(lambda: tree.maps and tree.truths, "map and truth", kick=True)
+            scene = sampler.draw([seed])[0]
+            shown = occupancy(worlds, standing(sampler, 0, scene.bodies)).cells.tobytes()
+            tree.until(lambda shown=shown: tree.shows(shown), "map and truth", kick=True)
             tree.place(scene.starts[0])
             result = tree.drive(scene.goals[0], radius + ROOM)
             far = math.dist(tree.pose[:2], scene.goals[0])

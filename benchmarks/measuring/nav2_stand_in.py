@@ -78,6 +78,10 @@ class StandIn:
         """(3,) the robot's true pose."""
         return conversions.odometry_from_ros(self.truths[-1])[0]
 
+    def shows(self, cells: bytes) -> bool:
+        """True if the robot has told where it is, and the newest map has these cells."""
+        return bool(self.truths and self.maps) and self.maps[-1].data.tobytes() == cells
+
     def place(self, pose: Array) -> None:
         """Says where the robot is to simulator and policy."""
         message, placed = PoseWithCovarianceStamped(), conversions.pose_to_ros(pose, 0, "map")
