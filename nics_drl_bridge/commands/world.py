@@ -1,4 +1,4 @@
-"""`nics world import` and `nics world draw`: worlds of others, and what a world looks like."""
+"""`nics world`: imports worlds of others, draws a world, and writes its map."""
 
 import math
 import os
@@ -14,7 +14,9 @@ from nics_drl_bridge.errors import ConfigError
 if TYPE_CHECKING:
     from nics_drl_bridge.sim.sections import Standing
 
-world = typer.Typer(help="Imports worlds of others, and draws worlds.", no_args_is_help=True)
+world = typer.Typer(
+    help="Imports worlds of others, draws worlds, and writes their maps.", no_args_is_help=True
+)
 
 SDF, MAPS, PICTURES = (".world", ".sdf"), (".yaml", ".yml"), (".png", ".pgm", ".bmp")
 HEIGHT = 0.2  # default of the height that counts [m]: TurtleBot3's lidar is at 0.18 m
@@ -212,3 +214,40 @@ def draw(
             raise ConfigError(f"--out {file}: must end in .png.")
         write_bytes(file, world_picture(opened, radius, seed, outline))
         typer.echo(f"{file}: the world {opened.name!r}, seed {seed}")
+
+
+@world.command("map")
+def map_(
+    name: Annotated[str, Argument(metavar="WORLD", help="A shipped one, a YAML file, or a set.")],
+    out: Annotated[Path | None, Option(help="The .yaml to write; <world>_map.yaml.")] = None,
+    seed: Annotated[int, Option(min=0, help="Of the episode.")] = 0,
+    robot: Annotated[str, Option(help="A shipped robot or a YAML file.")] = "differential",
+    resolution: Annotated[float, Option(help="Greatest side of a cell [m].")] = 0.01,
+) -> None:
+    """Writes the map of an episode, of all that stands in it, as Nav2's map_server reads it.
+
+    Obstacles that move are left out. `nics world map room`, then
+    `ros2 run nav2_map_server map_server --ros-args -p yaml_filename:=room_map.yaml`.
+    """
+    with one_sentence():
+        from nics_drl_bridge.lidar.maps import map_files
+        from nics_drl_bridge.robot.spec import load_robot
+        from nics_drl_bridge.sim.occupancy import occupancy, standing
+        from nics_drl_bridge.sim.scenes import SetSampler
+        from nics_drl_bridge.sim.world_set import load_worlds
+
+        if not 1e-3 <= resolution <= 100.0:
+            raise ConfigError(f"--resolution {resolution:g}: must be from 0.001 to 100 m.")
+        worlds = load_worlds(name)
+        sampler = SetSampler(worlds, load_robot(robot).footprint_radius)
+        scene = sampler.draw([seed])[0]
+        member = int(scene.member)
+        opened = worlds.members[member]
+        file = out or Path(f"{opened.name}_map.yaml")
+        if file.suffix not in MAPS:
+            raise ConfigError(f"--out {file}: must end in .yaml.")
+        grid = occupancy(opened, standing(sampler, member, scene.bodies), resolution)
+        map_files(grid, file)
+        rows, columns = grid.cells.shape
+        size = f"{columns} x {rows} cells of {grid.resolution:.4g} m"
+        typer.echo(f"{file}: the map of {opened.name!r}, seed {seed}, {size}")

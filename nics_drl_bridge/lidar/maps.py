@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 import warnings
 from collections.abc import Sequence
@@ -16,8 +17,9 @@ from PIL import Image
 from pydantic import Field, model_validator
 from scipy import ndimage
 
-from nics_drl_bridge.config import Schema, find_config, load_yaml
+from nics_drl_bridge.config import Schema, dump_yaml, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.files import write_bytes, write_text
 from nics_drl_bridge.geometry import rotate
 from nics_drl_bridge.lidar import map_kernels
 from nics_drl_bridge.lidar.fixture_kernels import Fixtures
@@ -148,6 +150,26 @@ def load_map(
     grey, opaque = read_image(path.parent / file.image, str(path))
     cells = np.ascontiguousarray(cells_of(grey, opaque, file)[::-1])
     return GridMap(cells, file.resolution, file.origin, unknown_stops, occupied_from)
+
+
+def map_files(grid: GridMap, path: Path) -> None:
+    """Writes a map as files of Nav2's map_server: YAML, and a PGM of the same name beside it.
+
+    `load_map` gives the same cells. They are trinary, or raw if some are neither free nor occupied.
+    """
+    image, mode = path.with_suffix(".pgm"), "trinary"
+    if np.isin(grid.cells, (FREE, OCCUPIED, UNKNOWN)).all():
+        pixels = np.select([grid.cells == FREE, grid.cells == OCCUPIED], [254, 0], 205)
+    else:
+        mode, pixels = "raw", np.where(grid.cells == UNKNOWN, 255, grid.cells)
+    content = io.BytesIO()
+    Image.fromarray(pixels.astype(np.uint8)[::-1]).save(content, "PPM")
+    write_bytes(image, content.getvalue())
+    about = {
+        "image": image.name, "resolution": float(grid.resolution), "origin": list(grid.origin),
+        "negate": 0, "occupied_thresh": 0.65, "free_thresh": 0.196, "mode": mode,
+    }  # fmt: skip
+    write_text(path, dump_yaml(about))
 
 
 def cells_of(

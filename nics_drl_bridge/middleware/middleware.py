@@ -13,6 +13,7 @@ from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, RobotView
 from nics_drl_bridge.lidar.sensor import unread
 from nics_drl_bridge.middleware import measurement as measured
 from nics_drl_bridge.middleware import timeline
+from nics_drl_bridge.middleware.belief import parted
 from nics_drl_bridge.middleware.ekf import LEAST_POSE_STD, LEAST_TWIST_STD, START_STD, Estimator
 from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, SCAN, Kind, Measurement
 from nics_drl_bridge.middleware.timeline import ReportedPose, Stamps
@@ -104,6 +105,18 @@ class Middleware:
         self.estimator.reset(time_ns, pose, std)
         self._trail.reset()
         self._begin(time_ns)
+
+    def place(self, pose: ArrayLike, covariance: ArrayLike) -> None:
+        """Takes the robot to be at a pose (3,) in `map`, with a covariance (3, 3), from now on.
+
+        Its motion, odometry and all topics go on.
+        """
+        belief = self.estimator.belief
+        mean, spread = belief.mean.copy(), parted(belief.covariance)
+        mean[:3], spread[:3, :3] = pose, covariance
+        anchor = belief.anchor and belief.anchor._replace(mean=mean, covariance=spread)
+        self.estimator.belief = belief._replace(mean=mean, covariance=spread, anchor=anchor)
+        self._timeline.reset()
 
     def _begin(self, time_ns: int) -> None:
         self._start_ns, self._unstamped_ns = time_ns, time_ns - 1

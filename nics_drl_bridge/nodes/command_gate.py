@@ -21,17 +21,18 @@ from nics_drl_bridge.gate import inputs, shield
 from nics_drl_bridge.gate.black_box import Entry
 from nics_drl_bridge.gate.gate import decide
 from nics_drl_bridge.gate.limits import PERIOD_S, Limits, load_limits
-from nics_drl_bridge.gate.state import Decision, GateConfig, ShieldConfig, begin
+from nics_drl_bridge.gate.state import Decision, GateConfig, ShieldConfig, begin, replace
 from nics_drl_bridge.gate.stopping import doubtful, gate_config, require_possible, shield_config
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import Array
+from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
-from nics_drl_bridge.nodes import qos, runner, wire
+from nics_drl_bridge.nodes import device_parameters, qos, runner, wire
 from nics_drl_bridge.nodes.conversions import is_rotation, sensor_from_ros, sensor_type
 from nics_drl_bridge.nodes.gate_log import GateLog
 from nics_drl_bridge.nodes.parameters import (
     BLACK_BOX,
+    FOREIGN,
     LIMITS,
     PRIORITY,
     RULES_IN_SECONDS,
@@ -41,6 +42,7 @@ from nics_drl_bridge.nodes.parameters import (
     stamped,
 )
 
+TWIST, TWIST_STAMPED = "Twist", "TwistStamped"
 STALE_S = 0.05  # a motion that was decided on longer ago than this is decided on again [s]
 SCAN_PERIODS = 1.75  # for a slow lidar, default age limit of a command's scan, in its periods
 ROTATION = slice(3, 7)  # position of an odometry's quaternion among its numbers
@@ -133,6 +135,22 @@ def command(content: bytes) -> inputs.Command:
     return inputs.Command(wire.stamp_of(content), np.array(wire.stamped_twist_of(content)))
 
 
+def foreign_command(
+    kind: str, oldest_ns: int, newest: inputs.Scan | None, content: bytes
+) -> inputs.Command:
+    """Reads a command of another controller, which counts as computed from the newest scan.
+
+    A stamp, if it has one, must not be older than `oldest_ns`. Raises `wire.UNREADABLE`.
+    """
+    if newest is None:
+        raise ValueError("no scan has come yet that it could be from")
+    if kind == TWIST:
+        return inputs.Command(newest.stamp_ns, np.array(wire.twist_of(content)))
+    if 0 < wire.stamp_of(content) < oldest_ns:
+        raise ValueError("its stamp is older than command_age; is use_sim_time the same at both?")
+    return replace(command(content), stamp_ns=newest.stamp_ns)
+
+
 def e_stop(content: bytes) -> inputs.EStop:
     """Reads a serialised Bool."""
     return inputs.EStop(wire.truth_of(content))
@@ -168,6 +186,7 @@ class CommandGate(qos.QosWatch):
         if self._config.shield is not None:
             shield.rehearse()
         self._stamped = bool(runner.declare_row(self, stamped("cmd_vel")))
+        runner.declare_row(self, FOREIGN)
         kind = TwistStamped if self._stamped else Twist
         self._out = self.create_publisher(kind, "cmd_vel", qos.COMMAND)
         self._listen()
@@ -178,11 +197,13 @@ class CommandGate(qos.QosWatch):
             logger.warning(refused)
 
     def _listen(self) -> None:
+        raw = device_parameters.choice(self, FOREIGN.name, ("none", TWIST, TWIST_STAMPED))
+        given = command if raw == "none" else partial(self._foreign, raw)
         readers: tuple[tuple[Any, str, Callable[[bytes], inputs.Input], Any], ...] = (
             (LaserScan, "scan", partial(scan, self._lidar), qos.SENSOR),
             (Odometry, "odom", odometry, qos.SENSOR),
             (Odometry, "odometry/filtered", estimate, qos.SENSOR),
-            (TwistStamped, "cmd_vel_raw", command, qos.COMMAND),
+            (Twist if raw == TWIST else TwistStamped, "cmd_vel_raw", given, qos.COMMAND),
             (Bool, "e_stop", e_stop, qos.EVERY_COMMAND),
             *(
                 (sensor_type(each), each.name, partial(reading, each), qos.SENSOR)
@@ -203,6 +224,11 @@ class CommandGate(qos.QosWatch):
             self._log.refuse(f"{topic}: {error}")
         else:
             self._decide(given)
+
+    def _foreign(self, kind: str, content: bytes) -> inputs.Command:
+        age_ns = round(self._config.command_age_s * NS_PER_S)
+        oldest_ns = int(self.get_clock().now().nanoseconds) - age_ns
+        return foreign_command(kind, oldest_ns, self._state.scan, content)
 
     def _arm(self) -> tuple[bool, str]:
         return self._answer(inputs.Arm(self.count_publishers(self._out.topic_name)))

@@ -19,13 +19,14 @@ from geometry_msgs.msg import (
     Twist,
     TwistStamped,
 )
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import OccupancyGrid, Odometry
 from numpy.typing import ArrayLike, NDArray
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Imu, JointState, LaserScan
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import NS_PER_S, Array
+from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.sectors import Reader, reader_beside
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader, to_device
@@ -131,6 +132,39 @@ def pose_from_ros(message: PoseStamped | PoseWithCovarianceStamped) -> tuple[Arr
     known = isinstance(message, PoseWithCovarianceStamped)
     covariance = np.reshape(message.pose.covariance, (6, 6))[PLANAR] if known else None
     return np.array(messages.pose_row(message)), covariance
+
+
+def pose_to_ros(pose: ArrayLike, time_ns: int, frame: str) -> PoseStamped:
+    """Returns a pose (3,) in a frame as a PoseStamped."""
+    x, y, heading = np.asarray(pose, np.float64).tolist()
+    message = PoseStamped()
+    message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
+    message.pose.position.x, message.pose.position.y = x, y
+    message.pose.orientation = heading_to_ros(heading)
+    return message
+
+
+def map_to_ros(grid: GridMap, time_ns: int, frame: str) -> OccupancyGrid:
+    """Returns a map as an OccupancyGrid, measured at a time [ns] and in force since."""
+    message = OccupancyGrid(data=array.array("b", grid.cells.tobytes()))
+    message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
+    info, (x, y, heading) = message.info, grid.origin
+    info.map_load_time, info.resolution = message.header.stamp, grid.resolution
+    info.height, info.width = grid.cells.shape
+    info.origin.position.x, info.origin.position.y = x, y
+    info.origin.orientation = heading_to_ros(heading)
+    return message
+
+
+def map_from_ros(message: OccupancyGrid) -> GridMap:
+    """Returns the map of an OccupancyGrid. Raises ConfigError if sizes do not fit."""
+    info, cells = message.info, np.array(message.data, np.int8)
+    if cells.size != info.height * info.width or not cells.size or not info.resolution > 0.0:
+        size = f"{info.height} x {info.width} of {info.resolution:g} m"
+        raise ConfigError(f"map: {cells.size} cells are no {size}; look at who publishes it.")
+    place, turn = info.origin.position, info.origin.orientation
+    origin = place.x, place.y, heading_of(turn.x, turn.y, turn.z, turn.w)
+    return GridMap(cells.reshape(info.height, info.width), float(info.resolution), origin)
 
 
 def imu_from_ros(message: Imu) -> tuple[float, float] | None:

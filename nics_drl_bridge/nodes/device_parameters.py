@@ -52,6 +52,7 @@ class Frames(NamedTuple):
     odom: str
     base: str
     laser: str
+    footprint: str  # empty for none
     prefix: str  # of all but the map
 
 
@@ -140,8 +141,8 @@ def frames(node: Node, namespace: str) -> Frames:
     """Returns the frames of a robot; those of a fleet begin with its namespace, except the map."""
     prefix = str(node.get_parameter("frame_prefix").value) + (f"{namespace}/" if namespace else "")
     world, *own = (str(node.get_parameter(f"{each}_frame").value) for each in Frames._fields[:-1])
-    odom, base, laser = (prefix + name for name in own)
-    return Frames(world, odom, base, laser, prefix)
+    odom, base, laser, footprint = (name and prefix + name for name in own)
+    return Frames(world, odom, base, laser, footprint, prefix)
 
 
 def _check_episode(node: Node, parameters: list[Parameter]) -> SetParametersResult:

@@ -8,9 +8,9 @@ from rclpy.node import Node
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.interface import S_PER_NS, Array
-from nics_drl_bridge.middleware.measurement import ODOM
+from nics_drl_bridge.interface import Array
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.map_to_odom import transform_from_ros
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
 
 
@@ -18,64 +18,100 @@ class GoalFrames:
     """Knows where the frames of a robot are: map, odometry, the robot, and what is mounted on it.
 
     The frames of odometry and robot are those of its `odom`; `base_frame` is another name of the
-    latter. What moves on the robot, so is told on `/tf` alone, is not followed.
+    latter. Of `/tf`, only a localiser's map -> odom is followed, not what moves on the robot.
     """
 
     def __init__(self, node: Node, topics: RobotTopics) -> None:
         self._node, self._topics = node, topics
         self._mounted: dict[str, tuple[str, Array]] = {}  # frame: its parent, and its pose there
+        self._odom: Array | None = None  # pose of `odom` in `map`, by a localiser
         self._transforms = conversions.message_type("tf2_msgs/msg/TFMessage")
-        self._heard = None
+        self._heard = []
         if self._transforms is not None:
-            given = self._transforms, "/tf_static", self._take, qos.FIXED_TRANSFORMS
-            self._heard = node.create_subscription(*given)
+            for topic, take, quality in (
+                ("/tf_static", self._take, qos.LATCHED),
+                ("/tf", self._follow, qos.TRANSFORMS),
+            ):
+                self._heard.append(node.create_subscription(self._transforms, topic, take, quality))
 
     def close(self) -> None:
-        """Ends the subscription."""
-        if self._heard is not None:
-            self._node.destroy_subscription(self._heard)
+        """Ends the subscriptions."""
+        while self._heard:
+            self._node.destroy_subscription(self._heard.pop())
 
     def _take(self, message: Any) -> None:
-        for each in message.transforms:
-            place, turn = each.transform.translation, each.transform.rotation
-            heading = conversions.heading_of(turn.x, turn.y, turn.z, turn.w)
-            parent, child = each.header.frame_id.strip("/"), each.child_frame_id.strip("/")
-            self._mounted[child] = parent, np.array([place.x, place.y, heading])
+        for parent, child, pose in map(transform_from_ros, message.transforms):
+            self._mounted[child] = parent, pose
+        self._follow(message)
+
+    def _follow(self, message: Any) -> None:
+        wanted = self._map, self._topics.frames[0].strip("/")
+        for parent, child, pose in map(transform_from_ros, message.transforms):
+            if (parent, child) == wanted:
+                self._odom = pose
+
+    @property
+    def _map(self) -> str:
+        return str(self._node.get_parameter("map_frame").value)
+
+    def robot_in(self, frame: str) -> Array | None:
+        """Returns the robot's pose (3,) in the map or `odom`; None while it is unknown."""
+        reported = self._topics.in_odom()
+        if reported is None or frame == self._topics.frames[0].strip("/"):
+            return reported
+        if frame not in ("", self._map):
+            return None
+        if self._odom is not None:
+            return geometry.compose(self._odom, reported)
+        return self._topics.view().pose if self._topics.located else None
 
     def in_map(self, goal: PoseStamped) -> Array:
         """Returns x, y (2,) of a goal in the map, as the robot stands now. Raises ConfigError."""
         place = np.array([goal.pose.position.x, goal.pose.position.y, 0.0])
-        frame = asked = goal.header.frame_id.strip("/")
-        known = [str(self._node.get_parameter(f"{name}_frame").value) for name in ("map", "base")]
+        try:
+            frame, place = self.fixed(goal.header.frame_id, place)
+        except ConfigError as error:
+            raise ConfigError(f"goal_pose: {error}") from None
+        if frame == self._map:
+            return self._of_localiser(place)[:2]
+        there: Array = geometry.compose(
+            self._topics.view().pose, geometry.between(self._topics.in_odom(), place)
+        )[:2]
+        return there
+
+    def fixed(self, frame: str, places: Array) -> tuple[str, Array]:
+        """Returns poses (..., 3) of a frame in the map or `odom`, and which of them it is.
+
+        Those of the robot, or of what is mounted on it, are in `odom`, as the robot stands now.
+        Raises ConfigError for a frame that is not known, or as long as the robot's place is not.
+        """
+        asked = frame = frame.strip("/")
         odom, robot = (each.strip("/") for each in self._topics.frames)
-        bases = {known[1], robot} - {""}
+        bases = {str(self._node.get_parameter("base_frame").value), robot} - {""}
         for _ in range(len(self._mounted) + 1):
-            if frame in ("", known[0]):
-                return place[:2]
+            if frame in ("", self._map):
+                return self._map, places
             if frame in bases or (frame == odom and odom):
-                return self._from_robot(place, asked, frame == odom)
+                reported = self._topics.in_odom()
+                if reported is None or not self._topics.located:
+                    why = f"a goal in the frame {asked!r} is refused"
+                    why = f"{why}, as the robot's place is not known yet"
+                    raise ConfigError(f"{why}; give it again when odometry and pose have come.")
+                return odom, places if frame == odom else geometry.compose(reported, places)
             if frame not in self._mounted:
                 break
             frame, mount = self._mounted[frame]
-            place = geometry.compose(mount, place)
-        names = ", ".join(repr(each) for each in sorted({known[0], odom, *bases} - {""}))
+            places = geometry.compose(mount, places)
+        names = ", ".join(repr(each) for each in sorted({self._map, odom, *bases} - {""}))
         heard = "one that /tf_static joins to them"
         if self._transforms is None:
             heard = "install tf2_msgs for those that /tf_static joins to them"
         why = f"a goal in the frame {asked!r} is refused, which is not known here"
-        raise ConfigError(f"goal_pose: {why}; give it in {names}, or {heard}.")
+        raise ConfigError(f"{why}; give it in {names}, or {heard}.")
 
-    def _from_robot(self, place: Array, frame: str, of_odometry: bool) -> Array:
-        newest = self._topics.middleware.cache.newest.get(ODOM)
-        if newest is None or not self._topics.located:
-            why = f"a goal in the frame {frame!r} is refused, as the robot's place is not known yet"
-            raise ConfigError(f"goal_pose: {why}; give it again when odometry and pose have come.")
-        pose, now_ns = self._topics.view().pose, self._topics.newest_ns
-        if of_odometry:  # the robot has gone on since the newest odometry
-            reported, twist = newest.value
-            since_s = (now_ns - newest.stamp_ns) * S_PER_NS
-            place = geometry.between(
-                geometry.compose(reported, geometry.exp(twist * since_s)), place
-            )
-        there: Array = geometry.compose(pose, place)[:2]
-        return there
+    def _of_localiser(self, place: Array) -> Array:
+        """Returns a pose (3,) in the map of a localiser, if there is one, in the estimate's."""
+        robot = None if self._odom is None else self.robot_in(self._map)
+        if robot is None:
+            return place
+        return geometry.compose(self._topics.view().pose, geometry.between(robot, place))

@@ -12,6 +12,7 @@ from nics_drl_bridge.middleware.measurement import Health
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.lifecycle import ManagedNode
+from nics_drl_bridge.nodes.map_to_odom import MapToOdom, odom_in_map
 from nics_drl_bridge.nodes.parameters import middleware
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
 from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED
@@ -40,6 +41,12 @@ class MiddlewareNode(ManagedNode):
         self._filtered = self.create_lifecycle_publisher(Odometry, topic, qos.SENSOR_RELIABLE)
         self._topics = RobotTopics(self, model, on_odometry=self._publish)
         self.undo.callback(self._topics.close)
+        self._topics.hear_initial_pose()
+        self._map_to_odom: MapToOdom | None = None
+        if self.get_parameter("publish_map_to_odom").value:
+            tolerance = float(self.get_parameter("transform_tolerance").value or 0.0)
+            self._map_to_odom = MapToOdom(self, tolerance)
+            self.undo.callback(self._map_to_odom.close)
 
     def _publish(self, stamp_ns: int) -> None:
         if self.state != ACTIVE:
@@ -52,6 +59,9 @@ class MiddlewareNode(ManagedNode):
         message.pose.covariance = conversions.covariance_to_ros(estimator.covariance[:3, :3])
         message.twist.covariance = conversions.covariance_to_ros(estimator.twist_covariance)
         self._filtered.publish(message)
+        if self._map_to_odom is not None and (reported := self._topics.in_odom()) is not None:
+            home = odom_in_map(self._topics.view().pose, reported)
+            self._map_to_odom.publish(home, stamp_ns, (frames[0], self._topics.frames[0]))
 
     def _reset(self) -> tuple[bool, str]:
         if self.state == UNCONFIGURED:

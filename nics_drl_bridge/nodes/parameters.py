@@ -68,7 +68,14 @@ def sensors() -> list[Row]:
 
 def middleware() -> list[Row]:
     """Returns the parameters of `middleware_node` alone."""
-    return [Row("map_frame", "map", "Frame id of the estimate.", fixed=False), BASE_FRAME]
+    return [
+        Row("map_frame", "map", "Frame id of the estimate.", fixed=False),
+        BASE_FRAME,
+        Row("publish_map_to_odom", True,
+            "Whether to publish map -> odom on /tf by the estimate, where no other node does."),
+        Row("transform_tolerance", 0.2, "By which the stamp of map -> odom is ahead [s].",
+            (0.0, 10.0)),
+    ]  # fmt: skip
 
 
 def policy() -> list[Row]:
@@ -92,6 +99,44 @@ def policy() -> list[Row]:
     ]  # fmt: skip
 
 
+def nav2() -> list[Row]:
+    """Returns the parameters of Nav2's controller server that `policy_node` knows, too."""
+    return [
+        Row("navigate_to_pose", True,
+            "Whether to serve this action, too, where no other node does."),
+        Row("lookahead", 1.0, "From the robot to the sub-goal on a path [m].", (0.1, 100.0), False),
+        Row("controller_plugins", ["FollowPath"], "Names that goals of follow_path may ask for."),
+        Row("goal_checker_plugins", ["general_goal_checker"], "The same, of the goal's checks."),
+        Row("progress_checker_plugins", ["progress_checker"], "The same, of the progress' checks."),
+        Row("failure_tolerance", 0.3,
+            "So long a robot that touches something waits [s]; -1 for ever.", (-1.0, 1e6), False),
+        Row("costmap_update_timeout", 1.0,
+            "Silence of scan or odom that ends a path [s]; ten control periods at least.",
+            (0.0, 1e6), False),
+        Row("speed_limit_topic", "speed_limit", "Where a SpeedLimit comes from."),
+    ]  # fmt: skip
+
+
+def checkers(goals: Sequence[str], progress: Sequence[str]) -> list[Row]:
+    """Returns the parameters of the checks of these names, as of Nav2's simple checkers."""
+    span = (0.0, 1e6)
+    rows = [
+        ("xy_goal_tolerance", 0.25, "Greatest distance from the goal [m].", span),
+        ("yaw_goal_tolerance", 0.25, "Of the heading there [rad]; not of robots that steer.", span),
+        ("stateful", True, "Whether a place that was reached stays so.", None),
+        ("path_length_tolerance", 1.0, "Greatest way that may be left at the goal [m].", span),
+    ], [
+        ("required_movement_radius", 0.5, "That the robot has to leave [m].", span),
+        ("movement_time_allowance", 10.0, "Within this time [s].", span),
+    ]  # fmt: skip
+    return [
+        Row(f"{name}.{key}", default, about, limits, fixed=False)
+        for names, those in zip((goals, progress), rows, strict=True)
+        for name in names
+        for key, default, about, limits in those
+    ]
+
+
 def device(laser_frame: str = "") -> list[Row]:
     """Returns the parameters of all simulators, but `robots`, which is a count or names."""
     return [
@@ -104,6 +149,9 @@ def device(laser_frame: str = "") -> list[Row]:
         Row("odom_frame", "odom", "Frame id of odom."),
         Row("base_frame", "base_link", "Frame id of base_link."),
         Row("laser_frame", laser_frame, "Frame id of the lidar.", shown="that of the model"),
+        Row("footprint_frame", "",
+            "Frame id of a further frame at base_link, as base_footprint; none if empty."),
+        Row("map_resolution", 0.01, "Greatest side of the cells of map [m].", (0.001, 10.0)),
         Row("publish_map_to_odom", False,
             "Whether to publish the true map -> odom on /tf, in place of a localiser."),
         Row("rate", 1.0, "Simulated seconds per second in realtime.", (0.01, 1000.0)),
@@ -193,10 +241,17 @@ def gate_rules(odom_rate: float = math.nan, scan_age: float = math.nan) -> list[
 RULES_IN_SECONDS = ("scan_age", "odom_age", "command_age", "e_stop_silence")
 
 
+FOREIGN = Row(
+    "foreign_commands", "none",
+    "Type of cmd_vel_raw of a controller that does not stamp it with its scan, as Nav2's: Twist or "
+    "TwistStamped; the newest scan's age then counts. none: of the policy.",
+)  # fmt: skip
+
+
 def gate() -> list[Row]:
     """Returns all parameters of `command_gate`."""
     shield = [SHIELD, *SHIELD_NUMBERS]
-    return [MODEL, LIMITS, *shield, *gate_rules(), stamped("cmd_vel"), BLACK_BOX, PRIORITY]
+    return [MODEL, LIMITS, *shield, *gate_rules(), stamped("cmd_vel"), FOREIGN, BLACK_BOX, PRIORITY]
 
 
 def drive() -> list[Row]:
@@ -225,9 +280,10 @@ class NodeFacts(NamedTuple):
     example: str  # after `--ros-args`
 
 
-DRIVEN_BY = ("cmd_vel", "ackermann_cmd (of a robot that steers, with ackermann_msgs)")
-TOLD = ("scan", "odom", "the model's further sensors", "joint_states", "ground_truth", "/clock",
-        "/tf, /tf_static (with tf2_msgs)", "/diagnostics")  # fmt: skip
+DRIVEN_BY = ("cmd_vel", "ackermann_cmd (of a robot that steers, with ackermann_msgs)",
+             "initialpose")  # fmt: skip
+TOLD = ("scan", "odom", "the model's further sensors", "joint_states", "ground_truth", "map",
+        "/clock", "/tf, /tf_static (with tf2_msgs)", "/diagnostics")  # fmt: skip
 SERVED = ("~/reset", "~/pause", "~/repeat", "~/touched")
 HEARD = ("scan", "odom", "the model's further sensors", "cmd_vel", "pose (with pose_type)",
          "imu (with use_imu)")  # fmt: skip
@@ -243,13 +299,19 @@ NODES: dict[str, Callable[[], NodeFacts]] = {
     ),
     "middleware_node": lambda: NodeFacts(
         "Caches a robot's topics and publishes the estimate of its state; a managed node.",
-        HEARD, ("odometry/filtered", "/diagnostics"), ("~/reset",),
+        (*HEARD, "initialpose"),
+        ("odometry/filtered", "/tf (with tf2_msgs)", "/diagnostics"), ("~/reset",),
         [*managed(), *sensors(), *middleware()], "-p use_imu:=true -r __ns:=/car",
     ),
     "policy_node": lambda: NodeFacts(
         "Drives a robot to goals by a policy, which answers each scan; a managed node.",
-        (*HEARD, "goal_pose", "/tf_static (with tf2_msgs)"), ("cmd_vel_raw", "/diagnostics"), (),
-        [*managed(), *sensors(), *policy()], '-p policy:=my_policy.onnx -p "goal:=[1.0, 2.0]"',
+        (*HEARD, "initialpose", "goal_pose", "map, speed_limit (with nav2_msgs)",
+         "/tf, /tf_static (with tf2_msgs)"),
+        ("cmd_vel_raw", "/diagnostics"),
+        ("follow_path, navigate_to_pose (actions, with nav2_msgs)",),
+        [*managed(), *sensors(), *policy(), *nav2(),
+         *checkers(("general_goal_checker",), ("progress_checker",))],
+        '-p policy:=my_policy.onnx -p "goal:=[1.0, 2.0]"',
     ),
     "command_gate": lambda: NodeFacts(
         "Passes a policy's commands on while they can be trusted; it starts disarmed.",

@@ -16,8 +16,10 @@ from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos, runner
+from nics_drl_bridge.nodes.follow_path import Drive, PathActions
 from nics_drl_bridge.nodes.goal_frames import GoalFrames
 from nics_drl_bridge.nodes.lifecycle import ManagedNode
+from nics_drl_bridge.nodes.nav2_parameters import ControllerParameters
 from nics_drl_bridge.nodes.parameters import policy
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
 from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED
@@ -39,6 +41,8 @@ class PolicyNode(ManagedNode):
         declare_sensors(self)
         for row in policy():
             runner.declare_row(self, row)
+        self._nav2 = ControllerParameters(self)
+        self.ignores = self._nav2.ignores  # of Nav2's file for its controller server
         self._acted_ns = 0
         runner.diagnose(self, "policy", self._look)
 
@@ -56,8 +60,12 @@ class PolicyNode(ManagedNode):
         self.undo.callback(self.destroy_subscription, goals)
         self._topics = RobotTopics(self, model, self._act, self._act, self._on_lidar)
         self.undo.callback(self._topics.close)
+        self._topics.hear_initial_pose()
         self._frames = GoalFrames(self, self._topics)
         self.undo.callback(self._frames.close)
+        given = self._topics, self._frames, model, self._nav2
+        self._actions = PathActions(self, *given, self._toward)
+        self.undo.callback(self._actions.close)
         timer = runner.steadily(self, POLLS * model.control_period, self._act)
         self.undo.callback(self.destroy_timer, timer)
 
@@ -67,6 +75,7 @@ class PolicyNode(ManagedNode):
 
     def deactivate(self) -> None:
         """Leaves a zero command behind."""
+        self._actions.stop("the node is deactivated")
         runner.last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
 
     def _declared_pace(self, control_period: float) -> tuple[ActionPace, Deadline]:
@@ -95,6 +104,10 @@ class PolicyNode(ManagedNode):
         self.get_logger().info(f"scans of {lidar.beams} beams {span} are {done}")
 
     def _on_goal(self, message: PoseStamped) -> None:
+        if self._actions.active or self._actions.led:
+            told = "a goal_pose is not used, as an action leads the robot"
+            self.get_logger().info(told, throttle_duration_sec=5.0)
+            return
         try:
             goal = self._frames.in_map(message)
         except ConfigError as error:
@@ -108,6 +121,8 @@ class PolicyNode(ManagedNode):
     def _act(self, _: int = 0) -> None:
         if self.state != ACTIVE:
             return
+        if self._actions.tick():
+            self._raw.publish(self._message(np.zeros(3), self._acted_ns))
         newest, begin_s = self._topics.middleware.cache.newest, time.monotonic()
         needed = (SCAN, ODOM, *(sensor.name for sensor in self._task.sensors))
         if not newest.keys() >= set(needed):
@@ -137,17 +152,24 @@ class PolicyNode(ManagedNode):
         return runner.Condition(f"{self.state}; {done.late} late inferences", done.late > 0, facts)
 
     def _twist(self) -> Array:
+        if self._actions.active:
+            self._goal = np.full(2, np.nan)  # the one before is given up
+            return self._actions.twist()
         if not (self._topics.located and np.isfinite(self._goal).all()):
             return np.zeros(3)
-        view = self._topics.view()
-        verdict = self._task.judge(view, {"goal": self._goal})
+        verdict = self._task.judge(self._topics.view(), {"goal": self._goal})
         if verdict.reached or verdict.touched:
             why = "touching something, stopped" if verdict.touched else "goal reached"
             self.get_logger().info(why, throttle_duration_sec=5.0)
             return np.zeros(3)
+        return self._toward(self._goal).twist
+
+    def _toward(self, goal: Array) -> Drive:
+        view = self._topics.view()
         if told := resume(self._policy, self._acted_ns * S_PER_NS):
             self.get_logger().warning(told, throttle_duration_sec=5.0)
-        return self._asked(view, self._goal)
+        touched = bool(self._task.judge(view, {"goal": goal}).touched)
+        return Drive(self._asked(view, goal), touched)
 
     def _asked(self, view: RobotView, goal: Array) -> Array:
         try:

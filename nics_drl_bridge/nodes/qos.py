@@ -55,7 +55,7 @@ first one's unnoticed. Also `e_stop`, of which no press may be overwritten."""
 
 COMMAND = profile_of(Offer(1))  # commands and goals: only the newest counts, and it has to arrive
 TRANSFORMS = profile_of(Offer(100))  # `/tf`: like tf2's own, whose listeners request reliable
-FIXED_TRANSFORMS = profile_of(Offer(1, transient_local=True))  # `/tf_static`: for late joiners too
+LATCHED = profile_of(Offer(1, transient_local=True))  # `/tf_static`, `map`: for late joiners too
 DIAGNOSTICS = profile_of(Offer(10))  # as the diagnostic aggregator expects `/diagnostics`
 
 MOMENT_S, UNKNOWN = 0.5, "_UNKNOWN_"

@@ -11,16 +11,25 @@ from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from sensor_msgs.msg import Imu, LaserScan
 
+from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BridgeError, ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import Array, RobotView
+from nics_drl_bridge.interface import S_PER_NS, Array, RobotView
 from nics_drl_bridge.lidar.sectors import Reader
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
-from nics_drl_bridge.middleware.ekf import ANYWHERE
-from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCAN
+from nics_drl_bridge.middleware.ekf import ANYWHERE, START_STD
+from nics_drl_bridge.middleware.measurement import (
+    CMD_VEL,
+    IMU,
+    ODOM,
+    POSE,
+    SCAN,
+    checked_covariance,
+)
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.initial_pose import INITIAL_POSE, initial_pose
 from nics_drl_bridge.nodes.parameters import NO_POSE, POSE_TYPES, STAMPED, sensors
 from nics_drl_bridge.nodes.runner import declare_row
 
@@ -67,6 +76,7 @@ class RobotTopics:
         self._on_odometry, self._on_scan, self._on_lidar = on_odometry, on_scan, on_lidar
         self._reader: Reader | None = Reader(model.lidar, backwards=False)
         self._header, self._told = b"", ""
+        self._placed: tuple[Array, Array] | None = None  # pose and covariance of `initialpose`
         self._subscriptions: list[Any] = []
         stamped = bool(node.get_parameter(STAMPED).value)
         command = TwistStamped if stamped else Twist
@@ -114,6 +124,36 @@ class RobotTopics:
         self._started, self._since_ns = True, stamp_ns
         self.middleware.reset(stamp_ns, pose)
 
+    def hear_initial_pose(self) -> None:
+        """Subscribes to `initialpose`, which says where in the map the robot is."""
+        kind = PoseWithCovarianceStamped
+        self._subscribe(INITIAL_POSE, kind, self._take_initial_pose, qos.COMMAND)
+
+    def _take_initial_pose(self, message: PoseWithCovarianceStamped) -> None:
+        logger = self._node.get_logger()
+        try:
+            pose = initial_pose(message, str(self._node.get_parameter("map_frame").value))
+            spread = START_STD**2 * np.eye(3)  # where nothing corrects it, it defines the map
+            if self._posed:
+                given = checked_covariance(conversions.pose_from_ros(message)[1], 3, START_STD)
+                spread = spread if given is None else given
+        except (ConfigError, ValueError) as error:
+            logger.error(f"{str(error).removesuffix('.')}. The estimate stays as it is.")
+            return
+        self._placed = pose, spread
+        if self._started:
+            self.middleware.place(*self._placed)
+        logger.info(f"the robot is at ({pose[0]:.2f}, {pose[1]:.2f}) m, {pose[2]:.2f} rad")
+
+    def in_odom(self) -> Array | None:
+        """Returns the robot's pose (3,) by odometry at the newest datum; None before any."""
+        newest = self.middleware.cache.newest.get(ODOM)
+        if newest is None:
+            return None
+        pose, twist = newest.value  # the robot has gone on since
+        since_s = (self.newest_ns - newest.stamp_ns) * S_PER_NS
+        return geometry.compose(pose, geometry.exp(twist * since_s))
+
     @property
     def newest_ns(self) -> int:
         """Stamp of the newest datum [ns]; 0 if there is none."""
@@ -122,7 +162,8 @@ class RobotTopics:
     @property
     def located(self) -> bool:
         """True if the robot's position in the map is known."""
-        return not self._posed or POSE in self.middleware.cache.newest
+        known = self._placed is not None or not self._posed
+        return known or POSE in self.middleware.cache.newest
 
     def view(self) -> RobotView:
         """Returns the view at the stamp of the newest datum."""
@@ -168,6 +209,8 @@ class RobotTopics:
         if not self._started and np.isfinite(pose).all():
             self.middleware.reset(stamp, pose, *((ANYWHERE,) if self._posed else ()))
             self._started = True
+            if self._placed is not None:
+                self.middleware.place(*self._placed)
         used = self.middleware.odometry(stamp, self.now_ns(), pose, twist)
         newest = self.middleware.cache.newest
         if used and self._on_odometry is not None and newest[ODOM].stamp_ns == stamp:

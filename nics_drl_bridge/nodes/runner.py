@@ -250,10 +250,11 @@ def given_values(node: Node) -> dict[str, Parameter]:
 def unknown(node: Node) -> list[str]:
     """Returns a sentence for each value whose parameter the node does not have."""
     known = [name for name in node._parameters if not name.startswith(QOS)]
+    ignores = getattr(node, "ignores", lambda _: False)
     return [
         f"there is no parameter {name!r}, its value is ignored; {nearest(name, known)}"
         for name in sorted(given_values(node))
-        if name not in (*known, SHARED) and not name.startswith(QOS)
+        if name not in (*known, SHARED) and not name.startswith(QOS) and not ignores(name)
     ]
 
 

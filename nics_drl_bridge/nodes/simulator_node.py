@@ -13,7 +13,6 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
-from numpy.typing import ArrayLike
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -32,14 +31,16 @@ from nics_drl_bridge.lidar.spec import to_device
 from nics_drl_bridge.nodes import conversions, device_parameters, parameters, qos, runner, wire
 from nics_drl_bridge.nodes.conversions import sensor_to_ros, sensor_type
 from nics_drl_bridge.nodes.link import identity
+from nics_drl_bridge.nodes.map_to_odom import odom_in_map, transform_to_ros
 from nics_drl_bridge.nodes.robot_topics import TWIST, TWIST_STAMPED
 from nics_drl_bridge.nodes.simulation_interfaces import open_services
+from nics_drl_bridge.nodes.world_topics import WorldTopics
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.device import LEAST_VARIANCE, DeviceWorld, Sensed, variances
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
-CLOCK = "/clock"
+CLOCK, CLOCK_NS = "/clock", 15_000_000  # longest time between two messages in real time [ns]
 WATCH_S, QUIET_S = 2.0, 5.0
 LONGEST_TICK_S = 0.005  # longest time between two checks for delayed data that are due [s]
 
@@ -128,9 +129,11 @@ class RobotPort:
             self._node.destroy_publisher(each)
 
     def mounts(self) -> list[TransformStamped]:
-        """Returns the transforms base_link -> laser, and to each further sensor."""
+        """Returns the transforms base_link -> laser, to each further sensor, and footprint."""
         mounted = [(self.frames.laser, self._model.lidar.mount)]
         mounted += [(frame, sensor.mount) for sensor, frame, _ in self._sensors]
+        if self.frames.footprint:
+            mounted.append((self.frames.footprint, (0.0, 0.0, 0.0)))
         base = self.frames.base
         return [transform_to_ros(base, frame, place, Time()) for frame, place in mounted]
 
@@ -139,7 +142,7 @@ class RobotPort:
         frames = self.frames
         moving = [transform_to_ros(frames.odom, frames.base, sensed.odom, now)]
         if self._locates:
-            home = geometry.compose(sensed.pose, geometry.between(sensed.odom, np.zeros(3)))
+            home = odom_in_map(sensed.pose, sensed.odom)
             moving.append(transform_to_ros(frames.map, frames.odom, home, now))
         return moving
 
@@ -238,16 +241,6 @@ class CommandInlet:
             )
 
 
-def transform_to_ros(parent: str, child: str, pose: ArrayLike, stamp: Time) -> TransformStamped:
-    """Returns a pose (3,) of a child frame in its parent as a transform."""
-    x, y, heading = np.asarray(pose, np.float64).tolist()
-    message = TransformStamped(child_frame_id=child)
-    message.header.frame_id, message.header.stamp = parent, stamp
-    message.transform.translation.x, message.transform.translation.y = x, y
-    message.transform.rotation = conversions.heading_to_ros(heading)
-    return message
-
-
 class DeviceNode(qos.QosWatch):
     """Takes `cmd_vel`; publishes `scan`, `odom`, `joint_states`, `ground_truth`, `/clock`, `/tf`.
 
@@ -267,6 +260,7 @@ class DeviceNode(qos.QosWatch):
         self._make = make
         self.use_world(load_worlds(str(self.get_parameter("world").value)))
         self.paused, self._lags, self._hardware = False, 0, model.robot.name
+        self._told_ns = 0  # newest time on `/clock`
         self.device.advance()  # compiles before anything waits for it
         self._first_ns = time.time_ns() // self._time.step_ns * self._time.step_ns
         self.now_ns = self._first_ns
@@ -319,6 +313,7 @@ class DeviceNode(qos.QosWatch):
         for name in self._names:
             self._open_robot(name)
         self._open_transforms()
+        self._world_topics = WorldTopics(self, lambda: self.device, self._names)
         runner.serve(self, "~/reset", self._reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
         runner.serve(self, "~/repeat", self._repeat)
@@ -367,7 +362,7 @@ class DeviceNode(qos.QosWatch):
             self.get_logger().warning(f"the package tf2_msgs is not installed, {silent}; {fix}")
             return
         self._moving = self.create_publisher(self._transforms, "/tf", qos.TRANSFORMS)
-        self._fixed = self.create_publisher(self._transforms, "/tf_static", qos.FIXED_TRANSFORMS)
+        self._fixed = self.create_publisher(self._transforms, "/tf_static", qos.LATCHED)
         self._publish_mounts()
 
     def _publish_mounts(self) -> None:
@@ -390,6 +385,8 @@ class DeviceNode(qos.QosWatch):
             late = any((*self._time.scan_late_ns, *self._time.odom_late_ns))
             ticks = max(1.0, np.ceil(period / LONGEST_TICK_S)) if late else 1.0
             self._timer = runner.steadily(self, period / ticks, self._on_time)
+            if step_ns > CLOCK_NS:
+                runner.steadily(self, CLOCK_NS / NS_PER_S, self._on_clock)
         elif not self._time.lockstep:
             runner.steadily(self, 0.0, self._on_free_time)
 
@@ -444,6 +441,19 @@ class DeviceNode(qos.QosWatch):
         if behind > 1:
             self._soon.trigger()  # not here: commands that have arrived are for the next step
         self._outbox.flush(max(self.now_ns, self._real_time.time_at(steady_ns)))
+
+    def _on_clock(self) -> None:
+        """Tells the time between two steps, which may be too far apart for timers by `/clock`."""
+        if self.paused:
+            return
+        time_ns = self._real_time.time_at(time.monotonic_ns())
+        if self._told_ns < (between_ns := min(time_ns, self.now_ns + self._time.step_ns - 1)):
+            self._tell_time(between_ns)
+
+    def _tell_time(self, time_ns: int) -> None:
+        self._told_ns = time_ns
+        if self._clock_topic.get_subscription_count():
+            self._clock_topic.publish(Clock(clock=conversions.stamp_to_ros(time_ns)))
 
     def _on_free_time(self) -> None:
         if not self.paused:
@@ -530,8 +540,7 @@ class DeviceNode(qos.QosWatch):
 
     def _publish(self) -> None:
         now_ns = self.now_ns
-        if self._clock_topic.get_subscription_count():
-            self._clock_topic.publish(Clock(clock=conversions.stamp_to_ros(now_ns)))
+        self._tell_time(now_ns)
         odom_due, scan_due = self._odom_pace.due(now_ns), self._scan_pace.due(now_ns)
         if odom_due or scan_due:
             self._publish_data(odom_due, scan_due)

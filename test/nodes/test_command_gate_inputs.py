@@ -11,6 +11,7 @@ from geometry_msgs.msg import Quaternion, TwistStamped
 from rclpy.serialization import serialize_message
 from std_msgs.msg import Bool
 
+from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.lidar.spec import from_device, load_lidar
 from nics_drl_bridge.nodes import command_gate, conversions, wire
 
@@ -84,3 +85,30 @@ def test_an_estimate_one_of_whose_variances_is_no_number_is_uncertain(place, var
     message = odometry()
     message.pose.covariance[place] = variance
     assert np.isnan(command_gate.estimate(serialize_message(message)).std).any()
+
+
+def scanned(stamp_ns):
+    return inputs.Scan(stamp_ns, np.ones(LIDAR.beams, np.float32), (0.0, 0.1))
+
+
+def test_another_controllers_command_counts_as_of_the_newest_scan():
+    twist = conversions.twist_to_ros([0.5, 0.0, 0.2])
+    stamped = TwistStamped(twist=twist)
+    stamped.header.stamp = conversions.stamp_to_ros(STAMP_NS)
+    for kind, message in (("Twist", twist), ("TwistStamped", stamped)):
+        content = serialize_message(message)
+        read = command_gate.foreign_command(kind, STAMP_NS - 1, scanned(STAMP_NS + 7), content)
+        assert (read.stamp_ns, read.twist.tolist()) == (STAMP_NS + 7, [0.5, 0.0, 0.2])
+
+
+def test_another_controllers_command_is_refused_if_it_is_old_or_before_any_scan():
+    stamped = TwistStamped()
+    stamped.header.stamp = conversions.stamp_to_ros(STAMP_NS)
+    content = serialize_message(stamped)
+    with pytest.raises(ValueError, match="its stamp is older than command_age"):
+        command_gate.foreign_command("TwistStamped", STAMP_NS + 1, scanned(STAMP_NS), content)
+    with pytest.raises(ValueError, match="no scan has come yet"):
+        command_gate.foreign_command("TwistStamped", 0, None, content)
+    unstamped = serialize_message(TwistStamped())
+    kept = command_gate.foreign_command("TwistStamped", 1, scanned(STAMP_NS), unstamped)
+    assert kept.stamp_ns == STAMP_NS

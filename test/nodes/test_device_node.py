@@ -261,7 +261,7 @@ def test_a_car_is_driven_by_speed_and_steering_angle(stamped):
 def test_its_transforms_are_those_of_rep_105_and_the_mount_is_told_to_late_comers(stamped):
     kind = import_module("tf2_msgs.msg").TFMessage
     moving = stamped.peer.listen(kind, "/tf", qos.TRANSFORMS)
-    fixed = stamped.peer.listen(kind, "/tf_static", qos.FIXED_TRANSFORMS)
+    fixed = stamped.peer.listen(kind, "/tf_static", qos.LATCHED)
     stamped.peer.until(lambda: moving and fixed, "transforms")
     (odom,), (mount,) = moving[-1].transforms, fixed[-1].transforms
     assert (odom.header.frame_id, odom.child_frame_id) == ("car/odom", "car/base_link")

@@ -13,8 +13,6 @@ from rclpy.node import Node
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.middleware.measurement import ODOM
-from nics_drl_bridge.middleware.middleware import Datum
 from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.goal_frames import GoalFrames
 from nics_drl_bridge.nodes.parameters import policy
@@ -32,8 +30,10 @@ class Topics:
 
     def __init__(self):
         self.frames, self.located, self.newest_ns = ("bot/odom", "bot/base"), True, 200_000_000
-        odometry = Datum(100_000_000, 0, 0, (REPORTED, TWIST))
-        self.middleware = SimpleNamespace(cache=SimpleNamespace(newest={ODOM: odometry}))
+        self.reported = geometry.compose(REPORTED, [0.1, 0.0, 0.0])
+
+    def in_odom(self):
+        return self.reported
 
     def view(self):
         return SimpleNamespace(pose=ESTIMATE)
@@ -83,6 +83,17 @@ def test_a_goal_of_the_odometry_lies_as_far_from_the_robot_as_there(frames):
     assert wanted == pytest.approx([2.0, 2.9])
 
 
+def test_with_a_localiser_a_goal_of_the_map_lies_as_far_from_the_robot_as_in_its_map(frames):
+    other = TransformStamped(child_frame_id="bot/odom")
+    other.header.frame_id, other.transform.translation.x = "map", -5.0
+    other.transform.rotation.w = 1.0
+    frames._follow(SimpleNamespace(transforms=[other]))
+    now = geometry.compose([-5.0, 0.0, 0.0], frames._topics.reported)
+    assert frames.robot_in("map") == pytest.approx(now)
+    wanted = geometry.compose(ESTIMATE, geometry.between(now, [1.0, -2.0, 0.0]))[:2]
+    assert frames.in_map(goal("map", 1.0, -2.0)) == pytest.approx(wanted)
+
+
 def test_a_goal_of_a_mounted_frame_follows_its_transforms(frames):
     mount(frames, "base_link", "mast", 0.2, 0.0, 0.0)
     mount(frames, "mast", "camera", 0.0, 0.1, math.pi)
@@ -102,7 +113,7 @@ def test_frames_that_are_mounted_on_each_other_end_in_a_refusal(frames):
 
 
 def test_before_the_robots_place_is_known_only_goals_of_the_map_are_taken(frames):
-    frames._topics.middleware.cache.newest.clear()
+    frames._topics.reported = None
     assert frames.in_map(goal("map", 1.0, 0.0)) == pytest.approx([1.0, 0.0])
     with pytest.raises(ConfigError, match="place is not known yet"):
         frames.in_map(goal("base_link", 1.0, 0.0))

@@ -18,6 +18,12 @@ NEEDS_MORE = {
     ("subscribe", "/ackermann_cmd"),  # ackermann_msgs
     ("publish", "/tf"),  # tf2_msgs
     ("publish", "/tf_static"),
+    ("subscribe", "/tf"),
+    ("subscribe", "/tf_static"),
+    ("subscribe", "/map"),  # nav2_msgs
+    ("subscribe", "/speed_limit"),
+    ("execute", "/follow_path"),
+    ("execute", "/navigate_to_pose"),
 }
 """What a node does with other parameters, or where more packages are installed."""
 

@@ -1,0 +1,111 @@
+"""Names that a parameter file of Nav2 expects of a robot: topics, frames, actions, with types."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+
+# What nodes of Nav2 say to each other, and the frame of a lidar that its own simulator plays.
+OWN = {
+    "cmd_vel_smoothed", "collision_monitor_state", "base_scan", "speed_filter_mask",
+    "keepout_filter_mask",
+}  # fmt: skip
+OWN_ENDS = ("costmap_raw", "published_footprint", "filter_info", "/voxel_grid", "costmap_updates")
+FRAME_KEYS = ("frame", "frame_id")
+TYPES = {
+    "scan": "sensor_msgs/msg/LaserScan",
+    "odom": "nav_msgs/msg/Odometry",
+    "map": "nav_msgs/msg/OccupancyGrid",
+    "cmd_vel": "geometry_msgs/msg/Twist",
+    "clock": "rosgraph_msgs/msg/Clock",
+    "tf": "tf2_msgs/msg/TFMessage",
+    "tf_static": "tf2_msgs/msg/TFMessage",
+    "initialpose": "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "goal_pose": "geometry_msgs/msg/PoseStamped",
+    "speed_limit": "nav2_msgs/msg/SpeedLimit",
+}
+# What its nodes use without naming it, as their defaults.
+ALWAYS = {"map", "cmd_vel", "clock", "tf", "tf_static", "initialpose", "goal_pose"}
+
+
+def values(given: Any, key: str = "") -> Iterator[tuple[str, str]]:
+    """All texts in a tree, each with the key that it stands under."""
+    if isinstance(given, Mapping):
+        for name, each in given.items():
+            yield from values(each, str(name))
+    elif isinstance(given, str):
+        yield key, given
+
+
+def wanted(file: Path) -> tuple[set[str], set[str]]:
+    """Topics and frames that a parameter file names and that Nav2 does not make itself."""
+    text = file.read_text(encoding="utf-8")
+    named = list(values(yaml.safe_load(text)))
+    topics, frames = set(ALWAYS), set[str]()
+    for key, value in named:
+        name = value.strip("/")
+        if not name or name in OWN or name.endswith(OWN_ENDS):
+            continue
+        if key.endswith(FRAME_KEYS):
+            frames.add(name)
+        elif key == "topic" or key.endswith("_topic"):
+            topics.add(name)
+    return topics, frames
+
+
+HEARD = ("cmd_vel", "initialpose", "goal_pose", "speed_limit")  # the others are published
+LATCHED = ("map", "tf_static")
+ACTIONS = {
+    "follow_path": "nav2_msgs/action/FollowPath",
+    "navigate_to_pose": "nav2_msgs/action/NavigateToPose",
+}
+
+
+def unserved_topics(node: Node, topics: set[str]) -> list[str]:
+    """A line for each topic that nobody serves, with its type and quality of service."""
+    return [fault for topic in sorted(topics) if (fault := _fault(node, topic))]
+
+
+def _fault(node: Node, topic: str) -> str:
+    kind, name = TYPES.get(topic), f"/{topic}"
+    if kind is None:
+        return f"{topic}: nothing of that name is known"
+    look = "subscriptions" if topic in HEARD else "publishers"
+    ends = getattr(node, f"get_{look}_info_by_topic")(name)
+    ends = [end for end in ends if end.node_name != node.get_name()]
+    kinds = {end.topic_type for end in ends}
+    if not kinds & {kind, kind.replace("Twist", "TwistStamped")}:
+        return f"{topic}: no {look} of {kind}, but {sorted(kinds) or 'none'}"
+    offers = [end.qos_profile for end in ends]
+    reliable = all(one.reliability == ReliabilityPolicy.RELIABLE for one in offers)
+    if topic not in HEARD and not reliable:
+        return f"{topic}: is not offered reliably"
+    if topic in LATCHED and not all(
+        one.durability == DurabilityPolicy.TRANSIENT_LOCAL for one in offers
+    ):
+        return f"{topic}: is not kept for late joiners"
+    return ""
+
+
+def unserved_actions(node: Node) -> list[str]:
+    """A line for each action that nobody serves."""
+    served = dict(node.get_service_names_and_types())
+    return [
+        f"{name}: nobody serves the action"
+        for name, kind in ACTIONS.items()
+        if f"{kind}_SendGoal" not in served.get(f"/{name}/_action/send_goal", ())
+    ]
+
+
+def frames_in(messages: list[Any]) -> set[str]:
+    """All frames that messages of `/tf` and `/tf_static` have told of."""
+    found = set()
+    for message in messages:
+        for each in message.transforms:
+            found |= {each.header.frame_id, each.child_frame_id}
+    return found

@@ -1,0 +1,138 @@
+"""A stand-in for Nav2's behaviour tree: plans on `map`, has `follow_path` drive, and plans anew."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped, Twist, TwistStamped
+from nav_msgs.msg import OccupancyGrid, Odometry, Path
+from numpy.typing import NDArray
+from rclpy.action import ActionClient
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from std_srvs.srv import Trigger
+
+from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.runner import open_context
+from nics_drl_bridge.policy.route import route
+
+Array = NDArray[np.float64]
+DEADLINE_S = 300.0
+STUCK_S = 2.0  # silence after which the simulator, which waits for commands, is told a zero
+REPLAN = 40  # feedbacks after which the path is planned anew
+
+
+class StandIn:
+    """Speaks to a simulator in lock-step and to a policy; relays the commands of the latter."""
+
+    def __init__(self, domain_id: int, kind: Any, controller: str = "FollowPath") -> None:
+        self.context = open_context(domain_id=domain_id)
+        self.node = node = Node("behaviour_tree", context=self.context)
+        self._executor = SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(node)
+        self.kind, self.client = kind, ActionClient(node, kind, "follow_path")
+        self.maps, self.truths, self.feedback = list[Any](), list[Any](), list[Any]()
+        self._commands = node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
+        self.poses = node.create_publisher(PoseWithCovarianceStamped, "initialpose", qos.COMMAND)
+        self._moved_s = time.monotonic()
+        self._controller = controller
+        node.create_subscription(TwistStamped, "cmd_vel_raw", self._relay, qos.COMMAND)
+        node.create_subscription(OccupancyGrid, "map", self.maps.append, qos.LATCHED)
+        node.create_subscription(Odometry, "ground_truth", self.truths.append, qos.SENSOR)
+
+    def _relay(self, message: TwistStamped) -> None:
+        self._moved_s = time.monotonic()
+        self._commands.publish(message.twist)
+
+    def close(self) -> None:
+        """Ends the node."""
+        self._executor.shutdown(timeout_sec=1.0)
+        self.node.destroy_node()
+        self.context.try_shutdown()
+
+    def until(self, done: Callable[[], Any], what: str, kick: bool = False) -> None:
+        """Spins until something is the case. Raises TimeoutError."""
+        begin = time.monotonic()
+        while not done():
+            if time.monotonic() - begin > DEADLINE_S:
+                raise TimeoutError(f"not within {DEADLINE_S:g} s: {what}")
+            self._executor.spin_once(timeout_sec=0.02)
+            if kick and time.monotonic() - self._moved_s > STUCK_S:
+                self._relay(TwistStamped())  # a message was lost
+
+    def call(self, kind: Any, service: str, request: Any = None) -> Any:
+        """The answer of a service."""
+        client = self.node.create_client(kind, service)
+        self.until(client.service_is_ready, service)
+        future = client.call_async(kind.Request() if request is None else request)
+        self.until(future.done, service)
+        self.node.destroy_client(client)
+        return future.result()
+
+    @property
+    def pose(self) -> Array:
+        """(3,) the robot's true pose."""
+        return conversions.odometry_from_ros(self.truths[-1])[0]
+
+    def shows(self, cells: bytes) -> bool:
+        """True if the robot has told where it is, and the newest map has these cells."""
+        return bool(self.truths and self.maps) and self.maps[-1].data.tobytes() == cells
+
+    def place(self, pose: Array) -> None:
+        """Says where the robot is to simulator and policy."""
+        message, placed = PoseWithCovarianceStamped(), conversions.pose_to_ros(pose, 0, "map")
+        message.header, message.pose.pose = placed.header, placed.pose
+        self.poses.publish(message)
+
+    def plan(self, goal: Array, radius: float) -> Path:
+        """A path to a goal (2,) on the newest map."""
+        grid = conversions.map_from_ros(self.maps[-1])
+        return path_to_ros(route(grid, self.pose[:2], goal, radius))
+
+    def send(self, path: Path, **names: str) -> Any:
+        """Sends a path; returns the goal's handle."""
+        goal = self.kind.Goal(path=path)
+        for field, name in names.items():
+            if hasattr(goal, field):
+                setattr(goal, field, name)
+        future = self.client.send_goal_async(goal, feedback_callback=self.feedback.append)
+        self.until(future.done, "an answer to a goal", kick=True)
+        return future.result()
+
+    def drive(self, goal: Array, radius: float) -> Any:
+        """Has the robot driven to a goal (2,), planning anew now and then; returns the result."""
+        handle = self.send(self.plan(goal, radius), controller_id=self._controller)
+        while True:
+            result, known = handle.get_result_async(), len(self.feedback)
+            self.until(
+                lambda result=result, known=known: (
+                    result.done() or len(self.feedback) >= known + REPLAN
+                ),
+                "a result", kick=True,
+            )  # fmt: skip
+            if result.done():
+                return result.result()
+            if math.dist(self.pose[:2], goal) > 1.0:
+                handle = self.send(self.plan(goal, radius), controller_id=self._controller)
+
+    def touched(self) -> bool:
+        """True if the robot has touched something."""
+        return "true" in self.call(Trigger, "simulator_node/touched").message
+
+
+def path_to_ros(points: Array) -> Path:
+    """A path (P, 2) in the map, each pose turned to the next one."""
+    steps = np.diff(points, axis=0)
+    headings = np.arctan2(steps[:, 1], steps[:, 0])
+    headings = np.append(headings, headings[-1:] if len(headings) else 0.0)
+    path = Path()
+    path.header.frame_id = "map"
+    path.poses = [
+        conversions.pose_to_ros([*point, heading], 0, "map")
+        for point, heading in zip(points, headings, strict=True)
+    ]
+    return path

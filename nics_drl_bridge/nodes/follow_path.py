@@ -1,0 +1,390 @@
+"""Nav2's actions `follow_path` and `navigate_to_pose`, served by a policy."""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from nav_msgs.msg import OccupancyGrid
+from rclpy.node import Node
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.interface import S_PER_NS, Array
+from nics_drl_bridge.lidar.maps import GridMap
+from nics_drl_bridge.middleware.measurement import ODOM, SCAN
+from nics_drl_bridge.nodes import conversions, qos, runner
+from nics_drl_bridge.nodes.goal_frames import GoalFrames
+from nics_drl_bridge.nodes.held_action import (
+    ABORT,
+    CANCELED,
+    SUCCEED,
+    HeldActionServer,
+    duration_to_ros,
+    result_of,
+)
+from nics_drl_bridge.nodes.nav2_parameters import ControllerParameters, chosen
+from nics_drl_bridge.nodes.robot_topics import RobotTopics
+from nics_drl_bridge.policy.follow import GoalChecker, Path, Place, ProgressChecker
+from nics_drl_bridge.policy.route import route
+
+FOLLOW, NAVIGATE = "follow_path", "navigate_to_pose"
+KINDS = {FOLLOW: "nav2_msgs/action/FollowPath", NAVIGATE: "nav2_msgs/action/NavigateToPose"}
+SPEED_LIMIT = "nav2_msgs/msg/SpeedLimit"
+LOOK_S = 2.0  # time between two looks for another server of `navigate_to_pose` [s]
+PATIENT_PERIODS = 10  # silence of this many control periods is no silence
+TURNING = 1.5  # turn rate at the goal, by the angle that is left [1/s]
+LEAST_TURN, SLOWEST = 0.3, 0.1  # [rad/s], and for the time that is left [m/s]
+
+
+class Refusal(Exception):  # noqa: N818  (an outcome, by the standard's code)
+    """A goal ends here, with a code of its action's result, and a sentence."""
+
+    def __init__(self, code: str, sentence: str) -> None:
+        super().__init__(sentence)
+        self.code = code
+
+
+class Drive(NamedTuple):
+    """What a policy wants, on its way to a goal."""
+
+    twist: Array  # (3,) for `cmd_vel`
+    touched: bool
+
+
+class Goal(NamedTuple):
+    """A goal that was accepted."""
+
+    name: str  # of its action
+    kind: Any  # its type
+    server: HeldActionServer
+    handle: Any
+
+    @property
+    def code(self) -> str:
+        """Code of a result for a path that can't be driven."""
+        return "INVALID_PATH" if self.name == FOLLOW else "UNKNOWN"
+
+
+@dataclass
+class Run:
+    """A goal that is being driven to."""
+
+    goal: Goal
+    frame: str  # of the path
+    path: Path
+    arrival: GoalChecker
+    progress: ProgressChecker
+    started_s: float
+    valid_s: float  # last time that the robot could be driven
+
+
+class PathActions:
+    """Serves both actions while a node is active; one goal at a time, and the newest one counts.
+
+    `drive` asks the policy for a goal (2,) in the map of the estimate. Without nav2_msgs nothing is
+    served. `navigate_to_pose` is left to another node that serves it, as Nav2's bt_navigator.
+    """
+
+    def __init__(
+        self, node: Node, topics: RobotTopics, frames: GoalFrames, model: SimulatorModel,
+        parameters: ControllerParameters, drive: Callable[[Array], Drive],
+    ) -> None:  # fmt: skip
+        self._node, self._topics, self._frames, self._robot = node, topics, frames, model.robot
+        self._parameters, self._drive = parameters, drive
+        self._run: Run | None = None
+        self._map: tuple[str, GridMap] | None = None  # and its frame
+        self._limit = math.inf  # of the speed [m/s]
+        self._period_s = model.control_period
+        self._undo: list[Callable[[], Any]] = []
+        self._servers: dict[str, HeldActionServer] = {}
+        self._kinds = {name: conversions.message_type(kind) for name, kind in KINDS.items()}
+        if None in self._kinds.values():
+            why = "the package nav2_msgs is not installed, so that its actions are not served"
+            node.get_logger().info(f"{why}; install it with your ROS 2 distribution.")
+            return
+        self._serve(FOLLOW, self._follow)
+        if node.get_parameter(NAVIGATE).value:
+            self._serve(NAVIGATE, self._navigate)
+            timer = runner.steadily(node, LOOK_S, self._look)
+            self._undo.append(lambda: node.destroy_timer(timer))
+        self._listen(OccupancyGrid, "map", self._take_map, qos.LATCHED)
+        topic = str(node.get_parameter("speed_limit_topic").value)
+        self._listen(conversions.message_type(SPEED_LIMIT), topic, self._take_limit, qos.COMMAND)
+
+    def _listen(self, kind: Any, topic: str, take: Callable[[Any], None], quality: Any) -> None:
+        heard = self._node.create_subscription(kind, topic, take, quality)
+        self._undo.append(lambda: self._node.destroy_subscription(heard))
+
+    def _serve(self, name: str, begin: Callable[[Goal], Run]) -> None:
+        kind = self._kinds[name]
+
+        def take(handle: Any) -> None:
+            self._accept(Goal(name, kind, self._servers[name], handle), begin)
+
+        self._servers[name] = HeldActionServer(self._node, kind, name, self._open, take)
+
+    def close(self) -> None:
+        """Ends all goals and topics."""
+        self.stop("the node is being cleaned up")
+        while self._undo:
+            self._undo.pop()()
+        while self._servers:
+            self._servers.popitem()[1].destroy()
+
+    def _open(self) -> bool:
+        return getattr(self._node, "state", runner.ACTIVE) == runner.ACTIVE
+
+    @property
+    def active(self) -> bool:
+        """True while a goal is being driven to."""
+        return self._run is not None
+
+    @property
+    def led(self) -> bool:
+        """True if another node serves `navigate_to_pose`, and so takes care of `goal_pose`."""
+        wanted = f"{self._node.resolve_topic_name(NAVIGATE)}/_action/send_goal"
+        own = self._node.get_name(), self._node.get_namespace()
+        for name, space in self._node.get_node_names_and_namespaces():
+            if (name, space) != own:
+                served = self._node.get_service_names_and_types_by_node(name, space)
+                if any(each == wanted for each, _ in served):
+                    return True
+        return False
+
+    def _look(self) -> None:
+        if NAVIGATE in self._servers and self.led:
+            told = f"another node serves {NAVIGATE}, so this one does not any more"
+            self._node.get_logger().info(told)
+            self._servers.pop(NAVIGATE).destroy()
+
+    def _take_map(self, message: OccupancyGrid) -> None:
+        try:
+            grid = conversions.map_from_ros(message)
+        except ConfigError as error:
+            self._node.get_logger().error(f"{error} It is not used.")
+        else:
+            self._map = message.header.frame_id.strip("/"), grid
+
+    def _take_limit(self, message: Any) -> None:
+        limit = float(message.speed_limit)
+        if not (math.isfinite(limit) and limit >= 0.0):
+            self._node.get_logger().error(f"speed limit {limit:g}: must be 0, for none, or more.")
+            return
+        if message.percentage:
+            limit *= 0.01 * float(self._robot.in_fields(self._robot.command_high)[0])
+        self._limit = limit or math.inf
+
+    # A goal begins.
+
+    def _accept(self, goal: Goal, begin: Callable[[Goal], Run]) -> None:
+        before, self._run = self._run, None
+        try:
+            self._run = begin(goal)
+        except Refusal as refusal:
+            self._end(goal, ABORT, refusal.code, str(refusal))
+        if before is not None:
+            self._end(before.goal, ABORT, "UNKNOWN", "a newer goal has taken its place.")
+
+    def _follow(self, goal: Goal) -> Run:
+        asked, known, names = goal.handle.request, self._parameters, []
+        for what, those in (
+            ("controller", known.controllers),
+            ("goal_checker", known.goals),
+            ("progress_checker", known.progress),
+        ):
+            name, wrong = chosen(what.replace("_", " "), getattr(asked, f"{what}_id", ""), those)
+            if wrong:
+                raise Refusal("INVALID_CONTROLLER", f"{FOLLOW}: {wrong}")
+            names.append(name)
+        poses = np.array([_pose_of(each.pose) for each in asked.path.poses]).reshape(-1, 3)
+        headers = [asked.path.header, *(each.header for each in asked.path.poses[:1])]
+        frame = next((each.frame_id for each in headers if each.frame_id), "")
+        return self._begin(goal, frame, poses, names[1:])
+
+    def _navigate(self, goal: Goal) -> Run:
+        asked = goal.handle.request
+        if asked.behavior_tree:
+            fix = "leave it empty, or let Nav2 serve the action"
+            reason = f"there are no behaviour trees here, as {asked.behavior_tree!r}; {fix}."
+            raise Refusal("FAILED_TO_LOAD_BEHAVIOR_TREE", f"{NAVIGATE}: {reason}")
+        end = _pose_of(asked.pose.pose)[None]
+        frame, end = self._placed(goal, asked.pose.header.frame_id, end)
+        try:
+            Path(end)
+            way = self._way(frame, self._robot_in(NAVIGATE, frame), end[0])
+        except ConfigError as error:
+            raise Refusal("UNKNOWN", f"{NAVIGATE}: {error}") from None
+        return self._begin(
+            goal, frame, way, (self._parameters.goals[0], self._parameters.progress[0])
+        )
+
+    def _way(self, frame: str, robot: Array, end: Array) -> Array:
+        """Returns the way (P, 3) on the map, if there is one; else straight."""
+        points = np.stack([robot[:2], end[:2]])
+        if self._map is not None and frame in ("", self._map[0]):
+            points = route(self._map[1], *points, self._robot.footprint_radius)
+        return np.column_stack([points, np.full(len(points), end[2])])
+
+    def _placed(self, goal: Goal, frame: str, poses: Array) -> tuple[str, Array]:
+        try:
+            return self._frames.fixed(frame, poses)
+        except ConfigError as error:
+            raise Refusal("TF_ERROR", f"{goal.name}: {error}") from None
+
+    def _robot_in(self, name: str, frame: str) -> Array:
+        robot = self._frames.robot_in(frame)
+        if robot is None:
+            fix = "give the goal again when odometry and pose have come"
+            raise Refusal("TF_ERROR", f"{name}: the robot's place is not known yet; {fix}.")
+        return robot
+
+    def _begin(self, goal: Goal, frame: str, poses: Array, checks: Sequence[str]) -> Run:
+        try:
+            Path(poses)
+        except ConfigError as error:
+            raise Refusal(goal.code, f"{goal.name}: {error}") from None
+        frame, poses = self._placed(goal, frame, poses)
+        self._robot_in(goal.name, frame)
+        self._require_on_map(goal, frame, poses)
+        arrival, progress = self._parameters.checks(*checks)
+        checkers = GoalChecker(arrival, not self._robot.steers), ProgressChecker(progress)
+        now_s = time.monotonic()
+        return Run(goal, frame, Path(poses), *checkers, now_s, now_s)
+
+    def _require_on_map(self, goal: Goal, frame: str, poses: Array) -> None:
+        if self._map is None:
+            return
+        wanted, grid = self._map
+        here, there = self._frames.robot_in(frame), self._frames.robot_in(wanted)
+        if here is None or there is None:
+            return
+        points = geometry.compose(there, geometry.between(here, poses))[:, :2]
+        cells = grid.world_to_cell(points)
+        off = ((cells < 0) | (cells >= grid.cells.shape)).any(axis=-1)
+        if off.any():
+            k = int(np.argmax(off))
+            place = f"({points[k, 0]:.2f}, {points[k, 1]:.2f}) m"
+            why = f"pose {k} of the path, {place}, is off the map; replan it."
+            raise Refusal(goal.code, f"{goal.name}: {why}")
+
+    # A goal is driven to.
+
+    def tick(self) -> bool:
+        """Ends a goal that was cancelled, or whose data are silent; True if one was ended."""
+        run = self._run
+        if run is None:
+            return False
+        if run.goal.handle.is_cancel_requested:
+            self._run = None
+            self._end(run.goal, CANCELED, "NONE")
+            return True
+        longest = self._parameters.number("costmap_update_timeout")
+        longest = max(longest, PATIENT_PERIODS * self._period_s)
+        newest, now_ns = self._topics.middleware.cache.newest, self._topics.now_ns()
+        silent = [
+            topic for topic in (SCAN, ODOM)
+            if topic not in newest or (now_ns - newest[topic].arrival_ns) * S_PER_NS > longest
+        ]  # fmt: skip
+        if silent and time.monotonic() - run.started_s > longest:
+            self._run = None
+            told = f"nothing on {' and '.join(silent)} for {longest:g} s."
+            self._end(run.goal, ABORT, "CONTROLLER_TIMED_OUT", told)
+            return True
+        return False
+
+    def twist(self) -> Array:
+        """Returns the twist (3,) towards the end of the path, and reports; ends the goal there."""
+        run = self._run
+        assert run is not None  # noqa: S101
+        try:
+            return self._steer(run)
+        except Refusal as refusal:
+            self._run = None
+            self._end(run.goal, ABORT, refusal.code, str(refusal))
+            return np.zeros(3)
+
+    def _steer(self, run: Run) -> Array:
+        robot = self._robot_in("the path", run.frame)
+        place = run.path.locate(robot, float(self._parameters.number("lookahead")))
+        turn = run.arrival.turn_left(place, robot, run.path.end)
+        if turn == 0.0:
+            self._run = None
+            self._end(run.goal, SUCCEED, "NONE")
+            return np.zeros(3)
+        now_s = self._topics.newest_ns * S_PER_NS
+        if run.progress.stuck(now_s, robot):
+            raise Refusal("FAILED_TO_MAKE_PROGRESS", "the robot has not got on for too long.")
+        estimate = self._topics.view()
+        ahead = geometry.compose(estimate.pose, geometry.between(robot, [*place.ahead, 0.0]))
+        drive = self._drive(ahead[:2])
+        if drive.touched:
+            self._wait(run)
+        else:
+            run.valid_s = time.monotonic()
+        twist = np.zeros(3) if drive.touched else drive.twist
+        if turn is not None:
+            twist = self._turning(turn)
+        twist = self._within_limit(twist)
+        self._report(run, robot, place, estimate.twist)
+        return twist
+
+    def _wait(self, run: Run) -> None:
+        """Raises Refusal when a robot that touches something has waited for long enough."""
+        patience = self._parameters.number("failure_tolerance")
+        if 0.0 <= patience < time.monotonic() - run.valid_s:
+            code = "PATIENCE_EXCEEDED" if patience else "NO_VALID_CONTROL"
+            raise Refusal(code, "the robot touches something, so that no command is valid.")
+
+    def _turning(self, turn: float) -> Array:
+        """Returns a turn on the spot."""
+        most = float(self._robot.in_fields(self._robot.command_high)[2])
+        rate = min(max(TURNING * abs(turn), LEAST_TURN), most)
+        return np.array([0.0, 0.0, math.copysign(rate, turn)])
+
+    def _within_limit(self, twist: Array) -> Array:
+        """Slows a twist down to the speed limit; the robot's way stays the same."""
+        share = min(1.0, self._limit / max(float(np.hypot(*twist[:2])), 1e-9))
+        steers = self._robot.steers and not self._robot.takes_turn_rate
+        return twist * np.array([share, share, 1.0 if steers else share])
+
+    def _report(self, run: Run, robot: Array, place: Place, twist: Array) -> None:
+        speed = float(np.hypot(*twist[:2]))
+        pose = conversions.pose_to_ros(robot, self._topics.newest_ns, run.frame)
+        times = time.monotonic() - run.started_s, place.remaining / max(speed, SLOWEST)
+        told = {
+            "distance_to_goal": place.distance, "speed": speed, "robot_pose": pose,
+            "position_tracking_error": place.left, "heading_tracking_error": place.turned,
+            "current_path_index": place.index, "remaining_path_length": place.remaining,
+            "current_pose": pose, "distance_remaining": place.remaining, "header": pose.header,
+            "navigation_time": duration_to_ros(times[0]),
+            "estimated_time_remaining": duration_to_ros(times[1]),
+        }  # fmt: skip
+        feedback = run.goal.kind.Feedback()
+        for part in (feedback, getattr(feedback, "tracking_feedback", None)):
+            for name in told.keys() & getattr(part, "get_fields_and_field_types", dict)().keys():
+                setattr(part, name, told[name])
+        run.goal.handle.publish_feedback(feedback)
+
+    def stop(self, why: str) -> None:
+        """Aborts the goal, if there is one."""
+        run, self._run = self._run, None
+        if run is not None:
+            self._end(run.goal, ABORT, "UNKNOWN", f"{why}.")
+
+    def _end(self, goal: Goal, end: str, code: str, sentence: str = "") -> None:
+        if goal.handle.is_cancel_requested:
+            end = CANCELED
+        log = self._node.get_logger()
+        told = "goal reached" if end == SUCCEED else f"goal {end}: {sentence}".removesuffix(": ")
+        (log.warning if end == ABORT else log.info)(told)
+        goal.server.finish(goal.handle, end, result_of(goal.kind, code, sentence))
+
+
+def _pose_of(pose: Any) -> Array:
+    turn = pose.orientation
+    heading = conversions.heading_of(turn.x, turn.y, turn.z, turn.w)
+    return np.array([pose.position.x, pose.position.y, heading])

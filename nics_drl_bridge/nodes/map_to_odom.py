@@ -1,0 +1,88 @@
+"""The transform map -> odom on `/tf`, by the estimate, unless another node publishes it."""
+
+import math
+import time
+from collections import deque
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import TransformStamped
+from numpy.typing import ArrayLike
+from rclpy.node import Node
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.interface import NS_PER_S, Array
+from nics_drl_bridge.nodes import conversions, qos
+
+QUIET_S = 2.0  # so long after another's transform, ours is published again
+KEPT = 100  # own transforms that are known again when they are heard
+
+
+def transform_to_ros(parent: str, child: str, pose: ArrayLike, stamp: Any) -> TransformStamped:
+    """Returns a pose (3,) of a child frame in its parent as a transform."""
+    x, y, heading = np.asarray(pose, np.float64).tolist()
+    message = TransformStamped(child_frame_id=child)
+    message.header.frame_id, message.header.stamp = parent, stamp
+    message.transform.translation.x, message.transform.translation.y = x, y
+    message.transform.rotation = conversions.heading_to_ros(heading)
+    return message
+
+
+def transform_from_ros(message: TransformStamped) -> tuple[str, str, Array]:
+    """Returns parent and child of a transform, without slashes, and the child's pose (3,) there."""
+    place, turn = message.transform.translation, message.transform.rotation
+    heading = conversions.heading_of(turn.x, turn.y, turn.z, turn.w)
+    parent, child = message.header.frame_id.strip("/"), message.child_frame_id.strip("/")
+    return parent, child, np.array([place.x, place.y, heading])
+
+
+def odom_in_map(in_map: ArrayLike, in_odom: ArrayLike) -> Array:
+    """Returns the pose (3,) of `odom` in `map`, from a robot's poses (3,) in both."""
+    return geometry.compose(in_map, geometry.between(in_odom, np.zeros(3)))
+
+
+class MapToOdom:
+    """Publishes map -> odom, its stamp ahead by a tolerance [s] as AMCL's, so that it is in force.
+
+    It is silent without tf2_msgs, and while another node, as a localiser, publishes it.
+    """
+
+    def __init__(self, node: Node, tolerance_s: float) -> None:
+        self._node, self._ahead_ns = node, round(tolerance_s * NS_PER_S)
+        self._own: deque[tuple[int, int]] = deque(maxlen=KEPT)  # stamps
+        self._frames, self._heard_s = ("", ""), -math.inf
+        self._kind: Any = conversions.message_type("tf2_msgs/msg/TFMessage")
+        if self._kind is None:
+            told = "the package tf2_msgs is not installed, so that map -> odom is not published"
+            node.get_logger().warning(f"{told}; install it with your ROS 2 distribution.")
+            return
+        self._publisher = node.create_publisher(self._kind, "/tf", qos.TRANSFORMS)
+        given = self._kind, "/tf", self._take, qos.TRANSFORMS
+        self._subscription = node.create_subscription(*given)
+
+    def close(self) -> None:
+        """Ends its topics."""
+        if self._kind is not None:
+            self._node.destroy_subscription(self._subscription)
+            self._node.destroy_publisher(self._publisher)
+
+    def publish(self, odom: Array, stamp_ns: int, frames: tuple[str, str]) -> None:
+        """Publishes the pose (3,) of odom in map at a time [ns], with the frames of both."""
+        self._frames = frames
+        if self._kind is None or time.monotonic() - self._heard_s < QUIET_S or not all(frames):
+            return
+        stamp = conversions.stamp_to_ros(stamp_ns + self._ahead_ns)
+        self._own.append((stamp.sec, stamp.nanosec))
+        one = transform_to_ros(*frames, odom, stamp)
+        self._publisher.publish(self._kind(transforms=[one]))
+
+    def _take(self, message: Any) -> None:
+        for each in message.transforms:
+            stamp, parent = each.header.stamp, each.header.frame_id.strip("/")
+            own = (stamp.sec, stamp.nanosec) in self._own
+            if own or (parent, each.child_frame_id.strip("/")) != self._frames:
+                continue
+            if time.monotonic() - self._heard_s > QUIET_S:
+                told = f"another node publishes {' -> '.join(self._frames)}, so this one does not"
+                self._node.get_logger().info(told)
+            self._heard_s = time.monotonic()

@@ -1,0 +1,64 @@
+"""Parameters of Nav2's controller server that a policy in its place goes by."""
+
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any
+
+from rclpy.node import Node
+
+from nics_drl_bridge.nodes.parameters import checkers, nav2
+from nics_drl_bridge.nodes.runner import declare_row
+from nics_drl_bridge.policy.follow import GoalCheck, ProgressCheck
+
+# Those that are for its own plugins, or for a loop that a policy, which answers scans, has not.
+UNUSED = {
+    "controller_frequency", "min_x_velocity_threshold", "min_y_velocity_threshold",
+    "min_theta_velocity_threshold", "use_realtime_priority", "path_handler_plugins", "odom_topic",
+    "odom_duration", "publish_zero_velocity", "introspection_mode", "bond_heartbeat_period",
+    "stateful", "search_window", "speed_limit_topic", "enable_stamped_cmd_vel",
+}  # fmt: skip
+
+
+class ControllerParameters:
+    """Names of controllers and checkers, and the checks by their names."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        values = {row.name: declare_row(node, row) for row in nav2()}
+        self.controllers, self.goals, self.progress = (
+            tuple(values[f"{kind}_plugins"])
+            for kind in ("controller", "goal_checker", "progress_checker")
+        )
+        for row in checkers(self.goals, self.progress):
+            declare_row(node, row)
+
+    def number(self, name: str) -> float:
+        """Returns the value of a numeric parameter."""
+        return float(self._node.get_parameter(name).value or 0.0)
+
+    def checks(self, goal: str, progress: str) -> tuple[GoalCheck, ProgressCheck]:
+        """Returns the checks of two names."""
+        return self._filled(GoalCheck, goal), self._filled(ProgressCheck, progress)
+
+    def _filled(self, kind: Any, name: str) -> Any:
+        known = {each.name: self._node.get_parameter(f"{name}.{each.name}").value
+                 for each in fields(kind)}  # fmt: skip
+        return kind(**known)
+
+    def ignores(self, name: str) -> bool:
+        """True for a parameter of Nav2's own controller, which means nothing to a policy."""
+        first = name.split(".")[0]
+        handlers = ("PathHandler", "path_handler")
+        return name in UNUSED or first in (*self._all(), *handlers)
+
+    def _all(self) -> Sequence[str]:
+        return (*self.controllers, *self.goals, *self.progress)
+
+
+def chosen(what: str, asked: str, known: Sequence[str]) -> tuple[str, str]:
+    """Returns a plugin by its name, the only one by none; and what is wrong, if it is unknown."""
+    if not asked and len(known) == 1:
+        return known[0], ""
+    if asked in known:
+        return asked, ""
+    return "", f"there is no {what} {asked!r}; name one of {', '.join(map(repr, known))}."

@@ -1,0 +1,70 @@
+"""A simulator's `map`, and `initialpose`, which puts a robot elsewhere."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import OccupancyGrid
+from rclpy.node import Node
+
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.nodes import conversions, qos, runner
+from nics_drl_bridge.nodes.initial_pose import INITIAL_POSE, initial_pose
+from nics_drl_bridge.sim.device import DeviceWorld
+from nics_drl_bridge.sim.occupancy import occupancy, standing
+
+LOOK_S = 0.2  # time between two looks at what stands in the world
+
+
+class WorldTopics:
+    """Publishes `map`, the occupancy of all that stands, and puts robots at `initialpose`.
+
+    The map is for late joiners, too, and published anew when something stands elsewhere; before
+    anybody subscribes it is not made. Robots are in namespaces, "" for one.
+    """
+
+    def __init__(self, node: Node, world: Callable[[], DeviceWorld], namespaces: tuple[str, ...]) -> None:
+        self._node, self._world = node, world
+        self._frame = str(node.get_parameter("map_frame").value)
+        self._cell = float(node.get_parameter("map_resolution").value or 0.0)
+        self._map = node.create_publisher(OccupancyGrid, "map", qos.LATCHED)
+        self._shown: Any = None  # what stood in the world that was published
+        runner.steadily(node, LOOK_S, self._look)
+        for k, name in enumerate(namespaces):
+            topic = f"{name}/{INITIAL_POSE}" if name else INITIAL_POSE
+            kind = PoseWithCovarianceStamped
+            node.create_subscription(kind, topic, self._taker(k), qos.COMMAND)
+
+    def _look(self) -> None:
+        if self._shown is None and not self._map.get_subscription_count():
+            return
+        simulator = self._world().simulator
+        member = int(simulator.data.member[0])
+        still = standing(simulator.sampler, member, simulator.obstacles[0])
+        shown = member, [(shape, tuple(np.asarray(pose))) for shape, pose in still]
+        if shown != self._shown:
+            self._shown = shown
+            grid = occupancy(simulator.world.members[member], still, self._cell)
+            now_ns = int(self._node.get_clock().now().nanoseconds)
+            self._map.publish(conversions.map_to_ros(grid, now_ns, self._frame))
+
+    def _taker(self, robot: int) -> Any:
+        def take(message: PoseWithCovarianceStamped) -> None:
+            logger, simulator = self._node.get_logger(), self._world().simulator
+            try:
+                pose = initial_pose(message, self._frame)
+                world = simulator.world.members[int(simulator.data.member[0])]
+                x1, y1, x2, y2 = world.extent
+                if not (x1 <= pose[0] <= x2 and y1 <= pose[1] <= y2):
+                    where = f"x {x1:g} to {x2:g} m, y {y1:g} to {y2:g} m"
+                    place = f"x {pose[0]:.2f} m, y {pose[1]:.2f} m"
+                    raise ConfigError(f"{INITIAL_POSE}: {place} is outside the world ({where}).")
+            except ConfigError as error:
+                logger.error(f"{error} The robot stays where it is.")
+                return
+            simulator.put_robot(robot, pose, np.zeros(simulator.data.state.shape[-1]))
+            self._world().put(robot)
+            logger.info(f"a robot is put at ({pose[0]:.2f}, {pose[1]:.2f}) m, {pose[2]:.2f} rad")
+
+        return take

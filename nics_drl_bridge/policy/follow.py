@@ -1,0 +1,127 @@
+"""Following a path by a policy that drives to goals: sub-goals on it, progress, and its end."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.geometry import wrap_angle
+from nics_drl_bridge.interface import Array
+
+SPACING = 0.05  # between the points of a path [m]
+WINDOW = 2.0  # of the way ahead, in which the nearest point is looked for [m]
+FARTHEST = 1e6  # greatest coordinate of a path [m]
+
+
+@dataclass(frozen=True)
+class GoalCheck:
+    """When a path counts as followed, as of Nav2's SimpleGoalChecker."""
+
+    xy_goal_tolerance: float = 0.25  # [m]
+    yaw_goal_tolerance: float = 0.25  # [rad]; robots that steer are not turned
+    stateful: bool = True  # a place that was reached stays so while the robot turns
+    path_length_tolerance: float = 1.0  # greatest length of the way that may be left [m]
+
+
+@dataclass(frozen=True)
+class ProgressCheck:
+    """When a robot counts as stuck, as of Nav2's SimpleProgressChecker."""
+
+    required_movement_radius: float = 0.5  # that it has to leave [m]
+    movement_time_allowance: float = 10.0  # within this time [s]
+
+
+class Place(NamedTuple):
+    """Place of a robot on its path."""
+
+    ahead: Array  # (2,) sub-goal [m]
+    index: int  # of the nearest pose that the path was given by
+    remaining: float  # length of the way that is left [m]
+    distance: float  # straight to the end [m]
+    left: float  # of the path, negative to its right [m]
+    turned: float  # from the path's direction to the right [rad]
+
+
+class Path:
+    """A path (P, 3) or (P, 2), and where on it the robot is. Raises ConfigError for none.
+
+    Points that have been passed are not looked at again, so that a path may cross itself.
+    """
+
+    def __init__(self, poses: Array) -> None:
+        if not len(poses):
+            raise ConfigError("the path is empty; give one with at least one pose.")
+        if not (np.abs(poses) < FARTHEST).all():
+            raise ConfigError("the path has a coordinate that is no number, or out of all reach.")
+        steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+        along = np.concatenate([[0.0], np.cumsum(steps)])
+        count = max(1, math.ceil(along[-1] / SPACING)) + 1
+        self.end = poses[-1]
+        self._along = np.linspace(0.0, along[-1], count)
+        self._points = np.column_stack([np.interp(self._along, along, poses[:, i]) for i in (0, 1)])
+        self._given = np.minimum(np.searchsorted(along, self._along), len(poses) - 1)
+        self._at = 0
+
+    @property
+    def length(self) -> float:
+        """Of the whole path [m]."""
+        return float(self._along[-1])
+
+    def locate(self, pose: Array, lookahead: float) -> Place:
+        """Returns the place of a robot at a pose (3,); the sub-goal is at most `lookahead` [m] on.
+
+        It goes on to the nearest point.
+        """
+        last = int(np.searchsorted(self._along, self._along[self._at] + WINDOW, "right"))
+        away = np.hypot(*(self._points[self._at : last] - pose[:2]).T)
+        at = self._at = self._at + int(np.argmin(away))
+        ahead = int(np.searchsorted(self._along, self._along[at] + lookahead, "right")) - 1
+        after = min(at + 1, len(self._points) - 1)
+        direction = self._points[after] - self._points[max(after - 1, 0)]
+        heading = math.atan2(direction[1], direction[0]) if direction.any() else float(pose[2])
+        off = pose[:2] - self._points[at]
+        return Place(
+            self._points[ahead], int(self._given[at]), self.length - float(self._along[at]),
+            math.dist(pose[:2], self.end[:2]),
+            math.cos(heading) * off[1] - math.sin(heading) * off[0],
+            float(wrap_angle(heading - pose[2])),
+        )  # fmt: skip
+
+
+class GoalChecker:
+    """Judges whether a path has been followed to its end."""
+
+    def __init__(self, check: GoalCheck, turns: bool) -> None:
+        self._check, self._turns, self._there = check, turns, False
+
+    def turn_left(self, place: Place, pose: Array, end: Array) -> float | None:
+        """Returns the turn that is left [rad], 0 at the goal; None if its place is not reached."""
+        check = self._check
+        near = place.distance <= check.xy_goal_tolerance
+        here = near and place.remaining <= check.path_length_tolerance
+        self._there = here or (self._there and check.stateful)
+        if not self._there:
+            return None
+        turn = float(wrap_angle(end[2] - pose[2])) if self._turns and len(end) > 2 else 0.0
+        return turn if abs(turn) > check.yaw_goal_tolerance else 0.0
+
+
+class ProgressChecker:
+    """Judges whether a robot gets on."""
+
+    def __init__(self, check: ProgressCheck) -> None:
+        self._check = check
+        self._base: tuple[float, Array] | None = None
+
+    def stuck(self, time_s: float, pose: Array) -> bool:
+        """True if a robot, at a pose (3,) at a time, has not moved enough for too long."""
+        check = self._check
+        if self._base is None or (
+            math.dist(pose[:2], self._base[1][:2]) > check.required_movement_radius
+        ):
+            self._base = time_s, pose
+        return time_s - self._base[0] > check.movement_time_allowance

@@ -1,0 +1,68 @@
+"""Shortest ways on a map, for a robot that is taken for a disc: Dijkstra's search over cells."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.interface import Array
+from nics_drl_bridge.lidar.maps import FREE, OCCUPIED, GridMap
+
+CELL = 0.1  # least side of a cell [m]
+COMFORT = 0.4  # distance from obstacles up to which a way is longer than it is [m]
+DEARER = 3.0  # by at most this share
+STEPS = ((0, 1, 1.0), (1, 0, 1.0), (1, 1, math.sqrt(2.0)), (1, -1, math.sqrt(2.0)))
+
+
+def route(grid: GridMap, start: ArrayLike, goal: ArrayLike, radius: float) -> Array:
+    """Returns a way (P, 2) from start to goal (2,) [m] that keeps a radius [m] to what is occupied.
+
+    It keeps more where there is room. Unknown cells count as free. Raises ConfigError for a start
+    or goal off the map, and if there is no way.
+    """
+    parts = max(1, math.ceil(CELL / grid.resolution - 1e-6))
+    coarse = _coarse(grid, parts)
+    room = coarse.distance_field
+    ends = [tuple(coarse.world_to_cell(each).tolist()) for each in (start, goal)]
+    for name, cell in zip(("start", "goal"), ends, strict=True):
+        if not all(0 <= i < n for i, n in zip(cell, room.shape, strict=True)):
+            raise ConfigError(f"the {name} of the way is off the map; give one on it.")
+    passable = room > radius
+    for cell in ends:  # the robot stands there, or is asked to
+        passable[cell] = True
+    dear = 1.0 + DEARER * np.clip(1.0 - (room - radius) / COMFORT, 0.0, 1.0)
+    number = np.arange(room.size).reshape(room.shape)
+    links = []
+    for down, right, far in STEPS:
+        a = (slice(0, room.shape[0] - down), slice(max(0, -right), room.shape[1] - max(0, right)))
+        b = (slice(down, None), slice(max(0, right), room.shape[1] - max(0, -right)))
+        both = passable[a] & passable[b]
+        cost = far * 0.5 * (dear[a] + dear[b])
+        links.append((number[a][both], number[b][both], cost[both]))
+    first, second, cost = (np.concatenate(each) for each in zip(*links, strict=True))
+    graph = coo_array((cost, (first, second)), shape=(room.size, room.size)).tocsr()
+    begin, end = (int(number[cell]) for cell in ends)
+    far, before = dijkstra(graph, directed=False, indices=end, return_predecessors=True)
+    if not np.isfinite(far[begin]):
+        reason = f"for a robot of radius {radius:g} m there is no way to the goal on the map"
+        raise ConfigError(f"{reason}; give a goal in the space that it reaches.")
+    cells = [begin]
+    while cells[-1] != end:
+        cells.append(int(before[cells[-1]]))
+    middles = coarse.cell_to_world(np.stack(np.divmod(cells[1:-1], room.shape[1]), axis=-1))
+    ways = [np.asarray(start, np.float64)[:2], *middles, np.asarray(goal, np.float64)[:2]]
+    return np.array(ways)
+
+
+def _coarse(grid: GridMap, parts: int) -> GridMap:
+    """Returns the map with cells several times as large, occupied if a part of them is."""
+    rows, columns = (math.ceil(count / parts) * parts for count in grid.cells.shape)
+    cells = np.full((rows, columns), FREE, np.int8)
+    cells[: grid.cells.shape[0], : grid.cells.shape[1]] = np.where(grid.blocked, OCCUPIED, FREE)
+    large = cells.reshape(rows // parts, parts, columns // parts, parts).max(axis=(1, 3))
+    return GridMap(large, grid.resolution * parts, grid.origin)

@@ -1,0 +1,146 @@
+"""A world as a grid of free and occupied cells, for planners: all that stands still in it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise, zip_longest
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import ndimage
+
+from nics_drl_bridge.geometry import compose, rotate
+from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
+from nics_drl_bridge.lidar.maps import FREE, OCCUPIED, GridMap
+from nics_drl_bridge.lidar.shapes import Circle, Shape
+from nics_drl_bridge.sim.scenes import SetSampler
+from nics_drl_bridge.sim.world import World
+
+Array = NDArray[np.float64]
+Placed = tuple[Shape, ArrayLike]  # a shape, and its pose (3,)
+CELL, MOST_CELLS = 0.01, 1_000_000  # side of a cell [m]; in fields with more cells it is larger
+SAMPLES = 8  # of an edge, in a cell
+ROUNDING = 1e-6  # share of a cell by which a field may exceed whole cells
+
+
+def standing(sampler: SetSampler, member: int, bodies: Array) -> list[Placed]:
+    """Returns the obstacles that stand still, of bodies (K, 7) in a world of the sampler."""
+    own = sampler.samplers[member].motions
+    both = zip_longest(bodies, own[: len(bodies)])  # what is no part of the world stands
+    return [
+        (sampler.shapes[int(body[SHAPE])], body[:3])
+        for body, motion in both
+        if motion is None and body[RADIUS] > 0.0
+    ]
+
+
+def occupancy(world: World, obstacles: Sequence[Placed] = (), cell: float = CELL) -> GridMap:
+    """Returns the map of a world: its own map, walls, and the given obstacles.
+
+    A cell is occupied if its centre is in something solid, or a wall runs through it; a field with
+    walls is closed by cells around it. The `cell` [m] is a greatest one: those of the world's own
+    map are divided evenly, so that nothing of it is lost; a larger world gets larger ones.
+    """
+    grid = world.grid
+    place, first, size, cell = _frame_of(world, cell)
+    origin = compose(place, [*(first * cell), 0.0])
+    made = GridMap(np.full(size, FREE, np.int8), cell, tuple(origin.tolist()))
+    if world.size is not None:
+        _enclose(made, np.array(world.size) / 2.0)
+    if grid is not None:
+        _paste(made.cells, grid, first, round(grid.resolution / cell))
+    for wall in np.array(world.walls, np.float64).reshape(-1, 2, 2):
+        _occupy(made, _along(wall, cell))
+    for shape, pose in obstacles:
+        _fill(made, shape, np.asarray(pose, np.float64))
+    return made
+
+
+def _frame_of(world: World, cell: float) -> tuple[Any, NDArray[np.int_], tuple[int, int], float]:
+    """Frame (3,) of the rows, first column and row, their numbers, and the side of a cell [m]."""
+    grid, ends = world.grid, world.all_walls().reshape(-1, 2)
+    if world.size is not None or world.bounds is not None:
+        ends = np.concatenate([ends, np.reshape(world.extent, (2, 2))])
+    place: Any = grid.origin if grid is not None else (*ends.min(axis=0), 0.0)
+    corners = rotate(ends - place[:2], -place[2])
+    if grid is not None:
+        own = np.array([(0, 0), grid.cells.shape[::-1]]) * grid.resolution
+        corners = np.concatenate([corners, own])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    cell = max(cell, math.sqrt(float(np.prod(high - low)) / MOST_CELLS))
+    if grid is not None:
+        cell = grid.resolution / max(1, math.ceil(grid.resolution / cell - ROUNDING))
+    first = np.floor(low / cell + ROUNDING).astype(int) - 1
+    columns, rows = np.ceil(high / cell - ROUNDING).astype(int) + 1 - first
+    return place, first, (int(rows), int(columns)), cell
+
+
+def _enclose(made: GridMap, half: Array) -> None:
+    """Occupies all around a field of half its size (2,) [m]."""
+    rows, columns = (np.arange(count) for count in made.cells.shape)
+    if not made.origin[2]:  # x is that of the column alone
+        x = made.cell_to_world(np.stack([0 * columns, columns], axis=-1))[:, 0]
+        y = made.cell_to_world(np.stack([rows, 0 * rows], axis=-1))[:, 1]
+        made.cells[np.abs(y) > half[1]] = OCCUPIED
+        made.cells[:, np.abs(x) > half[0]] = OCCUPIED
+        return
+    away = np.abs(made.cell_to_world(np.moveaxis(np.indices(made.cells.shape), 0, -1)))
+    made.cells[(away > half).any(axis=-1)] = OCCUPIED
+
+
+def _paste(cells: NDArray[np.int8], grid: GridMap, first: NDArray[np.int_], parts: int) -> None:
+    own = grid.cells.repeat(parts, axis=0).repeat(parts, axis=1)
+    column, row = -first
+    into = cells[row : row + own.shape[0], column : column + own.shape[1]]
+    into[:] = np.where(into == OCCUPIED, into, own)
+
+
+def _along(corners: Array, cell: float) -> Array:
+    """Points (P, 2) on straight lines from corner to corner (V, 2), several in each cell."""
+    parts = []
+    for begin, end in pairwise(corners):
+        count = max(2, math.ceil(math.dist(begin, end) / cell * SAMPLES))
+        parts.append(begin + np.linspace(0.0, 1.0, count)[:, None] * (end - begin))
+    return np.concatenate(parts)
+
+
+def _occupy(made: GridMap, points: Array) -> None:
+    at = made.world_to_cell(points)
+    at = at[((at >= 0) & (at < made.cells.shape)).all(axis=-1)]
+    made.cells[at[:, 0], at[:, 1]] = OCCUPIED
+
+
+def _fill(made: GridMap, shape: Shape, pose: Array) -> None:
+    """Occupies the cells in a shape; of a part that is too thin to hold a centre, its outline."""
+    around = made.world_to_cell(pose[:2])
+    reach = math.ceil(shape.radius / made.resolution) + 1
+    low = np.maximum(around - reach, 0)
+    high = np.minimum(around + reach + 1, made.cells.shape)
+    if (low >= high).any():
+        return
+    box = made.cells[low[0] : high[0], low[1] : high[1]]
+    middles = made.cell_to_world(np.moveaxis(np.indices(box.shape), 0, -1) + low)
+    local = rotate(middles - pose[:2], -pose[2])
+    inside = _inside(shape, local)
+    box[inside] = OCCUPIED
+    if len(shape.outline):
+        edge = _along(np.concatenate([shape.outline, shape.outline[:1]]), made.resolution)
+        points = pose[:2] + rotate(edge, pose[2])
+        at = made.world_to_cell(points) - low
+        kept = ((at >= 0) & (at < box.shape)).all(axis=-1)
+        seen = ndimage.maximum_filter(inside, 3)
+        thin = at[kept][~seen[at[kept][:, 0], at[kept][:, 1]]]
+        box[thin[:, 0], thin[:, 1]] = OCCUPIED
+
+
+def _inside(shape: Shape, points: Array) -> NDArray[np.bool_]:
+    if isinstance(shape, Circle):
+        return np.asarray(np.hypot(points[..., 0], points[..., 1]) <= shape.radius)
+    if len(shape.outline) < 3:
+        return np.zeros(points.shape[:-1], np.bool_)
+    from matplotlib.path import Path
+
+    found = Path(shape.outline).contains_points(points.reshape(-1, 2))
+    return np.asarray(found.reshape(points.shape[:-1]))

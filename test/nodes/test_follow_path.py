@@ -1,0 +1,228 @@
+from __future__ import annotations
+
+import math
+import tarfile
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+pytest.importorskip("nav2_msgs", reason="nav2_msgs is not installed")
+
+from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
+from nav2_msgs.action import FollowPath, NavigateToPose
+from nav2_msgs.msg import SpeedLimit
+from nav_msgs.msg import Odometry, Path
+from rclpy.action import ActionClient, ActionServer
+from test_packaging import ROOT
+
+from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.policy_node import PolicyNode
+from nics_drl_bridge.nodes.runner import open_context, unknown
+
+pytestmark = pytest.mark.ros
+SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
+ARCHIVE = ROOT.parent / "shared" / "upstream" / "nav2_interfaces.tar.gz"
+CODES = FollowPath.Result
+
+
+class Tree:
+    """The test's end of the actions, which relays the commands to a simulator in lock-step."""
+
+    def __init__(self, peer):
+        self.peer, self.feedback = peer, []
+        self.truths = peer.listen(Odometry, "ground_truth")
+        self.raw = peer.listen(TwistStamped, "cmd_vel_raw", qos.EVERY_COMMAND)
+        self.commands = peer.node.create_publisher(Twist, "cmd_vel", qos.COMMAND)
+        peer.node.create_subscription(
+            TwistStamped, "cmd_vel_raw", lambda m: self.commands.publish(m.twist), qos.EVERY_COMMAND
+        )
+        self.clients = {
+            kind: ActionClient(peer.node, kind, name)
+            for kind, name in ((FollowPath, "follow_path"), (NavigateToPose, "navigate_to_pose"))
+        }
+
+    @property
+    def pose(self):
+        return conversions.odometry_from_ros(self.truths[-1])[0]
+
+    def until(self, done, what):
+        """Waits; a command of zero makes up for a message that was lost."""
+        for _ in range(40):
+            if self.peer.within(3.0, done):
+                return
+            self.commands.publish(Twist())
+        raise AssertionError(f"never: {what}")
+
+    def send(self, goal):
+        kind = FollowPath if isinstance(goal, FollowPath.Goal) else NavigateToPose
+        client = self.clients[kind]
+        self.until(client.server_is_ready, "the action")
+        future = client.send_goal_async(goal, feedback_callback=self.feedback.append)
+        self.until(future.done, "an answer")
+        assert future.result().accepted
+        return future.result()
+
+    def end(self, handle):
+        future = handle.get_result_async()
+        self.until(future.done, "a result")
+        return future.result()
+
+    def ended(self, goal):
+        return self.end(self.send(goal))
+
+
+def path(*points, frame="map"):
+    made = Path()
+    made.header.frame_id = frame
+    made.poses = [conversions.pose_to_ros([*p, 0.0], 0, frame) for p in points]
+    return FollowPath.Goal(path=made, controller_id="FollowPath")
+
+
+@pytest.fixture(scope="module")
+def tree(launch, meet, module_domain_id):
+    start = {"episode_start": [-2.0, -2.0, 0.0], "episode_start_given": True}
+    simulator = launch("simulator_node", module_domain_id, mode="lockstep", world="empty", **start)
+    policy = launch(
+        "policy_node", module_domain_id, rate=0.0, deadline=30.0, costmap_update_timeout=60.0
+    )
+    made = Tree(meet(module_domain_id))
+    made.goals = made.peer.speak(PoseStamped, "goal_pose")
+    made.limits = made.peer.speak(SpeedLimit, "speed_limit")
+    made.policy = policy
+    made.until(lambda: made.truths and made.raw, "the robot")
+    yield made
+    simulator.check()
+    policy.check()
+
+
+def test_a_path_is_followed_to_its_end_with_feedback(tree):
+    tree.feedback.clear()
+    result = tree.ended(path((-2.0, -2.0), (0.0, -2.0), (0.5, -1.5)))
+    assert (result.status, result.result.error_code) == (SUCCEEDED, CODES.NONE)
+    assert math.dist(tree.pose[:2], (0.5, -1.5)) < 0.35
+    told = [each.feedback.tracking_feedback for each in tree.feedback]
+    assert told[0].distance_to_goal > 2.0 > 0.5 > told[-1].distance_to_goal
+    assert told[0].remaining_path_length > told[-1].remaining_path_length
+    assert max(each.speed for each in told) > 0.1
+    assert told[-1].robot_pose.header.frame_id == "map"
+    assert np.abs([each.position_tracking_error for each in told]).max() < 0.5
+    tree.until(lambda: tree.raw[-1].twist == Twist(), "rest")
+
+
+def by(**names):
+    return FollowPath.Goal(path=path((0.0, 0.0)).path, **names)
+
+
+REFUSED = [
+    (path(), CODES.INVALID_PATH, "the path is empty"),
+    (path((math.nan, 0.0)), CODES.INVALID_PATH, "no number"),
+    (path((0.0, 0.0), (9.0, 0.0)), CODES.INVALID_PATH, "(9.00, 0.00) m, is off the map"),
+    (path((0.0, 0.0), frame="kitchen"), CODES.TF_ERROR, "'kitchen' is refused, which is not known"),
+    (by(controller_id="DWB"), CODES.INVALID_CONTROLLER, "'DWB'; name one of 'FollowPath'"),
+    (by(goal_checker_id="exact"), CODES.INVALID_CONTROLLER, "no goal checker 'exact'"),
+]
+
+
+@pytest.mark.parametrize(("goal", "code", "sentence"), REFUSED)
+def test_a_path_that_can_not_be_followed_ends_with_the_standards_code_and_a_sentence(
+    tree, goal, code, sentence
+):
+    result = tree.ended(goal)
+    assert (result.status, result.result.error_code) == (ABORTED, code)
+    assert sentence in result.result.error_msg
+    assert result.result.error_msg.startswith("follow_path: ")
+
+
+def test_a_path_ahead_of_the_robot_is_where_it_looks(tree):
+    before = tree.pose
+    result = tree.ended(path((0.0, 0.0), (0.8, 0.0), frame="base_link"))
+    assert result.status == SUCCEEDED
+    ahead = before[:2] + 0.8 * np.array([math.cos(before[2]), math.sin(before[2])])
+    assert math.dist(tree.pose[:2], ahead) < 0.4
+
+
+def test_a_cancelled_path_stops_the_robot(tree):
+    handle = tree.send(path(tree.pose[:2].tolist(), (0.0, 0.0), (2.0, 2.0)))
+    tree.until(lambda: tree.raw[-1].twist.linear.x > 0.1, "driving")
+    future = handle.cancel_goal_async()
+    tree.until(future.done, "cancelling")
+    assert tree.end(handle).status == CANCELED
+    tree.until(lambda: tree.raw[-1].twist == Twist(), "rest")
+
+
+def test_a_newer_path_takes_the_place_of_the_one_before_and_no_goal_pose_does(tree):
+    first = tree.send(path(tree.pose[:2].tolist(), (-2.0, 2.0)))
+    second = tree.send(path(tree.pose[:2].tolist(), (0.0, 0.5)))
+    ended = tree.end(first)
+    assert ended.status == ABORTED
+    assert "a newer goal" in ended.result.error_msg
+    tree.goals.publish(PoseStamped())
+    log = tree.policy.log
+    tree.until(lambda: "goal_pose is not used" in log.read_text(), "a sentence")
+    assert tree.end(second).status == SUCCEEDED
+
+
+def test_a_speed_limit_is_kept_and_a_robot_that_does_not_get_on_is_given_up(tree):
+    most = max(raw.twist.linear.x for raw in tree.raw)
+    tree.limits.publish(SpeedLimit(percentage=True, speed_limit=1.0))
+    tree.peer.within(0.5, lambda: False)
+    known = len(tree.raw)
+    handle = tree.send(path(tree.pose[:2].tolist(), (-2.0, -2.0)))
+    result = tree.end(handle)
+    assert result.result.error_code == CODES.FAILED_TO_MAKE_PROGRESS
+    fastest = max(abs(raw.twist.linear.x) for raw in tree.raw[known + 2 :])
+    assert 0.0 < fastest < 0.05 < most
+    tree.limits.publish(SpeedLimit())
+
+
+def test_navigate_to_pose_drives_to_a_goal_and_knows_no_trees(tree):
+    goal = NavigateToPose.Goal()
+    goal.pose.header.frame_id, goal.behavior_tree = "map", "mine.xml"
+    result = tree.ended(goal)
+    assert result.result.error_code == NavigateToPose.Result.FAILED_TO_LOAD_BEHAVIOR_TREE
+    goal.behavior_tree, goal.pose.pose.position.x = "", -1.5
+    tree.feedback.clear()
+    result = tree.ended(goal)
+    assert (result.status, result.result.error_code) == (SUCCEEDED, 0)
+    assert math.dist(tree.pose[:2], (-1.5, 0.0)) < 0.35
+    assert (
+        tree.feedback[0].feedback.distance_remaining > tree.feedback[-1].feedback.distance_remaining
+    )
+
+
+def test_navigate_to_pose_is_left_to_another_node_that_serves_it(tree):
+    other = ActionServer(tree.peer.node, NavigateToPose, "navigate_to_pose", lambda _: None)
+    log = tree.policy.log
+    tree.until(lambda: "another node serves navigate_to_pose" in log.read_text(), "a sentence")
+    other.destroy()
+
+
+@pytest.mark.skipif(not ARCHIVE.is_file(), reason="the sources of Nav2 do not lie there")
+def test_nav2s_own_parameter_file_is_taken_under_the_name_of_its_controller_server(
+    domain_id, tmp_path
+):
+    name = "navigation2/nav2_bringup/params/nav2_params.yaml"
+    with tarfile.open(ARCHIVE) as archive:
+        archive.extract(name, tmp_path, filter="data")
+    words = ["--params-file", str(tmp_path / name), "-r", "__node:=controller_server"]
+    context = open_context(["node", "--ros-args", *words], domain_id)
+    node = PolicyNode(context)
+    assert unknown(node) == []
+    goal, progress = node._nav2.checks("general_goal_checker", "progress_checker")
+    assert goal.xy_goal_tolerance == 0.25
+    assert progress.movement_time_allowance == 10.0
+    node.destroy_node()
+    context.try_shutdown()
+
+
+def test_results_of_distributions_without_codes_are_filled_as_far_as_they_go():
+    from nics_drl_bridge.nodes.held_action import result_of
+
+    class Bare:
+        class Result:
+            pass
+
+    assert vars(result_of(Bare, "TF_ERROR", "why")) == {}
+    told = result_of(FollowPath, "TF_ERROR", "why")
+    assert (told.error_code, told.error_msg) == (CODES.TF_ERROR, "why")

@@ -1,0 +1,36 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.policy.route import route
+from nics_drl_bridge.sim.occupancy import occupancy
+from nics_drl_bridge.sim.world_set import load_worlds
+
+START, GOAL, RADIUS = (-2.0, -3.0), (5.5, 3.0), 0.2
+
+
+@pytest.fixture(scope="module")
+def room():
+    return occupancy(load_worlds("room"))
+
+
+def test_a_way_leads_through_doors_and_touches_nothing(room):
+    way = route(room, START, GOAL, RADIUS)
+    assert (tuple(way[0]), tuple(way[-1])) == (START, GOAL)
+    cells = room.world_to_cell(way[1:-1])
+    assert room.distance_field[cells[:, 0], cells[:, 1]].min() > RADIUS
+    assert np.hypot(*np.diff(way, axis=0).T).max() < 0.3
+
+
+def test_a_robot_that_fits_through_no_door_gets_one_sentence(room):
+    with pytest.raises(ConfigError, match="there is no way to the goal on the map"):
+        route(room, START, GOAL, 0.9)
+
+
+@pytest.mark.parametrize("name", ["start", "goal"])
+def test_an_end_off_the_map_is_told(room, name):
+    ends = {"start": START, "goal": GOAL, name: (50.0, 0.0)}
+    with pytest.raises(ConfigError, match=f"the {name} of the way is off the map"):
+        route(room, ends["start"], ends["goal"], RADIUS)
