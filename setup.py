@@ -1,5 +1,6 @@
 """Packaging for pip and for colcon (build type ament_python)."""
 
+import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -99,6 +100,8 @@ def data_files() -> list[tuple[str, list[str]]]:
         "share/ament_index/resource_index/packages": [f"resource/{PACKAGE}"],
         SHARE: ["package.xml"],
     }
+    if not {"bdist_wheel", "editable_wheel"} & set(sys.argv):  # pip makes one of its own
+        by_folder["bin"] = ["resource/bin/nics"]
     for top in ("config", "launch", "urdf"):
         for path in sorted((ROOT / top).rglob("*")):
             file = path.relative_to(ROOT)

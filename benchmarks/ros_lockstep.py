@@ -4,7 +4,8 @@ The env is that of `gymnasium.make`: a command to a simulator node in a process 
 720-beam scan among ten obstacles and its odometry back, the estimator, observation and reward. The
 bare echo is what ROS 2 itself allows: two processes of rclpy's own executor, by the transports that
 it chooses, that exchange the same messages, made once, and do nothing else; with
-`--executor standing` they are processes of this package's executor, whose wait set stands. Both are
+`--executor standing` they are processes of this package's executor, whose wait set stands, and with
+`--executor events` of rclpy's experimental one. Both are
 measured in turns, chunk by chunk, so that whatever else the machine does falls on both.
 
 Bars: 0.7 env steps for each exchange of the bare pair of rclpy's executor (of standing ones 0.5),
@@ -23,7 +24,10 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -53,9 +57,11 @@ WORLD = {
 DEPTH, PATIENCE_S = 10, 60.0
 CONTROLS = {"slow": "speed: a step rests", "standing": "the commands: the robot does not drive"}
 REST_S, DRIVEN_M = 0.003, 0.1
-RATIOS = {"rclpy": 0.7, "standing": 0.5}
+RATIOS = {"rclpy": 0.7, "standing": 0.5, "events": 0.5}
 """The least, by the executor of the bare pair."""
-EXECUTORS = {"rclpy": SingleThreadedExecutor, "standing": StandingExecutor}
+EXECUTORS: dict[str, Any] = {"rclpy": SingleThreadedExecutor, "standing": StandingExecutor}
+if find_spec("rclpy.experimental"):  # since Kilted
+    EXECUTORS["events"] = import_module("rclpy.experimental").EventsExecutor
 Exchange = Callable[[], Callable[[], object] | None]
 Chunk = Callable[[int], list[float]]
 

@@ -165,6 +165,22 @@ class _Index(IndexDataCacheFile):  # type: ignore[misc]
         except (AttributeError, ImportError):  # a class of some arguments is no longer there
             return {}
 
+    def save(self, key: Any, data: Any) -> None:
+        """Saves data with what they belong to.
+
+        numba gives them a number in the index first. Of two processes at once, each may give the
+        same one; and a process that is ended in between leaves it to data of an earlier version.
+        """
+        super().save(key, (self._version, key, data))
+
+    def load(self, key: Any) -> Any:
+        """Returns the data of a key, or None if there are none: others' would crash."""
+        try:
+            version, owner, data = super().load(key)
+        except (AttributeError, ImportError, TypeError, ValueError):  # none, or of other versions
+            return None
+        return data if (version, owner) == (self._version, key) else None
+
 
 class _Cache(FunctionCache):  # type: ignore[misc]
     """Machine code on disk, stamped with the content of all that it was compiled from."""

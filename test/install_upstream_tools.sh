@@ -25,7 +25,8 @@ if [ ! -e "$env/bin/ros2" ]; then
         ./ros2cli/ros2{pkg,run,node,topic,param,service,action,lifecycle,interface} ./ros2cli/ros2cli
     # Containers of components need these; launch_ros imports them whatever it starts.
     mkdir -p "$site/composition_interfaces"
-    echo "LoadNode = ListNodes = UnloadNode = None" >"$site/composition_interfaces/srv.py"
+    echo "class LoadNode: Request = Response = None
+ListNodes = UnloadNode = LoadNode" >"$site/composition_interfaces/srv.py"
     touch "$site/composition_interfaces/__init__.py"
 fi
 

@@ -132,6 +132,38 @@ def test_a_kernel_that_moves_within_its_file_leaves_nothing_behind(package):
     assert len(list(package.rglob("*.nbi"))) == before
 
 
+def index(folder, version="1"):
+    made = kernels._Index(str(folder), "file", "stamp")
+    made._version += version
+    return made
+
+
+def test_of_two_processes_that_save_at_once_neither_gets_the_others_code(tmp_path, monkeypatch):
+    one, other = index(tmp_path), index(tmp_path)
+    write, unaware = one._save_data, dict
+
+    def meanwhile(name, data):
+        other._load_index = unaware  # it looked before either had saved
+        other.save("of another", "another's code")
+        write(name, data)
+
+    monkeypatch.setattr(one, "_save_data", meanwhile)
+    one.save("own", "own code")
+    assert index(tmp_path).load("of another") in (None, "another's code")
+    assert index(tmp_path).load("own") in (None, "own code")
+
+
+def test_a_process_that_ends_while_it_saves_leaves_no_code_of_an_earlier_version(
+    tmp_path, monkeypatch
+):
+    index(tmp_path, "1").save("key", "old code")
+    assert index(tmp_path, "1").load("key") == "old code"
+    ended = index(tmp_path, "2")
+    monkeypatch.setattr(ended, "_save_data", lambda *_: None)
+    ended.save("key", "new code")
+    assert index(tmp_path, "2").load("key") is None
+
+
 def test_imports_are_read_in_every_spelling(tmp_path):
     path = tmp_path / "some.py"
     path.write_text(

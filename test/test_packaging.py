@@ -220,6 +220,13 @@ def test_a_sourced_colcon_install_runs_an_executable(install_space: Path) -> Non
     assert "Usage" in run("bash", "-c", sourced, cwd=install_space)
 
 
+def test_a_sourced_colcon_install_has_nics_on_the_path(install_space: Path) -> None:
+    sourced = f"source {install_space}/setup.bash && command -v nics && nics --help"
+    answer = run("bash", "-c", sourced, cwd=install_space)
+    assert answer.startswith(f"{install_space / PACKAGE / 'bin' / 'nics'}\n")
+    assert "Usage" in answer
+
+
 def requirements(metadata: Message, extra: str = "") -> list[Requirement]:
     """What the wheel requires on this machine, with an extra or without."""
     every = [Requirement(text) for text in metadata.get_all("Requires-Dist", [])]

@@ -311,4 +311,6 @@ def rehearse(model: SimulatorModel) -> RobotView:
         middleware.command(stamp_ns - period_ns, np.zeros(len(model.robot.command)))
         middleware.odometry(stamp_ns, stamp_ns, still, still)
         middleware.scan(stamp_ns, stamp_ns, free)
+        middleware.pose(stamp_ns, stamp_ns, still)
+    _ = middleware.estimator.twist_covariance
     return middleware.view(2 * period_ns)

@@ -54,8 +54,8 @@ class ManagedNode(QosWatch, LifecycleNode):
             return
         self._starting = True
         for trigger in (self.trigger_configure, self.trigger_activate):
-            if trigger() != SUCCESS and self._failure is not None:
-                raise self._failure
+            if trigger() != SUCCESS:
+                raise self._failure or BridgeError(f"{self.get_name()} could not be started.")
         self._starting = False
 
     def stop(self) -> None:
@@ -100,7 +100,12 @@ class ManagedNode(QosWatch, LifecycleNode):
         self.stop()
         return self._attempt(self.undo.close, UNCONFIGURED)
 
-    on_error = on_shutdown
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """As at a shutdown; what has failed is kept for `start`."""
+        failure = self._failure
+        done = self.on_shutdown(state)
+        self._failure = failure
+        return done
 
     def _attempt(self, do: Callable[[], None], reached: str) -> TransitionCallbackReturn:
         """Does the work of a transition; rclpy itself would not report why one failed."""

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from robots import direct_model
@@ -171,6 +174,38 @@ def test_a_rehearsal_ends_with_a_robot_that_stands_still_in_the_open():
     assert np.allclose(view.twist, 0.0, atol=1e-9)
     assert np.isposinf(view.ranges).all()
     assert view.scan_age_s == view.odom_age_s == 0.0
+
+
+USED = """
+import numpy as np
+from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.kernels import KERNELS
+from nics_drl_bridge.middleware.middleware import Middleware, rehearse
+
+def known():
+    return {(kernel.__name__, types) for kernel in KERNELS for types in kernel.overloads}
+
+model = builtin_model("ackermann")
+rehearse(model)
+rehearsed, middleware, period = known(), Middleware(model), round(model.control_period * 1e9)
+middleware.reset(period, np.zeros(3))
+for k in range(2, 30):
+    now, far = k * period, 3.0 if k % 9 == 0 else 0.0
+    pose, twist = np.array([0.05 * k, 0.01, 0.02]), np.array([0.5 + far, 0.0, 0.1])
+    middleware.command(now - 3 * period * (k % 7 == 0), np.full(len(model.robot.command), 0.1))
+    middleware.odometry(now, now, pose, twist)
+    middleware.scan(now, now, np.full(model.lidar.beams, 3.0, np.float32))
+    middleware.pose(now - period // 3, now, pose + far)
+    middleware.imu(now - period // 2, now, 0.1 + far)
+    middleware.view(now + period // 2), middleware.estimator.twist_covariance
+print(sorted(name for name, _ in known() - rehearsed))
+"""
+
+
+@pytest.mark.process
+def test_what_is_rehearsed_is_all_that_a_moving_robot_calls():
+    done = subprocess.run([sys.executable, "-c", USED], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
 
 
 def test_after_a_change_of_lidar_only_scans_of_its_beams_are_taken(middleware):

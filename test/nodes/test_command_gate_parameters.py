@@ -8,7 +8,6 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from dataclasses import replace
 
-from launch_stub import ROOT, Launched
 from rclpy.node import Node
 
 from nics_drl_bridge.config import dump_yaml, find_config
@@ -45,33 +44,10 @@ def declared(domain_id, tmp_path):
     return declare
 
 
-def launched(file, declared, **values):
-    """What the gate is told when a launch file starts it."""
-    gate = Launched(values=values).run(file).nodes["command_gate"]
-    return declared(gate["parameters"], gate["files"])
-
-
 def test_a_gate_that_is_told_nothing_requires_an_emergency_stop(declared):
     config = declared()
     assert config.e_stop_required
     assert not config.simulated
-
-
-def test_a_launched_vehicle_requires_an_emergency_stop_whatever_its_file_says(declared, tmp_path):
-    assert launched("vehicle.launch.py", declared).e_stop_required
-    file = tmp_path / "own.yaml"
-    text = (ROOT / "config" / "nodes" / "bridge.yaml").read_text(encoding="utf-8")
-    own = text.replace("e_stop_required: true", "e_stop_required: false")
-    assert own != text
-    file.write_text(own, encoding="utf-8")
-    assert launched("vehicle.launch.py", declared, params_file=str(file)).e_stop_required
-    assert launched("bridge.launch.py", declared).e_stop_required
-
-
-def test_a_launched_simulation_requires_none_unless_it_is_asked_to(declared):
-    config = launched("simulation.launch.py", declared)
-    assert (config.e_stop_required, config.simulated) == (False, True)
-    assert launched("simulation.launch.py", declared, e_stop_required="true").e_stop_required
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from nav_msgs.msg import Odometry
 
 from nics_drl_bridge.nodes import qos
+from nics_drl_bridge.nodes.policy_node import PolicyNode
 from nodes.peer import stamp_ns
 
 pytestmark = pytest.mark.ros
@@ -110,3 +111,29 @@ def test_a_middleware_publishes_its_estimate_only_while_active_and_its_health_al
     assert stamp_ns(filtered[-1]) == last
     assert lead(managed, "middleware_node", "cleanup")
     managed.until(lambda: message() == "unconfigured", "a diagnosis")
+
+
+@pytest.fixture
+def mistaken(monkeypatch):
+    def configure(_):
+        raise TypeError("a mistake of ours")
+
+    monkeypatch.setattr(PolicyNode, "configure", configure)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_mistake_in_configure_ends_a_node_that_leads_itself(launch, domain_id, mistaken):
+    node = launch("policy_node", domain_id)
+    assert node.wait() == 1
+    assert "TypeError: a mistake of ours" in node.read_text()
+
+
+def test_a_mistake_in_configure_leaves_a_node_that_is_led_unconfigured(
+    launch, meet, domain_id, mistaken
+):
+    peer = meet(domain_id)
+    node = launch("policy_node", domain_id, autostart=False)
+    assert not lead(peer, "policy_node", "configure")
+    assert state(peer, "policy_node") == "unconfigured"
+    assert "TypeError: a mistake of ours" in node.read_text()
+    assert node.close() == 0

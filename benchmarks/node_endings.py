@@ -1,0 +1,153 @@
+"""How long does a node take to end, by SIGINT and SIGTERM in turn, on busy cores?
+
+Each node is ended many times while it starts (after its first line), while it compiles its kernels
+into an empty cache, and while it runs, beside loops that are always busy. It has to end by itself,
+with exit code 0. The control takes away what ends a node while it compiles.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from measuring.verdict import answer, parser_of
+
+from nics_drl_bridge.nodes.parameters import NODES
+from nics_drl_bridge.nodes.processes import free_domain_id
+
+CONTROLS = {"late": "the handler that ends a node while it compiles"}
+LIMIT_S, PATIENCE_S, READY_S, POLL_S = 1.0, 60.0, 280.0, 0.01
+PHASES = {"starting": "]: starting", "compiling": "]: compiling, once", "running": "]: running"}
+NEVER_COMPILES = ("record_node",)
+MOMENTS_S = 2.0  # after its line, a node is ended at moments that are spread over this time [s]
+GIVEN = {"command_gate": ["-p", "limits:=ackermann"]}
+START = """
+import sys
+from nics_drl_bridge.nodes import ending, start
+if sys.argv[1] == "late":
+    ending.own_process = lambda: None
+start.start(sys.argv[2], sys.argv[2:])
+"""
+LOOP = """
+while True:
+    pass
+"""
+
+
+@contextmanager
+def busy(loops: int) -> Iterator[None]:
+    """Runs busy loops beside the block."""
+    started = [subprocess.Popen([sys.executable, "-c", LOOP]) for _ in range(loops)]
+    try:
+        yield
+    finally:
+        for each in started:
+            each.kill()
+            each.wait()
+
+
+def ended(node: str, phase: str, number: int, control: str | None, folder: Path) -> dict[str, Any]:
+    """Ends a node once in a phase: its exit code, the time [s], and what it wrote if it failed."""
+    log, own = folder / "log", {"ROS_HOME": str(folder), "ROS_LOG_DIR": str(folder)}
+    if phase == "compiling":
+        own["NUMBA_CACHE_DIR"] = str(folder / "cache")
+    words = ["--ros-args", *GIVEN.get(node, []), "-r", f"__ns:=/{phase}_{number}"]
+    with log.open("wb") as file:
+        process = subprocess.Popen(
+            [sys.executable, "-c", START, control or "", node, *words], env=os.environ | own,
+            stdout=file, stderr=file, stdin=subprocess.DEVNULL, cwd=folder, start_new_session=True,
+        )  # fmt: skip
+    try:
+        deadline = time.monotonic() + READY_S
+        while PHASES[phase] not in log.read_text(errors="replace"):
+            if process.poll() is not None or time.monotonic() > deadline:
+                raise RuntimeError(f"{node} was never {phase}:\n{log.read_text(errors='replace')}")
+            time.sleep(POLL_S)
+        time.sleep(number % 10 / 10 * MOMENTS_S)
+        begin = time.monotonic()
+        process.send_signal((signal.SIGINT, signal.SIGTERM)[number % 2])
+        code: int | None = None
+        with suppress(subprocess.TimeoutExpired):
+            code = process.wait(PATIENCE_S)
+        took_s = time.monotonic() - begin
+    finally:
+        process.kill()
+        process.wait()
+    told = log.read_text(errors="replace")
+    clean = code == 0 and "Traceback" not in told
+    return {"code": code, "took_s": took_s, "clean": clean, "log": "" if clean else told[-2000:]}
+
+
+def measure(given: argparse.Namespace) -> dict[str, Any]:
+    """All endings, by node and phase."""
+    os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    found: dict[str, Any] = {}
+    with busy(given.loops):
+        for node in given.nodes:
+            for phase in given.phases:
+                if phase == "compiling" and node in NEVER_COMPILES:
+                    continue
+                each = []
+                for k in range(given.times):
+                    with tempfile.TemporaryDirectory() as folder:
+                        each.append(ended(node, phase, k, given.control, Path(folder)))
+                found[f"{node} {phase}"] = {
+                    "median_s": statistics.median(one["took_s"] for one in each),
+                    "longest_s": max(one["took_s"] for one in each),
+                    "failed": [one for one in each if not one["clean"]],
+                }
+    return {"times": given.times, "loops": given.loops, "limit_s": LIMIT_S, "endings": found}
+
+
+def missed_of(result: dict[str, Any]) -> list[str]:
+    """The bars that were missed."""
+    missed = []
+    for name, each in result["endings"].items():
+        if not each["longest_s"] <= LIMIT_S:
+            missed.append(f"{name}: took {each['longest_s']:.2f} s, bar {LIMIT_S:g} at most")
+        if each["failed"]:
+            codes = sorted({str(one["code"]) for one in each["failed"]})
+            missed.append(f"{name}: {len(each['failed'])} ended badly, codes {', '.join(codes)}")
+    return missed
+
+
+def table_of(result: dict[str, Any]) -> str:
+    """The figures, a node and phase in a line."""
+    rows = [f"{'':<28}{'median [s]':>12}{'longest [s]':>12}{'bad':>5}\n"]
+    rows += [
+        f"{name:<28}{each['median_s']:>12.3f}{each['longest_s']:>12.3f}{len(each['failed']):>5}\n"
+        for name, each in result["endings"].items()
+    ]
+    return "".join(rows)
+
+
+def options(words: Sequence[str] | None = None) -> argparse.Namespace:
+    """The arguments."""
+    parser = parser_of(__doc__, CONTROLS)
+    parser.add_argument("--times", type=int, default=10, help="of each node in each phase")
+    parser.add_argument("--loops", type=int, default=2, help="busy ones")
+    parser.add_argument("--nodes", nargs="+", default=list(NODES), choices=list(NODES))
+    parser.add_argument("--phases", nargs="+", default=list(PHASES), choices=list(PHASES))
+    return parser.parse_args(words)
+
+
+def main() -> None:
+    """Prints a table, or one JSON object."""
+    given = options()
+    result = measure(given)
+    answer(result, missed_of(result), table_of(result), given.json)
+
+
+if __name__ == "__main__":
+    main()

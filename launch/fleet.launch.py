@@ -1,0 +1,11 @@
+"""Several robots in one simulator, each with a bridge in its namespace.
+
+ros2 launch nics_drl_bridge fleet.launch.py robots:='[ant, bee]'
+ros2 service call /ant/command_gate/arm std_srvs/srv/Trigger
+"""
+
+from nics_drl_bridge.nodes import launching
+
+
+def generate_launch_description():
+    return launching.whole_simulation(robots="2")

@@ -1,0 +1,189 @@
+"""The launch files, by the real `ros2 launch`."""
+
+from __future__ import annotations
+
+import itertools
+import re
+import subprocess
+import time
+from contextlib import ExitStack
+
+import pytest
+
+pytest.importorskip("ros2launch", reason="needs ros2: make test-upstream")
+
+from benchmarks.runs import BENCHMARKS
+from domains import claimed_domain
+from nodes.peer import Peer
+from rcl_interfaces.srv import GetParameters
+from rclpy.parameter import parameter_value_to_python
+
+from nics_drl_bridge.config import find_config
+from upstream.launched import PACKAGE, Launched
+
+pytestmark = [pytest.mark.ros, pytest.mark.process, pytest.mark.slow]
+
+BRIDGE = ("command_gate", "middleware_node", "policy_node")
+NODES = {
+    "bridge": BRIDGE,
+    "description": (),
+    "fleet": (
+        "simulator_node", *(f"robot{k}.{node}" for k in (1, 2) for node in BRIDGE)
+    ),
+    "simulation": ("simulator_node", *BRIDGE),
+    "simulator": ("simulator_node",),
+    "vehicle": BRIDGE,
+}  # fmt: skip
+SUFFIXES = ("py", "xml")
+FILES = [f"{name}.launch.{suffix}" for name, nodes in NODES.items() if nodes for suffix in SUFFIXES]
+TIMES, MOMENTS_S = 10, 4.0
+
+
+@pytest.fixture
+def launch(tmp_path):
+    """Starts a launch file, `launch(file, **arguments)`; it ends with the test."""
+    numbers = itertools.count()
+    with ExitStack() as started:
+        domain_id = started.enter_context(claimed_domain())
+
+        def start(file, **arguments):
+            folder = tmp_path / str(next(numbers))
+            folder.mkdir()
+            return started.enter_context(Launched(file, folder, domain_id, **arguments))
+
+        yield start
+
+
+@pytest.fixture
+def told():
+    """The values of parameters, `told(launched, node, *names)`."""
+    with ExitStack() as opened:
+
+        def ask(launched, node, *names):
+            peer = Peer(launched.domain_id)
+            opened.callback(peer.close)
+            request = GetParameters.Request(names=list(names))
+            answer = peer.call(GetParameters, f"{node}/get_parameters", request)
+            return [parameter_value_to_python(value) for value in answer.values]
+
+        yield ask
+
+
+@pytest.fixture
+def busy(monkeypatch):
+    """Two busy loops beside the test."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    from node_endings import busy
+
+    with busy(2):
+        yield
+
+
+def arguments(file):
+    command = ["ros2", "launch", PACKAGE, file, "--show-args"]
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_a_launch_file_runs_and_ctrl_c_ends_all_of_it_well(launch, file):
+    launched = launch(file)
+    launched.runs(*NODES[file.partition(".")[0]])
+    launched.ends_well()
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_where_nothing_of_a_description_is_installed_it_ends_by_itself(launch, suffix):
+    launched = launch(f"description.launch.{suffix}", model="mecanum")
+    assert launched.wait() == 0, launched.text
+
+
+@pytest.mark.parametrize("name", NODES)
+def test_the_twin_in_xml_has_the_same_arguments(name):
+    python, xml = (arguments(f"{name}.launch.{suffix}") for suffix in SUFFIXES)
+    assert python == xml
+    assert "'model':" in python
+    assert "'namespace':" in python
+
+
+def test_arguments_reach_every_node(launch, told):
+    launched = launch(
+        "simulation.launch.py", namespace="car", model="differential", world="corridor",
+        policy="go_to_goal", fallback="dynamic_window", stamped="false", start="1.0, 0.5, 0.25",
+        autostart="false", log_level="warn",
+    )  # fmt: skip
+    names = "model", "world", "enable_stamped_cmd_vel", "episode_start"
+    assert told(launched, "/car/simulator_node", *names)[:3] == ["differential", "corridor", False]
+    (start,) = told(launched, "/car/simulator_node", "episode_start")
+    assert list(start) == [1.0, 0.5, 0.25]
+    names = "model", "enable_stamped_cmd_vel", "limits", "e_stop_required", "use_sim_time"
+    given = ["differential", False, "differential", False, True]
+    assert told(launched, "/car/command_gate", *names) == given
+    names = "policy", "fallback", "model", "enable_stamped_cmd_vel", "autostart", "base_frame"
+    given = ["go_to_goal", "dynamic_window", "differential", False, False, "base_link"]
+    assert told(launched, "/car/policy_node", *names) == given
+    launched.ends_well()
+
+
+def test_a_fleet_has_a_bridge_in_each_namespace_with_the_frames_of_its_robot(launch, told):
+    launched = launch(
+        "fleet.launch.py", robots="[ant, bee]", start="-1 0 0 1 0 0", autostart="false"
+    )
+    assert list(*told(launched, "/simulator_node", "robots")) == ["ant", "bee"]
+    for robot in ("ant", "bee"):
+        launched.runs(f"{robot}.command_gate")
+        assert told(launched, f"/{robot}/policy_node", "base_frame") == [f"{robot}/base_link"]
+    launched.ends_well()
+
+
+def test_what_is_not_given_stands_in_the_file_of_parameters(launch, told, tmp_path):
+    text = find_config("bridge", "nodes").read_text(encoding="utf-8")
+    own = text.replace("fallback: ''", "fallback: mppi")
+    own = own.replace("e_stop_required: true", "e_stop_required: false")
+    file = tmp_path / "car.yaml"
+    file.write_text(own, encoding="utf-8")
+    launched = launch("vehicle.launch.py", params_file=file, autostart="false")
+    assert told(launched, "/policy_node", "fallback", "policy") == ["mppi", "dynamic_window"]
+    # But a vehicle requires an emergency stop, whatever its file says.
+    names = "e_stop_required", "limits", "use_sim_time"
+    assert told(launched, "/command_gate", *names) == [True, "ackermann", False]
+    launched.ends_well()
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ({"start": "1.0"}, "launch argument 'start' is '1.0'; give x, y, heading"),
+        ({"model": "ackerman"}, "did you mean 'ackermann'"),
+        ({"simulator": "gazebo"}, "Valid options are: \\['simulator', 'mujoco'\\]"),
+        ({"params_file": "none.yaml"}, "none.yaml: no such file"),
+    ],
+)
+def test_an_argument_that_can_not_be_used_ends_it_with_a_sentence(launch, words, sentence):
+    launched = launch("simulation.launch.xml", **words)
+    assert launched.wait() == 1
+    assert re.search(sentence, launched.text), launched.text
+    assert "Traceback" not in launched.text
+
+
+def test_a_simulator_without_a_bridge_is_driven_by_whom_it_may_concern(launch):
+    launched = launch("simulator.launch.py", world="empty")
+    launched.runs("simulator_node")
+    assert launched.text.count("process started") == 1
+    launched.ends_well()
+
+
+@pytest.mark.campaign
+@pytest.mark.timeout(1200)
+@pytest.mark.parametrize("name", ["bridge", "fleet", "simulation", "vehicle"])
+def test_ctrl_c_ends_it_ten_times_beside_two_busy_loops(launch, busy, name):
+    """At moments from the start of the processes until all have been running for a while."""
+    took = []
+    for k in range(TIMES):
+        launched = launch(f"{name}.launch.{SUFFIXES[k % 2]}", world="empty")
+        launched.told("process started", times=len(NODES[name]))
+        launched.told(r"\]: starting", times=len(NODES[name]))
+        if k >= TIMES // 2:
+            launched.runs(*NODES[name])
+        time.sleep(MOMENTS_S * k / TIMES)
+        took.append(launched.ends_well())
+    print(f"{name}: ended after {sorted(took)[TIMES // 2]:.2f} s, at most {max(took):.2f} s")
