@@ -53,6 +53,13 @@ EXTRAS = {
     # Isaac's runner of policy bundles, which the tests hold ours against; reading and writing them
     # needs `deploy` alone. A library of its pictures has wheels for this platform only.
     "leapp": [f"leapp>=0.7.2; {ROS_WHEELS_EXIST}"],
+    # The site of docs/, and what runs and shows its notebooks.
+    "docs": [
+        "ipykernel>=6.29",
+        "mkdocs-material>=9.6,<10",
+        "mkdocstrings[python]>=0.29",
+        "nbconvert>=7.16",
+    ],
     "test": [
         "build",
         "colcon-bash",
