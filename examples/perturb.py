@@ -1,4 +1,4 @@
-"""Success of a policy in the nominal simulator, and where robot, sensors and scene are drawn anew."""
+"""Success of a policy in the nominal simulator, and where robot, sensors and scene vary."""
 
 from pathlib import Path
 

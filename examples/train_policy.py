@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from nics_drl_bridge.policy import train
-from nics_drl_bridge.policy.training_settings import load_settings
+from nics_drl_bridge.policy.training_settings import chosen_settings
 from nics_drl_bridge.report.pictures import Point, training_curve
 
 STEPS = 120_000  # a tenth of what a good policy takes
@@ -11,7 +11,8 @@ OUT = Path("runs/example")
 
 
 def main() -> None:
-    settings = load_settings("demo").model_copy(update={"steps": STEPS, "worlds": {"arena": 128}})
+    changes = {"steps": STEPS, "worlds": {"arena": 128}}
+    settings = chosen_settings("navigation", "demo", changes)  # config/training/demo.yaml
     curve = []
 
     def tell(progress: train.checkpoints.Progress) -> None:

@@ -93,10 +93,10 @@ def schemas_of(schema: type[BaseModel]) -> dict[str, type[BaseModel]]:
     found = {schema.__name__: schema}
 
     def visit(annotation: Any) -> None:
-        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-            if annotation.__name__ not in found:
-                found[annotation.__name__] = annotation
-                inside(annotation)
+        is_schema = isinstance(annotation, type) and issubclass(annotation, BaseModel)
+        if is_schema and annotation.__name__ not in found:
+            found[annotation.__name__] = annotation
+            inside(annotation)
         for part in getattr(annotation, "__args__", ()):
             visit(part)
 
@@ -181,8 +181,8 @@ def page(kind: Kind) -> str:
     whole = kind.schema.model_json_schema()
     schemas = schemas_of(kind.schema)
     opening = (
-        f"Every key of the file; [the guide](../{kind.guide}.md) says what they are for. A key that "
-        "is not known, stands twice or is out of range is refused by its name."
+        f"Every key of the file; [the guide](../{kind.guide}.md) says what they are for. A key "
+        "that is not known, stands twice or is out of range is refused by its name."
     )
     parts = [section(kind.schema, whole, f"# {kind.title}\n\n{opening}")]
     inner = whole.get("$defs", {})
