@@ -34,7 +34,8 @@ def main() -> None:
     figure, grid = panels(1, 3, (9.0, 3.4))
     rays = np.stack([np.cos(lidar.angles), np.sin(lidar.angles)], axis=1)
     for axes, at, ranges in zip(grid, robots, scans["auto"], strict=False):
-        axes.plot(*(at + ranges[:, None] * rays).T, ".", markersize=1.5)
+        hits = (at + ranges[:, None] * rays)[ranges < lidar.range_max]
+        axes.plot(*hits.T, ".", markersize=1.5)
         axes.plot(*at, "o")
         axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
     Path("scan_shapes.png").write_bytes(png(figure))

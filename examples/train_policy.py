@@ -6,7 +6,7 @@ from nics_drl_bridge.policy import train
 from nics_drl_bridge.policy.training_settings import chosen_settings
 from nics_drl_bridge.report.pictures import Point, training_curve
 
-STEPS = 120_000  # a tenth of what a good policy takes
+STEPS = 120_000  # half a minute; `nics demo` takes 800,000
 OUT = Path("runs/example")
 
 
