@@ -94,7 +94,7 @@ def test_every_page_and_file_that_a_page_names_exists(page):
     named = re.findall(r"`((?:docs|examples|config|benchmarks)/[\w/.-]+\.\w+)`", text_of(page))
     named += [
         str((page.parent / to).resolve().relative_to(ROOT))
-        for to in re.findall(r"\]\(([^)#:\s]+)", FENCED.sub("", text_of(page)))
+        for to in re.findall(r"\]\((?![a-z]+:)([^)#\s]+)", FENCED.sub("", text_of(page)))
     ]
     made = {"docs/CHANGELOG.md", "docs/CONTRIBUTING.md"}
     notebooks = {f"docs/notebooks/{p.stem}.md" for p in (ROOT / "docs/notebooks").glob("*.ipynb")}
