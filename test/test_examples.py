@@ -51,7 +51,7 @@ def test_every_example_is_short_has_a_main_and_stands_in_the_docs_with_its_pictu
 
 def test_there_are_twelve_on_the_road():
     road = (ROOT / "docs" / "examples.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^\| (\d+) \| `(\w+)\.py`", road, re.MULTILINE)
+    rows = re.findall(r"^## (\d+)\. (\w+)\.py$", road, re.MULTILINE)
     assert [int(number) for number, _ in rows] == list(range(1, 13))
     assert {name for _, name in rows} <= {example.stem for example in EXAMPLES}
 

@@ -23,13 +23,19 @@ ROS = (
 WITHOUT_ROS = f"""
 import sys
 
-class Absent:
-    def find_spec(self, name, *_):
-        top = name.partition(".")[0]
-        if top in {ROS} or top.endswith("_msgs") or top.endswith("_srvs"):
-            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+class Without:
+    def __init__(self, finder):
+        self.finder = finder
 
-sys.meta_path.insert(0, Absent())
+    def find_spec(self, name, path=None, target=None):
+        top = name.partition(".")[0]
+        absent = top in {ROS} or top.endswith(("_msgs", "_srvs"))
+        return None if absent else self.finder.find_spec(name, path, target)
+
+    def __getattr__(self, name):
+        return getattr(self.finder, name)
+
+sys.meta_path[:] = [Without(finder) for finder in sys.meta_path]
 """
 NICS = "from nics_drl_bridge.commands.cli import main\nmain()"
 SETTINGS = "{worlds: {empty: 32}, steps: 2048, hidden: [16], ppo: {rollout: 16, batch: 256}}"

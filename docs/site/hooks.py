@@ -7,18 +7,23 @@ from posixpath import normpath, relpath
 from typing import Any
 
 from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
 from nbconvert import MarkdownExporter
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "nics_drl_bridge"
 AT_THE_TOP = ("CHANGELOG.md", "CONTRIBUTING.md")
+SHIM = "assets/iframe-worker.js"  # workers for pages from the disk, as the search is one
 NAMED = re.compile(r"(?<!\[)`docs/(?P<page>[\w/]+\.md)`")
 LINK = re.compile(r"\[(?P<text>[^\]]*)\]\((?P<to>[^)#\s:]+)(?P<anchor>#[^)]*)?\)")
 
 
+@event_priority(-100)  # after the plugin `offline`, which asks the network for its shim
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Lists the pages of the package's rooms, in place of `api/`."""
+    """Takes our copy of the shim, and lists the pages of the package's rooms in place of `api/`."""
+    scripts = config.extra_javascript
+    scripts[:] = [SHIM if "iframe-worker" in str(one) else one for one in scripts]
     for tab in config.nav or ():
         for entry in tab.get("Reference", ()) if isinstance(tab, dict) else ():
             if entry.get("Python") == "api/":
