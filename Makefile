@@ -15,6 +15,7 @@ WORKERS := $(shell echo $$(($$(nproc 2>/dev/null || getconf _NPROCESSORS_ONLN) *
 BENCHMARKS ?=
 QUICK ?=
 OUT ?=
+EXAMPLES ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -55,7 +56,7 @@ DESCRIBED_BY := setup.py setup.cfg package.xml pyproject.toml constraints.txt Ma
 
 OTHER_PYTHON := name another interpreter, as in: make setup PYTHON=python3.12
 
-.PHONY: help setup demo test test-quick test-all test-jazzy test-ray test-messages test-upstream test-clients test-lerobot test-ament ros-status lint format types pytest benchmark tables clean distclean
+.PHONY: help setup demo test test-quick test-all test-jazzy test-ray test-messages test-upstream test-clients test-lerobot test-ament test-release ros-status lint format types pytest benchmark tables docs reference notebooks pictures clean distclean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' Makefile | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 15
@@ -125,7 +126,7 @@ test-quick: setup ## under a minute, after each edit: no processes, no training
 
 test-all: test ## before a release: the long campaigns, other distributions, clients and Ray too
 	$(BIN)/python -m pytest $(PARALLEL) -m campaign $(PYTEST_ARGS)
-	$(MAKE) test-jazzy test-messages test-clients test-lerobot test-ament test-ray $(if $(UPSTREAM_LIES_THERE),test-upstream)
+	$(MAKE) test-jazzy test-messages test-clients test-lerobot test-ament test-release test-ray $(if $(UPSTREAM_LIES_THERE),test-upstream)
 
 ros-status:
 ifeq ($(ROS),system)
@@ -278,6 +279,9 @@ $(AMENT)/.ready: Makefile
 		$(CLEAN_ENV) $(AMENT)/bin/python -m pip install -qq $(AMENT_LIBRARIES)
 	@touch $@
 
+test-release: setup ## wheel and source archive, installed into an environment of their own, run the demo
+	$(CLEAN_ENV) $(BIN)/python -m pytest test/test_release.py $(PYTEST_ARGS)
+
 # To its end whatever one of them says; each is told with machine, commit and load.
 benchmark: setup ## run every benchmark, write benchmarks/results.json: make benchmark [BENCHMARKS="parity files"] [QUICK=1] [OUT=file]
 	@cd benchmarks && ../$(BIN)/python -m measuring.run_all \
@@ -285,6 +289,19 @@ benchmark: setup ## run every benchmark, write benchmarks/results.json: make ben
 
 tables: setup ## make the tables of README and docs from benchmarks/results.json
 	@cd benchmarks && ../$(BIN)/python -m measuring.tables
+
+docs: setup ## build the site of docs/ into build/docs: open build/docs/index.html
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	@echo "open build/docs/index.html"
+
+reference: setup ## make docs/reference/ from the schemas of the files and from the commands
+	$(BIN)/python docs/site/reference.py
+
+notebooks: setup ## run docs/notebooks/ and keep their outputs
+	$(BIN)/python docs/site/notebooks.py
+
+pictures: setup ## run the examples and keep their pictures in docs/examples/: make pictures [EXAMPLES="own_task"]
+	$(BIN)/python docs/site/pictures.py $(EXAMPLES)
 
 clean: ## remove what building and testing left behind
 	rm -rf build dist install log *.egg-info .mypy_cache .pytest_cache .ruff_cache .hypothesis

@@ -1,14 +1,15 @@
 """Somebody else's network drives to a goal, by a mapping that says what goes in and comes out."""
 
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import gymnasium
 import numpy as np
 from onnx import TensorProto, helper, numpy_helper, save
+from PIL import Image
 
 import nics_drl_bridge  # noqa: F401 - makes the environments known
 from nics_drl_bridge.generator import open_model
+from nics_drl_bridge.policy.evaluation import drive
 from nics_drl_bridge.policy.policies import open_policy
 
 MAPPING = """
@@ -23,33 +24,34 @@ outputs:
   turn: {of: action, index: 1, multiply: 2.0}
 """
 
-# It turns to the goal, and slows down for what is in front of it.
-weights = np.zeros((38, 2), np.float32)
-weights[15:21, 0], weights[37, 1] = 0.2, 1.0
-nodes = [
-    helper.make_node("Concat", ["scan", "goal"], ["seen"], axis=1),
-    helper.make_node("MatMul", ["seen", "weights"], ["raw"]),
-    helper.make_node("Tanh", ["raw"], ["action"]),
-]
-ends = {"scan": ["n", 36], "goal": ["n", 2], "action": ["n", 2]}
-infos = [helper.make_tensor_value_info(n, TensorProto.FLOAT, shape) for n, shape in ends.items()]
-initial = [numpy_helper.from_array(weights, "weights")]
-graph = helper.make_graph(nodes, "theirs", infos[:2], infos[2:], initial)
 
-with TemporaryDirectory() as folder:
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    save(model, f"{folder}/theirs.onnx")
-    mapping = Path(folder) / "theirs.yaml"
-    mapping.write_text(MAPPING, encoding="utf-8")
+def network():
+    """It turns to the goal, and slows down for what is in front of it."""
+    weights = np.zeros((38, 2), np.float32)
+    weights[15:21, 0], weights[37, 1] = 0.2, 1.0
+    nodes = [
+        helper.make_node("Concat", ["scan", "goal"], ["seen"], axis=1),
+        helper.make_node("MatMul", ["seen", "weights"], ["raw"]),
+        helper.make_node("Tanh", ["raw"], ["action"]),
+    ]
+    ends = {"scan": ["n", 36], "goal": ["n", 2], "action": ["n", 2]}
+    infos = [helper.make_tensor_value_info(n, TensorProto.FLOAT, of) for n, of in ends.items()]
+    initial = [numpy_helper.from_array(weights, "weights")]
+    graph = helper.make_graph(nodes, "theirs", infos[:2], infos[2:], initial)
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+
+
+def main():
+    save(network(), "theirs.onnx")
+    Path("theirs.yaml").write_text(MAPPING, encoding="utf-8")
     robot = open_model("differential")
-    policy, task = open_policy(str(mapping), robot)
+    policy, task = open_policy("theirs.yaml", robot)
+    make = {"model": robot, "world": "empty", "task": task, "render_mode": "rgb_array"}
+    env = gymnasium.make("NicsBridge/Navigation-v0", **make)
+    episode = drive(env, policy, seed=0)
+    print(episode.result)
+    Image.fromarray(env.render()).quantize(64).save("drive_foreign_policy.png")
 
-env = gymnasium.make("NicsBridge/Navigation-v0", model=robot, world="empty", task=task)
-observation, info = env.reset(seed=0)
-ended = False
-while not ended:
-    observation, reward, terminated, truncated, info = env.step(policy.act(observation))
-    ended = terminated or truncated
 
-print("reached the goal" if info["is_success"] else "did not reach the goal")
-env.close()
+if __name__ == "__main__":
+    main()

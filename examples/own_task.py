@@ -1,103 +1,65 @@
-"""A task of one's own, in one file: patrol between two places, again and again.
-
-    gymnasium.make("NicsBridge/Task-v0", task="examples/own_task.py:Patrol")
-
-`docs/tasks.md` explains each part. Run as a program, this file drives an episode of it.
-"""
-
-from __future__ import annotations
+"""A task of one's own: patrol between two places; `docs/tasks.md` explains each part."""
 
 from dataclasses import dataclass
 from functools import cached_property
 
-import gymnasium
 import numpy as np
+from PIL import Image
 
-import nics_drl_bridge  # noqa: F401 - makes the environments known
-from nics_drl_bridge.env.task import Task, bearing, distance, limited
+from nics_drl_bridge import make
+from nics_drl_bridge.env.task import Task, bearing, distance
 
 
 @dataclass(frozen=True)
 class Patrol(Task):
-    """Drive back and forth between the start and the goal that the world drew.
-
-    Attributes:
-        radius: how near is there [m].
-        rounds: so many arrivals are a success.
-    """
-
-    radius: float = 0.3
-    rounds: int = 3
+    radius: float = 0.3  # how near is there [m]
+    rounds: int = 3  # so many arrivals are a success
 
     @cached_property
-    def observation_space(self):
-        """The scan, distance and bearing of the present target, and the twist."""
-        return self.box([0, -1, -1, *[-1000] * 3], [1000, 1, 1, *[1000] * 3])
+    def observation_space(self):  # the scan, then distance, cosine, sine of the target's bearing
+        return self.box([0, -1, -1], [1000, 1, 1])
 
     def reset(self, episodes):
-        """Both places, how many arrivals there were, and whether the last step was one."""
-        places = np.stack([episodes.goals, episodes.starts[..., :2]], axis=-2)  # (n, M, 2, 2)
-        count = np.zeros(places.shape[:-2], np.int64)  # (n, M)
-        return {"places": places, "arrivals": count, "arrived": count > 0}
+        goal, start = episodes.goals.copy(), episodes.starts[..., :2].copy()
+        count = np.zeros(goal.shape[:-1], np.int64)
+        return {"goal": goal, "start": start, "arrivals": count, "arrived": count > 0}
 
-    def target(self, memory):
-        """(..., 2) the goal after an even number of arrivals, the start after an odd one."""
-        even = (memory["arrivals"] % 2 == 0)[..., None]
-        return np.where(even, memory["places"][..., 0, :], memory["places"][..., 1, :])
+    def target(self, memory):  # the goal after an even number of arrivals, else the start
+        return np.where(memory["arrivals"][..., None] % 2 == 0, memory["goal"], memory["start"])
 
     def update(self, before, after, memory):
-        """Counts arrivals, before anything is judged."""
         memory["arrived"][...] = distance(after.pose, self.target(memory)) < self.radius
         memory["arrivals"] += memory["arrived"]
 
     def observation(self, view, memory):
-        """What the robot sees."""
-        parts = [
-            self.free_share(view.ranges),
-            bearing(view.pose, self.target(memory)),
-            limited(view.twist),
-        ]
+        parts = [self.free_share(view.ranges), bearing(view.pose, self.target(memory))]
         return np.concatenate(parts, axis=-1).astype(np.float32)
 
     def reward(self, before, after, memory):
-        """An arrival pays 5, a metre of approach 1, a touch costs 10."""
-        target = self.target(memory)
-        approach = distance(before.pose, target) - distance(after.pose, target)
-        return {
-            "progress": np.where(memory["arrived"], 0.0, approach),
-            "arrival": 5.0 * memory["arrived"],
-            "collision": -10.0 * self.touches(after.ranges),
-        }
+        was, now = (distance(view.pose, self.target(memory)) for view in (before, after))
+        progress = np.where(memory["arrived"], 0.0, was - now)
+        return {"progress": progress, "arrival": 5.0 * memory["arrived"]}
 
     def end(self, view, memory):
-        """At a touch, and after the last round."""
         return self.touches(view.ranges) | (memory["arrivals"] >= self.rounds)
 
-    def info(self, view, memory):
-        """What an evaluation reads."""
-        return {
-            "is_success": memory["arrivals"] >= self.rounds,
-            "collision": self.touches(view.ranges),
-            "arrivals": memory["arrivals"].copy(),
-        }
+    def info(self, view, memory):  # what an evaluation reads
+        arrivals, touches = memory["arrivals"].copy(), self.touches(view.ranges)
+        return {"is_success": arrivals >= self.rounds, "collision": touches, "arrivals": arrivals}
+
+
+def main():
+    env = make(task=Patrol, model="differential", world="empty", render_mode="rgb_array")
+    (observation, _), ended, frames = env.reset(seed=1), False, []
+    while not ended:
+        ahead, left = observation[-2:]
+        action = max(ahead, 0.0) - 1.0, left if ahead > 0.0 else np.sign(left)
+        observation, _, ended, _, info = env.step(np.array(action, np.float32))
+        frames.append(env.render())
+    print(f"{info['arrivals']} arrivals")
+    picture = np.min(frames[::6], axis=0)  # of many moments, as in a long exposure
+    Image.fromarray(picture).quantize(64).save("own_task.png")
 
 
 if __name__ == "__main__":
-    env = gymnasium.make("NicsBridge/Task-v0", task=Patrol, model="differential", world="empty")
-    observation, info = env.reset(seed=1)
-    total, ended = 0.0, False
-    while not ended:
-        ahead, left = observation[-5:-3]  # cosine and sine of the target's bearing
-        turn = left if ahead > 0.0 else np.sign(left)
-        action = np.array([max(ahead, 0.0) - 1.0, turn], np.float32)
-        observation, reward, terminated, truncated, info = env.step(action)
-        total, ended = total + reward, terminated or truncated
-    print(f"{info['arrivals']} arrivals, reward {total:.2f}: {info['reward_terms']}")
-
-    envs = gymnasium.make_vec(
-        "NicsBridge/Task-v0", num_envs=64, task=Patrol, model="differential", world="empty"
-    )
-    envs.reset(seed=1)
-    for _ in range(100):
-        _, rewards, *_ = envs.step(envs.action_space.sample())
-    print(f"64 worlds of the same task, mean reward of the last step {rewards.mean():.3f}")
+    main()

@@ -1,0 +1,86 @@
+"""Hooks of the site: pages that are made of the code, of notebooks and of files beside docs/."""
+
+import base64
+import re
+from pathlib import Path, PurePosixPath
+from posixpath import normpath, relpath
+from typing import Any
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.plugins import event_priority
+from mkdocs.structure.files import File, Files
+from nbconvert import MarkdownExporter
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = ROOT / "nics_drl_bridge"
+AT_THE_TOP = ("CHANGELOG.md", "CONTRIBUTING.md")
+SHIM = "assets/iframe-worker.js"  # workers for pages from the disk, as the search is one
+NAMED = re.compile(r"(?<!\[)`docs/(?P<page>[\w/]+\.md)`")
+LINK = re.compile(r"\[(?P<text>[^\]]*)\]\((?P<to>[^)#\s:]+)(?P<anchor>#[^)]*)?\)")
+
+
+@event_priority(-100)  # after the plugin `offline`, which asks the network for its shim
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Takes our copy of the shim, and lists the pages of the package's rooms in place of `api/`."""
+    scripts = config.extra_javascript
+    scripts[:] = [SHIM if "iframe-worker" in str(one) else one for one in scripts]
+    for tab in config.nav or ():
+        for entry in tab.get("Reference", ()) if isinstance(tab, dict) else ():
+            if entry.get("Python") == "api/":
+                entry["Python"] = [{room: f"api/{room}.md"} for room in rooms()]
+    return config
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Adds what is no page of docs/ by itself."""
+    made: dict[str, str | bytes] = {f"api/{room}.md": api_page(room) for room in rooms()}
+    made |= {name: (ROOT / name).read_text(encoding="utf-8") for name in AT_THE_TOP}
+    for notebook in sorted(Path(config.docs_dir).glob("notebooks/*.ipynb")):
+        made |= notebook_pages(notebook)
+    for name, content in made.items():
+        files.append(File.generated(config, name, content=content))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: MkDocsConfig, files: Files) -> str:
+    """Makes links of the pages that a text names, and plain text of links that leave docs/."""
+    here = str(PurePosixPath(page.file.src_uri).parent)
+
+    def named(match: re.Match[str]) -> str:
+        to = match["page"]
+        found = files.get_file_from_path(to) is not None
+        return f"[{match[0]}]({relpath(to, here)})" if found else match[0]
+
+    def within(match: re.Match[str]) -> str:
+        leaves = normpath(f"{here}/{match['to']}").startswith("..")
+        return match["text"] if leaves else match[0]
+
+    return LINK.sub(within, NAMED.sub(named, markdown))
+
+
+def rooms() -> list[str]:
+    """The rooms of the package, the modules at its top first."""
+    return ["top", *sorted(path.parent.name for path in PACKAGE.glob("*/__init__.py"))]
+
+
+def api_page(room: str) -> str:
+    """The page of a room: all its modules but the kernels."""
+    folder = PACKAGE if room == "top" else PACKAGE / room
+    modules = sorted(folder.glob("*.py") if room == "top" else folder.rglob("*.py"))
+    kept = [m for m in modules if not m.stem.endswith("kernels") and not m.stem.startswith("_")]
+    names = [".".join(m.relative_to(ROOT).with_suffix("").parts) for m in kept]
+    title = "nics_drl_bridge" if room == "top" else f"nics_drl_bridge.{room}"
+    return "\n\n".join([f"# {title}", *(f"::: {name}" for name in names)]) + "\n"
+
+
+def notebook_pages(path: Path) -> dict[str, str | bytes]:
+    """A notebook as a page, with its pictures beside it."""
+    text, resources = MarkdownExporter().from_filename(str(path))
+    pictures = resources["outputs"]
+    folder = f"notebooks/{path.stem}"
+    for name in pictures:
+        text = text.replace(f"]({name})", f"]({path.stem}/{name})")
+    return {f"notebooks/{path.stem}.md": text} | {
+        f"{folder}/{name}": data if isinstance(data, bytes) else base64.b64decode(data)
+        for name, data in pictures.items()
+    }

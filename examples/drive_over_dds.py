@@ -1,0 +1,42 @@
+"""One policy drives an episode in process and over DDS: the same numbers, to the bit."""
+
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+
+import nics_drl_bridge  # noqa: F401 - makes the environments known
+from nics_drl_bridge.generator import open_model
+from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
+from nics_drl_bridge.policy.evaluation import drive
+from nics_drl_bridge.policy.policies import open_policy
+from nics_drl_bridge.report.pictures import trajectories
+from nics_drl_bridge.sim.world import load_world
+
+ENV, WORLD, SEED = "NicsBridge/Navigation-v0", "circles", 1_000_000
+
+
+def main() -> None:
+    model, domain_id = open_model("differential"), free_domain_id()
+    policy, task = open_policy("differential", model)
+    here = gymnasium.make(ENV, model=model, world=WORLD, task=task, estimator=True)
+    inside = drive(here, policy, SEED)
+
+    parameters = {"model": "differential", "world": WORLD, "mode": "lockstep"}
+    options = {"domain_id": domain_id, "timeout_s": 120.0}
+    with NodeProcess("simulator_node", Path("logs"), parameters, domain_id):
+        there = gymnasium.make(
+            ENV, backend="dds", model=model, world=WORLD, task=task, backend_options=options
+        )
+        outside = drive(there, policy, SEED)
+        there.close()
+
+    difference = np.abs(inside.estimate - outside.estimate).max()
+    print(f"{outside.result} over DDS; the estimates are {difference:g} apart")
+    runs = {"in process": [inside], "over DDS": [outside]}
+    picture = trajectories(runs, load_world(WORLD), model.robot.footprint_radius)
+    Path("drive_over_dds.png").write_bytes(picture)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,42 @@
+"""Three robots share one world: each turns to a goal of its own and drives there."""
+
+import gymnasium
+import numpy as np
+from PIL import Image
+
+import nics_drl_bridge  # noqa: F401 - makes the environments known
+
+ROBOTS, SEED = 3, 2
+
+
+def to_the_goal(cosine: np.ndarray, sine: np.ndarray) -> np.ndarray:
+    """Actions (M, 2) in [-1, 1]: forward speed and turn rate, by the goal's bearing."""
+    ahead = np.where(cosine > 0.7, 0.6 * cosine, 0.0)
+    return np.stack([ahead, np.where(cosine > 0.0, sine, np.sign(sine))], axis=-1)
+
+
+def main() -> None:
+    env = gymnasium.make(
+        "NicsBridge/CooperativeReaching-v0",
+        model="differential",
+        world="empty",
+        task_options={"robots": ROBOTS},
+        render_mode="rgb_array",
+    )
+    observation, info = env.reset(seed=SEED)
+    own, ended, pictures = np.arange(ROBOTS), False, []
+    while not ended:
+        seen = observation.reshape(ROBOTS, -1)
+        goals = seen[:, -3 - 3 * (ROBOTS - 1) - 4 * ROBOTS :][:, : 4 * ROBOTS]
+        cosine, sine = goals.reshape(ROBOTS, ROBOTS, 4)[own, own, 1:3].T
+        action = to_the_goal(cosine, sine).astype(np.float32)
+        pictures.append(env.render())
+        observation, _, terminated, truncated, info = env.step(action.ravel())
+        ended = terminated or truncated
+    print(f"{len(pictures)} steps, reached: {bool(np.all(info['is_success']))}")
+    shown = [pictures[k] for k in (0, len(pictures) // 2, -1)]
+    Image.fromarray(np.concatenate(shown, axis=1)).quantize(64).save("several_robots.png")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,28 @@
+"""Trains a policy for a short time in the fast simulator; it becomes one file, `policy.onnx`."""
+
+from pathlib import Path
+
+from nics_drl_bridge.policy import train
+from nics_drl_bridge.policy.training_settings import chosen_settings
+from nics_drl_bridge.report.pictures import Point, training_curve
+
+STEPS = 120_000  # half a minute; `nics demo` takes 800,000
+OUT = Path("runs/example")
+
+
+def main() -> None:
+    changes = {"steps": STEPS, "worlds": {"arena": 128}}
+    settings = chosen_settings("navigation", "demo", changes)  # config/training/demo.yaml
+    curve = []
+
+    def tell(progress: train.checkpoints.Progress) -> None:
+        curve.append(Point(progress.steps, progress.success, progress.collision))
+
+    result = train.run(train.TrainOrder(settings, seeds=[0], out=OUT, episodes=100), tell)[0]
+    print(f"{result.trained.steps} steps: {train.line_of(result.summaries['arena'])}")
+    print(f"the policy is {OUT}/seed_0/policy.onnx")
+    Path("train_policy.png").write_bytes(training_curve(curve))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,102 @@
+"""What the pages say a user can type: each command exists, each piece of Python compiles."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shlex
+import textwrap
+from pathlib import Path
+
+import pytest
+from typer.main import get_command
+
+from nics_drl_bridge.commands.cli import app
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+MAKE_TARGETS = set(
+    re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+)
+FENCED = re.compile(r"^```(?P<kind>[a-z]*)\n(?P<text>.*?)^```$", re.MULTILINE | re.DOTALL)
+INDENTED = re.compile(r"(?<=\n\n)(?:    .*\n+)+")
+INLINE = re.compile(r"`((?:nics|make) [^`\n]+)`")
+PLACEHOLDERS = {"...", "NAME"}
+
+
+def text_of(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+def command_lines(text: str) -> list[str]:
+    """Lines that begin with `nics` or `make`, in blocks and between backticks."""
+    plain = FENCED.sub("", text)
+    lines = [line.strip() for block in INDENTED.findall(plain) for line in block.splitlines()]
+    lines += INLINE.findall(plain)
+    return [line for line in lines if line.startswith(("nics ", "make "))]
+
+
+def words_of(line: str) -> list[str]:
+    return shlex.split(line.replace("'...", "'").replace("...", ""), comments=True)[1:]
+
+
+def check_options(words: list[str]) -> None:
+    """Raises AssertionError for a command or an option of `nics` that does not exist."""
+    command = get_command(app)
+    while hasattr(command, "commands") and words and not words[0].startswith("-"):
+        name = words.pop(0)
+        if name in PLACEHOLDERS:
+            return
+        assert name in command.commands, f"there is no command {name!r}"
+        command = command.commands[name]
+    known = {opt for one in command.params for opt in (*one.opts, *one.secondary_opts)}
+    known |= {"--help", "--version"}
+    for word in words:
+        if word.startswith("-") and not re.fullmatch(r"-[\d.]+(,.*)?", word):
+            assert word.split("=")[0] in known, f"{command.name} has no option {word!r}"
+
+
+CASES = [(page, line) for page in PAGES for line in command_lines(text_of(page))]
+
+
+@pytest.mark.parametrize(("page", "line"), CASES, ids=lambda value: str(value)[-60:])
+def test_every_command_that_a_page_shows_exists(page, line):
+    words = words_of(line)
+    if line.startswith("nics "):
+        check_options(words)
+    else:
+        targets = [word for word in words if "=" not in word and not word.startswith("-")]
+        assert set(targets) <= MAKE_TARGETS, f"{page.name}: {line}"
+
+
+@pytest.mark.parametrize(
+    "line", ["nics trian --robot x", "nics train --robott x", "nics world drew x"]
+)
+def test_a_command_or_an_option_that_there_is_not_is_found(line):
+    with pytest.raises(AssertionError):
+        check_options(words_of(line))
+
+
+def test_commands_are_found_in_blocks_and_in_sentences():
+    text = "Text `nics urdf X`.\n\n    nics train --seeds 0  # once\n    make demo\n\nMore.\n"
+    assert command_lines(text) == ["nics train --seeds 0  # once", "make demo", "nics urdf X"]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_piece_of_python_that_a_page_shows_compiles(page):
+    for block in FENCED.finditer(text_of(page)):
+        if block["kind"] == "python":
+            ast.parse(textwrap.dedent(block["text"]))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_page_and_file_that_a_page_names_exists(page):
+    named = re.findall(r"`((?:docs|examples|config|benchmarks)/[\w/.-]+\.\w+)`", text_of(page))
+    named += [
+        str((page.parent / to).resolve().relative_to(ROOT))
+        for to in re.findall(r"\]\((?![a-z]+:)([^)#\s]+)", FENCED.sub("", text_of(page)))
+    ]
+    made = {"docs/CHANGELOG.md", "docs/CONTRIBUTING.md"}
+    notebooks = {f"docs/notebooks/{p.stem}.md" for p in (ROOT / "docs/notebooks").glob("*.ipynb")}
+    missing = [one for one in named if one not in made | notebooks and not (ROOT / one).exists()]
+    assert not [one for one in missing if "NAME" not in one and "ROBOT" not in one]

@@ -1,0 +1,66 @@
+"""The site: made from the code without a warning, and readable without a network."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.sim.world import World
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "docs" / "site"))
+import reference  # noqa: E402
+
+
+def test_the_reference_is_what_the_schemas_and_commands_say():
+    for name, text in reference.pages().items():
+        written = (ROOT / "docs" / "reference" / name).read_text(encoding="utf-8")
+        assert written == text, f"docs/reference/{name} is out of date; run `make reference`"
+
+
+def test_a_key_has_its_type_default_range_and_the_comment_at_its_field():
+    schema = World.model_json_schema()
+    found = reference.rows(World, schema["properties"], schema["required"])
+    rows = {row.split("|")[1].strip(): row for row in found}
+    assert "| number | `0.3` | ≥ 0 | around the footprint at start" in rows["`clearance`"]
+    assert "| text | required |" in rows["`name`"]
+
+
+def test_a_comment_above_a_field_is_its_meaning_too():
+    assert reference.meaning(RobotSpec, "angular_is").startswith("meaning of `angular.z`")
+
+
+def test_every_schema_within_a_file_has_a_table():
+    page = reference.page(reference.KINDS["world"])
+    for name in World.model_json_schema()["$defs"]:
+        assert f"## {name}\n" in page
+
+
+def test_every_page_of_the_reference_and_of_docs_is_in_the_navigation():
+    text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    listed = set(re.findall(r"[\w/]+\.md", text))
+    written = {p.relative_to(ROOT / "docs").as_posix() for p in (ROOT / "docs").rglob("*.md")}
+    assert written <= listed, f"add to nav of mkdocs.yml: {sorted(written - listed)}"
+    assert yaml.safe_load(text)["site_dir"] == "build/docs"
+
+
+@pytest.mark.process
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_site_is_built_without_a_warning_and_asks_for_nothing_outside(tmp_path):
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    asked = re.compile(r"""<(?:script|img|iframe)[^>]*\ssrc="https?:|<link[^>]*\shref="https?:""")
+    pages = list(tmp_path.rglob("*.html"))
+    assert len(pages) > 50
+    canonical = re.compile(r'<link rel="canonical"[^>]*>')
+    for page in pages:
+        text = canonical.sub("", page.read_text(encoding="utf-8"))
+        assert not asked.search(text), page

@@ -1,0 +1,87 @@
+"""A release as a user gets it: wheel and source archive, in an environment of their own."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+TORCH = ("--torch-backend", "cpu")
+INSTRUCTIONS = {"FROM", "WORKDIR", "COPY", "RUN", "ENTRYPOINT", "CMD"}
+
+
+def text_of(name: str) -> str:
+    return (ROOT / name).read_text(encoding="utf-8")
+
+
+def run(*command: str | Path, cwd: Path) -> str:
+    """Runs a command away from this repository; what it printed is returned, or shown."""
+    clean = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    done = subprocess.run(
+        [str(word) for word in command], cwd=cwd, env=clean, text=True, timeout=1700,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+    )  # fmt: skip
+    assert done.returncode == 0, f"{command} ended with {done.returncode}:\n{done.stdout}"
+    return done.stdout
+
+
+def container_lines() -> list[tuple[str, str]]:
+    """The instructions of the Containerfile, each with its arguments on one line."""
+    text = re.sub(r"^#.*\n", "", text_of("Containerfile"), flags=re.MULTILINE)
+    lines = text.replace("\\\n", " ").splitlines()
+    return [tuple(line.split(maxsplit=1)) for line in lines if line.strip()]
+
+
+@pytest.fixture(scope="module")
+def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the source archive, and the wheel that is made of it."""
+    folder = tmp_path_factory.mktemp("dist")
+    run(sys.executable, "-m", "build", "--no-isolation", "--outdir", folder, ROOT, cwd=folder)
+    return folder
+
+
+@pytest.mark.campaign
+@pytest.mark.process
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("kind", ["*.whl", "*.tar.gz"])
+def test_a_release_runs_the_demo_outside_of_the_repository(dist, kind, tmp_path):
+    archive = next(dist.glob(kind))
+    uv, python = Path(sys.executable).with_name("uv"), tmp_path / "venv" / "bin" / "python"
+    run(uv, "venv", "--python", sys.executable, tmp_path / "venv", cwd=tmp_path)
+    install = (uv, "pip", "install", "--python", python, "--constraints", ROOT / "constraints.txt")
+    run(*install, *TORCH, f"{archive}[ros,train,deploy]", cwd=tmp_path)
+    where = run(python, "-c", "import nics_drl_bridge as n; print(n.__file__)", cwd=tmp_path)
+    assert str(tmp_path) in where
+    words = ["demo", "--policy", "differential", "--episodes", "2", "--out", "demo"]
+    told = run(python.with_name("nics"), *words, cwd=tmp_path)
+    assert "in process 2/2, over DDS 2/2" in told
+    assert (tmp_path / "demo" / "report.html").is_file()
+
+
+def test_the_container_file_copies_what_there_is_and_runs_what_is_installed():
+    lines = container_lines()
+    assert lines[0][0] == "FROM"
+    assert {name for name, _ in lines} == INSTRUCTIONS
+    for name, words in lines:
+        if name == "COPY":
+            *sources, _ = words.split()
+            assert all((ROOT / source).exists() for source in sources), words
+    asked = re.search(r"'\.\[(.*?)\]'", text_of("Containerfile"))
+    extras = re.findall(r'^    "([a-z-]+)": \[', text_of("setup.py"), re.MULTILINE)
+    assert set(asked[1].split(",")) <= set(extras)
+    assert dict(lines)["ENTRYPOINT"] == '["nics"]'
+
+
+def test_the_citation_has_the_version_of_the_package_and_what_its_format_needs():
+    citation = yaml.safe_load(text_of("CITATION.cff"))
+    assert {"cff-version", "message", "title", "authors"} <= set(citation)
+    assert all(one["authors"] for one in (citation, *citation["references"]))
+    (version,) = re.findall("<version>(.*)</version>", text_of("package.xml"))
+    assert citation["version"] == version
+    assert f"{citation['license']}" in text_of("LICENSE")
