@@ -115,9 +115,9 @@ class Unseen:
         derivative = np.eye(3)
         derivative[:2, 2] = lever
         before = derivative @ anchor.covariance[:3, :3] @ derivative.T
-        return pose, before + self.drift(lever, far, max(seconds, 0.0))
+        return pose, before + self._drift(lever, far, max(seconds, 0.0))
 
-    def drift(self, lever: Array, far: float, seconds: float) -> Array:
+    def _drift(self, lever: Array, far: float, seconds: float) -> Array:
         """Covariance (3, 3) that a pose by odometry gains in a time, on a path with `lever` (2,).
 
         A heading error that grows along the path rotates the rest of it: on a straight path with a

@@ -14,9 +14,10 @@ from nics_drl_bridge.middleware.measurement import Acceptance, Judgement, Kind, 
 from nics_drl_bridge.robot.kernels import SERIES, term_arrays, wrap
 
 Array = NDArray[np.float64]
-LEAST_POSE_DRIFT, LEAST_STATE_DRIFT = 2e-3, 5e-3
+LEAST_POSE_DRIFT, LEAST_STATE_DRIFT = 1e-2, 2e-2
 """Lower bounds on the model's error after a second, of the pose [m or rad / sqrt(s)], and of the
 state as a share of its range [1 / sqrt(s)]."""
+LEAST_SLIP = 5e-3  # Lower bound on the motion that wheels miss [m or rad / sqrt(s)]
 LEAST_TWIST_STD = LEAST_POSE_STD = START_STD = 1e-3
 """Lower bounds on the standard deviations of a twist [m/s, rad/s] and of a pose [m, rad], and that
 of the pose at a reset."""
@@ -27,7 +28,6 @@ GATE = {Kind.TWIST: 16.27, Kind.YAW_RATE: 10.83, Kind.POSE: 16.27}
 PATIENCE: dict[Kind, float] = {Kind.TWIST: 3, Kind.YAW_RATE: np.inf, Kind.POSE: 5}
 NEWS = 0.5  # Possible error of the state of a stuck or pushed robot, as a share of its range
 REACHABLE = 2.0  # States and commands are cut at this many times their range
-
 FARTHEST = 1e8  # Innovations beyond this [m, rad, m/s, rad/s] are never believed
 ANYWHERE = (100.0, 100.0, np.pi)  # Std of a pose in a pose sensor's map, by odometry [m, rad]
 LONGEST_GAP_S = 10.0  # Longest gap that is predicted [s]: beyond, the robot may be anywhere
@@ -59,6 +59,10 @@ class Estimator:
             Kind.YAW_RATE: np.diag([GYRO_STD**2]),
             Kind.POSE: np.diag(np.maximum(model.noise.pose, LEAST_POSE_STD) ** 2),
         }
+        # Measured drift is motion that the model misses, wheels do not; an assumed one may be slip.
+        missed = model.noise.drift(model.robot) ** 2 - model.noise.simulated_drift(model.robot) ** 2
+        self._slip = np.diag(np.maximum(missed[:3], LEAST_SLIP**2))
+        self._walk = self._noise[Kind.TWIST] * model.control_period
         self.unseen = Unseen(model, self._process, self._noise[Kind.TWIST], self._news)
         self._observe_pose, self._suddenly = np.eye(3, 3 + size), np.eye(3 + size, size, -3)
         self._filter, self._trial = (ExtendedKalmanFilter(3 + size, 3) for _ in range(2))
@@ -247,14 +251,14 @@ class Estimator:
         anchor = self._anchor
         if anchor is None or anchor.cross is None:
             return
-        way, seconds = geometry.between(anchor.odom, odom), (self.time_ns - anchor.time_ns) / NS_PER_S
-        noise = self.unseen.drift(np.array([-way[1], way[0]]), self.unseen.reach(seconds)[0], seconds)
-        mean, covariance, distance = kernels.retrace(
-            self._filter.x, self._filter.P, anchor.mean[:3].copy(), anchor.covariance[:3, :3].copy(),
-            anchor.cross, way, noise,
-        )  # fmt: skip
+        way = geometry.between(anchor.odom, odom)
+        seconds = (self.time_ns - anchor.time_ns) / NS_PER_S
+        pose, spread = anchor.mean[:3].copy(), anchor.covariance[:3, :3].copy()
+        then = pose, spread, anchor.cross, way, self._walk * seconds
+        mean, covariance, distance = kernels.retrace(self._filter.x, self._filter.P, *then)
         if distance <= GATE[Kind.POSE]:
             self._filter.x, self._filter.P = mean, covariance
+            self._filter.P[:3, :3] += self._slip * seconds
             kernels.settle(self._filter.x, self._filter.P, *self._limits)
 
     def _expect(self, kind: Kind) -> tuple[Array, Array]:

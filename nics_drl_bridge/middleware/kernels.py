@@ -246,14 +246,17 @@ def distance(innovation, derivative, covariance, noise):  # type: ignore[no-unty
 
 
 @kernel(allocates=True)
-def recall(pose, spread, cross, innovation, derivative, covariance, noise):  # type: ignore[no-untyped-def]
+def recall(  # type: ignore[no-untyped-def]
+    pose, spread, cross, innovation, derivative, covariance, noise
+):  # fmt: skip
     """Corrects an earlier pose (3,) by a present innovation (n,), of `derivative` (n, 3 + S).
 
     Returns the pose, its covariance `spread` (3, 3), and the present mean's with it (3 + S, 3).
     """
     seen = derivative @ cross
     gain = np.linalg.solve(derivative @ covariance @ derivative.T + noise, seen)
-    return pose + innovation @ gain, spread - seen.T @ gain, cross - covariance @ (derivative.T @ gain)
+    less = cross - covariance @ (derivative.T @ gain)
+    return pose + innovation @ gain, spread - seen.T @ gain, less
 
 
 @kernel(allocates=True)
