@@ -340,16 +340,15 @@ def test_a_way_that_belies_the_twists_is_left_out():
     assert np.hypot(*moved[:2]) > 0.9 * np.hypot(*twist[:2])
 
 
-@pytest.mark.parametrize("heading", [0.0, 2.0])
+@pytest.mark.parametrize("heading", [0.0, 1.0])
 def test_the_way_goes_on_from_a_pose_that_was_measured_in_between(heading):
     estimator = Estimator(direct_model())
-    estimator.reset(0, np.zeros(3), 1.0)
+    estimator.reset(0, np.zeros(3), 2.0)
     estimator.anchor(np.zeros(3))
     estimator.command(0, [1.0, 0.0, 0.0])
-    there = np.array([5.0, 3.0, heading])
+    there = np.array([1.5, 0.5, heading])
     estimator.predict(PERIOD // 2)
-    for _ in range(5):  # until it is believed
-        estimator.update(Kind.POSE, there, np.full(3, 1e-3))
+    estimator.update(Kind.POSE, there, np.full(3, 1e-3))
     stepped(estimator, PERIOD, [1.0, 0.0, 0.0], [0.1, 0.0, 0.0])
     ahead = geometry.compose(there, np.array([0.05, 0.0, 0.0]))
     assert estimator.at(PERIOD)[0] == pytest.approx(ahead, abs=0.01)
