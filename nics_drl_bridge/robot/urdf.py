@@ -29,7 +29,7 @@ def urdf_of(
         _add(_add(robot, "material", name=name), "color", rgba=colour)
     link = _add(robot, "link", name=base)
     disc = (spec.footprint_radius, BODY_HEIGHT)
-    _geometry(_add(link, "collision"), disc, (0.0, 0.0, BODY_HEIGHT))
+    _collision(_add(link, "collision"), spec)
     if spec.textbook is None:
         _visual(link, "body", disc, (0.0, 0.0, BODY_HEIGHT))
     else:
@@ -44,6 +44,16 @@ def urdf_of(
         _joint(robot, joint, "fixed", (base, frame), (x, y, 0.0), yaw=yaw)
     ElementTree.indent(robot)
     return f'<?xml version="1.0"?>\n{ElementTree.tostring(robot, encoding="unicode")}\n'
+
+
+def _collision(parent: Element, spec: RobotSpec) -> None:
+    """Adds the footprint: a disc, or the box around its corners, as URDF has no prism."""
+    if spec.footprint is None:
+        _geometry(parent, (spec.footprint_radius, BODY_HEIGHT), (0.0, 0.0, BODY_HEIGHT))
+        return
+    (back, front), (right, left) = ((min(of), max(of)) for of in zip(*spec.footprint, strict=True))
+    middle = (0.5 * (back + front), 0.5 * (right + left), BODY_HEIGHT)
+    _geometry(parent, (front - back, left - right, BODY_HEIGHT), middle)
 
 
 def _wheel(robot: Element, parent: str, wheel: Wheel) -> None:
