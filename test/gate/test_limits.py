@@ -37,7 +37,8 @@ def test_a_car_keeps_its_steering_when_its_speed_is_cut():
 
 
 def test_what_a_robot_can_not_do_at_all_is_dropped_and_the_rest_stays():
-    assert saturate(np.array([-0.6, 1.0]), LIMITS["differential"]).tolist() == [-0.5, 1.0]
+    forwards = replace(LIMITS["differential"], low=np.array([0.0, -2.0]))
+    assert saturate(np.array([-1e-9, 1.0]), forwards).tolist() == [0.0, 1.0]
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
