@@ -27,6 +27,7 @@ GATE = {Kind.TWIST: 16.27, Kind.YAW_RATE: 10.83, Kind.POSE: 16.27}
 # Consecutive outliers after which they are believed. A gyro never is: odometry has precedence.
 PATIENCE: dict[Kind, float] = {Kind.TWIST: 3, Kind.YAW_RATE: np.inf, Kind.POSE: 5}
 NEWS = 0.5  # Possible error of the state of a stuck or pushed robot, as a share of its range
+STILL = np.zeros(3)
 REACHABLE = 2.0  # States and commands are cut at this many times their range
 FARTHEST = 1e8  # Innovations beyond this [m, rad, m/s, rad/s] are never believed
 ANYWHERE = (100.0, 100.0, np.pi)  # Std of a pose in a pose sensor's map, by odometry [m, rad]
@@ -78,10 +79,10 @@ class Estimator:
         self.belief = Belief(time_ns, mean, spread, (0, 0, 0), None, False, error)
         self._log = log_of(np.zeros(len(self._least)))
 
-    def anchor(self, odom: Array) -> None:
-        """Records the present pose (3,) in `odom`."""
+    def anchor(self, odom: Array, twist: Array = STILL) -> None:
+        """Records the present pose (3,) in `odom` and body twist (3,)."""
         mean, covariance = self._filter.x, self._filter.P
-        self._anchor = Anchor(self.time_ns, odom, mean, covariance, covariance[:, :3].copy())
+        self._anchor = Anchor(self.time_ns, odom, twist, mean, covariance, covariance[:, :3].copy())
 
     def lose(self, time_ns: int, seconds: float, continuous: bool, command: Array) -> None:
         """Continues from the last odometry, seconds ago, at a time [ns] to which the clock was set.
@@ -89,7 +90,7 @@ class Estimator:
         The robot may be anywhere within reach, unless odometry is `continuous`: then the next one's
         pose bridges the motion. The command (C,) is in effect.
         """
-        anchor = self._anchor or Anchor(0, np.zeros(3), self._filter.x, self._filter.P)
+        anchor = self._anchor or Anchor(0, STILL, STILL, self._filter.x, self._filter.P)
         covariance = self.unseen.doubted(anchor.covariance, seconds)
         known = self._anchor is not None and continuous
         since = anchor._replace(time_ns=time_ns - round(seconds * NS_PER_S)) if known else None
@@ -197,8 +198,8 @@ class Estimator:
         verdict = self._correct(measurement)
         if odom is not None:
             if not lost and verdict.outcome is not Acceptance.OUTLIER:
-                self._retrace(odom)
-            self.anchor(odom)
+                self._retrace(odom, measurement.value)
+            self.anchor(odom, measurement.value)
         elif kind is Kind.POSE and verdict.outcome is not Acceptance.OUTLIER:
             self._lost = False
         return verdict
@@ -243,10 +244,11 @@ class Estimator:
             )  # fmt: skip
             self._anchor = anchor._replace(mean=mean, covariance=covariance, cross=cross)
 
-    def _retrace(self, odom: Array) -> None:
+    def _retrace(self, odom: Array, twist: Array) -> None:
         """Corrects by the way from the newest odometry to one of this time, if that is likely.
 
         A twist is but a moment's, the way all that wheels did since, whatever the model expects.
+        Between two twists the robot may have had either.
         """
         anchor = self._anchor
         if anchor is None or anchor.cross is None:
@@ -255,7 +257,8 @@ class Estimator:
         seconds = (self.time_ns - anchor.time_ns) / NS_PER_S
         pose, spread = anchor.mean[:3].copy(), anchor.covariance[:3, :3].copy()
         then = pose, spread, anchor.cross, way, self._walk * seconds
-        mean, covariance, distance = kernels.retrace(self._filter.x, self._filter.P, *then)
+        slack = (0.5 * seconds * (twist - anchor.twist)) ** 2
+        mean, covariance, distance = kernels.retrace(self._filter.x, self._filter.P, *then, slack)
         if distance <= GATE[Kind.POSE]:
             self._filter.x, self._filter.P = mean, covariance
             self._filter.P[:3, :3] += self._slip * seconds

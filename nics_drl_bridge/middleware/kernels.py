@@ -260,10 +260,10 @@ def recall(  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=True)
-def retrace(mean, covariance, pose, spread, cross, way, noise):  # type: ignore[no-untyped-def]
+def retrace(mean, covariance, pose, spread, cross, way, noise, slack):  # type: ignore[no-untyped-def]
     """Corrects by the `way` (3,) measured from an earlier pose, see `recall`, to the present one.
 
-    Returns mean, covariance, and the squared, normalised innovation.
+    Returns mean, covariance, and the squared, normalised innovation, with `slack` (3,) besides.
     """
     c, s = math.cos(pose[2]), math.sin(pose[2])
     x, y, size = mean[0] - pose[0], mean[1] - pose[1], mean.shape[0]
@@ -278,7 +278,7 @@ def retrace(mean, covariance, pose, spread, cross, way, noise):  # type: ignore[
     innovation = np.array([way[0] - ahead, way[1] - before, turn])
     gain = np.linalg.solve(total, shared.T)
     less = covariance - shared @ gain
-    distance = innovation @ np.linalg.solve(total, innovation)
+    distance = innovation @ np.linalg.solve(total + np.diag(slack), innovation)
     return mean + innovation @ gain, (less + less.T) * 0.5, distance
 
 

@@ -37,7 +37,8 @@ def test_a_car_keeps_its_steering_when_its_speed_is_cut():
 
 
 def test_what_a_robot_can_not_do_at_all_is_dropped_and_the_rest_stays():
-    assert saturate(np.array([-1e-9, 1.0]), LIMITS["differential"]).tolist() == [0.0, 1.0]
+    forwards = replace(LIMITS["differential"], low=np.array([0.0, -2.0]))
+    assert saturate(np.array([-1e-9, 1.0]), forwards).tolist() == [0.0, 1.0]
 
 
 @pytest.mark.parametrize("robot", ROBOTS)
@@ -123,14 +124,17 @@ def test_a_motion_too_soon_after_the_last_is_not_published():
         ((", jerk: 40.0", ""), "the key 'commands.speed_command.jerk' is missing"),
         (("max: 1.0", "max: .inf"), "finite"),
         (("rate: 2.0", "rate: 0.0"), "greater than 0"),
-        (("min: 0.0, max: 1.0", "min: 0.0, max: 0.0"), "min must be less than max"),
-        (("min: 0.0, max: 1.0", "min: 0.2, max: 1.0"), "less than or equal to 0"),
+        (("min: -0.5, max: 1.0", "min: 0.0, max: 0.0"), "min must be less than max"),
+        (("min: -0.5, max: 1.0", "min: 0.2, max: 1.0"), "less than or equal to 0"),
         (("jerk: 40.0}", "jerk: 40.0, snap: 1.0}"), "unknown key 'commands.speed_command.snap'"),
         (
             ("max: 1.0", "max: 10.0"),
             "'commands.speed_command.max': 10 m/s is beyond the robot's own",
         ),
-        (("min: 0.0", "min: -0.1"), "'commands.speed_command.min': -0.1 m/s is beyond the robot's"),
+        (
+            ("min: -0.5, max: 1.0", "min: -0.6, max: 1.0"),
+            "'commands.speed_command.min': -0.6 m/s is beyond the robot's",
+        ),
         (("max: 0.5", "max: 0.51"), "give at most 0.5"),
         (("rate: 2.0", "rate: 1e308"), "within a period of the gate, 0.02 s, and limits nothing"),
         (("rate: 2.0", "rate: 51.0"), "give at most 50"),

@@ -340,7 +340,7 @@ def test_a_way_that_belies_the_twists_is_left_out():
     assert np.hypot(*moved[:2]) > 0.9 * np.hypot(*twist[:2])
 
 
-@pytest.mark.parametrize("heading", [0.0, 1.0])
+@pytest.mark.parametrize("heading", [0.0, 0.3])
 def test_the_way_goes_on_from_a_pose_that_was_measured_in_between(heading):
     estimator = Estimator(direct_model())
     estimator.reset(0, np.zeros(3), 2.0)
