@@ -88,25 +88,33 @@ def ended(node: str, phase: str, number: int, control: str | None, folder: Path)
     return {"code": code, "took_s": took_s, "clean": clean, "log": "" if clean else told[-2000:]}
 
 
+def summary(endings: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The figures of a node's endings in one phase."""
+    return {
+        "median_s": statistics.median(each["took_s"] for each in endings),
+        "longest_s": max(each["took_s"] for each in endings),
+        "failed": [each for each in endings if not each["clean"]],
+    }
+
+
 def measure(given: argparse.Namespace) -> dict[str, Any]:
     """All endings, by node and phase."""
     os.environ["ROS_DOMAIN_ID"] = str(free_domain_id())
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     found: dict[str, Any] = {}
-    with busy(given.loops):
-        for node in given.nodes:
-            for phase in given.phases:
-                if phase == "compiling" and node in NEVER_COMPILES:
-                    continue
-                each = []
-                for k in range(given.times):
-                    with tempfile.TemporaryDirectory() as folder:
-                        each.append(ended(node, phase, k, given.control, Path(folder)))
-                found[f"{node} {phase}"] = {
-                    "median_s": statistics.median(one["took_s"] for one in each),
-                    "longest_s": max(one["took_s"] for one in each),
-                    "failed": [one for one in each if not one["clean"]],
-                }
+    cases = [(node, phase) for phase in given.phases for node in given.nodes]
+    with busy(given.loops), tempfile.TemporaryDirectory() as folder:
+        for node, phase in cases:
+            if phase == "compiling" and node in NEVER_COMPILES:
+                continue
+            own = [Path(folder) / f"{node}_{phase}_{k}" for k in range(given.times)]
+            for each in own:
+                each.mkdir()
+            name = f"{node} {phase}"
+            found[name] = summary([
+                ended(node, phase, k, given.control, each) for k, each in enumerate(own)
+            ])  # fmt: skip
+            sys.stderr.write(row_of(name, found[name]))
     return {"times": given.times, "loops": given.loops, "limit_s": LIMIT_S, "endings": found}
 
 
@@ -122,14 +130,16 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     return missed
 
 
+def row_of(name: str, each: dict[str, Any]) -> str:
+    """A line of the table."""
+    figures = f"{each['median_s']:>12.3f}{each['longest_s']:>12.3f}{len(each['failed']):>5}"
+    return f"{name:<28}{figures}\n"
+
+
 def table_of(result: dict[str, Any]) -> str:
     """The figures, a node and phase in a line."""
-    rows = [f"{'':<28}{'median [s]':>12}{'longest [s]':>12}{'bad':>5}\n"]
-    rows += [
-        f"{name:<28}{each['median_s']:>12.3f}{each['longest_s']:>12.3f}{len(each['failed']):>5}\n"
-        for name, each in result["endings"].items()
-    ]
-    return "".join(rows)
+    head = f"{'':<28}{'median [s]':>12}{'longest [s]':>12}{'bad':>5}\n"
+    return head + "".join(row_of(name, each) for name, each in result["endings"].items())
 
 
 def options(words: Sequence[str] | None = None) -> argparse.Namespace:
