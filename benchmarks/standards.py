@@ -36,7 +36,7 @@ CONTROLS = {
 }
 BARS = {"sim_conformance_failed": 0, "client_overhead": 0.1, "leapp_max_abs_difference": 1e-6}
 ROBOT, WORLD, CLAIMED = "ackermann", "circles", "NAMED_POSES"
-REST_S, PATIENCE_S, WARM = 0.002, 60.0, 50
+REST_S, PATIENCE_S, WARM = 0.002, 300.0, 50
 OBSERVATIONS, POLICY = 64, "differential"
 
 

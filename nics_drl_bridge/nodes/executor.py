@@ -66,6 +66,7 @@ class StandingExecutor(SingleThreadedExecutor):
             self._call(self._entities.come())
         for answer in asked:
             answer()
+        self._changed |= bool(asked)  # it may have destroyed entities, which can't be waited for
         for timer in due:
             self._tick(timer)
         if left:
