@@ -36,7 +36,7 @@ CONTROLS = {
 }
 BARS = {"sim_conformance_failed": 0, "client_overhead": 0.1, "leapp_max_abs_difference": 1e-6}
 ROBOT, WORLD, CLAIMED = "ackermann", "circles", "NAMED_POSES"
-REST_S, PATIENCE_S, WARM = 0.002, 60.0, 50
+REST_S, PATIENCE_S, WARM = 0.002, 300.0, 50
 OBSERVATIONS, POLICY = 64, "differential"
 
 
@@ -126,7 +126,7 @@ def leapp(folder: Path) -> dict[str, float]:
     from nics_drl_bridge.policy.leapp import export_bundle
     from nics_drl_bridge.policy.policy_file import load_policy
 
-    policy = load_policy(shipped(POLICY))
+    policy = load_policy(shipped() / f"{POLICY}.onnx")
     manager = InferenceManager(str(export_bundle(policy, folder / "bundle")))
     layout, random = policy.contract.observation, np.random.default_rng(0)
     scans = random.uniform(0.0, 1.0, (OBSERVATIONS, layout.scan_parts))

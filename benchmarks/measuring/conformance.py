@@ -20,14 +20,14 @@ from simulation_interfaces import msg, srv
 from simulation_interfaces.action import SimulateSteps
 
 from nics_drl_bridge.nodes.runner import open_context
-from nics_drl_bridge.nodes.simulation_interfaces.server import snake_case
+from nics_drl_bridge.nodes.simulation_interfaces.client import snake_case
 
 OK, UNSUPPORTED = msg.Result.RESULT_OK, msg.Result.RESULT_FEATURE_UNSUPPORTED
 FAILED, NOT_FOUND = msg.Result.RESULT_OPERATION_FAILED, msg.Result.RESULT_NOT_FOUND
 STATES = msg.SimulationState
 SHAPE = "kind: circle\nradius: 0.15\n"
 WORLD = "name: text\nsize: [5.0, 4.0]\ngoal_distance: [1.0, 3.0]\n"
-PATIENCE_S = 60.0
+PATIENCE_S = 300.0
 
 
 class Client:

@@ -20,6 +20,7 @@ from rclpy.waitable import NumberOfEntities
 
 from nics_drl_bridge.interface import NS_PER_S
 
+InvalidHandle = rclpy_implementation.InvalidHandle
 PARTS_MISSING = (AttributeError, TypeError)  # raised if rclpy differs from what is known here
 Received = tuple[Callable[..., Any], tuple[Any, ...]]  # a callback and its arguments
 HANDED_OVER, REST, LONGEST_REST_S = object(), 0.4, 1e-3
@@ -65,6 +66,7 @@ class StandingExecutor(SingleThreadedExecutor):
             self._call(self._entities.come())
         for answer in asked:
             answer()
+        self._changed |= bool(asked)  # it may have destroyed entities, which can't be waited for
         for timer in due:
             self._tick(timer)
         if left:
@@ -237,7 +239,10 @@ def _answer(client: Any, number: int, response: Any) -> None:
 def _take(subscriptions: Iterable[tuple[Any, int]]) -> list[Received]:
     received = []
     for subscription, arguments in subscriptions:
-        taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+        try:
+            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+        except InvalidHandle:  # a callback has destroyed it
+            continue
         if taken is not None:
             received.append((subscription.callback, taken[:arguments]))
     return received

@@ -137,10 +137,17 @@ def checkers(goals: Sequence[str], progress: Sequence[str]) -> list[Row]:
     ]
 
 
+STANDARD = Row(
+    "simulation_interfaces", True,
+    "Whether to offer the services of simulation_interfaces, where that package is installed.",
+)  # fmt: skip
+
+
 def device(laser_frame: str = "") -> list[Row]:
     """Returns the parameters of all simulators, but `robots`, which is a count or names."""
     return [
         Row("world", "arena", "World file, or the name of a shipped world."),
+        STANDARD,
         Row("randomisation", "", "Draws in each episode: a file, mild or strong; none if empty."),
         Row("mode", MODES[0], f"How time runs: {', '.join(MODES)}."),
         stamped("cmd_vel"),
@@ -183,10 +190,6 @@ def device(laser_frame: str = "") -> list[Row]:
 ROBOTS = Row(
     "robots", 1, "How many robots, named robot1, robot2, ..., or their namespaces; 1 has none."
 )
-STANDARD = Row(
-    "simulation_interfaces", True,
-    "Whether to offer the services of simulation_interfaces, where that package is installed.",
-)  # fmt: skip
 FRICTION = Row("friction", 1.0, "Friction between tyres and floor; ice has 0.1.", span=(0.01, 2.0))
 
 

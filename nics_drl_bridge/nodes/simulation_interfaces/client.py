@@ -42,6 +42,11 @@ class StandardOptions(Schema):
     obstacles: bool = True  # puts those of the episode's scene, where entities have their names
 
 
+def snake_case(name: str) -> str:
+    """Returns the name of a service as all simulators write it: `get_entities`."""
+    return "".join(f"_{c.lower()}" if c.isupper() else c for c in name).removeprefix("_")
+
+
 def module(kind: str) -> Any:
     """Returns the module `srv` or `msg` of the messages. Raises ConfigError if they are missing."""
     try:
@@ -80,9 +85,10 @@ class StandardEpisodes:
             )
 
     def _client(self, name: str) -> Any:
-        words = "".join(f"_{c.lower()}" if c.isupper() else c for c in name).removeprefix("_")
         prefix = f"{self._options.services.rstrip('/')}/" if self._options.services else ""
-        return self._link.node.create_client(getattr(self._types, name), f"{prefix}{words}")
+        return self._link.node.create_client(
+            getattr(self._types, name), f"{prefix}{snake_case(name)}"
+        )
 
     def _call(self, name: str, timeout_s: float, *fine: int, **fields: Any) -> Any:
         """Calls a service. Raises BackendError for a result that is neither OK nor `fine`."""

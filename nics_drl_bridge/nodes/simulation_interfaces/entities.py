@@ -73,7 +73,7 @@ class EntityServices:
         kinds = EntityCategory
         if entity.robot >= 0:
             spec = self._host.model.robot
-            return _info(kinds.CATEGORY_ROBOT, f"the robot {spec.name}", (spec.kind,))
+            return _info(kinds.CATEGORY_ROBOT, f"the robot {spec.name}", ("robot",))
         kind = kinds.CATEGORY_STATIC_OBJECT
         if entity.motion is not None:
             walks = isinstance(entity.motion, Pedestrian)

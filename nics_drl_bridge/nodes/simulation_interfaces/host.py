@@ -1,4 +1,4 @@
-"""What the services need of the node that offers them, and how they refuse."""
+"""Requirements of the services on the node that offers them, and how they refuse."""
 
 from __future__ import annotations
 

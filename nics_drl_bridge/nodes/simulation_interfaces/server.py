@@ -10,13 +10,13 @@ from rclpy.action import ActionServer
 from simulation_interfaces.msg import Result, SimulatorFeatures
 
 from nics_drl_bridge.nodes import conversions
+from nics_drl_bridge.nodes.simulation_interfaces.client import PACKAGE, snake_case
 from nics_drl_bridge.nodes.simulation_interfaces.entities import EntityServices
 from nics_drl_bridge.nodes.simulation_interfaces.host import Handler, RefusalError, served
 from nics_drl_bridge.nodes.simulation_interfaces.spawning import FORMATS, Spawning
 from nics_drl_bridge.nodes.simulation_interfaces.state import WITHOUT_WORLD, Simulation
 from nics_drl_bridge.nodes.simulation_interfaces.worlds import Worlds
 
-PACKAGE = "simulation_interfaces"
 FEATURES = (
     "SPAWNING", "DELETING", "ENTITY_TAGS", "ENTITY_BOUNDS", "ENTITY_BOUNDS_BOX",
     "ENTITY_BOUNDS_CONVEX", "ENTITY_CATEGORIES", "SPAWNING_RESOURCE_STRING",
@@ -76,11 +76,6 @@ class Server:
         told.features = [getattr(told, name) for name in FEATURES if hasattr(told, name)]
         told.spawn_formats, told.custom_info = FORMATS, ABOUT
         return response
-
-
-def snake_case(name: str) -> str:
-    """Returns the name of a service as all simulators write it: `get_entities`."""
-    return "".join(f"_{c.lower()}" if c.isupper() else c for c in name).removeprefix("_")
 
 
 def _refuse(what: str, *_: Any) -> NoReturn:

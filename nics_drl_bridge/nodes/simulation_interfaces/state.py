@@ -58,7 +58,7 @@ class Simulation:
     def halt(self, state: int) -> None:
         """Holds the simulation in a state other than playing."""
         self._host.pause(True)
-        self._halted = state
+        self._halted, self._stepping = state, False
 
     def require_world(self) -> None:
         """Raises RefusalError if no world is loaded."""
@@ -183,11 +183,15 @@ class Simulation:
         elif scope & SCOPES.SCOPE_TIME:
             self._host.rewind()
 
-    def _reset_all(self) -> None:
+    def restore(self) -> None:
+        """Removes what was spawned, and brings back what was deleted."""
         changed = self.entities.robot_names != list(self._host.robot_names)
         self.entities.restore()
         if changed:
             self._host.reopen_robots()
+
+    def _reset_all(self) -> None:
+        self.restore()
         self._host.begin(rewind=True)
 
     def remove(self, *names: str) -> None:

@@ -56,6 +56,7 @@ class Worlds:
         self._unload()
 
     def _unload(self) -> None:
+        self._simulation.restore()
         self._simulation.halt(WITHOUT_WORLD)
         self._entities.told.clear()
 
@@ -65,10 +66,7 @@ class Worlds:
         self._unload()
         world = self._read(found, request)
         host, simulation = self._host, self._simulation
-        changed = simulation.entities.robot_names != list(host.robot_names)
         host.use_world(world)
-        if changed:
-            host.reopen_robots()
         simulation.renew()
         host.begin(rewind=True)
         simulation.halt(STOPPED)
