@@ -196,7 +196,7 @@ UPSTREAM_LIES_THERE := $(wildcard $(UPSTREAM)/launch_ros.tar.gz)
 
 # Message packages that have no wheels are built from their files.
 MESSAGES := .venv-messages
-MESSAGE_TESTS := test/nodes/test_device_node.py test/nodes/simulation_interfaces
+MESSAGE_TESTS := test/nodes/test_device_node.py test/nodes/simulation_interfaces test/benchmarks/test_standards.py
 
 test-messages: setup $(MESSAGES)/.ready ## the tests that need tf2_msgs, ackermann_msgs, simulation_interfaces, nav2_msgs, built here
 	source $(MESSAGES)/setup.bash && $(CLEAN_ENV) PYTHONPATH="$$PYTHONPATH" \
