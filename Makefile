@@ -198,7 +198,7 @@ UPSTREAM_LIES_THERE := $(wildcard $(UPSTREAM)/launch_ros.tar.gz)
 # Message packages that have no wheels are built from their files.
 MESSAGES := .venv-messages
 MESSAGE_TESTS := test/nodes/test_device_node.py test/nodes/simulation_interfaces test/nodes/test_map_to_odom.py \
-	test/nodes/test_follow_path.py test/benchmarks/test_nav2_standards.py
+	test/nodes/test_follow_path.py test/benchmarks/test_nav2_standards.py test/benchmarks/test_standards.py
 
 test-messages: setup $(MESSAGES)/.ready ## the tests that need tf2_msgs, ackermann_msgs, simulation_interfaces, nav2_msgs, built here
 	source $(MESSAGES)/setup.bash && $(CLEAN_ENV) PYTHONPATH="$$PYTHONPATH" \

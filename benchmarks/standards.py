@@ -159,6 +159,10 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     return [*missed, *result.get("failed", [])]
 
 
+NOT_BUILT = (
+    "simulation_interfaces is not installed: run `make test-messages`, and source "
+    ".venv-messages/setup.bash"
+)
 PARTS = ("simulation_interfaces", "leapp", "nav2")
 
 
@@ -167,7 +171,10 @@ def measure(given: Any) -> dict[str, Any]:
     domain_id, result = free_domain_id(), dict[str, Any]()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        if "simulation_interfaces" in given.parts:
+        built = importlib.util.find_spec("simulation_interfaces") is not None
+        if "simulation_interfaces" in given.parts and not built:
+            result["failed"] = [NOT_BUILT]
+        elif "simulation_interfaces" in given.parts:
             result |= conformance(domain_id, folder, given.control)
             result |= overhead(domain_id, folder, given.control, given.chunks, given.size)
         if "leapp" in given.parts:
