@@ -267,7 +267,8 @@ class PathActions:
         off = ((cells < 0) | (cells >= grid.cells.shape)).any(axis=-1)
         if off.any():
             k = int(np.argmax(off))
-            place = f"({points[k, 0]:.2f}, {points[k, 1]:.2f}) m"
+            x, y = points[k].round(2) + 0.0  # no negative zero
+            place = f"({x:.2f}, {y:.2f}) m"
             why = f"pose {k} of the path, {place}, is off the map; replan it."
             raise Refusal(goal.code, f"{goal.name}: {why}")
 
@@ -378,9 +379,10 @@ class PathActions:
     def _end(self, goal: Goal, end: str, code: str, sentence: str = "") -> None:
         if goal.handle.is_cancel_requested:
             end = CANCELED
-        log = self._node.get_logger()
-        told = "goal reached" if end == SUCCEED else f"goal {end}: {sentence}".removesuffix(": ")
-        (log.warning if end == ABORT else log.info)(told)
+        if end == ABORT:
+            self._node.get_logger().warning(f"goal aborted: {sentence}")
+        else:
+            self._node.get_logger().info("goal reached" if end == SUCCEED else "goal cancelled")
         goal.server.finish(goal.handle, end, result_of(goal.kind, code, sentence))
 
 

@@ -138,9 +138,11 @@ def _fill(made: GridMap, shape: Shape, pose: Array) -> None:
 def _inside(shape: Shape, points: Array) -> NDArray[np.bool_]:
     if isinstance(shape, Circle):
         return np.asarray(np.hypot(points[..., 0], points[..., 1]) <= shape.radius)
-    if len(shape.outline) < 3:
-        return np.zeros(points.shape[:-1], np.bool_)
-    from matplotlib.path import Path
-
-    found = Path(shape.outline).contains_points(points.reshape(-1, 2))
-    return np.asarray(found.reshape(points.shape[:-1]))
+    within = np.zeros(points.shape[:-1], np.bool_)
+    x, y = points[..., 0], points[..., 1]
+    corners = shape.outline if len(shape.outline) > 2 else np.zeros((0, 2))
+    for (x1, y1), (x2, y2) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        if y1 != y2:  # a ray along x crosses an odd number of edges
+            crosses = (y1 > y) != (y2 > y)
+            within ^= crosses & (x < x1 + (y - y1) * (x2 - x1) / (y2 - y1))
+    return within
