@@ -136,9 +136,15 @@ def generate(
     model = SimulatorModel(
         robot, identified.model, replace(identified.calibration, inputs=(), limits={}), lidar,
         bake(lidar, (*shapes, footprint_shape(robot))), identified.noise,
-        report=report, latency=recording.latency, sensors=tuple(sensors),
+        _control_period(lidar, identified.model), report, recording.latency, tuple(sensors),
     )  # fmt: skip
     return model, identified
+
+
+def _control_period(lidar: LidarSpec, kinematics: TaylorModel) -> float:
+    """The usual period [s], or that of a slower lidar: nothing new is seen before its next scan."""
+    steps = max(CONTROL_PERIOD_S, 1.0 / lidar.rate) / kinematics.dt
+    return round(round(steps) * kinematics.dt, 9)
 
 
 def footprint_shape(robot: RobotSpec) -> Circle | Polygon:

@@ -1,4 +1,4 @@
-"""What works on this machine: Python, ROS 2, extras, cores, compiled kernels."""
+"""Checks of this machine: Python, ROS 2, extras, cores, compiled kernels."""
 
 import os
 import sys

@@ -126,7 +126,7 @@ def fitted(settings: TrainingSettings, model: SimulatorModel, inherited: bool) -
         changed["max_episode_steps"] = pace.steps
         limit = f"{pace.steps * pace.period:g} s ({pace.steps} steps)"
         told.append(f"time limit {limit}, for {pace.far:g} m at {pace.speed:g} m/s")
-        if inherited:
+        if inherited and pace.steps > MAX_EPISODE_STEPS:
             changed |= _stretched(settings, options, pace.steps / MAX_EPISODE_STEPS, told)
     made = settings.model_copy(update={**changed, "task_options": options})
     short = pace.shortfall(made.max_episode_steps)
@@ -136,7 +136,7 @@ def fitted(settings: TrainingSettings, model: SimulatorModel, inherited: bool) -
 def _stretched(
     settings: TrainingSettings, options: dict[str, Any], factor: float, told: list[str]
 ) -> dict[str, Any]:
-    """What changes for episodes longer by a factor; `options` in place."""
+    """Returns the changes for episodes longer by a factor; those of `options` are made in place."""
     if reward := options.get("time_reward"):
         options["time_reward"] = round(reward / factor, 6)
         told.append(f"time_reward {options['time_reward']:g}, was {reward:g}")

@@ -196,7 +196,9 @@ class DynamicWindow:
 
 
 POLICIES: dict[str, Callable[[Navigation, SimulatorModel | None], Policy]] = {
-    "dynamic_window": lambda task, model: DynamicWindow(task, model=model),
+    "dynamic_window": lambda task, model: DynamicWindow(
+        task, period=0.1 if model is None else model.control_period, model=model
+    ),
     "mppi": Mppi,
     "random": lambda task, _: RandomActions(task),
     "straight": StraightToGoal,

@@ -9,9 +9,20 @@ import pytest
 
 pytest.importorskip("gymnasium")
 
-from nics_drl_bridge.commands.episodes import FAST, PLACES, EvaluationOrder, _places
+from nics_drl_bridge.commands.conditions import NO_CONDITIONS, Conditions
+from nics_drl_bridge.commands.episodes import (
+    DEFAULT_ROBOT,
+    FAST,
+    PLACES,
+    EvaluationOrder,
+    _places,
+    contracts_of,
+    limited,
+    model_name,
+)
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.robot.spec import robot_from
+from nics_drl_bridge.robot.spec import load_robot, robot_from
+from nics_drl_bridge.sim.world_set import load_worlds
 
 KART = SimpleNamespace(robot=robot_from({"kind": "ackermann_throttle", "footprint_radius": 0.2}))
 
@@ -31,3 +42,36 @@ def test_a_robot_without_cmd_vel_is_driven_in_process_alone_and_that_is_said():
 def test_to_ask_for_topics_with_such_a_robot_is_refused():
     with pytest.raises(ConfigError, match="names no field of cmd_vel"):
         _places(order(FAST, "dds"), KART, print)
+
+
+def contract(robot, **known):
+    """What a policy file tells of itself, as far as an evaluation asks."""
+    steps = known.pop("max_episode_steps", None)
+    spec = SimpleNamespace(name=robot)
+    return SimpleNamespace(robot=spec, provenance=known, max_episode_steps=steps)
+
+
+def test_a_baseline_drives_the_robot_of_the_policy_beside_it(tmp_path):
+    assert contracts_of(["dynamic_window", "straight"]) == {}
+    assert model_name(None, {}) == DEFAULT_ROBOT
+    mine = {"mine.onnx": contract("mine", model=str(tmp_path))}
+    assert model_name(None, mine) == str(tmp_path)
+    assert model_name(None, {"shipped.onnx": contract("mecanum")}) == "mecanum"
+    assert model_name("ackermann", mine) == "ackermann"
+
+
+def test_a_policy_of_a_robot_that_is_gone_asks_for_its_model(tmp_path):
+    gone = {"mine.onnx": contract("mine", model=str(tmp_path / "gone"))}
+    with pytest.raises(ConfigError, match=r"mine.onnx: .*'mine', .*which is gone; .* with --model"):
+        model_name(None, gone)
+
+
+def test_an_evaluation_uses_the_time_limit_of_the_policy_and_tells_if_it_is_short():
+    said, world = list[str](), load_worlds("doorway")
+    slow = SimpleNamespace(robot=load_robot("turtlebot3_burger"), control_period=0.1)
+    known = {"mine.onnx": contract("mine", max_episode_steps=400)}
+    assert limited(NO_CONDITIONS, known, slow, world, said.append).steps == 400
+    assert limited(NO_CONDITIONS, {}, slow, world, said.append).steps == 573
+    assert said == []
+    assert limited(Conditions(steps=300), known, slow, world, said.append).steps == 300
+    assert "an episode ends after 30 s" in said[0]

@@ -24,9 +24,7 @@ FILES = {
     "empty.csv": "",
     "table.csv": "t,x\n0.0,1.0\n0.1,1.1\n0.2,1.2\n",
     "begun.yaml": "robot: differential\n",
-    "misspelt.yaml": ROBOT.replace(
-        "wheel_radius", "need the parameter 'wheel_radius'; is 'wheel_radus' it?"
-    ),
+    "misspelt.yaml": ROBOT.replace("wheel_radius", "wheel_radus"),
     "no_command.yaml": ROBOT.partition("command:")[0],
     "turned.yaml": ROBOT.replace("min: -2.0, max: 2.0", "min: 2.0, max: -2.0"),
     "with_unit.yaml": ROBOT.replace("footprint_radius: 0.15", "footprint_radius: 0.15 m"),
@@ -72,7 +70,7 @@ MISTAKES = {
     "urdf nobody": "unknown robot 'nobody'",
     "demo --policy strait": "unknown policy 'strait'; did you mean 'straight'?",
     # Keys, values and units of files.
-    "drive --robot misspelt.yaml --out m": "need the parameter 'wheel_radius'; is 'wheel_radus' it?",
+    "drive --robot misspelt.yaml --out m": "parameter 'wheel_radius'; is 'wheel_radus' it?",
     "drive --robot no_command.yaml --out m": "misses|missing|must",
     "drive --robot turned.yaml --out m": "turned.yaml: .*min",
     "drive --robot with_unit.yaml --out m": "key 'footprint_radius': .*'0.15 m'",

@@ -55,7 +55,7 @@ def test_a_goal_that_cant_be_reached_in_time_is_told_and_none_at_all_is_refused(
     told = pace.shortfall(300)
     assert "'doorway': a goal may lie 7 m away, which takes 32 s at 0.22 m/s" in told
     assert "set max_episode_steps to 573" in told
-    with pytest.raises(ConfigError, match="no goal can be reached in time: .* ends after 5 s"):
+    with pytest.raises(ConfigError, match=r"no goal can be reached in time: .* ends after 5 s"):
         pace.shortfall(50)
 
 

@@ -1,0 +1,51 @@
+from __future__ import annotations
+
+import shlex
+
+import pytest
+import typer
+from command_line import nics
+
+from nics_drl_bridge.commands.cli import app
+from nics_drl_bridge.commands.examples import EXAMPLES
+
+
+def commands(group, before=()):
+    """Every command below a group of click, by its words."""
+    for name, command in group.commands.items():
+        words = (*before, name)
+        if hasattr(command, "commands"):
+            yield from commands(command, words)
+        else:
+            yield words, command
+
+
+KNOWN = dict(commands(typer.main.get_command(app)))
+
+
+def test_every_command_has_an_example():
+    assert {" ".join(words) for words in KNOWN} == set(EXAMPLES)
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_an_example_uses_options_that_there_are(name):
+    command = KNOWN[tuple(name.split())]
+    options = {option for each in command.params for option in each.opts}
+    for example in EXAMPLES[name]:
+        words = shlex.split(example)
+        assert words[: len(name.split()) + 1] == ["nics", *name.split()]
+        assert {word for word in words if word.startswith("--")} <= options
+
+
+def test_units_survive_in_the_help_and_an_example_ends_it(tmp_path):
+    told = nics("record", "--help", cwd=tmp_path).stdout
+    assert "keep within [m]." in " ".join(told.split())
+    assert told.rstrip().splitlines()[-1].strip().startswith("nics record --robot")
+
+
+def test_options_complete_to_what_is_shipped_and_to_files(tmp_path, monkeypatch):
+    from nics_drl_bridge.commands.console import completing
+
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "diff_mine.yaml").write_text("")
+    assert completing("robots")("diff") == ["differential", "diff_mine.yaml"]

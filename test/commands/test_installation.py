@@ -1,0 +1,29 @@
+from __future__ import annotations
+
+import json
+import sys
+from unittest import mock
+
+from command_line import nics
+
+from nics_drl_bridge.commands.installation import EXTRAS, checks
+
+
+def test_the_doctor_tells_what_works_on_this_machine(tmp_path):
+    told = nics("doctor", "--install", "--json", cwd=tmp_path)
+    assert told.returncode == 0, told.stderr
+    parts = {each["part"]: each for each in json.loads(told.stdout)["checks"]}
+    assert {"Python", "ROS 2", "cores", "kernels", *(f"extra {name}" for name in EXTRAS)} <= set(
+        parts
+    )
+    assert parts["Python"]["works"]
+    assert "of " in parts["kernels"]["found"]
+
+
+def test_a_missing_extra_comes_with_the_command_that_installs_it():
+    with mock.patch.dict(sys.modules, {"torch": None, "rclpy": None}):
+        found = {each.part: each for each in checks()}
+    assert not found["extra train"].works
+    assert "'torch' is missing" in found["extra train"].found
+    assert found["extra train"].fix == "pip install 'nics_drl_bridge[train]'"
+    assert "pip install 'nics_drl_bridge[ros]'" in found["ROS 2"].fix
