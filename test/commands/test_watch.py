@@ -4,10 +4,10 @@ import threading
 from contextlib import closing
 
 import pytest
-from command_line import run
+from command_line import nics
+from watch.rig import Client, source, until
 
 from nics_drl_bridge.commands import watch as module
-from watch.rig import Client, source, until
 
 
 @pytest.mark.parametrize(
@@ -23,12 +23,11 @@ from watch.rig import Client, source, until
         (["straight", "--world", "areena"], "did you mean 'arena'?"),
     ],
 )
-def test_options_that_do_not_fit_are_one_sentence(options, said, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    done = run("watch", *options)
-    assert done.exit_code == 2
-    assert said in done.output
-    assert done.output.count("\n") == 1
+def test_options_that_do_not_fit_are_one_sentence(options, said, tmp_path):
+    done = nics("watch", *options, cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert done.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 
 

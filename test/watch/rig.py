@@ -143,6 +143,9 @@ class Browser:
     def open(self, url: str, width: int, height: int) -> None:
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 760}
         self.call("Emulation.setDeviceMetricsOverride", **size)
+        self.call("Page.navigate", url="about:blank")  # ends what shows an earlier server
+        self.ask("0")
+        self.events.clear()
         self.call("Page.navigate", url=url)
         until(lambda: self.ask("!!(window.nics && nics.counters.draws > 2)"), "a drawn frame")
 

@@ -43,7 +43,6 @@ def at(browser, x, y):
 
 @pytest.mark.parametrize("size", SIZES)
 def test_all_of_it_fits_into_the_window_and_nothing_complains(browser, page, size):
-    browser.events.clear()
     browser.open(page[0], *size)
     assert browser.ask("document.documentElement.scrollWidth") <= size[0]
     assert browser.ask("document.documentElement.scrollHeight") <= size[1]
