@@ -3,6 +3,7 @@
 import io
 import os
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -71,11 +72,10 @@ def write_mp4(path: Path, shown: Iterable[Pixels], fps: float) -> None:
     height, width = first.shape[:2]
     try:
         options = {"fps": fps, "macro_block_size": 2, "quality": 8, "ffmpeg_log_level": "error"}
-        video = imageio_ffmpeg.write_frames(str(part), (width, height), **options)
-        video.send(None)
-        for each in chain([first], shown):
-            video.send(np.ascontiguousarray(each))
-        video.close()
+        with closing(imageio_ffmpeg.write_frames(str(part), (width, height), **options)) as video:
+            video.send(None)
+            for each in chain([first], shown):
+                video.send(np.ascontiguousarray(each))
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)

@@ -55,7 +55,7 @@ class PageServer:
             raise ConfigError(f"the page {missing(error.name or 'websockets')}") from None
         self._requests: queue.Queue[Request] = queue.Queue(MOST_REQUESTS)
         self._news = threading.Condition()
-        self._texts, self._numbers = ["", "", ""], [0, 0, 0]  # newest stage, frame and notice
+        self._texts, self._numbers = ["", "", ""], [0, 0, 0]  # newest stage, notice and frame
         self._pages: set[Any] = set()
         self.closed = False
         try:
@@ -83,11 +83,11 @@ class PageServer:
 
     def publish(self, frame: Frame, **about: Any) -> None:
         """Shows a frame, and further facts beside it."""
-        self._set(1, json.dumps(frame.plain() | about, separators=(",", ":")))
+        self._set(2, json.dumps(frame.plain() | about, separators=(",", ":")))
 
     def tell(self, sentence: str) -> None:
         """Shows a sentence for a while."""
-        self._set(2, json.dumps({"kind": "notice", "text": sentence}))
+        self._set(1, json.dumps({"kind": "notice", "text": sentence}))
 
     def _set(self, part: int, text: str) -> None:
         with self._news:
@@ -156,7 +156,7 @@ class PageServer:
     def _send(self, page: Any) -> None:
         from websockets.exceptions import ConnectionClosed
 
-        seen = [0, 0, self._numbers[2]]
+        seen = [0, self._numbers[1], 0]
         with suppress(ConnectionClosed):
             while texts := self._due(page, seen):
                 for text in texts:

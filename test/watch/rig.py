@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import threading
 import time
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
 
 import numpy as np
@@ -72,7 +72,9 @@ class Client:
     def __init__(self, server: PageServer) -> None:
         from websockets.sync.client import connect
 
-        self.socket = connect(f"{server.url.replace('http', 'ws')}socket", max_size=None)
+        address = f"{server.url.replace('http', 'ws')}socket"
+        self._open = ExitStack()
+        self.socket = self._open.enter_context(connect(address, max_size=None))
 
     def ask(self, kind: str, **about) -> None:
         self.socket.send(json.dumps({"kind": kind, **about}))
@@ -86,7 +88,7 @@ class Client:
                 return message
 
     def close(self) -> None:
-        self.socket.close()
+        self._open.close()
 
 
 @contextmanager
@@ -116,7 +118,9 @@ class Browser:
         command = [CHROMIUM, f"--user-data-dir={folder}", *self.FLAGS]
         self._process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
         lines = (re.search(r"ws://\S+", line) for line in self._process.stderr)
-        self._socket = connect(next(filter(None, lines))[0], max_size=None)
+        self._open = ExitStack()
+        address = next(filter(None, lines))[0]
+        self._socket = self._open.enter_context(connect(address, max_size=None))
         threading.Thread(target=self._process.stderr.read, daemon=True).start()
         self._count, self._session, self.events = 0, {}, []
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
@@ -139,6 +143,9 @@ class Browser:
     def open(self, url: str, width: int, height: int) -> None:
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 760}
         self.call("Emulation.setDeviceMetricsOverride", **size)
+        self.call("Page.navigate", url="about:blank")  # ends what shows an earlier server
+        self.ask("0")
+        self.events.clear()
         self.call("Page.navigate", url=url)
         until(lambda: self.ask("!!(window.nics && nics.counters.draws > 2)"), "a drawn frame")
 
@@ -166,6 +173,6 @@ class Browser:
 
     def close(self) -> None:
         with suppress(Exception):
-            self._socket.close()
+            self._open.close()
         self._process.terminate()
         self._process.wait(DEADLINE_S)

@@ -1,0 +1,65 @@
+from __future__ import annotations
+
+import threading
+from contextlib import closing
+
+import pytest
+from command_line import nics
+from watch.rig import Client, source, until
+
+from nics_drl_bridge.commands import watch as module
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--ros", "--bag", "drive"], "leave one of them out"),
+        (["straight", "--bag", "drive"], "--bag shows what others drive"),
+        (["--ros", "--gate", "differential"], "--gate: --ros shows what others drive"),
+        (["--ros", "--record", "a.gif"], "nics bag record"),
+        (["--record", "a.avi"], "--record 'a.avi': "),
+        (["--bag", "nowhere", "--world", "arena", "--world", "room"], "a robot is in one"),
+        (["strait"], "did you mean 'straight'?"),
+        (["straight", "--world", "areena"], "did you mean 'arena'?"),
+    ],
+)
+def test_options_that_do_not_fit_are_one_sentence(options, said, tmp_path):
+    done = nics("watch", *options, cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_episode_is_written_to_its_end(tmp_path, monkeypatch):
+    written = []
+    monkeypatch.setattr(
+        "nics_drl_bridge.watch.record.write",
+        lambda path, stage, frames, fps: written.extend([fps, *frames]),
+    )
+    with closing(source()) as made:
+        module._record(tmp_path / "a.gif", made, 2)
+    fps, *frames = written
+    assert fps == 10.0
+    names = [frame.worlds[0].name.rpartition(" ")[2] for frame in frames]
+    assert set(names) == {"3", "4"}
+    assert frames[-1].worlds[0].state
+    assert frames[-1].worlds[0].state == frames[-5].worlds[0].state  # it stays for a second
+
+
+def test_the_page_is_served_until_it_is_interrupted(monkeypatch):
+    servers = []
+
+    def show(made, server):
+        servers.append(server)
+        server.set_stage(made.stage())
+        until(lambda: server.watched, "the page")
+
+    monkeypatch.setattr("nics_drl_bridge.watch.show.show", show)
+    with closing(source()) as made:
+        serving = threading.Thread(target=module._serve, args=(made, 0, False))
+        serving.start()
+        with closing(Client(until(lambda: servers, "a server")[0])) as client:
+            assert client.next("stage")["title"] == "forward in field"
+        serving.join()
+    assert servers[0].closed

@@ -1,0 +1,175 @@
+from __future__ import annotations
+
+from contextlib import closing
+
+import numpy as np
+import pytest
+from robots import direct_model
+
+from nics_drl_bridge.errors import BridgeError, ConfigError
+from nics_drl_bridge.lidar.exact_kernels import RADIUS, X, Y
+from nics_drl_bridge.watch.server import Request
+from watch.rig import shown, source
+
+
+@pytest.fixture
+def driven():
+    with closing(source()) as made:
+        yield made
+
+
+def bodies(made):
+    shot = made.lanes[0].env.shot()
+    return shot.bodies[shot.bodies[:, RADIUS] > 0.0]
+
+
+def pose(made):
+    return made.lanes[0].env.shot().poses[0]
+
+
+def free_spot(made):
+    """A place amid the field that no disc and no robot is near."""
+    spots = np.stack(np.meshgrid(*[np.linspace(-2.0, 2.0, 9)] * 2), axis=-1).reshape(-1, 2)
+    taken = np.concatenate([bodies(made)[:, [X, Y]], pose(made)[None, :2]])
+    apart = np.linalg.norm(spots[:, None] - taken, axis=-1).min(axis=1)
+    return spots[apart.argmax()].tolist()
+
+
+def test_the_policy_drives_and_the_trail_shows_where(driven):
+    begin = pose(driven)
+    for _ in range(3):
+        driven.advance()
+    frame = driven.frame()
+    assert frame.time_s == pytest.approx(0.3)
+    (way,) = frame.worlds[0].trails
+    assert way.shape == (4, 2)
+    assert way[0] == pytest.approx(begin[:2])
+    assert way[-1] == pytest.approx(pose(driven)[:2])
+    assert frame.worlds[0].shot.commands == pytest.approx(np.array([[2.0, 0.0, 0.0]]))
+    assert frame.worlds[0].shot.covariance.shape == (1, 3, 3)
+
+
+def test_a_goal_that_is_dragged_moves(driven):
+    assert not driven.take(Request(kind="goal", x=1.25, y=-0.5))
+    assert driven.frame().worlds[0].shot.goals.tolist() == [[1.25, -0.5]]
+    driven.advance()
+    assert driven.frame().worlds[0].shot.goals.tolist() == [[1.25, -0.5]]
+
+
+@pytest.mark.parametrize("shape", ["circle", "box"])
+def test_an_obstacle_is_added_while_all_else_stays_where_it_is(driven, shape):
+    driven.take(Request(kind="goal", x=1.25, y=-0.5))
+    driven.advance()
+    x, y = free_spot(driven)
+    before, stood = bodies(driven), pose(driven)
+    assert driven.take(Request(kind="obstacle", x=x, y=y, shape=shape))
+    after = bodies(driven)
+    assert len(after) == len(before) + 1
+    assert pose(driven) == pytest.approx(stood)
+    assert driven.frame().worlds[0].shot.goals.tolist() == [[1.25, -0.5]]
+    places = {tuple(body) for body in after[:, [X, Y]].round(9)}
+    assert places == {(x, y), *(tuple(body) for body in before[:, [X, Y]].round(9))}
+    assert len(driven.stage().worlds[0].shapes) == 2
+
+
+def test_the_lidar_sees_an_added_obstacle(driven):
+    x, y = free_spot(driven)
+    driven.take(Request(kind="clear"))
+    assert len(bodies(driven)) == 0
+    before = driven.frame().worlds[0].shot.ranges
+    driven.take(Request(kind="obstacle", x=x, y=y))
+    after = driven.frame().worlds[0].shot.ranges
+    assert (after < before).any()
+    assert not (after > before + 1e-3).any()
+
+
+def test_an_obstacle_on_the_robot_or_outside_is_refused_and_nothing_changes(driven):
+    before, (x, y) = bodies(driven), pose(driven)[:2]
+    with pytest.raises(ConfigError, match="touches the robot; move it"):
+        driven.take(Request(kind="obstacle", x=x, y=y))
+    with pytest.raises(ConfigError, match="is outside the world"):
+        driven.take(Request(kind="obstacle", x=50.0, y=0.0))
+    assert bodies(driven) == pytest.approx(before)
+    driven.advance()
+
+
+def test_the_next_episode_is_in_the_world_as_it_was_at_first(driven):
+    x, y = free_spot(driven)
+    driven.take(Request(kind="obstacle", x=x, y=y))
+    assert driven.take(Request(kind="seed", value=9))
+    assert len(bodies(driven)) == 2
+    assert driven.frame().worlds[0].name.endswith("episode 9")
+
+
+def test_a_person_drives_while_keys_are_held_and_the_robot_stops_once_they_are_silent(
+    driven, monkeypatch
+):
+    clock = [100.0]
+    monkeypatch.setattr("nics_drl_bridge.watch.episode.time.monotonic", lambda: clock[0])
+    driven.take(Request(kind="drive", twist=(-0.5, 0.0, 1.0)))
+    driven.advance()
+    assert driven.frame().worlds[0].shot.commands[0] == pytest.approx([-1.0, 0.0, 2.0], abs=1e-6)
+    clock[0] += 0.6
+    driven.advance()
+    assert driven.frame().worlds[0].shot.commands[0] == pytest.approx([0.0, 0.0, 0.0], abs=1e-6)
+    driven.take(Request(kind="drive", on=False))
+    driven.advance()
+    assert driven.frame().worlds[0].shot.commands[0] == pytest.approx([2.0, 0.0, 0.0])
+
+
+def test_another_policy_goes_on_from_here_and_one_that_does_not_open_changes_nothing(driven):
+    driven.advance()
+    stood = pose(driven)
+    assert driven.take(Request(kind="policy", name="other"))
+    assert pose(driven) == pytest.approx(stood)
+    assert driven.stage().chosen["policy"] == "other"
+    with pytest.raises(BridgeError, match="does not open"):
+        driven.take(Request(kind="policy", name="broken"))
+    assert driven.stage().chosen["policy"] == "other"
+    driven.advance()
+
+
+def test_an_episode_that_ended_is_shown_for_a_while_and_the_next_one_begins(driven):
+    driven.take(Request(kind="clear"))
+    for _ in range(100):
+        if driven.lanes[0].state:
+            break
+        driven.advance()
+    assert driven.lanes[0].state in ("collision", "success")
+    assert driven.unfinished(1)
+    while driven.lanes[0].seed == 3:
+        driven.advance()
+    assert driven.lanes[0].seed == 4
+    assert not driven.lanes[0].state
+    assert len(bodies(driven)) == 2
+
+
+def test_a_page_asks_for_all_of_it_over_its_socket():
+    with closing(source()) as made, shown(made) as (_, client):
+        stage = client.next("stage")
+        assert {"goal", "obstacle", "drive", "policy", "speed"} <= set(stage["can"])
+        client.ask("pause", on=True)
+        client.ask("goal", x=1.0, y=1.5)
+        client.next("frame", lambda frame: frame["worlds"][0]["goals"] == [[1000, 1500]])
+        client.ask("obstacle", x=50.0, y=0.0)
+        assert "outside the world" in client.next("notice")["text"]
+        client.ask("clear")
+        client.next("stage")
+        client.next("frame", lambda frame: frame["worlds"][0]["bodies"] == [])
+        client.ask("world", name="room")
+        assert client.next("stage")["places"][0]["name"] == "room"
+
+
+def test_720_beams_are_sent_30_times_a_second_with_much_to_spare():
+    import json
+    import time
+
+    from robots import lidar
+
+    with closing(source(model=direct_model(sensor=lidar(beams=720)))) as made:
+        made.advance()
+        begin = time.thread_time()
+        for _ in range(30):
+            text = json.dumps(made.frame().plain())
+        assert time.thread_time() - begin < 0.5
+        assert len(text) < 20_000
