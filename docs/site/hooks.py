@@ -7,23 +7,20 @@ from posixpath import normpath, relpath
 from typing import Any
 
 from mkdocs.config.defaults import MkDocsConfig
-from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
 from nbconvert import MarkdownExporter
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "nics_drl_bridge"
 AT_THE_TOP = ("CHANGELOG.md", "CONTRIBUTING.md")
-SHIM = "assets/iframe-worker.js"  # workers for pages from the disk, as the search is one
+ASKED = "https://unpkg.com/iframe-worker/shim"  # the theme's, without which pages from the disk
+SHIM = "assets/iframe-worker.js"  # have no workers, as the search is one; and our copy of it
 NAMED = re.compile(r"(?<!\[)`docs/(?P<page>[\w/]+\.md)`")
 LINK = re.compile(r"\[(?P<text>[^\]]*)\]\((?P<to>[^)#\s:]+)(?P<anchor>#[^)]*)?\)")
 
 
-@event_priority(-100)  # after the plugin `offline`, which asks the network for its shim
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
-    """Takes our copy of the shim, and lists the pages of the package's rooms in place of `api/`."""
-    scripts = config.extra_javascript
-    scripts[:] = [SHIM if "iframe-worker" in str(one) else one for one in scripts]
+    """Lists the pages of the package's rooms in place of `api/`."""
     for tab in config.nav or ():
         for entry in tab.get("Reference", ()) if isinstance(tab, dict) else ():
             if entry.get("Python") == "api/":
@@ -56,6 +53,16 @@ def on_page_markdown(markdown: str, page: Any, config: MkDocsConfig, files: File
         return match["text"] if leaves else match[0]
 
     return LINK.sub(within, NAMED.sub(named, markdown))
+
+
+def on_post_page(output: str, page: Any, config: MkDocsConfig) -> str:
+    """Takes our copy of the shim."""
+    return output.replace(ASKED, relpath(SHIM, str(PurePosixPath(page.file.dest_uri).parent)))
+
+
+def on_post_template(output_content: str, template_name: str, config: MkDocsConfig) -> str:
+    """Takes our copy of the shim."""
+    return output_content.replace(ASKED, SHIM)
 
 
 def rooms() -> list[str]:
