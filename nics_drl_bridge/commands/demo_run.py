@@ -293,9 +293,14 @@ def _verdict(
         ),
         ("arrived" if arrived else "did not arrive", "deployed, in real time", arrived),
     ]
-    given = f"{learned.policy} --model {plan.model} --world {plan.world}"
+    conclusion = conclude(identified)
+    if conclusion.ready:
+        more = "drive more episodes, or take a recording of your own robot"
+        next_step = more if share.value >= GOOD else "train for longer, by --train-steps"
+        conclusion = conclusion._replace(advice=f"Next: {next_step}.")
     return verdict_blocks(
-        tiles, conclude(identified), f"nics evaluate {given}",
+        tiles, conclusion,
+        f"nics evaluate {learned.policy} --model {plan.model} --world {plan.world}",
         "nics demo --recording DRIVE --robot ROBOT.yaml  # of your own robot",
     )  # fmt: skip
 
@@ -333,7 +338,7 @@ def _episodes(plan: DemoPlan, model: SimulatorModel, of: Episodes) -> list[str]:
     for a, b in list(zip(here, there, strict=True))[:PANELS]:
         runs = {both[0]: [a], both[1]: [b]}
         if a.seed == live.seed:
-            runs["deployed in real time"] = [live]
+            runs["deployed"] = [live]
         drawn.append((pictures.trajectories(runs, world, radius), ""))
     text = (
         f"{successes(here)} of {len(here)} episodes reached the goal in process, "
