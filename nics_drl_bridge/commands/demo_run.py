@@ -75,8 +75,8 @@ class Learned:
 
 
 @dataclass(frozen=True)
-class Episodes:
-    """Episodes of the demo: of the evaluation, and the same ones in process and over DDS."""
+class DemoEpisodes:
+    """DemoEpisodes of the demo: of the evaluation, and the same ones in process and over DDS."""
 
     summary: Summary
     here: Sequence[Episode]  # in process
@@ -105,7 +105,7 @@ def run(plan: DemoPlan, say: Say) -> str:
     arrived = (episode.seed for episode in there if episode.result == "success")
     live = timed("deploying", _deploy, model, learned.policy, next(arrived, 0))
     times = [(part, f"{s:.0f}") for part, s in {**took, "all": sum(took.values())}.items()]
-    episodes = Episodes(summary, here, there, live)
+    episodes = DemoEpisodes(summary, here, there, live)
     sections = sections_of(plan, model, identified, learned, episodes)
     folded = html.details("Wall time", [html.table(("part", "wall time [s]"), times)])
     file = plan.out / "report.html"
@@ -266,7 +266,11 @@ def _write_limits(robot: RobotSpec, path: Path) -> Path:
 
 
 def sections_of(
-    plan: DemoPlan, model: SimulatorModel, identified: Identified, learned: Learned, of: Episodes
+    plan: DemoPlan,
+    model: SimulatorModel,
+    identified: Identified,
+    learned: Learned,
+    of: DemoEpisodes,
 ) -> list[tuple[str, Sequence[str]]]:
     """Sections of the report, the verdict first, each a heading and HTML blocks."""
     return [
@@ -279,7 +283,7 @@ def sections_of(
 
 
 def _verdict(
-    plan: DemoPlan, learned: Learned, identified: Identified, of: Episodes
+    plan: DemoPlan, learned: Learned, identified: Identified, of: DemoEpisodes
 ) -> Sequence[str]:
     summary, here, there = of.summary, of.here, of.there
     share, same, arrived = summary.success, successes(there), of.live.result == "success"
@@ -298,9 +302,14 @@ def _verdict(
         ),
         ("arrived" if arrived else "did not arrive", "deployed, in real time", arrived),
     ]
-    given = f"{learned.policy} --model {plan.model} --world {plan.world}"
+    conclusion = conclude(identified)
+    if conclusion.ready:
+        more = "drive more episodes, or take a recording of your own robot"
+        next_step = more if share.value >= GOOD else "train for longer, by --train-steps"
+        conclusion = conclusion._replace(advice=f"Next: {next_step}.")
     return verdict_blocks(
-        tiles, conclude(identified), f"nics evaluate {given}",
+        tiles, conclusion,
+        f"nics evaluate {learned.policy} --model {plan.model} --world {plan.world}",
         "nics demo --recording DRIVE --robot ROBOT.yaml  # of your own robot",
     )  # fmt: skip
 
@@ -324,7 +333,7 @@ def _policy(plan: DemoPlan, learned: Learned, summary: Summary) -> list[str]:
     return [*blocks, html.paragraph(text), table]
 
 
-def _episodes(plan: DemoPlan, model: SimulatorModel, of: Episodes) -> list[str]:
+def _episodes(plan: DemoPlan, model: SimulatorModel, of: DemoEpisodes) -> list[str]:
     here, there, live = of.here, of.there, of.live
     both, each = (LABELS[FAST], LABELS[DDS]), ("steps", "path [m]")
     rows = [
@@ -339,7 +348,7 @@ def _episodes(plan: DemoPlan, model: SimulatorModel, of: Episodes) -> list[str]:
     for a, b in list(zip(here, there, strict=True))[:PANELS]:
         runs = {both[0]: [a], both[1]: [b]}
         if a.seed == live.seed:
-            runs["deployed in real time"] = [live]
+            runs["deployed"] = [live]
         drawn.append((pictures.trajectories(runs, world, radius), ""))
     text = (
         f"{successes(here)} of {len(here)} episodes reached the goal in process, "

@@ -19,6 +19,7 @@ class Conclusion(NamedTuple):
     doubts: tuple[str, ...]  # reasons not to trust it
     gaps: tuple[str, ...]  # what the drive could not teach
     advice: str  # the next step
+    ready: bool  # false if a policy had better wait for another drive
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -29,16 +30,15 @@ class Conclusion(NamedTuple):
 def conclude(identified: Identified) -> Conclusion:
     """Draws the conclusion of a fit."""
     about = *shortfall(identified.judgement), *doubts(identified.held_out)
-    gaps = identified.gaps
+    gaps, ready = identified.gaps, False
     if about or not identified.judgement:
         advice = "drive once more, for 60 s or longer, and generate anew before a policy is trained"
     elif identified.fit.unmoved or identified.model.assumed:
         advice = "drive once more as said above: a policy would act by what was not learnt"
-    elif gaps:
-        advice = "train a policy in the simulator, or first drive once more as said above"
     else:
-        advice = "train a policy in the simulator"
-    return Conclusion(accuracy(identified), about, gaps, f"Next: {advice}.")
+        first = ", or first drive once more as said above" if gaps else ""
+        advice, ready = f"train a policy in the simulator{first}", True
+    return Conclusion(accuracy(identified), about, gaps, f"Next: {advice}.", ready)
 
 
 def accuracy(identified: Identified) -> str:

@@ -99,7 +99,7 @@ def write_fit_page(
     if assumed:
         figures.append((str(assumed), "of the terms are assumed from the textbook", False))
     train = f"nics train --robot {folder} --world arena --seeds 0 --out runs/first"
-    commands = () if conclusion.doubts else (train,)
+    commands = (train,) if conclusion.ready else ()
     sections = [
         ("Verdict", verdict_blocks(figures, conclusion, *commands)),
         ("Paths", path_blocks(identified)),

@@ -28,7 +28,7 @@ LINES: tuple[dict[str, Any], ...] = (
     {"color": MODEL, "linewidth": 1.4, "linestyle": "--"},
     {"color": GREEN, "linewidth": 1.4, "linestyle": ":"},
 )
-LEAST_WIDTH = 5.5
+LEAST_WIDTH, LEAST_PANEL = 5.5, 4.6  # of the pictures of a world, and of an episode [inch]
 WORLD_SIDE = 7.5  # the longer side of a world's picture [inch]
 
 
@@ -36,7 +36,7 @@ def trajectories(runs: Mapping[str, Sequence[Episode]], world: AnyWorld, footpri
     """Draws a panel per episode with its path in each run, of equal seeds (the paper's Fig. 7)."""
     count = max(len(episodes) for episodes in runs.values())
     columns, rows = min(count, 3), -(-count // 3)
-    size = max(4.2 * columns, LEAST_WIDTH), 4.2 * rows + 0.5
+    size = max(4.2 * columns, LEAST_PANEL), 4.2 * rows + 0.5
     figure, grid = panels(rows, columns, size)
     for axes, *episodes in zip(grid, *runs.values(), strict=False):
         _panel(axes, dict(zip(runs, episodes, strict=True)), world, footprint)

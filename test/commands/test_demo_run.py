@@ -9,8 +9,8 @@ from robots import direct_model
 
 from nics_drl_bridge.commands import demo_run as learning
 from nics_drl_bridge.commands.demo_run import (
+    DemoEpisodes,
     DemoPlan,
-    Episodes,
     Learned,
     learn,
     sections_of,
@@ -89,7 +89,7 @@ def test_the_report_begins_with_success_in_three_worlds_and_folds_the_figures(
     live = episode(0, "success" if arrived else "time-out")
     points = [Point(8192, 0.1, 0.8), Point(80_000, 0.9, 0.1)]
     learned = Learned("policy.onnx", "PPO learned it.", points)
-    of = Episodes(summary, [episode(0), episode(1)], [episode(0), episode(1)], live)
+    of = DemoEpisodes(summary, [episode(0), episode(1)], [episode(0), episode(1)], live)
     sections = dict(sections_of(DemoPlan(tmp_path), model, identified, learned, of))
     assert next(iter(sections)) == "Verdict"
     verdict = "".join(sections["Verdict"])
