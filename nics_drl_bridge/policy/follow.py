@@ -46,7 +46,7 @@ class Place(NamedTuple):
     turned: float  # from the path's direction to the right [rad]
 
 
-class Path:
+class PlannedPath:
     """A path (P, 3) or (P, 2), and where on it the robot is. Raises ConfigError for none.
 
     Points that have been passed are not looked at again, so that a path may cross itself.
