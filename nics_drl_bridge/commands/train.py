@@ -155,7 +155,11 @@ def _run_watched(train_run: Any, order: Any, learn: Any, as_json: bool) -> None:
 
 
 def _run(
-    train_run: Any, order: Any, learn: Any, as_json: bool, note: Callable[[str], None] = lambda _: None
+    train_run: Any,
+    order: Any,
+    learn: Any,
+    as_json: bool,
+    note: Callable[[str], None] = lambda _: None,
 ) -> None:
     def told(progress: Any) -> None:
         what = f"seed {progress.seed}: {progress.line}"

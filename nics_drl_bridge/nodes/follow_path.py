@@ -226,7 +226,7 @@ class PathActions:
         """Returns the way (P, 3) on the map, if there is one; else straight."""
         points = np.stack([robot[:2], end[:2]])
         if self._map is not None and frame in ("", self._map[0]):
-            points = route(self._map[1], *points, self._robot.footprint_radius)
+            points = route(self._map[1], points[0], points[1], self._robot.footprint_radius)
         return np.column_stack([points, np.full(len(points), end[2])])
 
     def _placed(self, goal: Goal, frame: str, poses: Array) -> tuple[str, Array]:
@@ -350,7 +350,8 @@ class PathActions:
         """Slows a twist down to the speed limit; the robot's way stays the same."""
         share = min(1.0, self._limit / max(float(np.hypot(*twist[:2])), 1e-9))
         steers = self._robot.steers and not self._robot.takes_turn_rate
-        return twist * np.array([share, share, 1.0 if steers else share])
+        slower: Array = twist * np.array([share, share, 1.0 if steers else share])
+        return slower
 
     def _report(self, run: Run, robot: Array, place: Place, twist: Array) -> None:
         speed = float(np.hypot(*twist[:2]))
@@ -359,7 +360,7 @@ class PathActions:
         told = {
             "distance_to_goal": place.distance, "speed": speed, "robot_pose": pose,
             "position_tracking_error": place.left, "heading_tracking_error": place.turned,
-            "current_path_index": place.index, "remaining_path_length": place.remaining,
+            "current_path_index": place.nearest, "remaining_path_length": place.remaining,
             "current_pose": pose, "distance_remaining": place.remaining, "header": pose.header,
             "navigation_time": duration_to_ros(times[0]),
             "estimated_time_remaining": duration_to_ros(times[1]),
