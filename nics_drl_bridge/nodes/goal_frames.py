@@ -75,9 +75,7 @@ class GoalFrames:
         if frame == self._map:
             return self._of_localiser(place)[:2]
         if (robot := self._topics.in_odom()) is None:
-            raise ConfigError(
-                "goal_pose: no odometry has come, so its place is unknown; wait for it."
-            )
+            raise ConfigError("goal_pose: its place is unknown before odometry comes; wait for it.")
         there: Array = geometry.compose(self._topics.view().pose, geometry.between(robot, place))
         return there[:2]
 

@@ -182,7 +182,8 @@ class EpisodeSource:
         worlds = dict.fromkeys([first, *shipped_worlds()])
         return Stage(
             f"{self._policy} in {', '.join(lane.world.name for lane in self.lanes)}", self.model,
-            tuple(lane.env.world for lane in self.lanes), CAN | frozenset({"drive"} if self._drives else ()),
+            tuple(lane.env.world for lane in self.lanes),
+            CAN | frozenset({"drive"} if self._drives else ()),
             {"policy": list(policies), "world": list(worlds)},
             {"policy": self._policy, "world": first},
         )  # fmt: skip

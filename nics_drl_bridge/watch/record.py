@@ -143,7 +143,8 @@ def _ring(pose: Any, radius: float, shape: Any) -> NDArray[np.float64]:
         turns = np.linspace(0.0, 2.0 * np.pi, CORNERS, endpoint=False)
         corners = radius * np.stack([np.cos(turns), np.sin(turns)], axis=1)
     ring: NDArray[np.float64] = geometry.rotate(np.concatenate([corners, corners[:1]]), pose[2])
-    return ring + np.asarray(pose)[:2]
+    ring += np.asarray(pose)[:2]
+    return ring
 
 
 WRITERS: dict[str, Callable[[Path, Stage, Iterable[Frame], float], None]] = {
