@@ -14,7 +14,7 @@ from PIL import Image
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.env.rendering import WorldPicture
-from nics_drl_bridge.env.shot import hits_of
+from nics_drl_bridge.env.snapshot import hits_of
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.extensions import missing
 from nics_drl_bridge.files import check_above, write_bytes
