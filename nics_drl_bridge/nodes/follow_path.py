@@ -359,7 +359,7 @@ class PathActions:
         told = {
             "distance_to_goal": place.distance, "speed": speed, "robot_pose": pose,
             "position_tracking_error": place.left, "heading_tracking_error": place.turned,
-            "current_path_index": place.index, "remaining_path_length": place.remaining,
+            "current_path_index": place.pose, "remaining_path_length": place.remaining,
             "current_pose": pose, "distance_remaining": place.remaining, "header": pose.header,
             "navigation_time": duration_to_ros(times[0]),
             "estimated_time_remaining": duration_to_ros(times[1]),

@@ -39,7 +39,7 @@ class Place(NamedTuple):
     """Place of a robot on its path."""
 
     ahead: Array  # (2,) sub-goal [m]
-    index: int  # of the nearest pose that the path was given by
+    pose: int  # index of the nearest pose that the path was given by
     remaining: float  # length of the way that is left [m]
     distance: float  # straight to the end [m]
     left: float  # of the path, negative to its right [m]

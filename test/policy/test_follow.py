@@ -22,7 +22,7 @@ def test_the_sub_goal_lies_ahead_on_the_path():
     assert place.ahead == pytest.approx([1.5, 0.0], abs=0.05)
     assert place.remaining == pytest.approx(3.5, abs=0.05)
     assert place.distance == pytest.approx(math.hypot(1.5, 1.9))
-    assert place.index == 1  # the nearest of the given poses ahead
+    assert place.pose == 1  # the nearest of the given poses ahead
 
 
 def test_near_the_end_the_sub_goal_is_the_end():
