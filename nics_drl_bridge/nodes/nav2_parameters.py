@@ -15,7 +15,6 @@ UNUSED = {
     "controller_frequency", "min_x_velocity_threshold", "min_y_velocity_threshold",
     "min_theta_velocity_threshold", "use_realtime_priority", "path_handler_plugins", "odom_topic",
     "odom_duration", "publish_zero_velocity", "introspection_mode", "bond_heartbeat_period",
-    "stateful", "search_window", "speed_limit_topic", "enable_stamped_cmd_vel",
 }  # fmt: skip
 
 

@@ -198,3 +198,23 @@ def test_an_imported_world_of_barn_is_the_one_that_is_shipped(tmp_path):
         shipped.starts,
         shipped.goals,
     )
+
+
+def test_the_map_of_a_world_is_a_world_again_with_the_same_walls(tmp_path):
+    said = done("map", "arena", "--seed", 1, "--resolution", 0.05, cwd=tmp_path)
+    assert "the map of 'arena', seed 1, 122 x 122 cells of 0.05 m" in said
+    done("import", "arena_map.yaml", cwd=tmp_path)
+    grid = load_world(tmp_path / "arena_map_world.yaml").grid
+    assert grid.cells[0].all()
+    assert 0.9 < np.mean(grid.free) < 0.97
+
+
+def test_a_map_that_can_not_be_written_is_one_sentence(tmp_path):
+    for words, sentence in (
+        (("--out", "map.png"), "must end in .yaml"),
+        (("--resolution", 0), "must be from 0.001 to 100 m"),
+    ):
+        ran = nics("world", "map", "arena", *words, cwd=tmp_path)
+        assert ran.returncode == 2
+        assert sentence in ran.stderr
+        assert len(ran.stderr.strip().splitlines()) == 1
