@@ -22,7 +22,8 @@ from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE, X, Y
 from nics_drl_bridge.watch.frame import Frame, Stage, WorldFrame
 
 Pixels = NDArray[np.uint8]  # (H, W, 3)
-COLOURS = 64  # of a GIF, whose size grows with them
+COLOURS = 128  # of a GIF, whose size grows with them
+SAMPLES = 12  # frames that its colours are taken from
 CORNERS = 24  # of a disc
 
 
@@ -53,12 +54,24 @@ def beside(row: list[Pixels]) -> Pixels:
 
 def write_gif(path: Path, shown: Iterable[Pixels], fps: float) -> None:
     """Writes a GIF that repeats for ever."""
-    images = [Image.fromarray(each) for each in shown]
-    palette = images[len(images) // 2].quantize(COLOURS)  # one for all, or colours flicker
-    first, *rest = [each.quantize(palette=palette, dither=Image.Dither.NONE) for each in images]
+    every = list(shown)
+    palette = palette_of(every[:: -(-len(every) // SAMPLES)])  # one for all, or colours flicker
+    first, *rest = [
+        Image.fromarray(each).quantize(palette=palette, dither=Image.Dither.NONE) for each in every
+    ]
     buffer, duration = io.BytesIO(), round(1000.0 / fps)
     first.save(buffer, "GIF", save_all=True, append_images=rest, duration=duration, loop=0)
     write_bytes(path, buffer.getvalue())
+
+
+def palette_of(some: list[Pixels]) -> Image.Image:
+    """Palette of the most frequent colours: a mean of several would lose those of small things."""
+    parts = np.concatenate([each.reshape(-1, 3) for each in some]).astype(np.int64)
+    colours, counts = np.unique(parts @ np.array([1 << 16, 1 << 8, 1]), return_counts=True)
+    best = colours[np.argsort(-counts)[:COLOURS]]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(np.stack([best >> 16, best >> 8 & 255, best & 255], axis=1).ravel().tolist())
+    return palette
 
 
 def write_mp4(path: Path, shown: Iterable[Pixels], fps: float) -> None:

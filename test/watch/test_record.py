@@ -35,6 +35,8 @@ def test_a_gif_has_each_frame_and_moves(made, tmp_path):
             shown.append(np.asarray(image.convert("RGB"), int))
     assert shown[0].shape == (500, 500, 3)
     assert np.abs(shown[0] - shown[3]).max() > 50
+    for colour in ([0x1F, 0x6F, 0xB2], [0xF2, 0xC1, 0x4E]):  # of robot and goal, exactly
+        assert (shown[0] == colour).all(axis=-1).sum() > 20
 
 
 def test_an_mp4_has_each_frame(made, tmp_path):
