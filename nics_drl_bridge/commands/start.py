@@ -4,7 +4,7 @@ import sys
 
 from nics_drl_bridge import extensions
 
-EXIT_BAD_INPUT = 2
+EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
 
 
 def main() -> None:
@@ -18,6 +18,9 @@ def main() -> None:
             raise
         sys.stderr.write(f"nics: {clause}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
+    except KeyboardInterrupt:  # before a command has begun
+        sys.stderr.write("nics: interrupted; nothing was started.\n")
+        raise SystemExit(EXIT_INTERRUPTED) from None
 
 
 if __name__ == "__main__":

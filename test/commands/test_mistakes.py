@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from command_line import nics
 
+from nics_drl_bridge.commands import start
 from nics_drl_bridge.config import share_folder
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.recording import save_recording
@@ -195,3 +196,13 @@ def test_a_run_with_other_settings_is_not_overwritten(folder):
     (folder / "run" / "settings.yaml").write_text("robot: ackermann\n", encoding="utf-8")
     done = nics("train", "--robot", "differential", "--out", "run", cwd=folder)
     assert "run: holds a run with other settings; choose another --out" in sentence_of(done)
+
+
+def test_ctrl_c_before_a_command_has_begun_is_one_sentence(capsys):
+    with (
+        mock.patch("nics_drl_bridge.commands.cli.main", side_effect=KeyboardInterrupt),
+        pytest.raises(SystemExit) as end,
+    ):
+        start.main()
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "nics: interrupted; nothing was started.\n"
