@@ -5,7 +5,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame
 from nics_drl_bridge.watch.server import PageServer
-from nics_drl_bridge.watch.show import PACE, Pace, open_page
+from nics_drl_bridge.watch.show import PACE, Tempo, open_page
 
 
 class HumanView:
@@ -15,7 +15,7 @@ class HumanView:
     """
 
     def __init__(self, model: SimulatorModel, world: AnyWorld, fps: int) -> None:
-        self._server, self._pace, self._period_s = PageServer(port=0), Pace(), 1.0 / fps
+        self._server, self._pace, self._period_s = PageServer(port=0), Tempo(), 1.0 / fps
         self._trail, self._frames = Track(), 0
         self._server.set_stage(Stage(world.name, model, (world,), PACE))
         open_page(self._server.url)

@@ -40,7 +40,7 @@ class FrameSource(Protocol):
         """Frees all resources."""
 
 
-class Pace:
+class Tempo:
     """Tells when the next frame is due: at a speed, after a pause, or one by one."""
 
     def __init__(self) -> None:
@@ -78,7 +78,7 @@ class Pace:
 
 def show(source: FrameSource, server: PageServer) -> None:
     """Shows a source until the server is closed."""
-    pace, shown_s = Pace(), 0.0
+    pace, shown_s = Tempo(), 0.0
 
     def publish() -> None:
         server.publish(source.frame(), **pace.plain())

@@ -6,7 +6,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.watch import show as module
 from nics_drl_bridge.watch.frame import Frame, WorldFrame
 from nics_drl_bridge.watch.server import Request
-from nics_drl_bridge.watch.show import Pace, open_page
+from nics_drl_bridge.watch.show import Tempo, open_page
 from watch.rig import shot, shown, until
 from watch.test_server import STAGE
 
@@ -76,7 +76,7 @@ def test_a_page_that_was_closed_while_paused_holds_nobody_up():
 
 @pytest.mark.parametrize(("given", "taken"), [(2.0, 2.0), (1e9, 64.0), (0.0, 0.05)])
 def test_the_speed_stays_within_bounds(given, taken):
-    pace = Pace()
+    pace = Tempo()
     pace.take(Request(kind="speed", value=given))
     assert pace.speed == taken
 
