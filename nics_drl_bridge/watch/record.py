@@ -147,7 +147,7 @@ def _log(rerun: Any, recording: Any, at: str, stage: Stage, world: WorldFrame) -
 
 def _ring(pose: Any, radius: float, shape: Any) -> NDArray[np.float64]:
     """Closed outline (V + 1, 2) of a shape, or of a robot by its footprint, at a pose (3,)."""
-    outline = getattr(shape, "footprint", None)
+    outline: Any = getattr(shape, "footprint", None)
     if outline is None:
         outline = getattr(shape, "outline", np.zeros((0, 2)))
         outline = outline * (radius / shape.radius) if len(outline) else outline
@@ -155,7 +155,8 @@ def _ring(pose: Any, radius: float, shape: Any) -> NDArray[np.float64]:
     if not len(corners):
         turns = np.linspace(0.0, 2.0 * np.pi, CORNERS, endpoint=False)
         corners = radius * np.stack([np.cos(turns), np.sin(turns)], axis=1)
-    return geometry.rotate(np.concatenate([corners, corners[:1]]), pose[2]) + pose[:2]
+    closed = np.concatenate([corners, corners[:1]])
+    return np.asarray(geometry.rotate(closed, pose[2]) + pose[:2])
 
 
 WRITERS: dict[str, Callable[[Path, Stage, Iterable[Frame], float], None]] = {
