@@ -146,6 +146,5 @@ def _serve(source: Any, port: int | None, browser: bool) -> None:
     from nics_drl_bridge.watch.show import open_page, show
 
     with closing(PageServer(PORT if port is None else port)) as server:
-        typer.echo(f"watch: {server.url} (Ctrl-C ends it)", err=True)
         open_page(server.url, browser)
         show(source, server)

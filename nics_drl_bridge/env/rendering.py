@@ -1,6 +1,7 @@
 """Pictures of a world from above, for `render_mode="rgb_array"` and for videos."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -33,7 +34,7 @@ class WorldPicture:
         width, depth = (SIZE_IN * (high - low) / (high - low).max()).tolist()
         self._low, self._high = low - MARGIN * (high - low), high + MARGIN * (high - low)
         figure = Figure(figsize=(width, depth), dpi=DPI)
-        self._canvas = FigureCanvasAgg(figure)
+        self._canvas: Any = FigureCanvasAgg(figure)
         self._axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
 
     def draw(self, shot: Snapshot, trails: Sequence[Array] = ()) -> NDArray[np.uint8]:

@@ -318,8 +318,8 @@ class FastSimulator:
 
     def obstacles_of(self, n: int) -> Array:
         """(K, 7) those of world n."""
-        there: Array = self._obstacles(np.array([n]))[0]
-        return there
+        of_one: Array = self._obstacles(np.array([n]))[0]
+        return of_one
 
     def _obstacles(self, worlds: Indices) -> Array:
         bodies = self.data.bodies[worlds, : self.sampler.count]

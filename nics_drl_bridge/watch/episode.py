@@ -178,12 +178,12 @@ class EpisodeSource:
         """See `show.FrameSource`."""
         robot, first = self.model.robot.name, self.lanes[0].world.name
         fitting = [name for name in shipped_policies() if name == robot]
+        can = CAN | {"drive"} if self._drives else CAN
         policies = dict.fromkeys([self._policy, *fitting, *POLICIES])
         worlds = dict.fromkeys([first, *shipped_worlds()])
         return Stage(
             f"{self._policy} in {', '.join(lane.world.name for lane in self.lanes)}", self.model,
-            tuple(lane.env.world for lane in self.lanes),
-            CAN | frozenset({"drive"} if self._drives else ()),
+            tuple(lane.env.world for lane in self.lanes), can,
             {"policy": list(policies), "world": list(worlds)},
             {"policy": self._policy, "world": first},
         )  # fmt: skip

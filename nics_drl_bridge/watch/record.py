@@ -23,6 +23,7 @@ from nics_drl_bridge.watch.frame import Frame, Stage, WorldFrame
 
 Pixels = NDArray[np.uint8]  # (H, W, 3)
 COLOURS = 128  # of a GIF, whose size grows with them
+ALIKE = 12  # difference of two colours of which a GIF has one
 SAMPLES = 12  # frames that its colours are taken from
 CORNERS = 24  # of a disc
 
@@ -65,12 +66,17 @@ def write_gif(path: Path, shown: Iterable[Pixels], fps: float) -> None:
 
 
 def palette_of(some: list[Pixels]) -> Image.Image:
-    """Palette of the most frequent colours: a mean of several would lose those of small things."""
+    """Palette of the most frequent colours that differ: means would lose those of small things."""
     parts = np.concatenate([each.reshape(-1, 3) for each in some]).astype(np.int64)
     colours, counts = np.unique(parts @ np.array([1 << 16, 1 << 8, 1]), return_counts=True)
-    best = colours[np.argsort(-counts)[:COLOURS]]
+    best = colours[np.argsort(-counts)]
+    rows = np.stack([best >> 16, best >> 8 & 255, best & 255], axis=1)
+    chosen = rows[:0]
+    while len(rows) and len(chosen) < COLOURS:
+        chosen = np.concatenate([chosen, rows[:1]])
+        rows = rows[np.abs(rows - rows[0]).max(axis=1) > ALIKE]
     palette = Image.new("P", (1, 1))
-    palette.putpalette(np.stack([best >> 16, best >> 8 & 255, best & 255], axis=1).ravel().tolist())
+    palette.putpalette(chosen.ravel().tolist())
     return palette
 
 
@@ -147,7 +153,7 @@ def _log(rerun: Any, recording: Any, at: str, stage: Stage, world: WorldFrame) -
 
 def _ring(pose: Any, radius: float, shape: Any) -> NDArray[np.float64]:
     """Closed outline (V + 1, 2) of a shape, or of a robot by its footprint, at a pose (3,)."""
-    outline = getattr(shape, "footprint", None)
+    outline: Any = getattr(shape, "footprint", None)
     if outline is None:
         outline = np.asarray(getattr(shape, "outline", np.zeros((0, 2))))
         outline = outline * (radius / shape.radius) if len(outline) else outline
@@ -155,9 +161,8 @@ def _ring(pose: Any, radius: float, shape: Any) -> NDArray[np.float64]:
     if not len(corners):
         turns = np.linspace(0.0, 2.0 * np.pi, CORNERS, endpoint=False)
         corners = radius * np.stack([np.cos(turns), np.sin(turns)], axis=1)
-    ring: NDArray[np.float64] = geometry.rotate(np.concatenate([corners, corners[:1]]), pose[2])
-    ring += np.asarray(pose)[:2]
-    return ring
+    closed = np.concatenate([corners, corners[:1]])
+    return np.asarray(geometry.rotate(closed, pose[2]) + pose[:2])
 
 
 WRITERS: dict[str, Callable[[Path, Stage, Iterable[Frame], float], None]] = {
