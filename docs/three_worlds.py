@@ -31,7 +31,7 @@ def drawn(env: BridgeEnv, picture: WorldPicture, place: str, episode: Episode) -
     font = ImageFont.load_default(15)
     for k, pose in enumerate(episode.path):
         env.reset(seed=episode.seed, options={"start": pose})
-        shot = picture.draw(env.shot(), [episode.path[: k + 1, :2]])
+        shot = picture.draw(env.snapshot(), [episode.path[: k + 1, :2]])
         image = Image.new("RGB", (SIDE, SIDE + HEAD), "white")
         image.paste(Image.fromarray(shot).resize((SIDE, SIDE), Image.Resampling.LANCZOS), (0, HEAD))
         end = f": {episode.result}" if k == len(episode.path) - 1 else ""

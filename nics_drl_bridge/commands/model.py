@@ -245,9 +245,10 @@ def generate(
         from nics_drl_bridge.report.fit_pictures import write_pictures
 
         page = out / "report.html"
-        write_fit_page(page, str(recording), spec, identified, model.report)
-        if pictures:
-            write_pictures(spec, identified, out / "pictures")
+        with console.progress_bar("drawing the report"):
+            write_fit_page(page, str(recording), spec, identified, model.report)
+            if pictures:
+                write_pictures(spec, identified, out / "pictures")
         typer.echo(opening(model.report))
         typer.echo(f"\nall figures: {out / 'report.txt'}, with pictures: {page}")
         typer.echo(f"model written to {out}")

@@ -77,6 +77,7 @@ def import_(
 
 def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
     lidar, scan, seen = facts["lidar"], facts["scan"], facts["observation"]
+    steps = facts["max_episode_steps"]
     limits = "{name} {min:g} to {max:g} {unit}"
     commands = [limits.format(**command) for command in facts["robot"]["command"]]
     observed = "the beams of this lidar"
@@ -94,6 +95,7 @@ def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
         "lidar": f"{lidar['name']}: {lidar['beams']} beams, {lidar['range_max']:g} m",
         "observation": f"{seen['size']} parts, {seen['scan_parts']} of them the scan",
         "control period": f"{facts['control_period']:g} s",
+        "time limit": "not told" if steps is None else f"{steps * facts['control_period']:g} s",
         "model": facts["model_fingerprint"],
         "graph": facts["graph_sha256"][:16],
     }

@@ -77,6 +77,9 @@ def train(
             raise ConfigError(f"--{option}: a resumed run has its own settings; leave it out.")
         if resume and out is None:
             raise ConfigError("--resume needs --out, the folder of the run to go on with.")
+        if watch and engine is not None and engine not in OWN:
+            reason = "worlds of other processes are not shown; leave out --watch, or --engine"
+            raise ConfigError(f"--watch --engine {engine}: {reason}.")
         extensions.require("training", *extensions.TRAINING)
         from nics_drl_bridge.policy import train as train_run
 
@@ -87,13 +90,7 @@ def train(
         every = [*(seeds or [0]), *(more_seeds or [])]
         order = train_run.TrainOrder(chosen, every, folder, episodes, resume, command)
         with _learner(engine, address, env_runners, chosen.num_envs) as learn:
-            if not watch:
-                _run(train_run, order, learn, as_json)
-            elif engine is None or engine in OWN:
-                _run_watched(train_run, order, learn, as_json)
-            else:
-                reason = "worlds on a cluster are not shown; leave out --watch, or --engine"
-                raise ConfigError(f"--watch --engine {engine}: {reason}.")
+            (_run_watched if watch else _run)(train_run, order, learn, as_json)
 
 
 def _plain(result: Any) -> dict[str, Any]:
@@ -155,7 +152,11 @@ def _run_watched(train_run: Any, order: Any, learn: Any, as_json: bool) -> None:
 
 
 def _run(
-    train_run: Any, order: Any, learn: Any, as_json: bool, note: Callable[[str], None] = lambda _: None
+    train_run: Any,
+    order: Any,
+    learn: Any,
+    as_json: bool,
+    note: Callable[[str], None] = lambda _: None,
 ) -> None:
     def told(progress: Any) -> None:
         what = f"seed {progress.seed}: {progress.line}"

@@ -90,7 +90,9 @@ def _episodes(
     from nics_drl_bridge.watch.episode import EpisodeSource
 
     under = Conditions(given["lidar"], given["randomisation"], given["gate"])
-    model = open_model(name or driving.robot_of(policy), under.lidar)
+    contracts = driving.contracts_of([policy])
+    own = [driving.robot_of(*each) for each in contracts.items()]  # a baseline has none
+    model = open_model(name or (own or [driving.DEFAULT_ROBOT])[0], under.lidar)
 
     def make(policy: str, world: Any) -> Any:
         options = {"estimator": True, "randomisation": under.ranges}

@@ -240,8 +240,8 @@ def map_(
             raise ConfigError(f"--resolution {resolution:g}: must be from 0.001 to 100 m.")
         worlds = load_worlds(name)
         sampler = SetSampler(worlds, load_robot(robot).footprint_radius)
-        scene = sampler.draw([seed])[0]
-        member = int(scene.member)
+        scenes = sampler.draw([seed])
+        scene, member = scenes[0], int(scenes.member[0])
         opened = worlds.members[member]
         file = out or Path(f"{opened.name}_map.yaml")
         if file.suffix not in MAPS:

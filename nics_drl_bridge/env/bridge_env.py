@@ -12,8 +12,8 @@ from nics_drl_bridge import extensions
 from nics_drl_bridge.env import guard
 from nics_drl_bridge.env.guard import give, halts_on_error
 from nics_drl_bridge.env.registry import make_task
-from nics_drl_bridge.env.shot import Shot, gate_of, goals_of
 from nics_drl_bridge.env.sim_backend import completed, make_backend
+from nics_drl_bridge.env.snapshot import Snapshot, gate_of, goals_of
 from nics_drl_bridge.env.task import Episodes, Memory, Task, still, team_space
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
@@ -262,7 +262,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             return None
         if self._picture is None:
             self._picture = self._make_picture()
-        return self._picture.draw(self.shot())
+        return self._picture.draw(self.snapshot())
 
     def _make_picture(self) -> Any:
         if self.render_mode == "human":
@@ -271,13 +271,13 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
 
         return WorldPicture(self.model, self.world)
 
-    def shot(self) -> Shot:
+    def snapshot(self) -> Snapshot:
         """All that a picture of the world shows now. Raises ResetNeeded before an episode."""
         if self._view is None or self.scene is None:
             raise gymnasium.error.ResetNeeded("call reset() before render().")
         facts, told, view = self._backend.facts(), self._facts, self._view
         covariance = told.get("covariance")
-        return Shot(
+        return Snapshot(
             poses=np.reshape(facts.get("true_pose", view.pose), (self.robots, 3)),
             ranges=view.ranges[0], bodies=facts.get("bodies", self.scene.bodies),
             goals=goals_of(self.memory).copy(), member=int(np.asarray(self.scene.member)),

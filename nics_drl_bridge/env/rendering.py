@@ -12,7 +12,7 @@ from matplotlib.patches import Polygon as Outline
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.env.shot import Shot, hits_of
+from nics_drl_bridge.env.snapshot import Snapshot, hits_of
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE
 from nics_drl_bridge.sim.world_set import AnyWorld
@@ -36,7 +36,7 @@ class WorldPicture:
         self._canvas = FigureCanvasAgg(figure)
         self._axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
 
-    def draw(self, shot: Shot, trails: Sequence[Array] = ()) -> NDArray[np.uint8]:
+    def draw(self, shot: Snapshot, trails: Sequence[Array] = ()) -> NDArray[np.uint8]:
         """Returns the pixels (H, W, 3) of a shot, with the ways (T, 2) that its robots came."""
         axes = self._axes
         axes.clear()
@@ -51,8 +51,8 @@ class WorldPicture:
             axes.plot(*np.transpose(trail), color=ROBOTS[m % len(ROBOTS)], linewidth=1.5)
         for m, (pose, scan) in enumerate(zip(shot.poses, shot.ranges, strict=True)):
             self._robot(axes, pose, scan, ROBOTS[m % len(ROBOTS)])
-        self._canvas.draw()
-        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+        self._canvas.draw()  # type: ignore[no-untyped-call]
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()  # type: ignore[no-untyped-call]
 
     def _robot(self, axes: Axes, pose: Array, ranges: NDArray[np.float32], colour: str) -> None:
         lidar, robot = self._model.lidar, self._model.robot

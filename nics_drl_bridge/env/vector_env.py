@@ -15,7 +15,7 @@ from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
 from nics_drl_bridge.env.guard import check_action, check_reset, check_starts, give, override
 from nics_drl_bridge.env.kernels import episode_seeds
 from nics_drl_bridge.env.registry import make_task
-from nics_drl_bridge.env.shot import Shot, goals_of
+from nics_drl_bridge.env.snapshot import Snapshot, goals_of
 from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task, still, team_space, total
 from nics_drl_bridge.env.teaching import Teacher, Teaching
 from nics_drl_bridge.errors import ConfigError
@@ -301,14 +301,14 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             from nics_drl_bridge.env.rendering import WorldPicture  # loads matplotlib
 
             self._pictures = [WorldPicture(self.model, self.world) for _ in range(self.num_envs)]
-        return tuple(picture.draw(self.shot(n)) for n, picture in enumerate(self._pictures))
+        return tuple(picture.draw(self.snapshot(n)) for n, picture in enumerate(self._pictures))
 
-    def shot(self, n: int) -> Shot:
+    def snapshot(self, n: int) -> Snapshot:
         """All that a picture of world n shows now; `step` does not change its arrays."""
         data, bodies = self.simulator.data, self.simulator.obstacles_of(n)
         goals = goals_of({name: rows[n] for name, rows in self.memory.items() if name == "goal"})
         seen = data.pose[n].copy(), data.ranges[n].copy(), bodies, goals.copy()
-        return Shot(*seen, int(data.member[n]), int(data.steps[n]), data.odom[n].copy())
+        return Snapshot(*seen, int(data.member[n]), int(data.steps[n]), data.odom[n].copy())
 
 
 def flat(observations: Observation) -> Observation:

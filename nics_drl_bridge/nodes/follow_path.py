@@ -28,7 +28,7 @@ from nics_drl_bridge.nodes.held_action import (
 )
 from nics_drl_bridge.nodes.nav2_parameters import ControllerParameters, chosen
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
-from nics_drl_bridge.policy.follow import GoalChecker, Path, Place, ProgressChecker
+from nics_drl_bridge.policy.follow import GoalChecker, Place, PlannedPath, ProgressChecker
 from nics_drl_bridge.policy.route import route
 
 FOLLOW, NAVIGATE = "follow_path", "navigate_to_pose"
@@ -48,8 +48,8 @@ class Refusal(Exception):  # noqa: N818  (an outcome, by the standard's code)
         self.code = code
 
 
-class Drive(NamedTuple):
-    """What a policy wants, on its way to a goal."""
+class Wish(NamedTuple):
+    """Motion that a policy asks for, on its way to a goal."""
 
     twist: Array  # (3,) for `cmd_vel`
     touched: bool
@@ -75,7 +75,7 @@ class Run:
 
     goal: Goal
     frame: str  # of the path
-    path: Path
+    path: PlannedPath
     arrival: GoalChecker
     progress: ProgressChecker
     started_s: float
@@ -91,7 +91,7 @@ class PathActions:
 
     def __init__(
         self, node: Node, topics: RobotTopics, frames: GoalFrames, model: SimulatorModel,
-        parameters: ControllerParameters, drive: Callable[[Array], Drive],
+        parameters: ControllerParameters, drive: Callable[[Array], Wish],
     ) -> None:  # fmt: skip
         self._node, self._topics, self._frames, self._robot = node, topics, frames, model.robot
         self._parameters, self._drive = parameters, drive
@@ -214,7 +214,7 @@ class PathActions:
         end = _pose_of(asked.pose.pose)[None]
         frame, end = self._placed(goal, asked.pose.header.frame_id, end)
         try:
-            Path(end)
+            PlannedPath(end)
             way = self._way(frame, self._robot_in(NAVIGATE, frame), end[0])
         except ConfigError as error:
             raise Refusal("UNKNOWN", f"{NAVIGATE}: {error}") from None
@@ -226,7 +226,7 @@ class PathActions:
         """Returns the way (P, 3) on the map, if there is one; else straight."""
         points = np.stack([robot[:2], end[:2]])
         if self._map is not None and frame in ("", self._map[0]):
-            points = route(self._map[1], *points, self._robot.footprint_radius)
+            points = route(self._map[1], points[0], points[1], self._robot.footprint_radius)
         return np.column_stack([points, np.full(len(points), end[2])])
 
     def _placed(self, goal: Goal, frame: str, poses: Array) -> tuple[str, Array]:
@@ -244,7 +244,7 @@ class PathActions:
 
     def _begin(self, goal: Goal, frame: str, poses: Array, checks: Sequence[str]) -> Run:
         try:
-            Path(poses)
+            PlannedPath(poses)
         except ConfigError as error:
             raise Refusal(goal.code, f"{goal.name}: {error}") from None
         frame, poses = self._placed(goal, frame, poses)
@@ -253,7 +253,7 @@ class PathActions:
         arrival, progress = self._parameters.checks(*checks)
         checkers = GoalChecker(arrival, not self._robot.steers), ProgressChecker(progress)
         now_s = time.monotonic()
-        return Run(goal, frame, Path(poses), *checkers, now_s, now_s)
+        return Run(goal, frame, PlannedPath(poses), *checkers, now_s, now_s)
 
     def _require_on_map(self, goal: Goal, frame: str, poses: Array) -> None:
         if self._map is None:
@@ -350,7 +350,8 @@ class PathActions:
         """Slows a twist down to the speed limit; the robot's way stays the same."""
         share = min(1.0, self._limit / max(float(np.hypot(*twist[:2])), 1e-9))
         steers = self._robot.steers and not self._robot.takes_turn_rate
-        return twist * np.array([share, share, 1.0 if steers else share])
+        slower: Array = twist * np.array([share, share, 1.0 if steers else share])
+        return slower
 
     def _report(self, run: Run, robot: Array, place: Place, twist: Array) -> None:
         speed = float(np.hypot(*twist[:2]))
@@ -359,7 +360,7 @@ class PathActions:
         told = {
             "distance_to_goal": place.distance, "speed": speed, "robot_pose": pose,
             "position_tracking_error": place.left, "heading_tracking_error": place.turned,
-            "current_path_index": place.index, "remaining_path_length": place.remaining,
+            "current_path_index": place.nearest, "remaining_path_length": place.remaining,
             "current_pose": pose, "distance_remaining": place.remaining, "header": pose.header,
             "navigation_time": duration_to_ros(times[0]),
             "estimated_time_remaining": duration_to_ros(times[1]),

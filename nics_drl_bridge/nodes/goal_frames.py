@@ -74,10 +74,10 @@ class GoalFrames:
             raise ConfigError(f"goal_pose: {error}") from None
         if frame == self._map:
             return self._of_localiser(place)[:2]
-        there: Array = geometry.compose(
-            self._topics.view().pose, geometry.between(self._topics.in_odom(), place)
-        )[:2]
-        return there
+        if (robot := self._topics.in_odom()) is None:
+            raise ConfigError("goal_pose: its place is unknown before odometry comes; wait for it.")
+        there: Array = geometry.compose(self._topics.view().pose, geometry.between(robot, place))
+        return there[:2]
 
     def fixed(self, frame: str, places: Array) -> tuple[str, Array]:
         """Returns poses (..., 3) of a frame in the map or `odom`, and which of them it is.

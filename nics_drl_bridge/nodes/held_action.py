@@ -12,7 +12,7 @@ from nics_drl_bridge.interface import NS_PER_S
 SUCCEED, ABORT, CANCELED = "succeed", "abort", "canceled"
 
 
-class HeldActionServer(ActionServer):  # type: ignore[misc]
+class HeldActionServer(ActionServer):
     """Accepts goals while `open_` says so, and hands each to `begin`, until `finish` ends it.
 
     None is waited for in a callback: rclpy polls what waits, in every turn of an executor.

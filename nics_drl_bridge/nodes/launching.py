@@ -1,4 +1,4 @@
-"""What the launch files start, and their arguments; for those of `launch/`, and for your own.
+"""Arguments and actions of the launch files, those of `launch/` and your own.
 
 An argument that is left empty leaves what the file of parameters says.
 """
@@ -38,7 +38,7 @@ class Robot(NamedTuple):
 
 
 class Setup:
-    """What the launch arguments and the file of parameters request together."""
+    """The request that launch arguments and the file of parameters make together."""
 
     def __init__(self, values: Values) -> None:
         self.values = values

@@ -120,7 +120,7 @@ def nav2() -> list[Row]:
 def checkers(goals: Sequence[str], progress: Sequence[str]) -> list[Row]:
     """Returns the parameters of the checks of these names, as of Nav2's simple checkers."""
     span = (0.0, 1e6)
-    rows = [
+    rows: tuple[list[tuple[str, Any, str, tuple[float, float] | None]], ...] = [
         ("xy_goal_tolerance", 0.25, "Greatest distance from the goal [m].", span),
         ("yaw_goal_tolerance", 0.25, "Of the heading there [rad]; not of robots that steer.", span),
         ("stateful", True, "Whether a place that was reached stays so.", None),

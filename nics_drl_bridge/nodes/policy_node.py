@@ -16,7 +16,7 @@ from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
 from nics_drl_bridge.nodes import conversions, qos, runner
-from nics_drl_bridge.nodes.follow_path import Drive, PathActions
+from nics_drl_bridge.nodes.follow_path import PathActions, Wish
 from nics_drl_bridge.nodes.goal_frames import GoalFrames
 from nics_drl_bridge.nodes.lifecycle import ManagedNode
 from nics_drl_bridge.nodes.nav2_parameters import ControllerParameters
@@ -164,12 +164,12 @@ class PolicyNode(ManagedNode):
             return np.zeros(3)
         return self._toward(self._goal).twist
 
-    def _toward(self, goal: Array) -> Drive:
+    def _toward(self, goal: Array) -> Wish:
         view = self._topics.view()
         if told := resume(self._policy, self._acted_ns * S_PER_NS):
             self.get_logger().warning(told, throttle_duration_sec=5.0)
         touched = bool(self._task.judge(view, {"goal": goal}).touched)
-        return Drive(self._asked(view, goal), touched)
+        return Wish(self._asked(view, goal), touched)
 
     def _asked(self, view: RobotView, goal: Array) -> Array:
         try:

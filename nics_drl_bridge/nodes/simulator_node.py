@@ -22,7 +22,6 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, LaserScan
 from std_srvs.srv import SetBool
 
-from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, BridgeError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array

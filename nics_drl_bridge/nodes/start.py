@@ -1,5 +1,6 @@
 """Entry points of the nodes: one sentence, not a traceback, where ROS 2 is missing."""
 
+import faulthandler
 import os
 import signal
 import sys
@@ -15,6 +16,7 @@ def start(node: str, args: list[str] | None = None) -> None:
     """Runs a node by its name and ends the process; what can't be used is one sentence, and 2."""
     for number in (signal.SIGINT, signal.SIGTERM):  # to import takes seconds
         signal.signal(number, lambda *_: os._exit(0))
+    faulthandler.enable()  # a crash of a library is told with the place in Python
     from nics_drl_bridge.nodes import ending, usage
 
     words = sys.argv[1:] if args is None else args[1:]

@@ -11,7 +11,7 @@ from nav_msgs.msg import Odometry
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
-from nics_drl_bridge.env.shot import Shot
+from nics_drl_bridge.env.snapshot import Snapshot
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.shapes import BODY
@@ -21,7 +21,7 @@ from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
 from nics_drl_bridge.nodes.runner import open_context
 from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.world_set import AnyWorld
-from nics_drl_bridge.watch.frame import Frame, Stage, Trail, WorldFrame
+from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame
 from nics_drl_bridge.watch.server import Request
 
 NAME, GATE = "nics_watch", ": gate"
@@ -44,7 +44,7 @@ class RosSource:
         bounds = (-half, -half, half, half)
         self._world = world or World(name="map", bounds=bounds, goal_distance=(0.0, 1.0))
         self._model, self.period_s, self._title = model, PERIOD_S, namespace or "live topics"
-        self._trail, self._goal = Trail(), np.zeros((0, 2))
+        self._trail, self._goal = Track(), np.zeros((0, 2))
         self._gate: str | None = None
         self._truth: Array | None = None
         self._new_lidar: LidarSpec | None = None
@@ -88,18 +88,18 @@ class RosSource:
                 self._gate = "" if fine else status.message
 
     def stage(self) -> Stage:
-        """See `show.Source`."""
+        """See `show.FrameSource`."""
         return Stage(self._title, self._model, (self._world,), frozenset({"goal"}))
 
     def frame(self) -> Frame:
-        """See `show.Source`."""
+        """See `show.FrameSource`."""
         with self._topics.lock:
             middleware, view = self._topics.middleware, self._topics.view()
             command = middleware.commanded
             covariance = middleware.estimator.covariance[None, :3, :3].copy()
             heard = sorted(middleware.cache.newest)
         pose = view.pose if self._truth is None else self._truth
-        shot = Shot(
+        shot = Snapshot(
             pose[None], view.ranges[None], np.zeros((0, BODY)), self._goal,
             estimates=view.pose[None], covariance=covariance, commands=command[None],
             gate=self._gate,

@@ -24,7 +24,9 @@ class WorldTopics:
     anybody subscribes it is not made. Robots are in namespaces, "" for one.
     """
 
-    def __init__(self, node: Node, world: Callable[[], DeviceWorld], namespaces: tuple[str, ...]) -> None:
+    def __init__(
+        self, node: Node, world: Callable[[], DeviceWorld], namespaces: tuple[str, ...]
+    ) -> None:
         self._node, self._world = node, world
         self._frame = str(node.get_parameter("map_frame").value)
         self._cell = float(node.get_parameter("map_resolution").value or 0.0)

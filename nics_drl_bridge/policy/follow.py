@@ -39,14 +39,14 @@ class Place(NamedTuple):
     """Place of a robot on its path."""
 
     ahead: Array  # (2,) sub-goal [m]
-    index: int  # of the nearest pose that the path was given by
+    nearest: int  # index of the nearest pose that the path was given by
     remaining: float  # length of the way that is left [m]
     distance: float  # straight to the end [m]
     left: float  # of the path, negative to its right [m]
     turned: float  # from the path's direction to the right [rad]
 
 
-class Path:
+class PlannedPath:
     """A path (P, 3) or (P, 2), and where on it the robot is. Raises ConfigError for none.
 
     Points that have been passed are not looked at again, so that a path may cross itself.

@@ -127,7 +127,8 @@ class Entities:
     def pose(self, entity: Entity) -> Array:
         """Returns x, y, heading (3,) of an entity in `map`."""
         if entity.robot >= 0:
-            return self.simulator.data.pose[0, entity.robot].copy()
+            own: Array = self.simulator.data.pose[0, entity.robot].copy()
+            return own
         part = np.array(entity.parts[0][1])
         return geometry.compose(
             self.bodies()[entity.slots[0], :3], geometry.between(part, np.zeros(3))
@@ -141,7 +142,8 @@ class Entities:
             return np.array([*geometry.rotate(body[:2], sensed.pose[2]), body[2]])
         if entity.motion is None:
             return np.zeros(3)
-        return self.simulator.data.velocity[0, entity.slots[0]].copy()
+        moving: Array = self.simulator.data.velocity[0, entity.slots[0]].copy()
+        return moving
 
     def outlines(self, entity: Entity) -> list[Array]:
         """Returns the convex hulls (V, 2) of an entity's shapes in its own frame [m]."""

@@ -318,7 +318,8 @@ class FastSimulator:
 
     def obstacles_of(self, n: int) -> Array:
         """(K, 7) those of world n."""
-        return self._obstacles(np.array([n]))[0]
+        there: Array = self._obstacles(np.array([n]))[0]
+        return there
 
     def _obstacles(self, worlds: Indices) -> Array:
         bodies = self.data.bodies[worlds, : self.sampler.count]

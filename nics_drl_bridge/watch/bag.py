@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from nics_drl_bridge.env.shot import Shot, hits_of
+from nics_drl_bridge.env.snapshot import Snapshot, hits_of
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import S_PER_NS, Array
@@ -18,7 +18,7 @@ from nics_drl_bridge.middleware.playback import Playback, in_order, played
 from nics_drl_bridge.recording.messages import commanded
 from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.world_set import AnyWorld
-from nics_drl_bridge.watch.frame import Frame, Stage, Trail, WorldFrame
+from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame
 from nics_drl_bridge.watch.server import Request
 
 CAN = frozenset({"pause", "speed", "step", "seek", "restart"})
@@ -44,14 +44,14 @@ class BagSource:
         self._now = 0
 
     def stage(self) -> Stage:
-        """See `show.Source`."""
+        """See `show.FrameSource`."""
         span = float(self._times[0]), float(self._times[-1])
         return Stage(self._path.name, self._model, (self._world,), CAN, span_s=span)
 
     def frame(self) -> Frame:
-        """See `show.Source`."""
+        """See `show.FrameSource`."""
         poses = np.array([shot.poses for shot in self._shots[: self._now + 1]])
-        step = -(-len(poses) // Trail.MOST)
+        step = -(-len(poses) // Track.MOST)
         ways = tuple(np.concatenate([poses[::step], poses[-1:]])[:, :, :2].transpose(1, 0, 2))
         state = "the end" if self._now == len(self._shots) - 1 else ""
         world = WorldFrame(self._shots[self._now], self._path.name, 0, ways, state)
@@ -63,7 +63,7 @@ class BagSource:
         return False
 
     def take(self, request: Request) -> bool:
-        """See `show.Source`."""
+        """See `show.FrameSource`."""
         seconds = request.value if request.kind == "seek" else 0.0
         if request.kind in ("seek", "restart"):
             self._now = max(0, bisect_right(self._times, seconds) - 1)
@@ -79,10 +79,14 @@ class BagSource:
 
 def _read(
     path: str | Path, model: SimulatorModel, topics: Mapping[str, str]
-) -> tuple[list[float], list[Shot], Any]:
+) -> tuple[list[float], list[Snapshot], Any]:
     """Times from the first on [s], shots, and the lidar of the bag."""
     messages = played(path, topics)
-    playback, stamps, shots = Playback(model, POSE in messages, any_lidar=True), [], list[Shot]()
+    playback, stamps, shots = (
+        Playback(model, POSE in messages, any_lidar=True),
+        [],
+        list[Snapshot](),
+    )
     middleware, every = playback.middleware, SCAN if SCAN in messages else ODOM
     command: Array | None = None
     for role, message in in_order(messages):
@@ -93,7 +97,7 @@ def _read(
             continue
         stamps.append(middleware.newest_ns or 0)
         view = middleware.view(stamps[-1])
-        shots.append(Shot(
+        shots.append(Snapshot(
             view.pose[None], view.ranges[None], np.zeros((0, BODY)), np.zeros((0, 2)),
             step=len(shots), estimates=view.pose[None],
             covariance=middleware.estimator.covariance[None, :3, :3].copy(),
@@ -105,7 +109,7 @@ def _read(
     return [(stamp - stamps[0]) * S_PER_NS for stamp in stamps], shots, playback.lidar
 
 
-def place_of(model: SimulatorModel, shots: list[Shot]) -> World:
+def place_of(model: SimulatorModel, shots: list[Snapshot]) -> World:
     """A field without walls that holds what was driven, and most of what was seen."""
     poses = np.concatenate([shot.poses[:, :2] for shot in shots])
     some = shots[:: max(1, len(shots) // 50)]

@@ -20,7 +20,7 @@ from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim.scenes import scaled
 from nics_drl_bridge.sim.world import Obstacles, World
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
-from nics_drl_bridge.watch.frame import Frame, Stage, Trail, WorldFrame
+from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame
 from nics_drl_bridge.watch.server import Request
 
 Env = gymnasium.Env[Any, Any]
@@ -36,7 +36,7 @@ class Lane:
     """One world in which episodes are driven, one after the other."""
 
     def __init__(self, make: Make, policy: str, world: AnyWorld, seed: int) -> None:
-        self._make, self._policy, self.trail = make, policy, Trail()
+        self._make, self._policy, self.trail = make, policy, Track()
         self.seed, self._native = seed, world
         self._open(policy, world)
         self.begin()
@@ -62,8 +62,8 @@ class Lane:
         begin(self._driver)
         self.state, self._over_s = "", 0.0
         if not options:  # otherwise the way so far is still that of this episode
-            self.time_s, self.trail = 0.0, Trail()
-        self.trail.add(self.env.shot().poses, 1)
+            self.time_s, self.trail = 0.0, Track()
+        self.trail.add(self.env.snapshot().poses, 1)
 
     def advance(self, command: NDArray[np.float64] | None) -> bool:
         """Advances one period under a command (C,), or that of the policy; True in a new env."""
@@ -75,7 +75,7 @@ class Lane:
         action = self._driver.act(self._seen) if command is None else self._action(command)
         self._seen, _, terminated, truncated, info = self._env.step(action)
         self.time_s += self.env.model.control_period
-        self.trail.add(self.env.shot().poses, 1)
+        self.trail.add(self.env.snapshot().poses, 1)
         if terminated or truncated:
             touched = "collision" if np.any(info["collision"]) else "time-out"
             self.state = "success" if np.all(info["is_success"]) else touched
@@ -116,7 +116,7 @@ class Lane:
     def add(self, shape: Shape, x: float, y: float) -> None:
         """Adds an obstacle [m]. Raises ConfigError where there is a robot, or no world."""
         reach = shape.radius + self.env.model.robot.footprint_radius
-        apart = np.linalg.norm(self.env.shot().poses[:, :2] - (x, y), axis=1)
+        apart = np.linalg.norm(self.env.snapshot().poses[:, :2] - (x, y), axis=1)
         if apart.min() <= reach:
             raise ConfigError(f"an obstacle at ({x:.2f} m, {y:.2f} m) touches the robot; move it.")
         self._rebuild(self._policy, Obstacles(shapes=(shape,), at=((x, y, 0.0),)))
@@ -127,7 +127,7 @@ class Lane:
 
     def _rebuild(self, policy: str, *more: Obstacles, emptied: bool = False) -> None:
         """Goes on from here in a new env: with another policy, or other obstacles."""
-        shot, kept = self.env.shot(), dict(vars(self))
+        shot, kept = self.env.snapshot(), dict(vars(self))
         world = standing(self.env, *more, emptied=emptied)
         try:
             self._open(policy, world)
@@ -139,7 +139,7 @@ class Lane:
 
     def frame(self, place: int) -> WorldFrame:
         """The world now; `place` is that of its first member."""
-        shot = self.env.shot()
+        shot = self.env.snapshot()
         name = f"{self.world.name}, episode {self.seed}"
         return WorldFrame(shot, name, place + shot.member, self.trail.ways, self.state)
 
@@ -150,7 +150,7 @@ class Lane:
 
 def standing(env: BridgeEnv, *more: Obstacles, emptied: bool = False) -> World:
     """The world of an env with its obstacles where they are now, or none, and more of them."""
-    shot = env.shot()
+    shot = env.snapshot()
     world, shapes, groups = env.world.members[shot.member], env.world.shapes, list(more)
     motions = [group.motion for group in world.obstacles for _ in range(group.counts[1])]
     for body, motion in zip(shot.bodies, motions, strict=False):
@@ -175,26 +175,27 @@ class EpisodeSource:
         self._command, self._by_hand, self._asked_s = 0.0 * robot.command_low, False, 0.0
 
     def stage(self) -> Stage:
-        """See `show.Source`."""
+        """See `show.FrameSource`."""
         robot, first = self.model.robot.name, self.lanes[0].world.name
         fitting = [name for name in shipped_policies() if name == robot]
         policies = dict.fromkeys([self._policy, *fitting, *POLICIES])
         worlds = dict.fromkeys([first, *shipped_worlds()])
         return Stage(
             f"{self._policy} in {', '.join(lane.world.name for lane in self.lanes)}", self.model,
-            tuple(lane.env.world for lane in self.lanes), CAN | ({"drive"} if self._drives else ()),
+            tuple(lane.env.world for lane in self.lanes),
+            CAN | frozenset({"drive"} if self._drives else ()),
             {"policy": list(policies), "world": list(worlds)},
             {"policy": self._policy, "world": first},
         )  # fmt: skip
 
     def frame(self) -> Frame:
-        """See `show.Source`."""
+        """See `show.FrameSource`."""
         sizes = [len(lane.env.world.members) for lane in self.lanes]
         worlds = [lane.frame(sum(sizes[:n])) for n, lane in enumerate(self.lanes)]
         return Frame(self.lanes[0].time_s, tuple(worlds))
 
     def advance(self) -> bool:
-        """Advances all worlds by one control period; see `show.Source`."""
+        """Advances all worlds by one control period; see `show.FrameSource`."""
         held = time.monotonic() - self._asked_s < HELD_S
         command = self._command if held else 0.0 * self._command
         given = command if self._by_hand else None
@@ -202,7 +203,7 @@ class EpisodeSource:
         return any(changed)
 
     def take(self, request: Request) -> bool:
-        """See `show.Source`."""
+        """See `show.FrameSource`."""
         lane = self.lanes[min(request.world, len(self.lanes) - 1)]
         if request.kind == "goal":
             lane.aim(request.x, request.y)

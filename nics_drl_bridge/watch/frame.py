@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nics_drl_bridge.env.shot import Shot
+from nics_drl_bridge.env.snapshot import Snapshot
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE, X, Y
 from nics_drl_bridge.lidar.maps import GridMap
@@ -44,7 +44,8 @@ class Stage:
         places = [_place(one, each.shapes) for each in self.worlds for one in each.members]
         return {
             "kind": "stage", "title": self.title, "can": sorted(self.can), "commands": commands,
-            "footprint": robot.footprint, "radius": robot.footprint_radius,
+            "sideways": robot.moves_sideways, "footprint": robot.footprint,
+            "radius": robot.footprint_radius,
             "lidar": {
                 "mount": lidar.mount, "first": lidar.angle_min, "step": lidar.angle_increment,
                 "far": lidar.range_max,
@@ -75,7 +76,7 @@ def _map(grid: GridMap) -> dict[str, Any]:
 class WorldFrame:
     """One world at one time."""
 
-    shot: Shot
+    shot: Snapshot
     name: str = ""
     place: int = 0  # in the `worlds` of the stage, member by member
     trails: tuple[Array, ...] = ()  # (T, 2) way of each robot in this episode [m]
@@ -127,7 +128,7 @@ class Frame:
         return {"kind": "frame", "time": self.time_s, "note": self.note, "worlds": worlds}
 
 
-class Trail:
+class Track:
     """The way of M robots in an episode, at most `MOST` points of each."""
 
     MOST = 600

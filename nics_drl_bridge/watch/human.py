@@ -1,9 +1,9 @@
 """The page of one env, for `render_mode="human"`."""
 
-from nics_drl_bridge.env.shot import Shot
+from nics_drl_bridge.env.snapshot import Snapshot
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.sim.world_set import AnyWorld
-from nics_drl_bridge.watch.frame import Frame, Stage, Trail, WorldFrame
+from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame
 from nics_drl_bridge.watch.server import PageServer
 from nics_drl_bridge.watch.show import PACE, Pace, open_page
 
@@ -16,11 +16,11 @@ class HumanView:
 
     def __init__(self, model: SimulatorModel, world: AnyWorld, fps: int) -> None:
         self._server, self._pace, self._period_s = PageServer(port=0), Pace(), 1.0 / fps
-        self._trail, self._frames = Trail(), 0
+        self._trail, self._frames = Track(), 0
         self._server.set_stage(Stage(world.name, model, (world,), PACE))
         open_page(self._server.url)
 
-    def draw(self, shot: Shot) -> None:
+    def draw(self, shot: Snapshot) -> None:
         """Shows a shot, and returns when the next one is due."""
         self._trail.add(shot.poses, shot.step)
         self._frames += 1

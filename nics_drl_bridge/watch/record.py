@@ -14,7 +14,7 @@ from PIL import Image
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.env.rendering import WorldPicture
-from nics_drl_bridge.env.shot import hits_of
+from nics_drl_bridge.env.snapshot import hits_of
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.extensions import missing
 from nics_drl_bridge.files import check_above, write_bytes
@@ -136,13 +136,15 @@ def _ring(pose: Any, radius: float, shape: Any) -> NDArray[np.float64]:
     """Closed outline (V + 1, 2) of a shape, or of a robot by its footprint, at a pose (3,)."""
     outline = getattr(shape, "footprint", None)
     if outline is None:
-        outline = getattr(shape, "outline", np.zeros((0, 2)))
+        outline = np.asarray(getattr(shape, "outline", np.zeros((0, 2))))
         outline = outline * (radius / shape.radius) if len(outline) else outline
     corners = np.array(outline, np.float64)
     if not len(corners):
         turns = np.linspace(0.0, 2.0 * np.pi, CORNERS, endpoint=False)
         corners = radius * np.stack([np.cos(turns), np.sin(turns)], axis=1)
-    return geometry.rotate(np.concatenate([corners, corners[:1]]), pose[2]) + pose[:2]
+    ring: NDArray[np.float64] = geometry.rotate(np.concatenate([corners, corners[:1]]), pose[2])
+    ring += np.asarray(pose)[:2]
+    return ring
 
 
 WRITERS: dict[str, Callable[[Path, Stage, Iterable[Frame], float], None]] = {

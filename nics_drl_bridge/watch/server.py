@@ -24,7 +24,7 @@ POLICY = "; ".join([  # nothing comes from elsewhere, and nothing goes there
 
 
 class Request(Schema):
-    """What a page asks for."""
+    """A request of a page."""
 
     kind: Literal[
         "goal", "obstacle", "clear", "drive", "policy", "world", "seed", "restart", "seek",

@@ -19,7 +19,7 @@ PACE = frozenset({"pause", "speed", "step"})
 Handle = Callable[[Request], None]
 
 
-class Source(Protocol):
+class FrameSource(Protocol):
     """Frames, and what can be done to where they come from."""
 
     period_s: float  # from one frame to the next, at a speed of 1 [s]
@@ -76,7 +76,7 @@ class Pace:
         return {"speed": self.speed, "paused": self.paused}
 
 
-def show(source: Source, server: PageServer) -> None:
+def show(source: FrameSource, server: PageServer) -> None:
     """Shows a source until the server is closed."""
     pace, shown_s = Pace(), 0.0
 

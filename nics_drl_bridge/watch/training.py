@@ -4,7 +4,7 @@ import time
 from typing import Protocol
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
-from nics_drl_bridge.watch.frame import Frame, Stage, Trail, WorldFrame
+from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame
 from nics_drl_bridge.watch.server import PageServer
 
 MOST_WORLDS = 9
@@ -25,7 +25,7 @@ class TrainingView:
         each = max(1, MOST_WORLDS // len(envs))
         sizes = [len(env.world.members) for env in envs]
         self._worlds = [  # with the place of the first member of their world set
-            (env, n, sum(sizes[:k]), Trail())
+            (env, n, sum(sizes[:k]), Track())
             for k, env in enumerate(envs[:MOST_WORLDS])
             for n in range(min(each, env.num_envs))
         ]
@@ -50,7 +50,7 @@ class TrainingView:
     def _frame(self) -> Frame:
         worlds = []
         for env, n, first, trail in self._worlds:
-            shot, name = env.shot(n), f"{env.world.name} {n}"
+            shot, name = env.snapshot(n), f"{env.world.name} {n}"
             worlds.append(WorldFrame(shot, name, first + shot.member, trail.ways))
         period_s = self._worlds[0][0].model.control_period
         return Frame(self._steps * period_s, tuple(worlds), self.note)

@@ -31,6 +31,12 @@ def test_options_that_do_not_fit_are_one_sentence(options, said, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_training_of_other_processes_can_not_be_watched(tmp_path):
+    done = nics("train", "--watch", "--engine", "ray", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "--watch --engine ray: worlds of other processes are not shown" in done.stderr
+
+
 def test_an_episode_is_written_to_its_end(tmp_path, monkeypatch):
     written = []
     monkeypatch.setattr(

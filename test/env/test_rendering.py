@@ -9,8 +9,8 @@ from robots import direct_model, field
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.env.shot import gate_of
 from nics_drl_bridge.env.sim_backend import SimBackend
+from nics_drl_bridge.env.snapshot import gate_of
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -72,9 +72,9 @@ def test_render_mode_human_shows_each_reset_and_step_on_the_viewer(monkeypatch, 
 def test_a_shot_tells_command_estimate_covariance_and_gate():
     shown = env(None, estimator=True)
     shown.reset(seed=0)
-    assert shown.shot().covariance is None
+    assert shown.snapshot().covariance is None
     shown.step(np.array([1.0, 0.0, 0.0], np.float32))
-    shot = shown.shot()
+    shot = shown.snapshot()
     assert shot.commands == pytest.approx(np.array([[2.0, 0.0, 0.0]]))
     assert np.all(np.linalg.eigvalsh(shot.covariance[0]) > 0.0)
     assert shot.estimates == pytest.approx(shot.poses, abs=0.05)

@@ -7,7 +7,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 
-from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.nodes.backends import DdsBackend
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
@@ -54,6 +54,11 @@ def test_a_whole_number_is_taken_for_a_floating_point_parameter(started):
     assert isinstance(node.get_parameter("rate").value, float)
     assert list(declare(node, "start", [0.0, 0.0, 0.0], "Pose.")) == [1.0, 2.0, 3.0]
     assert declare(node, "count", 1, "Of robots.") == 3
+
+
+def test_an_argument_that_ros_does_not_know_is_one_sentence(domain_id):
+    with pytest.raises(BackendError, match=r"ROS 2 knows no argument .*--wait.*; write them as in"):
+        open_context(["node", "--ros-args", "--wait"], domain_id)
 
 
 @pytest.mark.parametrize("value", ["0", "0.05", "11", ".nan", ".inf", "fast", "true", "[1.0]"])

@@ -9,7 +9,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.policy.follow import (
     GoalCheck,
     GoalChecker,
-    Path,
+    PlannedPath,
     ProgressCheck,
     ProgressChecker,
 )
@@ -18,30 +18,30 @@ CORNER = np.array([(0.0, 0.0, 0.0), (2.0, 0.0, math.pi / 2), (2.0, 2.0, math.pi)
 
 
 def test_the_sub_goal_lies_ahead_on_the_path():
-    place = Path(CORNER).locate(np.array([0.5, 0.1, 0.0]), 1.0)
+    place = PlannedPath(CORNER).locate(np.array([0.5, 0.1, 0.0]), 1.0)
     assert place.ahead == pytest.approx([1.5, 0.0], abs=0.05)
     assert place.remaining == pytest.approx(3.5, abs=0.05)
     assert place.distance == pytest.approx(math.hypot(1.5, 1.9))
-    assert place.index == 1  # the nearest of the given poses ahead
+    assert place.nearest == 1  # the nearest of the given poses ahead
 
 
 def test_near_the_end_the_sub_goal_is_the_end():
-    path = Path(CORNER)
+    path = PlannedPath(CORNER)
     for pose in ((1.0, 0.0, 0.0), (2.0, 0.5, 0.0), (2.0, 1.5, 0.0)):
         place = path.locate(np.array(pose), 1.0)
     assert place.ahead == pytest.approx([2.0, 2.0])
 
 
 def test_errors_have_the_signs_of_the_standard():
-    left = Path(CORNER).locate(np.array([0.5, 0.2, 0.3]), 1.0)
+    left = PlannedPath(CORNER).locate(np.array([0.5, 0.2, 0.3]), 1.0)
     assert left.left == pytest.approx(0.2)  # to the left of the path
     assert left.turned == pytest.approx(-0.3)  # turned to the left of its direction
-    assert Path(CORNER).locate(np.array([0.5, -0.2, -0.3]), 1.0).left == pytest.approx(-0.2)
+    assert PlannedPath(CORNER).locate(np.array([0.5, -0.2, -0.3]), 1.0).left == pytest.approx(-0.2)
 
 
 def test_a_path_that_comes_back_is_followed_to_its_turn_first():
     there_and_back = np.array([(0.0, 0.0), (5.0, 0.0), (0.0, 0.0)])
-    path = Path(there_and_back)
+    path = PlannedPath(there_and_back)
     assert path.locate(np.zeros(3), 1.0).remaining == pytest.approx(10.0)
     assert path.locate(np.array([0.5, 0.0, 0.0]), 1.0).remaining == pytest.approx(9.5, abs=0.05)
 
@@ -53,17 +53,17 @@ def test_a_path_that_comes_back_is_followed_to_its_turn_first():
 )  # fmt: skip
 def test_what_is_no_path_is_refused(poses, why):
     with pytest.raises(ConfigError, match=why):
-        Path(poses)
+        PlannedPath(poses)
 
 
 def test_a_path_of_one_pose_is_its_own_end():
-    place = Path(CORNER[2:]).locate(np.array([2.0, 1.0, 0.0]), 1.0)
+    place = PlannedPath(CORNER[2:]).locate(np.array([2.0, 1.0, 0.0]), 1.0)
     assert (place.remaining, place.distance) == (0.0, 1.0)
     assert place.ahead == pytest.approx([2.0, 2.0])
 
 
 def arrive(checker, *poses):
-    path, turn = Path(CORNER), None
+    path, turn = PlannedPath(CORNER), None
     for pose in ((1.0, 0.0, 0.0), (2.0, 0.5, 0.0), *poses):
         turn = checker.turn_left(path.locate(np.array(pose), 1.0), np.array(pose), path.end)
     return turn
@@ -86,7 +86,7 @@ def test_a_place_that_was_reached_stays_so_if_the_check_is_stateful():
 
 def test_a_loop_does_not_end_where_it_begins():
     loop = np.array([(0.0, 0.0, 0.0), (2.0, 0.0, 0.0), (2.0, 2.0, 0.0), (0.0, 0.1, 0.0)])
-    path, checker = Path(loop), GoalChecker(GoalCheck(), turns=False)
+    path, checker = PlannedPath(loop), GoalChecker(GoalCheck(), turns=False)
     assert checker.turn_left(path.locate(np.zeros(3), 1.0), np.zeros(3), path.end) is None
 
 

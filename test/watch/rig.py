@@ -16,7 +16,7 @@ import pytest
 from robots import direct_model, field
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
-from nics_drl_bridge.env.shot import Shot
+from nics_drl_bridge.env.snapshot import Snapshot
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.watch.episode import EpisodeSource
 from nics_drl_bridge.watch.server import PageServer
@@ -29,11 +29,11 @@ needs_chromium = pytest.mark.skipif(
 )
 
 
-def shot(**changes) -> Shot:
+def shot(**changes) -> Snapshot:
     """One robot at (1 m, 0 m), heading 90 degrees, amid 72 beams of 1 m; one disc."""
     pose = np.array([[1.0, 0.0, np.pi / 2]])
     body = np.array([[1.0, 1.5, 0.0, 1.0, 0.0, 0.25, 0.0]])
-    known = Shot(pose, np.ones((1, 72), np.float32), body, np.array([[2.0, 0.5]]))
+    known = Snapshot(pose, np.ones((1, 72), np.float32), body, np.array([[2.0, 0.5]]))
     return replace(known, **changes)
 
 
@@ -150,7 +150,8 @@ class Browser:
         until(lambda: self.ask("!!(window.nics && nics.counters.draws > 2)"), "a drawn frame")
 
     def ask(self, expression: str):
-        done = self.call("Runtime.evaluate", expression=expression, returnByValue=True)
+        how = {"returnByValue": True, "awaitPromise": True}
+        done = self.call("Runtime.evaluate", expression=expression, **how)
         assert "exceptionDetails" not in done, done["exceptionDetails"]
         return done["result"].get("value")
 

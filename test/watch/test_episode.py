@@ -19,12 +19,12 @@ def driven():
 
 
 def bodies(made):
-    shot = made.lanes[0].env.shot()
+    shot = made.lanes[0].env.snapshot()
     return shot.bodies[shot.bodies[:, RADIUS] > 0.0]
 
 
 def pose(made):
-    return made.lanes[0].env.shot().poses[0]
+    return made.lanes[0].env.snapshot().poses[0]
 
 
 def free_spot(made):

@@ -8,7 +8,7 @@ import pytest
 from robots import direct_model, field
 
 from nics_drl_bridge.sim.world_set import load_worlds
-from nics_drl_bridge.watch.frame import Frame, Stage, Trail, WorldFrame, thousandths
+from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame, thousandths
 from watch.rig import shot
 
 
@@ -49,12 +49,12 @@ def test_the_ellipse_holds_95_percent_of_the_positions():
 
 
 def test_a_trail_begins_anew_with_each_episode_and_never_grows_without_end():
-    trail = Trail()
-    for step in range(3 * Trail.MOST):
+    trail = Track()
+    for step in range(3 * Track.MOST):
         trail.add(np.array([[step * 0.01, 0.0, 0.0]]), step)
     (way,) = trail.ways
-    assert len(way) <= Trail.MOST
-    assert way[-1, 0] == pytest.approx(0.01 * (3 * Trail.MOST - 1))
+    assert len(way) <= Track.MOST
+    assert way[-1, 0] == pytest.approx(0.01 * (3 * Track.MOST - 1))
     trail.add(np.zeros((1, 3)), 0)
     assert len(trail.ways[0]) == 1
 

@@ -37,7 +37,7 @@ def test_the_pace_of_the_page_holds_the_program_until_the_next_step():
     with closing(view), closing(Client(view._server)):
         until(lambda: view._server.watched, "the page")
         view._pace.take(Request(kind="pause", on=True))
-        drawing = threading.Thread(target=view.draw, args=(env.shot(),))
+        drawing = threading.Thread(target=view.draw, args=(env.snapshot(),))
         drawing.start()
         drawing.join(0.5)
         assert drawing.is_alive()

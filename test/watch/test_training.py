@@ -56,7 +56,7 @@ def test_nothing_is_drawn_or_sent_while_nobody_looks(server, monkeypatch):
     envs = Envs(2)
     view = TrainingView(server, envs)
     monkeypatch.setattr(server, "publish", lambda *_: pytest.fail("nobody looks"))
-    monkeypatch.setattr(envs.envs[0], "shot", lambda _: pytest.fail("nobody looks"))
+    monkeypatch.setattr(envs.envs[0], "snapshot", lambda _: pytest.fail("nobody looks"))
     for _ in range(3):
         envs.step()
         view()

@@ -63,7 +63,7 @@ class Server:
     @property
     def has_world(self) -> bool:
         """True unless the world was unloaded."""
-        return self._simulation.state != WITHOUT_WORLD
+        return bool(self._simulation.state != WITHOUT_WORLD)
 
     def _offer(self, name: str, reply: Callable[[Any, Any], Any]) -> None:
         kind = conversions.message_type(f"{PACKAGE}/srv/{name}")

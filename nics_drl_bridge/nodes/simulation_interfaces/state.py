@@ -81,7 +81,7 @@ class Simulation:
             raise RefusalError(codes.INCORRECT_TRANSITION, f"{told}, or load or unload a world.")
         if wanted == QUITTING:
             self.halt(QUITTING)
-            runner.steadily(self._host, GOODBYE_S, self._host.context.try_shutdown)  # type: ignore[arg-type]
+            runner.steadily(self._host, GOODBYE_S, self._host.context.try_shutdown)
             return
         if state in (WITHOUT_WORLD, QUITTING):
             raise RefusalError(codes.INCORRECT_TRANSITION, NO_WORLD)

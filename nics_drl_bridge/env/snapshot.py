@@ -1,4 +1,4 @@
-"""Shot: all that a picture of one world shows at one time."""
+"""Snapshot: all that a picture of one world shows at one time."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Shot:
+class Snapshot:
     """One world with its M robots; what nobody knows is None."""
 
     poses: Array  # (M, 3) x [m], y [m], heading [rad] in `map`; the truth where it is known
@@ -35,7 +35,7 @@ def goals_of(memory: Mapping[str, NDArray[Any]]) -> Array:
 
 
 def gate_of(info: Mapping[str, Any]) -> str | None:
-    """State of the gate by the `info` of a step, see `Shot.gate`; None without a gate."""
+    """State of the gate by the `info` of a step, see `Snapshot.gate`; None without a gate."""
     if "stopped_by" not in info:
         return None
     return str(info["stopped_by"]) or ("shield" if info["shielded"] else "")
