@@ -30,7 +30,7 @@ def text_of(page: Path) -> str:
 
 def command_lines(text: str) -> list[str]:
     """Lines that begin with `nics` or `make`, in blocks and between backticks."""
-    plain = FENCED.sub("", text)
+    plain = re.sub(r"\\\n\s+", "", FENCED.sub("", text))
     lines = [line.strip() for block in INDENTED.findall(plain) for line in block.splitlines()]
     lines += INLINE.findall(plain)
     return [line for line in lines if line.startswith(("nics ", "make "))]
