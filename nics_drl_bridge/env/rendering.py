@@ -52,8 +52,8 @@ class WorldPicture:
             axes.plot(*np.transpose(trail), color=ROBOTS[m % len(ROBOTS)], linewidth=1.5)
         for m, (pose, scan) in enumerate(zip(shot.poses, shot.ranges, strict=True)):
             self._robot(axes, pose, scan, ROBOTS[m % len(ROBOTS)])
-        self._canvas.draw()  # type: ignore[no-untyped-call]
-        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()  # type: ignore[no-untyped-call]
+        self._canvas.draw()
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
     def _robot(self, axes: Axes, pose: Array, ranges: NDArray[np.float32], colour: str) -> None:
         lidar, robot = self._model.lidar, self._model.robot
