@@ -290,9 +290,9 @@ benchmark: setup ## run every benchmark, write benchmarks/results.json: make ben
 tables: setup ## make the tables of README and docs from benchmarks/results.json
 	@cd benchmarks && ../$(BIN)/python -m measuring.tables
 
-docs: setup ## build the site of docs/ into build/docs: open build/docs/index.html
+docs: setup ## build the site of docs/ into build/docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
-	@echo "open build/docs/index.html"
+	@echo "to read and search it: $(BIN)/python -m http.server -b 127.0.0.1 -d build/docs"
 
 reference: setup ## make docs/reference/ from the schemas of the files and from the commands
 	$(BIN)/python docs/site/reference.py

@@ -13,8 +13,9 @@ from nbconvert import MarkdownExporter
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "nics_drl_bridge"
 AT_THE_TOP = ("CHANGELOG.md", "CONTRIBUTING.md")
-ASKED = "https://unpkg.com/iframe-worker/shim"  # the theme's, without which pages from the disk
-SHIM = "assets/iframe-worker.js"  # have no workers, as the search is one; and our copy of it
+# The theme's for pages from the disk, which have no workers, as its search is one; served pages do
+# without, and nothing here is loaded from elsewhere.
+SHIM = re.compile(r"<script[^>]*unpkg\.com/iframe-worker[^>]*></script>")
 NAMED = re.compile(r"(?<!\[)`docs/(?P<page>[\w/]+\.md)`")
 LINK = re.compile(r"\[(?P<text>[^\]]*)\]\((?P<to>[^)#\s:]+)(?P<anchor>#[^)]*)?\)")
 
@@ -56,13 +57,13 @@ def on_page_markdown(markdown: str, page: Any, config: MkDocsConfig, files: File
 
 
 def on_post_page(output: str, page: Any, config: MkDocsConfig) -> str:
-    """Takes our copy of the shim."""
-    return output.replace(ASKED, relpath(SHIM, str(PurePosixPath(page.file.dest_uri).parent)))
+    """Takes out what would be loaded from elsewhere."""
+    return SHIM.sub("", output)
 
 
 def on_post_template(output_content: str, template_name: str, config: MkDocsConfig) -> str:
-    """Takes our copy of the shim."""
-    return output_content.replace(ASKED, SHIM)
+    """Takes out what would be loaded from elsewhere."""
+    return SHIM.sub("", output_content)
 
 
 def rooms() -> list[str]:
