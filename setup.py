@@ -55,8 +55,8 @@ EXTRAS = {
     # Isaac's runner of policy bundles, which the tests hold ours against; reading and writing them
     # needs `deploy` alone. A library of its pictures has wheels for this platform only.
     "leapp": [f"leapp>=0.7.2; {ROS_WHEELS_EXIST}"],
-    # The page of `nics watch` is websockets alone; files of it need the others.
-    "view": ["imageio-ffmpeg>=0.5", "rerun-sdk>=0.24", "websockets>=14"],
+    "view": ["websockets>=14"],
+    "video": ["imageio-ffmpeg>=0.5", "rerun-sdk>=0.24"],
     # The site of docs/, and what runs and shows its notebooks.
     "docs": [
         "ipykernel>=6.29",
@@ -85,7 +85,7 @@ EXTRAS = {
 }
 # All that a user may want. ROS 2 comes from a ROS 2 installation, or from `ros` beside this.
 EXTRAS["all"] = [
-    one for name in ("bags", "deploy", "mujoco", "multi", "train", "view") for one in EXTRAS[name]
+    one for name in ("bags", "deploy", "mujoco", "multi", "train", "video", "view") for one in EXTRAS[name]
 ]
 # What `make setup` installs: where a ROS 2 is sourced, and where none is.
 APART = ("ros", "distributed", "all")

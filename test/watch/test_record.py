@@ -40,7 +40,7 @@ def test_a_gif_has_each_frame_and_moves(made, tmp_path):
 
 
 def test_an_mp4_has_each_frame(made, tmp_path):
-    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'view'")
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
     path = tmp_path / "episode.mp4"
     write(path, made.stage(), frames(made, 6), 10.0)
     assert [file.name for file in tmp_path.iterdir()] == ["episode.mp4"]
@@ -49,7 +49,7 @@ def test_an_mp4_has_each_frame(made, tmp_path):
 
 
 def test_a_recording_of_rerun_holds_robot_scan_goal_and_commands(made, tmp_path):
-    pytest.importorskip("rerun", reason="needs the extra 'view'")
+    pytest.importorskip("rerun", reason="needs the extra 'video'")
     path = tmp_path / "episode.rrd"
     write(path, made.stage(), frames(made), 10.0)
     assert [file.name for file in tmp_path.iterdir()] == ["episode.rrd"]
@@ -81,7 +81,7 @@ def test_a_missing_library_is_one_sentence(made, tmp_path, monkeypatch, suffix, 
 
 
 def test_a_failure_leaves_no_part_of_a_file(made, tmp_path):
-    pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'view'")
+    pytest.importorskip("imageio_ffmpeg", reason="needs the extra 'video'")
 
     def broken():
         yield made.frame()
