@@ -67,11 +67,16 @@ def check_reset(seed: Any, options: Any, worlds: int = 1) -> None:
 def override(
     memory: dict[str, NDArray[Any]], options: Mapping[str, Any] | None, *of_env: str
 ) -> None:
-    """Writes values of `reset(options=...)` into all rows of the memory arrays that they name."""
+    """Writes values of `reset(options=...)` into all rows of the memory arrays that they name.
+
+    Options `of_env` are the env's own, also where a task remembers something by the same name.
+    """
     for name, value in (options or {}).items():
+        if name in of_env:
+            continue
         if name in memory:
             give(memory[name], name, value)
-        elif name not in of_env:
+        else:
             valid = {*memory, *of_env}
             raise ConfigError(f"unknown reset option {name!r}; {nearest(str(name), valid)}")
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from robots import direct_model
 
-from nics_drl_bridge.commands import demo_run as learning
+from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.demo_run import (
     DemoEpisodes,
     DemoPlan,
@@ -28,7 +28,7 @@ from nics_drl_bridge.robot.spec import load_robot
 @pytest.fixture
 def without_torch(monkeypatch):
     monkeypatch.setattr(
-        learning, "find_spec", lambda name: None if name == "torch" else find_spec(name)
+        extensions, "find_spec", lambda name: None if name == "torch" else find_spec(name)
     )
 
 

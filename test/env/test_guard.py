@@ -235,7 +235,7 @@ def test_everything_that_an_env_calls_was_thrown_from():
     """The property above would be empty where nothing passes through the fault."""
     FAULT.now, names = Fault(), set()
     for whole in (True, False):
-        env = single(Robot(), whole, "rgb_array")
+        env = single(Robot(), whole, "human")  # the page alone is closed
         env._picture = Picture()
         env.reset(seed=0)
         env.step(AHEAD)
@@ -248,10 +248,10 @@ def test_everything_that_an_env_calls_was_thrown_from():
 
 def test_a_picture_that_cant_be_closed_keeps_no_backend_open():
     FAULT.now = Fault()
-    env = single(Robot(), True, "rgb_array")
+    env = single(Robot(), True, "human")
+    env._picture = Picture()
     env.reset(seed=0)
     env.step(AHEAD)
-    env._picture = Picture()
     FAULT.now = Fault(1)
     with pytest.raises(ValueError, match="thrown"):
         env.close()

@@ -5,17 +5,24 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
+from PIL import ImageColor
 from robots import direct_model, field
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.env.bridge_env import BridgeEnv
+from nics_drl_bridge.env.rendering import ROBOTS
 from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.env.snapshot import gate_of
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot.spec import RobotSpec
 
-BLUE = np.array([0x1F, 0x6F, 0xB2])
+
+def pixel(colour):
+    return np.array(ImageColor.getrgb(colour))
+
+
+BLUE = pixel(ROBOTS[0])
 
 
 def env(mode, **arguments):
@@ -46,8 +53,8 @@ def test_every_robot_of_a_team_is_drawn():
     shown = env("rgb_array", task="cooperative_reaching")
     shown.reset(seed=1)
     picture = shown.render().reshape(-1, 3).astype(int)
-    for colour in (BLUE, [0x2F, 0x85, 0x5A], [0x7A, 0x4F, 0xA3]):
-        assert (np.abs(picture - colour) < 3).all(axis=-1).sum() > 100
+    for colour in ROBOTS[:3]:
+        assert (np.abs(picture - pixel(colour)) < 3).all(axis=-1).sum() > 100
 
 
 @pytest.mark.parametrize("method", ["reset", "step"])

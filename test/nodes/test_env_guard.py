@@ -133,6 +133,7 @@ def picture_fails(env):
 
 
 def close_fails(env):
+    env.unwrapped.render_mode = "human"  # whose page is all that is closed
     env.unwrapped._picture = SimpleNamespace(close=lambda: 1 / 0)
     env.close()
 

@@ -5,9 +5,11 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageColor
 
+from nics_drl_bridge.env.rendering import ROBOTS
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.style import GOAL
 from nics_drl_bridge.watch.record import beside, check_file, write
 from watch.rig import source
 
@@ -35,8 +37,8 @@ def test_a_gif_has_each_frame_and_moves(made, tmp_path):
             shown.append(np.asarray(image.convert("RGB"), int))
     assert shown[0].shape == (500, 500, 3)
     assert np.abs(shown[0] - shown[3]).max() > 50
-    for colour in ([0x1F, 0x6F, 0xB2], [0xF2, 0xC1, 0x4E]):  # of robot and goal, exactly
-        assert (shown[0] == colour).all(axis=-1).sum() > 20
+    for colour in (ROBOTS[0], GOAL):  # exactly
+        assert (shown[0] == ImageColor.getrgb(colour)).all(axis=-1).sum() > 20
 
 
 def test_an_mp4_has_each_frame(made, tmp_path):
@@ -76,7 +78,7 @@ def test_an_unknown_kind_of_file_is_one_sentence(tmp_path, name):
 @pytest.mark.parametrize(("suffix", "module"), [("mp4", "imageio_ffmpeg"), ("rrd", "rerun")])
 def test_a_missing_library_is_one_sentence(made, tmp_path, monkeypatch, suffix, module):
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(ConfigError, match=r"pip install 'nics_drl_bridge\[view\]'"):
+    with pytest.raises(ConfigError, match=r"pip install 'nics_drl_bridge\[video\]'"):
         write(tmp_path / f"episode.{suffix}", made.stage(), frames(made), 10.0)
 
 
