@@ -1,5 +1,6 @@
 """Backends of an env: the fast simulator in this process, those by name, and user-defined ones."""
 
+import math
 from inspect import signature
 from typing import Any
 
@@ -16,6 +17,12 @@ from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 Array = NDArray[np.float64]
+
+
+def _sent(pose: Array) -> Array:
+    """Returns a pose (3,) as it comes out of a message, whose quaternion rounds the heading."""
+    z, w = math.sin(float(pose[2]) / 2.0), math.cos(float(pose[2]) / 2.0)
+    return np.array([pose[0], pose[1], math.atan2(2.0 * (w * z), 1.0 - 2.0 * (z * z))])
 
 
 class SimBackend:
@@ -93,7 +100,7 @@ class SimBackend:
             return RobotView(odom, twist, ranges, now * 1e-9, 0.0, 0.0, sensed)
         views = []
         for m, middleware in enumerate(self._middlewares):
-            middleware.odometry(now, now, data.odom[0, m].copy(), data.twist[0, m].copy())
+            middleware.odometry(now, now, _sent(data.odom[0, m]), data.twist[0, m].copy())
             middleware.scan(now, now, data.ranges[0, m].copy())
             for name, readings in self.simulator.readings.items():
                 middleware.sense(name, now, now, readings[0, m].copy())

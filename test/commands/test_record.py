@@ -100,7 +100,7 @@ def test_the_summary_tells_each_command_and_the_next_step():
     drive = record(CAR, np.random.default_rng(0), duration=30.0)
     measured, speed, steering, after = model.drive_summary(drive, given)
     assert measured.startswith("measured: a path of ")
-    assert speed.startswith("speed_command: moved from -0.5")
+    assert speed.startswith("speed_command: moved from -0.4")
     assert "on its own" in steering
     assert after == "next: nics generate runs/drive.npz --robot ackermann --out drive_model"
 

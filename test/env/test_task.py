@@ -61,7 +61,7 @@ def test_a_task_from_a_file_passes_the_checker_and_steps_alike_alone_and_in_a_ve
 
 def test_the_own_tasks_terms_stand_in_info_and_sum_to_the_reward():
     env = gymnasium.make(TASK, model=direct_model(), world=field(), task=PATROL)
-    env.reset(seed=0, options={"start": (0.0, 0.0, 0.0), "places": [[1.0, 0.0], [0.0, 0.0]]})
+    env.reset(seed=0, options={"start": (0.0, 0.0, 0.0), "goal": (1.0, 0.0)})
     arrivals, ahead = 0, np.array([0.5, 0.0, 0.0], np.float32)
     for _ in range(40):
         back = arrivals % 2 == 1
@@ -126,9 +126,9 @@ def test_a_task_of_a_module_that_is_not_there_is_one_sentence():
 
 def test_the_discrete_actions_are_the_papers_drives():
     """efc-robot/MultiVehicleEnv, basic.py: stop, then ahead and back, each straight and turning."""
-    car = load_robot("ackermann")  # it can't reverse: speed from 0 to 1
+    car = load_robot("ackermann")  # speed from -0.5 to 1
     assert discrete_commands(car).tolist() == [
-        [0, 0], [1, 0], [1, 0.5], [1, -0.5], [0, 0], [0, 0.5], [0, -0.5],
+        [0, 0], [1, 0], [1, 0.5], [1, -0.5], [-0.5, 0], [-0.5, 0.5], [-0.5, -0.5],
     ]  # fmt: skip
     mecanum = discrete_commands(load_robot("mecanum"))
     assert mecanum.shape == (9, 3)
@@ -147,7 +147,9 @@ def test_a_discrete_action_gives_its_command_for_one_robot_and_for_many():
 
 
 def test_a_car_by_turn_rates_does_not_learn_to_steer_at_rest():
-    steering = load_robot("ackermann")
+    car = load_robot("ackermann")
+    ahead_only = car.command[0].model_copy(update={"min": 0.0})
+    steering = car.model_copy(update={"command": (ahead_only, *car.command[1:])})
     turning = steering.model_copy(update={"angular_is": "turn_rate"})
     ahead, at_rest = [[0.0, 0.6], [-1.0, 0.6]]  # actions; the car's least speed is 0
     for robot, angle in ((steering, 0.3), (turning, 0.0)):

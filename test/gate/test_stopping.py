@@ -39,7 +39,7 @@ def test_a_shipped_robot_has_measured_values_and_room_of_its_own(robot):
 
 def test_the_outline_of_a_robot_that_has_one_is_swept():
     assert shield_of("jackal")[0].outline == load_robot("jackal").footprint
-    assert shield_of("mecanum")[0].outline == ()
+    assert shield_of("differential")[0].outline == ()
 
 
 def test_what_is_given_goes_before_the_file():

@@ -294,7 +294,7 @@ def test_a_command_is_limited_to_what_the_robot_may_do(robot):
     robot.wish = (9.0, 0.0, 4.0)
     robot.gets(1.0, 0.0, 0.5)
     robot.wish = (-9.0, 0.0, -4.0)
-    robot.gets(0.0, 0.0, -0.5)
+    robot.gets(-0.5, 0.0, -0.5)
 
 
 def test_a_command_that_is_far_out_of_range_becomes_zero(robot):

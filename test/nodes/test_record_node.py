@@ -135,15 +135,15 @@ def test_leaving_the_bound_stops_the_robot(launch, meet, domain_id, tmp_path):
     robot, out = FakeRobot(meet(domain_id)), tmp_path / "drive.npz"
     node = launch("record_node", domain_id, out=str(out), bound=1.5)
     robot.until(lambda: robot.driven, "it drives")
-    robot.pose = [3.0, -2.0 + 1.3, 0.0]  # still inside with its radius of 0.15 m
+    robot.pose = [3.0, -2.0 + 1.2, 0.0]  # still inside with its radius of 0.26 m
     known = len(robot.heard)
     robot.until(lambda: len(robot.heard) > known + 10, "it goes on")
     assert code_of(node) is None
-    robot.pose = [3.0, -2.0 + 1.36, 0.0]
+    robot.pose = [3.0, -2.0 + 1.26, 0.0]
     robot.until(lambda: code_of(node) is not None, "it ends")
     robot.peer.until(lambda: robot.heard[-1] == Twist(), "zero")
     assert code_of(node) == 2
-    assert "left its circle of 1.5 m, at x 0.00, y 1.36 m from the start" in said(node)
+    assert "left its circle of 1.5 m, at x 0.00, y 1.26 m from the start" in said(node)
     assert seconds(out) > 0.5
 
 

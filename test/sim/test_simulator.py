@@ -71,7 +71,7 @@ def test_the_same_seeds_give_the_same_bits_in_another_simulator(renderer):
 def test_a_world_gives_the_same_bits_in_a_batch_of_any_size(robot, batch):
     model = noisy_model() if robot == "direct" else builtin_model(robot)
     radius = RADIUS if robot == "direct" else model.robot.footprint_radius
-    world = field(4.0, obstacles=[circles(3, (radius,))])
+    world = field(3.0 if robot == "mecanum" else 4.0, obstacles=[circles(3, (radius,))])
     commands = random_commands(model, 25, batch, 1)
     together = drive(FastSimulator(model, world, batch), range(batch), commands)
     single = FastSimulator(model, world)
