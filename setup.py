@@ -85,7 +85,9 @@ EXTRAS = {
 }
 # All that a user may want. ROS 2 comes from a ROS 2 installation, or from `ros` beside this.
 EXTRAS["all"] = [
-    one for name in ("bags", "deploy", "mujoco", "multi", "train", "video", "view") for one in EXTRAS[name]
+    one
+    for name in ("bags", "deploy", "mujoco", "multi", "train", "video", "view")
+    for one in EXTRAS[name]
 ]
 # What `make setup` installs: where a ROS 2 is sourced, and where none is.
 APART = ("ros", "distributed", "all")
