@@ -189,7 +189,7 @@ def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
             given = place, policy, name, order.world, seeds, logs
             runs[place] = drive_in(*given, on_episode, say, under)
         evaluated.append(judged(policy, runs, model, world, order.out, PANELS))
-    write_evaluation(order, name, model, evaluated)
+    write_evaluation(replace(order, conditions=under), name, model, evaluated)
     return evaluated
 
 
@@ -337,7 +337,7 @@ def drive_vehicle(
         starts = [(one.seed, {"start": one.path[0], "goal": one.goal}) for one in episodes]
         again = [drive(env, driver, *each) for each in starts]
     made = judged(policy, {VEHICLE: episodes, FAST: again}, model, world, order.out)
-    write_evaluation(order, name, model, [made])
+    write_evaluation(replace(order, conditions=under), name, model, [made])
     return made
 
 

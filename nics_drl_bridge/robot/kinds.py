@@ -30,6 +30,7 @@ from nics_drl_bridge.robot.spec import (
 from nics_drl_bridge.robot.template import Template
 
 BEYOND = 0.01  # share of a limit by which rounded figures may lie beyond it
+MISSPELT = 0.8  # least likeness of a misspelt parameter; other parameters' are less alike
 MOST_VARIED = 6
 AT_ONCE_S = 1e-9  # lag of a robot whose commands are what its wheels do
 T = TypeVar("T")
@@ -200,7 +201,9 @@ def _made(spec: RobotSpec, make: Callable[[RobotKind], T]) -> T:
         return make(kind)
     except KeyError as error:
         needed = f"the {spec.textbook} kinematics need the parameter {error}"
-        near = difflib.get_close_matches(str(error.args[0]), spec.parameters, n=1)
+        usual = {*kind.template.parameters, *kind.template.lengths}  # no slips of the pen
+        own = [name for name in spec.parameters if name not in usual]
+        near = difflib.get_close_matches(str(error.args[0]), own, n=1, cutoff=MISSPELT)
         fix = f"is {near[0]!r} it?" if near else "add it under `parameters:`."
         raise ConfigError(f"{robot}: {needed}; {fix}") from None
 

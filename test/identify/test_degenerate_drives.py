@@ -243,7 +243,7 @@ def test_a_whole_mirror_image_is_told(car):
 def test_commands_beyond_the_limits_are_held_there_and_told(differential):
     commands = random_commands(differential) * [3.0, 1.5]
     found = identify(driven(differential, commands), differential)
-    assert said(found, "forward_command was beyond the robot's limits, 0 to 1 m/s")
+    assert said(found, "forward_command was beyond the robot's limits, -0.5 to 1 m/s")
     terms = found.model.named.terms
     assert terms["d_left_wheel"]["left_wheel"] == pytest.approx(-9.06, abs=0.1)  # dt is 20 ms
     assert found.fit.r2[3:].min() > 0.999

@@ -124,10 +124,11 @@ def test_a_pose_that_jumps_once_for_good_splits_the_drive_and_is_told(car):
 
 
 class StraightFirst:
-    """Draws commands of a car that turns only in the last third of a drive."""
+    """Draws commands of a car that never backs, and turns only in the last third of a drive."""
 
     def uniform(self, low, high, size):
-        held = np.random.default_rng(0).uniform(low, high, size)
+        ahead = np.maximum(low, [0.0, -np.inf])
+        held = np.random.default_rng(0).uniform(ahead, high, size)
         held[: 2 * len(held) // 3 + 1, 1] = 0.0
         return held
 

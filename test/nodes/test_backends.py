@@ -261,7 +261,7 @@ def test_the_executor_rests_only_for_a_caller_that_waits_and_now_has_all():
         return serialize_message(message)
 
     worked, got = [], []
-    mail = _Mailbox(("odom", "scan"), lambda stamp, *_: worked.append(stamp))
+    mail = _Mailbox(("odom", "scan"), lambda stamp, *_: worked.append(stamp), slack_ns=0)
     assert mail.put("odom", stamped(1)) is mail.put("scan", stamped(1)) is None
     caller = threading.Thread(target=lambda: got.append(mail.wait(2 * NS_PER_S, TIMEOUT_S)))
     caller.start()

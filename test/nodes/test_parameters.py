@@ -63,7 +63,8 @@ def test_help_tells_the_topics_and_services_of_a_node(node):
         # A drive speaks once somebody listens.
         assert topics or (name, told) == ("record_node", facts.publishes)
     services = {service for service, _ in made.get_service_names_and_types_by_node(*place)}
-    assert {each.replace("~", f"/{made.get_name()}") for each in facts.services} <= services
+    always = {each for each in facts.services if "(" not in each}  # whatever is installed
+    assert {each.replace("~", f"/{made.get_name()}") for each in always} <= services
 
 
 @pytest.mark.parametrize(

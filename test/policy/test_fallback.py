@@ -43,6 +43,11 @@ def task_of(robot, **options):
     return Navigation(load_robot(robot), lidar(beams=360), **options)
 
 
+def front_of(robot):
+    """How far a robot reaches ahead of its origin [m]."""
+    return max(x for x, _ in robot.footprint or [(robot.footprint_radius, 0.0)])
+
+
 def before_a_wall(task, *distances, speed=0.0):
     """Observations (N, O) of a robot in front of walls at distances from its origin [m]."""
     cosine = np.cos(task.lidar.angles)
@@ -135,10 +140,11 @@ def test_an_action_is_admissible_as_long_as_its_stop_ends_before_the_margin(robo
         for _ in range(round(time_s / kinematics.dt)):
             pose, state = kinematics.step(pose, state, given)
     way = waited + np.linalg.norm((pose - start)[:2])
-    outline = max(x for x, _ in task.robot.footprint or [(task.robot.footprint_radius, 0.0)])
-    nearest = outline + KEPT.margin + way
-    walls = np.arange(nearest - 0.3, nearest + 0.3, 0.01)
-    told = judge.can_stop(before_a_wall(task, *walls, speed=speed), np.tile(command, (60, 1)))
+    front = front_of(task.robot)
+    nearest = front + KEPT.margin + way
+    walls = np.arange(max(nearest - 0.3, front), nearest + 0.3, 0.01)  # none inside the robot
+    commands = np.tile(command, (len(walls), 1))
+    told = judge.can_stop(before_a_wall(task, *walls, speed=speed), commands)
     assert walls[told].min() == pytest.approx(nearest, abs=0.06)  # a cell of the map
     assert not told[walls < nearest - 0.06].any()
     assert told[walls > nearest + 0.06].all()
@@ -147,7 +153,7 @@ def test_an_action_is_admissible_as_long_as_its_stop_ends_before_the_margin(robo
 def test_within_the_margin_a_policy_may_still_drive_away():
     task, model = task_of("mecanum"), builtin_model("mecanum")
     judge = Mppi(task, model, samples=1, clearance=KEPT)
-    seen = before_a_wall(task, task.robot.footprint_radius + 0.5 * KEPT.margin)
+    seen = before_a_wall(task, front_of(task.robot) + 0.5 * KEPT.margin)
     ahead, back = (np.array([[speed, 0.0, 0.0]]) for speed in (0.3, -0.3))
     assert judge.can_stop(seen, back).all()
     assert not judge.can_stop(seen, ahead).any()
