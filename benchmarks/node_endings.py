@@ -1,8 +1,9 @@
 """How long does a node take to end, by SIGINT and SIGTERM in turn, on busy cores?
 
 Each node is ended many times while it starts (after its first line), while it compiles its kernels
-into an empty cache, and while it runs, beside loops that are always busy. It has to end by itself,
-with exit code 0. The control takes away what ends a node while it compiles.
+into an empty cache, within a native step of compiling that is drawn out to seconds, and
+while it runs, beside loops that are always busy. It has to end by itself, with exit code 0. The
+control takes away what ends a node within such a step; elsewhere Python's own handlers are as fast.
 """
 
 from __future__ import annotations
@@ -25,18 +26,45 @@ from measuring.verdict import answer, parser_of
 from nics_drl_bridge.nodes.parameters import NODES
 from nics_drl_bridge.nodes.processes import free_domain_id
 
-CONTROLS = {"late": "the handler that ends a node while it compiles"}
+CONTROLS = {"late": "the handler that ends a node within a step of native code"}
 LIMIT_S, PATIENCE_S, READY_S, POLL_S = 1.0, 60.0, 280.0, 0.01
-PHASES = {"starting": "]: starting", "compiling": "]: compiling, once", "running": "]: running"}
+PHASES = {
+    "starting": "]: starting", "compiling": "]: compiling, once", "native": "native code, seconds",
+    "running": "]: running",
+}  # fmt: skip
+COLD = ("compiling", "native")  # into an empty cache
 NEVER_COMPILES = ("record_node",)
 MOMENTS_S = 2.0  # after its line, a node is ended at moments that are spread over this time [s]
 GIVEN = {"command_gate": ["-p", "limits:=ackermann"]}
 START = """
-import sys
+import hashlib, sys, time
 from nics_drl_bridge.nodes import ending, start
 if sys.argv[1] == "late":
     ending.own_process = lambda: None
-start.start(sys.argv[2], sys.argv[2:])
+if sys.argv[2] == "native":
+    from numba.core import event
+
+    def work(rounds):
+        begin = time.perf_counter()
+        hashlib.pbkdf2_hmac("sha256", b"", b"", rounds)
+        return time.perf_counter() - begin
+
+    class Long(event.Listener):  # in place of LLVM's longest steps, wherever the signal falls
+        seconds = 6.0
+
+        def on_start(self, _):
+            seconds, Long.seconds = Long.seconds, 0.0
+            if seconds:
+                rounds = int(100_000 * seconds / work(100_000))
+                sys.stderr.write("native code, seconds\\n")
+                sys.stderr.flush()
+                work(rounds)
+
+        def on_end(self, _):
+            pass
+
+    event.register("numba:compile", Long())
+start.start(sys.argv[3], sys.argv[3:])
 """
 LOOP = """
 while True:
@@ -59,13 +87,14 @@ def busy(loops: int) -> Iterator[None]:
 def ended(node: str, phase: str, number: int, control: str | None, folder: Path) -> dict[str, Any]:
     """Ends a node once in a phase: its exit code, the time [s], and what it wrote if it failed."""
     log, own = folder / "log", {"ROS_HOME": str(folder), "ROS_LOG_DIR": str(folder)}
-    if phase == "compiling":
+    if phase in COLD:
         own["NUMBA_CACHE_DIR"] = str(folder / "cache")
     words = ["--ros-args", *GIVEN.get(node, []), "-r", f"__ns:=/{phase}_{number}"]
     with log.open("wb") as file:
         process = subprocess.Popen(
-            [sys.executable, "-c", START, control or "", node, *words], env=os.environ | own,
-            stdout=file, stderr=file, stdin=subprocess.DEVNULL, cwd=folder, start_new_session=True,
+            [sys.executable, "-c", START, control or "", phase, node, *words],
+            env=os.environ | own, stdout=file, stderr=file, stdin=subprocess.DEVNULL, cwd=folder,
+            start_new_session=True,
         )  # fmt: skip
     try:
         deadline = time.monotonic() + READY_S
@@ -105,7 +134,7 @@ def measure(given: argparse.Namespace) -> dict[str, Any]:
     cases = [(node, phase) for phase in given.phases for node in given.nodes]
     with busy(given.loops), tempfile.TemporaryDirectory() as folder:
         for node, phase in cases:
-            if phase == "compiling" and node in NEVER_COMPILES:
+            if phase in COLD and node in NEVER_COMPILES:
                 continue
             own = [Path(folder) / f"{node}_{phase}_{k}" for k in range(given.times)]
             for each in own:
