@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import json
 import sys
-from unittest import mock
 
 from command_line import nics
 
@@ -20,9 +19,10 @@ def test_the_doctor_tells_what_works_on_this_machine(tmp_path):
     assert "of " in parts["kernels"]["found"]
 
 
-def test_a_missing_extra_comes_with_the_command_that_installs_it():
-    with mock.patch.dict(sys.modules, {"torch": None, "rclpy": None}):
-        found = {each.part: each for each in checks()}
+def test_a_missing_extra_comes_with_the_command_that_installs_it(monkeypatch):
+    for module in ("torch", "rclpy"):
+        monkeypatch.setitem(sys.modules, module, None)
+    found = {each.part: each for each in checks()}
     assert not found["extra train"].works
     assert "'torch' is missing" in found["extra train"].found
     assert found["extra train"].fix == "pip install 'nics_drl_bridge[train]'"

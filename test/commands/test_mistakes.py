@@ -168,10 +168,10 @@ def test_a_mistake_is_one_sentence(words, folder):
 
 
 @pytest.mark.parametrize("given", MODULES, ids=" without ".join)
-def test_a_missing_module_is_one_sentence_with_what_to_install(given, folder):
+def test_a_missing_module_is_one_sentence_with_what_to_install(given, folder, monkeypatch):
     words, module = given
-    with mock.patch.dict(sys.modules, {module: None}):
-        sentence = sentence_of(nics(*words.split(), cwd=folder))
+    monkeypatch.setitem(sys.modules, module, None)
+    sentence = sentence_of(nics(*words.split(), cwd=folder))
     assert re.search(MODULES[given], sentence), sentence
 
 
