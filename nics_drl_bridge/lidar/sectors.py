@@ -153,7 +153,7 @@ def _check(lidar: LidarSpec, layout: ScanLayout, angles: Array) -> None:
 
 
 def _narrower(lidar: LidarSpec, layout: ScanLayout) -> str:
-    if layout == LAYOUTS["around"] and covers(lidar, "front"):
+    if layout.model_dump() == LAYOUTS["around"].model_dump() and covers(lidar, "front"):
         return "say `scan: front`, its 270 deg"
     return "use a wider lidar, or another layout"
 
