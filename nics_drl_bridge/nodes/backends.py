@@ -72,7 +72,9 @@ class _Mailbox:
         return None
 
     def _work_in(self) -> None:
-        if self._worked_ns != self._awaited_ns <= self._mail[ODOM].stamp_ns + self._slack_ns:
+        if self._worked_ns != (wanted := self._awaited_ns) >= 0 and (
+            wanted <= self._mail[ODOM].stamp_ns + self._slack_ns
+        ):
             self._worked_ns = self._awaited_ns
             self._work(*self._mail[ODOM])
 
