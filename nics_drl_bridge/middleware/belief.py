@@ -16,12 +16,18 @@ LEVELS, MOST_CORNERS = 3, 4096  # values tried per variable for the greatest spe
 
 
 class Anchor(NamedTuple):
-    """The newest odometry: time [ns], pose in `odom` (3,), mean and covariance after it."""
+    """The newest odometry: time [ns], pose in `odom`, twist, mean and covariance after it.
+
+    What was measured since corrects them, too. `cross` (3 + S, 3) is the covariance of the present
+    mean with that pose; None if the pose was set anew since.
+    """
 
     time_ns: int
-    odom: Array
+    odom: Array  # (3,)
+    twist: Array  # (3,)
     mean: Array
     covariance: Array
+    cross: Array | None = None
 
 
 class Belief(NamedTuple):
@@ -44,6 +50,7 @@ class Foreseen(NamedTuple):
     covariance: Array
     expected: tuple[Array, Array]
     error: Array  # see `Belief`
+    transition: Array  # (3 + S, 3 + S) derivative to the mean before
     update: tuple[Array, Array] | None = None  # gain (3 + S, 3), covariance after; if in advance
 
 

@@ -4,6 +4,7 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import ArrayLike, NDArray
 
+from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.middleware import kernels
@@ -13,9 +14,10 @@ from nics_drl_bridge.middleware.measurement import Acceptance, Judgement, Kind, 
 from nics_drl_bridge.robot.kernels import SERIES, term_arrays, wrap
 
 Array = NDArray[np.float64]
-LEAST_POSE_DRIFT, LEAST_STATE_DRIFT = 2e-3, 5e-3
+LEAST_POSE_DRIFT, LEAST_STATE_DRIFT = 1e-2, 2e-2
 """Lower bounds on the model's error after a second, of the pose [m or rad / sqrt(s)], and of the
 state as a share of its range [1 / sqrt(s)]."""
+LEAST_SLIP = 5e-3  # Lower bound on the motion that wheels miss [m or rad / sqrt(s)]
 LEAST_TWIST_STD = LEAST_POSE_STD = START_STD = 1e-3
 """Lower bounds on the standard deviations of a twist [m/s, rad/s] and of a pose [m, rad], and that
 of the pose at a reset."""
@@ -25,6 +27,7 @@ GATE = {Kind.TWIST: 16.27, Kind.YAW_RATE: 10.83, Kind.POSE: 16.27}
 # Consecutive outliers after which they are believed. A gyro never is: odometry has precedence.
 PATIENCE: dict[Kind, float] = {Kind.TWIST: 3, Kind.YAW_RATE: np.inf, Kind.POSE: 5}
 NEWS = 0.5  # Possible error of the state of a stuck or pushed robot, as a share of its range
+STILL = np.zeros(3)
 REACHABLE = 2.0  # States and commands are cut at this many times their range
 FARTHEST = 1e8  # Innovations beyond this [m, rad, m/s, rad/s] are never believed
 ANYWHERE = (100.0, 100.0, np.pi)  # Std of a pose in a pose sensor's map, by odometry [m, rad]
@@ -57,6 +60,10 @@ class Estimator:
             Kind.YAW_RATE: np.diag([GYRO_STD**2]),
             Kind.POSE: np.diag(np.maximum(model.noise.pose, LEAST_POSE_STD) ** 2),
         }
+        # Measured drift is motion that the model misses, wheels do not; an assumed one may be slip.
+        missed = model.noise.drift(model.robot) ** 2 - model.noise.simulated_drift(model.robot) ** 2
+        self._slip = np.diag(np.maximum(missed[:3], LEAST_SLIP**2))
+        self._walk = self._noise[Kind.TWIST] * model.control_period
         self.unseen = Unseen(model, self._process, self._noise[Kind.TWIST], self._news)
         self._observe_pose, self._suddenly = np.eye(3, 3 + size), np.eye(3 + size, size, -3)
         self._filter, self._trial = (ExtendedKalmanFilter(3 + size, 3) for _ in range(2))
@@ -72,9 +79,10 @@ class Estimator:
         self.belief = Belief(time_ns, mean, spread, (0, 0, 0), None, False, error)
         self._log = log_of(np.zeros(len(self._least)))
 
-    def anchor(self, odom: Array) -> None:
-        """Records the present pose (3,) in `odom`."""
-        self._anchor = Anchor(self.time_ns, odom, self._filter.x, self._filter.P)
+    def anchor(self, odom: Array, twist: Array = STILL) -> None:
+        """Records the present pose (3,) in `odom` and body twist (3,)."""
+        mean, covariance = self._filter.x, self._filter.P
+        self._anchor = Anchor(self.time_ns, odom, twist, mean, covariance, covariance[:, :3].copy())
 
     def lose(self, time_ns: int, seconds: float, continuous: bool, command: Array) -> None:
         """Continues from the last odometry, seconds ago, at a time [ns] to which the clock was set.
@@ -82,7 +90,7 @@ class Estimator:
         The robot may be anywhere within reach, unless odometry is `continuous`: then the next one's
         pose bridges the motion. The command (C,) is in effect.
         """
-        anchor = self._anchor or Anchor(0, np.zeros(3), self._filter.x, self._filter.P)
+        anchor = self._anchor or Anchor(0, STILL, STILL, self._filter.x, self._filter.P)
         covariance = self.unseen.doubted(anchor.covariance, seconds)
         known = self._anchor is not None and continuous
         since = anchor._replace(time_ns=time_ns - round(seconds * NS_PER_S)) if known else None
@@ -145,7 +153,10 @@ class Estimator:
         if self._foreseen is None or self._foreseen.time_ns != time_ns:
             self._foreseen = self._forecast(time_ns)
         self._lost = self._lost or time_ns - self.time_ns > self._motion.longest_ns
-        self.time_ns, self._filter.x, self._filter.P, _, self._error, _ = self._foreseen
+        here = self._foreseen
+        self.time_ns, self._filter.x, self._filter.P, self._error = *here[:3], here.error
+        if self._anchor is not None and self._anchor.cross is not None:
+            self._anchor = self._anchor._replace(cross=here.transition @ self._anchor.cross)
 
     def foresee(self, time_ns: int) -> None:
         """Computes in advance the prediction to a time and the update by a twist measured then.
@@ -162,12 +173,12 @@ class Estimator:
 
     def _forecast(self, time_ns: int) -> Foreseen:
         own, motion, log, now = self._filter, self._motion, self._log, self.time_ns
-        mean, covariance, expected, error = kernels.forecast(
+        mean, covariance, *rest = kernels.forecast(
             own.x, own.P, self._process, now, time_ns, motion, log
         )
         if time_ns - now > motion.longest_ns:
             covariance = self.unseen.doubted(covariance, (time_ns - now) / NS_PER_S)
-        return Foreseen(time_ns, mean, covariance, expected, error)
+        return Foreseen(time_ns, mean, covariance, *rest)
 
     def update(self, kind: Kind, value: ArrayLike, std: ArrayLike | None = None) -> Judgement:
         """Corrects by a measured value (n,), with its standard deviations or the model's."""
@@ -177,7 +188,8 @@ class Estimator:
     def correct(self, measurement: Measurement) -> Judgement:
         """Corrects by a measurement at this time, after bridging unobserved motion."""
         kind, odom, anchor = measurement.kind, measurement.odom, self._anchor
-        if self._lost and odom is not None:
+        lost = self._lost
+        if lost and odom is not None:
             self._lost = False
             seconds = 0.0 if anchor is None else (self.time_ns - anchor.time_ns) / NS_PER_S
             if anchor and (bridged := self.unseen.bridged(anchor, odom, seconds)) is not None:
@@ -185,7 +197,9 @@ class Estimator:
                 self._foreseen = None
         verdict = self._correct(measurement)
         if odom is not None:
-            self.anchor(odom)
+            if not lost and verdict.outcome is not Acceptance.OUTLIER:
+                self._retrace(odom, measurement.value)
+            self.anchor(odom, measurement.value)
         elif kind is Kind.POSE and verdict.outcome is not Acceptance.OUTLIER:
             self._lost = False
         return verdict
@@ -203,6 +217,7 @@ class Estimator:
         if outcome is Acceptance.OUTLIER:
             self._count(kind, self._outliers[kind] + 1)
             return Judgement(distance, outcome)
+        self._recall(innovation, derivative, noise)
         here = self._foreseen_here if kind is Kind.TWIST and outcome is Acceptance.USED else None
         if kind is Kind.POSE and outcome is Acceptance.JUMP:
             self._jump(value, noise)
@@ -218,6 +233,36 @@ class Estimator:
         kernels.settle(self._filter.x, self._filter.P, *self._limits)
         self._foreseen = None
         return Judgement(distance, outcome)
+
+    def _recall(self, innovation: Array, derivative: Array, noise: Array) -> None:
+        """Corrects where the newest odometry was, by what is about to correct the present."""
+        if (anchor := self._anchor) is not None and anchor.cross is not None:
+            mean, covariance = anchor.mean.copy(), anchor.covariance.copy()
+            mean[:3], covariance[:3, :3], cross = kernels.recall(
+                mean[:3].copy(), covariance[:3, :3].copy(), anchor.cross, innovation, derivative,
+                self._filter.P, noise,
+            )  # fmt: skip
+            self._anchor = anchor._replace(mean=mean, covariance=covariance, cross=cross)
+
+    def _retrace(self, odom: Array, twist: Array) -> None:
+        """Corrects by the way from the newest odometry to one of this time, if that is likely.
+
+        A twist is but a moment's, the way all that wheels did since, whatever the model expects.
+        Between two twists the robot may have had either.
+        """
+        anchor = self._anchor
+        if anchor is None or anchor.cross is None:
+            return
+        way = geometry.between(anchor.odom, odom)
+        seconds = (self.time_ns - anchor.time_ns) / NS_PER_S
+        pose, spread = anchor.mean[:3].copy(), anchor.covariance[:3, :3].copy()
+        then = pose, spread, anchor.cross, way, self._walk * seconds
+        slack = (0.5 * seconds * (twist - anchor.twist)) ** 2
+        mean, covariance, distance = kernels.retrace(self._filter.x, self._filter.P, *then, slack)
+        if distance <= GATE[Kind.POSE]:
+            self._filter.x, self._filter.P = mean, covariance
+            self._filter.P[:3, :3] += self._slip * seconds
+            kernels.settle(self._filter.x, self._filter.P, *self._limits)
 
     def _expect(self, kind: Kind) -> tuple[Array, Array]:
         if kind is Kind.POSE:
@@ -251,9 +296,15 @@ class Estimator:
                 return Acceptance.NEWS
             if believed:
                 self._filter.P = parted(doubtful)
+                self._part()
         return Acceptance.JUMP if believed else Acceptance.OUTLIER
 
+    def _part(self) -> None:
+        if (anchor := self._anchor) is not None:
+            self._anchor = anchor._replace(cross=None)
+
     def _jump(self, pose: Array, noise: Array) -> None:
+        self._part()
         self._filter.P = parted(self._filter.P)
         mean = np.array(self._filter.x)
         mean[:3], self._filter.P[:3, :3] = pose, noise

@@ -214,7 +214,7 @@ def expect(mean, now, motion, log):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def forecast(mean, covariance, process, begin, end, motion, log):  # type: ignore[no-untyped-def]
-    """Predicts mean, covariance, what `expect` returns, and the derivative to a rates' error.
+    """Predicts mean, covariance, `expect`, and derivatives to a rates' error and to the mean.
 
     `process` is added per second.
     """
@@ -226,7 +226,7 @@ def forecast(mean, covariance, process, begin, end, motion, log):  # type: ignor
     transition, error = derivative[:, :width].copy(), derivative[:, width:].copy()
     spread = transition @ covariance @ transition.T + error @ (process[3:, 3:] / time) @ error.T
     spread[:3, :3] += process[:3, :3] * time
-    return moved, (spread + spread.T) * 0.5, expect(moved, end, motion, log), error
+    return moved, (spread + spread.T) * 0.5, expect(moved, end, motion, log), error, transition
 
 
 @kernel(allocates=True)
@@ -243,6 +243,43 @@ def distance(innovation, derivative, covariance, noise):  # type: ignore[no-unty
     """Squared, normalised innovation (Mahalanobis): chi-squared if the filter is consistent."""
     spread = derivative @ covariance @ derivative.T + noise
     return innovation @ np.linalg.solve(spread, innovation)
+
+
+@kernel(allocates=True)
+def recall(  # type: ignore[no-untyped-def]
+    pose, spread, cross, innovation, derivative, covariance, noise
+):  # fmt: skip
+    """Corrects an earlier pose (3,) by a present innovation (n,), of `derivative` (n, 3 + S).
+
+    Returns the pose, its covariance `spread` (3, 3), and the present mean's with it (3 + S, 3).
+    """
+    seen = derivative @ cross
+    gain = np.linalg.solve(derivative @ covariance @ derivative.T + noise, seen)
+    less = cross - covariance @ (derivative.T @ gain)
+    return pose + innovation @ gain, spread - seen.T @ gain, less
+
+
+@kernel(allocates=True)
+def retrace(mean, covariance, pose, spread, cross, way, noise, slack):  # type: ignore[no-untyped-def]
+    """Corrects by the `way` (3,) measured from an earlier pose, see `recall`, to the present one.
+
+    Returns mean, covariance, and the squared, normalised innovation, with `slack` (3,) besides.
+    """
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    x, y, size = mean[0] - pose[0], mean[1] - pose[1], mean.shape[0]
+    ahead, before = c * x + s * y, c * y - s * x
+    here, there = np.zeros((3, size)), np.zeros((3, 3))
+    here[0, 0], here[0, 1], here[1, 0], here[1, 1], here[2, 2] = c, s, -s, c, 1.0
+    there[0, 0], there[0, 1], there[1, 0], there[1, 1], there[2, 2] = -c, -s, s, -c, -1.0
+    there[0, 2], there[1, 2] = before, -ahead
+    shared = covariance @ here.T + cross @ there.T
+    total = here @ shared + there @ (cross.T @ here.T + spread @ there.T) + noise
+    turn = wrap(way[2] - mean[2] + pose[2])
+    innovation = np.array([way[0] - ahead, way[1] - before, turn])
+    gain = np.linalg.solve(total, shared.T)
+    less = covariance - shared @ gain
+    distance = innovation @ np.linalg.solve(total + np.diag(slack), innovation)
+    return mean + innovation @ gain, (less + less.T) * 0.5, distance
 
 
 @kernel(allocates=True)

@@ -30,7 +30,7 @@ class Measurement(NamedTuple):
     kind: Kind
     value: Array
     noise: Array | None = None  # covariance of the value; None for the model's
-    odom: Array | None = None  # (3,) pose that came with a twist, which bridges unobserved motion
+    odom: Array | None = None  # (3,) pose that came with a twist: how far the robot came
 
 
 class Acceptance(IntEnum):

@@ -177,8 +177,8 @@ class Middleware:
     def odometry(self, stamp_ns: int, arrival_ns: int, pose: ArrayLike, twist: ArrayLike) -> bool:
         """Takes an odometry: pose (3,) in `odom`, body twist (3,); True if it was accepted.
 
-        The twist corrects the estimate. The pose, which drifts, only bridges motion for which
-        there are no other data: when the clock was set, or after a loss of data.
+        The twist corrects the estimate, and so does the way between two poses; the pose, which
+        drifts, bridges motion for which there are no other data.
         """
         value = np.array(pose, dtype=np.float64), np.array(twist, dtype=np.float64)
         if not (np.isfinite(value[0]).all() and np.isfinite(value[1]).all()):

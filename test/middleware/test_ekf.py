@@ -17,7 +17,7 @@ from nics_drl_bridge.interface import Start
 from nics_drl_bridge.middleware import kernels
 from nics_drl_bridge.middleware.ekf import Estimator
 from nics_drl_bridge.middleware.kernels import Log, MotionModel
-from nics_drl_bridge.middleware.measurement import Acceptance, Kind
+from nics_drl_bridge.middleware.measurement import Acceptance, Kind, Measurement
 from nics_drl_bridge.robot.kernels import SERIES, rates, scratch, term_arrays
 from nics_drl_bridge.robot.noise import Level, Noise
 from nics_drl_bridge.sim.randomisation import Randomisation
@@ -307,6 +307,51 @@ def test_a_model_that_is_a_little_wrong_does_not_lead_the_estimate_astray(robot)
             view, info = backend.step(command)
         assert not info["true_collision"]
         assert np.hypot(*(view.pose - info["true_pose"])[:2]) < 0.1
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_a_wrong_model_leaves_the_estimate_where_odometry_is(robot):
+    model, rng = builtin_model(robot), np.random.default_rng(7)
+    wrong = Randomisation(
+        name="wrong", kinematics={"scale": [0.95, 1.05]}, action_latency=(0.5, 0.5)
+    )
+    backend = SimBackend(model, field(60.0), estimator=True, randomisation=wrong)
+    backend.reset(Start(0, np.array([0.0, 0.0, 1.0])))
+    for step in range(150):
+        if step % 7 == 0:
+            command = random_command(model, rng)
+        view, _ = backend.step(command)
+    odometry = backend.simulator.data.odom[0, 0]
+    assert np.abs(geometry.between(odometry, view.pose)).max() < 0.03
+
+
+def stepped(estimator, stamp, twist, odom):
+    estimator.predict(stamp)
+    estimator.correct(Measurement(Kind.TWIST, np.asarray(twist), odom=np.asarray(odom)))
+
+
+def test_a_way_that_belies_the_twists_is_left_out():
+    estimator = driven("differential")
+    begin, twist = estimator.at(estimator.time_ns)
+    estimator.anchor(np.zeros(3))
+    for step in range(1, 11):
+        stepped(estimator, 2 * SECOND + step * PERIOD, twist, np.zeros(3))
+    moved = geometry.between(begin, estimator.at(estimator.time_ns)[0])
+    assert np.hypot(*moved[:2]) > 0.9 * np.hypot(*twist[:2])
+
+
+@pytest.mark.parametrize("heading", [0.0, 0.3])
+def test_the_way_goes_on_from_a_pose_that_was_measured_in_between(heading):
+    estimator = Estimator(direct_model())
+    estimator.reset(0, np.zeros(3), 2.0)
+    estimator.anchor(np.zeros(3))
+    estimator.command(0, [1.0, 0.0, 0.0])
+    there = np.array([1.5, 0.5, heading])
+    estimator.predict(PERIOD // 2)
+    estimator.update(Kind.POSE, there, np.full(3, 1e-3))
+    stepped(estimator, PERIOD, [1.0, 0.0, 0.0], [0.1, 0.0, 0.0])
+    ahead = geometry.compose(there, np.array([0.05, 0.0, 0.0]))
+    assert estimator.at(PERIOD)[0] == pytest.approx(ahead, abs=0.01)
 
 
 def test_a_robot_that_is_stuck_is_noticed_at_once():
