@@ -6,7 +6,7 @@
   process of its own.
 - LEAPP: a policy that comes with the package is exported as a bundle, which LEAPP runs; both are
   given the same observations.
-- Nav2: what `nav2_standards` measures, where it is there.
+- Nav2: what `nav2_standards` measures, by its bars; its control is its own.
 
 Bars: no check fails, a step over the standard takes a tenth longer at most, and both policies give
 the same actions. The controls announce a feature that is not there, or let each step rest.
@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium
+import nav2_standards
 import numpy as np
 from measuring.verdict import answer, parser_of
 
@@ -156,6 +157,8 @@ def missed_of(result: dict[str, Any]) -> list[str]:
         for name, bar in BARS.items()
         if name in result and not result[name] <= bar
     ]
+    if "map_agreement" in result:
+        missed += nav2_standards.missed_of(result)
     return [*missed, *result.get("failed", [])]
 
 
@@ -179,9 +182,7 @@ def measure(given: Any) -> dict[str, Any]:
             result |= overhead(domain_id, folder, given.control, given.chunks, given.size)
         if "leapp" in given.parts:
             result |= leapp(folder)
-        if "nav2" in given.parts and importlib.util.find_spec("nav2_standards"):
-            import nav2_standards
-
+        if "nav2" in given.parts:
             result |= nav2_standards.figures()
     return result
 

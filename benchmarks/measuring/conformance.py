@@ -342,7 +342,7 @@ def _loads(c: Client) -> bool:
     right = loaded.result.result == OK and loaded.world.name == "empty"
     right = right and int(c("GetSimulationState").state.state) == STATES.STATE_STOPPED
     empty = c.code("LoadWorld", world_resource=msg.Resource())
-    other = c.code("LoadWorld", world_resource=msg.Resource(uri="/tmp/world.usd"))
+    other = c.code("LoadWorld", world_resource=msg.Resource(uri="hall.usd"))
     return right and [empty, other] == [codes.NO_RESOURCE, codes.UNSUPPORTED_FORMAT]
 
 

@@ -60,6 +60,20 @@ TopicsOption = Annotated[Path | None, Option(help="YAML file: a bag's topic for 
 SalvageOption = Annotated[
     bool, Option("--salvage", help="Take what is intact of a damaged bag, and tell the rest.")
 ]
+OtherLidarOption = Annotated[
+    str | None, Option(help="A shipped lidar (rplidar_a2) or a YAML file, instead of the model's.")
+]
+RandomisationOption = Annotated[
+    str | None, Option(help="Drawn in each episode: a shipped one (mild) or a YAML file.")
+]
+GateOption = Annotated[
+    str | None,
+    Option(
+        metavar="LIMITS",
+        help="Drive through the gate and its shield, with these limits: shipped ones "
+        "(differential) or a YAML file.",
+    ),
+]
 TopicOption = Annotated[
     list[str] | None,
     Option(

@@ -9,7 +9,10 @@ import typer
 from typer import Argument, Option
 
 from nics_drl_bridge.commands.console import (
+    GateOption,
     JsonOption,
+    OtherLidarOption,
+    RandomisationOption,
     completing,
     needs_ros,
     one_sentence,
@@ -34,13 +37,9 @@ def evaluate(
         "--in", help="fast, dds or mujoco_dds; several times; all by default.")] = None,
     episodes: Annotated[int | None, Option(min=1, help="How many; 20, or 1 on a vehicle.")] = None,
     seed: Annotated[int, Option(min=0, help="Of the first episode.")] = 1_000_000,
-    lidar: Annotated[str | None, Option(
-        help="A shipped lidar (rplidar_a2) or a YAML file, instead of the model's.")] = None,
-    randomisation: Annotated[str | None, Option(
-        help="Drawn in each episode: a shipped one (mild) or a YAML file.")] = None,
-    gate: Annotated[str | None, Option(
-        metavar="LIMITS", help="Drive through the gate and its shield, with these limits: shipped "
-        "ones (differential) or a YAML file.")] = None,
+    lidar: OtherLidarOption = None,
+    randomisation: RandomisationOption = None,
+    gate: GateOption = None,
     fallback: Annotated[str, Option(
         metavar="PLANNER", help="dynamic_window or mppi: acts where the policy asks for what can't "
         "be stopped before a touch.")] = "",

@@ -8,7 +8,15 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge.commands.console import TopicOption, needs_ros, one_sentence, roles_of
+from nics_drl_bridge.commands.console import (
+    GateOption,
+    OtherLidarOption,
+    RandomisationOption,
+    TopicOption,
+    needs_ros,
+    one_sentence,
+    roles_of,
+)
 from nics_drl_bridge.errors import ConfigError
 
 DEFAULT_POLICY = "differential"
@@ -25,13 +33,9 @@ def watch(
         "--world", "--scene", help="A shipped world (circles) or a YAML file; several times: side "
         "by side.")] = None,
     seed: Annotated[int, Option(min=0, help="Of the first episode.")] = 1_000_000,
-    lidar: Annotated[str | None, Option(
-        help="A shipped lidar (rplidar_a2) or a YAML file, instead of the model's.")] = None,
-    randomisation: Annotated[str | None, Option(
-        help="Drawn in each episode: a shipped one (mild) or a YAML file.")] = None,
-    gate: Annotated[str | None, Option(
-        metavar="LIMITS", help="Drive through the gate and its shield, with these limits: shipped "
-        "ones (differential) or a YAML file.")] = None,
+    lidar: OtherLidarOption = None,
+    randomisation: RandomisationOption = None,
+    gate: GateOption = None,
     ros: Annotated[bool, Option("--ros", help="Show live topics instead.")] = False,
     namespace: Annotated[str, Option(help="For --ros: of the robot's topics.")] = "",
     bag: Annotated[Path | None, Option(help="Show a recorded drive instead.")] = None,

@@ -72,7 +72,7 @@ def test_a_car_that_trembles_at_rest_was_walked_into(module):
     places = module("measuring.shield_places")
     place = places.Place("ackermann", "crowd")
     place.begin(places.Job("ram", 1, standing=True))
-    for _ in range(40):
+    for _ in range(80):
         place.step(np.zeros(3))
     simulator, (x, y, radius) = place._sim, place.truth.circles[0]
     # People keep out of its way, so it is put where one of them is about to tread.
@@ -83,7 +83,7 @@ def test_a_car_that_trembles_at_rest_was_walked_into(module):
     place.step(np.zeros(3))
     assert place.outcome.walked_into
     assert not place.outcome.contact
-    assert place.outcome.path > 0.005  # its noise
+    assert place.outcome.path > 0.01  # its noise
 
 
 def test_a_robot_that_drives_into_something_is_in_contact(module):
