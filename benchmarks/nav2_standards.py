@@ -6,8 +6,8 @@ share that end within 5 cm of what the same beam shows, edges of obstacles inclu
 planned on that map are sent to `follow_path`, in lock-step over DDS, by a stand-in for the
 behaviour tree; one is followed if the action succeeds, at the goal, without a touch. The last
 figure counts topics, frames, types, qualities of service and actions that Nav2's parameter file
-names and nobody serves. Needs nav2_msgs and tf2_msgs for the last two: source what `make test-
-messages` builds.
+names and nobody serves. Needs nav2_msgs and tf2_msgs for the last two: source what
+`make test-messages` builds.
 """
 
 from __future__ import annotations
