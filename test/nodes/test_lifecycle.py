@@ -35,7 +35,7 @@ def lead(peer, node, transition):
     request = ChangeState.Request()
     request.transition.label = transition
     # To configure may mean to compile.
-    return peer.call(ChangeState, f"{node}/change_state", request, 200.0).success
+    return peer.call(ChangeState, f"{node}/change_state", request, times=1, each_s=200.0).success
 
 
 def state(peer, node):
