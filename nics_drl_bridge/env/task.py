@@ -1,5 +1,6 @@
 """Task: the job of a robot, written once for one robot over ROS 2 and thousands in arrays."""
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
@@ -30,6 +31,7 @@ DRIVES = ((0, 0, 0), (1, 0, 0), (1, 0, 1), (1, 0, -1), (-1, 0, 0), (-1, 0, 1), (
 """Stop; ahead, to the left, to the right; and back: signs of linear.x, linear.y, angular.z, as in
 the authors' code (efc-robot/MultiVehicleEnv). What can't reverse stays, and turns if it can."""
 SIDEWAYS = ((0, 1, 0), (0, -1, 0))  # Two more for a robot that moves sideways
+CONTACT_ANGLE = math.radians(4.0)  # 2 cm of what is 0.3 m away
 
 
 @dataclass(frozen=True)
@@ -92,7 +94,8 @@ class Task(ABC):
     robot: RobotSpec  # gives commands, their limits, and the footprint
     lidar: LidarSpec  # gives the scan
     actions: Actions = "continuous"  # a Box, or `discrete`: the paper's drives, see `DRIVES`
-    contact_margin: float = 0.02  # a return this close to the footprint counts as a contact [m]
+    # returns this close to the footprint count as a contact [m], in the mean of `CONTACT_ANGLE`
+    contact_margin: float = 0.02
     top_speed: float | None = None  # of commands in m/s, where the robot's limits are wider [m/s]
     # sectors instead of beams, to mean the same for any lidar; contact is judged from the beams
     scan: ScanLayout | None = None
@@ -249,7 +252,8 @@ class Task(ABC):
         leaves = contact_ranges(self.robot, self.lidar, self.contact_margin)
         sectors = 0 if self.scan is None else self.scan.sectors
         per_metre = np.float32(1.0 / self.sight.range_max)
-        return ScanScale(per_metre, leaves, sectors, self.plan)
+        beside = int(CONTACT_ANGLE / 2.0 / abs(self.lidar.angle_increment))
+        return ScanScale(per_metre, leaves, beside, sectors, self.plan)
 
 
 def discrete_commands(robot: RobotSpec) -> Array:

@@ -40,6 +40,8 @@ class Teaching(Schema):
     contact: float | None = None
     path: float = 0.0  # reward of each metre by which the way around obstacles gets shorter
     retries: int = Field(default=0, ge=0, le=1000)  # times that a failed episode is driven again
+    # by which robots are larger all around while they learn [m], to keep away from what stands
+    margin: float = Field(default=0.0, ge=0.0, le=1.0)
     curriculum: Curriculum | None = None
 
 

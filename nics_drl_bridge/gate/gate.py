@@ -63,7 +63,10 @@ def decide(
             state = _stopped(config, replace(state, latched=cause), now, disarm=True)
         else:
             value, recent = motion.value, _recent(config, state, motion.value, now)
-            state = replace(state, value=value, slope=motion.slope, moved_s=now, recent=recent)
+            state = replace(
+                state, value=value, slope=motion.slope, moved_s=now, recent=recent,
+                shielded=motion.shielded,
+            )  # fmt: skip
             state, shielded = frozen.watch_motion(config, state, now), motion.shielded
     twist = config.cmd_vel(state.value)
     return state, Decision(twist, publish, cause, refused, answer, granted, shielded)
@@ -99,7 +102,7 @@ def _serve(
 def _stopped(config: GateConfig, state: GateState, moved_s: float, disarm: bool) -> GateState:
     zero, published = np.zeros_like(state.value), moved_s > state.moved_s
     return replace(
-        state, value=zero, slope=zero, moved_s=moved_s, push=None,
+        state, value=zero, slope=zero, moved_s=moved_s, push=None, shielded=False,
         recent=_recent(config, state, zero, moved_s) if published else state.recent,
         armed=state.armed and not disarm,
     )  # fmt: skip
@@ -434,7 +437,9 @@ def follow(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
     if config.limits is None:
         return motion
     since = now - state.moved_s if math.isfinite(state.moved_s) else config.gap_s
-    value, slope = limits.follow(state.value, state.slope, motion.value, since, config.limits)
+    # A turn need not wait for a speed that the shield holds back.
+    given = motion.value, since, config.limits, not state.shielded
+    value, slope = limits.follow(state.value, state.slope, *given)
     return replace(motion, value=value, slope=slope)
 
 

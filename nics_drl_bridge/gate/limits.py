@@ -153,14 +153,14 @@ def saturate(command: Array, limits: Limits) -> Array:
 
 
 def follow(
-    value: Array, slope: Array, target: Array, dt: float, limits: Limits
+    value: Array, slope: Array, target: Array, dt: float, limits: Limits, waits: bool = True
 ) -> tuple[Array, Array]:
     """Moves a command (C,) and its slope towards its target as fast as rate and jerk allow."""
     # The turn waits for the speed, so that an accelerating robot is on its path from the start.
     wanted, after, change = target.copy(), value.copy(), slope.copy()
     given = (value, slope, wanted, limits.low, limits.high, limits.rate, limits.jerk)
     for turning in (False, True):
-        if turning:
+        if turning and waits:
             wanted[limits.turn] *= _progress(after[limits.linear], target[limits.linear])
         for i in np.flatnonzero(limits.turn == turning):
             after[i], change[i] = _follow_one(dt, *(float(each[i]) for each in given))

@@ -187,21 +187,28 @@ def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
     """Returns the greatest part of a motion from which it can stop, braking harder if needed."""
     if config.shield is None or config.limits is None or state.obstacles is None:
         return motion
-    speeds = config.limits.linear | config.limits.turn
-
-    def part(share: float) -> Array:
-        return np.where(speeds, share * motion.value, motion.value)
-
-    if not motion.value[speeds].any() or _safe(config, state, motion.value, now):
+    linear, turn = config.limits.linear, config.limits.turn
+    if not motion.value[linear | turn].any() or _safe(config, state, motion.value, now):
         return motion
+
+    def part(ahead: float, about: float) -> Array:
+        return motion.value * np.where(linear, ahead, np.where(turn, about, 1.0))
+
+    def safe(ahead: float, about: float) -> bool:
+        return _safe(config, state, part(ahead, about), now)
+
+    # A way that is barred bars no turn on the spot: else a robot could not turn away from it.
+    turns = bool(motion.value[turn].any()) and safe(0.0, 1.0)
     low, high = 0.0, 1.0
     for _ in range(FINEST):
         middle = (low + high) / 2.0
-        if _safe(config, state, part(middle), now):
+        if safe(middle, 1.0 if turns else middle):
             low = middle
         else:
             high = middle
-    return replace(motion, value=part(low), slope=np.zeros_like(motion.slope), shielded=True)
+    value = part(low, 1.0 if turns else low)
+    slope = np.where(turn & turns, motion.slope, 0.0)
+    return replace(motion, value=value, slope=slope, shielded=True)
 
 
 def _safe(config: GateConfig, state: GateState, value: Array, now: float) -> bool:

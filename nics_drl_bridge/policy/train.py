@@ -5,7 +5,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +92,8 @@ def make_train_env(
 ) -> TrainVecEnv:  # fmt: skip
     """Makes the worlds of the settings in one env; model and worlds may already be open."""
     model = model or open_model(settings.robot, settings.lidar)
+    if margin := settings.teaching.margin:
+        model = replace(model, robot=model.robot.grown(margin))
     envs = [
         BridgeVectorEnv(
             count, model, (scenes or {}).get(world, world), settings.task, settings.task_options,

@@ -43,6 +43,7 @@ TWIST_UNITS = dict(zip(CMD_VEL_FIELDS, POSE_UNITS, strict=True))
 # SI units of a state or a command; 1 for a ratio or a count.
 Unit = Literal["m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N*m", "V", "A", "1"]
 MOST_CORNERS, MOST_VARIABLES = 512, 32  # of a footprint; of a state or a command
+SHARPEST = 0.2  # Corner up to which a grown outline keeps its edges parallel, 1 + its cosine
 FASTEST = 1e6  # Greatest absolute value of a variable, in its unit
 
 
@@ -192,6 +193,25 @@ class RobotSpec(Schema):
                     f"state {v.name!r} is {v.twist} of the twist, so its unit is {unit}"
                 )
         return self
+
+    def grown(self, margin: float) -> RobotSpec:
+        """The robot with a footprint that is larger all around by a margin [m].
+
+        With an outline `footprint_radius` stays, by which worlds place robots: where the robot has
+        room so has this one, but for the margin.
+        """
+        if self.footprint is None:
+            return self.model_copy(update={"footprint_radius": self.footprint_radius + margin})
+        corners = np.array(self.footprint)
+        following = np.roll(corners, -1, axis=0)
+        x, y = (following - corners).T
+        left = np.sign(np.sum(corners[:, 0] * following[:, 1] - corners[:, 1] * following[:, 0]))
+        after = left * np.stack([y, -x], axis=-1) / np.hypot(x, y)[:, None]  # out of each edge
+        before = np.roll(after, 1, axis=0)
+        bend = 1.0 + np.sum(before * after, axis=-1, keepdims=True)
+        moved = corners + margin * (before + after) / np.maximum(bend, SHARPEST)
+        footprint = tuple(map(tuple, moved.tolist()))
+        return self.model_copy(update={"footprint": footprint})
 
     @property
     def variable_names(self) -> tuple[str, ...]:

@@ -26,6 +26,7 @@ STILL, WANDER, PATROL, PEDESTRIAN = range(4)  # values of the column KIND
 # Memory of an obstacle, a row of marks (N, K, F).
 SPEED, VX, VY, DIRECTION, AIM, GOAL_X, GOAL_Y, UNTIL, INDEX, WAY, REST, MARK = range(12)
 SLACK = 1e-6  # Margin that is never used [m]: rounding must not make two bodies touch
+ROBOT_GAP = 0.1  # Which an obstacle keeps to a robot, as people do [m]; less may look like a touch
 PASSES = 3  # Number of times a displacement is bent before the remaining excess is shortened
 FINEST = 0.25  # Least step along a path through a static map, in cells
 HALVINGS = 8  # Number of bisections of its last step to find the end of the free path
@@ -129,6 +130,7 @@ def _hold_bodies(dx, dy, k, traffic, bend):  # type: ignore[no-untyped-def]
         if j >= first:
             vx, vy = speeds[j - first, 0], speeds[j - first, 1]
             step = math.sqrt(vx * vx + vy * vy) * period
+            near += ROBOT_GAP
         reach = near + 2.0 * (length + SLACK) + step
         away2 = ox * ox + oy * oy
         if away2 >= reach * reach or away2 == 0.0:

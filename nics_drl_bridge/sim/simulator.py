@@ -139,7 +139,7 @@ class EpisodeSampler:
         given = randomisation
         sizes = (1.0,) if given is None else given.sizes
         most = None if given is None or given.obstacles.count is None else given.obstacles.count[1]
-        self.scenes = SetSampler(world, footprint_shape(model.robot).radius, robots, sizes, most)
+        self.scenes = SetSampler(world, model.robot.footprint_radius, robots, sizes, most)
         self.draws = None if given is None else Sampler(given, model, robots)
 
     def draw(self, seeds: ArrayLike) -> tuple[Scenes, Draws | None]:

@@ -107,6 +107,28 @@ def test_too_close_to_measure_is_a_touch_and_unknown_is_not(task):
     assert judge(task, view(ranges=ranges), [5.0, 5.0]).touched
 
 
+def test_one_beam_that_errs_is_no_touch_and_what_is_as_wide_as_a_finger_is_one():
+    sensor = lidar(beams=720)
+    task = Navigation(DIRECT, sensor)
+    ranges = np.full(720, FOOTPRINT + 0.1)
+    ranges[100] = FOOTPRINT - 0.05
+    assert not judge(task, view(ranges=ranges), [5.0, 5.0]).touched
+    ranges[97:104] = FOOTPRINT
+    assert judge(task, view(ranges=ranges), [5.0, 5.0]).touched
+
+
+def test_noise_of_two_centimetres_is_no_touch_five_centimetres_away():
+    rng, sensor = np.random.default_rng(0), lidar(beams=720)
+    task = Navigation(DIRECT, sensor)
+    near = FOOTPRINT + 0.05
+    scans = near + 0.02 * rng.standard_normal((200, 720))
+    single = (scans < FOOTPRINT + task.contact_margin).any(axis=1)
+    assert single.all()
+    assert not any(judge(task, view(ranges=scan), [5.0, 5.0]).touched for scan in scans)
+    touching = FOOTPRINT + 0.02 * rng.standard_normal((200, 720))
+    assert all(judge(task, view(ranges=scan), [5.0, 5.0]).touched for scan in touching)
+
+
 def reward(task, before, after, goal, ranges=None):
     one, other = view(before), view(after, ranges=ranges)
     return task.reward(one, other, {"goal": np.array(goal)})

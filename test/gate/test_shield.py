@@ -46,8 +46,8 @@ def ranges(value, where=None):
 class Faced(Rig):
     """A car that wants to go straight on, and a scan that never changes but by noise."""
 
-    def __init__(self, seen, shield=CAR, wish=(1.0, 0.0, 0.0)):
-        super().__init__(config(shield=shield, frozen_distance=1e9))
+    def __init__(self, seen, shield=CAR, wish=(1.0, 0.0, 0.0), robot="ackermann"):
+        super().__init__(config(robot, shield=shield, frozen_distance=1e9))
         self.ranges, self.frozen = seen, True
         self.wish = np.array(wish)
 
@@ -96,6 +96,20 @@ def test_the_speed_is_such_that_the_robot_stops_before_what_lies_ahead(distance)
 
 def test_a_robot_stands_before_what_it_must_not_come_nearer_to():
     assert Faced(ranges(0.19)).settles() == 0.0
+
+
+def test_what_bars_the_way_bars_no_turn_on_the_spot():
+    round_one = replace(CAR, wheelbase=0.0)
+    rig = Faced(ranges(0.19), round_one, wish=(1.0, 0.0, 0.5), robot="differential")
+    assert rig.settles(0.5) == 0.0
+    assert rig.decision.twist[2] == pytest.approx(0.5)
+    assert rig.decision.shielded
+    corners = ((0.4, 0.15), (-0.4, 0.15), (-0.4, -0.15), (0.4, -0.15))
+    box = replace(round_one, outline=corners, footprint_radius=float(np.hypot(0.4, 0.15)))
+    at_a_corner = ranges(0.46, where=np.abs(LIDAR.angles - 0.5) < 0.1)
+    barred = Faced(at_a_corner, box, (0.0, 0.0, 0.5), "differential")
+    barred.settles(0.5)
+    assert 0.0 <= barred.decision.twist[2] < 0.2
 
 
 def test_something_too_close_to_measure_counts_as_an_obstacle():

@@ -154,6 +154,16 @@ def test_a_robot_without_textbook_is_told_so():
         require_textbook(RobotSpec.model_validate(data()))
 
 
+def test_a_grown_robot_keeps_the_margin_from_each_edge_of_its_outline_and_around_its_circle():
+    corners = [[0.3, 0.1], [-0.1, 0.1], [-0.1, -0.1], [0.3, -0.1]]
+    for order in (1, -1):
+        given = data(footprint=corners[::order], footprint_radius=float(np.hypot(0.3, 0.1)))
+        grown = RobotSpec.model_validate(given).grown(0.05)
+        assert np.abs(np.array(grown.footprint)).max(axis=0) == pytest.approx([0.35, 0.15])
+        assert grown.footprint_radius == pytest.approx(np.hypot(0.3, 0.1))  # where it may stand
+    assert RobotSpec.model_validate(data()).grown(0.05).footprint_radius == pytest.approx(0.25)
+
+
 def test_a_footprint_gives_the_radius_of_the_circle_that_holds_it():
     given = data(footprint=[[0.3, 0.1], [-0.1, 0.1], [-0.1, -0.1], [0.3, -0.1]])
     del given["footprint_radius"]
