@@ -70,6 +70,7 @@ RUNS: dict[str, Run] = {
     "shield": row("shield", "--episodes 3000", "--episodes 30", 2 * HOUR),
     "soak": row("soak", "", "--minutes 0.2 --warm-up 0.1"),
     "soak_env": row("soak_env", "", "--steps 200000"),
+    "standards": row("standards", "", "--parts leapp", HOUR),
     "table2_lidar": row("table2_lidar", "", "--scans 512 --repeats 5"),
     "table3_density": row("table3_density", "", "--scans 256"),
     "training_differential": row(

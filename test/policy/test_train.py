@@ -64,6 +64,14 @@ def weights(algorithm):
     return {name: value.clone() for name, value in policy.state_dict().items()}
 
 
+def test_robots_are_larger_while_they_learn_and_only_then():
+    learning = settings(teaching={"margin": 0.07}, randomisation=None)
+    grown = training.make_train_env(learning).envs[0].model.robot.footprint_radius
+    assert grown == pytest.approx(MODEL.robot.footprint_radius + 0.07)
+    judged = training._env_of(learning, "one", 2, MODEL)
+    assert judged.model.robot.footprint_radius == MODEL.robot.footprint_radius
+
+
 def steps_in(path):
     state = read_checkpoint(path)["state"]
     return state["counters"]["num_timesteps"] if "counters" in state else state["steps"]
