@@ -97,7 +97,6 @@ class Task(ABC):
     # returns this close to the footprint count as a contact [m], in the mean of `CONTACT_ANGLE`
     contact_margin: float = 0.02
     top_speed: float | None = None  # of commands in m/s, where the robot's limits are wider [m/s]
-    reverse_speed: float | None = None  # greatest backwards, likewise; 0: only ahead [m/s]
     # sectors instead of beams, to mean the same for any lidar; contact is judged from the beams
     scan: ScanLayout | None = None
     sensors: tuple[Sensor, ...] = ()  # further ones, whose shares end each observation
@@ -108,9 +107,6 @@ class Task(ABC):
             raise ConfigError(f"task option actions={self.actions!r}: no such actions; {known}")
         if self.top_speed is not None and not self.top_speed > 0.0:
             raise ConfigError(f"task option top_speed={self.top_speed!r}: must be above 0 m/s.")
-        if self.reverse_speed is not None and not self.reverse_speed >= 0.0:
-            fix = "must be 0 m/s, for a robot that only drives ahead, or above"
-            raise ConfigError(f"task option reverse_speed={self.reverse_speed!r}: {fix}.")
         if self.sensors and not self.observes_sensors:
             name = type(self).__name__
             raise ConfigError(f"task option sensors: {name} observes no further sensors.")
@@ -180,11 +176,11 @@ class Task(ABC):
     def command_limits(self) -> tuple[Array, Array]:
         """Commands (C,) of the least and of the greatest action."""
         low, high = self.robot.command_low, self.robot.command_high
+        if self.top_speed is None:
+            return low, high
         speeds = np.array([each.unit == "m/s" for each in self.robot.command])
-        ahead = np.array([each.cmd_vel == "linear.x" for each in self.robot.command])
-        top = np.where(speeds, _or_inf(self.top_speed), np.inf)
-        back = np.where(speeds & ahead, _or_inf(self.reverse_speed), np.inf)
-        return np.maximum(low, -np.minimum(top, back)), np.minimum(high, top)
+        top = np.where(speeds, self.top_speed, np.inf)
+        return np.maximum(low, -top), np.minimum(high, top)
 
     @cached_property
     def discrete_commands(self) -> Array:
@@ -319,10 +315,6 @@ def total(values: Array) -> Array:
     for k in range(1, values.shape[-1]):
         summed += values[..., k]
     return np.asarray(summed)
-
-
-def _or_inf(limit: float | None) -> float:
-    return math.inf if limit is None else limit
 
 
 def contact_ranges(robot: RobotSpec, lidar: LidarSpec, margin: float) -> NDArray[np.float32]:

@@ -269,18 +269,6 @@ def test_a_top_speed_limits_commands_in_m_per_s_and_no_others():
     assert fast.command([1.0, 1.0]).tolist() == free.command([1.0, 1.0]).tolist() == [2.0, 2.5]
 
 
-def test_a_robot_without_reverse_speed_drives_ahead_and_turns_both_ways():
-    jackal = open_model("jackal")
-    low, high = Navigation(jackal.robot, jackal.lidar).command_limits
-    ahead, greatest = Navigation(jackal.robot, jackal.lidar, reverse_speed=0.0).command_limits
-    assert (low[0], ahead[0], ahead[1]) == (-0.5, 0.0, low[1])
-    assert np.array_equal(greatest, high)
-    slow = Navigation(jackal.robot, jackal.lidar, top_speed=0.3, reverse_speed=0.4)
-    assert slow.command_limits[0][0] == -0.3
-    with pytest.raises(ConfigError, match=r"reverse_speed=-0\.1: must be 0 m/s"):
-        Navigation(jackal.robot, jackal.lidar, reverse_speed=-0.1)
-
-
 def test_a_top_speed_that_is_none_is_refused():
     jackal = open_model("jackal")
     with pytest.raises(ConfigError, match=r"top_speed=0\.0: must be above 0 m/s"):
