@@ -18,6 +18,7 @@ from nics_drl_bridge.commands.console import (
     one_sentence,
 )
 from nics_drl_bridge.errors import BackendError, ConfigError
+from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 if TYPE_CHECKING:
     from nics_drl_bridge.recording.recording import Recording
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 def record(
     out: Annotated[Path, Option(help="An .npz file, or the folder of a rosbag2, to write.")],
-    robot: RobotOption = "ackermann",
+    robot: RobotOption = DEFAULT_ROBOT,
     bound: Annotated[float, Option(help="Radius around the start to keep within [m].")] = 2.0,
     duration: Annotated[float, Option(help="Of the drive [s].")] = 60.0,
     speed: Annotated[float, Option(help="Share of the greatest speeds to use.")] = 1.0,
@@ -188,7 +189,7 @@ def generate(
     out: Annotated[Path, Option(help="Folder of the model to write.")],
     robot: Annotated[
         str | None,
-        Option(help="A shipped robot or a YAML file; else the map's or import's, or ackermann."),
+        Option(help=f"Shipped, or a YAML file; else the recording's own, or {DEFAULT_ROBOT}."),
     ] = None,
     mapping: Annotated[
         Path | None,
@@ -255,8 +256,8 @@ def generate(
 
 
 def drive(
-    robot: Annotated[str, Option(help="A robot's YAML file, or a shipped robot.")],
     out: Annotated[Path, Option(help="Folder of the model to write.")],
+    robot: RobotOption = DEFAULT_ROBOT,
     recording: Annotated[
         Path | None, Option(help="An .npz to keep the drive in, as one of a real robot.")
     ] = None,
