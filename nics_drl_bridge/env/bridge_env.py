@@ -74,7 +74,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     Args:
         backend: `sim`, `dds`, or your own object, see `interface.Backend`; it may lack `halt` and
             `facts`, see `env.sim_backend.CompletedBackend`.
-        model: a SimulatorModel, its folder, or the name of a shipped robot; see `DEFAULT_ROBOT`.
+        model: a SimulatorModel, its folder, or a shipped robot's name; else `DEFAULT_ROBOT`.
         world: a World, its YAML file, or the name of a shipped one.
         task: a name, `path/to/file.py:ClassName`, a class, or a Task; see `env.registry.make_task`.
         task_options: further arguments of the task's class.
