@@ -259,16 +259,15 @@ def generate(
         from nics_drl_bridge.report.fit_page import write_fit_page
         from nics_drl_bridge.report.fit_pictures import write_pictures
 
-        page = out / "report.html"
         with console.progress_bar("drawing the report"):
-            write_fit_page(page, str(recording), spec, identified, model.report)
+            write_fit_page(out / "report.html", str(recording), spec, identified, model.report)
             if pictures:
                 write_pictures(spec, identified, out / "pictures")
         if as_json:
             typer.echo(json.dumps(fit_facts(out, spec.name, identified)))
             return
         typer.echo(opening(model.report))
-        typer.echo(f"\nall figures: {out / 'report.txt'}, with pictures: {page}")
+        typer.echo(f"\nall figures: {out / 'report.txt'}, with pictures: {out / 'report.html'}")
         typer.echo(f"model written to {out}")
 
 
