@@ -35,7 +35,11 @@ PHASES = {
 COLD = ("compiling", "native")  # into an empty cache
 NEVER_COMPILES = ("record_node",)
 MOMENTS_S = 2.0  # after its line, a node is ended at moments that are spread over this time [s]
-GIVEN = {"command_gate": ["-p", "limits:=ackermann"]}
+MODEL = ["-p", "model:=ackermann"]
+GIVEN = {
+    "command_gate": [*MODEL, "-p", "limits:=ackermann"],
+    "record_node": ["-p", "robot:=ackermann"],
+}
 START = """
 import hashlib, sys, time
 from nics_drl_bridge.nodes import ending, start
@@ -89,7 +93,7 @@ def ended(node: str, phase: str, number: int, control: str | None, folder: Path)
     log, own = folder / "log", {"ROS_HOME": str(folder), "ROS_LOG_DIR": str(folder)}
     if phase in COLD:
         own["NUMBA_CACHE_DIR"] = str(folder / "cache")
-    words = ["--ros-args", *GIVEN.get(node, []), "-r", f"__ns:=/{phase}_{number}"]
+    words = ["--ros-args", *GIVEN.get(node, MODEL), "-r", f"__ns:=/{phase}_{number}"]
     with log.open("wb") as file:
         process = subprocess.Popen(
             [sys.executable, "-c", START, control or "", phase, node, *words],

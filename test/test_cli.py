@@ -94,7 +94,8 @@ def test_an_unknown_command_or_option_is_refused(tmp_path):
 
 
 def test_generate_makes_a_model_of_a_recording_and_replaces_it(drive, tmp_path):
-    first = nics("generate", drive, "--out", "models/car", cwd=tmp_path)
+    words = ("generate", drive, "--robot", "ackermann", "--out", "models/car")
+    first = nics(*words, cwd=tmp_path)
     assert first.returncode == 0, first.stderr
     assert first.stdout.endswith("model written to models/car\n")
     assert names(tmp_path / "models") == {"car"}
@@ -103,7 +104,7 @@ def test_generate_makes_a_model_of_a_recording_and_replaces_it(drive, tmp_path):
     assert model.robot.name == "ackermann"
     assert opening(model.report) in first.stdout
     assert "models/car/report.html" in first.stdout
-    again = nics("generate", drive, "--out", "models/car", "--alpha", "0.9", cwd=tmp_path)
+    again = nics(*words, "--alpha", "0.9", cwd=tmp_path)
     assert again.returncode == 0, again.stderr
     assert names(tmp_path / "models") == {"car"}
     assert load_model(tmp_path / "models" / "car").fingerprint != model.fingerprint

@@ -39,6 +39,7 @@ GRACE_S, WATCH_S = 0.25, 1.2
 """A motion on `cmd_vel` so long after the exception has stayed; it is watched for so long."""
 MOVES_S, HANGS_S, TRIES = 5.0, 10.0, 3
 MOVING = 0.05
+ROBOT = "ackermann"
 AHEAD = np.array([1.0, 0.0], np.float32)
 METHODS = ("command", "reset", "step_into")
 ERRORS = (ValueError, ZeroDivisionError, MemoryError, KeyboardInterrupt, SystemExit)
@@ -221,7 +222,7 @@ def make_env(domain_id: int) -> BridgeEnv:
     """An env in real time whose task and picture can be made to throw."""
     options = {"mode": "realtime", "domain_id": domain_id, "stale_after_s": 60.0}
     made = gymnasium.make(
-        "NicsBridge/Task-v0", backend="dds", world="empty", task=Thrower,
+        "NicsBridge/Task-v0", backend="dds", model=ROBOT, world="empty", task=Thrower,
         render_mode="rgb_array", backend_options=options,
     )  # fmt: skip
     env = made.unwrapped
@@ -308,7 +309,12 @@ def campaign(seed: int, rounds: int, control: str | None = None) -> Score:
     score, rng, domain_id = Score(), np.random.default_rng(seed), free_domain_id()
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        parameters = {"world": "empty", "mode": "realtime", "command_timeout": 3600.0}
+        parameters = {
+            "model": ROBOT,
+            "world": "empty",
+            "mode": "realtime",
+            "command_timeout": 3600.0,
+        }
         parameters["enable_stamped_cmd_vel"] = False
         node = stack.enter_context(NodeProcess("simulator_node", folder, parameters, domain_id))
         watcher = Watcher(domain_id)

@@ -44,12 +44,13 @@ def _seed(rng: Rng, folder: Path, simulator: FastSimulator) -> Attempt:
     settings.write_text(dump_yaml(SHORT_TRAINING), encoding="utf-8")
     out = folder / "out"
     short = ("--world", "arena", "--episodes", "1", "--out", out)
+    robot = ("--robot", "ackermann")
     acts: dict[str, Callable[[], object]] = {
         "reset": lambda: simulator.reset([seed]),
         "scene": lambda: sample_scene(load_world("arena"), 0.2, seed),  # type: ignore[arg-type]
-        "evaluate": nics("evaluate", "straight", "--in", "fast", f"--seed={seed}", *short),
+        "evaluate": nics("evaluate", "straight", *robot, "--in", "fast", f"--seed={seed}", *short),
         "train": nics("train", "--settings", settings, f"--seeds={seed}", "--out", out),
-        "record": nics("record", "--preview", f"--seed={seed}", "--out", folder / "d.npz"),
+        "record": nics("record", "--preview", *robot, f"--seed={seed}", "--out", folder / "d.npz"),
     }
     name = str(rng.choice(list(acts)))
     return Attempt("seed", f"{name} {str(seed)[:30]}", acts[name])
@@ -61,9 +62,13 @@ def _path(rng: Rng, folder: Path) -> Attempt:
         ("policy", "info"), ("explain",), ("bag", "info"), ("bake", "--world"),
         ("bake", "--shapes"), ("bake", "--lidar"), ("bake", "--robot"),
         ("generate", "--out", "model", "--robot"),
-        ("generate", "--out", "model"), ("train", "--settings"), ("doctor",),
+        ("generate", "--robot", "ackermann", "--out", "model"), ("train", "--settings"),
+        ("doctor", "--model", "ackermann"),
         ("evaluate", "--in", "fast", "--out", "evaluated"), ("urdf",),
-        ("evaluate", "straight", "--in", "fast", "--out", "evaluated", "--world"),
+        (
+            "evaluate", "straight", "--robot", "ackermann", "--in", "fast", "--out", "evaluated",
+            "--world",
+        ),
         ("doctor", "--policy"), ("bag", "replay", "x", "--estimate", "--model"),
     )  # fmt: skip
     command = commands[int(rng.integers(len(commands)))]

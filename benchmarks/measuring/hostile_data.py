@@ -149,7 +149,8 @@ def _recording(rng: Rng, folder: Path, whole: Whole) -> Attempt:
         parts[name] = _npy_of(other)
         told, verdict = f"{name} of type {other.dtype}", "any"
     path.write_bytes(_zip(parts))
-    act = nics("generate", path, "--out", folder / "out") if rng.random() < 0.2 else _read(path)
+    words = ("generate", path, "--robot", ROBOT, "--out", folder / "out")
+    act = nics(*words) if rng.random() < 0.2 else _read(path)
     return Attempt("recording", told, act, verdict)
 
 

@@ -7,13 +7,15 @@ import typer
 from typer import Option
 
 from nics_drl_bridge.commands.console import WorldOption, one_sentence
+from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 
 def demo(
     recording: Annotated[Path | None, Option(help="A drive; by default a textbook one.")] = None,
     out: Annotated[Path, Option(help="Folder for everything the demo writes.")] = Path("runs/demo"),
     robot: Annotated[
-        str | None, Option(help="Shipped, or a YAML file; differential, for a recording ackermann.")
+        str | None,
+        Option(help=f"Shipped, or a YAML file; else the recording's own, or {DEFAULT_ROBOT}."),
     ] = None,
     world: WorldOption = "arena",
     episodes: Annotated[int, Option(min=1, help="How many, in process and again over DDS.")] = 5,
@@ -26,6 +28,5 @@ def demo(
     with one_sentence():
         from nics_drl_bridge.commands.demo_run import DemoPlan, run
 
-        robot = robot or ("ackermann" if recording else "differential")
         plan = DemoPlan(out, robot, world, recording, episodes, policy, train_steps)
         typer.echo(run(plan, typer.echo))

@@ -28,10 +28,12 @@ from nics_drl_bridge.policy.pace import Fitted, fitted, pace_of
 from nics_drl_bridge.policy.policies import open_policy, shipped_policies
 from nics_drl_bridge.policy.training_settings import load_training
 from nics_drl_bridge.recording import textbook
-from nics_drl_bridge.recording.readers import read_recording
-from nics_drl_bridge.recording.recording import save_recording
+from nics_drl_bridge.recording.readers import read_recording, robot_and_drive
+from nics_drl_bridge.recording.recording import Recording, save_recording
+from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.report import html, pictures
 from nics_drl_bridge.report.fit_page import fit_tile, model_blocks, path_blocks, verdict_blocks
+from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.world import load_world
@@ -52,7 +54,7 @@ class DemoPlan:
     """Plan of a demo."""
 
     out: Path  # output folder
-    robot: str = "differential"  # name or YAML file, as the world
+    robot: str | None = None  # name or YAML file, as the world; None: as the recording tells
     world: str = "arena"
     recording: Path | None = None  # of a drive; None makes one with the robot's textbook kinematics
     episodes: int = 5  # number of episodes, in process and again over DDS
@@ -120,14 +122,19 @@ def run(plan: DemoPlan, say: Say) -> str:
     )
 
 
+def _recorded(plan: DemoPlan, say: Say) -> tuple[RobotSpec, Recording]:
+    """Reads the plan's drive with its robot, or records one of a textbook robot."""
+    if plan.recording is not None:
+        return robot_and_drive(plan.recording, plan.robot, TopicRoles(), None)
+    robot, file = load_robot(plan.robot or DEFAULT_ROBOT), plan.out / "recording.npz"
+    say(f"recording a drive of the textbook {robot.name!r} robot")
+    save_recording(textbook.record(robot, np.random.default_rng(RECORDING_SEED)), file)
+    return robot, read_recording(file, robot)
+
+
 def _generate(plan: DemoPlan, say: Say) -> tuple[SimulatorModel, Identified]:
-    robot, world = load_robot(plan.robot), load_world(plan.world)
-    source = plan.recording or plan.out / "recording.npz"
-    if plan.recording is None:
-        say(f"recording a drive of the textbook {robot.name!r} robot")
-        save_recording(textbook.record(robot, np.random.default_rng(RECORDING_SEED)), source)
-    say(f"generating a simulator of the robot {robot.name!r} from {source}")
-    recording = read_recording(source, robot)
+    world, (robot, recording) = load_world(plan.world), _recorded(plan, say)
+    say(f"generating a simulator of the robot {robot.name!r} from {recording.source}")
     # The demo has to steer even if the drive never did; the report names the assumptions.
     model, identified = generate(recording, robot, lidar_of(robot), world.shapes, assume=True)
     save_model(model, plan.model)
@@ -179,7 +186,7 @@ def _trained(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
 
     trained = train(settings, TRAINING_SEED, plan.out / "training", tell)
     result, file = SeedResult(TRAINING_SEED, trained, {}), plan.out / "policy.onnx"
-    export(settings, result, f"nics demo --robot {plan.robot}", file)
+    export(settings, result, f"nics demo --robot {plan.robot or model.robot.name}", file)
     steps = f"{trained.steps:,} steps, {trained.stepping_s:.0f} s of {trained.wall_s:.0f} s"
     how = f"PPO learned it from nothing in the generated simulator: {steps} in the simulator."
     return Learned(str(file), how, curve)

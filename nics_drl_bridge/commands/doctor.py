@@ -16,16 +16,16 @@ from nics_drl_bridge.commands.console import (
     table,
 )
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 EXIT_FINDINGS = 1
-DEFAULT = "ackermann"
 
 
 def doctor(
     bag: Annotated[Path | None, Argument(help="A bag to look at; else the live robot.")] = None,
     model: Annotated[
         str | None,
-        Option(help="What it must fit: a model's folder, or a shipped robot (ackermann)."),
+        Option(help=f"What it must fit: a model's folder, or a shipped robot ({DEFAULT_ROBOT})."),
     ] = None,
     policy: Annotated[str | None, Option(help="What it must fit instead: a policy file.")] = None,
     namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
@@ -46,7 +46,7 @@ def doctor(
         from nics_drl_bridge.report.doctor_facts import expected_of, facts_of_bag
 
         if policy is None:
-            expected = expected_of(open_model(model or DEFAULT))
+            expected = expected_of(open_model(model or DEFAULT_ROBOT))
         elif model is not None:
             raise ConfigError("--model and --policy: give one of them, what the robot must fit.")
         else:
@@ -68,7 +68,7 @@ def doctor(
             rows = [(f.severity, f.check, f.where, f.what, f.fix) for f in findings]
             typer.echo(table(heads, rows))
         else:
-            typer.echo(f"{facts.source}: all fits {policy or model or DEFAULT}.")
+            typer.echo(f"{facts.source}: all fits {policy or model or DEFAULT_ROBOT}.")
         if findings:
             raise typer.Exit(EXIT_FINDINGS)
 

@@ -30,6 +30,7 @@ from nics_drl_bridge.policy.stateful import Policy
 from nics_drl_bridge.report.doctor import examine
 from nics_drl_bridge.report.doctor_facts import expected_of
 from nics_drl_bridge.report.pictures import trajectories
+from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim.scenes import Scene, sample_scene
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
@@ -38,7 +39,6 @@ FAST, DDS, MUJOCO, VEHICLE = "fast", "dds", "mujoco_dds", "vehicle"
 NODES = {DDS: "simulator_node", MUJOCO: "mujoco_node"}
 PLACES = (FAST, *NODES)
 LABELS = {FAST: "in process", DDS: "over DDS", MUJOCO: "MuJoCo over DDS", VEHICLE: "on the vehicle"}
-DEFAULT_ROBOT = "ackermann"
 EVALUATION = "evaluation.json"
 GATE, RAW = "command_gate", "cmd_vel_raw"
 LISTEN_S, ARM_S = 5.0, 60.0

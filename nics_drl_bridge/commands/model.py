@@ -18,14 +18,16 @@ from nics_drl_bridge.commands.console import (
     one_sentence,
 )
 from nics_drl_bridge.errors import BackendError, ConfigError
+from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 if TYPE_CHECKING:
+    from nics_drl_bridge.identify.identify import Identified
     from nics_drl_bridge.recording.recording import Recording
 
 
 def record(
     out: Annotated[Path, Option(help="An .npz file, or the folder of a rosbag2, to write.")],
-    robot: RobotOption = "ackermann",
+    robot: RobotOption = DEFAULT_ROBOT,
     bound: Annotated[float, Option(help="Radius around the start to keep within [m].")] = 2.0,
     duration: Annotated[float, Option(help="Of the drive [s].")] = 60.0,
     speed: Annotated[float, Option(help="Share of the greatest speeds to use.")] = 1.0,
@@ -152,6 +154,7 @@ def import_(
     source: Annotated[Path, Argument(help="A bag, a table, or a folder of tables.")],
     mapping: Annotated[Path, Option("--map", help="YAML: what is what, docs/recordings.md.")],
     out: Annotated[Path, Option(help="The .npz file to write.")],
+    as_json: console.JsonOption = False,
 ) -> None:
     """Keeps a recording of any form as an .npz, after the repairs that its mapping needs."""
     with one_sentence():
@@ -165,22 +168,33 @@ def import_(
         with console.progress_bar(f"reading {source}"):
             drive = read_recording(source, mapping=mapping)
             save_recording(drive, out)
-        for line in stream_lines(drive):
+        streams = stream_facts(drive)
+        if as_json:
+            told = {"recording": str(out), "streams": streams, "repairs": drive.repairs}
+            typer.echo(json.dumps(told | {"robot": drive.robot}))
+            return
+        rows = [
+            (
+                s["stream"], f"{s['rows']}", f"{s['rate_hz']:.1f} Hz",
+                f"{s['from_s']:.2f} to {s['to_s']:.2f} s", s["clock"],
+            )
+            for s in streams
+        ]  # fmt: skip
+        typer.echo(console.table(("stream", "rows", "rate", "time", "clock"), rows))
+        for line in (*drive.repairs, f"recording written to {out}"):
             typer.echo(line)
-        typer.echo(f"recording written to {out}")
 
 
-def stream_lines(drive: "Recording") -> list[str]:
-    """Returns a line for each stream of a recording, and for each thing that was mended."""
-    rows = [
-        (
-            name, f"{len(s.t)}", f"{(len(s.t) - 1) / max(s.t[-1] - s.t[0], 1e-9):.1f} Hz",
-            f"{s.t[0]:.2f} to {s.t[-1]:.2f} s", s.clock,
-        )
+def stream_facts(drive: "Recording") -> list[dict[str, Any]]:
+    """Returns name, number of rows, rate, first and last time, and clock of each stream."""
+    return [
+        {
+            "stream": name, "rows": len(s.t),
+            "rate_hz": (len(s.t) - 1) / max(float(s.t[-1] - s.t[0]), 1e-9),
+            "from_s": float(s.t[0]), "to_s": float(s.t[-1]), "clock": s.clock,
+        }
         for name, s in drive.streams.items()
     ]  # fmt: skip
-    heads = ("stream", "rows", "rate", "time", "clock")
-    return [console.table(heads, rows), *drive.repairs]
 
 
 def generate(
@@ -188,7 +202,7 @@ def generate(
     out: Annotated[Path, Option(help="Folder of the model to write.")],
     robot: Annotated[
         str | None,
-        Option(help="A shipped robot or a YAML file; else the map's or import's, or ackermann."),
+        Option(help=f"Shipped, or a YAML file; else the recording's own, or {DEFAULT_ROBOT}."),
     ] = None,
     mapping: Annotated[
         Path | None,
@@ -212,6 +226,7 @@ def generate(
         bool, Option("--anyway", help="Write it even if predictions of unseen data are of no use.")
     ] = False,
     pictures: Annotated[bool, Option(help="Draw the fit into the model's pictures/.")] = False,
+    as_json: console.JsonOption = False,
 ) -> None:
     """Generates a simulator from a recording and writes it as a folder."""
     with one_sentence():
@@ -244,19 +259,35 @@ def generate(
         from nics_drl_bridge.report.fit_page import write_fit_page
         from nics_drl_bridge.report.fit_pictures import write_pictures
 
-        page = out / "report.html"
         with console.progress_bar("drawing the report"):
-            write_fit_page(page, str(recording), spec, identified, model.report)
+            write_fit_page(out / "report.html", str(recording), spec, identified, model.report)
             if pictures:
                 write_pictures(spec, identified, out / "pictures")
+        if as_json:
+            typer.echo(json.dumps(fit_facts(out, spec.name, identified)))
+            return
         typer.echo(opening(model.report))
-        typer.echo(f"\nall figures: {out / 'report.txt'}, with pictures: {page}")
+        typer.echo(f"\nall figures: {out / 'report.txt'}, with pictures: {out / 'report.html'}")
         typer.echo(f"model written to {out}")
 
 
+def fit_facts(out: Path, robot: str, identified: "Identified") -> dict[str, Any]:
+    """Returns the conclusion, equations and errors of a fit; null for what is not finite."""
+    from nics_drl_bridge.identify.conclusion import conclude
+    from nics_drl_bridge.identify.report import equations_with_errors
+
+    errors = json.dumps([asdict(each) for each in identified.judgement])
+    return {
+        "model": str(out), "robot": robot, **conclude(identified)._asdict(),
+        "equations": equations_with_errors(identified.model),
+        "errors": json.loads(errors, parse_constant=lambda _: None),
+        "report": str(out / "report.txt"), "page": str(out / "report.html"),
+    }  # fmt: skip
+
+
 def drive(
-    robot: Annotated[str, Option(help="A robot's YAML file, or a shipped robot.")],
     out: Annotated[Path, Option(help="Folder of the model to write.")],
+    robot: RobotOption = DEFAULT_ROBOT,
     recording: Annotated[
         Path | None, Option(help="An .npz to keep the drive in, as one of a real robot.")
     ] = None,

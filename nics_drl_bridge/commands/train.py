@@ -17,6 +17,7 @@ from typer import Argument, Option
 from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.console import JsonOption, completing, one_sentence, progress_bar
 from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 OWN = ("lean", "sb3")  # the engines of PPO in this process, see `training_settings.Engine`
 
@@ -27,7 +28,7 @@ def train(
     robot: Annotated[
         str | None,
         Option(
-            help="A shipped robot (differential), a YAML file, or the folder of a model.",
+            help=f"A shipped robot ({DEFAULT_ROBOT}), a YAML file, or the folder of a model.",
             autocompletion=completing("robots"),
         ),
     ] = None,

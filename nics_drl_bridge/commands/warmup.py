@@ -10,8 +10,9 @@ from typing import Any
 import typer
 
 from nics_drl_bridge.commands.console import JsonOption, one_sentence, progress_bar
+from nics_drl_bridge.robot import DEFAULT_ROBOT
 
-ROBOT, WORLD = "differential", "arena"
+WORLD = "arena"
 
 
 def warmup(
@@ -49,7 +50,7 @@ def _compiled_by(part: Callable[..., Any], *given: Any) -> tuple[int, float, Any
 def _model() -> Any:
     from nics_drl_bridge.generator import builtin_model
 
-    return builtin_model(ROBOT)
+    return builtin_model(DEFAULT_ROBOT)
 
 
 def _simulate(model: Any) -> None:

@@ -18,13 +18,12 @@ from nics_drl_bridge.commands.console import (
     roles_of,
 )
 from nics_drl_bridge.errors import ConfigError
-
-DEFAULT_POLICY = "differential"
+from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 
 def watch(
     policy: Annotated[str | None, Argument(
-        help="A policy file, a shipped policy (differential, the default) or a baseline "
+        help=f"A policy file, a shipped policy ({DEFAULT_ROBOT}, the default) or a baseline "
         "(dynamic_window).")] = None,
     model: Annotated[str | None, Option(
         "--model", "--robot", help="A model's folder, or a shipped robot; else the policy's own.")
@@ -56,7 +55,7 @@ def watch(
         elif ros:
             source = _ros(model, world, namespace)
         else:
-            source = _episodes(policy or DEFAULT_POLICY, model, world or ["circles"], seed, given)
+            source = _episodes(policy or DEFAULT_ROBOT, model, world or ["circles"], seed, given)
         with closing(source):
             if record is not None:
                 _record(record, source, episodes)
@@ -96,7 +95,7 @@ def _episodes(
     under = Conditions(given["lidar"], given["randomisation"], given["gate"])
     contracts = driving.contracts_of([policy])
     own = [driving.robot_of(*each) for each in contracts.items()]  # a baseline has none
-    model = open_model(name or (own or [driving.DEFAULT_ROBOT])[0], under.lidar)
+    model = open_model(name or (own or [DEFAULT_ROBOT])[0], under.lidar)
 
     def make(policy: str, world: Any) -> Any:
         options = {"estimator": True, "randomisation": under.ranges}
@@ -109,7 +108,7 @@ def _bag(bag: Path, name: str | None, worlds: list[str] | None, topics: dict[str
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.watch.bag import BagSource
 
-    model = open_model(name or DEFAULT_POLICY)
+    model = open_model(name or DEFAULT_ROBOT)
     return BagSource(bag, model, topics, _only(worlds))
 
 
@@ -118,7 +117,7 @@ def _ros(name: str | None, worlds: list[str] | None, namespace: str) -> Any:
 
     with needs_ros("nics watch --ros"):
         from nics_drl_bridge.nodes.watching import RosSource
-    return RosSource(open_model(name or DEFAULT_POLICY), _only(worlds), namespace)
+    return RosSource(open_model(name or DEFAULT_ROBOT), _only(worlds), namespace)
 
 
 def _only(worlds: list[str] | None) -> Any:

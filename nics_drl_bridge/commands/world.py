@@ -10,6 +10,7 @@ from typer import Argument, Option
 
 from nics_drl_bridge.commands.console import one_sentence
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 if TYPE_CHECKING:
     from nics_drl_bridge.sim.sections import Standing
@@ -189,7 +190,7 @@ def draw(
     name: Annotated[str, Argument(metavar="WORLD", help="A shipped one, a YAML file, or a set.")],
     out: Annotated[Path | None, Option(help="The .png to write; <world>.png.")] = None,
     seed: Annotated[int, Option(min=0, help="Of the episode.")] = 0,
-    robot: Annotated[str, Option(help="A shipped robot or a YAML file.")] = "differential",
+    robot: Annotated[str, Option(help="A shipped robot or a YAML file.")] = DEFAULT_ROBOT,
     footprint: Annotated[float | None, Option(help="Instead: radius of a round robot [m].")] = None,
 ) -> None:
     """Draws a world as an episode finds it: walls, map, obstacles, start and goal.
@@ -221,7 +222,7 @@ def map_(
     name: Annotated[str, Argument(metavar="WORLD", help="A shipped one, a YAML file, or a set.")],
     out: Annotated[Path | None, Option(help="The .yaml to write; <world>_map.yaml.")] = None,
     seed: Annotated[int, Option(min=0, help="Of the episode.")] = 0,
-    robot: Annotated[str, Option(help="A shipped robot or a YAML file.")] = "differential",
+    robot: Annotated[str, Option(help="A shipped robot or a YAML file.")] = DEFAULT_ROBOT,
     resolution: Annotated[float, Option(help="Greatest side of a cell [m].")] = 0.01,
 ) -> None:
     """Writes the map of an episode, of all that stands in it, as Nav2's map_server reads it.

@@ -20,6 +20,7 @@ from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Backend, RobotView, Start
 from nics_drl_bridge.lidar.sensor import unread
 from nics_drl_bridge.random_kernels import episode_seed
+from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.scenes import Scene, sample_scene
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
@@ -73,7 +74,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     Args:
         backend: `sim`, `dds`, or your own object, see `interface.Backend`; it may lack `halt` and
             `facts`, see `env.sim_backend.CompletedBackend`.
-        model: a SimulatorModel, its folder, or the name of a shipped robot.
+        model: a SimulatorModel, its folder, or a shipped robot's name; else `DEFAULT_ROBOT`.
         world: a World, its YAML file, or the name of a shipped one.
         task: a name, `path/to/file.py:ClassName`, a class, or a Task; see `env.registry.make_task`.
         task_options: further arguments of the task's class.
@@ -98,7 +99,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     }  # fmt: skip
 
     def __init__(
-        self, backend: str | Backend = "sim", model: str | SimulatorModel = "ackermann",
+        self, backend: str | Backend = "sim", model: str | SimulatorModel = DEFAULT_ROBOT,
         world: str | AnyWorld = "arena", task: str | type[Task] | Task = "navigation",
         task_options: dict[str, Any] | None = None, estimator: bool | None = None,
         backend_options: dict[str, Any] | None = None,

@@ -14,6 +14,7 @@ from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS
 from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world_set import AnyWorld
 
@@ -46,7 +47,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
     }  # fmt: skip
 
     def __init__(
-        self, model: str | SimulatorModel = "ackermann", world: str | AnyWorld = "arena",
+        self, model: str | SimulatorModel = DEFAULT_ROBOT, world: str | AnyWorld = "arena",
         task: str | type[Task] | Task = "cooperative_reaching",
         task_options: dict[str, Any] | None = None, max_episode_steps: int = MAX_EPISODE_STEPS,
         randomisation: str | Randomisation | None = None, render_mode: str | None = None,

@@ -22,6 +22,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import NS_PER_S, RobotView
 from nics_drl_bridge.lidar.shapes import BODY
+from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
@@ -69,7 +70,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
     }  # fmt: skip
 
     def __init__(
-        self, num_envs: int = 1, model: str | SimulatorModel = "ackermann",
+        self, num_envs: int = 1, model: str | SimulatorModel = DEFAULT_ROBOT,
         world: str | AnyWorld = "arena", task: str | type[Task] | Task = "navigation",
         task_options: dict[str, Any] | None = None, max_episode_steps: int = 300,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP, copy: bool = True, *,

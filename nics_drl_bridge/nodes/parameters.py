@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError, distribution
 from typing import Any, NamedTuple
 
+from nics_drl_bridge.robot import DEFAULT_ROBOT
+
 MODES = ("realtime", "lockstep", "as_fast_as_possible")
 NO_POSE, POSE_TYPES = "none", ("PoseStamped", "PoseWithCovarianceStamped")
 OWN = -1.0  # of a delay: as in the model
@@ -44,7 +46,7 @@ def stamped(what: str) -> Row:
     return Row(STAMPED, stamped_by_default(), about)
 
 
-MODEL = Row("model", "ackermann", "Folder of a SimulatorModel, or a shipped robot.")
+MODEL = Row("model", DEFAULT_ROBOT, "Folder of a SimulatorModel, or a shipped robot.")
 BASE_FRAME = Row("base_frame", "base_link", "Frame id of the robot.", fixed=False)
 
 
@@ -260,7 +262,7 @@ def gate() -> list[Row]:
 def drive() -> list[Row]:
     """Returns the parameters of `record_node`."""
     return [
-        Row("robot", "ackermann", "A shipped robot, or its YAML file."),
+        Row("robot", DEFAULT_ROBOT, "A shipped robot, or its YAML file."),
         Row("out", "drive.npz", "File *.npz of the recording, or folder of a rosbag2."),
         Row("bound", 2.0, "Radius of the circle around the start to keep within [m]."),
         Row("duration", 60.0, "Of the drive [s]."),
@@ -298,7 +300,7 @@ NODES: dict[str, Callable[[], NodeFacts]] = {
     "mujoco_node": lambda: NodeFacts(
         "Robots in MuJoCo behind the topics of the hardware.", DRIVEN_BY, TOLD, SERVED,
         [MODEL, ROBOTS, *device(), renderer("exact"), FRICTION],
-        "-p model:=differential -p world:=empty",
+        "-p model:=mecanum -p world:=empty",
     ),
     "middleware_node": lambda: NodeFacts(
         "Caches a robot's topics and publishes the estimate of its state; a managed node.",
@@ -321,7 +323,7 @@ NODES: dict[str, Callable[[], NodeFacts]] = {
         ("cmd_vel_raw", "scan", "odom", "odometry/filtered", "e_stop",
          "the model's further sensors"),
         ("cmd_vel", "/diagnostics"), ("~/arm", "~/reset", "~/e_stop"), gate(),
-        "-p limits:=ackermann",
+        f"-p limits:={DEFAULT_ROBOT}",
     ),
     "record_node": lambda: NodeFacts(
         "Drives a robot so that it shows its whole motion, and records it; the robot moves.",

@@ -10,6 +10,7 @@ from pydantic import Field, field_validator, model_validator
 from nics_drl_bridge.config import Schema, find_config, load_yaml, shipped_names, validate
 from nics_drl_bridge.env.teaching import Teaching
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 Share = Annotated[float, Field(gt=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=1, le=10**12)]
@@ -87,7 +88,7 @@ class TrainingSettings(Schema):
 
     task: str = "navigation"  # a name, or `path/to/file.py:ClassName`
     task_options: dict[str, Any] = Field(default_factory=dict)  # of the task's class
-    robot: str = "differential"  # name of a shipped robot, or the folder of a model
+    robot: str = DEFAULT_ROBOT  # name of a shipped robot, or the folder of a model
     lidar: str | None = None  # a shipped one or a file, instead of the model's own
     worlds: dict[str, Count] = Field(default_factory=lambda: {"circles": 256}, min_length=1)
     randomisation: str | None = None  # quantities drawn in each episode: a shipped one or a file
@@ -165,7 +166,7 @@ def load_training(name: str | Path) -> TrainingSettings:
 
 def chosen_settings(task: str, name: str | None, changes: dict[str, Any]) -> TrainingSettings:
     """Settings by name or file, else those shipped for task and robot, with changes by the user."""
-    robot = str(changes.get("robot", "differential"))
+    robot = str(changes.get("robot", DEFAULT_ROBOT))
     if name is None and f"{task}_{robot}" not in shipped_names("training"):
         base = TrainingSettings(task=task, robot=robot)
     else:

@@ -25,9 +25,9 @@ from nics_drl_bridge.recording.table import Source
 from nics_drl_bridge.recording.table_files import Files
 from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.recording.values import unit_of
-from nics_drl_bridge.robot.spec import RobotSpec, definition, load_robot, robot_from
+from nics_drl_bridge.robot import DEFAULT_ROBOT
+from nics_drl_bridge.robot.spec import RobotSpec, definition, robot_from
 
-DEFAULT_ROBOT = "ackermann"
 FOLDER = "xtark_folder"  # the mapping of a folder that is read without one,
 FILES, WHEELS = ("cmd.csv", "vrpn.csv"), ("L_wheel.csv", "R_wheel.csv")  # what it has, may have
 MOST_BYTES = 64 * 2**20  # of each of these; by --map tables may be larger
@@ -137,7 +137,7 @@ def _loaded(mapping: Mapping | str | Path) -> Mapping:
 def robot_and_drive(
     path: Path, robot: str | None, topics: TopicRoles, mapping: Mapping | str | Path | None
 ) -> tuple[RobotSpec, Recording]:
-    """Reads a drive with its robot: that named, else the mapping's, the recording's, or a car."""
+    """Reads a drive with its robot: the named one, else its mapping's or own, or the default."""
     if mapping is not None:
         given = _loaded(mapping)
         given = given if robot is None else given.model_copy(update={"robot": robot})
@@ -146,11 +146,18 @@ def robot_and_drive(
         _check_units(given, spec)
         return spec, arranged(drive, spec)
     if not is_recording(path):
-        spec = load_robot(robot or DEFAULT_ROBOT)
+        spec = robot_from(robot or _robot_of_folder(path) or DEFAULT_ROBOT)
         return spec, read_recording(path, spec, topics)
     drive = read_recording(path, None, topics)
     spec = _ranged(robot or drive.robot or DEFAULT_ROBOT, drive, drive.variables)
     return spec, drive if drive.robot is None else arranged(drive, spec)
+
+
+def _robot_of_folder(path: Path) -> str | dict[str, Any] | None:
+    """Returns the robot of a folder that is read by its shipped mapping; None of another form."""
+    if not _holds(path, FILES) or is_bag(path):
+        return None
+    return load_mapping(find_config(FOLDER, "recordings")).robot
 
 
 def robot_of(mapping: Mapping | str | Path, recording: Recording) -> RobotSpec:

@@ -11,7 +11,6 @@ pytest.importorskip("gymnasium")
 
 from nics_drl_bridge.commands.conditions import NO_CONDITIONS, Conditions
 from nics_drl_bridge.commands.episodes import (
-    DEFAULT_ROBOT,
     FAST,
     PLACES,
     EvaluationOrder,
@@ -21,6 +20,7 @@ from nics_drl_bridge.commands.episodes import (
     model_name,
 )
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.robot.spec import load_robot, robot_from
 from nics_drl_bridge.sim.world_set import load_worlds
 

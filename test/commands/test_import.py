@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -39,10 +40,14 @@ def test_a_log_becomes_a_mapping_a_recording_and_a_model(folder, tmp_path):
     again = nics("inspect", folder / "drive.csv", "--map", "my.yaml", cwd=tmp_path)
     assert "is there already" in again.stderr
 
-    words = ("--map", "my.yaml", "--out", "drive.npz")
-    done = nics("import", folder / "drive.csv", *words, cwd=tmp_path)
+    words = ("import", folder / "drive.csv", "--map", "my.yaml", "--out")
+    done = nics(*words, "drive.npz", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "command" in done.stdout
+    told = json.loads(nics(*words, "again.npz", "--json", cwd=tmp_path).stdout)
+    assert (told["recording"], told["robot"]["kind"]) == ("again.npz", "ackermann")
+    (pose,) = (stream for stream in told["streams"] if stream["stream"] == "pose")
+    assert pose["rate_hz"] == pytest.approx((pose["rows"] - 1) / (pose["to_s"] - pose["from_s"]))
     kept = load_recording(tmp_path / "drive.npz")
     assert kept.variables == ("speed_command", "steering_command")
     assert kept.robot == {"kind": "ackermann", "footprint_radius": 0.2}
@@ -54,10 +59,15 @@ def test_a_log_with_its_mapping_becomes_a_simulator(folder, tmp_path):
         "robot: ackermann\ntime: time\npose: {x: x, y: y, heading: yaw}\n"
         "command: {steering_command: cmd_steering, speed_command: cmd_speed}\n"
     )
-    words = ("--map", "my.yaml", "--out", "model")
+    words = ("--map", "my.yaml", "--out", "model", "--json")
     done = nics("generate", folder / "drive.csv", *words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert load_model(tmp_path / "model").robot.name == "ackermann"
+    told = json.loads(done.stdout)
+    assert (told["model"], told["robot"], told["ready"]) == ("model", "ackermann", True)
+    assert any(equation.startswith("vx = ") for equation in told["equations"])
+    assert told["accuracy"] in " ".join((tmp_path / told["report"]).read_text().split())
+    assert all(each["model"]["position_m"] >= 0.0 for each in told["errors"])
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,10 @@ def test_without_ros_it_is_one_sentence(tmp_path):
         (("--out", "drive.csv"), "unknown kind of recording '.csv'"),
         many(("--out", "taken.npz"), "taken.npz: is there already"),
         many(("--out", "drive.npz", "--robot", "ackerman"), "did you mean 'ackermann'?"),
-        many(("--out", "drive.npz", "--bound", "0.5"), "too small for robot 'ackermann'"),
+        many(
+            ("--out", "d.npz", "--robot", "ackermann", "--bound", "0.5"),
+            "too small for robot 'ackermann'",
+        ),
         many(("--out", "drive.npz", "--speed", "2"), "speed 2: must be from 0.05 to 1"),
     ],
 )

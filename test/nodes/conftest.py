@@ -82,7 +82,8 @@ def starter(
         ) -> Any:
             folder: Path = tmp_path_factory.mktemp(f"{node}_{next(numbers)}")
             stamped = "stamped" if node == "record_node" else "enable_stamped_cmd_vel"
-            parameters = {"model": model_folder, stamped: False} | parameters
+            own = {"robot": "ackermann"} if node == "record_node" else {"model": model_folder}
+            parameters = {**own, stamped: False} | parameters
             LAUNCHED.append(kind(node, folder, parameters, domain_id, namespace, remap))
             return started.enter_context(LAUNCHED[-1])
 

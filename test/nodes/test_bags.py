@@ -179,18 +179,22 @@ def test_a_replay_in_lock_step_gives_the_same_estimate_bit_for_bit(
 
 
 def test_the_doctor_finds_nothing_at_the_simulator_and_a_second_driver_beside_it(
-    launch, meet, module_domain_id
+    launch, meet, module_domain_id, model_folder
 ):
     launch("simulator_node", module_domain_id, world="empty")
     peer = meet(module_domain_id)
     scans = peer.listen(LaserScan, "scan")
     peer.until(lambda: scans, "a scan", ENDS_S)
-    out, err, code = ended(nics(module_domain_id, "doctor", "--duration", "3", "--json"))
+    out, err, code = ended(
+        nics(module_domain_id, "doctor", "--model", model_folder, "--duration", "3", "--json")
+    )
     assert json.loads(out)["findings"] == [], err
     assert code == 0
     for _ in range(2):
         peer.speak(Twist, "cmd_vel")
-    out, err, code = ended(nics(module_domain_id, "doctor", "--duration", "2", "--json"))
+    out, err, code = ended(
+        nics(module_domain_id, "doctor", "--model", model_folder, "--duration", "2", "--json")
+    )
     (finding,) = json.loads(out)["findings"]
     assert code == 1
     assert (finding["check"], finding["where"]) == ("publishers", "/cmd_vel")

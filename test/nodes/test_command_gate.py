@@ -33,7 +33,7 @@ from nodes.peer import DEADLINE_S
 
 pytestmark = pytest.mark.ros
 
-GIVEN = ["gate", "--ros-args", "-p", "limits:=ackermann", "-p"]
+GIVEN = ["gate", "--ros-args", "-p", "model:=ackermann", "-p", "limits:=ackermann", "-p"]
 """The last one is followed by a parameter."""
 
 SOON_S = 0.5  # what the gate is made for, on a machine with time

@@ -71,7 +71,7 @@ def test_a_typo_in_the_limits_is_one_sentence(declared, tmp_path):
     text = find_config("ackermann", "limits").read_text(encoding="utf-8")
     file.write_text(text.replace("max: 1.0", "max: 10.0"), encoding="utf-8")
     with pytest.raises(ConfigError, match=r"speed_command\.max': 10 m/s is beyond the robot's own"):
-        declared({"limits": str(file)})
+        declared({"model": "ackermann", "limits": str(file)})
 
 
 @pytest.mark.parametrize(("rate", "age"), [(10.0, 0.3), (5.0, 0.35), (4.0, 0.4375), (40.0, 0.3)])

@@ -78,8 +78,8 @@ def driving(simulators, listeners):
         options = {"mode": mode, "domain_id": simulators[mode]}
         options |= {"stale_after_s": PATIENCE_S} if mode == "realtime" else {}
         env = gymnasium.make(
-            NAVIGATION, backend="dds", world="empty", task=Thrower, max_episode_steps=100_000,
-            backend_options=options, **arguments,
+            NAVIGATION, backend="dds", model="ackermann", world="empty", task=Thrower,
+            max_episode_steps=100_000, backend_options=options, **arguments,
         )  # fmt: skip
         made.append(env)
         env.reset(seed=1)
@@ -213,8 +213,8 @@ def test_one_robot_of_a_fleet_that_cant_be_halted_keeps_none_of_the_others_movin
     peer = meet(domain_id)
     heard = [peer.listen(Twist, f"{name}/cmd_vel", qos.EVERY_COMMAND) for name in names]
     env = gymnasium.make(
-        COOPERATIVE_REACHING, backend="dds", world="empty", task_options={"robots": 3},
-        backend_options={"domain_id": domain_id, "namespaces": names},
+        COOPERATIVE_REACHING, backend="dds", model="ackermann", world="empty",
+        task_options={"robots": 3}, backend_options={"domain_id": domain_id, "namespaces": names},
     ).unwrapped  # fmt: skip
 
     def drive():
@@ -259,7 +259,7 @@ def test_what_a_user_is_told_by_may_raise(simulators, listeners, monkeypatch):
     told = {"say": say, "vehicle": True, "start": "present"}
     peer, heard = listeners[mode]
     options = {"mode": mode, "domain_id": simulators[mode], "stale_after_s": PATIENCE_S, **told}
-    env = BridgeEnv("dds", world="empty", backend_options=options)
+    env = BridgeEnv("dds", "ackermann", "empty", backend_options=options)
     try:
         env.reset(seed=0)
         heard.clear()

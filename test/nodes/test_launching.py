@@ -70,5 +70,5 @@ def test_the_model_of_the_file_of_parameters_is_drawn_where_none_is_given(tmp_pa
     file = tmp_path / "own.yaml"
     file.write_text("/**:\n  ros__parameters:\n    model: jackal\n")
     assert '<robot name="jackal"' in setup_of(params_file=str(file)).description()
-    assert '<robot name="ackermann"' in setup_of().description()
+    assert '<robot name="differential"' in setup_of().description()
     assert '<robot name="mecanum"' in setup_of(model="mecanum").description()

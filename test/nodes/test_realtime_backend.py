@@ -84,7 +84,7 @@ def drive_on(backend):
 
 def test_gymnasium_make_drives_a_simulator_in_real_time(simulator):
     options = {"domain_id": simulator[0], "mode": "realtime", "stale_after_s": PATIENCE_S}
-    env = gymnasium.make(NAVIGATION, backend="dds", backend_options=options)
+    env = gymnasium.make(NAVIGATION, backend="dds", model="ackermann", backend_options=options)
     try:
         _, info = env.reset(seed=3)
         before = info["pose"]

@@ -226,7 +226,7 @@ def test_ctrl_c_on_the_command_line_saves_a_bag_and_tells_what_it_holds(
 ):
     pytest.importorskip("rosbags")
     robot = FakeRobot(meet(domain_id))
-    command = nics("--out", "drive")
+    command = nics("--robot", "ackermann", "--out", "drive")
     robot.until(lambda: robot.driven, "it drives")
     command.process.send_signal(signal.SIGINT)
     robot.until(lambda: command.ended, "it ends")

@@ -39,7 +39,7 @@ options = {
     "mode": "realtime", "vehicle": True, "stale_after_s": 1e6, "timeout_s": 60.0, "say": say,
     "start": "wait" if wait else "present",
 }
-env = gymnasium.make(NAVIGATION, backend="dds", backend_options=options)
+env = gymnasium.make(NAVIGATION, backend="dds", model="ackermann", backend_options=options)
 env.reset(seed=3)
 action = np.array([1.0, 0.0], np.float32)
 task = env.unwrapped.task
@@ -162,7 +162,7 @@ def opened(*given):
     return SimpleNamespace(act=act), task
 
 policy_node.open_policy = opened
-policy_node.main([sys.argv[0], "--ros-args", "-p", "goal:=[8.0, 5.0]"])
+policy_node.main([sys.argv[0], "--ros-args", "-p", "goal:=[8.0, 5.0]", "-p", "model:=ackermann"])
 """
 
 

@@ -145,7 +145,7 @@ def test_what_is_not_given_stands_in_the_file_of_parameters(launch, told, tmp_pa
     assert told(launched, "/policy_node", "fallback", "policy") == ["mppi", "dynamic_window"]
     # But a vehicle requires an emergency stop, whatever its file says.
     names = "e_stop_required", "limits", "use_sim_time"
-    assert told(launched, "/command_gate", *names) == [True, "ackermann", False]
+    assert told(launched, "/command_gate", *names) == [True, "differential", False]
     launched.ends_well()
 
 

@@ -11,6 +11,7 @@ from typer import Argument, Option
 
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands.console import SalvageOption, intact, needs_ros, one_sentence
+from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 bag = typer.Typer(help="Records, describes, replays, exports and saves bags.", no_args_is_help=True)
 
@@ -82,7 +83,7 @@ def replay(
     ] = False,
     model: Annotated[
         str, Option(help="For --estimate: folder of a model, or a shipped robot.")
-    ] = "ackermann",
+    ] = DEFAULT_ROBOT,
     topic: Annotated[
         list[str] | None,
         Option(

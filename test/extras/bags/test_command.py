@@ -79,7 +79,8 @@ def test_what_is_intact_is_saved_and_the_loss_is_told(damaged, tmp_path):
 def test_generate_takes_what_is_intact_when_told_to(tmp_path):
     car, bag = load_robot("ackermann"), tmp_path / "drive"
     write_bag(textbook.record(car, np.random.default_rng(0), duration=30.0), bag, car)
-    told = nics("generate", cut(bag, 0.8), "--salvage", "--out", tmp_path / "model")
+    words = ("--robot", "ackermann", "--salvage", "--out", tmp_path / "model")
+    told = nics("generate", cut(bag, 0.8), *words)
     assert told.exit_code == 0, told.output
     assert "are lost" in told.stderr
     assert (tmp_path / "model" / "model.yaml").is_file()
