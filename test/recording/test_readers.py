@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from nics_drl_bridge.errors import RecordingError
-from nics_drl_bridge.recording.readers import read_recording
+from nics_drl_bridge.recording.readers import read_recording, robot_and_drive
 from nics_drl_bridge.recording.recording import Recording, Stream, save_recording
+from nics_drl_bridge.recording.topic_roles import TopicRoles
+from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 
 @pytest.fixture
@@ -43,6 +45,16 @@ def test_it_reads_commands_poses_and_wheels_with_their_clocks(folder):
     assert np.array_equal(recording.wheels.values[0], [3.0, 5.0])
     clocks = {name: stream.clock for name, stream in recording.streams.items()}
     assert clocks == {"command": "robot", "pose": "mocap", "wheels": "robot"}
+
+
+def test_a_folder_tells_its_robot_and_a_drive_that_tells_none_is_of_the_default(folder, tmp_path):
+    def robot_of(path, named=None):
+        return robot_and_drive(path, named, TopicRoles(), None)[0].name
+
+    assert robot_of(folder) == "ackermann"
+    assert robot_of(folder, "tricycle") == "tricycle"
+    save_recording(read_recording(folder), tmp_path / "drive.npz")
+    assert robot_of(tmp_path / "drive.npz") == DEFAULT_ROBOT
 
 
 def test_wheels_and_acceleration_may_be_missing(folder):
