@@ -193,7 +193,7 @@ def test_the_doctor_finds_nothing_at_the_simulator_and_a_second_driver_beside_it
     for _ in range(2):
         peer.speak(Twist, "cmd_vel")
     out, err, code = ended(
-        nics(module_domain_id, "doctor", "--model", model_folder, "--duration", "2", "--json")
+        nics(module_domain_id, "doctor", "--model", model_folder, "--duration", "6", "--json")
     )
     (finding,) = json.loads(out)["findings"]
     assert code == 1
