@@ -31,6 +31,7 @@ Flags = NDArray[np.bool_]
 FINEST = 6  # bisections of the scale
 SPEEDS, TURNS = 3, 9
 """Arcs of the family: number of speeds along each axis, and number of turn rates."""
+CREEP = 0.1  # a speed that is not safe at this [m/s] would use up what a turn on the spot needs
 MOVING = 0.1  # above this speed the ratio of turn rate to speed gives the curvature [m/s]
 CALM = 0.5  # share of its deceleration with which the robot should stop when nothing is sudden
 STEP = 0.02  # distance between two checked places of the footprint on an arc [m]
@@ -188,7 +189,8 @@ def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
     if config.shield is None or config.limits is None or state.obstacles is None:
         return motion
     linear, turn = config.limits.linear, config.limits.turn
-    if not motion.value[linear | turn].any() or _safe(config, state, motion.value, now):
+    turning, speed = motion.value[turn].any(), np.abs(motion.value[linear]).max(initial=0.0)
+    if not (turning or speed):
         return motion
 
     def part(ahead: float, about: float) -> Array:
@@ -197,8 +199,12 @@ def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
     def safe(ahead: float, about: float) -> bool:
         return _safe(config, state, part(ahead, about), now)
 
+    on_the_spot = bool(turning) and config.shield.wheelbase == 0.0
+    creeps = on_the_spot and 0.0 < speed < CREEP
+    if safe(1.0, 1.0) and (not creeps or safe(CREEP / speed, 1.0)):
+        return motion
     # A way that is barred bars no turn on the spot: else a robot could not turn away from it.
-    turns = bool(motion.value[turn].any()) and safe(0.0, 1.0)
+    turns = bool(turning) and safe(0.0, 1.0)
     low, high = 0.0, 1.0
     for _ in range(FINEST):
         middle = (low + high) / 2.0
@@ -206,6 +212,8 @@ def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
             low = middle
         else:
             high = middle
+    if turns and on_the_spot and low * speed < CREEP:
+        low = 0.0
     value = part(low, 1.0 if turns else low)
     slope = np.where(turn & turns, motion.slope, 0.0)
     return replace(motion, value=value, slope=slope, shielded=True)

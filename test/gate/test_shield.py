@@ -13,6 +13,7 @@ from nics_drl_bridge.gate import shield_kernels
 from nics_drl_bridge.gate.gate import decide
 from nics_drl_bridge.gate.inputs import Odometry, Scan, Tick
 from nics_drl_bridge.gate.shield import (
+    CREEP,
     MEMORY_S,
     SPACING_S,
     body_of,
@@ -110,6 +111,17 @@ def test_what_bars_the_way_bars_no_turn_on_the_spot():
     barred = Faced(at_a_corner, box, (0.0, 0.0, 0.5), "differential")
     barred.settles(0.5)
     assert 0.0 <= barred.decision.twist[2] < 0.2
+
+
+def test_a_robot_that_turns_does_not_creep_nearer():
+    wishes = {"ahead": (1.0, 0.0, 0.0), "turning": (1.0, 0.0, 0.5)}
+    rigs = {
+        name: Faced(ranges(0.23), replace(CAR, wheelbase=0.0), wish, robot="differential")
+        for name, wish in wishes.items()
+    }
+    assert 0.0 < rigs["ahead"].settles(0.5) < CREEP
+    assert rigs["turning"].settles(0.5) == 0.0
+    assert rigs["turning"].decision.twist[2] == pytest.approx(0.5)
 
 
 def test_something_too_close_to_measure_counts_as_an_obstacle():
