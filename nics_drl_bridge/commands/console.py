@@ -78,7 +78,7 @@ TopicOption = Annotated[
     list[str] | None,
     Option(
         metavar="ROLE=TOPIC",
-        help="The same for one role, as cmd_vel=/car/drive; may be given several times. Roles: "
+        help="Topic of one role, as cmd_vel=/car/drive; may be given several times. Roles: "
         "cmd_vel, pose, odom, joint_states, imu; none as a topic leaves a role out.",
     ),
 ]
@@ -154,7 +154,7 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     from rich.table import Table
     from rich.text import Text
 
-    made = Table(*heads, box=SIMPLE, pad_edge=False)
+    made = Table(*map(Text, heads), box=SIMPLE, pad_edge=False)  # no markup: [m] is a unit
     for row in rows:
         made.add_row(*(Text(cell, overflow="fold") for cell in row))
     console = Console()

@@ -12,7 +12,6 @@ from nics_drl_bridge.commands.console import (
     GateOption,
     OtherLidarOption,
     RandomisationOption,
-    TopicOption,
     needs_ros,
     one_sentence,
     roles_of,
@@ -38,7 +37,8 @@ def watch(
     ros: Annotated[bool, Option("--ros", help="Show live topics instead.")] = False,
     namespace: Annotated[str, Option(help="For --ros: of the robot's topics.")] = "",
     bag: Annotated[Path | None, Option(help="Show a recorded drive instead.")] = None,
-    topic: TopicOption = None,
+    topic: Annotated[list[str] | None, Option(metavar="ROLE=TOPIC", help="For --bag: as "
+        "odom=/wheel_odom. Roles: scan, odom, cmd_vel, pose, imu.")] = None,
     record: Annotated[Path | None, Option(
         metavar="FILE", help="Write .mp4, .gif or .rrd (Rerun) instead of a page.")] = None,
     episodes: Annotated[int, Option(min=1, help="For --record: how many.")] = 1,
@@ -46,7 +46,7 @@ def watch(
         min=0, max=65535, help="Of the page; 0 takes any (default 8765).")] = None,
     browser: Annotated[bool, Option(help="Open the page in a browser.")] = True,
 ) -> None:  # fmt: skip
-    """Shows a policy driving, live topics or a bag, on a page served to this machine only."""
+    """Shows a policy, live topics or a bag on a page in the browser."""
     with one_sentence():
         given = {"lidar": lidar, "randomisation": randomisation, "gate": gate}
         _check(given, ros, bag, record, policy)
