@@ -132,7 +132,7 @@ class RobotSpec(Schema):
     # meaning of `angular.z` for a robot that steers: a turn rate [rad/s], as in any Twist, or the
     # steering angle [rad] itself
     angular_is: Literal["turn_rate", "steering"] = "turn_rate"
-    # of a circle around `base_link` [m], 10 at most; optional with a `footprint`, which it then circumscribes
+    # of a circle around `base_link` [m], 10 at most; optional with a `footprint`, then around that
     footprint_radius: float = Field(ge=1e-3)
     # corners of a polygon instead, in `base_link` [m], in either direction
     footprint: tuple[tuple[float, float], ...] | None = Field(
