@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.console import (
     GateOption,
     OtherLidarOption,
@@ -77,7 +78,9 @@ def _check(
         raise ConfigError(f"{', '.join(named)}: {where} shows what others drive; leave it out.")
     if ros and record is not None:
         raise ConfigError("--record: live topics are recorded by nics bag record; show that bag.")
-    if record is not None:
+    if record is None:  # before the source is opened, which may take a while
+        extensions.require("the page", "websockets")
+    else:
         from nics_drl_bridge.watch.record import check_file
 
         check_file(record)
