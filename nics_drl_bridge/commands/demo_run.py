@@ -17,7 +17,7 @@ from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, PolicyError
-from nics_drl_bridge.files import write_text
+from nics_drl_bridge.files import write_bytes, write_text
 from nics_drl_bridge.generator import SimulatorModel, generate, lidar_of, save_model
 from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.identify import Identified
@@ -103,6 +103,9 @@ def run(plan: DemoPlan, say: Say) -> str:
     learned = timed("learning", learn, model)
     summary = timed("evaluating", _evaluate, model, learned.policy)
     here = timed("driving in process", _drive, FAST, learned.policy)
+    world, radius, paths = load_world(plan.world), model.robot.footprint_radius, "paths.png"
+    write_bytes(plan.out / paths, pictures.trajectories({LABELS[FAST]: here}, world, radius))
+    say(f"  the paths are drawn in {plan.out / paths}")  # while the report takes a while
     there = timed("driving over DDS", _drive, DDS, learned.policy)
     arrived = (episode.seed for episode in there if episode.result == "success")
     live = timed("deploying", _deploy, model, learned.policy, next(arrived, 0))
