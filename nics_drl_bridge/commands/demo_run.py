@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from nics_drl_bridge import extensions
-from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS, Say, drive_in
+from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS, START_S, Say, drive_in
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
@@ -42,7 +42,7 @@ RECORDING_SEED, TRAINING_SEED = 1, 0
 MANY = 500  # episodes of the evaluation in the fast simulator
 BASELINE = "dynamic_window"
 LINES = 10  # number of progress reports of a training
-START_S, ARRIVE_S = 60.0, 40.0  # time that a node may take to start, and the robot to arrive
+ARRIVE_S = 90.0  # time that the robot may take [s]; its policy may have to be compiled
 FULL_COMMAND_S, FULL_RATE_S = 0.3, 0.05  # of the demo's gate, from zero to greatest command, rate
 GOOD = 0.9  # share of successes below which the verdict doubts a policy
 PANELS = 9  # maximum number of episodes that are drawn
