@@ -151,10 +151,10 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Formats a table; without a terminal no cell is cut or wrapped."""
     from rich.box import SIMPLE
     from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column, Table
     from rich.text import Text
 
-    made = Table(*map(Text, heads), box=SIMPLE, pad_edge=False)  # no markup: [m] is a unit
+    made = Table(*(Column(Text(head)) for head in heads), box=SIMPLE, pad_edge=False)  # no markup
     for row in rows:
         made.add_row(*(Text(cell, overflow="fold") for cell in row))
     console = Console()
