@@ -102,11 +102,11 @@ fi
 @touch $(1)
 endef
 
-# uv knows nothing of pip's settings. PyTorch's own index has wheels for Linux without the
+# uv knows nothing of pip's settings, nor, unless told, of the system's certificates. PyTorch's own index has wheels for Linux without the
 # libraries of GPUs, which are five times the size; without it, those with them have to do.
 WHEELS := $(subst $(SPACE),$(COMMA),$(strip $(or $(UV_FIND_LINKS),$(PIP_FIND_LINKS))))
 TORCH := $(if $(WHEELS),,--torch-backend cpu)
-UV_INSTALL = $(if $(WHEELS),UV_FIND_LINKS=$(WHEELS)) $(if $(PIP_INDEX_URL),UV_DEFAULT_INDEX=$(PIP_INDEX_URL)) \
+UV_INSTALL = UV_SYSTEM_CERTS=$${UV_SYSTEM_CERTS:-1} $(if $(WHEELS),UV_FIND_LINKS=$(WHEELS)) $(if $(PIP_INDEX_URL),UV_DEFAULT_INDEX=$(PIP_INDEX_URL)) \
 	$(BIN)/uv pip install --quiet --python $(BIN)/python --constraints $(VENV)/constraints.txt
 
 $(READY): $(DESCRIBED_BY)

@@ -120,6 +120,7 @@ def whole_road(*words: object, cwd: Path) -> tuple[Running, tuple[str, str], str
 def test_it_goes_the_whole_road_and_leaves_a_report(tmp_path):
     running, successes, text = whole_road(*READY_MADE, cwd=tmp_path)
     assert successes == ("2", "2")
+    assert (tmp_path / "out" / "paths.png").is_file()
     assert any("the deployed nodes reached the goal" in line for line in running.lines)
     page = Sources()
     page.feed(text)

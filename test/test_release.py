@@ -61,6 +61,7 @@ def test_a_release_runs_the_demo_outside_of_the_repository(dist, kind, tmp_path)
     words = ["demo", "--policy", "differential", "--episodes", "2", "--out", "demo"]
     told = run(python.with_name("nics"), *words, cwd=tmp_path)
     assert "in process 2/2, over DDS 2/2" in told
+    assert (tmp_path / "demo" / "paths.png").is_file()
     assert (tmp_path / "demo" / "report.html").is_file()
 
 

@@ -14,6 +14,7 @@ import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from textwrap import shorten
 from typing import Any
 
 from measuring.figures import TABLES
@@ -116,8 +117,9 @@ class Page:
         for name in sorted(runs & set(self.runs)):
             entry = self.runs[name]
             if entry["state"] != MET:
-                wrong = " ".join("; ".join(entry["failures"] or [entry["error"] or ""]).split())
-                notes.append(f"{OF_MISSED} `{entry['script']}` {entry['state']}: {wrong[:300]}")
+                wrong = "; ".join(entry["failures"] or [entry["error"] or ""])
+                wrong = shorten(wrong, 300, placeholder=" ...")  # between words
+                notes.append(f"{OF_MISSED} `{entry['script']}` {entry['state']}: {wrong}")
             if entry["quick"]:
                 notes.append(f"{OF_QUICK} `{entry['script']}`: a short run")
         return [line for note in notes for line in ("", note)]

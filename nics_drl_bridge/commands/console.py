@@ -78,7 +78,7 @@ TopicOption = Annotated[
     list[str] | None,
     Option(
         metavar="ROLE=TOPIC",
-        help="The same for one role, as cmd_vel=/car/drive; may be given several times. Roles: "
+        help="Topic of one role, as cmd_vel=/car/drive; may be given several times. Roles: "
         "cmd_vel, pose, odom, joint_states, imu; none as a topic leaves a role out.",
     ),
 ]
@@ -151,10 +151,10 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Formats a table; without a terminal no cell is cut or wrapped."""
     from rich.box import SIMPLE
     from rich.console import Console
-    from rich.table import Table
+    from rich.table import Column, Table
     from rich.text import Text
 
-    made = Table(*heads, box=SIMPLE, pad_edge=False)
+    made = Table(*(Column(Text(head)) for head in heads), box=SIMPLE, pad_edge=False)  # no markup
     for row in rows:
         made.add_row(*(Text(cell, overflow="fold") for cell in row))
     console = Console()

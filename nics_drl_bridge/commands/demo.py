@@ -24,7 +24,7 @@ def demo(
     ] = None,
     train_steps: Annotated[int | None, Option(min=1, help="Environment steps to train.")] = None,
 ) -> None:
-    """Goes the whole road once: generate, train, evaluate, drive over DDS, deploy, report."""
+    """Goes the whole road once, from a recording to a report."""
     with one_sentence():
         from nics_drl_bridge.commands.demo_run import DemoPlan, run
 

@@ -12,12 +12,12 @@ from typing import Any, TypeVar
 import numpy as np
 
 from nics_drl_bridge import extensions
-from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS, Say, drive_in
+from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS, START_S, Say, drive_in
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, PolicyError
-from nics_drl_bridge.files import write_text
+from nics_drl_bridge.files import write_bytes, write_text
 from nics_drl_bridge.generator import SimulatorModel, generate, lidar_of, save_model
 from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.identify import Identified
@@ -42,7 +42,7 @@ RECORDING_SEED, TRAINING_SEED = 1, 0
 MANY = 500  # episodes of the evaluation in the fast simulator
 BASELINE = "dynamic_window"
 LINES = 10  # number of progress reports of a training
-START_S, ARRIVE_S = 60.0, 40.0  # time that a node may take to start, and the robot to arrive
+ARRIVE_S = 90.0  # time that the robot may take [s]; its policy may have to be compiled
 FULL_COMMAND_S, FULL_RATE_S = 0.3, 0.05  # of the demo's gate, from zero to greatest command, rate
 GOOD = 0.9  # share of successes below which the verdict doubts a policy
 PANELS = 9  # maximum number of episodes that are drawn
@@ -103,6 +103,9 @@ def run(plan: DemoPlan, say: Say) -> str:
     learned = timed("learning", learn, model)
     summary = timed("evaluating", _evaluate, model, learned.policy)
     here = timed("driving in process", _drive, FAST, learned.policy)
+    world, radius, paths = load_world(plan.world), model.robot.footprint_radius, "paths.png"
+    write_bytes(plan.out / paths, pictures.trajectories({LABELS[FAST]: here}, world, radius))
+    say(f"  the paths are drawn in {plan.out / paths}")  # while the report takes a while
     there = timed("driving over DDS", _drive, DDS, learned.policy)
     arrived = (episode.seed for episode in there if episode.result == "success")
     live = timed("deploying", _deploy, model, learned.policy, next(arrived, 0))

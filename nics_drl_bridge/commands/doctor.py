@@ -35,7 +35,7 @@ def doctor(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Tells what of a robot or a bag does not fit a model or a policy; it sends nothing."""
+    """Tells what of a robot or a bag does not fit; it sends nothing."""
     with one_sentence():
         if install:
             _tell_installation(as_json)
@@ -89,7 +89,7 @@ def explain(
     file: Annotated[Path, Argument(help="What command_gate wrote at a stop, *.jsonl.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Tells why command_gate stopped a robot, by deciding anew on what it wrote down."""
+    """Tells why command_gate stopped a robot, from what it wrote down."""
     with one_sentence():
         from nics_drl_bridge.gate import black_box
 

@@ -182,6 +182,7 @@ def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
         for place in places:
             what = f"{Path(policy).stem} {LABELS[place]}"
             say(f"driving {order.episodes} episodes of {policy} {LABELS[place]}")
+            tell(what, 0, order.episodes)
 
             def on_episode(episode: Episode, what: str = what) -> None:
                 tell(what, episode.seed - order.seed + 1, order.episodes)

@@ -61,7 +61,7 @@ def evaluate(
     arm: Annotated[bool, Option("--arm", help="For --hardware: arm command_gate.")] = False,
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
-    """Drives policies through the same episodes in several worlds, and compares."""
+    """Drives policies through the same episodes, and compares them."""
     with one_sentence():
         place = _point(goal)
         if backend not in (None, "dds"):

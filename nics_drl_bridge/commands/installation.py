@@ -16,6 +16,8 @@ EXTRAS = {  # what each brings, by the modules that it needs
     "deploy": ("driving by policy files", ("onnx", "onnxruntime")),
     "train": ("training", TRAINING),
     "multi": ("teams, as PettingZoo environments", ("pettingzoo",)),
+    "view": ("the page of nics watch", ("websockets",)),
+    "video": ("MP4 and Rerun files of nics watch", ("imageio_ffmpeg", "rerun")),
     "mujoco": ("robots with real wheels, in MuJoCo", ("mujoco",)),
     "distributed": ("training on a Ray cluster", ("ray",)),
 }

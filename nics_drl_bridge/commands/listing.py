@@ -27,7 +27,7 @@ def list_(
     what: Annotated[Listed, Argument(help="What to list.")],
     as_json: JsonOption = False,
 ) -> None:
-    """Lists the robots, worlds, lidars or policies that come with the package."""
+    """Lists the robots, worlds, lidars or policies that are shipped."""
     with one_sentence():
         rows = ROWS[what]()
         if as_json:

@@ -40,7 +40,7 @@ def record(
     preview: Annotated[bool, Option("--preview", help="Show the drive's plan, and stop.")] = False,
     yes: Annotated[bool, Option("--yes", help="Do not ask before the robot moves.")] = False,
 ) -> None:
-    """Drives a robot over ROS 2 so that it shows its whole motion, and records it."""
+    """Drives a robot so that it shows its whole motion; records it."""
     with one_sentence():
         arguments = node_arguments(namespace, remap or ())
         given = {
@@ -119,7 +119,7 @@ def inspect(
     ] = None,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Lists what a recording of any form holds, and begins the mapping that says what is what."""
+    """Lists what a recording of any form holds and begins its mapping."""
     with one_sentence():
         from nics_drl_bridge.files import write_text
         from nics_drl_bridge.recording.guess import NOT_USED, first_mapping
@@ -156,7 +156,7 @@ def import_(
     out: Annotated[Path, Option(help="The .npz file to write.")],
     as_json: console.JsonOption = False,
 ) -> None:
-    """Keeps a recording of any form as an .npz, after the repairs that its mapping needs."""
+    """Keeps a recording of any form as an .npz, read by its mapping."""
     with one_sentence():
         from nics_drl_bridge.recording.readers import read_recording
         from nics_drl_bridge.recording.recording import save_recording
@@ -228,7 +228,7 @@ def generate(
     pictures: Annotated[bool, Option(help="Draw the fit into the model's pictures/.")] = False,
     as_json: console.JsonOption = False,
 ) -> None:
-    """Generates a simulator from a recording and writes it as a folder."""
+    """Generates a simulator from a recording, and writes its folder."""
     with one_sentence():
         from nics_drl_bridge.generator import check_place, lidar_of, save_model
         from nics_drl_bridge.generator import generate as generate_model
@@ -295,7 +295,7 @@ def drive(
     duration: Annotated[float, Option(min=5.0, max=3600.0, help="Of the drive [s].")] = 60.0,
     seed: Annotated[int, Option(min=0, help="Of the commands, which are random.")] = 0,
 ) -> None:
-    """Drives the textbook model of a robot, and generates a simulator from that drive.
+    """Drives a robot's textbook model and generates a simulator of it.
 
     For training before there is a recording; with one, `nics generate` makes a truer simulator.
     """

@@ -42,7 +42,7 @@ def export(
     file: Annotated[str, Argument(help="A policy file, or the name of a shipped one.")],
     leapp: Annotated[Path, Option(help="Folder of the bundle: network, YAML file, start values.")],
 ) -> None:
-    """Writes a policy file in the format of others: LEAPP, of Isaac's deployment."""
+    """Writes a policy file in a format of others: Isaac's LEAPP."""
     with one_sentence():
         from nics_drl_bridge.policy.foreign import load_any
         from nics_drl_bridge.policy.leapp import export_bundle
@@ -60,7 +60,7 @@ def import_(
         str | None, Option("--robot", "--model", help="A shipped robot, or the folder of a model.")
     ] = None,
 ) -> None:
-    """Makes a policy file of somebody else's policy; one of ours comes back as it was."""
+    """Makes a policy file of somebody else's policy."""
     with one_sentence():
         from nics_drl_bridge.generator import open_model
         from nics_drl_bridge.policy.contract import SUFFIX

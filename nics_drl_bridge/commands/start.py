@@ -2,8 +2,6 @@
 
 import sys
 
-from nics_drl_bridge import extensions
-
 EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
 
 
@@ -14,6 +12,8 @@ def main() -> None:
 
         run()
     except ImportError as error:
+        from nics_drl_bridge import extensions
+
         if (clause := extensions.unmet(error)) is None:
             raise
         sys.stderr.write(f"nics: {clause}\n")

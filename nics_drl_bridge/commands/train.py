@@ -82,7 +82,8 @@ def train(
             reason = "worlds of other processes are not shown; leave out --watch, or --engine"
             raise ConfigError(f"--watch --engine {engine}: {reason}.")
         extensions.require("training", *extensions.TRAINING)
-        from nics_drl_bridge.policy import train as train_run
+        with progress_bar("loading PyTorch"):
+            from nics_drl_bridge.policy import train as train_run
 
         resumed = train_run.settings_of(out) if resume and out is not None else None
         chosen = resumed or _told(task, settings, named)

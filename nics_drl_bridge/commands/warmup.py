@@ -18,10 +18,10 @@ WORLD = "arena"
 def warmup(
     as_json: JsonOption = False,
 ) -> None:
-    """Compiles what generating, training and driving need, on two cores, once on a machine."""
+    """Compiles all kernels ahead, on two cores, once on a machine."""
     with one_sentence():
         begin = time.monotonic()
-        typer.echo("compiling the kernels: about a minute, once on this machine", err=True)
+        typer.echo("compiling the kernels: a minute or two, once on this machine", err=True)
         # Fresh processes: what a fork shares with its parent's threads may be locked for ever.
         with (
             progress_bar("compiling"),

@@ -8,11 +8,11 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.console import (
     GateOption,
     OtherLidarOption,
     RandomisationOption,
-    TopicOption,
     needs_ros,
     one_sentence,
     roles_of,
@@ -38,7 +38,8 @@ def watch(
     ros: Annotated[bool, Option("--ros", help="Show live topics instead.")] = False,
     namespace: Annotated[str, Option(help="For --ros: of the robot's topics.")] = "",
     bag: Annotated[Path | None, Option(help="Show a recorded drive instead.")] = None,
-    topic: TopicOption = None,
+    topic: Annotated[list[str] | None, Option(metavar="ROLE=TOPIC", help="For --bag: as "
+        "odom=/wheel_odom. Roles: scan, odom, cmd_vel, pose, imu.")] = None,
     record: Annotated[Path | None, Option(
         metavar="FILE", help="Write .mp4, .gif or .rrd (Rerun) instead of a page.")] = None,
     episodes: Annotated[int, Option(min=1, help="For --record: how many.")] = 1,
@@ -46,7 +47,7 @@ def watch(
         min=0, max=65535, help="Of the page; 0 takes any (default 8765).")] = None,
     browser: Annotated[bool, Option(help="Open the page in a browser.")] = True,
 ) -> None:  # fmt: skip
-    """Shows a policy driving, live topics or a bag, on a page served to this machine only."""
+    """Shows a policy, live topics or a bag on a page in the browser."""
     with one_sentence():
         given = {"lidar": lidar, "randomisation": randomisation, "gate": gate}
         _check(given, ros, bag, record, policy)
@@ -77,7 +78,9 @@ def _check(
         raise ConfigError(f"{', '.join(named)}: {where} shows what others drive; leave it out.")
     if ros and record is not None:
         raise ConfigError("--record: live topics are recorded by nics bag record; show that bag.")
-    if record is not None:
+    if record is None:  # before the source is opened, which may take a while
+        extensions.require("the page", "websockets")
+    else:
         from nics_drl_bridge.watch.record import check_file
 
         check_file(record)

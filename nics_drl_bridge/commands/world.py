@@ -193,7 +193,7 @@ def draw(
     robot: Annotated[str, Option(help="A shipped robot or a YAML file.")] = DEFAULT_ROBOT,
     footprint: Annotated[float | None, Option(help="Instead: radius of a round robot [m].")] = None,
 ) -> None:
-    """Draws a world as an episode finds it: walls, map, obstacles, start and goal.
+    """Draws a world as an episode finds it, with start and goal.
 
     Of a set, such as barn or a folder of files, it is the world of the episode.
     """
@@ -225,7 +225,7 @@ def map_(
     robot: Annotated[str, Option(help="A shipped robot or a YAML file.")] = DEFAULT_ROBOT,
     resolution: Annotated[float, Option(help="Greatest side of a cell [m].")] = 0.01,
 ) -> None:
-    """Writes the map of an episode, of all that stands in it, as Nav2's map_server reads it.
+    """Writes the map of an episode, as Nav2's map_server reads it.
 
     Obstacles that move are left out. `nics world map room`, then
     `ros2 run nav2_map_server map_server --ros-args -p yaml_filename:=room_map.yaml`.

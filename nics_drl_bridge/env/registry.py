@@ -99,7 +99,7 @@ def _class_of(name: str) -> type[Task]:
     if not colon:
         if name not in TASKS:
             hint = nearest(name, TASKS)
-            raise ConfigError(f"unknown task {name!r}; {hint} Or give path/to/file.py:ClassName.")
+            raise ConfigError(f"unknown task {name!r}; {hint} (or give path/to/file.py:ClassName).")
         return _class_of(TASKS[name])
     module = extensions.module_at(path, "task")
     found = getattr(module, attribute, None)

@@ -191,6 +191,7 @@ def run(
     """Trains and evaluates seed after seed; ConfigError for a run in the folder, or none there."""
     _check(order.settings, order.seeds, order.out, order.resumed)
     settings, model = order.settings, open_model(order.settings.robot, order.settings.lidar)
+    make_task(settings.task, model, settings.task_options)  # refused before a folder is begun
     write_text(order.out / SETTINGS, dump_yaml(settings.model_dump(mode="json")))
     results = []
     for seed in order.seeds:

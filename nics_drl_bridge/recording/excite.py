@@ -312,13 +312,13 @@ class DrivePlan:
 
     def __post_init__(self) -> None:
         checked_seeds(self.seed)
-        for name, value, low, high in (
-            ("bound", self.bound, self.robot.footprint_radius, 1000.0),
-            ("duration", self.duration, SHORTEST_S, LONGEST_S),
-            ("speed", self.speed, 0.05, 1.0),
+        for name, value, low, high, unit in (
+            ("bound", self.bound, self.robot.footprint_radius, 1000.0, " m"),
+            ("duration", self.duration, SHORTEST_S, LONGEST_S, " s"),
+            ("speed", self.speed, 0.05, 1.0, ""),
         ):
             if not low <= value <= high:
-                raise ConfigError(f"{name} {value:g}: must be from {low:g} to {high:g}.")
+                raise ConfigError(f"{name} {value:g}: must be from {low:g} to {high:g}{unit}.")
 
     def begin(self) -> Exploration:
         """Returns the previewed drive, at its start; raises ConfigError as `preview` does."""

@@ -43,6 +43,7 @@ TWIST_UNITS = dict(zip(CMD_VEL_FIELDS, POSE_UNITS, strict=True))
 # SI units of a state or a command; 1 for a ratio or a count.
 Unit = Literal["m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N*m", "V", "A", "1"]
 MOST_CORNERS, MOST_VARIABLES = 512, 32  # of a footprint; of a state or a command
+LARGEST = 10.0  # reach of a footprint [m]: none of a robot or a car, but many in centimetres
 SHARPEST = 0.2  # Corner up to which a grown outline keeps its edges parallel, 1 + its cosine
 FASTEST = 1e6  # Greatest absolute value of a variable, in its unit
 
@@ -131,8 +132,8 @@ class RobotSpec(Schema):
     # meaning of `angular.z` for a robot that steers: a turn rate [rad/s], as in any Twist, or the
     # steering angle [rad] itself
     angular_is: Literal["turn_rate", "steering"] = "turn_rate"
-    # of a circle around `base_link` [m]; optional with a `footprint`, which it then circumscribes
-    footprint_radius: float = Field(ge=1e-3, le=1e3)
+    # of a circle around `base_link` [m], 10 at most; optional with a `footprint`, then around that
+    footprint_radius: float = Field(ge=1e-3)
     # corners of a polygon instead, in `base_link` [m], in either direction
     footprint: tuple[tuple[float, float], ...] | None = Field(
         default=None, min_length=3, max_length=MOST_CORNERS
@@ -166,6 +167,9 @@ class RobotSpec(Schema):
 
     @model_validator(mode="after")
     def _consistent(self) -> RobotSpec:
+        if not self.footprint_radius <= LARGEST:
+            told = f"its footprint reaches {self.footprint_radius:.6g} m from base_link"
+            raise ValueError(f"{told}, at most {LARGEST:g} m can be; lengths are in metres")
         if self.footprint is not None:
             if geometry.edges_cross(np.array(self.footprint)):
                 raise ValueError("edges of footprint cross or touch; list its corners in order")

@@ -2,9 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from typing import Any
 
-from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.errors import ConfigError, nearest
 
 Given = Mapping[str, Any]  # a part of a robot's file
 Ranges = Mapping[str, tuple[float, float]]
@@ -12,6 +13,7 @@ Ranges = Mapping[str, tuple[float, float]]
 # command tells in its own unit may come to a multiple of that.
 TWIST_RANGES = {"vx": ("m/s", 10.0), "vy": ("m/s", 10.0), "wz": ("rad/s", 10.0)}
 BEYOND = 2.0
+MISSPELT = 0.85  # least likeness of a misspelt parameter: "steering_rate" is no "steering_lag"
 SHARES = 1.0  # range of a command without a unit, in both directions
 
 
@@ -80,6 +82,10 @@ class Template:
         if isinstance(own, Mapping) and isinstance(radius, int | float):
             sizes = {name: round(share * radius, 4) for name, share in self.lengths.items()}
             usual = {**sizes, **self.parameters}
+            for name in own:  # one of the user's own may have any other name
+                if get_close_matches(str(name), usual.keys() - own.keys(), 1, MISSPELT):
+                    fault = f"unknown parameter {name!r}; {nearest(name, usual)}"
+                    raise ConfigError(f"robot {data['name']!r}: {fault}")
             data["parameters"], data["assumed"] = {**usual, **own}, sorted(set(usual) - set(own))
         return data
 

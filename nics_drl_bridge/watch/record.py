@@ -16,7 +16,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.env.rendering import WorldPicture
 from nics_drl_bridge.env.snapshot import hits_of
 from nics_drl_bridge.errors import ConfigError, nearest
-from nics_drl_bridge.extensions import missing
+from nics_drl_bridge.extensions import require
 from nics_drl_bridge.files import check_above, write_bytes
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE, X, Y
 from nics_drl_bridge.watch.frame import Frame, Stage, WorldFrame
@@ -81,11 +81,9 @@ def palette_of(some: list[Pixels]) -> Image.Image:
 
 
 def write_mp4(path: Path, shown: Iterable[Pixels], fps: float) -> None:
-    """Writes an MP4 (H.264), completely or not at all. Raises ConfigError without its encoder."""
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise ConfigError(f"{path}: {missing(error.name or '')}") from None
+    """Writes an MP4 (H.264), completely or not at all."""
+    import imageio_ffmpeg
+
     shown = iter(shown)
     first, part = next(shown), path.with_name(f".{path.stem}.{os.getpid()}.mp4")
     height, width = first.shape[:2]
@@ -101,11 +99,9 @@ def write_mp4(path: Path, shown: Iterable[Pixels], fps: float) -> None:
 
 
 def write_rrd(path: Path, stage: Stage, frames: Iterable[Frame]) -> None:
-    """Writes a recording of Rerun. Raises ConfigError without its library."""
-    try:
-        import rerun
-    except ImportError as error:
-        raise ConfigError(f"{path}: {missing(error.name or '')}") from None
+    """Writes a recording of Rerun."""
+    import rerun
+
     part = path.with_name(f".{path.stem}.{os.getpid()}.rrd")
     try:
         with rerun.RecordingStream("nics_drl_bridge") as recording:
@@ -165,6 +161,7 @@ def _ring(pose: Any, radius: float, shape: Any) -> NDArray[np.float64]:
     return np.asarray(geometry.rotate(closed, pose[2]) + pose[:2])
 
 
+LIBRARIES = {".mp4": ("imageio_ffmpeg",), ".rrd": ("rerun",)}
 WRITERS: dict[str, Callable[[Path, Stage, Iterable[Frame], float], None]] = {
     ".gif": lambda path, stage, frames, fps: write_gif(path, pictures(stage, frames), fps),
     ".mp4": lambda path, stage, frames, fps: write_mp4(path, pictures(stage, frames), fps),
@@ -173,9 +170,10 @@ WRITERS: dict[str, Callable[[Path, Stage, Iterable[Frame], float], None]] = {
 
 
 def check_file(path: Path) -> None:
-    """Raises ConfigError for a name of no known kind, or in a folder that can't be."""
+    """Raises ConfigError for a kind that is unknown or lacks its library, or a bad folder."""
     if path.suffix not in WRITERS:
         raise ConfigError(f"--record {str(path)!r}: {nearest(path.suffix, WRITERS)}")
+    require(str(path), *LIBRARIES.get(path.suffix, ()))
     check_above(path)
 
 

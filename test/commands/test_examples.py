@@ -43,6 +43,17 @@ def test_units_survive_in_the_help_and_an_example_ends_it(tmp_path):
     assert told.rstrip().splitlines()[-1].strip().startswith("nics record --robot")
 
 
+@pytest.mark.parametrize("words", [(), ("world",), ("bag",), ("policy",)])
+def test_no_line_of_a_list_of_commands_is_cut(words, tmp_path):
+    told = nics(*words, "--help", cwd=tmp_path).stdout
+    assert "..." not in told.partition("Commands:")[2]
+
+
+def test_units_survive_in_the_heads_of_tables(tmp_path):
+    told = nics("list", "worlds", cwd=tmp_path).stdout
+    assert "size [m]" in told
+
+
 def test_options_complete_to_what_is_shipped_and_to_files(tmp_path, monkeypatch):
     from nics_drl_bridge.commands.console import completing
 

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
+from pathlib import Path
 
 from command_line import nics
 
@@ -28,3 +30,9 @@ def test_a_missing_extra_comes_with_the_command_that_installs_it(monkeypatch):
     assert "'torch' is missing" in found["extra train"].found
     assert found["extra train"].fix == "pip install 'nics_drl_bridge[train]'"
     assert "pip install 'nics_drl_bridge[ros]'" in found["ROS 2"].fix
+
+
+def test_every_extra_that_all_brings_is_examined():
+    setup = (Path(__file__).parents[2] / "setup.py").read_text(encoding="utf-8")
+    brought = re.search(r"for name in \((.*?)\)", setup)
+    assert {name.strip().strip('"') for name in brought[1].split(",")} <= set(EXTRAS)

@@ -4,6 +4,7 @@ import threading
 from contextlib import closing
 
 import pytest
+import typer
 from command_line import nics
 from watch.rig import Client, source, until
 
@@ -29,6 +30,14 @@ def test_options_that_do_not_fit_are_one_sentence(options, said, tmp_path):
     assert said in done.stderr
     assert done.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_page_without_its_library_is_refused_before_a_robot_is_opened(monkeypatch, capsys):
+    monkeypatch.setattr(module.extensions, "lacking", lambda names: next(iter(names)))
+    monkeypatch.setattr(module, "_episodes", lambda *given: pytest.fail("a robot was opened"))
+    with pytest.raises(typer.Exit):
+        module.watch("straight")
+    assert "pip install 'nics_drl_bridge[view]'" in capsys.readouterr().err
 
 
 def test_a_training_of_other_processes_can_not_be_watched(tmp_path):

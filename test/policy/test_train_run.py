@@ -81,6 +81,14 @@ def test_what_can_not_be_trained_gives_one_sentence(
     assert "Traceback" not in done.output
 
 
+def test_a_misspelt_task_leaves_no_folder_that_refuses_the_right_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text("")
+    done = nics("--task", "mine.py:Patrol", "--out", "run")
+    assert "mine.py has no such Task" in " ".join(done.output.split())
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.skipif(find_spec("ray") is not None, reason="Ray is there")
 def test_where_ray_is_missing_one_sentence_says_what_to_install(tmp_path):
     done = nics("--engine", "ray", "--out", tmp_path)

@@ -172,7 +172,7 @@ def test_a_circle_in_which_a_car_can_not_turn_is_refused(bound):
     [
         ({"bound": 0.1}, "bound 0.1: must be from 0.26.* to 1000"),
         ({"bound": float("nan")}, "bound nan: must be from"),
-        ({"duration": 5.0}, "duration 5: must be from 20 to 3600"),
+        ({"duration": 5.0}, "duration 5: must be from 20 to 3600 s"),
         ({"speed": 0.0}, "speed 0: must be from 0.05 to 1"),
         ({"speed": 1.5}, "speed 1.5: must be from"),
         ({"seed": -1}, "seed -1: must be a whole number from 0"),

@@ -117,6 +117,7 @@ def test_a_node_is_told_which_command_is_no_field_of_cmd_vel():
         ({"state": [TWIST | {"unit": "rad"}]}, "state 'a' is vx of the twist, so its unit is m/s"),
         ({"angular_is": "sideways"}, "'turn_rate' or 'steering'"),
         ({"footprint_radius": 0.0}, "greater than or equal to 0.001"),
+        ({"footprint_radius": 30.0}, "reaches 30 m from base_link, at most 10 m can be"),
         ({"command": []}, "at least 1 item"),
         ({"state": data()["command"][:1]}, "unknown key 'state.0.cmd_vel'"),
         ({"state": [{"name": "push", "unit": "m", "min": 0, "max": 1}]}, "a name of its own"),

@@ -150,3 +150,10 @@ def test_what_is_no_robot_is_refused_in_one_sentence(given, ranges, sentence):
         robot_from(given, ranges)
     assert sentence in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_misspelt_parameter_is_refused_and_one_of_the_users_own_is_not():
+    with pytest.raises(ConfigError, match=r"unknown parameter 'trak'; did you mean 'track'\?"):
+        made("differential", parameters={"trak": 0.16})
+    robot = made("ackermann", parameters={"wheelbase": 0.3, "steering_rate": 2.0, "mass": 3.0})
+    assert robot.parameters["mass"] == 3.0

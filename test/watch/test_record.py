@@ -79,7 +79,7 @@ def test_an_unknown_kind_of_file_is_one_sentence(tmp_path, name):
 def test_a_missing_library_is_one_sentence(made, tmp_path, monkeypatch, suffix, module):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(ConfigError, match=r"pip install 'nics_drl_bridge\[video\]'"):
-        write(tmp_path / f"episode.{suffix}", made.stage(), frames(made), 10.0)
+        check_file(tmp_path / f"episode.{suffix}")  # before anything is driven
 
 
 def test_a_failure_leaves_no_part_of_a_file(made, tmp_path):

@@ -52,7 +52,7 @@ def info(
     as_json: console.JsonOption = False,
     salvage: SalvageOption = False,
 ) -> None:
-    """Tells what is in a bag: topics, rates, gaps, and whose clock stamped them."""
+    """Tells a bag's topics, rates and gaps, and whose clock stamped it."""
     with one_sentence():
         from nics_drl_bridge.extras.bags.info import bag_info
 
@@ -94,7 +94,7 @@ def replay(
     out: Annotated[Path | None, Option(help="For --estimate: .npz or .csv to write.")] = None,
     salvage: SalvageOption = False,
 ) -> None:
-    """Plays a bag over ROS 2, or gives the estimate that the middleware makes of it."""
+    """Plays a bag over ROS 2, or gives the middleware's estimate of it."""
     with one_sentence(), intact(path, salvage) as whole:
         if estimate:
             from nics_drl_bridge.generator import open_model
@@ -144,7 +144,7 @@ def export(
     ] = None,
     salvage: SalvageOption = False,
 ) -> None:
-    """Writes a bag for others: as a dataset to learn from, or as MCAP to look at."""
+    """Writes a bag for others: as a dataset, or as MCAP to look at."""
     with one_sentence(), intact(path, salvage) as whole:
         from nics_drl_bridge.errors import ConfigError
         from nics_drl_bridge.generator import open_model
@@ -180,7 +180,7 @@ def salvage(
     out: Annotated[Path, Argument(help="Folder of the bag to write.")],
     storage: StorageOption = "mcap",
 ) -> None:
-    """Writes what is intact of a damaged bag as a new one, and says how much is lost."""
+    """Writes what is intact of a damaged bag as a new one."""
     with one_sentence():
         from nics_drl_bridge.recording.messages import check_libraries
 
