@@ -82,12 +82,11 @@ class Fit:
     @np.errstate(over="ignore", invalid="ignore")
     def curves(self) -> tuple[statistics.Curve, ...]:
         """Accuracy against the number of terms, of the degrees of freedom that move."""
-        names, found = (self.model.dofs, self.model.variables), self.regression
-        curves = [_curve(found, d, *names) for d in found.moving]
-        if self.alpha == "auto":
-            return tuple(curves)
-        kept = [prune(found.beta[d], self.alpha, _floor(found, d)) for d in found.moving]
-        return tuple(replace(c, kept=int(k.sum())) for c, k in zip(curves, kept, strict=True))
+        found, names = self.regression, (self.model.dofs, self.model.variables)
+        kept = {d: _kept(found, d, self.alpha, *names) for d in found.moving}
+        return tuple(
+            replace(_curve(found, d, *names), kept=int(keep.sum())) for d, keep in kept.items()
+        )
 
     @property
     def unmoved(self) -> tuple[str, ...]:
@@ -180,7 +179,7 @@ def pruned(regression: Regression, spec: RobotSpec, alpha: Alpha = ALPHA) -> Fit
         chi, target = regression.rows(d)
         scale = _scale(chi)
         unit = chi / scale
-        keep = _kept(regression, d, spec, alpha)
+        keep = _kept(regression, d, alpha, spec.dof_names, spec.variable_names)
         if keep.any():
             beta = np.linalg.lstsq(unit[:, keep], target, rcond=None)[0]
             rest = target - unit[:, keep] @ beta
@@ -204,13 +203,15 @@ def pruned(regression: Regression, spec: RobotSpec, alpha: Alpha = ALPHA) -> Fit
     return Fit(model, regression, rmse, r2, alpha, outliers, conditions)
 
 
-def _kept(regression: Regression, d: int, spec: RobotSpec, alpha: Alpha) -> NDArray[np.bool_]:
+def _kept(
+    regression: Regression, d: int, alpha: Alpha, dofs: tuple[str, ...], variables: tuple[str, ...]
+) -> NDArray[np.bool_]:
     """Returns a mask (K,) of the terms that a degree of freedom keeps."""
     beta, floor = regression.beta[d], _floor(regression, d)
     if alpha != "auto":
         return prune(beta, alpha, floor)
-    count = _curve(regression, d, spec.dof_names, spec.variable_names).kept
-    return np.isin(np.arange(len(beta)), by_weight(beta, floor)[:count])
+    order = by_weight(beta, floor)[: _curve(regression, d, dofs, variables).kept]
+    return np.isin(np.arange(len(beta)), order)
 
 
 def _floor(regression: Regression, d: int) -> float:

@@ -188,8 +188,7 @@ def _put(shot, w, n, lane, scratch):  # type: ignore[no-untyped-def]
 def _linearise(terms, free, scratch):  # type: ignore[no-untyped-def]
     """Computes the terms and the rates; their derivatives by the state if any are wanted."""
     states, sloped = scratch.state_slope.shape[1], free.shape[0] > 0
-    scratch.rate[:] = 0.0
-    scratch.jacobian[:] = 0.0
+    scratch.rate[:], scratch.jacobian[:] = 0.0, 0.0
     for k in range(terms.dof.shape[0]):
         d, coefficient = terms.dof[k], terms.coefficient[k]
         factors, degree = terms.factors[k], terms.degree[k]
@@ -226,11 +225,9 @@ def _multiply(product, first, factors, degree, without, x):  # type: ignore[no-u
 @kernel(inline=True)
 def _step(lane, terms, free, scratch, dt):  # type: ignore[no-untyped-def]
     """Moves a window and its derivatives by a step."""
-    rate, pose = scratch.rate[:, lane], scratch.pose[lane]
-    sloped = free.shape[0] > 0
+    rate, pose, sloped = scratch.rate[:, lane], scratch.pose[lane], free.shape[0] > 0
     first = _follow_twist(lane, terms, free, scratch) if sloped else 0
-    turn = rate[2] * dt
-    along = dt * _sinc(turn / 2.0)
+    turn, along = rate[2] * dt, dt * _sinc(rate[2] * dt / 2.0)
     c, s = math.cos(pose[2] + turn / 2.0), math.sin(pose[2] + turn / 2.0)
     dx, dy = along * (c * rate[0] - s * rate[1]), along * (s * rate[0] + c * rate[1])
     if sloped:
@@ -243,11 +240,9 @@ def _step(lane, terms, free, scratch, dt):  # type: ignore[no-untyped-def]
 def _follow_twist(lane, terms, free, scratch):  # type: ignore[no-untyped-def]
     state = scratch.state_slope[lane]
     for d in range(3):
-        twist = scratch.twist[d]
-        for p in range(twist.shape[0]):
-            twist[p] = 0.0
+        scratch.twist[d] = 0.0
         for j in range(state.shape[0]):
-            _add(twist, scratch.jacobian[d, j, lane], state[j])
+            _add(scratch.twist[d], scratch.jacobian[d, j, lane], state[j])
     p = 0
     while p < free.shape[0] and terms.dof[free[p]] < 3:
         scratch.twist[terms.dof[free[p]], p] += scratch.value[free[p], lane]
@@ -278,11 +273,10 @@ def _follow_state(lane, terms, free, k, scratch, dt):  # type: ignore[no-untyped
     state, before, rate = scratch.state_slope[lane], scratch.before, scratch.rate[:, lane]
     states, count = state.shape
     for i in range(states):
-        was, now = before[i], state[i]
         for p in range(count):
-            was[p] = now[p]
+            before[i, p] = state[i, p]
     for i in range(states):
-        moves, now = not _is_limited(terms, i, rate), state[i]
+        moves, now = terms.fall[i] <= rate[3 + i] <= terms.rise[i], state[i]
         for j in range(states if moves and count > 0 else 0):
             _add(now, dt * scratch.jacobian[3 + i, j, lane], before[j])
         while k < free.shape[0] and terms.dof[free[k]] == 3 + i:
@@ -308,11 +302,6 @@ def _hold(slope, value, moved, rate, dt, bounds):  # type: ignore[no-untyped-def
     unheld -= math.copysign(dt * bounds.friction, unheld)
     if moved != unheld:
         slope[:] = 0.0
-
-
-@kernel(inline=True)
-def _is_limited(terms, i, rate):  # type: ignore[no-untyped-def]
-    return not terms.fall[i] <= rate[3 + i] <= terms.rise[i]
 
 
 @kernel

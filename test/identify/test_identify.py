@@ -14,7 +14,6 @@ from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.fit import fit
 from nics_drl_bridge.identify.identify import Identified, cut, identify
 from nics_drl_bridge.identify.open_loop import open_loop_error, predict, windows
-from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.robot.kernels import SERIES, rollout, term_arrays
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot, robot_from
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -22,18 +21,6 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 
 def term(model, dof: str, name: str) -> float:
     return model.named.terms[dof].get(name, 0.0)
-
-
-def constant_steering(car: RobotSpec, angle: float) -> tuple[RobotSpec, Recording]:
-    """A drive with the steering held, the state not measured, and the spec to read it with."""
-    data = car.model_dump()
-    speed, steering = data["command"]
-    held = {**steering, "min": angle - 1e-9, "max": angle + 1e-9}
-    locked = {**data, "command": [speed, held]}
-    recording = drive(RobotSpec.model_validate(locked), noise=(5e-4, 1e-3), measured_state=False)
-    values = recording.command.values.copy()
-    values[:, 1] = angle
-    return car, replace(recording, command=replace(recording.command, values=values))
 
 
 @cache
@@ -45,9 +32,15 @@ def noisy() -> Identified:
 
 @cache
 def held(angle: float, assume: bool) -> Identified:
-    """A model of a drive with the steering held, completed by the textbook or not."""
-    spec, recording = constant_steering(load_robot("ackermann"), angle)
-    return identify(recording, spec, assume=assume)
+    """A model of such a drive with the steering held, completed by the textbook or not."""
+    car = load_robot("ackermann")
+    data = car.model_dump()
+    data["command"][1] |= {"min": angle - 1e-9, "max": angle + 1e-9}
+    recording = drive(RobotSpec.model_validate(data), noise=(5e-4, 1e-3), measured_state=False)
+    values = recording.command.values.copy()
+    values[:, 1] = angle
+    held = replace(recording, command=replace(recording.command, values=values))
+    return identify(held, car, assume=assume)
 
 
 def test_the_kernel_moves_robots_exactly_as_the_model_does(car):
@@ -76,7 +69,7 @@ def test_an_exact_recording_is_fitted_to_nine_digits_and_not_refined(differentia
 
 @pytest.mark.slow
 def test_the_held_out_part_is_not_used_for_the_model(car):
-    recording = drive(car, noise=(5e-4, 1e-3), measured_state=False)  # as that of `noisy`
+    recording = drive(car, noise=(5e-4, 1e-3), measured_state=False)
     spoiled = recording.pose.values.copy()
     spoiled[recording.pose.t > 26.7, :2] *= 1.5
     other = replace(recording, pose=replace(recording.pose, values=spoiled))
@@ -87,8 +80,7 @@ def test_the_held_out_part_is_not_used_for_the_model(car):
 
 @pytest.mark.slow
 def test_a_prediction_knows_no_pose_after_its_start(car):
-    found = noisy()
-    recording = found.recording
+    found, recording = noisy(), noisy().recording
     chosen = windows(found.drive, found.calibration, 30.0, 36.0, 5.0, 0.1)
     values = recording.pose.values.copy()
     values[recording.pose.t > chosen.start_t[-1]] = 7.0
