@@ -48,9 +48,7 @@ def record(
 
 @bag.command()
 def info(
-    path: BagArgument,
-    as_json: console.JsonOption = False,
-    salvage: SalvageOption = False,
+    path: BagArgument, as_json: console.JsonOption = False, salvage: SalvageOption = False
 ) -> None:
     """Tells what is in a bag: topics, rates, gaps, and whose clock stamped them."""
     with one_sentence():
