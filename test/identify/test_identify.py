@@ -35,7 +35,7 @@ def held(angle: float, assume: bool) -> Identified:
     """A model of such a drive with the steering held, completed by the textbook or not."""
     car = load_robot("ackermann")
     data = car.model_dump()
-    data["command"][1] |= {"min": angle - 1e-9, "max": angle + 1e-9}
+    data["command"][1].update(min=angle - 1e-9, max=angle + 1e-9)
     recording = drive(RobotSpec.model_validate(data), noise=(5e-4, 1e-3), measured_state=False)
     values = recording.command.values.copy()
     values[:, 1] = angle
