@@ -24,8 +24,7 @@ class Listed(str, Enum):
 
 
 def list_(
-    what: Annotated[Listed, Argument(help="What to list.")],
-    as_json: JsonOption = False,
+    what: Annotated[Listed, Argument(help="What to list.")], as_json: JsonOption = False
 ) -> None:
     """Lists the robots, worlds, lidars or policies that are shipped."""
     with one_sentence():

@@ -15,9 +15,7 @@ from nics_drl_bridge.robot import DEFAULT_ROBOT
 WORLD = "arena"
 
 
-def warmup(
-    as_json: JsonOption = False,
-) -> None:
+def warmup(as_json: JsonOption = False) -> None:
     """Compiles all kernels ahead, on two cores, once on a machine."""
     with one_sentence():
         begin = time.monotonic()

@@ -13,12 +13,7 @@ from nics_drl_bridge.identify import signals
 from nics_drl_bridge.identify.calibration import Calibration, Response
 from nics_drl_bridge.identify.drive import MIN_STAMPS, Drive, TwistIntervals
 from nics_drl_bridge.identify.signals import Motors
-from nics_drl_bridge.identify.statistics import (
-    minimise,
-    standard_errors,
-    uncertainty,
-    unexplained,
-)
+from nics_drl_bridge.identify.statistics import minimise, standard_errors, uncertainty, unexplained
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec

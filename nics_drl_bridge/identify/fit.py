@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -73,9 +74,19 @@ class Fit:
     regression: Regression  # on all features
     rmse: Array  # (D,) root mean square residual of dQ/dt, in the dof's unit, without outliers
     r2: Array  # (D,) share of the variance explained; 1 if the dof does not move
-    curves: tuple[statistics.Curve, ...]  # accuracy against the number of terms, of moving dofs
+    alpha: Alpha  # by which it was pruned
     outliers: Array  # (D,) share of the rows that were dropped as outliers
     condition: Array  # (D,) condition number of the standardised kept features
+
+    @cached_property
+    @np.errstate(over="ignore", invalid="ignore")
+    def curves(self) -> tuple[statistics.Curve, ...]:
+        """Accuracy against the number of terms, of the degrees of freedom that move."""
+        found, names = self.regression, (self.model.dofs, self.model.variables)
+        kept = {d: _kept(found, d, self.alpha, *names) for d in found.moving}
+        return tuple(
+            replace(_curve(found, d, *names), kept=int(keep.sum())) for d, keep in kept.items()
+        )
 
     @property
     def unmoved(self) -> tuple[str, ...]:
@@ -163,12 +174,12 @@ def pruned(regression: Regression, spec: RobotSpec, alpha: Alpha = ALPHA) -> Fit
     # keeps as many terms, in the same order, as improve the cross-validated error.
     samples, shape = regression.samples, regression.beta.shape
     coefficients, errors, conditions = np.zeros(shape), np.zeros(shape), np.ones(shape[0])
-    curves, noisy_state = [], excitation.states_are_noisy(samples, spec)
+    noisy_state = excitation.states_are_noisy(samples, spec)
     for d in regression.moving:
         chi, target = regression.rows(d)
         scale = _scale(chi)
         unit = chi / scale
-        keep, curve = _kept(regression, d, unit, target, spec, alpha)
+        keep = _kept(regression, d, alpha, spec.dof_names, spec.variable_names)
         if keep.any():
             beta = np.linalg.lstsq(unit[:, keep], target, rcond=None)[0]
             rest = target - unit[:, keep] @ beta
@@ -177,7 +188,6 @@ def pruned(regression: Regression, spec: RobotSpec, alpha: Alpha = ALPHA) -> Fit
         if noisy_state and d >= 3:
             _reestimate(coefficients[d], errors[d], d, regression, len(spec.state))
         conditions[d] = statistics.condition(chi[:, keep])
-        curves.append(curve)
     used = np.abs(coefficients).sum(axis=0) > 0.0
     model = TaylorModel(
         spec.variable_names, spec.dof_names, spec.dof_units, regression.powers[used],
@@ -190,22 +200,31 @@ def pruned(regression: Regression, spec: RobotSpec, alpha: Alpha = ALPHA) -> Fit
             found = statistics.errors_of(model, samples.rows(inside))
             rmse[d], r2[d] = (each[d] for each in found)
     outliers = 1.0 - (1.0 - regression.left_out) * regression.inliers.mean(axis=1)
-    return Fit(model, regression, rmse, r2, tuple(curves), outliers, conditions)
+    return Fit(model, regression, rmse, r2, alpha, outliers, conditions)
 
 
 def _kept(
-    regression: Regression, d: int, unit: Array, target: Array, spec: RobotSpec, alpha: Alpha
-) -> tuple[NDArray[np.bool_], statistics.Curve]:
-    """Returns a mask (K,) of the terms that a degree of freedom keeps, and its accuracy curve."""
-    beta = regression.beta[d]
-    floor = ROUNDING * max(float(np.abs(target).max()), ROUNDING)
-    order = by_weight(beta, floor)
-    names = (taylor.term_name(row, spec.variable_names) for row in regression.powers[order])
-    found = statistics.curve(spec.dof_names[d], tuple(names), unit[:, order], target)
+    regression: Regression, d: int, alpha: Alpha, dofs: tuple[str, ...], variables: tuple[str, ...]
+) -> NDArray[np.bool_]:
+    """Returns a mask (K,) of the terms that a degree of freedom keeps."""
+    beta, floor = regression.beta[d], _floor(regression, d)
     if alpha != "auto":
-        keep = prune(beta, alpha, floor)
-        return keep, replace(found, kept=int(keep.sum()))
-    return np.isin(np.arange(len(beta)), order[: found.kept]), found
+        return prune(beta, alpha, floor)
+    order = by_weight(beta, floor)[: _curve(regression, d, dofs, variables).kept]
+    return np.isin(np.arange(len(beta)), order)
+
+
+def _floor(regression: Regression, d: int) -> float:
+    return ROUNDING * max(float(np.abs(regression.rows(d)[1]).max()), ROUNDING)
+
+
+def _curve(
+    regression: Regression, d: int, dofs: tuple[str, ...], variables: tuple[str, ...]
+) -> statistics.Curve:
+    """Returns the accuracy of a degree of freedom by its first terms; `kept` is the knee."""
+    order, (chi, target) = by_weight(regression.beta[d], _floor(regression, d)), regression.rows(d)
+    names = tuple(taylor.term_name(row, variables) for row in regression.powers[order])
+    return statistics.curve(dofs[d], names, (chi / _scale(chi))[:, order], target)
 
 
 def _reestimate(

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.signal import lfilter
@@ -167,9 +168,12 @@ def problem_of(
     """Returns the prediction problem of a drive on one time axis."""
     command, spec, t, dt = drive.recording.command, drive.spec, samples.t, samples.dt
 
+    @lru_cache(maxsize=8)  # most values of a form shape no commands
+    def late(latency: float, curves: tuple[InputCurve, ...]) -> Array:
+        return taken(command, spec, curves, t - latency, t - latency + dt)
+
     def commands(values: Array) -> Array:
-        begin = t - form.latency_at(inputs, values)
-        return taken(command, spec, form.curves_at(inputs, values), begin, begin + dt)
+        return late(form.latency_at(inputs, values), form.curves_at(inputs, values))
 
     def shaped(model: TaylorModel, values: Array) -> TaylorModel:
         return form.actuated(model, inputs, values)

@@ -557,14 +557,9 @@ class Identified:
 @one_blas_thread
 @np.errstate(over="ignore", invalid="ignore")  # a diverging model shows in its figures
 def identify(
-    recording: Recording,
-    spec: RobotSpec,
-    order: Order = "auto",
-    alpha: Alpha = ALPHA,
-    train_until: float | None = None,
-    assume: bool = False,
-    strict: bool = False,
-) -> Identified:
+    recording: Recording, spec: RobotSpec, order: Order = "auto", alpha: Alpha = ALPHA,
+    train_until: float | None = None, assume: bool = False, strict: bool = False,
+) -> Identified:  # fmt: skip
     """Learns a motion up to `train_until` [s], and tests it on the rest; see `Settings`."""
     # Default: two thirds. RecordingError: unusable for this robot. FitError: it shows too little.
     drive = Drive(check(recording, spec), spec)

@@ -10,6 +10,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.robot.kernels import bounds_of, emf_of, next_state
 
+WIDTH = 16  # windows that are predicted at a time: vector instructions take some at once
 SMALL_TURN = 0.3  # below this angle the series of sin(a)/a is exact to the last digits [rad]
 
 
@@ -110,151 +111,197 @@ class Shot(NamedTuple):
 
 
 class Tangent(NamedTuple):
-    """Scratch memory of a window: values now, and their derivatives by the free coefficients."""
+    """Scratch memory of L windows: values now, and their derivatives by the free coefficients.
 
-    x: Array  # (S + C + 1,) X and a last entry of 1
-    value: Array  # (K,) of each term without its coefficient
-    rate: Array  # (3 + S,)
-    jacobian: Array  # (3 + S, S) of the rates by the state
-    state: Array  # (S, P)
-    before: Array  # (S, P) a step earlier
-    twist: Array  # (3, P)
-    pose: Array  # (3, P)
+    There is room for a whole number of `WIDTH` coefficients.
+    """
+
+    x: Array  # (S + C + 1, L) X and a last entry of 1
+    value: Array  # (K, L) of each term without its coefficient
+    rate: Array  # (3 + S, L)
+    jacobian: Array  # (3 + S, S, L) of the rates by the state
+    rest: Array  # (L,)
+    last: Array  # (L,) steps to the last horizon
+    pose: Array  # (L, 3)
+    state_slope: Array  # (L, S, P)
+    pose_slope: Array  # (L, 3, P)
+    before: Array  # (S, P) slope of a state a step earlier
+    twist: Array  # (3, P) slope
 
 
 def tangent(states: int, commands: int, terms: int, free: int) -> Tangent:
     """Returns scratch memory for `shoot`."""
-    shapes = ((states + commands + 1,), (terms,), (3 + states,), (3 + states, states),
-              (states, free), (states, free), (3, free), (3, free))  # fmt: skip
+    lanes, free = WIDTH, -(-free // WIDTH) * WIDTH
+    shapes = ((states + commands + 1, lanes), (terms, lanes), (3 + states, lanes),
+              (3 + states, states, lanes), (lanes,), (lanes,), (lanes, 3),
+              (lanes, states, free), (lanes, 3, free), (states, free), (3, free))  # fmt: skip
     return Tangent(*map(np.zeros, shapes))
 
 
 @kernel
 def shoot(shot, terms, free, dt, scratch):  # type: ignore[no-untyped-def]
-    """Predicts windows in steps of dt [s], and the derivatives by the `free` (P,) of `terms`."""
-    for w in range(shot.state.shape[0]):
-        _begin(shot.state[w], scratch)
-        at_x, at_y, heading = 0.0, 0.0, 0.0
-        last = 0
+    """Predicts windows in steps of dt [s], and the derivatives by the `free` (P,) of `terms`.
+
+    The free terms ascend, and so do the degrees of freedom of the terms.
+    """
+    for begin in range(0, shot.state.shape[0], WIDTH):
+        end = min(begin + WIDTH, shot.state.shape[0])
+        for n in range(_begin(shot, begin, end, scratch)):
+            _linearise(terms, free, scratch)
+            for w in range(begin, end):
+                if n < scratch.last[w - begin]:
+                    _step(w - begin, terms, free, scratch, dt)
+                    _put(shot, w, n + 1, w - begin, scratch)
+
+
+@kernel
+def _begin(shot, begin, end, scratch):  # type: ignore[no-untyped-def]
+    """Puts windows to their starts, and returns the steps to the last horizon."""
+    scratch.x[-1], last = 1.0, 0
+    scratch.pose[:], scratch.state_slope[:], scratch.pose_slope[:] = 0.0, 0.0, 0.0
+    for w in range(begin, end):
+        for i in range(shot.state.shape[1]):
+            scratch.x[i, w - begin] = shot.state[w, i]
+        _put(shot, w, 0, w - begin, scratch)
+        scratch.last[w - begin] = 0.0
         for h in range(shot.stop.shape[1]):
-            last = max(last, shot.stop[w, h])
-        for n in range(last):
-            for i in range(shot.command.shape[1]):
-                scratch.x[shot.state.shape[1] + i] = shot.command[shot.first[w] + n, i]
-            _linearise(terms, scratch)
-            _follow_twist(terms, free, scratch)
-            turn = scratch.rate[2] * dt
-            along = dt * _sinc(turn / 2.0)
-            c, s = math.cos(heading + turn / 2.0), math.sin(heading + turn / 2.0)
-            dx = along * (c * scratch.rate[0] - s * scratch.rate[1])
-            dy = along * (s * scratch.rate[0] + c * scratch.rate[1])
-            _follow_pose(scratch, dx, dy, along * c, along * s, dt)
-            at_x, at_y, heading = at_x + dx, at_y + dy, heading + turn
-            _follow_state(terms, free, scratch, dt)
-            for h in range(shot.stop.shape[1]):
-                if shot.stop[w, h] == n + 1:
-                    end, slope = shot.end[w, h], shot.slope[w, h]
-                    end[0], end[1], end[2] = at_x, at_y, heading
-                    for d in range(3):
-                        for p in range(free.shape[0]):
-                            slope[d, p] = scratch.pose[d, p]
+            scratch.last[w - begin] = max(scratch.last[w - begin], shot.stop[w, h])
+        last = max(last, int(scratch.last[w - begin]))
+    return last
+
+
+@kernel(inline=True)
+def _put(shot, w, n, lane, scratch):  # type: ignore[no-untyped-def]
+    """Writes what is wanted after n steps, and the command of the next."""
+    row = min(shot.first[w] + n, shot.command.shape[0] - 1)
+    for i in range(shot.command.shape[1]):
+        scratch.x[shot.state.shape[1] + i, lane] = shot.command[row, i]
+    for h in range(shot.stop.shape[1]):
+        if n > 0 and shot.stop[w, h] == n:
+            for d in range(3):
+                shot.end[w, h, d] = scratch.pose[lane, d]
+                for p in range(shot.slope.shape[3]):
+                    shot.slope[w, h, d, p] = scratch.pose_slope[lane, d, p]
 
 
 @kernel
-def _begin(state, scratch):  # type: ignore[no-untyped-def]
-    scratch.x[-1] = 1.0
-    for i in range(state.shape[0]):
-        scratch.x[i] = state[i]
-    scratch.state[:] = 0.0
-    scratch.pose[:] = 0.0
-
-
-@kernel
-def _linearise(terms, scratch):  # type: ignore[no-untyped-def]
-    """Computes the terms, the rates, and their derivatives by the state."""
-    states = scratch.state.shape[0]
-    scratch.rate[:] = 0.0
-    scratch.jacobian[:] = 0.0
+def _linearise(terms, free, scratch):  # type: ignore[no-untyped-def]
+    """Computes the terms and the rates; their derivatives by the state if any are wanted."""
+    states, sloped = scratch.state_slope.shape[1], free.shape[0] > 0
+    scratch.rate[:], scratch.jacobian[:] = 0.0, 0.0
     for k in range(terms.dof.shape[0]):
-        d, coefficient, value = terms.dof[k], terms.coefficient[k], 1.0
-        for f in range(terms.degree[k]):
-            value *= scratch.x[terms.factors[k, f]]
-            if terms.factors[k, f] < states:
-                rest = coefficient
-                for other in range(terms.degree[k]):
-                    if other != f:
-                        rest *= scratch.x[terms.factors[k, other]]
-                scratch.jacobian[d, terms.factors[k, f]] += rest
-        scratch.value[k] = value
-        scratch.rate[d] += coefficient * value
+        d, coefficient = terms.dof[k], terms.coefficient[k]
+        factors, degree = terms.factors[k], terms.degree[k]
+        value, rate = scratch.value[k if sloped else 0], scratch.rate[d]
+        _multiply(value, 1.0, factors, degree, -1, scratch.x)
+        for lane in range(rate.shape[0]):
+            rate[lane] += coefficient * value[lane]
+        for f in range(degree if sloped else 0):
+            if factors[f] < states:
+                _multiply(scratch.rest, coefficient, factors, degree, f, scratch.x)
+                slope = scratch.jacobian[d, factors[f]]
+                for lane in range(slope.shape[0]):
+                    slope[lane] += scratch.rest[lane]
     for i in range(terms.emf.shape[0]):
-        braking = emf_of(i, scratch.x, terms)
-        scratch.rate[3 + i] -= braking * scratch.x[i]
-        scratch.jacobian[3 + i, i] -= braking
+        rate, slope, state = scratch.rate[3 + i], scratch.jacobian[3 + i, i], scratch.x[i]
+        for lane in range(rate.shape[0]):
+            braking = emf_of(i, scratch.x[:, lane], terms)
+            rate[lane] -= braking * state[lane]
+            slope[lane] -= braking
 
 
 @kernel
-def _follow_twist(terms, free, scratch):  # type: ignore[no-untyped-def]
+def _multiply(product, first, factors, degree, without, x):  # type: ignore[no-untyped-def]
+    """Writes products (L,) of a number and all factors but one."""
+    for lane in range(product.shape[0]):
+        product[lane] = first
+    for f in range(degree):
+        if f != without:
+            factor = x[factors[f]]
+            for lane in range(product.shape[0]):
+                product[lane] *= factor[lane]
+
+
+@kernel(inline=True)
+def _step(lane, terms, free, scratch, dt):  # type: ignore[no-untyped-def]
+    """Moves a window and its derivatives by a step."""
+    rate, pose, sloped = scratch.rate[:, lane], scratch.pose[lane], free.shape[0] > 0
+    first = _follow_twist(lane, terms, free, scratch) if sloped else 0
+    turn, along = rate[2] * dt, dt * _sinc(rate[2] * dt / 2.0)
+    c, s = math.cos(pose[2] + turn / 2.0), math.sin(pose[2] + turn / 2.0)
+    dx, dy = along * (c * rate[0] - s * rate[1]), along * (s * rate[0] + c * rate[1])
+    if sloped:
+        _follow_pose(scratch.pose_slope[lane], scratch.twist, dx, dy, along * c, along * s, dt)
+    pose[0], pose[1], pose[2] = pose[0] + dx, pose[1] + dy, pose[2] + turn
+    _follow_state(lane, terms, free, first, scratch, dt)
+
+
+@kernel
+def _follow_twist(lane, terms, free, scratch):  # type: ignore[no-untyped-def]
+    state = scratch.state_slope[lane]
     for d in range(3):
-        for p in range(free.shape[0]):
-            scratch.twist[d, p] = 0.0
-        for j in range(scratch.state.shape[0]):
-            slope = scratch.jacobian[d, j]
-            if slope != 0.0:
-                for p in range(free.shape[0]):
-                    scratch.twist[d, p] += slope * scratch.state[j, p]
-    for p in range(free.shape[0]):
-        if terms.dof[free[p]] < 3:
-            scratch.twist[terms.dof[free[p]], p] += scratch.value[free[p]]
+        scratch.twist[d] = 0.0
+        for j in range(state.shape[0]):
+            _add(scratch.twist[d], scratch.jacobian[d, j, lane], state[j])
+    p = 0
+    while p < free.shape[0] and terms.dof[free[p]] < 3:
+        scratch.twist[terms.dof[free[p]], p] += scratch.value[free[p], lane]
+        p += 1
+    return p
 
 
 @kernel
-def _follow_pose(scratch, dx, dy, along_x, along_y, dt):  # type: ignore[no-untyped-def]
-    pose, twist = scratch.pose, scratch.twist
-    for p in range(pose.shape[1]):
-        lean = pose[2, p] + 0.5 * dt * twist[2, p]
-        pose[0, p] += along_x * twist[0, p] - along_y * twist[1, p] - lean * dy
-        pose[1, p] += along_y * twist[0, p] + along_x * twist[1, p] + lean * dx
-        pose[2, p] += dt * twist[2, p]
+def _add(total, factor, by):  # type: ignore[no-untyped-def]
+    if factor != 0.0:
+        for p in range(total.shape[0]):
+            total[p] += factor * by[p]
 
 
 @kernel
-def _follow_state(terms, free, scratch, dt):  # type: ignore[no-untyped-def]
-    states, count, before = scratch.state.shape[0], scratch.state.shape[1], scratch.before
+def _follow_pose(pose, twist, dx, dy, along_x, along_y, dt):  # type: ignore[no-untyped-def]
+    x, y, heading, vx, vy, wz = pose[0], pose[1], pose[2], twist[0], twist[1], twist[2]
+    for p in range(x.shape[0]):
+        x[p] += along_x * vx[p] - along_y * vy[p] - (heading[p] + 0.5 * dt * wz[p]) * dy
+    for p in range(x.shape[0]):
+        y[p] += along_y * vx[p] + along_x * vy[p] + (heading[p] + 0.5 * dt * wz[p]) * dx
+    for p in range(x.shape[0]):
+        heading[p] += dt * wz[p]
+
+
+@kernel(inline=True)
+def _follow_state(lane, terms, free, k, scratch, dt):  # type: ignore[no-untyped-def]
+    state, before, rate = scratch.state_slope[lane], scratch.before, scratch.rate[:, lane]
+    states, count = state.shape
     for i in range(states):
         for p in range(count):
-            before[i, p] = scratch.state[i, p]
+            before[i, p] = state[i, p]
     for i in range(states):
-        if _is_limited(terms, i, scratch):
-            continue
-        for j in range(states):
-            slope = dt * scratch.jacobian[3 + i, j]
-            if slope != 0.0:
-                for p in range(count):
-                    scratch.state[i, p] += slope * before[j, p]
-    for p in range(count):
-        d = terms.dof[free[p]]
-        if d >= 3 and not _is_limited(terms, d - 3, scratch):
-            scratch.state[d - 3, p] += dt * scratch.value[free[p]]
-    for i in range(states):
-        bounds, rate = bounds_of(terms, i), scratch.rate[3 + i]
-        moved = next_state(scratch.x[i], rate, dt, bounds)
-        unheld = scratch.x[i] + dt * min(max(rate, bounds.fall), bounds.rise)
-        slower = 1.0 + dt * bounds.drag * abs(unheld)
-        if slower > 1.0:
-            unheld /= slower
-            for p in range(count):
-                scratch.state[i, p] /= slower * slower
-        unheld -= math.copysign(dt * bounds.friction, unheld)
-        if moved != unheld:  # it sticks, or is held in its box
-            scratch.state[i] = 0.0
-        scratch.x[i] = moved
+        moves, now = terms.fall[i] <= rate[3 + i] <= terms.rise[i], state[i]
+        for j in range(states if moves and count > 0 else 0):
+            _add(now, dt * scratch.jacobian[3 + i, j, lane], before[j])
+        while k < free.shape[0] and terms.dof[free[k]] == 3 + i:
+            if moves:
+                now[k] += dt * scratch.value[free[k], lane]
+            k += 1
+        bounds, x = bounds_of(terms, i), scratch.x[i]
+        moved = next_state(x[lane], rate[3 + i], dt, bounds)
+        if count > 0:
+            _hold(now, x[lane], moved, rate[3 + i], dt, bounds)
+        x[lane] = moved
 
 
 @kernel
-def _is_limited(terms, i, scratch):  # type: ignore[no-untyped-def]
-    rate = scratch.rate[3 + i]
-    return not terms.fall[i] <= rate <= terms.rise[i]
+def _hold(slope, value, moved, rate, dt, bounds):  # type: ignore[no-untyped-def]
+    """Shortens the derivatives (P,) of a state by drag; none are left if it sticks or is held."""
+    unheld = value + dt * min(max(rate, bounds.fall), bounds.rise)
+    slower = 1.0 + dt * bounds.drag * abs(unheld)
+    if slower > 1.0:
+        unheld /= slower
+        for p in range(slope.shape[0]):
+            slope[p] /= slower * slower
+    unheld -= math.copysign(dt * bounds.friction, unheld)
+    if moved != unheld:
+        slope[:] = 0.0
 
 
 @kernel

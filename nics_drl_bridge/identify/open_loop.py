@@ -53,13 +53,9 @@ class Windows:
 
 
 def windows(
-    drive: Drive,
-    calibration: Calibration,
-    start: float,
-    stop: float,
-    horizon: float,
+    drive: Drive, calibration: Calibration, start: float, stop: float, horizon: float,
     spacing: float,
-) -> Windows:
+) -> Windows:  # fmt: skip
     """Selects windows of a `horizon` from `start` to `stop`, starts `spacing` apart, all in [s]."""
     t, pose = drive.dated.t, drive.dated.values
     origin, period = drive.recording.pose.t[0], float(np.median(np.diff(t)))
@@ -141,13 +137,9 @@ def _roll(model: TaylorModel, state: Array, command: Array) -> tuple[Array, Arra
 
 
 def open_loop_error(
-    model: TaylorModel,
-    calibration: Calibration,
-    drive: Drive,
-    start: float,
-    stop: float,
+    model: TaylorModel, calibration: Calibration, drive: Drive, start: float, stop: float,
     horizon: float = HORIZON_S,
-) -> OpenLoop:
+) -> OpenLoop:  # fmt: skip
     """Predicts a part of a drive [s] open-loop, every 0.1 s; RecordingError if it is too short."""
     chosen = windows(drive, calibration, start, stop, horizon, SPACING_S)
     if len(chosen.start_t) == 0:

@@ -127,8 +127,8 @@ class Shooting:
             np.ascontiguousarray(state[first]), first, np.ascontiguousarray(command), steps,
             np.zeros((*steps.shape, 3)), np.zeros((*steps.shape, 3, len(moving))),
         )  # fmt: skip
-        scratch = tangent(state.shape[1], command.shape[1], len(dofs), len(moving))
-        shoot(shot, terms, moving, model.dt, scratch)
+        sizes = state.shape[1], command.shape[1], len(dofs), len(moving)
+        shoot(shot, terms, moving, model.dt, tangent(*sizes))
         return _seen_from(values[-3:], shot) if self.mounted else (shot.end, shot.slope)
 
     def errors(
@@ -214,13 +214,13 @@ class _Search:
         self.pull = REFERENCE_M_S * np.sqrt(pull * 3 * np.count_nonzero(self.wanted))
 
     def at(self, theta: Array) -> tuple[TaylorModel, Array]:
-        """Returns the model and the values of the inputs."""
+        """Returns the model without what values shape, and the values of the inputs."""
         coefficients = self.model.coefficients.copy()
         coefficients[self.free] += theta[self.count :] * self.unit
         late = self.inputs.start.copy()
         late[self.sought] += self.inputs.scale[self.sought] * theta[: self.count]
         late = late if self.problem.fixed is None else self.problem.fixed
-        return self.problem.shaped(replace(self.model, coefficients=coefficients), late), late
+        return replace(self.model, coefficients=coefficients), late
 
     def shot(self, theta: Array, sloped: bool) -> tuple[Array, Array]:
         """Returns scaled errors (n,), and derivatives (n, P) by the coefficients."""
@@ -242,13 +242,15 @@ class _Search:
         """Returns its derivatives (n + P, I + P)."""
         count, unit = self.count, self.unit
         rest, slope = self.shot(theta, True)
-        late = np.empty((len(rest), count))
-        for c in range(count):
-            aside = theta + DIFFERENCE * (np.arange(len(theta)) == c)
-            late[:, c] = (self.shot(aside, False)[0] - rest) / DIFFERENCE
-        slope = np.clip(np.nan_to_num(slope * unit), -1e6, 1e6)
+        late, slope = self.late(theta, rest), np.clip(np.nan_to_num(slope * unit), -1e6, 1e6)
         own = np.concatenate([np.zeros((len(unit), count)), self.pull * np.eye(len(unit))], axis=1)
         return np.concatenate([np.concatenate([late, slope], axis=1), own])
+
+    def late(self, theta: Array, rest: Array) -> Array:
+        """Returns derivatives (n, I) of errors (n,) by the scaled values."""
+        aside = theta + DIFFERENCE * np.eye(self.count, len(theta))
+        every = [(self.shot(each, False)[0] - rest) / DIFFERENCE for each in aside]
+        return np.ascontiguousarray(np.reshape(every, (self.count, len(rest))).T)
 
     def run(self, first: Array | None, evaluations: int) -> Predictive:
         """Searches for the least errors."""
@@ -276,14 +278,14 @@ class _Search:
     def predictive(self, theta: Array) -> Predictive:
         """Returns the model with what tells its uncertainty."""
         best, late = self.at(theta)
+        best = self.problem.shaped(best, late)
         rest, slope = self.shot(theta, True)
         starts = np.repeat(self.problem.samples.t[self.first], 3 * self.wanted.sum(axis=1))
         span = np.floor(starts / max(self.problem.horizons)).astype(np.intp)
         errors = np.full(len(self.inputs.start), np.nan)
         if self.count:
-            late_slope = self.jacobian(theta)[: len(rest), : self.count]
-            scale = self.inputs.scale[self.sought]
-            errors[self.sought] = clustered_errors(late_slope / scale, rest, span)
+            late_slope = self.late(theta, rest) / self.inputs.scale[self.sought]
+            errors[self.sought] = clustered_errors(late_slope, rest, span)
         error = float(np.sqrt(np.mean(rest**2)))
         return Predictive(best, late, error, slope, rest, self.free, starts, errors)
 

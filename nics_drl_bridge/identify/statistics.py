@@ -33,12 +33,9 @@ def unexplained(chi: Array, signal: Array) -> Array:
 
 
 def minimise(
-    residual: Callable[[Array], Array],
-    start: Array,
-    scale: Array,
-    bounds: tuple[Array, Array] | None = None,
-    jacobian: Callable[[Array], Array] | None = None,
-) -> tuple[Array, Array, Array]:
+    residual: Callable[[Array], Array], start: Array, scale: Array,
+    bounds: tuple[Array, Array] | None = None, jacobian: Callable[[Array], Array] | None = None,
+) -> tuple[Array, Array, Array]:  # fmt: skip
     """Minimises a residual (n,) within bounds (P,); returns minimum, Jacobian (n, P), residual."""
     low, high = bounds or (np.full(len(start), -np.inf), np.full(len(start), np.inf))
     slope: Any = "2-point"

@@ -181,7 +181,7 @@ def doubts_of_fit(linear: Fit, exact: bool) -> Iterator[str]:
             advice = "lower the order or drive with more variety"
             useless = "their coefficients are no use one by one"
             yield f"The terms of {dof} are {alike}: {useless}; {advice}."
-    fitted = {c.dof for c in linear.curves} - {"vy"} if exact else set()
+    fitted = {dofs[d] for d in linear.regression.moving} - {"vy"} if exact else set()
     explained = zip(dofs, linear.r2, strict=True)
     if lost := _list([dof for dof, share in explained if share < UNEXPLAINED and dof in fitted]):
         why = "the robot did not follow its commands in a way that a polynomial can describe"

@@ -244,13 +244,9 @@ def _first_guess(drive: Drive, until_s: float, clock_offset: float, offsets: boo
 
 
 def _regressed(
-    u: Array,
-    twist: Array,
-    change: Array,
-    moves: NDArray[np.bool_],
-    bicycle: BicycleGeometry,
+    u: Array, twist: Array, change: Array, moves: NDArray[np.bool_], bicycle: BicycleGeometry,
     offsets: bool,
-) -> tuple[float, Array, Array, Array]:
+) -> tuple[float, Array, Array, Array]:  # fmt: skip
     """Regresses twist + lag * change on commands: what is left, gains, offsets, lags."""
     left, gain, offset, lag = 0.0, np.zeros(moves.shape), np.zeros(3), np.full(3, LAG_S)
     for i in np.flatnonzero(moves.any(axis=1)):

@@ -200,8 +200,7 @@ def whole_simulation(robots: str = "") -> Any:
     """Returns the launch description of a simulator, the bridges of its robots, and RViz."""
     arguments = [*common("true"), *of_nodes(), *of_simulator(robots), *of_bridge()]
     return launched(
-        [simulator, bridge, description],
-        [*arguments, e_stop_required("false"), *of_description()],
+        [simulator, bridge, description], [*arguments, e_stop_required("false"), *of_description()]
     )
 
 

@@ -14,13 +14,7 @@ from nics_drl_bridge.files import sha256
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.lidar.sectors import layout_of
 from nics_drl_bridge.policy import leapp_bundle, onnx_graph
-from nics_drl_bridge.policy.contract import (
-    MAPPINGS,
-    SUFFIX,
-    Rows,
-    contract_of,
-    golden_observations,
-)
+from nics_drl_bridge.policy.contract import MAPPINGS, SUFFIX, Rows, contract_of, golden_observations
 from nics_drl_bridge.policy.foreign_graph import Composer, Network
 from nics_drl_bridge.policy.foreign_mapping import ForeignPolicy
 from nics_drl_bridge.policy.policy_file import (

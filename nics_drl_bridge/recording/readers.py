@@ -15,12 +15,7 @@ from nics_drl_bridge.recording.bag_reader import load_bag
 from nics_drl_bridge.recording.bag_table import Bag
 from nics_drl_bridge.recording.mapped import read_mapped
 from nics_drl_bridge.recording.mapping import Mapping, load_mapping
-from nics_drl_bridge.recording.recording import (
-    Recording,
-    check,
-    is_recording,
-    load_recording,
-)
+from nics_drl_bridge.recording.recording import Recording, check, is_recording, load_recording
 from nics_drl_bridge.recording.table import Source
 from nics_drl_bridge.recording.table_files import Files
 from nics_drl_bridge.recording.topic_roles import TopicRoles
@@ -73,11 +68,9 @@ FORMATS = (
 
 
 def read_recording(
-    path: str | Path,
-    spec: RobotSpec | None = None,
-    topics: TopicRoles | None = None,
+    path: str | Path, spec: RobotSpec | None = None, topics: TopicRoles | None = None,
     mapping: Mapping | str | Path | None = None,
-) -> Recording:
+) -> Recording:  # fmt: skip
     """Reads any recording by a mapping or its file, else one of `FORMATS`, a bag with its robot.
 
     RecordingError, ConfigError: it is missing or unreadable, or does not fit robot or mapping.

@@ -61,11 +61,9 @@ class TopicData:
 
 
 def streams(
-    data: Mapping[str, TopicData],
-    stamps: Stamps,
-    place: str,
+    data: Mapping[str, TopicData], stamps: Stamps, place: str,
     of_robot: Collection[str] = ROBOT_STREAMS,
-) -> dict[str, Stream]:
+) -> dict[str, Stream]:  # fmt: skip
     """Stamps each stream, from near 0 on; RecordingError: headers are missing or unusable."""
     # With `auto`, by headers if there are any. Those less than 1 s before their receipt are of the
     # recorder's clock, others of a foreign one: shifted by the median delay, they leave a small

@@ -25,12 +25,9 @@ def _arc(book: Textbook, state: Array, goal: Array, since: Array | float, h: flo
 
 
 def record(
-    spec: RobotSpec,
-    rng: np.random.Generator,
-    duration: float = 60.0,
-    dt: float = 0.01,
+    spec: RobotSpec, rng: np.random.Generator, duration: float = 60.0, dt: float = 0.01,
     hold: float = 0.5,
-) -> Recording:
+) -> Recording:  # fmt: skip
     """Records a textbook robot without noise; commands last `hold`, rows are `dt` apart [s]."""
     book = textbook(spec)
     inner = max(1, int(np.ceil(dt / INTEGRATION_STEP_S - 1e-9)))

@@ -7,12 +7,7 @@ from nics_drl_bridge.files import write_text
 from nics_drl_bridge.identify.conclusion import OF_PATH, Conclusion, conclude, end_of
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.judgement import shortfall, usual
-from nics_drl_bridge.identify.report import (
-    COMPARED,
-    HEADS,
-    equations_with_errors,
-    judgement_rows,
-)
+from nics_drl_bridge.identify.report import COMPARED, HEADS, equations_with_errors, judgement_rows
 from nics_drl_bridge.identify.verdict import doubts
 from nics_drl_bridge.report import html
 from nics_drl_bridge.report.fit_pictures import (

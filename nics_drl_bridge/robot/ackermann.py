@@ -17,14 +17,7 @@ from nics_drl_bridge.robot.kinds import (
     steering_angle,
 )
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
-from nics_drl_bridge.robot.template import (
-    SHARES,
-    STEERED,
-    STEERED_LAGS,
-    Template,
-    names_of,
-    usual,
-)
+from nics_drl_bridge.robot.template import SHARES, STEERED, STEERED_LAGS, Template, names_of, usual
 
 LENGTHS = {"wheelbase": 1.3}
 TEMPLATE = Template((STEERED,), POSE_RATES, (), STEERED_LAGS, LENGTHS)
@@ -67,5 +60,5 @@ KIND = RobotKind(kinematics, drawing, TEMPLATE)
 VARIANTS = {
     "ackermann_throttle": RobotKind(
         by_throttle, drawing, Template((THROTTLE,), POSE_RATES, (), GAINS, LENGTHS)
-    ),
+    )
 }

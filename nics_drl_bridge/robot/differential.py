@@ -34,5 +34,5 @@ KIND = RobotKind(kinematics, drawing, Template((TWIST,), MOVES, (), LAGS, LENGTH
 VARIANTS = {
     "differential_wheels": RobotKind(
         kinematics, drawing, Template((WHEELS,), (), (), LAGS, LENGTHS)
-    ),
+    )
 }

@@ -63,10 +63,11 @@ def term_arrays(model: TaylorModel) -> Terms:
         raise ModelError(f"the kinematics have a term of order {order}; {most}")
     dofs, places = np.nonzero(model.coefficients)
     factors = np.full((len(dofs), order), one, dtype=np.int64)
-    for row, k in enumerate(places):
-        used = np.repeat(np.arange(one), model.powers[k])
-        factors[row, : len(used)] = used
-    count = (factors != one).sum(axis=1)
+    powers = model.powers[places]
+    count = powers.sum(axis=1)
+    factors[np.arange(order) < count[:, None]] = np.repeat(
+        np.tile(np.arange(one), len(dofs)), powers.ravel()
+    )
     coefficients = model.coefficients[dofs, places]
     fall, rise = np.ascontiguousarray(model.limits.T)
     return Terms(

@@ -63,12 +63,12 @@ def test_an_episode_is_written_to_its_end(tmp_path, monkeypatch):
 
 
 def test_the_page_is_served_until_it_is_interrupted(monkeypatch):
-    servers = []
+    servers, seen = [], threading.Event()
 
     def show(made, server):
         servers.append(server)
         server.set_stage(made.stage())
-        until(lambda: server.watched, "the page")
+        until(seen.is_set, "the page")
 
     monkeypatch.setattr("nics_drl_bridge.watch.show.show", show)
     with closing(source()) as made:
@@ -76,5 +76,7 @@ def test_the_page_is_served_until_it_is_interrupted(monkeypatch):
         serving.start()
         with closing(Client(until(lambda: servers, "a server")[0])) as client:
             assert client.next("stage")["title"] == "forward in field"
+            assert servers[0].watched
+            seen.set()
         serving.join()
     assert servers[0].closed

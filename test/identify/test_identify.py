@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -11,11 +12,10 @@ from nics_drl_bridge.identify.assume import assume_textbook
 from nics_drl_bridge.identify.calibration import Calibration, align
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.fit import fit
-from nics_drl_bridge.identify.identify import cut, identify
+from nics_drl_bridge.identify.identify import Identified, cut, identify
 from nics_drl_bridge.identify.open_loop import open_loop_error, predict, windows
-from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.robot.kernels import SERIES, rollout, term_arrays
-from nics_drl_bridge.robot.spec import RobotSpec, robot_from
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot, robot_from
 from nics_drl_bridge.robot.taylor import TaylorModel
 
 
@@ -23,16 +23,24 @@ def term(model, dof: str, name: str) -> float:
     return model.named.terms[dof].get(name, 0.0)
 
 
-def constant_steering(car: RobotSpec, angle: float) -> tuple[RobotSpec, Recording]:
-    """A drive with the steering held, the state not measured, and the spec to read it with."""
+@cache
+def noisy() -> Identified:
+    """A model of a noisy drive whose state was not measured."""
+    car = load_robot("ackermann")
+    return identify(drive(car, noise=(5e-4, 1e-3), measured_state=False), car)
+
+
+@cache
+def held(angle: float, assume: bool) -> Identified:
+    """A model of such a drive with the steering held, completed by the textbook or not."""
+    car = load_robot("ackermann")
     data = car.model_dump()
-    speed, steering = data["command"]
-    held = {**steering, "min": angle - 1e-9, "max": angle + 1e-9}
-    locked = {**data, "command": [speed, held]}
-    recording = drive(RobotSpec.model_validate(locked), noise=(5e-4, 1e-3), measured_state=False)
+    data["command"][1].update(min=angle - 1e-9, max=angle + 1e-9)
+    recording = drive(RobotSpec.model_validate(data), noise=(5e-4, 1e-3), measured_state=False)
     values = recording.command.values.copy()
     values[:, 1] = angle
-    return car, replace(recording, command=replace(recording.command, values=values))
+    held = replace(recording, command=replace(recording.command, values=values))
+    return identify(held, car, assume=assume)
 
 
 def test_the_kernel_moves_robots_exactly_as_the_model_does(car):
@@ -65,15 +73,14 @@ def test_the_held_out_part_is_not_used_for_the_model(car):
     spoiled = recording.pose.values.copy()
     spoiled[recording.pose.t > 26.7, :2] *= 1.5
     other = replace(recording, pose=replace(recording.pose, values=spoiled))
-    a, b = identify(recording, car).trial, identify(other, car).trial
+    a, b = noisy().trial, identify(other, car).trial
     assert np.array_equal(a.model.coefficients, b.model.coefficients)
     assert a.calibration == b.calibration
 
 
 @pytest.mark.slow
 def test_a_prediction_knows_no_pose_after_its_start(car):
-    recording = drive(car, noise=(5e-4, 1e-3), measured_state=False)
-    found = identify(recording, car)
+    found, recording = noisy(), noisy().recording
     chosen = windows(found.drive, found.calibration, 30.0, 36.0, 5.0, 0.1)
     values = recording.pose.values.copy()
     values[recording.pose.t > chosen.start_t[-1]] = 7.0
@@ -121,9 +128,8 @@ def test_a_short_drive_says_that_it_was_not_tried(car):
 
 
 @pytest.mark.slow
-def test_steering_that_never_moved_has_no_terms_and_a_sentence(car):
-    spec, recording = constant_steering(car, -0.4)
-    found = identify(recording, spec)
+def test_steering_that_never_moved_has_no_terms_and_a_sentence():
+    found = held(-0.4, assume=False)
     used = found.model.powers[:, [1, 3]]
     assert (used == 0).all()
     assert found.fit.unmoved == ("steering", "steering_command")
@@ -132,9 +138,8 @@ def test_steering_that_never_moved_has_no_terms_and_a_sentence(car):
 
 
 @pytest.mark.slow
-def test_on_request_the_textbook_completes_what_was_measured_at_a_constant(car):
-    spec, recording = constant_steering(car, -0.4)
-    plain, completed = identify(recording, spec), identify(recording, spec, assume=True)
+def test_on_request_the_textbook_completes_what_was_measured_at_a_constant():
+    plain, completed = held(-0.4, assume=False), held(-0.4, assume=True)
     learnt = term(plain.model, "wz", "speed")
     assert term(completed.model, "wz", "speed*steering") == pytest.approx(learnt / -0.4)
     assert ("wz", "speed*steering") in completed.model.assumed
@@ -143,17 +148,15 @@ def test_on_request_the_textbook_completes_what_was_measured_at_a_constant(car):
 
 
 @pytest.mark.slow
-def test_at_the_same_steering_the_completed_model_moves_like_the_learnt_one(car):
-    spec, recording = constant_steering(car, -0.4)
-    plain, completed = identify(recording, spec).model, identify(recording, spec, assume=True).model
+def test_at_the_same_steering_the_completed_model_moves_like_the_learnt_one():
+    plain, completed = held(-0.4, assume=False).model, held(-0.4, assume=True).model
     x = np.array([0.3, -0.4, 0.5, -0.4])
     assert np.allclose(plain.rates(x), completed.rates(x), atol=1e-9)
 
 
 @pytest.mark.slow
-def test_at_zero_steering_the_parameters_of_the_spec_are_assumed(car):
-    spec, recording = constant_steering(car, 0.0)
-    found = identify(recording, spec, assume=True)
+def test_at_zero_steering_the_parameters_of_the_spec_are_assumed():
+    found = held(0.0, assume=True)
     assert term(found.model, "wz", "speed*steering") == pytest.approx(1.0 / 0.2, rel=1e-3)
     assert any("from the parameters" in note for note in found.notes)
 

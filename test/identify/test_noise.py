@@ -178,12 +178,13 @@ def test_the_noise_of_a_pose_is_no_less_than_its_covariances_say():
 
 
 def test_covariances_leave_the_drift_that_was_measured():
-    spec, recording = slipping_car()
+    spec, recording = slipping_car(duration=12.0)
     pose = recording.pose
     told = replace(pose, sigma=np.tile([0.5, 0.5, 0.26], (len(pose.t), 1)))
     plain, with_claims = (
         identify(each, spec).noise for each in (recording, replace(recording, pose=told))
     )
     assert with_claims.pose == (0.5, 0.5, 0.26)
+    assert plain.position_drift.measured
     assert plain.position_drift.std > 0.0
     assert with_claims.position_drift == plain.position_drift

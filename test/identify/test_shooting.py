@@ -67,6 +67,26 @@ def test_coefficients_and_a_delay_are_found_together(car, problem):
     assert found.value_errors[0] < 0.01
 
 
+def test_windows_that_are_predicted_together_end_as_each_alone(car, problem):
+    car = replace(
+        car, drag=np.array([0.3, 0.0, 0.1]), friction=np.array([0.2, 0.0, 0.0]),
+        limits=np.array([[-1.0, 1.5], [-np.inf, np.inf], [-6.0, 6.0]]),
+        back_emf=np.outer([0.5, 0.0, 0.0], [1.0, 0.0]),
+    )  # fmt: skip
+    first, steps = problem.starts()
+    first, steps = first[::-1][:41], steps[::-1][:41]  # the last have shorter horizons
+    free = (car.coefficients != 0.0) & (np.arange(6) >= 3)[:, None]
+    end, slope = problem.predict(car, np.array([DELAY]), first, steps, free)
+    assert np.array_equal(end, problem.predict(car, np.array([DELAY]), first, steps)[0])
+    for w in range(len(first)):
+        one = slice(w, w + 1)
+        alone = problem.predict(car, np.array([DELAY]), first[one], steps[one], free)
+        assert np.array_equal(alone[0], end[one])
+        assert np.array_equal(alone[1], slope[one])
+    assert len(np.unique(steps.max(axis=1))) > 2
+    assert (slope[steps > 0] != 0.0).any(axis=(0, 1)).all()
+
+
 def test_a_value_between_equal_bounds_stays_and_has_no_error(car, problem):
     known = replace(DELAYS, start=np.array([0.08]), low=np.array([0.08]), high=np.array([0.08]))
     found = fitted(problem, car, car.coefficients == 4.0, known)

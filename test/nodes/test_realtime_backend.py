@@ -199,7 +199,8 @@ def test_a_vehicle_that_does_not_come_ends_the_reset_and_the_present_pose_would_
     connect, vehicle, monkeypatch
 ):
     monkeypatch.setattr(realtime_backend, "SAY_EVERY_S", 0.05)
-    vehicle.peer.listen(TwistStamped, "cmd_vel_raw")
+    for topic in ("cmd_vel_raw", "cmd_vel"):  # of a gate, and of the robot behind it
+        vehicle.peer.listen(TwistStamped, topic)
     options = {
         "domain_id": vehicle.domain_id,
         "command_topic": "cmd_vel_raw",

@@ -48,9 +48,7 @@ def record(
 
 @bag.command()
 def info(
-    path: BagArgument,
-    as_json: console.JsonOption = False,
-    salvage: SalvageOption = False,
+    path: BagArgument, as_json: console.JsonOption = False, salvage: SalvageOption = False
 ) -> None:
     """Tells a bag's topics, rates and gaps, and whose clock stamped it."""
     with one_sentence():

@@ -35,12 +35,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Array
 from nics_drl_bridge.policy import train, train_algorithms
-from nics_drl_bridge.policy.train_checkpoint import (
-    RECENT,
-    Progress,
-    read_checkpoint,
-    write_content,
-)
+from nics_drl_bridge.policy.train_checkpoint import RECENT, Progress, read_checkpoint, write_content
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds

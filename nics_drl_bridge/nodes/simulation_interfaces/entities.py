@@ -6,13 +6,7 @@ import re
 from typing import Any
 
 from geometry_msgs.msg import Twist
-from simulation_interfaces.msg import (
-    EntityCategory,
-    EntityInfo,
-    EntityState,
-    Result,
-    TagsFilter,
-)
+from simulation_interfaces.msg import EntityCategory, EntityInfo, EntityState, Result, TagsFilter
 from simulation_interfaces.srv import SetEntityState
 
 from nics_drl_bridge import geometry as planar
