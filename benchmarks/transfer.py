@@ -4,9 +4,8 @@ The shipped policy of each robot, one file, drives the same episodes in three pl
 simulator in process, the fast simulator over DDS, and the robot's machine in MuJoCo over DDS. The
 conditions are those of a deployment: a real lidar, mild randomisation, the gate and its shield.
 What counts is where the robot truly ended and whether it truly touched something; what the robot
-itself took for a success is told beside it. `without_randomisation` are policies that were trained
-in `circles` without any, see `benchmarks/policies`. Two robots are driven at a time, each in
-processes of its own.
+itself took for a success is told beside it. Two robots are
+driven at a time, each in processes of its own.
 """
 
 from __future__ import annotations
@@ -41,7 +40,6 @@ BELIEF = 0.05
 LEAST_WAY_M = 1.0
 BARS = {DDS: 0.02, MUJOCO: 0.04}
 """How far the success may be from that in process."""
-PLAIN, PLAIN_KEY = Path(__file__).parent / "policies", "without_randomisation"
 LIDAR, RANDOMISATION = "rplidar_a2", "mild"
 FIRST_SEED = 2_000_000
 SHARES = ("success", "collision", "believed")
@@ -57,32 +55,23 @@ def conditions(robot: str) -> Conditions:
 def measure(
     robots: list[str], worlds: list[str], places: list[str], episodes: int, folder: Path,
     control: str | None,
-) -> tuple[Found, Found]:  # fmt: skip
-    """What `nics evaluate` found: robot -> world -> place -> figures; then of the plain ones."""
-    own, plain = {}, {}
+) -> Found:  # fmt: skip
+    """What `nics evaluate` found: robot -> world -> place -> figures."""
+    runs = {}
     for robot, world in product(robots, worlds):
         given: Any = world, episodes, FIRST_SEED, folder / robot / world
         under: Any = {"control": control, "conditions": conditions(robot), "places": places}
-        own[f"{robot}/{world}"] = Run(robot, robot, *given, **under)
-        file = PLAIN / f"{robot}.onnx"
-        if world == "circles" and file.is_file() and control is None:
-            given = world, episodes, FIRST_SEED, folder / PLAIN_KEY / robot
-            plain[f"{PLAIN_KEY}/{robot}/{world}"] = Run(str(file), robot, *given, **under)
+        runs[f"{robot}/{world}"] = Run(robot, robot, *given, **under)
 
     def tell(name: str, figures: dict[str, Any]) -> None:
         shares = (f"{place} {100 * each['success'][0]:.1f} %" for place, each in figures.items())
         sys.stderr.write(f"{name}: {', '.join(shares)}\n")
 
-    found = evaluations({**own, **plain}, tell)
-    return _nested(found, own), _nested(found, plain)
-
-
-def _nested(found: dict[str, dict[str, Any]], names: dict[str, Run]) -> Found:
-    nested: Found = {}
-    for name in names:
-        robot, world = name.split("/")[-2:]
-        nested.setdefault(robot, {})[world] = found[name]
-    return nested
+    found: Found = {}
+    for name, figures in evaluations(runs, tell).items():
+        robot, world = name.split("/")
+        found.setdefault(robot, {})[world] = figures
+    return found
 
 
 def shares(found: Found, name: str) -> dict[str, Any]:
@@ -149,20 +138,19 @@ def _missed_belief(who: str, figures: dict[str, Any]) -> list[str]:
     return said
 
 
-def table_of(found: Found, plain: Found, wall_s: float) -> str:
+def table_of(found: Found, wall_s: float) -> str:
     """The figures for people."""
     lines = []
-    for kind, some in (("", found), (f", {PLAIN_KEY}", plain)):
-        for robot, worlds in some.items():
-            for world, places in worlds.items():
-                for place, figures in places.items():
-                    share, low, high = (100 * value for value in figures["success"])
-                    lines.append(
-                        f"{robot:<13}{world:<10}{LABELS[place]:<16}{share:5.1f} % ({low:.0f} to "
-                        f"{high:.0f}), collision {100 * figures['collision'][0]:.1f} %, believed "
-                        f"{100 * figures['believed'][0]:.1f} %, deviation "
-                        f"{figures['deviation'][0]:.2g} m{kind}"
-                    )
+    for robot, worlds in found.items():
+        for world, places in worlds.items():
+            for place, figures in places.items():
+                share, low, high = (100 * value for value in figures["success"])
+                lines.append(
+                    f"{robot:<13}{world:<10}{LABELS[place]:<16}{share:5.1f} % ({low:.0f} to "
+                    f"{high:.0f}), collision {100 * figures['collision'][0]:.1f} %, believed "
+                    f"{100 * figures['believed'][0]:.1f} %, deviation "
+                    f"{figures['deviation'][0]:.2g} m"
+                )
     return "\n".join([*lines, f"{wall_s:.0f} s on {os.cpu_count()} cores"]) + "\n"
 
 
@@ -179,10 +167,10 @@ def main() -> None:
     given = parser.parse_args()
     begin, chosen = time.perf_counter(), (given.robots, given.worlds, given.places)
     with tempfile.TemporaryDirectory() as folder:
-        found, plain = measure(*chosen, given.episodes, Path(folder), given.control)
+        found = measure(*chosen, given.episodes, Path(folder), given.control)
     result = {name: shares(found, name) for name in SHARES}
-    result |= {"points_from_fast": apart(found), PLAIN_KEY: shares(plain, "success")}
-    table = table_of(found, plain, time.perf_counter() - begin)
+    result |= {"points_from_fast": apart(found)}
+    table = table_of(found, time.perf_counter() - begin)
     answer({**result, "episodes": given.episodes}, missed(found), table, given.json)
 
 

@@ -231,14 +231,6 @@ TRANSFER = Table(
                              ("mujoco_dds", "MuJoCo"))
     ),
 )  # fmt: skip
-PLAIN = Table(
-    ("trained without randomisation", "in process", "over DDS", "MuJoCo over DDS"),
-    tuple(
-        ("transfer", title, *(f"{{without_randomisation.{robot}.circles.{place}|.0%}}" for place in
-                              ("fast", "dds", "mujoco_dds")))
-        for robot, title in ROBOTS.items()
-    ),
-)  # fmt: skip
 ROBUSTNESS = Table(
     ("success [%] at 0, 1/2, 1, 2 times the range", "declared range", *POLICIES.values()),
     tuple(
@@ -354,7 +346,6 @@ TABLES: Mapping[str, Table] = {
     "fig4": lidar.FIG4,
     "estimator": ESTIMATOR,
     "transfer": TRANSFER,
-    "transfer_plain": PLAIN,
     "robustness": ROBUSTNESS,
     "barn": BARN,
     "baselines": BASELINES,

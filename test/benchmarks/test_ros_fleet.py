@@ -8,12 +8,11 @@ from .runs import BENCHMARKS, asked, fails
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.campaign, pytest.mark.ros, pytest.mark.timeout(300)]
 SCRIPT = "ros_fleet.py"
 SHORT = ("--robots", "2", "--seconds", "2")
 
 
-@pytest.mark.campaign
 def test_every_robot_of_a_fleet_drives_and_is_heard():
     code, result = asked(SCRIPT, *SHORT)
     assert set(result["each"]) == {"robot1", "robot2"}
@@ -25,13 +24,11 @@ def test_every_robot_of_a_fleet_drives_and_is_heard():
     assert code == bool(result["failures"])
 
 
-@pytest.mark.campaign
 def test_a_fleet_that_nobody_commands_is_found_to_stand():
     missed = fails(SCRIPT, "standing", *SHORT)
     assert any(": driven_m 0.0" in line and "must be 0.1 at least" in line for line in missed)
 
 
-@pytest.mark.campaign
 def test_one_robot_that_nobody_hears_is_named():
     missed = fails(SCRIPT, "deaf", *SHORT, "--patience", "15")
     for topic in ("scan", "odom", "driven_m"):

@@ -8,12 +8,11 @@ from .runs import asked, fails
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
-pytestmark = [pytest.mark.ros, pytest.mark.timeout(300)]
+pytestmark = [pytest.mark.campaign, pytest.mark.ros, pytest.mark.timeout(300)]
 SCRIPT = "ros_lockstep.py"
 SHORT = ("--chunks", "2", "--size", "20")
 
 
-@pytest.mark.campaign
 def test_steps_and_echoes_are_measured_in_the_same_run():
     code, result = asked(SCRIPT, *SHORT)
     assert set(result) == {
@@ -26,12 +25,10 @@ def test_steps_and_echoes_are_measured_in_the_same_run():
     assert [line.split()[0] for line in result["failures"]] == ["ratio"] * code
 
 
-@pytest.mark.campaign
 def test_an_env_that_rests_in_each_step_is_too_slow():
     assert any(line.startswith("ratio 0.") for line in fails(SCRIPT, "slow", *SHORT))
 
 
-@pytest.mark.campaign
 def test_a_robot_that_stands_has_measured_nothing():
     missed = fails(SCRIPT, "standing", *SHORT)
     assert any(line.startswith("driven_m 0.0") for line in missed)

@@ -3,10 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from lidar_scenes import POLYGONS, Scene, by_plane_geometry, random_scene, random_shapes, ring
+from plain_scan import scan_robot
 from robots import lidar
 
 from nics_drl_bridge.errors import ConfigError, ModelError
-from nics_drl_bridge.lidar import baked_kernels
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.scan_kernels import LANES
@@ -255,7 +255,7 @@ def test_many_looked_up_at_once_are_each_looked_up_alone_to_the_bit(beams):
     walls, alone = np.array([[-3.0, -2.0, 3.0, -2.5]]), np.empty(beams, np.float32)
     together = scanner.scan(robots, bodies, walls)
     for robot, around, scan in zip(robots, bodies, together, strict=True):
-        baked_kernels.scan_robot(alone, robot, around, -1, walls, scanner.arguments)
+        scan_robot(alone, robot, around, -1, walls, scanner.arguments)
         assert alone.tobytes() == scan.tobytes()
 
 
