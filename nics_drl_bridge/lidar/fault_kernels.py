@@ -99,9 +99,9 @@ def _noise(ranges, device, by, coarse):  # type: ignore[no-untyped-def]
             first = _measured(ranges[i], first, device, coarse)
             second = _measured(ranges[k], second, device, coarse)
             ranges[i], ranges[k] = first, second  # after both are read: else it is not vectorised
-    for i in range(chunks * CHUNK, ranges.shape[0]):
-        first, _ = random.two_normals(by, np.uint32(i - chunks * HALF))
-        ranges[i] = _measured(ranges[i], first, device, coarse)
+    for last in range(chunks * CHUNK, ranges.shape[0]):
+        first, _ = random.two_normals(by, np.uint32(last - chunks * HALF))
+        ranges[last] = _measured(ranges[last], first, device, coarse)
 
 
 @kernel(inline=True)
