@@ -18,9 +18,6 @@ NOISE_STD, NOISE_PROPORTIONAL, DROPOUT, DROPOUT_FAR, TOO_CLOSE, QUANTISATION, SK
 PARAMETERS = 7
 AS_MINUS_INF, AS_RANGE_MIN, AS_NO_RETURN, AS_GHOST = range(4)  # values of TOO_CLOSE
 CLOCKWISE, AT_ONCE, COUNTER_CLOCKWISE = -1, 0, 1  # values of SKEW
-HALF = 8  # beams that are distorted at once: those of a pair of draws lie so far apart
-CHUNK = 2 * HALF  # beams that are skipped together, if none returns
-INFINITE = 0x7F800000  # bits of an infinite range, float32
 ROUNDING = 1e-9  # rounding error of a multiple of the quantisation step [m]
 
 
@@ -56,8 +53,7 @@ def distort(ranges, limits, faults, seed, counter):  # type: ignore[no-untyped-d
     elif coarse or faults[TOO_CLOSE] != AS_MINUS_INF:
         for i in range(ranges.shape[0]):
             value = _closed(ranges[i], device)
-            stepped = _limited(_stepped(value, device), device) if coarse else value
-            ranges[i] = stepped if abs(value) < np.float32(np.inf) else value
+            ranges[i] = _quantised(value, device) if coarse else value
     if faults[DROPOUT] > 0.0 or faults[DROPOUT_FAR] > 0.0:
         by = random.key(seed, random.DROPOUT_STREAM, counter)
         _drop(ranges, faults[DROPOUT], faults[DROPOUT_FAR] / (limits[1] * limits[1]), by)
@@ -88,29 +84,17 @@ def _ghosts(ranges, device, by):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True, inline=True)
 def _noise(ranges, device, by, coarse):  # type: ignore[no-untyped-def]
-    whole, chunks = ranges.view(np.int32), ranges.shape[0] // CHUNK
-    for c in range(chunks):
-        begin = c * CHUNK
-        if _is_empty(whole, begin):
-            continue
-        for j in range(HALF):
-            i, k = np.uintp(begin + j), np.uintp(begin + HALF + j)
-            first, second = random.two_normals(by, np.uint32(c * HALF + j))
-            first = _measured(ranges[i], first, device, coarse)
-            second = _measured(ranges[k], second, device, coarse)
-            ranges[i], ranges[k] = first, second  # after both are read: else it is not vectorised
-    for last in range(chunks * CHUNK, ranges.shape[0]):
-        first, _ = random.two_normals(by, np.uint32(last - chunks * HALF))
-        ranges[last] = _measured(ranges[last], first, device, coarse)
-
-
-@kernel(inline=True)
-def _is_empty(whole, begin):  # type: ignore[no-untyped-def]
-    """True if no beam of a chunk returns; of the ranges' bits, of which LLVM vectorises it."""
-    least = np.int32(INFINITE)
-    for j in range(CHUNK):
-        least = min(least, whole[np.uintp(begin + j)])
-    return least == np.int32(INFINITE)
+    half = ranges.shape[0] // 2
+    one, two = ranges[:half], ranges[half : 2 * half]  # no two draws of a pair side by side
+    for i in range(half):
+        first, second = random.two_normals(by, i)
+        first, second = _noisy(one[i], first, device), _noisy(two[i], second, device)
+        one[i] = _quantised(first, device) if coarse else first
+        two[i] = _quantised(second, device) if coarse else second
+    for i in range(2 * half, ranges.shape[0]):
+        first, _ = random.two_normals(by, half)
+        first = _noisy(ranges[i], first, device)
+        ranges[i] = _quantised(first, device) if coarse else first
 
 
 @kernel(inline=True)
@@ -119,26 +103,24 @@ def _closed(value, device):  # type: ignore[no-untyped-def]
 
 
 @kernel(contracts=True, inline=True)
-def _measured(value, draw, device, coarse):  # type: ignore[no-untyped-def]
+def _noisy(value, draw, device):  # type: ignore[no-untyped-def]
     value = _closed(value, device)
     noisy = value + (device.std + device.grows * value) * draw
-    noisy = _stepped(noisy, device) if coarse else noisy
-    return _limited(noisy, device) if abs(value) < np.float32(np.inf) else value
+    noisy = device.least if noisy < device.least else noisy
+    noisy = device.most if noisy > device.most else noisy
+    return noisy if abs(value) < np.float32(np.inf) else value
 
 
 @kernel(contracts=True, inline=True)
-def _stepped(value, device):  # type: ignore[no-untyped-def]
-    """Returns the nearest multiple of the step within the limits, but for rounding."""
+def _quantised(value, device):  # type: ignore[no-untyped-def]
+    """Returns the nearest multiple of the step within the limits."""
     count = np.floor(value * device.per_step + np.float32(0.5))
     count = device.first if count < device.first else count
     count = device.last if count > device.last else count
-    return count * device.step + count * device.rest  # rounded once
-
-
-@kernel(inline=True)
-def _limited(value, device):  # type: ignore[no-untyped-def]
-    value = device.least if value < device.least else value
-    return device.most if value > device.most else value
+    coarse = count * device.step + count * device.rest  # rounded once
+    coarse = device.least if coarse < device.least else coarse
+    coarse = device.most if coarse > device.most else coarse
+    return coarse if abs(value) < np.float32(np.inf) else value
 
 
 @kernel(allocates=True)
