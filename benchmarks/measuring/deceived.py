@@ -43,8 +43,8 @@ def stand() -> None:
     """From now on every policy stands still."""
     opened = episodes.open_policy
 
-    def standing(name: str, model: Any) -> Any:
-        _, task = opened(name, model)
+    def standing(*given: Any) -> Any:
+        _, task = opened(*given)
         return Standing(task), task
 
     episodes.open_policy = standing  # type: ignore[assignment]
