@@ -59,20 +59,21 @@ def test_large_and_negative_seeds_give_draws_of_their_own():
 
 
 @njit
-def pairs(seeds, counters, count):
-    out = np.empty((seeds, counters, 2, count), np.float32)
+def normals(seeds, counters, count):
+    out = np.empty((seeds, counters, count), np.float32)
     for i in range(seeds):
         for j in range(counters):
             by = random.key(i, 3, j)
             for k in range(count):
-                out[i, j, 0, k], out[i, j, 1, k] = random.two_normals(by, k)
+                out[i, j, k] = random.normal_of(random.bits(by, k))
     return out
 
 
 @pytest.mark.slow
 def test_normals_by_the_thousand_are_standard_normal_far_out_too():
-    sample = pairs(30, 60, 540).ravel().astype(np.float64)
+    sample = normals(30, 60, 1080).ravel().astype(np.float64)
     assert stats.kstest(sample, "norm").pvalue > 1e-3
+    assert sample.std() == pytest.approx(1.0, abs=4.0 / np.sqrt(2.0 * sample.size))
     assert stats.kurtosis(sample) == pytest.approx(0.0, abs=4.0 * np.sqrt(24.0 / sample.size))
     for share in (1e-3, 1e-4):
         far = stats.norm.isf(share)
@@ -81,12 +82,33 @@ def test_normals_by_the_thousand_are_standard_normal_far_out_too():
             assert tail.sum() == pytest.approx(expected, abs=4.0 * np.sqrt(expected))
 
 
+def test_normals_of_all_bits_are_the_standard_normal_distribution_within_a_5000th():
+    byte, chance = np.arange(511), np.convolve(np.ones(256), np.ones(256)) / 256**2
+    low, high = np.meshgrid(np.minimum(byte, 255), np.minimum(byte, 255))  # of two bytes each
+    rest_low, rest_high = np.meshgrid(byte - np.minimum(byte, 255), byte - np.minimum(byte, 255))
+    bits = (low << 0) + (rest_low << 8) + (high << 16) + (rest_high << 24)
+
+    @njit
+    def of_all(bits):
+        out = np.empty(bits.shape[0], np.float32)
+        for i in range(bits.shape[0]):
+            out[i] = random.normal_of(bits[i])
+        return out
+
+    drawn = of_all(bits.ravel().astype(np.uint32)).astype(np.float64)
+    share = np.outer(chance, chance).ravel()[order := np.argsort(drawn)]
+    below = np.cumsum(share) - 0.5 * share
+    assert np.abs(below - stats.norm.cdf(drawn[order])).max() < 2e-4
+    assert (share * drawn[order] ** 2).sum() == pytest.approx(1.0, abs=1e-3)
+    assert drawn.max() == -drawn.min() < 5.3
+
+
 @pytest.mark.slow
-def test_normals_of_a_pair_and_of_neighbours_are_not_correlated():
-    sample = pairs(30, 60, 540).astype(np.float64)
+def test_normals_of_neighbours_in_scan_counter_and_seed_are_not_correlated():
+    sample = normals(30, 60, 1080).astype(np.float64)
     for values in (sample, np.abs(sample) - np.sqrt(2.0 / np.pi)):
         limit = 4.5 * values.var() / np.sqrt(sample.size / 2)
-        for axis in range(4):
+        for axis in range(3):
             ahead = np.take(values, np.arange(1, sample.shape[axis]), axis=axis)
             behind = np.take(values, np.arange(sample.shape[axis] - 1), axis=axis)
             assert abs((ahead * behind).mean()) < limit

@@ -19,6 +19,9 @@ PARAMETERS = 7
 AS_MINUS_INF, AS_RANGE_MIN, AS_NO_RETURN, AS_GHOST = range(4)  # values of TOO_CLOSE
 CLOCKWISE, AT_ONCE, COUNTER_CLOCKWISE = -1, 0, 1  # values of SKEW
 ROUNDING = 1e-9  # rounding error of a multiple of the quantisation step [m]
+# Ranges are raised as whole numbers, in the same order, by the greater of the two: where LLVM knows
+# that a range may stay it masks the store, which takes longer than all the rest.
+INF, MINUS_INF, NONE = np.array([np.inf, -np.inf, -2.0], np.float32).view(np.int32)
 
 
 class Distortion(NamedTuple):
@@ -50,10 +53,13 @@ def distort(ranges, limits, faults, seed, counter):  # type: ignore[no-untyped-d
         _noise(ranges, device, random.key(seed, random.RANGE_STREAM, counter), True)
     elif noisy:
         _noise(ranges, device, random.key(seed, random.RANGE_STREAM, counter), False)
-    elif coarse or faults[TOO_CLOSE] != AS_MINUS_INF:
+    elif coarse:
         for i in range(ranges.shape[0]):
             value = _closed(ranges[i], device)
-            ranges[i] = _quantised(value, device) if coarse else value
+            coarser = _limited(_coarse(value, device), device)
+            ranges[i] = coarser if abs(value) < np.float32(np.inf) else value
+    elif device.close != -np.inf:
+        _close(ranges, device.close)
     if faults[DROPOUT] > 0.0 or faults[DROPOUT_FAR] > 0.0:
         by = random.key(seed, random.DROPOUT_STREAM, counter)
         _drop(ranges, faults[DROPOUT], faults[DROPOUT_FAR] / (limits[1] * limits[1]), by)
@@ -77,24 +83,27 @@ def _device(limits, faults):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def _ghosts(ranges, device, by):  # type: ignore[no-untyped-def]
+    whole = ranges.view(np.int32)
     for i in range(ranges.shape[0]):
         ghost = device.least + random.share_of(random.bits(by, i)) * (device.most - device.least)
-        ranges[i] = ghost if ranges[i] == -np.inf else ranges[i]
+        value = np.float32(ghost).view(np.int32)
+        whole[i] = max(whole[i], value if whole[i] == MINUS_INF else NONE)
 
 
-@kernel(allocates=True, inline=True)
+@kernel(allocates=True)
+def _close(ranges, close):  # type: ignore[no-untyped-def]
+    whole, value = ranges.view(np.int32), np.float32(close).view(np.int32)
+    for i in range(ranges.shape[0]):
+        whole[i] = max(whole[i], value if whole[i] == MINUS_INF else NONE)
+
+
+@kernel(allocates=True, contracts=True, inline=True)
 def _noise(ranges, device, by, coarse):  # type: ignore[no-untyped-def]
-    half = ranges.shape[0] // 2
-    one, two = ranges[:half], ranges[half : 2 * half]  # no two draws of a pair side by side
-    for i in range(half):
-        first, second = random.two_normals(by, i)
-        first, second = _noisy(one[i], first, device), _noisy(two[i], second, device)
-        one[i] = _quantised(first, device) if coarse else first
-        two[i] = _quantised(second, device) if coarse else second
-    for i in range(2 * half, ranges.shape[0]):
-        first, _ = random.two_normals(by, half)
-        first = _noisy(ranges[i], first, device)
-        ranges[i] = _quantised(first, device) if coarse else first
+    for i in range(ranges.shape[0]):
+        value = _closed(ranges[i], device)
+        noise = (device.std + device.grows * value) * random.normal_of(random.bits(by, i))
+        noisy = _coarse(value + noise, device) if coarse else value + noise
+        ranges[i] = _limited(noisy, device) if abs(value) < np.float32(np.inf) else value
 
 
 @kernel(inline=True)
@@ -103,33 +112,27 @@ def _closed(value, device):  # type: ignore[no-untyped-def]
 
 
 @kernel(contracts=True, inline=True)
-def _noisy(value, draw, device):  # type: ignore[no-untyped-def]
-    value = _closed(value, device)
-    noisy = value + (device.std + device.grows * value) * draw
-    noisy = device.least if noisy < device.least else noisy
-    noisy = device.most if noisy > device.most else noisy
-    return noisy if abs(value) < np.float32(np.inf) else value
-
-
-@kernel(contracts=True, inline=True)
-def _quantised(value, device):  # type: ignore[no-untyped-def]
-    """Returns the nearest multiple of the step within the limits."""
+def _coarse(value, device):  # type: ignore[no-untyped-def]
+    """Returns the nearest multiple of the step that is within the limits, but for float32."""
     count = np.floor(value * device.per_step + np.float32(0.5))
     count = device.first if count < device.first else count
     count = device.last if count > device.last else count
-    coarse = count * device.step + count * device.rest  # rounded once
-    coarse = device.least if coarse < device.least else coarse
-    coarse = device.most if coarse > device.most else coarse
-    return coarse if abs(value) < np.float32(np.inf) else value
+    return count * device.step + count * device.rest  # rounded once
+
+
+@kernel(inline=True)
+def _limited(value, device):  # type: ignore[no-untyped-def]
+    value = device.least if value < device.least else value
+    return device.most if value > device.most else value
 
 
 @kernel(allocates=True)
 def _drop(ranges, share, far, by):  # type: ignore[no-untyped-def]
-    share, far = np.float32(share), np.float32(far)
+    share, far, whole = np.float32(share), np.float32(far), ranges.view(np.int32)
     for i in range(ranges.shape[0]):
         reach = ranges[i] if ranges[i] > np.float32(0.0) else np.float32(0.0)
         lost = random.share_of(random.bits(by, i)) < share + far * reach * reach
-        ranges[i] = np.float32(np.inf) if lost & (ranges[i] < np.inf) else ranges[i]
+        whole[i] = max(whole[i], INF if lost else NONE)
 
 
 @kernel(allocates=True)

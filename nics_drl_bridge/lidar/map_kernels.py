@@ -191,7 +191,7 @@ def _jump(flat, here, limit, lanes):  # type: ignore[no-untyped-def]
 @kernel
 def _end(out, x, y, shape, limit, resolution, lanes):  # type: ignore[no-untyped-def]
     """Fuses the lanes that ended at a solid cell, not in the border around the map."""
-    singles, wholes = lanes.single, lanes.whole
+    singles, wholes, ranges = lanes.single, lanes.whole, out.view(np.int32)
     for j in range(out.shape[0]):
         k = np.uintp(j)
         column = x + wholes[k + COLUMN] * wholes[k + ASIDE]
@@ -199,4 +199,4 @@ def _end(out, x, y, shape, limit, resolution, lanes):  # type: ignore[no-untyped
         hit = (column >= 0) & (column < shape[1] - 2) & (row >= 0) & (row < shape[0] - 2)
         t = singles[k + T]
         value = np.float32(resolution) * t if hit & (t < limit) else np.float32(np.inf)
-        out[j] = min(out[j], value)
+        ranges[j] = min(ranges[j], np.float32(value).view(np.int32))  # see `exact_kernels._cross`
