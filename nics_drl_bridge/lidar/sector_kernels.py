@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge.kernels import kernel
 
 TURN = 2.0 * math.pi
+INF, UNKNOWN = np.array([np.inf, np.nan], np.float32).view(np.int32)
 
 
 class SectorPlan(NamedTuple):
@@ -42,17 +43,38 @@ def resample(out, ranges, plan):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def _by_beam(out, ranges, first, count):  # type: ignore[no-untyped-def]
-    beams = ranges.shape[0]
+    """Fills each sector from its own beams, by a sparse table (Bender, Farach-Colton 2000).
+
+    Row k has the least of each 2**k beams in a row. As whole numbers, ranges have the same order,
+    NaN is the greatest, and LLVM vectorises.
+    """
+    beams, rows, whole = ranges.shape[0], 1, ranges.view(np.int32)
     for s in range(out.shape[0]):
-        near, known = np.float32(np.inf), np.int32(0)
-        end = first[s] + count[s]
-        for b in range(first[s], min(end, beams)):
-            near = min(near, ranges[b]) if ranges[b] == ranges[b] else near
-            known |= np.int32(ranges[b] == ranges[b])
-        for b in range(end - beams):
-            near = min(near, ranges[b]) if ranges[b] == ranges[b] else near
-            known |= np.int32(ranges[b] == ranges[b])
-        out[s] = near if known != 0 else np.float32(np.nan)
+        while 1 << rows <= count[s]:
+            rows += 1
+    least = np.empty((rows, beams), np.int32)
+    row = least[0]
+    for b in range(beams):
+        row[b] = whole[b] if np.int32(whole[b] & np.int32(0x7FFFFFFF)) <= INF else UNKNOWN
+    for k in range(rows - 1):
+        step, last = 1 << k, beams - (2 << k) + 1
+        one, two, row = least[k, :last], least[k, step : step + last], least[k + 1]
+        for b in range(last):
+            row[b] = min(one[b], two[b])
+    for s in range(out.shape[0]):
+        begin, end = first[s], first[s] + count[s]
+        near = _nearest(least, begin, min(end, beams))
+        if end > beams:
+            near = min(near, _nearest(least, 0, end - beams))
+        out[s] = np.int32(near).view(np.float32)
+
+
+@kernel(inline=True)
+def _nearest(least, begin, end):  # type: ignore[no-untyped-def]
+    k = np.uintp(0)
+    while 2 << k <= end - begin:
+        k += np.uintp(1)
+    return min(least[k, np.uintp(begin)], least[k, np.uintp(end - (1 << k))])
 
 
 @kernel(allocates=True)
