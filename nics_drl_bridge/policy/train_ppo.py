@@ -3,17 +3,19 @@
 Proximal policy optimisation (Schulman and others 2017) with the loss of Stable-Baselines3. What is
 learnt from was driven with weights one update older. PPO's ratio accounts for that, as the
 probabilities with which the actions were drawn are kept. Driving and learning meet after each
-rollout, so that the bits do not depend on which of them is faster.
+rollout, so that the bits do not depend on which of them is faster. As soon as all is driven, actor
+and critic are learnt on a core each.
 """
 
 from __future__ import annotations
 
 import copy
 import math
+import threading
 from collections import deque
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import gymnasium
 import numpy as np
@@ -37,6 +39,7 @@ from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import PpoSettings, TrainingSettings
 from nics_drl_bridge.threads import run_parts
 
+T = TypeVar("T")
 Array = NDArray[np.float64]
 Ended = list[tuple[bool, bool]]  # success and collision of episodes
 Seen = tuple[torch.Tensor, torch.Tensor]  # features and state
@@ -174,6 +177,7 @@ class Learner:
         self._all = flattened(networks)
         self.optimiser = torch.optim.Adam([self._all], eps=ADAM_EPSILON, fused=True)
         self._parts = [Layers(layers) for layers in (networks.actor.layers, networks.critic)]
+        self.core_is_free = threading.Event()  # no thread collects meanwhile
 
     def learn(self, rollout: Transitions, rate: float) -> float:
         """Learns from a rollout with a learning rate; returns the loss of the last batch."""
@@ -190,17 +194,25 @@ class Learner:
         """Sets the gradients of all weights for a batch; returns the loss."""
         if batch.state is not None and batch.done is not None:
             return self._through_time(batch, batch.state, batch.done)
-        with torch.no_grad():
-            outputs = [part.forward(batch.seen) for part in self._parts]
+        outputs = self._each(lambda part, _: part.forward(batch.seen))
         raw, values = (each.detach().requires_grad_() for each in outputs)
         loss = loss_of(self.networks, raw, values, batch, self.ppo)
         wanted = raw, values, self.networks.log_std
         *gradients, spread = torch.autograd.grad(loss, wanted, materialize_grads=True)
         with torch.no_grad():
             self.networks.log_std.grad.copy_(spread)
-            for part, gradient in zip(self._parts, gradients, strict=True):
-                part.backward(gradient)
+        self._each(lambda part, k: part.backward(gradients[k]))
         return loss.detach()
+
+    def _each(self, act: Callable[[Layers, int], T]) -> list[T]:
+        """Applies a function to actor and critic, at once while a core is free: the same bits."""
+
+        def apply(k: int) -> T:
+            with torch.no_grad():  # which is of each thread
+                return act(self._parts[k], k)
+
+        both = range(len(self._parts))
+        return run_parts(apply, both) if self.core_is_free.is_set() else [apply(k) for k in both]
 
     def _through_time(
         self, batch: Transitions, state: torch.Tensor, done: torch.Tensor
@@ -345,12 +357,19 @@ class LeanPpo:
         learn = partial(self.learner.learn, rollout, rate)
         self.steps += self._ppo.rollout * self.collector.env.num_envs
         self.collector.networks.load_state_dict(self.networks.state_dict())
-        jobs: list[Callable[[], Any]] = [learn, self.collector.collect]
+        self.learner.core_is_free.clear()
+        jobs: list[Callable[[], Any]] = [learn, self._collect]
         loss, *collected = run_parts(lambda job: job(), jobs[: 1 + (self.steps < self._total)])
         self._rollout = None
         for one in collected:
             self._take(watch, *one)
         return float(loss)
+
+    def _collect(self) -> tuple[Transitions, Ended]:
+        try:
+            return self.collector.collect()
+        finally:
+            self.learner.core_is_free.set()
 
     def _take(self, watch: Watch, rollout: Transitions, ended: Ended) -> None:
         self._rollout = rollout

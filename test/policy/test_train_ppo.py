@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -12,6 +14,7 @@ from stable_baselines3.common.callbacks import ConvertCallback
 from stable_baselines3.common.logger import Logger
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.policy import train_ppo
 from nics_drl_bridge.policy.train_algorithms import Normaliser
 from nics_drl_bridge.policy.train_ppo import LeanPpo, Transitions, advantages_of
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
@@ -146,6 +149,39 @@ def test_an_update_moves_the_weights_as_stable_baselines3_does():
     lean.learner.learn(batch, 3e-4)
     for ours, other in zip(weights_of(lean), their_weights(theirs), strict=True):
         assert torch.allclose(ours, other, atol=2e-5)
+
+
+def test_actor_and_critic_learn_at_once_while_a_core_is_free_to_the_same_bits(monkeypatch):
+    lean, theirs = pair()
+    batch = filled(lean, theirs)
+    loss = lean.learner.differentiate(batch)
+    wanted = [each.grad.clone() for each in weights_of(lean)]
+    for each in weights_of(lean):
+        each.grad.zero_()
+    jobs = []
+    together = train_ppo.run_parts
+    monkeypatch.setattr(
+        train_ppo, "run_parts", lambda job, parts: jobs.append(len(parts)) or together(job, parts)
+    )
+    lean.learner.core_is_free.set()
+    assert torch.equal(lean.learner.differentiate(batch), loss)
+    assert jobs == [2, 2]  # forwards, backwards
+    for ours, grad in zip(weights_of(lean), wanted, strict=True):
+        assert torch.equal(ours.grad, grad)
+
+
+def test_a_core_is_free_to_learn_from_the_end_of_a_rollout_to_the_next_begin():
+    lean, _ = pair()
+    seen = []
+    collect = lean.collector.collect
+    lean.collector.collect = lambda: seen.append(lean.learner.core_is_free.is_set()) or collect()
+    lean.collector.last = lean.collector.env.reset()
+    rollout, _ = collect()
+    for _ in range(2):
+        lean._advance(rollout, SimpleNamespace(collisions=[]))
+        rollout = lean._rollout
+        assert lean.learner.core_is_free.is_set()
+    assert seen == [False, False]
 
 
 def test_a_batch_of_fewer_rows_than_the_one_before_has_gradients_of_its_own():
