@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from nics_drl_bridge.gate import shield_kernels
 from nics_drl_bridge.gate.shield_kernels import Body, Cells, Look, MountedBeams
@@ -35,9 +36,8 @@ def look(
     room = body.radius + body.margin + CELL
     if before is None:
         since, times = view.stamp_ns, np.full((CELLS, CELLS), -np.inf, np.float32)
-        if not _returns_within(view.ranges, lidar, room):
-            disc = body._replace(outline=Outline(np.zeros((0, 2)), 0, 0))
-            shield_kernels.cover(times, place, disc, room - body.radius, 0.0)
+        disc = body._replace(outline=Outline(np.zeros((0, 2)), 0, 0), radius=0.0)
+        shield_kernels.cover(times, place, disc, min(room, _nearest(view.ranges, lidar)), 0.0)
     else:
         since, moved = before.since_ns, np.subtract(corner, before.corner)
         times = shield_kernels.shifted(before.times, *moved.tolist())
@@ -48,9 +48,14 @@ def look(
     return Ground(since, corner, times, shield_kernels.unseen(times, sees, place))
 
 
-def _returns_within(ranges: Ranges, lidar: MountedBeams, room: float) -> bool:
-    """True if a beam (B,) ends, or is too short to be measured, within a distance of the robot."""
+def _nearest(ranges: Ranges, lidar: MountedBeams) -> float:
+    """Distance of the robot to the nearest end of a beam (B,), of five in a row the middle one.
+
+    What is too close to be measured is at 0. One beam of hundreds nearly always errs by much.
+    """
     angles = lidar.first + lidar.step * np.arange(len(ranges)) + lidar.heading
     short = np.where(np.isneginf(ranges), 0.0, ranges)
     ends = np.hypot(lidar.x + short * np.cos(angles), lidar.y + short * np.sin(angles))
-    return bool((ends <= room).any())
+    ends[np.isnan(ends) | np.isinf(ends)] = np.inf
+    beside = sliding_window_view(np.pad(ends, 2, constant_values=np.inf), 5)
+    return float(np.median(beside, axis=1).min(initial=np.inf))

@@ -5,6 +5,7 @@
 # An obstacle may approach if it is where the robot saw free space a moment ago.
 
 import math
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -205,18 +206,27 @@ def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
         return motion
     # A way that is barred bars no turn on the spot: else a robot could not turn away from it.
     turns = bool(turning) and safe(0.0, 1.0)
-    low, high = 0.0, 1.0
-    for _ in range(FINEST):
-        middle = (low + high) / 2.0
-        if safe(middle, 1.0 if turns else middle):
-            low = middle
-        else:
-            high = middle
-    if turns and on_the_spot and low * speed < CREEP:
-        low = 0.0
+    low = _greatest(lambda share: safe(share, 1.0 if turns else share))
+    if on_the_spot and low * speed < CREEP:
+        if turns:
+            low = 0.0
+        elif speed and safe(CREEP / speed, 0.0):  # nor does a turn that is barred bar the way back
+            value = part(_greatest(lambda share: safe(share, 0.0)), 0.0)
+            return replace(motion, value=value, slope=0.0 * value, shielded=True)
     value = part(low, 1.0 if turns else low)
     slope = np.where(turn & turns, motion.slope, 0.0)
     return replace(motion, value=value, slope=slope, shielded=True)
+
+
+def _greatest(safe: Callable[[float], bool]) -> float:
+    """Greatest safe share of a motion, found by bisection."""
+    if safe(1.0):
+        return 1.0
+    low, high = 0.0, 1.0
+    for _ in range(FINEST):
+        middle = (low + high) / 2.0
+        low, high = (middle, high) if safe(middle) else (low, middle)
+    return low
 
 
 def _safe(config: GateConfig, state: GateState, value: Array, now: float) -> bool:

@@ -85,6 +85,20 @@ def test_at_the_start_beside_something_it_may_not_turn():
     assert robot.may((0.5, 0.0, 0.0))
 
 
+@pytest.mark.parametrize(
+    ("away", "beams", "may"), [(0.33, 1, True), (0.38, 5, True), (0.33, 5, False)]
+)
+def test_at_the_start_the_ground_behind_is_free_as_far_as_all_that_it_sees(
+    away, beams, may, monkeypatch
+):
+    ranges = scan(np.zeros(3), FAR)
+    ranges[100 : 100 + beams] = away  # one alone errs
+    monkeypatch.setitem(globals(), "scan", lambda pose, walls: ranges)
+    robot = Robot()
+    robot.seen = robot.seen[robot.seen[:, 0] < 0.0]  # of that behind
+    assert robot.may((0.0, 0.0, 2.0)) == may
+
+
 def test_it_backs_up_as_far_as_it_came():
     robot, back = Robot(), 0.0
     robot.moves((0.3, 0.0, 0.0), 3.0)

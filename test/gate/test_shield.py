@@ -113,6 +113,19 @@ def test_what_bars_the_way_bars_no_turn_on_the_spot():
     assert 0.0 <= barred.decision.twist[2] < 0.2
 
 
+def test_what_bars_a_turn_bars_no_way_straight_back():
+    corners = ((0.4, 0.15), (-0.4, 0.15), (-0.4, -0.15), (0.4, -0.15))
+    radius = float(np.hypot(0.4, 0.15))
+    box = replace(CAR, wheelbase=0.0, outline=corners, footprint_radius=radius)
+    at_a_corner = ranges(0.46, where=np.abs(LIDAR.angles - 0.5) < 0.1)
+    rig = Faced(at_a_corner, box, (-0.3, 0.0, 0.5), "differential")
+    assert rig.settles(0.5) < -CREEP
+    assert rig.decision.shielded
+    behind = at_a_corner.copy()
+    behind[np.abs(LIDAR.angles) > 3.0] = 0.46  # so near that only a creep would be safe
+    assert Faced(behind, box, (-0.3, 0.0, 0.5), "differential").settles(0.5) == 0.0
+
+
 def test_a_robot_that_turns_does_not_creep_nearer():
     wishes = {"ahead": (1.0, 0.0, 0.0), "turning": (1.0, 0.0, 0.5)}
     rigs = {
