@@ -67,6 +67,7 @@ class Job:
     world: str
     episodes: int
     perturbations: tuple[str, ...]
+    multiples: tuple[float, ...]
     control: str | None
 
 
@@ -171,7 +172,7 @@ def curves(job: Job) -> tuple[Job, dict[str, list[int]]]:
     """Successes of a job under each perturbation: without any, and at each of the multiples."""
     nothing = reached(job, None, 0.0)
     return job, {
-        each: [nothing, *(reached(job, each, times) for times in MULTIPLES)]
+        each: [nothing, *(reached(job, each, times) for times in job.multiples)]
         for each in job.perturbations
     }
 
@@ -194,23 +195,27 @@ def measure(jobs: Sequence[Job]) -> dict[str, dict[str, list[float]]]:
     }
 
 
-def losses(success: Mapping[str, Mapping[str, Sequence[float]]]) -> dict[str, dict[str, float]]:
+def losses(
+    success: Mapping[str, Mapping[str, Sequence[float]]], multiples: Sequence[float] = MULTIPLES
+) -> dict[str, dict[str, float]]:
     """Points of success lost at the declared range: robot -> perturbation -> value."""
-    at = 1 + MULTIPLES.index(DECLARED)
+    at = 1 + multiples.index(DECLARED)
     return {
         robot: {each: round(100.0 * (some[0] - some[at]), 3) for each, some in own.items()}
         for robot, own in success.items()
     }
 
 
-def missed(success: Mapping[str, Mapping[str, Sequence[float]]]) -> list[str]:
+def missed(
+    success: Mapping[str, Mapping[str, Sequence[float]]], multiples: Sequence[float] = MULTIPLES
+) -> list[str]:
     """A sentence for each bar that was missed."""
     said = []
     for robot, own in success.items():
         if not (share := next(iter(own.values()))[0]) >= FLOOR - 1e-9:
             without = f"{share:.1%} success without a perturbation"
             said.append(f"{robot}: {without}, less than {FLOOR:.0%}")
-    for robot, own in losses(success).items():
+    for robot, own in losses(success, multiples).items():
         for each, lost in own.items():
             if not lost <= MOST_LOSS + 1e-9:
                 said.append(f"{robot}: {each} takes {lost:.1f} points, more than {MOST_LOSS:g}")
@@ -225,11 +230,14 @@ def worst(lost: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
     return {"points": points, "robot": robot, "perturbation": each}
 
 
-def draw(success: Mapping[str, Mapping[str, Sequence[float]]], file: Path) -> None:
+def draw(
+    success: Mapping[str, Mapping[str, Sequence[float]]], file: Path,
+    multiples: Sequence[float] = MULTIPLES,
+) -> None:  # fmt: skip
     """One panel for each perturbation: success over multiples of the declared range, by robot."""
     amounts = [declared(of_training(robot)) for robot in success]
     perturbations = list(dict.fromkeys(each for own in success.values() for each in own))
-    rows, where = -(-len(perturbations) // 3), [0.0, *MULTIPLES]
+    rows, where = -(-len(perturbations) // 3), [0.0, *multiples]
     figure, grid = style.panels(rows, 3, (10.0, 2.8 * rows), sharex=True, sharey=True)
     for axes, each in zip(grid, perturbations, strict=False):
         for (robot, own), marker in zip(success.items(), cycle(style.MARKERS)):
@@ -248,11 +256,13 @@ def draw(success: Mapping[str, Mapping[str, Sequence[float]]], file: Path) -> No
     write_bytes(file, style.png(figure, grid[0]))
 
 
-def table_of(success: Mapping[str, Mapping[str, Sequence[float]]], wall_s: float) -> str:
+def table_of(
+    success: Mapping[str, Mapping[str, Sequence[float]]], multiples: Sequence[float], wall_s: float
+) -> str:
     """The figures for people."""
-    heads = "".join(f"{f'x {times:g}':>8}" for times in (0.0, *MULTIPLES))
+    heads = "".join(f"{f'x {times:g}':>8}" for times in (0.0, *multiples))
     lines = [f"{'':<26}{heads}   lost at x {DECLARED:g}"]
-    lost = losses(success)
+    lost = losses(success, multiples)
     for robot, own in success.items():
         for each, some in own.items():
             cells = "".join(f"{100 * share:>8.1f}" for share in some)
@@ -267,22 +277,27 @@ def main() -> None:
     parser.add_argument("--robots", nargs="+", choices=robots, default=robots)
     parser.add_argument("--worlds", nargs="+", choices=WORLDS, default=list(WORLDS))
     parser.add_argument("--only", nargs="+", choices=PERTURBATIONS, default=list(PERTURBATIONS))
+    parser.add_argument("--multiples", nargs="+", type=float, default=MULTIPLES, metavar="M",
+                        help="of the declared range, which is measured in any case")  # fmt: skip
     parser.add_argument("--picture", type=Path, help="draw the curves into this file")
     given = parser.parse_args()
     begin = time.perf_counter()
+    multiples = tuple(sorted({DECLARED, *given.multiples}))
     job = partial(
-        Job, episodes=given.episodes, perturbations=tuple(given.only), control=given.control
-    )
+        Job, episodes=given.episodes, perturbations=tuple(given.only), multiples=multiples,
+        control=given.control,
+    )  # fmt: skip
     success = measure([job(*each) for each in product(given.robots, given.worlds)])
     if given.picture:
-        draw(success, given.picture)
-    lost = losses(success)
+        draw(success, given.picture, multiples)
+    lost = losses(success, multiples)
     result = {
         "declared": {robot: declared(of_training(robot)) for robot in success},
-        "multiples": [0.0, *MULTIPLES], "success": success,
+        "multiples": [0.0, *multiples], "success": success,
         "lost_points": lost, "worst": worst(lost), "episodes": given.episodes * len(given.worlds),
     }  # fmt: skip
-    answer(result, missed(success), table_of(success, time.perf_counter() - begin), given.json)
+    table = table_of(success, multiples, time.perf_counter() - begin)
+    answer(result, missed(success, multiples), table, given.json)
 
 
 if __name__ == "__main__":
