@@ -89,7 +89,7 @@ class _Mailbox:
 
     def clear(self) -> None:
         with self._lock:
-            self._mail = dict.fromkeys(self._mail, _Mail())
+            self._mail, self._worked_ns = dict.fromkeys(self._mail, _Mail()), -1
 
     def newest_ns(self) -> int:
         return max(mail.stamp_ns for mail in self._mail.values())

@@ -187,7 +187,7 @@ def test_a_start_that_it_is_started_with_alone_holds(launch, meet, domain_id):
     launch("simulator_node", domain_id, world="empty", episode_start=[1.0, -1.5, 0.5])
     peer.until(lambda: truths, "the robot")
     pose = conversions.odometry_from_ros(truths[0])[0]
-    assert pose == pytest.approx([1.0, -1.5, 0.5])
+    assert pose == pytest.approx([1.0, -1.5, 0.5], abs=0.1)  # the first one that is heard
 
 
 def test_commands_are_as_old_as_before_when_time_is_put_back(domain_id, model_folder):

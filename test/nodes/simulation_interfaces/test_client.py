@@ -87,12 +87,16 @@ def test_a_simulator_that_puts_time_back_and_tells_of_it_by_steps_alone_is_drive
     monkeypatch.setattr(EntityServices, "state", unstamped)
     launch("simulator_node", domain_id, world="circles", mode="lockstep")
     env = make(domain_id)
+    stamps = set()
     for seed in (3, 4):
         _, info = env.reset(seed=seed)
-        assert info["pose"] == pytest.approx(info["start"], abs=1e-6)
+        start = info["start"]
+        assert info["pose"] == pytest.approx(start, abs=1e-6)
         for _ in range(STEPS):
             _, _, _, _, info = env.step(np.array([0.6, 0.0], np.float32))
-        assert math.dist(info["pose"][:2], info["start"][:2]) > 0.1
+        assert math.dist(info["pose"][:2], start[:2]) > 0.1
+        stamps.add(info["stamp_ns"])
+    assert len(stamps) == 1  # of a time that was put back
 
 
 def test_a_feature_that_is_missing_is_named_when_the_env_is_made(
