@@ -66,8 +66,9 @@ def test_an_env_places_and_steps_a_simulator_by_the_standard_alone(
     assert int(client_of(domain_id)("GetSimulationState").state.state) == 2
 
 
+@pytest.mark.parametrize("stamped", [True, False])
 def test_a_simulator_that_puts_time_back_and_tells_of_it_by_steps_alone_is_driven(
-    launch, domain_id, make, monkeypatch
+    launch, domain_id, make, monkeypatch, stamped
 ):
     fewer = tuple(name for name in server.FEATURES if name != "SIMULATION_RESET_STATE")
     monkeypatch.setattr(server, "FEATURES", fewer)
@@ -78,13 +79,13 @@ def test_a_simulator_that_puts_time_back_and_tells_of_it_by_steps_alone_is_drive
             patch.setattr(self, "_publish", lambda: None)
             begin(self, rewind)
 
-    def unstamped(self, entity):
+    def told_of(self, entity):
         told = state(self, entity)
-        told.header.stamp = Time()
+        told.header.stamp = told.header.stamp if stamped else Time()
         return told
 
     monkeypatch.setattr(DeviceNode, "begin", silent)
-    monkeypatch.setattr(EntityServices, "state", unstamped)
+    monkeypatch.setattr(EntityServices, "state", told_of)
     launch("simulator_node", domain_id, world="circles", mode="lockstep")
     env = make(domain_id)
     stamps = set()
