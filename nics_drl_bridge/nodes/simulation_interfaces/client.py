@@ -166,9 +166,9 @@ class StandardEpisodes:
         self.advance()
         if time_ns:
             return time_ns + self._period_ns
-        self._await_steps(timeout_s)  # an answer without a stamp: by the first data
-        holds(lambda: self._mail.newest_ns() >= 0, timeout_s, POLL_S)
-        time.sleep(POLL_S)  # of several steps the last
+        # An answer without a stamp: by the first data, of several steps the last.
+        holds(lambda: self._pending[-1].done() and self._mail.newest_ns() >= 0, timeout_s, POLL_S)
+        time.sleep(POLL_S)
         return max(0, int(self._mail.newest_ns()))
 
     def _put_obstacles(self, start: Start, timeout_s: float) -> None:
