@@ -9,6 +9,7 @@ import zipfile
 from email.message import Message
 from email.parser import HeaderParser
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 from catkin_pkg.package import Package, parse_package
@@ -245,6 +246,20 @@ def test_package_xml_has_the_rosdep_key_of_every_python_library(metadata: Messag
 
 def test_package_xml_is_as_its_format_wants_it() -> None:
     package_xml().validate()
+
+
+@pytest.mark.parametrize(
+    "file",
+    [
+        str(file.relative_to(ROOT))
+        for pattern in ("package.xml", "launch/**/*.xml", "config/**/*.xml", f"{PACKAGE}/**/*.xml")
+        for file in sorted(ROOT.glob(pattern))
+    ],
+)
+def test_every_xml_file_is_well_formed(file: str) -> None:
+    ElementTree.parse(ROOT / file)
+    if lint := shutil.which("xmllint"):
+        run(lint, "--noout", file, cwd=ROOT)
 
 
 def package_xml() -> Package:

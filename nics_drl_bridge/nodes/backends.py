@@ -87,6 +87,13 @@ class _Mailbox:
     def stamp_ns(self, topic: str) -> int:
         return self._mail[topic].stamp_ns
 
+    def clear(self) -> None:
+        with self._lock:
+            self._mail, self._worked_ns = dict.fromkeys(self._mail, _Mail()), -1
+
+    def newest_ns(self) -> int:
+        return max(mail.stamp_ns for mail in self._mail.values())
+
     def wait(self, stamp_ns: int, timeout_s: float) -> dict[str, _Mail]:
         with self._lock:
             self._awaited_ns, self._failure = stamp_ns, None
@@ -152,7 +159,7 @@ class DdsBackend:
             self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
         self._episodes: EpisodeServices | StandardEpisodes
         if simulator == STANDARD.name:
-            self._episodes = StandardEpisodes(self._link, model, world, options)
+            self._episodes = StandardEpisodes(self._link, model, world, options, self._mail)
         else:
             self._episodes = EpisodeServices(self._link, simulator, model, world, randomisation)
         self._link.begin()

@@ -85,16 +85,17 @@ class Run:
 class PathActions:
     """Serves both actions while a node is active; one goal at a time, and the newest one counts.
 
-    `drive` asks the policy for a goal (2,) in the map of the estimate. Without nav2_msgs nothing is
-    served. `navigate_to_pose` is left to another node that serves it, as Nav2's bt_navigator.
+    `drive` asks the policy for a goal (2,) in the map of the estimate; `anew` empties its memory.
+    Without nav2_msgs nothing is served. `navigate_to_pose` is left to another node that serves it,
+    as Nav2's bt_navigator.
     """
 
     def __init__(
         self, node: Node, topics: RobotTopics, frames: GoalFrames, model: SimulatorModel,
-        parameters: ControllerParameters, drive: Callable[[Array], Wish],
+        parameters: ControllerParameters, drive: Callable[[Array], Wish], anew: Callable[[], None],
     ) -> None:  # fmt: skip
         self._node, self._topics, self._frames, self._robot = node, topics, frames, model.robot
-        self._parameters, self._drive = parameters, drive
+        self._parameters, self._drive, self._anew = parameters, drive, anew
         self._run: Run | None = None
         self._map: tuple[str, GridMap] | None = None  # and its frame
         self._limit = math.inf  # of the speed [m/s]
@@ -183,7 +184,9 @@ class PathActions:
     def _accept(self, goal: Goal, begin: Callable[[Goal], Run]) -> None:
         before, self._run = self._run, None
         try:
-            self._run = begin(goal)
+            run = self._run = begin(goal)
+            if before is None or not np.array_equal(before.path.end, run.path.end):
+                self._anew()  # not where the same way is planned again
         except Refusal as refusal:
             self._end(goal, ABORT, refusal.code, str(refusal))
         if before is not None:

@@ -28,6 +28,8 @@ class ControllerParameters:
             tuple(values[f"{kind}_plugins"])
             for kind in ("controller", "goal_checker", "progress_checker")
         )
+        if one := values["progress_checker_plugin"]:
+            self.progress = (one,)
         for row in checkers(self.goals, self.progress):
             declare_row(node, row)
 

@@ -64,7 +64,7 @@ class PolicyNode(ManagedNode):
         self._frames = GoalFrames(self, self._topics)
         self.undo.callback(self._frames.close)
         given = self._topics, self._frames, model, self._nav2
-        self._actions = PathActions(self, *given, self._toward)
+        self._actions = PathActions(self, *given, self._toward, lambda: begin(self._policy))
         self.undo.callback(self._actions.close)
         timer = runner.steadily(self, POLLS * model.control_period, self._act)
         self.undo.callback(self.destroy_timer, timer)

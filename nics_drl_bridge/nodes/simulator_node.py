@@ -176,16 +176,16 @@ class CommandInlet:
         self._kind = TWIST_STAMPED if stamped else TWIST
         kind, hear = (TwistStamped, self._on_stamped) if stamped else (Twist, self._on_bytes)
         heard = node.create_subscription(kind, f"{namespace}cmd_vel", hear, quality, raw=True)
-        self._topic, self._heard = heard.topic_name, [heard]
+        self._topic, self.heard = heard.topic_name, [heard]
         self._warned: set[str] = set()
         kind = conversions.message_type("ackermann_msgs/msg/AckermannDriveStamped")
         if robot.steers and kind is not None:  # its package is optional
             given = kind, f"{namespace}ackermann_cmd", self._on_ackermann, quality
-            self._heard.append(node.create_subscription(*given))
+            self.heard.append(node.create_subscription(*given))
 
     def close(self) -> None:
         """Listens no more."""
-        for each in self._heard:
+        for each in self.heard:
             self._node.destroy_subscription(each)
 
     def _on_bytes(self, content: bytes) -> None:
@@ -309,10 +309,10 @@ class DeviceNode(qos.QosWatch):
         self._clocks = {self.get_fully_qualified_name()}
         self._ports: list[RobotPort] = []
         self._inlets: list[CommandInlet] = []
+        self._world_topics = WorldTopics(self, lambda: self.device)
         for name in self._names:
             self._open_robot(name)
         self._open_transforms()
-        self._world_topics = WorldTopics(self, lambda: self.device, self._names)
         runner.serve(self, "~/reset", self._reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
         runner.serve(self, "~/repeat", self._repeat)
@@ -325,7 +325,9 @@ class DeviceNode(qos.QosWatch):
         port = RobotPort(self, space, self.model, frames, self._time, self._outbox)
         commands = qos.EVERY_COMMAND if self._time.lockstep else qos.COMMAND
         given = self.model.robot, commands, partial(self._on_command, port), self._too_old
-        self._inlets.append(CommandInlet(self, space, *given))
+        inlet = CommandInlet(self, space, *given)
+        inlet.heard.append(self._world_topics.hear(space, lambda: self._ports.index(port)))
+        self._inlets.append(inlet)
         self._ports.append(port)
 
     def add_robot(self, namespace: str) -> None:
@@ -384,7 +386,7 @@ class DeviceNode(qos.QosWatch):
             late = any((*self._time.scan_late_ns, *self._time.odom_late_ns))
             ticks = max(1.0, np.ceil(period / LONGEST_TICK_S)) if late else 1.0
             self._timer = runner.steadily(self, period / ticks, self._on_time)
-            if step_ns > CLOCK_NS:
+            if period * NS_PER_S > CLOCK_NS:
                 runner.steadily(self, CLOCK_NS / NS_PER_S, self._on_clock)
         elif not self._time.lockstep:
             runner.steadily(self, 0.0, self._on_free_time)
@@ -486,6 +488,7 @@ class DeviceNode(qos.QosWatch):
 
     def rewind(self) -> None:
         """Puts the time back to its start, while everything stays where it is."""
+        self._command_ns += self._first_ns - self.now_ns  # commands stay as old as they are
         self.now_ns = self._first_ns
         self._outbox.clear()
         self._odom_pace.begin(self.now_ns)

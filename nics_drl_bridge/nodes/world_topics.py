@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
-from rclpy.node import Node
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import conversions, qos, runner
@@ -21,22 +20,21 @@ class WorldTopics:
     """Publishes `map`, the occupancy of all that stands, and puts robots at `initialpose`.
 
     The map is for late joiners, too, and published anew when something stands elsewhere; before
-    anybody subscribes it is not made. Robots are in namespaces, "" for one.
+    anybody subscribes it is not made.
     """
 
-    def __init__(
-        self, node: Node, world: Callable[[], DeviceWorld], namespaces: tuple[str, ...]
-    ) -> None:
+    def __init__(self, node: Any, world: Callable[[], DeviceWorld]) -> None:
         self._node, self._world = node, world
         self._frame = str(node.get_parameter("map_frame").value)
         self._cell = float(node.get_parameter("map_resolution").value or 0.0)
         self._map = node.create_publisher(OccupancyGrid, "map", qos.LATCHED)
         self._shown: Any = None  # what stood in the world that was published
         runner.steadily(node, LOOK_S, self._look)
-        for k, name in enumerate(namespaces):
-            topic = f"{name}/{INITIAL_POSE}" if name else INITIAL_POSE
-            kind = PoseWithCovarianceStamped
-            node.create_subscription(kind, topic, self._taker(k), qos.COMMAND)
+
+    def hear(self, namespace: str, robot: Callable[[], int]) -> Any:
+        """Listens for a robot, whose number is looked up at each message."""
+        kind, topic = PoseWithCovarianceStamped, f"{namespace}{INITIAL_POSE}"
+        return self._node.create_subscription(kind, topic, self._taker(robot), qos.COMMAND)
 
     def _look(self) -> None:
         if self._shown is None and not self._map.get_subscription_count():
@@ -48,10 +46,9 @@ class WorldTopics:
         if shown != self._shown:
             self._shown = shown
             grid = occupancy(simulator.world.members[member], still, self._cell)
-            now_ns = int(self._node.get_clock().now().nanoseconds)
-            self._map.publish(conversions.map_to_ros(grid, now_ns, self._frame))
+            self._map.publish(conversions.map_to_ros(grid, self._node.now_ns, self._frame))
 
-    def _taker(self, robot: int) -> Any:
+    def _taker(self, robot: Callable[[], int]) -> Any:
         def take(message: PoseWithCovarianceStamped) -> None:
             logger, simulator = self._node.get_logger(), self._world().simulator
             try:
@@ -65,8 +62,8 @@ class WorldTopics:
             except ConfigError as error:
                 logger.error(f"{error} The robot stays where it is.")
                 return
-            simulator.put_robot(robot, pose, np.zeros(simulator.data.state.shape[-1]))
-            self._world().put(robot)
+            simulator.put_robot(robot(), pose, np.zeros(simulator.data.state.shape[-1]))
+            self._world().put(robot())
             logger.info(f"a robot is put at ({pose[0]:.2f}, {pose[1]:.2f}) m, {pose[2]:.2f} rad")
 
         return take

@@ -15,6 +15,7 @@ from nics_drl_bridge.interface import Array
 SPACING = 0.05  # between the points of a path [m]
 WINDOW = 2.0  # of the way ahead, in which the nearest point is looked for [m]
 FARTHEST = 1e6  # greatest coordinate of a path [m]
+LONGEST = 1e5  # greatest length of a path [m]
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,8 @@ class PlannedPath:
             raise ConfigError("the path has a coordinate that is no number, or out of all reach.")
         steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
         along = np.concatenate([[0.0], np.cumsum(steps)])
+        if along[-1] > LONGEST:
+            raise ConfigError(f"the path has {along[-1]:.3g} m, and {LONGEST:g} m are the most.")
         count = max(1, math.ceil(along[-1] / SPACING)) + 1
         self.end = poses[-1]
         self._along = np.linspace(0.0, along[-1], count)

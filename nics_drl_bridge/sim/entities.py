@@ -85,7 +85,8 @@ class Entities:
         bodies[sorted(self.removed), RADIUS] = 0.0
         found = scenes.starts.copy()
         if starts is not None:
-            found[:, : starts.shape[1]] = starts
+            own = [self.robots.index(name) for name in self._launched]  # that are still there
+            found[:, : len(own)] = starts[:, own]
         for entity in self.spawned.values():
             if entity.robot >= 0:
                 found[0, entity.robot] = entity.start
@@ -246,6 +247,9 @@ class Entities:
 
     def delete(self, entity: Entity) -> None:
         """Removes an entity. Raises ConfigError for the last robot."""
+        kept = [m for m in range(self.device.robots) if m != entity.robot]
+        if not kept:
+            raise ConfigError(f"{entity.name!r} is the last robot, which a simulator needs.")
         self.spawned.pop(entity.name, None)
         if entity.robot < 0:
             self.removed |= {slot for slot in entity.slots if slot < self._own}
@@ -253,32 +257,18 @@ class Entities:
             bodies[list(entity.slots), RADIUS] = 0.0
             self._show(bodies)
             return
-        kept = [m for m in range(self.device.robots) if m != entity.robot]
-        if not kept:
-            raise ConfigError(f"{entity.name!r} is the last robot, which a simulator needs.")
         if entity.robot < len(self._launched):
             self._launched.pop(entity.robot)
-        self._renumber(entity.robot)
-        self._remake(self._spare, kept)
-
-    def _renumber(self, gone: int) -> None:
         for each in self.spawned.values():
-            each.robot -= int(each.robot > gone)
-
-    def despawn(self) -> None:
-        """Removes all that was spawned."""
-        for entity in list(self.spawned.values()):
-            self.delete(entity)
+            each.robot -= int(each.robot > entity.robot)
+        self._remake(self._spare, kept)
 
     def restore(self) -> None:
         """Removes all that was spawned; from the next episode on all that was removed is back."""
-        there = [each for each in self.spawned.values() if each.robot < 0]
-        for entity in there:
-            self.delete(entity)
-        if self.spawned or self._launched != list(self.robots):
+        if self._spare or self.spawned or self._launched != list(self.robots):
             kept = list(range(len(self._launched)))
             self.spawned.clear()
-            self._remake(self._spare, kept, len(self.robots))
+            self._remake((), kept, len(self.robots))
             self._launched = list(self.robots)
         self.removed.clear()
 
@@ -287,10 +277,10 @@ class Entities:
         old, bodies = self.simulator, self.bodies().copy()
         # An own world, as the simulator of the present one goes on if this one can't be made.
         new = self.make(self.world.with_spare(tuple(spare)), count or len(robots))
-        slots = np.full(new.sampler.count, -1)
-        slots[: len(bodies)] = np.arange(len(bodies))
+        slots = np.arange(new.sampler.count)
+        slots[len(bodies) :] = -1
         table = np.zeros((len(slots), 7))
-        table[: len(bodies)] = bodies
+        table[: len(bodies)] = bodies[: len(slots)]
         # The shapes that are spare come last, and each of them has a slot of its own.
         new.take_over(old, np.array(robots, np.int64), slots)
         new.put_bodies(table)
@@ -324,8 +314,3 @@ def overlap(one: Array, other: Array) -> bool:
         if apart.any():
             return False
     return True
-
-
-__all__ = [
-    "Entities", "Entity", "OutsideError", "StillError", "UnknownEntityError", "overlap",
-]  # fmt: skip

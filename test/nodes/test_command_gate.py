@@ -52,6 +52,8 @@ PATIENT = {
 class Robot:
     """A robot with its policy around a gate; it does what it is told."""
 
+    kind = TwistStamped
+
     def __init__(self, peer, lidar):
         self.peer, self.lidar, self.stamp_ns, self.x = peer, lidar, START_NS, 0.0
         self.silent, self.wish, self.stamped = set(), (0.5, 0.0, 0.0), None
@@ -64,7 +66,7 @@ class Robot:
             "scan": peer.speak(LaserScan, "scan"),
             "odom": peer.speak(Odometry, "odom"),
             "filtered": peer.speak(Odometry, "odometry/filtered"),
-            "cmd_vel_raw": peer.speak(TwistStamped, "cmd_vel_raw"),
+            "cmd_vel_raw": peer.speak(self.kind, "cmd_vel_raw"),
             "e_stop": peer.speak(Bool, "e_stop", quality=qos.EVERY_COMMAND),
         }
         peer.node.create_timer(PERIOD_S, self.sends)
@@ -149,6 +151,15 @@ class Robot:
         said = self.peer.listen(DiagnosticArray, "/diagnostics")
         status = self.peer.another(said, "diagnostics").status[0]
         return {value.key: value.value for value in status.values} | {"": status.message}
+
+
+class Foreign(Robot):
+    """The same with a controller that knows nothing of scans' stamps, as Nav2's."""
+
+    kind = Twist
+
+    def command(self):
+        return conversions.twist_to_ros(self.wish)
 
 
 @pytest.fixture(scope="module")
@@ -331,6 +342,19 @@ def test_a_topic_that_falls_silent_stops_the_robot_until_it_speaks_again(robot, 
     robot.stops()
     robot.silent = set()
     robot.gets(*robot.wish)
+
+
+def test_another_controllers_twists_pass_until_scans_fall_silent(
+    launch, meet, domain_id, model, tmp_path
+):
+    given = {"limits": "ackermann", "black_box": str(tmp_path), **PATIENT}
+    gate = launch("command_gate", domain_id, foreign_commands="Twist", **given)
+    robot = Foreign(meet(domain_id), model.lidar)
+    robot.drives()
+    robot.silent = {"scan"}
+    robot.stops()
+    robot.says("scan")
+    gate.check()
 
 
 def test_another_publisher_of_commands_is_told_of_as_long_as_it_is_there(robot):

@@ -16,7 +16,7 @@ from nav_msgs.msg import Odometry, Path
 from rclpy.action import ActionClient, ActionServer
 from test_packaging import ROOT
 
-from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes import conversions, policy_node, qos
 from nics_drl_bridge.nodes.policy_node import PolicyNode
 from nics_drl_bridge.nodes.runner import open_context, unknown
 
@@ -214,6 +214,38 @@ def test_nav2s_own_parameter_file_is_taken_under_the_name_of_its_controller_serv
     assert progress.movement_time_allowance == 10.0
     node.destroy_node()
     context.try_shutdown()
+
+
+def test_the_progress_checker_of_humble_is_taken_by_its_own_name(domain_id, tmp_path):
+    file = tmp_path / "humble.yaml"
+    file.write_text(
+        "controller_server:\n  ros__parameters:\n    progress_checker_plugin: progress\n"
+        "    goal_checker_plugins: [general_goal_checker]\n    progress:\n"
+        "      plugin: nav2_controller::SimpleProgressChecker\n"
+        "      movement_time_allowance: 7.0\n",
+        encoding="utf-8",
+    )
+    words = ["--params-file", str(file), "-r", "__node:=controller_server"]
+    context = open_context(["node", "--ros-args", *words], domain_id)
+    node = PolicyNode(context)
+    assert unknown(node) == []
+    assert node._nav2.progress == ("progress",)
+    assert node._nav2.checks("general_goal_checker", "progress")[1].movement_time_allowance == 7.0
+    node.destroy_node()
+    context.try_shutdown()
+
+
+def test_a_policy_begins_anew_with_another_goal_and_not_with_another_way_to_it(tree, monkeypatch):
+    begun = []
+    monkeypatch.setattr(policy_node, "begin", begun.append)
+    first = tree.send(path((-2.0, -2.0), (1.0, 1.0)))
+    second = tree.send(path((-2.0, -2.0), (-1.0, 0.0), (1.0, 1.0)))
+    assert tree.end(first).status == ABORTED
+    assert len(begun) == 1
+    third = tree.send(path((-2.0, -2.0), (1.5, 1.0)))
+    assert tree.end(second).status == ABORTED
+    assert len(begun) == 2
+    tree.until(third.cancel_goal_async().done, "it is cancelled")
 
 
 def test_results_of_distributions_without_codes_are_filled_as_far_as_they_go():

@@ -21,7 +21,8 @@ from sensor_msgs.msg import JointState, LaserScan
 from std_srvs.srv import SetBool, Trigger
 
 from nics_drl_bridge.generator import save_model
-from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes import conversions, qos, simulator_node
+from nics_drl_bridge.nodes.runner import open_context
 from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.sim.world import load_world
 from nodes.peer import stamp_ns
@@ -171,6 +172,43 @@ def test_a_reset_begins_where_the_parameters_say(lockstep):
         pose, twist = conversions.odometry_from_ros(lockstep.said[topic][-1])
         assert pose == pytest.approx([0.5, -0.25, 1.0])
         assert twist.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_a_start_that_is_set_alone_holds(lockstep):
+    lockstep.reset(episode_seed=3, episode_start_given=False)
+    lockstep.reset(episode_start=[-0.5, 0.75, 2.0])
+    pose = conversions.odometry_from_ros(lockstep.said["ground_truth"][-1])[0]
+    assert pose == pytest.approx([-0.5, 0.75, 2.0])
+
+
+def test_a_start_that_it_is_started_with_alone_holds(launch, meet, domain_id):
+    peer = meet(domain_id)
+    truths = peer.listen(Odometry, "ground_truth")
+    launch("simulator_node", domain_id, world="empty", episode_start=[1.0, -1.5, 0.5])
+    peer.until(lambda: truths, "the robot")
+    pose = conversions.odometry_from_ros(truths[0])[0]
+    assert pose == pytest.approx([1.0, -1.5, 0.5], abs=0.1)  # the first one that is heard
+
+
+def test_commands_are_as_old_as_before_when_time_is_put_back(domain_id, model_folder):
+    given = ["mode:=realtime", "world:=empty", "command_timeout:=0.5", f"model:={model_folder}"]
+    words = [word for each in given for word in ("-p", each)]
+    context = open_context(["node", "--ros-args", *words], domain_id)
+    node = simulator_node.simulator_node(context)
+    try:
+        node.pause(True)
+        for _ in range(100):
+            node.step()
+        node._on_command(node._ports[0], np.array([0.5, 0.0]))
+        node.step()
+        assert node.device.commands[0, 0] == 0.5
+        node.rewind()
+        for _ in range(20):
+            node.step()
+        assert node.device.commands[0, 0] == 0.0
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
 
 
 def test_the_same_seed_and_commands_give_the_same_data_again(lockstep):

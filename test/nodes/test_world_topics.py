@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+import time
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from nics_drl_bridge.nodes.initial_pose import initial_pose
 from nics_drl_bridge.sim.occupancy import occupancy, standing
 from nics_drl_bridge.sim.scenes import SetSampler
 from nics_drl_bridge.sim.world_set import load_worlds
+from nodes.peer import stamp_ns
 
 pytestmark = pytest.mark.ros
 SEED = 5
@@ -87,6 +89,29 @@ def test_the_clock_ticks_at_50_hz_in_real_time_and_never_back(simulated):
     times = np.array([conversions.stamp_from_ros(each.clock) for each in clocks]) * 1e-9
     assert (np.diff(times) > 0.0).all()
     assert (len(times) - 1) / (times[-1] - times[0]) >= 50.0
+
+
+def test_the_clock_ticks_so_often_also_in_slow_motion(launch, meet, domain_id):
+    peer = meet(domain_id)
+    launch("simulator_node", domain_id, world="empty", rate=0.05, scan_rate=100.0, odom_rate=100.0)
+    clocks = peer.listen(Clock, "/clock")
+    peer.until(lambda: clocks, "the clock")
+    before, began = len(clocks), time.monotonic()
+    peer.until(lambda: len(clocks) > before + 60, "the clock")
+    assert (len(clocks) - before) / (time.monotonic() - began) > 20.0  # 5 steps a second
+
+
+def test_the_map_has_the_simulated_time(simulated):
+    peer, _, truths, *_ = simulated
+    maps = peer.listen(OccupancyGrid, "map", qos.LATCHED)
+    peer.until(lambda: maps, "the map")
+    known = maps[-1].header.stamp
+    assert peer.set_parameters("simulator_node", episode_seed=SEED + 2).successful
+    assert peer.call(Trigger, "simulator_node/reset").success
+    peer.until(lambda: maps[-1].header.stamp != known, "another map")
+    period_ns = 100_000_000  # of the odometry, and so of a step
+    first = stamp_ns(truths[0])
+    assert (stamp_ns(maps[-1]) - first) % period_ns == 0
 
 
 def test_an_initial_pose_puts_the_robot_there_and_its_odometry_goes_on(simulated):

@@ -49,7 +49,8 @@ def test_a_path_that_comes_back_is_followed_to_its_turn_first():
 @pytest.mark.parametrize(
     ("poses", "why"),
     [(np.zeros((0, 3)), "empty"), (np.full((2, 3), math.nan), "no number"),
-     (np.full((2, 3), 1e9), "no number, or out of all reach")],
+     (np.full((2, 3), 1e9), "no number, or out of all reach"),
+     (np.array([(0.0, 0.0), (2e5, 0.0)]), r"has 2e\+05 m, and 100000 m are the most")],
 )  # fmt: skip
 def test_what_is_no_path_is_refused(poses, why):
     with pytest.raises(ConfigError, match=why):

@@ -135,6 +135,35 @@ def test_a_robot_comes_and_goes_and_the_others_stay(staged):
         entities.delete(entities.find("right"))
 
 
+def test_the_last_robot_stays_also_where_it_was_spawned(staged):
+    entities = staged("empty")
+    entities.spawn_robot("second", START)
+    entities.delete(entities.find("car"))
+    with pytest.raises(ConfigError, match="'second' is the last robot"):
+        entities.delete(entities.find("second"))
+    assert names(entities) == entities.robot_names == ["second"]
+
+
+def test_starts_are_those_of_the_robots_that_are_still_there(staged):
+    entities = staged("empty", ("left", "right"))
+    entities.delete(entities.find("left"))
+    entities.spawn_robot("third", START)
+    entities.device.begin(0, np.array([-1.0, 0.0, 0.0, 1.0, -1.0, 0.5]))
+    assert entities.pose(entities.find("right")) == pytest.approx([1.0, -1.0, 0.5])
+    assert entities.pose(entities.find("third")) == pytest.approx(START)
+
+
+def test_room_for_what_was_spawned_is_given_back(staged):
+    entities = staged("arena")
+    room = entities.simulator.sampler.count
+    for k in range(3):
+        entities.spawn("disc", ((Circle(radius=0.1 + 0.05 * k), (0.0, 0.0, 0.0)),), START)
+        entities.restore()
+        entities.device.begin(0, None)
+        assert entities.simulator.sampler.count == room
+        assert entities.bodies() == pytest.approx(staged("arena").bodies())
+
+
 def test_only_what_moves_takes_a_twist(staged):
     entities = staged("arena")
     car, still = entities.find("car"), entities.find("obstacle_0")

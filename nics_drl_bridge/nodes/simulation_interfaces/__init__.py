@@ -5,20 +5,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from nics_drl_bridge.nodes import conversions, runner
-from nics_drl_bridge.nodes.parameters import STANDARD
+from nics_drl_bridge.nodes.parameters import NEWEST, STANDARD
 
 if TYPE_CHECKING:
     from nics_drl_bridge.nodes.simulation_interfaces.server import Server
-
-FIRST = "simulation_interfaces/srv/GetSimulatorFeatures"
 
 
 def open_services(node: Any) -> Server | None:
     """Offers the standard services at a device node; None without its messages, or if unwanted."""
     if not runner.declare_row(node, STANDARD):
         return None
-    if conversions.message_type(FIRST) is None:
-        missing = "the package simulation_interfaces is not installed"
+    if conversions.message_type(NEWEST) is None:
+        missing = "the package simulation_interfaces, 2.1 or newer, is not installed"
         node.get_logger().info(f"{missing}, so that its services are not offered")
         return None
     from nics_drl_bridge.nodes.simulation_interfaces.server import Server

@@ -17,6 +17,7 @@ from nics_drl_bridge.interface import NS_PER_S, Array, Start
 from nics_drl_bridge.lidar.exact_kernels import RADIUS
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.link import POLL_S, Link
+from nics_drl_bridge.nodes.parameters import NEWEST
 from nics_drl_bridge.nodes.runner import holds
 from nics_drl_bridge.sim.entities import OBSTACLE
 from nics_drl_bridge.sim.scenes import sample_scene
@@ -48,13 +49,11 @@ def snake_case(name: str) -> str:
 
 
 def module(kind: str) -> Any:
-    """Returns the module `srv` or `msg` of the messages. Raises ConfigError if they are missing."""
-    try:
-        return import_module(f"{PACKAGE}.{kind}")
-    except ModuleNotFoundError:
-        fix = f"install {PACKAGE} with your ROS 2 distribution, and source it"
-        told = f"simulator {PACKAGE!r} needs the messages of that name"
-        raise ConfigError(f"{told}; {fix}.") from None
+    """Returns the module `srv` or `msg` of the messages. ConfigError if missing or too old."""
+    if conversions.message_type(NEWEST) is None:
+        fix = f"install {PACKAGE} 2.1 or newer with your ROS 2 distribution, and source it"
+        raise ConfigError(f"simulator {PACKAGE!r} needs the messages of that name; {fix}.")
+    return import_module(f"{PACKAGE}.{kind}")
 
 
 class StandardEpisodes:
@@ -65,9 +64,11 @@ class StandardEpisodes:
     """
 
     def __init__(
-        self, link: Link, model: SimulatorModel, world: AnyWorld, options: StandardOptions
-    ) -> None:
+        self, link: Link, model: SimulatorModel, world: AnyWorld, options: StandardOptions,
+        mail: Any,
+    ) -> None:  # fmt: skip
         self._link, self._model, self._world, self._options = link, model, world, options
+        self._mail = mail  # of the data, see `backends`
         self._types, self._messages = module("srv"), module("msg")
         self._entity = options.entity or model.robot.name
         self._features = self._client("GetSimulatorFeatures")
@@ -159,10 +160,16 @@ class StandardEpisodes:
         self._put_obstacles(start, timeout_s)
         self._put(self._entity, start.pose.reshape(3), timeout_s)
         found = self._call("GetEntityState", timeout_s, entity=self._entity)
-        stamp_ns = conversions.stamp_from_ros(found.state.header.stamp) + self._period_ns
+        time_ns = conversions.stamp_from_ros(found.state.header.stamp)
         self._link.halt()
+        self._mail.clear()  # of what is from before a reset that put time back
         self.advance()
-        return stamp_ns
+        if time_ns:
+            return time_ns + self._period_ns
+        # An answer without a stamp: by the first data, of several steps the last.
+        holds(lambda: self._pending[-1].done() and self._mail.newest_ns() >= 0, timeout_s, POLL_S)
+        time.sleep(POLL_S)
+        return max(0, int(self._mail.newest_ns()))
 
     def _put_obstacles(self, start: Start, timeout_s: float) -> None:
         if not self._options.obstacles or not self._entities.service_is_ready():

@@ -58,12 +58,11 @@ class EntityServices:
 
     def __init__(self, host: Host, simulation: Simulation) -> None:
         self._host, self._simulation = host, simulation
-        self.told: dict[str, EntityInfo] = {}  # of the names whose information was set
 
     def info(self, entity: Entity) -> EntityInfo:
         """Returns what an entity is."""
-        if entity.name in self.told:
-            return self.told[entity.name]
+        if entity.name in self._simulation.told:
+            return self._simulation.told[entity.name]
         kinds = EntityCategory
         if entity.robot >= 0:
             spec = self._host.model.robot
@@ -136,7 +135,7 @@ class EntityServices:
             raise RefusalError(
                 FAILED, f"category {kind} is none of the standard; give 0 to 5 but 3."
             )
-        self.told[name] = request.info
+        self._simulation.told[name] = request.info
 
     def get_state(self, request: Any, response: Any) -> None:
         """Answers GetEntityState."""
@@ -173,9 +172,7 @@ class EntityServices:
 
     def delete(self, request: Any, _: Any) -> None:
         """Answers DeleteEntity."""
-        name = self.find(request.entity).name
-        self._simulation.remove(name)
-        self.told.pop(name, None)
+        self._simulation.remove(self.find(request.entity).name)
 
 
 def _info(kind: int, description: str, tags: tuple[str, ...]) -> EntityInfo:

@@ -46,7 +46,10 @@ class Found(NamedTuple):
 
 def local(uri: str) -> Path | None:
     """Returns the path that a URI or a plain path means; None if it is elsewhere."""
-    parts = urlsplit(uri)
+    try:
+        parts = urlsplit(uri)
+    except ValueError:  # of a host that is none
+        return None
     if parts.scheme == "file" and parts.netloc in ("", "localhost"):
         return Path(unquote(parts.path))
     return None if "://" in uri else Path(uri)

@@ -37,7 +37,7 @@ class Server:
         self._host, self._simulation = host, Simulation(host)
         simulation = self._simulation
         entities = EntityServices(host, simulation)
-        spawning, worlds = Spawning(host, simulation, entities), Worlds(host, simulation, entities)
+        spawning, worlds = Spawning(host, simulation, entities), Worlds(host, simulation)
         handlers: dict[str, Handler] = {
             "GetSimulationState": simulation.get_state, "SetSimulationState": simulation.set_state,
             "ResetSimulation": simulation.reset, "StepSimulation": simulation.step,

@@ -13,6 +13,7 @@ from simulation_interfaces.srv import SpawnEntities
 from nics_drl_bridge import geometry
 from nics_drl_bridge.config import find_config, read_text, share_folder
 from nics_drl_bridge.errors import BridgeError, ConfigError
+from nics_drl_bridge.nodes import device_parameters
 from nics_drl_bridge.nodes.simulation_interfaces import plane, resources
 from nics_drl_bridge.nodes.simulation_interfaces.entities import EntityServices
 from nics_drl_bridge.nodes.simulation_interfaces.host import Host, RefusalError, outcome
@@ -21,7 +22,8 @@ from nics_drl_bridge.sim.entities import NAME, OutsideError, hull_of
 from nics_drl_bridge.sim.models import Model, model_of_sdf, model_of_yaml
 from nics_drl_bridge.sim.sdf import AssetsError
 
-NAMESPACE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+# With room for the names of topics, which may have 255 characters in all.
+NAMESPACE = re.compile(r"(?=.{1,120}\Z)/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 FORMATS = ["sdf", "yaml"]
 FOLDER = "entities"  # of the shipped ones, in config/
 
@@ -39,15 +41,19 @@ class Spawning:
         model = self._model(request)
         wanted = request.name or ("" if model is None else model.name)
         name = self._name(wanted, request.allow_renaming)
-        space = self._namespace(request.entity_namespace)
+        space = self._namespace(request.entity_namespace, name, model is None)
         entities, code = self._simulation.entities, SpawnResult.INVALID_POSE
         posed = request.initial_pose
         base = plane.frame_pose(posed.header.frame_id, entities, self._host.frames, code)
         pose = plane.pose_from_ros(posed.pose, base, code)
         try:
             if model is None:
-                entities.spawn_robot(name, pose)
-                self._host.add_robot(space or re.sub(r"\W", "_", name))
+                robot = entities.spawn_robot(name, pose)
+                try:
+                    self._host.add_robot(space)
+                except BaseException:
+                    entities.delete(robot)
+                    raise
             else:
                 entities.spawn(name, model.parts, pose)
                 self._describe(name, model)
@@ -60,7 +66,7 @@ class Spawning:
         tags = list(dict.fromkeys((*info.tags, *model.tags)))
         told = EntityInfo(category=info.category, tags=tags)
         told.description = model.description or info.description
-        self._entities.told[name] = told
+        self._simulation.told[name] = told
 
     def _model(self, request: Any) -> Model | None:
         """The entity of a request; None for a robot. Raises RefusalError."""
@@ -107,11 +113,18 @@ class Spawning:
             raise RefusalError(SpawnResult.NAME_NOT_UNIQUE, f"the name {wanted!r} is taken; {fix}.")
         return free
 
-    def _namespace(self, given: str) -> str:
-        if given and not NAMESPACE.fullmatch(given):
-            told = f"entity_namespace {given!r} is no namespace of ROS; write it as in 'robot_1'."
-            raise RefusalError(SpawnResult.NAMESPACE_INVALID, told)
-        return given
+    def _namespace(self, given: str, name: str, robot: bool) -> str:
+        """The given one, or a robot's by its name, which no other may have. RefusalError."""
+        host: Any = self._host
+        space, code = given or re.sub(r"\W", "_", name), SpawnResult.NAMESPACE_INVALID
+        if (robot or given) and not NAMESPACE.fullmatch(space):
+            told = f"entity_namespace {given!r} is" if given else f"the name {name!r} makes"
+            code = code if given else SpawnResult.NAME_INVALID
+            raise RefusalError(code, f"{told} no namespace of ROS; write it as in 'robot_1'.")
+        if robot and device_parameters.frames(host, space.strip("/")) in host.frames:
+            told = f"the namespace {space!r} is that of another robot; give one as entity_namespace"
+            raise RefusalError(code, f"{told}.")
+        return space
 
     def spawn_all(self, request: Any, response: Any) -> None:
         """Answers SpawnEntities."""

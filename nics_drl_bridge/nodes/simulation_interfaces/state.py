@@ -7,7 +7,7 @@ from typing import Any
 
 from rclpy.action import CancelResponse
 from simulation_interfaces.action import SimulateSteps
-from simulation_interfaces.msg import Result, SimulationState
+from simulation_interfaces.msg import EntityInfo, Result, SimulationState
 from simulation_interfaces.srv import ResetSimulation, SetSimulationState
 
 from nics_drl_bridge.errors import BridgeError
@@ -38,6 +38,7 @@ class Simulation:
 
     def __init__(self, host: Host) -> None:
         self._host, self._stepping = host, False
+        self.told: dict[str, EntityInfo] = {}  # of the names whose information was set
         self._halted = STOPPED  # or paused, or without a world, while the host is paused
         self._turn: Any = host.create_guard_condition(lambda: None)  # type: ignore[attr-defined]
         self.renew()
@@ -186,6 +187,8 @@ class Simulation:
     def restore(self) -> None:
         """Removes what was spawned, and brings back what was deleted."""
         changed = self.entities.robot_names != list(self._host.robot_names)
+        kept = self.told.keys() - self.entities.spawned.keys()
+        self.told = {name: self.told[name] for name in kept}
         self.entities.restore()
         if changed:
             self._host.reopen_robots()
@@ -199,5 +202,6 @@ class Simulation:
         for name in names:
             entity = self.entities.find(name)
             self.entities.delete(entity)
+            self.told.pop(name, None)
             if entity.robot >= 0:
                 self._host.remove_robots([entity.robot])

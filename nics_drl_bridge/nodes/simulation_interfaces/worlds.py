@@ -12,7 +12,7 @@ from simulation_interfaces.srv import GetCurrentWorld, LoadWorld, UnloadWorld
 from nics_drl_bridge.config import parse_yaml, share_folder, validate
 from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.nodes.simulation_interfaces import resources
-from nics_drl_bridge.nodes.simulation_interfaces.entities import EntityServices, tags_match
+from nics_drl_bridge.nodes.simulation_interfaces.entities import tags_match
 from nics_drl_bridge.nodes.simulation_interfaces.host import Host, RefusalError
 from nics_drl_bridge.nodes.simulation_interfaces.state import STOPPED, WITHOUT_WORLD, Simulation
 from nics_drl_bridge.sim.models import HEIGHT, file_of
@@ -35,8 +35,8 @@ READ = {
 class Worlds:
     """Answers LoadWorld, UnloadWorld, GetCurrentWorld and GetAvailableWorlds."""
 
-    def __init__(self, host: Host, simulation: Simulation, entities: EntityServices) -> None:
-        self._host, self._simulation, self._entities = host, simulation, entities
+    def __init__(self, host: Host, simulation: Simulation) -> None:
+        self._host, self._simulation = host, simulation
         name = host.world.source
         self._resource = Resource(uri=name if Path(name).is_file() else host.world.name)
         self._codes = resources.Codes.of(CODES)
@@ -58,7 +58,7 @@ class Worlds:
     def _unload(self) -> None:
         self._simulation.restore()
         self._simulation.halt(WITHOUT_WORLD)
-        self._entities.told.clear()
+        self._simulation.told.clear()
 
     def load(self, request: Any, response: Any) -> None:
         """Answers LoadWorld: the present world is unloaded, even if the other can't be read."""
@@ -141,12 +141,13 @@ def _in_source(source: str) -> list[tuple[str, AnyWorld]]:
     path = resources.local(source)
     if path is None:
         raise ConfigError("is not on this machine; give a folder or file.")
-    if not path.is_dir():
-        return [(str(path), load_worlds(path))]
-    found = []
-    for file in sorted((*path.glob("*.yaml"), *path.glob("*.yml"))):
-        found.append((str(file), load_worlds(file)))
-    return found
+    files = sorted(path.iterdir()) if path.is_dir() else [path]
+    forms = [(str(file), file, resources.SUFFIXES.get(file.suffix.lower())) for file in files]
+    return [
+        (uri, world_of(read_sdf(file, HEIGHT, skip_unknown=True), file.stem)
+         if form == resources.SDF else load_worlds(file))
+        for uri, file, form in forms if form or not path.is_dir()
+    ]  # fmt: skip
 
 
 def _set_of(name: str) -> WorldResource:

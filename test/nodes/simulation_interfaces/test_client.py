@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+
 import gymnasium
 import numpy as np
 import pytest
@@ -7,11 +9,14 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 pytest.importorskip("simulation_interfaces", reason="needs what `make test-messages` builds")
 
+from builtin_interfaces.msg import Time
 from simulation_interfaces import msg
 
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.nodes.simulation_interfaces import server
+from nics_drl_bridge.nodes.simulation_interfaces.entities import EntityServices
+from nics_drl_bridge.nodes.simulator_node import DeviceNode
 
 pytestmark = pytest.mark.ros
 STEPS, TIMEOUT_S = 8, 60.0
@@ -59,6 +64,40 @@ def test_an_env_places_and_steps_a_simulator_by_the_standard_alone(
         assert info["pose"] == pytest.approx(known["pose"], abs=0.05)
         assert info["true_pose"] == pytest.approx(known["true_pose"], abs=0.05)
     assert int(client_of(domain_id)("GetSimulationState").state.state) == 2
+
+
+@pytest.mark.parametrize("stamped", [True, False])
+def test_a_simulator_that_puts_time_back_and_tells_of_it_by_steps_alone_is_driven(
+    launch, domain_id, make, monkeypatch, stamped
+):
+    fewer = tuple(name for name in server.FEATURES if name != "SIMULATION_RESET_STATE")
+    monkeypatch.setattr(server, "FEATURES", fewer)
+    begin, state = DeviceNode.begin, EntityServices.state
+
+    def silent(self, rewind=False):
+        with monkeypatch.context() as patch:
+            patch.setattr(self, "_publish", lambda: None)
+            begin(self, rewind)
+
+    def told_of(self, entity):
+        told = state(self, entity)
+        told.header.stamp = told.header.stamp if stamped else Time()
+        return told
+
+    monkeypatch.setattr(DeviceNode, "begin", silent)
+    monkeypatch.setattr(EntityServices, "state", told_of)
+    launch("simulator_node", domain_id, world="circles", mode="lockstep")
+    env = make(domain_id)
+    stamps = set()
+    for seed in (3, 4):
+        _, info = env.reset(seed=seed)
+        start = info["start"]
+        assert info["pose"] == pytest.approx(start, abs=1e-6)
+        for _ in range(STEPS):
+            _, _, _, _, info = env.step(np.array([0.6, 0.0], np.float32))
+        assert math.dist(info["pose"][:2], start[:2]) > 0.1
+        stamps.add(info["stamp_ns"])
+    assert len(stamps) == 1  # of a time that was put back
 
 
 def test_a_feature_that_is_missing_is_named_when_the_env_is_made(

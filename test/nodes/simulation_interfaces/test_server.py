@@ -1,14 +1,22 @@
 from __future__ import annotations
 
+import math
+import shutil
+from pathlib import Path
+
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 pytest.importorskip("simulation_interfaces", reason="needs what `make test-messages` builds")
 
-from geometry_msgs.msg import Twist
+from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import LaserScan
 from simulation_interfaces import msg, srv
+from std_srvs.srv import Trigger
+
+from nics_drl_bridge.nodes import conversions
+from nics_drl_bridge.nodes.simulator_node import DeviceNode
 
 pytestmark = pytest.mark.ros
 STATES, OK = msg.SimulationState, msg.Result.RESULT_OK
@@ -80,6 +88,90 @@ def test_a_robot_that_was_deleted_comes_back_with_a_reset(client, meet, simulato
     peer.until(lambda: scans, "its scan")
 
 
+@pytest.mark.parametrize(
+    ("name", "space", "code", "sentence"),
+    [
+        ("3rd", "", msg.SpawnResult.NAME_INVALID, "the name '3rd' makes no namespace"),
+        ("x" * 300, "", msg.SpawnResult.NAME_INVALID, "makes no namespace"),
+        ("third", "y" * 300, msg.SpawnResult.NAMESPACE_INVALID, "is no namespace of ROS"),
+        ("third", "left", msg.SpawnResult.NAMESPACE_INVALID, "is that of another robot"),
+        ("third", "/right", msg.SpawnResult.NAMESPACE_INVALID, "is that of another robot"),
+    ],
+)
+def test_a_robot_whose_topics_can_not_be_named_is_refused(client, name, space, code, sentence):
+    robot = msg.Resource(uri="ackermann")
+    answer = client.spawn(name, 1.0, entity_resource=robot, entity_namespace=space)
+    assert (answer.result.result, sentence in answer.result.error_message) == (code, True), answer
+    assert client.names(categories=[msg.EntityCategory(category=1)]) == ["left", "right"]
+    client.set_state(STATES.STATE_PLAYING)
+    assert client.code("GetEntityState", entity="left") == OK  # it lives
+
+
+def test_two_names_of_one_namespace_are_told_apart(client):
+    robot = msg.Resource(uri="ackermann")
+    assert client.spawn("a/b", 1.0, entity_resource=robot).result.result == OK
+    again = client.spawn("a_b", -1.0, entity_resource=robot)
+    assert again.result.result == msg.SpawnResult.NAMESPACE_INVALID
+    again = client.spawn("a_b", -1.0, entity_resource=robot, entity_namespace="c")
+    assert again.result.result == OK
+
+
+def test_a_robot_that_can_not_have_its_topics_is_not_there(client, monkeypatch):
+    def broken(*_):
+        raise RuntimeError("no topics")
+
+    monkeypatch.setattr(DeviceNode, "add_robot", broken)
+    refused = client.spawn("third", 1.0, entity_resource=msg.Resource(uri="ackermann")).result
+    assert "no topics" in refused.error_message
+    assert client.names(categories=[msg.EntityCategory(category=1)]) == ["left", "right"]
+
+
+def test_what_was_told_of_an_entity_goes_with_it(client):
+    told = msg.EntityInfo(description="mine", tags=["mine"])
+    for scope in (srv.ResetSimulation.Request.SCOPE_SPAWNED, 0):
+        client.spawn("disc", 1.0)
+        assert client.code("SetEntityInfo", entity="disc", info=told) == OK
+        assert client.code("ResetSimulation", scope=scope) == OK
+        client.spawn("disc", 1.0)
+        assert client("GetEntityInfo", entity="disc").info.description != "mine"
+        assert client.code("DeleteEntity", entity="disc") == OK
+
+
+def test_after_one_robot_is_deleted_the_others_keep_their_topics_and_starts(
+    launch, domain_id, client_of, meet
+):
+    start = [-1.0, 0.0, 0.0, 1.0, -1.0, 0.5]
+    node = launch(
+        "simulator_node", domain_id, world="empty", robots=["left", "right"], episode_start=start
+    )
+    client, peer = client_of(domain_id), meet(domain_id)
+    truths = peer.listen(Odometry, "right/ground_truth")
+    assert client.code("DeleteEntity", entity="left") == OK
+    assert peer.call(Trigger, "simulator_node/reset").success
+
+    def stands(x, y):
+        return truths and math.dist(conversions.odometry_from_ros(truths[-1])[0][:2], (x, y)) < 0.01
+
+    peer.until(lambda: stands(1.0, -1.0), "the robot at its own start")
+    pose = PoseWithCovarianceStamped()
+    pose.header.frame_id, pose.pose.pose.position.x = "map", 0.5
+    pose.pose.pose.orientation.w = 1.0
+    peer.speak(PoseWithCovarianceStamped, "right/initialpose").publish(pose)
+    peer.until(lambda: stands(0.5, 0.0), "the robot there")
+    assert peer.node.count_subscribers("/left/initialpose") == 0
+    node.check()
+
+
+def test_worlds_of_gazebo_are_listed_too(client, tmp_path):
+    hall = Path(__file__).resolve().parents[2] / "sim" / "gazebo" / "hall.world"
+    shutil.copy(hall, tmp_path / "hall.world")
+    (tmp_path / "notes.txt").write_text("no world", encoding="utf-8")
+    told = client("GetAvailableWorlds", additional_sources=[str(tmp_path)])
+    assert told.result.result == OK, told.result.error_message
+    uris = [each.world_resource.uri for each in told.worlds]
+    assert str(tmp_path / "hall.world") in uris
+
+
 def test_poses_may_be_given_in_the_frame_of_an_entity(client):
     base = msg.EntityState()
     base.pose.position.x, base.pose.orientation.z, base.pose.orientation.w = 1.0, 1.0, 0.0
@@ -120,6 +212,7 @@ def test_poses_may_be_given_in_the_frame_of_an_entity(client):
         ("LoadWorld", {"world_resource": msg.Resource(uri="nowhere")}, 2, "unknown world"),
         ("LoadWorld", {"world_resource": msg.Resource(uri="/no/a.yaml")}, 2, "no such file"),
         ("LoadWorld", {"world_resource": msg.Resource(uri="http://a/b.sdf")}, 101, "this machine"),
+        ("LoadWorld", {"world_resource": msg.Resource(uri="file://[")}, 101, "this machine"),
         ("SetSimulationState", {"state": STATES(state=77)}, 103, "state 77 can't be set"),
     ],
 )
