@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from importlib import import_module
 from importlib.util import find_spec
 from math import isnan
 from pathlib import Path
@@ -31,6 +32,7 @@ from nics_drl_bridge.report.doctor import examine
 from nics_drl_bridge.report.doctor_facts import expected_of
 from nics_drl_bridge.report.pictures import trajectories
 from nics_drl_bridge.robot import DEFAULT_ROBOT
+from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim.scenes import Scene, sample_scene
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
@@ -58,8 +60,8 @@ def drive_in(
     conditions: Conditions = NO_CONDITIONS,
 ) -> list[Episode]:  # fmt: skip
     """Drives episodes in one of `PLACES`, whose node, if any, has then ended. BridgeError."""
-    check_place(place)
     model, drawn = open_model(name), conditions.ranges
+    check_place(place, model.robot)
     if place == FAST:
         given = {"estimator": True, "randomisation": drawn}
         env, opened = env_of(policy, model, world, "sim", conditions, **given)
@@ -104,14 +106,18 @@ def env_of(
     return gymnasium.make(NAVIGATION, max_episode_steps=limit, **given), opened
 
 
-def check_place(place: str) -> None:
-    """Raises ConfigError if there is no such place, or what it needs is not installed."""
+def check_place(place: str, robot: RobotSpec) -> None:
+    """Raises ConfigError if there is no such place, or it lacks a module or can't have a robot."""
     if place not in PLACES:
         raise ConfigError(f"--in {place!r}: there is no such world; {nearest(place, PLACES)}")
-    if place != FAST and find_spec("rclpy") is None:
+    if place == FAST:
+        return
+    robot.require_cmd_vel()
+    if find_spec("rclpy") is None:
         raise ConfigError(f"the world {place!r} {MISSING_ROS.format(module='rclpy')}")
     if place == MUJOCO:
         extensions.load("nodes", NODES[MUJOCO])
+        import_module(extensions.known("nodes")[NODES[MUJOCO]].module).check(robot)
 
 
 def robot_of(policy: str, contract: Contract) -> str:
@@ -147,7 +153,7 @@ class EvaluationOrder:
     world: str = "circles"  # YAML file or name of the world
     episodes: int = 20
     seed: int = evaluation.FIRST_SEED
-    places: Sequence[str] = PLACES  # some of `PLACES`; the others are compared with the first
+    places: Sequence[str] = ()  # some of `PLACES`, compared with the first; none: all that work
     conditions: Conditions = NO_CONDITIONS
 
     @property
@@ -176,7 +182,7 @@ def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
     model, name = order.conditions.model(model_name(order.model, contracts), order.out)
     world = load_worlds(order.world)
     under = limited(order.conditions, contracts, model, world, say)
-    places, evaluated = _places(order, model, say), []
+    places, evaluated = _places(order, model.robot, say), []
     for policy in order.policies:
         runs = {}
         for place in places:
@@ -207,19 +213,19 @@ def limited(
     return replace(conditions, steps=steps)
 
 
-def _places(order: EvaluationOrder, model: SimulatorModel, say: Say) -> Sequence[str]:
-    """Returns the places of an order: of all, those where the robot can be driven."""
-    try:
-        model.robot.require_cmd_vel()
-    except ConfigError as error:
-        if tuple(order.places) == PLACES:
-            say(f"in process alone: {error}")
-            return (FAST,)
-        if set(order.places) != {FAST}:
-            raise
-    for place in order.places:
-        check_place(place)
-    return order.places
+def _places(order: EvaluationOrder, robot: RobotSpec, say: Say) -> Sequence[str]:
+    """Returns the places of an order; without any those that work here, and why no more do."""
+    found = list[str]()
+    for place in order.places or PLACES:  # whatever one of `PLACES` lacks, the next lacks, too
+        try:
+            check_place(place, robot)
+        except ConfigError as error:
+            if order.places:
+                raise
+            say(f"{' and '.join(LABELS[each] for each in found)} alone: {error}")
+            break
+        found.append(place)
+    return found
 
 
 def judged(

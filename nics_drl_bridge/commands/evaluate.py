@@ -34,7 +34,7 @@ def evaluate(
         "--world", "--scene", help="A shipped world (circles) or a YAML file.",
         autocompletion=completing("worlds"))] = "circles",
     places: Annotated[list[str] | None, Option(
-        "--in", help="fast, dds or mujoco_dds; several times; all by default.")] = None,
+        "--in", help="fast, dds or mujoco_dds; several times; else all that work here.")] = None,
     episodes: Annotated[int | None, Option(min=1, help="How many; 20, or 1 on a vehicle.")] = None,
     seed: Annotated[int, Option(min=0, help="Of the first episode.")] = 1_000_000,
     lidar: OtherLidarOption = None,
@@ -81,11 +81,10 @@ def evaluate(
         from nics_drl_bridge.commands import episodes as driving
         from nics_drl_bridge.commands.conditions import Conditions
 
-        chosen = {"places": tuple(dict.fromkeys(places))} if places else {}
         count, tell = episodes or (1 if hardware else 20), partial(typer.echo, err=True)
         under = Conditions(lidar, randomisation, gate, fallback)
         order = driving.EvaluationOrder(
-            policies, out, model, world, count, seed, **chosen, conditions=under
+            policies, out, model, world, count, seed, tuple(dict.fromkeys(places or ())), under
         )
         if hardware:
             options = {"start": start, "namespace": namespace, "pose_type": pose_type}
