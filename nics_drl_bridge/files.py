@@ -14,9 +14,12 @@ from typing import BinaryIO
 from nics_drl_bridge.errors import ConfigError, ModelError
 
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
+_POSIX = hasattr(os, "O_DIRECTORY")  # Windows opens no folders
 
 
 def _fsync(path: Path) -> None:
+    if not _POSIX:
+        return
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -97,7 +100,7 @@ def _swap(new: Path, path: Path) -> None:
     if path.exists() and _exchange(new, path):
         _fsync(path.parent)
         return
-    old = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.old."))
+    old = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.old.")) / path.name
     try:
         if path.exists():
             os.replace(path, old)
@@ -109,13 +112,13 @@ def _swap(new: Path, path: Path) -> None:
             raise
         _fsync(path.parent)
     finally:
-        shutil.rmtree(old, ignore_errors=True)
+        shutil.rmtree(old.parent, ignore_errors=True)
 
 
 def _exchange(one: Path, other: Path) -> bool:
     """Exchanges two paths atomically; False if the system can't (renameat2 is Linux's alone)."""
-    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-    if rename is None:
+    library = ctypes.CDLL(None, use_errno=True) if _POSIX else None
+    if (rename := getattr(library, "renameat2", None)) is None:
         return False
     if rename(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE) == 0:
         return True

@@ -367,7 +367,7 @@ def zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     all of it, which for many obstacles took a fifth of a step.
     """
     size = math.prod(shape) * dtype.itemsize
-    if size < LARGE:
+    if size < LARGE or not hasattr(mmap, "MAP_PRIVATE"):  # as on Windows
         return np.zeros(shape, dtype)
     fresh = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE)
     if hasattr(mmap, "MADV_NOHUGEPAGE"):
