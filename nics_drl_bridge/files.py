@@ -3,13 +3,14 @@
 import ctypes
 import errno
 import hashlib
+import json
 import os
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from nics_drl_bridge.errors import ConfigError, ModelError
 
@@ -53,6 +54,12 @@ def write_parts(path: str | Path, parts: Iterable[bytes]) -> None:
 def write_text(path: str | Path, text: str) -> None:
     """Writes a UTF-8 text file via a temporary one, fsynced and renamed."""
     write_bytes(path, text.encode())
+
+
+def json_of(data: Any, indent: int | None = None) -> str:
+    """JSON of plain data: null for numbers that are not finite, text for the unknown."""
+    known = json.loads(json.dumps(data, default=str), parse_constant=lambda _: None)
+    return json.dumps(known, allow_nan=False, indent=indent)
 
 
 def check_folder(path: str | Path, marker: str) -> Path:

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -391,3 +392,8 @@ def test_what_is_no_file_to_read_is_one_sentence(listed, name, what):
             file.truncate(MOST_BYTES + 1)
     with pytest.raises(ModelError, match=f"{name}: is (missing, or no file|larger than 256 MB);"):
         check_sums(listed, NAMES)
+
+
+def test_json_has_null_for_numbers_that_are_not_finite():
+    text = files.json_of({"nan": float("nan"), "ends": (-float("inf"), 1.5), "at": Path("a")})
+    assert text == '{"nan": null, "ends": [null, 1.5], "at": "a"}'

@@ -1,6 +1,5 @@
 """The same episodes in process, over DDS, in MuJoCo, and on the vehicle, compared as in Fig. 7."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
@@ -19,7 +18,7 @@ from nics_drl_bridge.config import shipped_names
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.env.sim_backend import make_backend
 from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, nearest
-from nics_drl_bridge.files import write_bytes, write_text
+from nics_drl_bridge.files import json_of, write_bytes, write_text
 from nics_drl_bridge.gate.gated_backend import GatedBackend
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.policy import evaluation
@@ -94,7 +93,7 @@ def env_of(
 ) -> tuple[gymnasium.Env[Any, Any], Policy]:  # fmt: skip
     """Makes the env of a policy's task with a backend, behind a gate if any; opens the policy."""
     register_envs()
-    opened, task = open_policy(policy, model, conditions.fallback)
+    opened, task = open_policy(policy, model, conditions.fallback, conditions.kind)
     task = replace(task, **conditions.task)
     field = load_worlds(world) if isinstance(world, str) else world
     given = {name: value for name, value in options.items() if value is not None}
@@ -268,7 +267,7 @@ def write_evaluation(
         "world": order.world, "seed": order.seed, "conditions": asdict(order.conditions),
         "policies": policies,
     }  # fmt: skip
-    write_text(order.out / EVALUATION, json.dumps(data) + "\n")
+    write_text(order.out / EVALUATION, json_of(data) + "\n")
 
 
 def rows_of(evaluated: Sequence[Evaluated]) -> list[tuple[str, ...]]:
@@ -316,7 +315,7 @@ def drive_vehicle(
     model, world = open_model(name), load_worlds(order.world)
     under = limited(order.conditions, contracts, model, world, say)
     # A misfit is an error before anything moves.
-    open_policy(policy, model, order.conditions.fallback)
+    open_policy(policy, model, order.conditions.fallback, order.conditions.kind)
     from nics_drl_bridge.nodes.listen import listen
 
     say(f"listening to the vehicle for {LISTEN_S:g} s, as nics doctor does")
