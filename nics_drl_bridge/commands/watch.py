@@ -53,7 +53,12 @@ def watch(
     with one_sentence():
         given = {"lidar": lidar, "randomisation": randomisation, "gate": gate}
         given["task"] = task
-        _check(record)
+        if record is None:  # before the source is opened, which may take a while
+            extensions.require("the page", "websockets")
+        else:
+            from nics_drl_bridge.watch.record import check_file
+
+            check_file(record)
         if bag is not None:
             source: Any = _bag(bag, model, world, roles_of(topic or []))
         elif ros:
@@ -65,16 +70,6 @@ def watch(
                 _record(record, source, episodes)
             else:
                 _serve(source, port, browser)
-
-
-def _check(record: Path | None) -> None:
-    """Raises ConfigError, before the source is opened, for a record that can't be written."""
-    if record is None:
-        extensions.require("the page", "websockets")
-    else:
-        from nics_drl_bridge.watch.record import check_file
-
-        check_file(record)
 
 
 def _episodes(
