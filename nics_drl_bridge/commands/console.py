@@ -76,7 +76,7 @@ NEEDED = {  # options that do nothing without another, by command
 }
 APART = {  # options that leave nothing to do for others, by command
     "evaluate": {
-        "hardware": ("places", "shadow", "lidar", "randomisation", "gate", "task"),
+        "hardware": ("places", "shadow", "lidar", "randomisation", "gate"),
         "shadow": ("places", "fallback", "lidar", "randomisation", "gate", "task"),
     },
     "watch": {
