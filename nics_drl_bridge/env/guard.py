@@ -5,6 +5,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import wraps
+from itertools import product
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import gymnasium
@@ -105,24 +106,23 @@ def check_places(
 ) -> None:  # fmt: skip
     """Raises ConfigError for starts of a footprint, or goals, (n, ..., 2 or 3) off the field.
 
-    Or in a wall; and for starts where an obstacle stands in the scene of their episode.
+    Or in a wall; and for starts where an obstacle stands in the scenes of all n episodes.
     """
+    free = not radius
     for scene, rows in zip(scenes, places, strict=True):
-        member = world.members[int(np.asarray(scene.member))]
+        member, at = world.members[int(np.asarray(scene.member))], rows.reshape(-1, rows.shape[-1])
         solid = 0.0 if member.grid is None else member.grid.resolution  # room in a full cell
-        for x, y in rows.reshape(-1, rows.shape[-1])[:, :2].tolist():
-            room = room_at(member, x, y)
-            if room < 0.0:
-                reason = "lies outside the world"
-            elif room <= max(radius, solid):
-                reason = "stands in a wall" if radius else "lies in a wall"
-            elif radius and any(_on(x, y, radius, body, world.shapes) for body in scene.bodies):
-                reason = "stands in an obstacle"
-            else:
-                continue
-            x1, y1, x2, y2 = member.extent
-            field = f"the field is {x1:g} to {x2:g} m by {y1:g} to {y2:g} m"
-            raise ConfigError(f"reset option {option!r}: ({x:g}, {y:g}) m {reason}; {field}.")
+        for x, y in at[:, :2].tolist():
+            if (room := room_at(member, x, y)) <= max(radius, solid):
+                reason = "is in a wall" if room >= 0.0 else "lies outside the world"
+                x1, y1, x2, y2 = member.extent
+                field = f"the field is {x1:g} to {x2:g} m by {y1:g} to {y2:g} m"
+                raise ConfigError(f"reset option {option!r}: ({x:g}, {y:g}) m {reason}; {field}.")
+        shapes, pairs = world.shapes, product(at[:, :2].tolist(), scene.bodies)
+        free = free or not any(_on(*place, radius, body, shapes) for place, body in pairs)
+    if not free and len(places):
+        fix = "move it, or take another seed"
+        raise ConfigError(f"reset option {option!r}: {at.tolist()} is on an obstacle; {fix}.")
 
 
 def _on(x: float, y: float, radius: float, body: NDArray[Any], shapes: Sequence[Shape]) -> bool:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 import warnings
 from dataclasses import replace
 
@@ -7,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from robots import FOOTPRINT, direct_model, field, lidar
+from robots import FOOTPRINT, circles, direct_model, field, lidar
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.env.bridge_env import BridgeEnv
@@ -363,13 +364,13 @@ SETS = WorldSet("two", (BLOCKED, field(obstacles=[BLOCK, NOTCHED], clearance=0.1
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"start": (2.9, 0.0, 0.0)}, r"'start': \(2.9, 0\) m stands in a wall; the field is"),
+        ({"start": (2.9, 0.0, 0.0)}, r"'start': \(2.9, 0\) m is in a wall; the field is"),
         ({"start": (2.6, -3.1, 0.0)}, "'start'.*lies outside the world"),
-        ({"start": (1.0, 1.0, 0.0)}, "'start'.*stands in an obstacle"),  # amid it
-        ({"start": (0.3, 1.4, 0.0)}, "'start'.*stands in an obstacle"),  # with its edge
-        ({"start": (-2.3, -1.0, 0.0)}, "'start'.*stands in an obstacle"),
+        ({"start": (1.0, 1.0, 0.0)}, "'start'.*is on an obstacle; move it"),  # amid it
+        ({"start": (0.3, 1.4, 0.0)}, "'start'.*is on an obstacle; move it"),  # with its edge
+        ({"start": (-2.3, -1.0, 0.0)}, "'start'.*is on an obstacle; move it"),
         ({"goal": (4.0, 0.0)}, "'goal'.*lies outside the world"),
-        ({"goal": (3.0, 0.0)}, "'goal'.*lies in a wall"),
+        ({"goal": (3.0, 0.0)}, "'goal'.*is in a wall"),
     ],
 )
 def test_a_start_or_goal_where_something_stands_is_refused(world, options, sentence):
@@ -386,3 +387,16 @@ def test_a_start_beside_what_stands_is_taken(world):
         for env in (BridgeEnv(model=MODEL, world=world), BridgeVectorEnv(3, MODEL, world)):
             _, info = env.reset(seed=0, options=options)
             assert np.reshape(info["start"], (-1, 3))[-1] == pytest.approx(start)
+
+
+def test_many_worlds_begin_at_a_start_where_an_obstacle_stands_in_some_of_them():
+    world = field(obstacles=[circles(8, (0.5,))])
+    model = replace(direct_model(), table=bake(lidar(), (*world.shapes, Circle(radius=FOOTPRINT))))
+    single, taken = BridgeEnv(model=model, world=world), []
+    for seed in range(16):
+        with contextlib.suppress(ConfigError):
+            single.reset(seed=seed, options={"start": (0.0, 0.0, 0.0)})
+            taken.append(seed)
+    assert 0 < len(taken) < 16
+    _, info = BridgeVectorEnv(16, model, world).reset(seed=0, options={"start": (0.0, 0.0, 0.0)})
+    assert not info["start"].any()
