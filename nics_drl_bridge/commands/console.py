@@ -69,12 +69,14 @@ TopicOption = Annotated[list[str] | None, Option(
 ]  # fmt: skip
 
 
-NEEDED = {  # options that do nothing without another, by command
+NEEDED: dict[
+    str, dict[str, tuple[str, ...]]
+] = {  # options that do nothing without another, by command
     "evaluate": dict.fromkeys(("start", "namespace", "pose_type", "yes", "arm"), ("hardware",))
     | {"topic": ("shadow",), "ahead": ("shadow",), "goal": ("hardware", "shadow")},
     "watch": {"topic": ("bag",), "namespace": ("ros",), "episodes": ("record",)},
 }
-APART = {  # options that leave nothing to do for others, by command
+APART: dict[str, dict[str, tuple[str, ...]]] = {  # options that leave others nothing to do
     "evaluate": {
         "hardware": ("places", "shadow", "lidar", "randomisation", "gate"),
         "shadow": ("places", "fallback", "lidar", "randomisation", "gate", "task"),

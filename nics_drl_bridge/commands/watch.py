@@ -81,7 +81,7 @@ def _episodes(
     from nics_drl_bridge.sim.world_set import load_worlds
     from nics_drl_bridge.watch.episode import EpisodeSource
 
-    under = Conditions(*map(given.get, ("lidar", "randomisation", "gate")), kind=given["task"])
+    under = Conditions(given["lidar"], given["randomisation"], given["gate"], kind=given["task"])
     contracts = driving.contracts_of([policy])
     own = [driving.robot_of(*each) for each in contracts.items()]  # a baseline has none
     model = open_model(name or (own or [DEFAULT_ROBOT])[0], under.lidar)

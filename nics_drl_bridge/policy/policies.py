@@ -240,7 +240,7 @@ def make_policy(
 
 def open_policy(
     name: str, model: SimulatorModel, fallback: str = "", kind: str | None = None
-) -> tuple[Policy, Any]:
+) -> tuple[Policy, Navigation]:
     """Opens a policy, with a fallback if any, and its task: navigation, or one of a `kind`.
 
     A kind is path/to/file.py:ClassName. Raises ConfigError, and PolicyError for another task.
@@ -254,7 +254,7 @@ def open_policy(
     from nics_drl_bridge.policy.foreign import load_any
 
     policy = load_any(name, model)
-    found: Any = policy.make_task(model, kind)
+    found: Any = policy.make_task(model, kind)  # of a kind it is any task
     if kind is None and not isinstance(found, Navigation):
         reason = f"is {policy.contract.task.name!r}; this drives policies of 'navigation'."
         raise PolicyError(name, "task.name", reason)

@@ -129,7 +129,7 @@ MISTAKES = {
     "evaluate differential --topic odom=/wheels": "--topic: belongs to --shadow",
     "evaluate differential --ahead 2": "--ahead: belongs to --shadow",
     # Numbers that are none.
-    "drive --robot differential --out m --duration nan": "--duration.*(must be a finite number|Input should be)",
+    "drive --robot differential --out m --duration nan": "--duration.*(finite|should)",
     "doctor --duration inf": "--duration inf: must be a finite number",
     "bag record bag --duration nan": "--duration.*(must be a finite number|Input should be)",
     "bag replay bag --rate nan": "--rate.*(must be a finite number|Input should be)",
