@@ -69,9 +69,7 @@ TopicOption = Annotated[list[str] | None, Option(
 ]  # fmt: skip
 
 
-NEEDED: dict[
-    str, dict[str, tuple[str, ...]]
-] = {  # options that do nothing without another, by command
+NEEDED: dict[str, dict[str, tuple[str, ...]]] = {  # options that do nothing without another
     "evaluate": dict.fromkeys(("start", "namespace", "pose_type", "yes", "arm"), ("hardware",))
     | {"topic": ("shadow",), "ahead": ("shadow",), "goal": ("hardware", "shadow")},
     "watch": {"topic": ("bag",), "namespace": ("ros",), "episodes": ("record",)},
