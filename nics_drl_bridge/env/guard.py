@@ -119,7 +119,7 @@ def check_places(
                 field = f"the field is {x1:g} to {x2:g} m by {y1:g} to {y2:g} m"
                 raise ConfigError(f"reset option {option!r}: ({x:g}, {y:g}) m {reason}; {field}.")
         shapes, pairs = world.shapes, product(at[:, :2].tolist(), scene.bodies)
-        free = free or not any(_on(*place, radius, body, shapes) for place, body in pairs)
+        free = free or not any(_on(x, y, radius, body, shapes) for (x, y), body in pairs)
     if not free and len(places):
         fix = "move it, or take another seed"
         raise ConfigError(f"reset option {option!r}: {at.tolist()} is on an obstacle; {fix}.")
