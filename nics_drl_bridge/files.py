@@ -3,20 +3,24 @@
 import ctypes
 import errno
 import hashlib
+import json
 import os
 import shutil
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from nics_drl_bridge.errors import ConfigError, ModelError
 
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
+_POSIX = hasattr(os, "O_DIRECTORY")  # Windows opens no folders
 
 
 def _fsync(path: Path) -> None:
+    if not _POSIX:
+        return
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -50,6 +54,12 @@ def write_parts(path: str | Path, parts: Iterable[bytes]) -> None:
 def write_text(path: str | Path, text: str) -> None:
     """Writes a UTF-8 text file via a temporary one, fsynced and renamed."""
     write_bytes(path, text.encode())
+
+
+def json_of(data: Any, indent: int | None = None) -> str:
+    """JSON of plain data: null for numbers that are not finite, text for the unknown."""
+    known = json.loads(json.dumps(data, default=str), parse_constant=lambda _: None)
+    return json.dumps(known, allow_nan=False, indent=indent)
 
 
 def check_folder(path: str | Path, marker: str) -> Path:
@@ -97,7 +107,7 @@ def _swap(new: Path, path: Path) -> None:
     if path.exists() and _exchange(new, path):
         _fsync(path.parent)
         return
-    old = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.old."))
+    old = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.old.")) / path.name
     try:
         if path.exists():
             os.replace(path, old)
@@ -109,13 +119,13 @@ def _swap(new: Path, path: Path) -> None:
             raise
         _fsync(path.parent)
     finally:
-        shutil.rmtree(old, ignore_errors=True)
+        shutil.rmtree(old.parent, ignore_errors=True)
 
 
 def _exchange(one: Path, other: Path) -> bool:
     """Exchanges two paths atomically; False if the system can't (renameat2 is Linux's alone)."""
-    rename = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
-    if rename is None:
+    library = ctypes.CDLL(None, use_errno=True) if _POSIX else None
+    if (rename := getattr(library, "renameat2", None)) is None:
         return False
     if rename(_AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE) == 0:
         return True

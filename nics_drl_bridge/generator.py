@@ -13,7 +13,6 @@ from nics_drl_bridge.config import Schema, dump_yaml, parse_yaml, read_text, val
 from nics_drl_bridge.errors import ConfigError, FitError, ModelError
 from nics_drl_bridge.identify import fit
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.excitation import narrow
 from nics_drl_bridge.identify.identify import Identified, identify
 from nics_drl_bridge.identify.report import fit_report, why_useless
 from nics_drl_bridge.lidar.bake import bake
@@ -23,7 +22,6 @@ from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 from nics_drl_bridge.lidar.table import TABLE_FILES, LidarTable
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.recording import Recording
-from nics_drl_bridge.robot.kinds import overdriven
 from nics_drl_bridge.robot.noise import Latency, Noise
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.robot.taylor import NamedTaylorModel, TaylorModel
@@ -127,16 +125,11 @@ def generate(
     identified = identify(recording, robot, order=order, alpha=alpha, assume=assume, strict=strict)
     if (reason := why_useless(identified, robot)) and not anyway:
         raise FitError(reason)
-    found = narrow(recording, robot)
-    if (wheels := overdriven(robot)) is not None:
-        found.append(wheels)
-    report = fit_report(recording.source, robot, identified)
-    if found:
-        report = "\n".join([report.rstrip(), "", "Mind:", *(f"  - {one}" for one in found), ""])
     model = SimulatorModel(
         robot, identified.model, replace(identified.calibration, inputs=(), limits={}), lidar,
         bake(lidar, (*shapes, footprint_shape(robot))), identified.noise,
-        _control_period(lidar, identified.model), report, recording.latency, tuple(sensors),
+        _control_period(lidar, identified.model), fit_report(recording.source, robot, identified),
+        recording.latency, tuple(sensors),
     )  # fmt: skip
     return model, identified
 

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from importlib.util import find_spec
+from pathlib import Path
 
 import pytest
 from command_line import nics
@@ -14,6 +15,7 @@ from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.policy.policies import shipped_policies
 from nics_drl_bridge.robot.spec import load_robot
 
+ROOT = Path(__file__).resolve().parents[1]
 PNG = b"\x89PNG"
 DEADLINE_S = 280.0
 missing = [name for name in ("rclpy", "mujoco") if find_spec(name) is None]
@@ -71,13 +73,40 @@ def test_lidar_randomisation_and_gate_are_the_same_in_process_and_over_dds(tmp_p
     told = json.loads((tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8"))
     assert told["conditions"] == {
         "lidar": "rplidar_a2", "randomisation": "mild", "gate": "differential",
-        "fallback": "mppi", "steps": 300, "task": {},
+        "fallback": "mppi", "steps": 300, "task": {}, "kind": None,
     }  # fmt: skip
     fast, dds = told["policies"]["dynamic_window"].values()
     assert dds["greatest_deviation"] < 1e-6
     for name in ("result", "fallback_actions"):
         assert [one[name] for one in fast["each"]] == [one[name] for one in dds["each"]]
     assert fast["fallback"] == dds["fallback"] >= 0.0
+
+
+@pytest.mark.slow
+def test_a_policy_of_a_task_of_ones_own_is_driven_by_the_file_of_the_task(tmp_path):
+    pytest.importorskip("torch")
+    from policy.policy_rig import network
+
+    from nics_drl_bridge.env.registry import make_task
+    from nics_drl_bridge.generator import builtin_model
+    from nics_drl_bridge.policy.train_export import export_policy
+
+    kind = f"{ROOT / 'examples' / 'own_task.py'}:Patrol"
+    model = builtin_model("differential")
+    task = make_task(kind, model, {"scan": 24})
+    size = task.observation_space.shape[0]
+    export_policy(network(size, 2), task, model, tmp_path / "patrol.onnx", None, {})
+    words = ("evaluate", "patrol.onnx", "--in", "fast", "--world", "empty", "--episodes", 1)
+    done = nics(*words, cwd=tmp_path)
+    assert done.returncode == 2
+    assert "say --task path/to/file.py:Patrol" in done.stderr
+    done = nics(*words, "--task", kind, "--out", "out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    told = json.loads((tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8"))
+    assert told["conditions"]["kind"] == kind
+    assert len(told["policies"]["patrol.onnx"]["fast"]["each"]) == 1
+    done = nics("evaluate", "straight", "--task", kind, "--in", "fast", cwd=tmp_path)
+    assert "policy 'straight' drives the task 'navigation' alone" in done.stderr
 
 
 @pytest.mark.slow
@@ -113,14 +142,14 @@ def test_a_shipped_policy_brings_its_own_robot(tmp_path):
         (("nowhere.onnx",), "nowhere.onnx"),
         (("dynamic_window", "--hardware"), "--backend dds"),
         (("dynamic_window", "--backend", "sim"), "--backend 'sim'"),
-        (("dynamic_window", "--goal", "there"), "--goal 'there'"),
+        (("dynamic_window", "--shadow", "x", "--goal", "there"), "--goal 'there'"),
         (("dynamic_window", "--gate", "diferential", "--in", "fast"), "differential"),
         (("dynamic_window", "--lidar", "rplidar_a9", "--in", "fast"), "rplidar_a"),
         (("dynamic_window", "--shadow", "nothing", "--lidar", "rplidar_a2"), "leave out --lidar"),
         (("dynamic_window", "--shadow", "nothing"), "nothing"),
         (("random", "--fallback", "mpi"), "fallback 'mpi': no such planner; did you mean 'mppi'"),
         (("random", "mppi", "--fallback", "mppi"), "fallback 'mppi' is the policy itself"),
-        (("random", "--shadow", "nothing", "--fallback", "mppi"), "leave it out"),
+        (("random", "--shadow", "nothing", "--fallback", "mppi"), "leave out --fallback"),
         (("dynamic_window", "--backend", "dds", "--hardware", "--in", "dds"), "--in"),
         (("dynamic_window", "random", "--backend", "dds", "--hardware"), "one policy at a time"),
     ],

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -105,6 +106,36 @@ def test_a_killed_writer_leaves_one_whole_version(tmp_path):
         content = path.read_bytes()
         assert len(content) == 4_000_000
         assert len(set(content)) == 1
+
+
+def test_where_folders_can_not_be_opened_as_on_windows_a_folder_is_written_all_the_same(
+    old, monkeypatch
+):
+    opened, library, replace = os.open, files.ctypes.CDLL, os.replace
+
+    def open_file(path, *rest, **named):
+        if os.path.isdir(path) and not named:  # with a name it is what removes folders
+            raise PermissionError(13, "Permission denied", str(path))
+        return opened(path, *rest, **named)
+
+    def replace_file(one, other):
+        if os.path.isdir(other):
+            raise PermissionError(13, "Access is denied", str(other))
+        replace(one, other)
+
+    def load(name, **named):
+        if name is None:
+            raise TypeError("argument of type 'NoneType' is not iterable")
+        return library(name, **named)
+
+    monkeypatch.setattr(files, "_POSIX", False)
+    monkeypatch.setattr(files.os, "open", open_file)
+    monkeypatch.setattr(files.os, "replace", replace_file)
+    monkeypatch.setattr(files.ctypes, "CDLL", load)
+    with whole_folder(old, MARKER) as temporary:
+        files.write_text(temporary / MARKER, "new")
+    assert (old / MARKER).read_text() == "new"
+    assert [each.name for each in old.parent.iterdir()] == [old.name]
 
 
 def test_a_finished_folder_takes_the_place_of_the_old_one(old):
@@ -361,3 +392,8 @@ def test_what_is_no_file_to_read_is_one_sentence(listed, name, what):
             file.truncate(MOST_BYTES + 1)
     with pytest.raises(ModelError, match=f"{name}: is (missing, or no file|larger than 256 MB);"):
         check_sums(listed, NAMES)
+
+
+def test_json_has_null_for_numbers_that_are_not_finite():
+    text = files.json_of({"nan": float("nan"), "ends": (-float("inf"), 1.5), "at": Path("a")})
+    assert text == '{"nan": null, "ends": [null, 1.5], "at": "a"}'

@@ -12,7 +12,7 @@ from nics_drl_bridge.commands.console import EXIT_BAD_INPUT
 from nics_drl_bridge.commands.demo import demo
 from nics_drl_bridge.commands.doctor import doctor, explain
 from nics_drl_bridge.commands.evaluate import evaluate
-from nics_drl_bridge.commands.examples import give_examples
+from nics_drl_bridge.commands.examples import complete
 from nics_drl_bridge.commands.listing import list_
 from nics_drl_bridge.commands.model import drive, generate, import_, inspect, record, urdf
 from nics_drl_bridge.commands.policy import policy
@@ -66,7 +66,7 @@ app.add_typer(policy, name="policy")
 app.add_typer(world, name="world")
 for name, extension in extensions.known("commands").items():
     app.add_typer(extension.load(), name=name)
-give_examples(app)
+complete(app)
 
 
 def main() -> None:

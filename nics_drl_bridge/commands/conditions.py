@@ -19,6 +19,7 @@ class Conditions:
     fallback: str = ""  # planner behind the policy, none by default
     steps: int | None = None  # time limit of an episode; None: that of policies, robot and world
     task: Mapping[str, Any] = field(default_factory=dict)  # options, instead of the policy's own
+    kind: str | None = None  # path/to/file.py:ClassName of a policy's task, if it is not shipped
 
     @property
     def ranges(self) -> Randomisation | None:

@@ -1,12 +1,15 @@
 """Shared parts of the commands: options, one-sentence errors, a table, a progress bar."""
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import wraps
 from glob import glob
+from inspect import signature
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from typer import Option
@@ -34,27 +37,15 @@ def completing(kind: str) -> Callable[[str], list[str]]:
     return complete
 
 
-RobotOption = Annotated[
-    str,
-    Option(
-        help="A shipped robot (see nics list robots) or a YAML file.",
-        autocompletion=completing("robots"),
-    ),
-]
-LidarOption = Annotated[
-    str | None,
-    Option(
-        help="A shipped lidar or a YAML file; else the robot's own, or paper.",
-        autocompletion=completing("lidars"),
-    ),
-]
-WorldOption = Annotated[
-    str,
-    Option(
-        "--world", "--scene", help="A shipped world (arena) or a YAML file.",
-        autocompletion=completing("worlds"),
-    ),
-]  # fmt: skip
+RobotOption = Annotated[str, Option(
+    help="A shipped robot (see nics list robots) or a YAML file.",
+    autocompletion=completing("robots"))]  # fmt: skip
+LidarOption = Annotated[str | None, Option(
+    help="A shipped lidar or a YAML file; else the robot's own, or paper.",
+    autocompletion=completing("lidars"))]  # fmt: skip
+WorldOption = Annotated[str, Option(
+    "--world", "--scene", help="A shipped world (arena) or a YAML file.",
+    autocompletion=completing("worlds"))]  # fmt: skip
 JsonOption = Annotated[bool, Option("--json", help="Print one JSON object instead.")]
 TopicsOption = Annotated[Path | None, Option(help="YAML file: a bag's topic for each role.")]
 SalvageOption = Annotated[
@@ -66,22 +57,62 @@ OtherLidarOption = Annotated[
 RandomisationOption = Annotated[
     str | None, Option(help="Drawn in each episode: a shipped one (mild) or a YAML file.")
 ]
-GateOption = Annotated[
-    str | None,
-    Option(
-        metavar="LIMITS",
-        help="Drive through the gate and its shield, with these limits: shipped ones "
-        "(differential) or a YAML file.",
-    ),
+TaskOption = Annotated[
+    str | None, Option(help="path/to/file.py:ClassName, of a policy of a task of your own.")
 ]
-TopicOption = Annotated[
-    list[str] | None,
-    Option(
-        metavar="ROLE=TOPIC",
-        help="Topic of one role, as cmd_vel=/car/drive; may be given several times. Roles: "
-        "cmd_vel, pose, odom, joint_states, imu; none as a topic leaves a role out.",
-    ),
-]
+GateOption = Annotated[str | None, Option(
+    metavar="LIMITS", help="Drive through the gate and its shield, with these limits: shipped ones "
+    "(differential) or a YAML file.")]  # fmt: skip
+TopicOption = Annotated[list[str] | None, Option(
+    metavar="ROLE=TOPIC", help="Topic of one role, as cmd_vel=/car/drive; may be given several "
+    "times. Roles: cmd_vel, pose, odom, joint_states, imu; none as a topic leaves a role out.")
+]  # fmt: skip
+
+
+NEEDED: dict[str, dict[str, tuple[str, ...]]] = {  # options that do nothing without another
+    "evaluate": dict.fromkeys(("start", "namespace", "pose_type", "yes", "arm"), ("hardware",))
+    | {"topic": ("shadow",), "ahead": ("shadow",), "goal": ("hardware", "shadow")},
+    "watch": {"topic": ("bag",), "namespace": ("ros",), "episodes": ("record",)},
+}
+APART: dict[str, dict[str, tuple[str, ...]]] = {  # options that leave others nothing to do
+    "evaluate": {
+        "hardware": ("places", "shadow", "lidar", "randomisation", "gate"),
+        "shadow": ("places", "fallback", "lidar", "randomisation", "gate", "task"),
+    },
+    "watch": {
+        "ros": ("bag", "record", "policy", "lidar", "randomisation", "gate", "task"),
+        "bag": ("policy", "lidar", "randomisation", "gate", "task"),
+    },
+}
+
+
+def checked(command: Callable[..., Any]) -> Callable[..., Any]:
+    """A command that refuses numbers that are not finite, and options that would do nothing."""
+    usual, needed = signature(command).parameters, NEEDED.get(command.__name__, {})
+
+    @wraps(command)
+    def run(**given: Any) -> Any:
+        told = {one: value for one, value in given.items() if value and value != usual[one].default}
+        with one_sentence():
+            for name, value in told.items():
+                for each in value if isinstance(value, tuple | list) else (value,):
+                    if isinstance(each, float) and not math.isfinite(each):
+                        raise ConfigError(f"{_option(name)} {each}: must be a finite number.")
+                others = needed.get(name, ())
+                if others and not told.keys() & others:
+                    fix = f"{' or '.join(map(_option, others))}; add that, or leave it out."
+                    raise ConfigError(f"{_option(name)}: belongs to {fix}")
+                for other in APART.get(command.__name__, {}).get(name, ()):
+                    if other in told:
+                        fix = f"does not go with {_option(name)}; leave out {_option(other)}"
+                        raise ConfigError(f"{_option(other)} {fix}, or {_option(name)}.")
+        return command(**given)
+
+    return run
+
+
+def _option(name: str) -> str:
+    return {"places": "--in", "policy": "a policy"}.get(name, f"--{name.replace('_', '-')}")
 
 
 def roles_of(options: Sequence[str]) -> dict[str, str]:

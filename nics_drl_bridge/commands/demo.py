@@ -13,17 +13,15 @@ from nics_drl_bridge.robot import DEFAULT_ROBOT
 def demo(
     recording: Annotated[Path | None, Option(help="A drive; by default a textbook one.")] = None,
     out: Annotated[Path, Option(help="Folder for everything the demo writes.")] = Path("runs/demo"),
-    robot: Annotated[
-        str | None,
-        Option(help=f"Shipped, or a YAML file; else the recording's own, or {DEFAULT_ROBOT}."),
-    ] = None,
+    robot: Annotated[str | None,
+        Option(help=f"Shipped, or a YAML file; else the recording's own, or {DEFAULT_ROBOT}.")] =
+        None,
     world: WorldOption = "arena",
     episodes: Annotated[int, Option(min=1, help="How many, in process and again over DDS.")] = 5,
-    policy: Annotated[
-        str | None, Option(help="Train none; drive by a policy file, a shipped one or a baseline.")
-    ] = None,
+    policy: Annotated[str | None,
+        Option(help="Train none; drive by a policy file, a shipped one or a baseline.")] = None,
     train_steps: Annotated[int | None, Option(min=1, help="Environment steps to train.")] = None,
-) -> None:
+) -> None:  # fmt: skip
     """Goes the whole road once, from a recording to a report."""
     with one_sentence():
         from nics_drl_bridge.commands.demo_run import DemoPlan, run

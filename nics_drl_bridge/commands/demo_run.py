@@ -16,7 +16,7 @@ from nics_drl_bridge.commands.episodes import DDS, FAST, LABELS, START_S, Say, d
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
-from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, PolicyError
+from nics_drl_bridge.errors import MISSING_ROS, BackendError, PolicyError
 from nics_drl_bridge.files import write_bytes, write_text
 from nics_drl_bridge.generator import SimulatorModel, generate, lidar_of, save_model
 from nics_drl_bridge.identify.conclusion import conclude
@@ -83,13 +83,13 @@ class DemoEpisodes:
     summary: Summary
     here: Sequence[Episode]  # in process
     there: Sequence[Episode]  # over DDS
-    live: Episode  # deployed
+    live: Episode | None  # deployed; None without ROS 2, with which `there` is empty, too
 
 
 def run(plan: DemoPlan, say: Say) -> str:
     """Runs all parts, whose processes have then ended; returns the last line. BridgeError."""
-    if find_spec("rclpy") is None:
-        raise ConfigError(f"the demo {MISSING_ROS.format(module='rclpy')}")
+    if not (topics := find_spec("rclpy") is not None):
+        say(f"in process alone: the world 'dds' {MISSING_ROS.format(module='rclpy')}")
     took: dict[str, float] = {}
 
     def timed(name: str, part: Callable[..., R], *arguments: Any) -> R:
@@ -106,9 +106,10 @@ def run(plan: DemoPlan, say: Say) -> str:
     world, radius, paths = load_world(plan.world), model.robot.footprint_radius, "paths.png"
     write_bytes(plan.out / paths, pictures.trajectories({LABELS[FAST]: here}, world, radius))
     say(f"  the paths are drawn in {plan.out / paths}")  # while the report takes a while
-    there = timed("driving over DDS", _drive, DDS, learned.policy)
+    there = timed("driving over DDS", _drive, DDS, learned.policy) if topics else []
     arrived = (episode.seed for episode in there if episode.result == "success")
-    live = timed("deploying", _deploy, model, learned.policy, next(arrived, 0))
+    given = model, learned.policy, next(arrived, 0)
+    live = timed("deploying", _deploy, *given) if topics else None
     times = [(part, f"{s:.0f}") for part, s in {**took, "all": sum(took.values())}.items()]
     episodes = DemoEpisodes(summary, here, there, live)
     sections = sections_of(plan, model, identified, learned, episodes)
@@ -119,10 +120,8 @@ def run(plan: DemoPlan, say: Say) -> str:
         f"simulator generated from {plan.recording or 'a textbook drive'}."
     )
     write_text(file, html.page("nics_drl_bridge: demo", lead, [*sections, ("Time", [folded])]))
-    return (
-        f"demo: in process {successes(here)}/{plan.episodes}, "
-        f"over DDS {successes(there)}/{plan.episodes}, report {file}"
-    )
+    over = f"over DDS {successes(there)}/{plan.episodes}, " if topics else ""
+    return f"demo: in process {successes(here)}/{plan.episodes}, {over}report {file}"
 
 
 def _recorded(plan: DemoPlan, say: Say) -> tuple[RobotSpec, Recording]:
@@ -296,7 +295,8 @@ def _verdict(
     plan: DemoPlan, learned: Learned, identified: Identified, of: DemoEpisodes
 ) -> Sequence[str]:
     summary, here, there = of.summary, of.here, of.there
-    share, same, arrived = summary.success, successes(there), of.live.result == "success"
+    share, same = summary.success, successes(there)
+    arrived = of.live is not None and of.live.result == "success"
     between = f"95 % confidence: {100 * share.low:.1f} to {100 * share.high:.1f} %"
     tiles = [
         fit_tile(identified),
@@ -313,6 +313,7 @@ def _verdict(
         ("arrived" if arrived else "did not arrive", "deployed, in real time", arrived),
     ]
     conclusion = conclude(identified)
+    tiles = tiles if of.live else tiles[:2]
     if conclusion.ready:
         more = "drive more episodes, or take a recording of your own robot"
         next_step = more if share.value >= GOOD else "train for longer, by --train-steps"
@@ -346,6 +347,11 @@ def _policy(plan: DemoPlan, learned: Learned, summary: Summary) -> list[str]:
 def _episodes(plan: DemoPlan, model: SimulatorModel, of: DemoEpisodes) -> list[str]:
     here, there, live = of.here, of.there, of.live
     both, each = (LABELS[FAST], LABELS[DDS]), ("steps", "path [m]")
+    world, radius = load_world(plan.world), model.robot.footprint_radius
+    if live is None:
+        text = f"{successes(here)} of {len(here)} episodes reached the goal in process."
+        shown = [(pictures.trajectories({both[0]: [a]}, world, radius), "") for a in here[:PANELS]]
+        return [html.paragraph(text), html.gallery(shown)]
     rows = [
         (
             f"{a.seed}", a.result, f"{a.steps}", f"{a.length:.2f}",
@@ -353,7 +359,6 @@ def _episodes(plan: DemoPlan, model: SimulatorModel, of: DemoEpisodes) -> list[s
         )
         for a, b in zip(here, there, strict=True)
     ]  # fmt: skip
-    world, radius = load_world(plan.world), model.robot.footprint_radius
     drawn = []
     for a, b in list(zip(here, there, strict=True))[:PANELS]:
         runs = {both[0]: [a], both[1]: [b]}

@@ -1,6 +1,5 @@
 """`nics doctor` and `nics explain`: what is wrong with a robot, and why its gate stopped it."""
 
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -16,6 +15,7 @@ from nics_drl_bridge.commands.console import (
     table,
 )
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.files import json_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 EXIT_FINDINGS = 1
@@ -23,18 +23,16 @@ EXIT_FINDINGS = 1
 
 def doctor(
     bag: Annotated[Path | None, Argument(help="A bag to look at; else the live robot.")] = None,
-    model: Annotated[
-        str | None,
-        Option(help=f"What it must fit: a model's folder, or a shipped robot ({DEFAULT_ROBOT})."),
-    ] = None,
+    model: Annotated[str | None,
+        Option(help=f"What it must fit: a model's folder, or a shipped robot ({DEFAULT_ROBOT}).")] =
+        None,
     policy: Annotated[str | None, Option(help="What it must fit instead: a policy file.")] = None,
     namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
     duration: Annotated[float, Option(min=1.0, help="How long to listen to a robot [s].")] = 5.0,
-    install: Annotated[
-        bool, Option("--install", help="Look at this machine instead: what works here.")
-    ] = False,
+    install: Annotated[bool, Option("--install",
+        help="Look at this machine instead: what works here.")] = False,
     as_json: JsonOption = False,
-) -> None:
+) -> None:  # fmt: skip
     """Tells what of a robot or a bag does not fit; it sends nothing."""
     with one_sentence():
         if install:
@@ -62,7 +60,7 @@ def doctor(
         findings = examine(facts, expected)
         if as_json:
             plain = {"source": facts.source, "findings": [asdict(each) for each in findings]}
-            typer.echo(json.dumps(plain))
+            typer.echo(json_of(plain))
         elif findings:
             heads = ("", "check", "where", "what does not fit", "what to do")
             rows = [(f.severity, f.check, f.where, f.what, f.fix) for f in findings]
@@ -78,7 +76,7 @@ def _tell_installation(as_json: bool) -> None:
 
     found = checks()
     if as_json:
-        typer.echo(json.dumps({"checks": [each._asdict() for each in found]}))
+        typer.echo(json_of({"checks": [each._asdict() for each in found]}))
         return
     heads = ("", "part", "what there is", "what to do")
     rows = [("+" if c.works else "-", c.part, c.found, "" if c.works else c.fix) for c in found]
@@ -88,14 +86,14 @@ def _tell_installation(as_json: bool) -> None:
 def explain(
     file: Annotated[Path, Argument(help="What command_gate wrote at a stop, *.jsonl.")],
     as_json: JsonOption = False,
-) -> None:
+) -> None:  # fmt: skip
     """Tells why command_gate stopped a robot, from what it wrote down."""
     with one_sentence():
         from nics_drl_bridge.gate import black_box
 
         again = black_box.replay(file)
         if as_json:
-            typer.echo(json.dumps({"story": list(again.story), "differing": again.differing}))
+            typer.echo(json_of({"story": list(again.story), "differing": again.differing}))
         else:
             typer.echo("\n".join(again.story))
         if again.differing:

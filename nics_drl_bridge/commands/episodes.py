@@ -1,10 +1,10 @@
 """The same episodes in process, over DDS, in MuJoCo, and on the vehicle, compared as in Fig. 7."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from importlib import import_module
 from importlib.util import find_spec
 from math import isnan
 from pathlib import Path
@@ -18,7 +18,7 @@ from nics_drl_bridge.config import shipped_names
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.env.sim_backend import make_backend
 from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, nearest
-from nics_drl_bridge.files import write_bytes, write_text
+from nics_drl_bridge.files import json_of, write_bytes, write_text
 from nics_drl_bridge.gate.gated_backend import GatedBackend
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.policy import evaluation
@@ -31,6 +31,7 @@ from nics_drl_bridge.report.doctor import examine
 from nics_drl_bridge.report.doctor_facts import expected_of
 from nics_drl_bridge.report.pictures import trajectories
 from nics_drl_bridge.robot import DEFAULT_ROBOT
+from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim.scenes import Scene, sample_scene
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
@@ -58,8 +59,8 @@ def drive_in(
     conditions: Conditions = NO_CONDITIONS,
 ) -> list[Episode]:  # fmt: skip
     """Drives episodes in one of `PLACES`, whose node, if any, has then ended. BridgeError."""
-    check_place(place)
     model, drawn = open_model(name), conditions.ranges
+    check_place(place, model.robot)
     if place == FAST:
         given = {"estimator": True, "randomisation": drawn}
         env, opened = env_of(policy, model, world, "sim", conditions, **given)
@@ -92,7 +93,7 @@ def env_of(
 ) -> tuple[gymnasium.Env[Any, Any], Policy]:  # fmt: skip
     """Makes the env of a policy's task with a backend, behind a gate if any; opens the policy."""
     register_envs()
-    opened, task = open_policy(policy, model, conditions.fallback)
+    opened, task = open_policy(policy, model, conditions.fallback, conditions.kind)
     task = replace(task, **conditions.task)
     field = load_worlds(world) if isinstance(world, str) else world
     given = {name: value for name, value in options.items() if value is not None}
@@ -104,14 +105,18 @@ def env_of(
     return gymnasium.make(NAVIGATION, max_episode_steps=limit, **given), opened
 
 
-def check_place(place: str) -> None:
-    """Raises ConfigError if there is no such place, or what it needs is not installed."""
+def check_place(place: str, robot: RobotSpec) -> None:
+    """Raises ConfigError if there is no such place, or it lacks a module or can't have a robot."""
     if place not in PLACES:
         raise ConfigError(f"--in {place!r}: there is no such world; {nearest(place, PLACES)}")
-    if place != FAST and find_spec("rclpy") is None:
+    if place == FAST:
+        return
+    robot.require_cmd_vel()
+    if find_spec("rclpy") is None:
         raise ConfigError(f"the world {place!r} {MISSING_ROS.format(module='rclpy')}")
     if place == MUJOCO:
         extensions.load("nodes", NODES[MUJOCO])
+        import_module(extensions.known("nodes")[NODES[MUJOCO]].module).check(robot)
 
 
 def robot_of(policy: str, contract: Contract) -> str:
@@ -147,7 +152,7 @@ class EvaluationOrder:
     world: str = "circles"  # YAML file or name of the world
     episodes: int = 20
     seed: int = evaluation.FIRST_SEED
-    places: Sequence[str] = PLACES  # some of `PLACES`; the others are compared with the first
+    places: Sequence[str] = ()  # some of `PLACES`, compared with the first; none: all that work
     conditions: Conditions = NO_CONDITIONS
 
     @property
@@ -176,7 +181,7 @@ def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
     model, name = order.conditions.model(model_name(order.model, contracts), order.out)
     world = load_worlds(order.world)
     under = limited(order.conditions, contracts, model, world, say)
-    places, evaluated = _places(order, model, say), []
+    places, evaluated = _places(order, model.robot, say), []
     for policy in order.policies:
         runs = {}
         for place in places:
@@ -207,19 +212,19 @@ def limited(
     return replace(conditions, steps=steps)
 
 
-def _places(order: EvaluationOrder, model: SimulatorModel, say: Say) -> Sequence[str]:
-    """Returns the places of an order: of all, those where the robot can be driven."""
-    try:
-        model.robot.require_cmd_vel()
-    except ConfigError as error:
-        if tuple(order.places) == PLACES:
-            say(f"in process alone: {error}")
-            return (FAST,)
-        if set(order.places) != {FAST}:
-            raise
-    for place in order.places:
-        check_place(place)
-    return order.places
+def _places(order: EvaluationOrder, robot: RobotSpec, say: Say) -> Sequence[str]:
+    """Returns the places of an order; without any those that work here, and why no more do."""
+    found = list[str]()
+    for place in order.places or PLACES:  # whatever one of `PLACES` lacks, the next lacks, too
+        try:
+            check_place(place, robot)
+        except ConfigError as error:
+            if order.places:
+                raise
+            say(f"{' and '.join(LABELS[each] for each in found)} alone: {error}")
+            break
+        found.append(place)
+    return found
 
 
 def judged(
@@ -262,7 +267,7 @@ def write_evaluation(
         "world": order.world, "seed": order.seed, "conditions": asdict(order.conditions),
         "policies": policies,
     }  # fmt: skip
-    write_text(order.out / EVALUATION, json.dumps(data) + "\n")
+    write_text(order.out / EVALUATION, json_of(data) + "\n")
 
 
 def rows_of(evaluated: Sequence[Evaluated]) -> list[tuple[str, ...]]:
@@ -310,7 +315,7 @@ def drive_vehicle(
     model, world = open_model(name), load_worlds(order.world)
     under = limited(order.conditions, contracts, model, world, say)
     # A misfit is an error before anything moves.
-    open_policy(policy, model, order.conditions.fallback)
+    open_policy(policy, model, order.conditions.fallback, order.conditions.kind)
     from nics_drl_bridge.nodes.listen import listen
 
     say(f"listening to the vehicle for {LISTEN_S:g} s, as nics doctor does")
@@ -334,10 +339,14 @@ def drive_vehicle(
             episodes.append(replace(driven, path=driven.estimate))
             say(f"  {driven.result}, {driven.steps} steps, {episodes[-1].length:.2f} m")
     env, driver = env_of(policy, model, order.world, "sim", under, estimator=True)
+    runs: dict[str, list[Episode]] = {VEHICLE: episodes}
+    starts = [(one.seed, {"start": one.path[0], "goal": one.goal}) for one in episodes]
     with closing(env):
-        starts = [(one.seed, {"start": one.path[0], "goal": one.goal}) for one in episodes]
-        again = [drive(env, driver, *each) for each in starts]
-    made = judged(policy, {VEHICLE: episodes, FAST: again}, model, world, order.out)
+        try:
+            runs[FAST] = [drive(env, driver, *each) for each in starts]
+        except ConfigError as error:  # by its map the vehicle may have stood in a wall
+            say(f"  not driven again in process: {error}")
+    made = judged(policy, runs, model, world, order.out)
     write_evaluation(replace(order, conditions=under), name, model, [made])
     return made
 

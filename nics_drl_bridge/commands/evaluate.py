@@ -1,9 +1,8 @@
 """`nics evaluate`: in simulators, on a vehicle, or against what was driven in a bag."""
 
-import json
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from typer import Argument, Option
@@ -13,6 +12,7 @@ from nics_drl_bridge.commands.console import (
     JsonOption,
     OtherLidarOption,
     RandomisationOption,
+    TaskOption,
     completing,
     needs_ros,
     one_sentence,
@@ -21,6 +21,7 @@ from nics_drl_bridge.commands.console import (
     table,
 )
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.files import check_above, json_of, write_bytes, write_text
 
 
 def evaluate(
@@ -30,11 +31,12 @@ def evaluate(
     model: Annotated[str | None, Option(
         "--model", "--robot", help="A model's folder, or a shipped robot; else the policy's own.",
         autocompletion=completing("robots"))] = None,
+    task: TaskOption = None,
     world: Annotated[str, Option(
         "--world", "--scene", help="A shipped world (circles) or a YAML file.",
         autocompletion=completing("worlds"))] = "circles",
     places: Annotated[list[str] | None, Option(
-        "--in", help="fast, dds or mujoco_dds; several times; all by default.")] = None,
+        "--in", help="fast, dds or mujoco_dds; several times; else all that work here.")] = None,
     episodes: Annotated[int | None, Option(min=1, help="How many; 20, or 1 on a vehicle.")] = None,
     seed: Annotated[int, Option(min=0, help="Of the first episode.")] = 1_000_000,
     lidar: OtherLidarOption = None,
@@ -69,23 +71,19 @@ def evaluate(
         if hardware != (backend == "dds"):
             reason = "belong together; the fast simulator over DDS is --in dds."
             raise ConfigError(f"--hardware and --backend dds {reason}")
-        if hardware and (shadow is not None or places):
-            raise ConfigError("--hardware drives a vehicle: leave out --in and --shadow.")
-        given = {"lidar": lidar, "randomisation": randomisation, "gate": gate}
-        _check(given, fallback, hardware, shadow is not None)
+        check_above(out / "evaluation.json")
         if hardware and len(policies) > 1:
             raise ConfigError(f"--hardware drives one policy at a time, not {', '.join(policies)}.")
         if shadow is not None:
-            _shadow(shadow, policies, model, topic or [], place, ahead, out)
+            _shadow(shadow, policies, model, topic or [], place, ahead, out, as_json)
             return
         from nics_drl_bridge.commands import episodes as driving
         from nics_drl_bridge.commands.conditions import Conditions
 
-        chosen = {"places": tuple(dict.fromkeys(places))} if places else {}
         count, tell = episodes or (1 if hardware else 20), partial(typer.echo, err=True)
-        under = Conditions(lidar, randomisation, gate, fallback)
+        under = Conditions(lidar, randomisation, gate, fallback, kind=task)
         order = driving.EvaluationOrder(
-            policies, out, model, world, count, seed, **chosen, conditions=under
+            policies, out, model, world, count, seed, tuple(dict.fromkeys(places or ())), under
         )
         if hardware:
             options = {"start": start, "namespace": namespace, "pose_type": pose_type}
@@ -102,17 +100,6 @@ def evaluate(
         for one in evaluated:
             typer.echo(driving.line_of(one))
         typer.echo(f"pictures and evaluation.json: {out}")
-
-
-def _check(given: dict[str, str | None], fallback: str, hardware: bool, shadow: bool) -> None:
-    """Raises ConfigError for conditions of a simulator where none drives."""
-    named = [f"--{name}" for name, value in given.items() if value is not None]
-    if named and (hardware or shadow):
-        where = "a vehicle has its own" if hardware else "a bag was recorded under its own"
-        raise ConfigError(f"{', '.join(named)}: {where}; leave out {', '.join(named)}.")
-    if fallback and shadow:
-        reason = "is driven, and --shadow compares the policy alone; leave it out"
-        raise ConfigError(f"--fallback {fallback}: {reason}.")
 
 
 def _ask(yes: bool, question: str) -> None:
@@ -135,15 +122,14 @@ def _point(text: str | None) -> tuple[float, float] | None:
 
 def _shadow(
     bag: Path, policies: list[str], model: str | None, topics: list[str],
-    goal: tuple[float, float] | None, ahead: float, out: Path,
+    goal: tuple[float, float] | None, ahead: float, out: Path, as_json: bool,
 ) -> None:  # fmt: skip
     from nics_drl_bridge.commands.episodes import contracts_of, model_name
-    from nics_drl_bridge.files import write_bytes, write_text
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.policy.shadow import PERCENTILES, shadow
     from nics_drl_bridge.report.pictures import shadow_picture
 
-    rows, lines = list[tuple[str, ...]](), list[str]()
+    rows, lines, told = list[tuple[str, ...]](), list[str](), list[dict[str, Any]]()
     for policy in policies:
         name = model_name(model, contracts_of([policy], model))
         made = shadow(bag, open_model(name), policy, roles_of(topics), goal, ahead)
@@ -154,7 +140,8 @@ def _shadow(
             "ahead_s": None if goal else ahead, "compared": len(made.time),
             "skipped": dict(made.skipped), "commands": differences,
         }  # fmt: skip
-        write_text(place.with_suffix(".json"), json.dumps(data) + "\n")
+        write_text(place.with_suffix(".json"), json_of(data) + "\n")
+        told.append(data)
         for (command, figures), unit in zip(differences.items(), made.units, strict=True):
             *amounts, opposite = figures.values()
             cells = (f"{value:.3g}" for value in amounts)
@@ -163,6 +150,9 @@ def _shadow(
         left_out = ", ".join(f"{count} {why}" for why, count in made.skipped.items() if count)
         anew = f"; its state began anew after {made.resets} gaps" if made.resets else ""
         lines.append(f"{compared}; left out: {left_out or 'none'}{anew}")
+    if as_json:
+        typer.echo(json_of({"policies": told}))
+        return
     heads = (
         "policy", "command", "unit", "mean", "mean size", *(f"{q} %" for q in PERCENTILES),
         "greatest", "opposite sign",

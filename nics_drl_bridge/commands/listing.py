@@ -1,6 +1,5 @@
 """`nics list`: what comes with the package, by the names that commands take."""
 
-import json
 from collections.abc import Callable
 from enum import Enum
 from typing import Annotated, Any
@@ -10,6 +9,7 @@ from typer import Argument
 
 from nics_drl_bridge.commands.console import JsonOption, one_sentence, table
 from nics_drl_bridge.config import shipped_names
+from nics_drl_bridge.files import json_of
 
 Row = dict[str, Any]
 
@@ -30,7 +30,7 @@ def list_(
     with one_sentence():
         rows = ROWS[what]()
         if as_json:
-            typer.echo(json.dumps({what.value: rows}))
+            typer.echo(json_of({what.value: rows}))
         else:
             cells = [tuple(map(str, row.values())) for row in rows]
             typer.echo(table(tuple(rows[0]), cells))

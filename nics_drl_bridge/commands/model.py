@@ -1,6 +1,5 @@
 """`nics record`, `inspect`, `import`, `generate` and `urdf`: from a robot to its model."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from nics_drl_bridge.commands.console import (
     one_sentence,
 )
 from nics_drl_bridge.errors import BackendError, ConfigError
+from nics_drl_bridge.files import json_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def record(
     use_sim_time: Annotated[bool, Option("--use-sim-time", help="Take time from /clock.")] = False,
     preview: Annotated[bool, Option("--preview", help="Show the drive's plan, and stop.")] = False,
     yes: Annotated[bool, Option("--yes", help="Do not ask before the robot moves.")] = False,
-) -> None:
+) -> None:  # fmt: skip
     """Drives a robot so that it shows its whole motion; records it."""
     with one_sentence():
         arguments = node_arguments(namespace, remap or ())
@@ -114,11 +114,10 @@ def drive_summary(recording: Any, given: dict[str, Any]) -> tuple[str, ...]:
 
 def inspect(
     source: Annotated[Path, Argument(help="A bag, a table, or a folder of tables.")],
-    mapping: Annotated[
-        Path | None, Option("--map", help="YAML file to begin: a first mapping, with guesses.")
-    ] = None,
+    mapping: Annotated[Path | None, Option("--map",
+        help="YAML file to begin: a first mapping, with guesses.")] = None,
     as_json: console.JsonOption = False,
-) -> None:
+) -> None:  # fmt: skip
     """Lists what a recording of any form holds and begins its mapping."""
     with one_sentence():
         from nics_drl_bridge.files import write_text
@@ -131,7 +130,7 @@ def inspect(
         with open_source(source) as opened, console.progress_bar(f"reading {source}"):
             tables = survey(opened)
         if as_json:
-            typer.echo(json.dumps({"tables": [asdict(table) for table in tables]}, default=str))
+            typer.echo(json_of({"tables": [asdict(table) for table in tables]}))
             return
         for table in tables:
             found = "".join(f"\n  {finding}" for finding in table.regularity + table.findings)
@@ -155,7 +154,7 @@ def import_(
     mapping: Annotated[Path, Option("--map", help="YAML: what is what, docs/recordings.md.")],
     out: Annotated[Path, Option(help="The .npz file to write.")],
     as_json: console.JsonOption = False,
-) -> None:
+) -> None:  # fmt: skip
     """Keeps a recording of any form as an .npz, read by its mapping."""
     with one_sentence():
         from nics_drl_bridge.recording.readers import read_recording
@@ -171,7 +170,7 @@ def import_(
         streams = stream_facts(drive)
         if as_json:
             told = {"recording": str(out), "streams": streams, "repairs": drive.repairs}
-            typer.echo(json.dumps(told | {"robot": drive.robot}))
+            typer.echo(json_of(told | {"robot": drive.robot}))
             return
         rows = [
             (
@@ -200,34 +199,28 @@ def stream_facts(drive: "Recording") -> list[dict[str, Any]]:
 def generate(
     recording: Annotated[Path, Argument(help="A bag, an .npz recording, or tables with a --map.")],
     out: Annotated[Path, Option(help="Folder of the model to write.")],
-    robot: Annotated[
-        str | None,
-        Option(help=f"Shipped, or a YAML file; else the recording's own, or {DEFAULT_ROBOT}."),
-    ] = None,
-    mapping: Annotated[
-        Path | None,
-        Option("--map", help="YAML: what is what in the recording, docs/recordings.md."),
-    ] = None,
+    robot: Annotated[str | None,
+        Option(help=f"Shipped, or a YAML file; else the recording's own, or {DEFAULT_ROBOT}.")] =
+        None,
+    mapping: Annotated[Path | None, Option("--map",
+        help="YAML: what is what in the recording, docs/recordings.md.")] = None,
     topics: console.TopicsOption = None,
     topic: console.TopicOption = None,
     world: console.WorldOption = "arena",
     lidar: LidarOption = None,
-    sensor: Annotated[
-        list[Path] | None, Option(help="YAML of a further sensor, docs/sensors.md; repeatable.")
-    ] = None,
+    sensor: Annotated[list[Path] | None,
+        Option(help="YAML of a further sensor, docs/sensors.md; repeatable.")] = None,
     order: Annotated[str, Option(help="Order of the Taylor model, 1 to 4, or auto.")] = "auto",
     alpha: Annotated[str, Option(help="Pruning of Eq. 2, 0 to 1, or auto for the knee.")] = "auto",
-    assume_textbook: Annotated[
-        bool, Option(help="Fill in from the textbook what the drive did not show.")
-    ] = False,
+    assume_textbook: Annotated[bool,
+        Option(help="Fill in from the textbook what the drive did not show.")] = False,
     strict: Annotated[bool, Option(help="Refuse if an input was not moved on its own.")] = False,
     salvage: console.SalvageOption = False,
-    anyway: Annotated[
-        bool, Option("--anyway", help="Write it even if predictions of unseen data are of no use.")
-    ] = False,
+    anyway: Annotated[bool, Option("--anyway",
+        help="Write it even if predictions of unseen data are of no use.")] = False,
     pictures: Annotated[bool, Option(help="Draw the fit into the model's pictures/.")] = False,
     as_json: console.JsonOption = False,
-) -> None:
+) -> None:  # fmt: skip
     """Generates a simulator from a recording, and writes its folder."""
     with one_sentence():
         from nics_drl_bridge.generator import check_place, lidar_of, save_model
@@ -264,7 +257,7 @@ def generate(
             if pictures:
                 write_pictures(spec, identified, out / "pictures")
         if as_json:
-            typer.echo(json.dumps(fit_facts(out, spec.name, identified)))
+            typer.echo(json_of(fit_facts(out, spec.name, identified)))
             return
         typer.echo(opening(model.report))
         typer.echo(f"\nall figures: {out / 'report.txt'}, with pictures: {out / 'report.html'}")
@@ -272,15 +265,14 @@ def generate(
 
 
 def fit_facts(out: Path, robot: str, identified: "Identified") -> dict[str, Any]:
-    """Returns the conclusion, equations and errors of a fit; null for what is not finite."""
+    """Returns the conclusion, equations and errors of a fit."""
     from nics_drl_bridge.identify.conclusion import conclude
     from nics_drl_bridge.identify.report import equations_with_errors
 
-    errors = json.dumps([asdict(each) for each in identified.judgement])
     return {
         "model": str(out), "robot": robot, **conclude(identified)._asdict(),
         "equations": equations_with_errors(identified.model),
-        "errors": json.loads(errors, parse_constant=lambda _: None),
+        "errors": [asdict(each) for each in identified.judgement],
         "report": str(out / "report.txt"), "page": str(out / "report.html"),
     }  # fmt: skip
 
@@ -288,13 +280,12 @@ def fit_facts(out: Path, robot: str, identified: "Identified") -> dict[str, Any]
 def drive(
     out: Annotated[Path, Option(help="Folder of the model to write.")],
     robot: RobotOption = DEFAULT_ROBOT,
-    recording: Annotated[
-        Path | None, Option(help="An .npz to keep the drive in, as one of a real robot.")
-    ] = None,
+    recording: Annotated[Path | None,
+        Option(help="An .npz to keep the drive in, as one of a real robot.")] = None,
     lidar: LidarOption = None,
     duration: Annotated[float, Option(min=5.0, max=3600.0, help="Of the drive [s].")] = 60.0,
     seed: Annotated[int, Option(min=0, help="Of the commands, which are random.")] = 0,
-) -> None:
+) -> None:  # fmt: skip
     """Drives a robot's textbook model and generates a simulator of it.
 
     For training before there is a recording; with one, `nics generate` makes a truer simulator.

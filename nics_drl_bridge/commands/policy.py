@@ -1,6 +1,5 @@
 """`nics policy`."""
 
-import json
 import math
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,7 +9,7 @@ from typer import Argument, Option
 
 from nics_drl_bridge.commands.console import JsonOption, one_sentence
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.files import write_bytes
+from nics_drl_bridge.files import json_of, write_bytes
 
 policy = typer.Typer(help="Policy files.", no_args_is_help=True)
 
@@ -22,11 +21,10 @@ def _group() -> None:
 
 @policy.command()
 def info(
-    file: Annotated[
-        str, Argument(help="A policy file, the name of a shipped one, or a foreign one's mapping.")
-    ],
+    file: Annotated[str,
+        Argument(help="A policy file, the name of a shipped one, or a foreign one's mapping.")],
     as_json: JsonOption = False,
-) -> None:
+) -> None:  # fmt: skip
     """Checks a policy file and tells what it was trained on and needs."""
     with one_sentence():
         from nics_drl_bridge.policy.foreign import load_any
@@ -34,14 +32,14 @@ def info(
 
         facts = summary(load_any(file))
         lines = (f"{name:<18} {value}" for name, value in _lines(facts))
-        typer.echo(json.dumps(facts) if as_json else "\n".join(lines))
+        typer.echo(json_of(facts) if as_json else "\n".join(lines))
 
 
 @policy.command()
 def export(
     file: Annotated[str, Argument(help="A policy file, or the name of a shipped one.")],
     leapp: Annotated[Path, Option(help="Folder of the bundle: network, YAML file, start values.")],
-) -> None:
+) -> None:  # fmt: skip
     """Writes a policy file in a format of others: Isaac's LEAPP."""
     with one_sentence():
         from nics_drl_bridge.policy.foreign import load_any
@@ -52,14 +50,12 @@ def export(
 
 @policy.command(name="import")
 def import_(
-    source: Annotated[
-        Path, Argument(help="A LEAPP bundle, or the mapping (YAML) of a foreign policy.")
-    ],
+    source: Annotated[Path,
+        Argument(help="A LEAPP bundle, or the mapping (YAML) of a foreign policy.")],
     out: Annotated[Path, Option("--out", "-o", help="The policy file to write (*.onnx).")],
-    robot: Annotated[
-        str | None, Option("--robot", "--model", help="A shipped robot, or the folder of a model.")
-    ] = None,
-) -> None:
+    robot: Annotated[str | None, Option("--robot", "--model",
+        help="A shipped robot, or the folder of a model.")] = None,
+) -> None:  # fmt: skip
     """Makes a policy file of somebody else's policy."""
     with one_sentence():
         from nics_drl_bridge.generator import open_model

@@ -18,6 +18,12 @@ def main() -> None:
             raise
         sys.stderr.write(f"nics: {clause}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
+    except RuntimeError as error:
+        if "no locator available" not in str(error):  # numba's, as kernels are imported
+            raise
+        reason = "neither the package's folder nor your home can be written to, to keep kernels in"
+        sys.stderr.write(f"nics: {reason}; set NUMBA_CACHE_DIR to a folder that can.\n")
+        raise SystemExit(EXIT_BAD_INPUT) from None
     except KeyboardInterrupt:  # before a command has begun
         sys.stderr.write("nics: interrupted; nothing was started.\n")
         raise SystemExit(EXIT_INTERRUPTED) from None

@@ -1,6 +1,5 @@
 """`nics train`."""
 
-import json
 import math
 import shlex
 import sys
@@ -17,6 +16,7 @@ from typer import Argument, Option
 from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.console import JsonOption, completing, one_sentence, progress_bar
 from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.files import json_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 OWN = ("lean", "sb3")  # the engines of PPO in this process, see `training_settings.Engine`
@@ -25,49 +25,32 @@ OWN = ("lean", "sb3")  # the engines of PPO in this process, see `training_setti
 def train(
     more_seeds: Annotated[list[int] | None, Argument(hidden=True)] = None,
     task: Annotated[str, Option(help="A task, or path/to/file.py:ClassName.")] = "navigation",
-    robot: Annotated[
-        str | None,
-        Option(
-            help=f"A shipped robot ({DEFAULT_ROBOT}), a YAML file, or the folder of a model.",
-            autocompletion=completing("robots"),
-        ),
-    ] = None,
-    settings: Annotated[
-        str | None,
-        Option(
-            help="Shipped settings (navigation_differential), or a YAML file; else those of the "
-            "robot, or of the shipped robot that moves like it.",
-            autocompletion=completing("training"),
-        ),
-    ] = None,
-    world: Annotated[
-        list[str] | None,
-        Option(
-            help="Train in this world only; several times: in all of them.",
-            autocompletion=completing("worlds"),
-        ),
-    ] = None,
+    robot: Annotated[str | None,
+        Option(help=f"A shipped robot ({DEFAULT_ROBOT}), a YAML file, or the folder of a model.",
+        autocompletion=completing("robots"))] = None,
+    settings: Annotated[str | None,
+        Option(help="Shipped settings (navigation_differential), or a YAML file; else those of the "
+        "robot, or of the shipped robot that moves like it.",
+        autocompletion=completing("training"))] = None,
+    world: Annotated[list[str] | None,
+        Option(help="Train in this world only; several times: in all of them.",
+        autocompletion=completing("worlds"))] = None,
     algorithm: Annotated[str | None, Option(help="ppo or sac.")] = None,
     seeds: Annotated[list[int] | None, Option(help="One or more, as --seeds 0 1 2.")] = None,
     steps: Annotated[int | None, Option(min=1, help="Environment steps.")] = None,
     episodes: Annotated[int, Option(min=1, help="Of the evaluation, in each world.")] = 500,
     out: Annotated[Path | None, Option(help="Folder of the run.")] = None,
     resume: Annotated[bool, Option(help="Go on where --out was interrupted.")] = False,
-    engine: Annotated[
-        str | None,
-        Option(help="lean or sb3 (Stable-Baselines3), in this process; ray (RLlib), a cluster."),
-    ] = None,
-    address: Annotated[
-        str | None, Option(help="Ray cluster: auto (this machine's), HOST:PORT; else started here.")
-    ] = None,
-    env_runners: Annotated[
-        int | None, Option(min=1, help="Ray processes that share the worlds; default: one per CPU.")
-    ] = None,
+    engine: Annotated[str | None,
+        Option(help="lean or sb3 (Stable-Baselines3), in this process; ray: a cluster.")] = None,
+    address: Annotated[str | None,
+        Option(help="Ray cluster: auto (this machine's), HOST:PORT; else started here.")] = None,
+    env_runners: Annotated[int | None, Option(min=1,
+        help="Ray processes that share the worlds; default: one per CPU.")] = None,
     as_json: JsonOption = False,
-    watch: Annotated[
-        bool, Option("--watch", help="Show some of the worlds on a page, as nics watch does.")
-    ] = False,
-) -> None:
+    watch: Annotated[bool, Option("--watch",
+        help="Show some of the worlds on a page, as nics watch does.")] = False,
+) -> None:  # fmt: skip
     """Trains policies in the fast simulator, and evaluates them."""
     with one_sentence():
         given = {"robot": robot, "algorithm": algorithm, "steps": steps, "world": world}
@@ -183,6 +166,6 @@ def _run(
         results = train_run.run(order, told, done, learn, evaluating)
     folder = order.out
     if as_json:
-        typer.echo(json.dumps({"out": str(folder), "seeds": list(map(_plain, results))}))
+        typer.echo(json_of({"out": str(folder), "seeds": list(map(_plain, results))}))
         return
     typer.echo(f"policy files, checkpoints and logs: {folder}; tensorboard --logdir {folder}")

@@ -1,15 +1,15 @@
 """`nics warmup`: compiles the kernels ahead, on two cores."""
 
-import json
+import signal
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from typing import Any
 
 import typer
 
 from nics_drl_bridge.commands.console import JsonOption, one_sentence, progress_bar
+from nics_drl_bridge.files import json_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 WORLD = "arena"
@@ -23,15 +23,15 @@ def warmup(as_json: JsonOption = False) -> None:
         # Fresh processes: what a fork shares with its parent's threads may be locked for ever.
         with (
             progress_bar("compiling"),
-            ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool,
+            get_context("spawn").Pool(2, signal.signal, (signal.SIGINT, signal.SIG_IGN)) as pool,
         ):
-            *first, model = pool.submit(_compiled_by, _model).result()
-            others = [pool.submit(_compiled_by, part, model) for part in (_simulate, _drive)]
-            done = [first, *(each.result()[:2] for each in others)]
+            *first, model = pool.apply(_compiled_by, (_model,))
+            others = [pool.apply_async(_compiled_by, (part, model)) for part in (_simulate, _drive)]
+            done = [first, *(each.get()[:2] for each in others)]
         count, cpu_s = sum(each[0] for each in done), sum(each[1] for each in done)
         took = time.monotonic() - begin
         if as_json:
-            typer.echo(json.dumps({"kernels": count, "cpu_s": cpu_s, "seconds": took}))
+            typer.echo(json_of({"kernels": count, "cpu_s": cpu_s, "seconds": took}))
         else:
             typer.echo(f"compiled {count} kernels in {took:.0f} s ({cpu_s:.0f} s of CPU)", err=True)
 

@@ -13,6 +13,7 @@ from nics_drl_bridge.commands.console import (
     GateOption,
     OtherLidarOption,
     RandomisationOption,
+    TaskOption,
     needs_ros,
     one_sentence,
     roles_of,
@@ -35,6 +36,7 @@ def watch(
     lidar: OtherLidarOption = None,
     randomisation: RandomisationOption = None,
     gate: GateOption = None,
+    task: TaskOption = None,
     ros: Annotated[bool, Option("--ros", help="Show live topics instead.")] = False,
     namespace: Annotated[str, Option(help="For --ros: of the robot's topics.")] = "",
     bag: Annotated[Path | None, Option(help="Show a recorded drive instead.")] = None,
@@ -50,7 +52,13 @@ def watch(
     """Shows a policy, live topics or a bag on a page in the browser."""
     with one_sentence():
         given = {"lidar": lidar, "randomisation": randomisation, "gate": gate}
-        _check(given, ros, bag, record, policy)
+        given["task"] = task
+        if record is None:  # before the source is opened, which may take a while
+            extensions.require("the page", "websockets")
+        else:
+            from nics_drl_bridge.watch.record import check_file
+
+            check_file(record)
         if bag is not None:
             source: Any = _bag(bag, model, world, roles_of(topic or []))
         elif ros:
@@ -64,28 +72,6 @@ def watch(
                 _serve(source, port, browser)
 
 
-def _check(
-    given: dict[str, str | None], ros: bool, bag: Path | None, record: Path | None,
-    policy: str | None,
-) -> None:  # fmt: skip
-    """Raises ConfigError for options that do not go together."""
-    if ros and bag is not None:
-        raise ConfigError("--ros shows live topics, --bag recorded ones; leave one of them out.")
-    named = [f"--{name}" for name, value in given.items() if value is not None]
-    named += [repr(policy)] if policy is not None else []
-    if named and (ros or bag is not None):
-        where = "--ros" if ros else "--bag"
-        raise ConfigError(f"{', '.join(named)}: {where} shows what others drive; leave it out.")
-    if ros and record is not None:
-        raise ConfigError("--record: live topics are recorded by nics bag record; show that bag.")
-    if record is None:  # before the source is opened, which may take a while
-        extensions.require("the page", "websockets")
-    else:
-        from nics_drl_bridge.watch.record import check_file
-
-        check_file(record)
-
-
 def _episodes(
     policy: str, name: str | None, worlds: list[str], seed: int, given: dict[str, str | None]
 ) -> Any:
@@ -95,7 +81,7 @@ def _episodes(
     from nics_drl_bridge.sim.world_set import load_worlds
     from nics_drl_bridge.watch.episode import EpisodeSource
 
-    under = Conditions(given["lidar"], given["randomisation"], given["gate"])
+    under = Conditions(given["lidar"], given["randomisation"], given["gate"], kind=given["task"])
     contracts = driving.contracts_of([policy])
     own = [driving.robot_of(*each) for each in contracts.items()]  # a baseline has none
     model = open_model(name or (own or [DEFAULT_ROBOT])[0], under.lidar)

@@ -154,12 +154,15 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         starts = np.array(self.scene.starts)
         if options and "start" in options:
             give(starts[None], "start", options["start"])
-            guard.check_starts(starts, self.world, self.model.robot.footprint_radius)
+            around = [self.scene], self.world, self.model.robot.footprint_radius
+            guard.check_places("start", starts[None], *around)
         episodes = Episodes(np.array([episode]), starts[None], self.scene.goals[None])
         if not self._rehearsed:
             self._rehearse(episodes)
         memory = self.task.reset(episodes)
         guard.override(memory, options, "start")
+        if options and "goal" in options:
+            guard.check_places("goal", memory["goal"], [self.scene], self.world)
         self._view = self._lifted(self._backend.reset(Start(episode, self._row(starts))))
         self.memory = memory
         self._command, self._facts, self._steps = self._rest, {}, 0

@@ -3,8 +3,9 @@
 import contextlib
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import wraps
+from itertools import product
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import gymnasium
@@ -13,11 +14,13 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.env import kernels
 from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SHAPE, SIN
+from nics_drl_bridge.lidar.shapes import Shape
 from nics_drl_bridge.seeds import GREATEST_SEED, checked_seeds
+from nics_drl_bridge.sim.collision_kernels import wall_distance
+from nics_drl_bridge.sim.scenes import Scene
 from nics_drl_bridge.sim.world import room_at
 from nics_drl_bridge.sim.world_set import AnyWorld
-
-INSIDE = 0.5  # a wall nearer than this share of the footprint's radius is in the robot
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -97,17 +100,43 @@ def give(rows: NDArray[Any], name: str, value: Any) -> None:
         raise ConfigError(f"{option}: must be finite.")
 
 
-def check_starts(starts: NDArray[np.float64], world: AnyWorld, radius: float) -> None:
-    """Raises ConfigError for a start (..., 3) outside the world, or that is in a wall."""
-    if len(world.members) > 1:  # each episode draws one of them
-        return
-    for x, y, _ in starts.reshape(-1, 3).tolist():
-        room = room_at(world.members[0], x, y)
-        if room < INSIDE * radius:
-            reason = "lies outside the world" if room < 0.0 else "stands in a wall"
-            x1, y1, x2, y2 = world.extent
-            field = f"the field is {x1:g} to {x2:g} m by {y1:g} to {y2:g} m"
-            raise ConfigError(f"reset option 'start': ({x:g}, {y:g}) m {reason}; {field}.")
+def check_places(
+    option: str, places: NDArray[np.float64], scenes: Iterable[Scene], world: AnyWorld,
+    radius: float = 0.0,
+) -> None:  # fmt: skip
+    """Raises ConfigError for starts of a footprint, or goals, (n, ..., 2 or 3) off the field.
+
+    Or in a wall; and for starts where an obstacle stands in the scenes of all n episodes.
+    """
+    free = not radius
+    for scene, rows in zip(scenes, places, strict=True):
+        member, at = world.members[int(np.asarray(scene.member))], rows.reshape(-1, rows.shape[-1])
+        solid = 0.0 if member.grid is None else member.grid.resolution  # room in a full cell
+        for x, y in at[:, :2].tolist():
+            if (room := room_at(member, x, y)) <= max(radius, solid):
+                reason = "is in a wall" if room >= 0.0 else "lies outside the world"
+                x1, y1, x2, y2 = member.extent
+                field = f"the field is {x1:g} to {x2:g} m by {y1:g} to {y2:g} m"
+                raise ConfigError(f"reset option {option!r}: ({x:g}, {y:g}) m {reason}; {field}.")
+        shapes, pairs = world.shapes, product(at[:, :2].tolist(), scene.bodies)
+        free = free or not any(_on(x, y, radius, body, shapes) for (x, y), body in pairs)
+    if not free and len(places):
+        fix = "move it, or take another seed"
+        raise ConfigError(f"reset option {option!r}: {at.tolist()} is on an obstacle; {fix}.")
+
+
+def _on(x: float, y: float, radius: float, body: NDArray[Any], shapes: Sequence[Shape]) -> bool:
+    """True if a disc is on a body."""
+    (dx, dy), (c, s), reach = (x, y) - body[:2], body[[COS, SIN]], body[RADIUS]
+    if reach <= 0.0 or dx * dx + dy * dy >= (radius + reach) ** 2:
+        return False
+    shape = shapes[int(body[SHAPE]) % len(shapes)]  # in one of some sizes
+    corners = shape.outline * (reach / shape.radius)
+    sides = np.concatenate([corners, np.roll(corners, -1, axis=0)], axis=1)
+    (ax, ay, bx, by), px, py = sides.T, c * dx + s * dy, c * dy - s * dx
+    beside = (bx - ax) * (py - ay) > (px - ax) * (by - ay)
+    inside = ((ay > py) != (by > py)) & (beside == (by > ay))
+    return not len(sides) or wall_distance(px, py, sides) < radius or bool(inside.sum() % 2)
 
 
 def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray[Any]:

@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
-from nics_drl_bridge.env.guard import check_action, check_reset, check_starts, give, override
+from nics_drl_bridge.env.guard import check_action, check_places, check_reset, give, override
 from nics_drl_bridge.env.kernels import episode_seeds
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.snapshot import Snapshot, goals_of
@@ -167,9 +167,11 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         if options and "start" in options:
             starts = np.empty((len(worlds), self.robots, 3))
             give(starts, "start", options["start"])
-            check_starts(starts, self.world, self.model.robot.footprint_radius)
 
         def places(scenes: Scenes) -> Array | None:
+            if starts is not None:
+                radius = self.model.robot.footprint_radius
+                check_places("start", starts, scenes, self.world, radius)
             moved = None if self._teacher is None else self._teacher.places(worlds, scenes)
             return moved if starts is None else starts
 
@@ -180,6 +182,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self._starts[worlds] = self.simulator.data.pose[worlds]
         fresh = self.task.reset(Episodes(seeds, self._starts[worlds], self.simulator.goals[worlds]))
         override(fresh, options, "start", "reset_mask")
+        if options and "goal" in options:
+            check_places("goal", fresh["goal"], scenes, self.world)
         for name, rows in fresh.items():
             if name not in self.memory:
                 self.memory[name] = np.zeros((self.num_envs, *rows.shape[1:]), rows.dtype)
@@ -367,7 +371,7 @@ def zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
     all of it, which for many obstacles took a fifth of a step.
     """
     size = math.prod(shape) * dtype.itemsize
-    if size < LARGE:
+    if size < LARGE or not hasattr(mmap, "MAP_PRIVATE"):  # as on Windows
         return np.zeros(shape, dtype)
     fresh = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE)
     if hasattr(mmap, "MADV_NOHUGEPAGE"):

@@ -3,9 +3,11 @@
 from math import isfinite
 from typing import NamedTuple
 
+from nics_drl_bridge.identify.excitation import narrow
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.judgement import shortfall, usual
 from nics_drl_bridge.identify.verdict import doubts
+from nics_drl_bridge.robot.kinds import overdriven
 from nics_drl_bridge.robot.taylor import EndErrors
 
 OF_PATH = " of the path"
@@ -30,13 +32,15 @@ class Conclusion(NamedTuple):
 def conclude(identified: Identified) -> Conclusion:
     """Draws the conclusion of a fit."""
     about = *shortfall(identified.judgement), *doubts(identified.held_out)
-    gaps, ready = identified.gaps, False
+    spec, ready = identified.drive.spec, False
+    beyond = *narrow(identified.recording, spec), overdriven(spec)
+    gaps = *identified.gaps, *(one for one in beyond if one)
     if about or not identified.judgement:
         advice = "drive once more, for 60 s or longer, and generate anew before a policy is trained"
     elif identified.fit.unmoved or identified.model.assumed:
         advice = "drive once more as said above: a policy would act by what was not learnt"
     else:
-        first = ", or first drive once more as said above" if gaps else ""
+        first = ", or first see to what is said above" if gaps else ""
         advice, ready = f"train a policy in the simulator{first}", True
     return Conclusion(accuracy(identified), about, gaps, f"Next: {advice}.", ready)
 

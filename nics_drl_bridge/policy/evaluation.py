@@ -91,7 +91,9 @@ def drive(
         on_start()
         begin(policy)
         before = acted(policy)
-        goal, bodies = info["goal"], info["bodies"]
+        goal, bodies = info.get("goal"), info["bodies"]
+        if goal is None:  # a task of one's own may not show it
+            goal = env.get_wrapper_attr("scene").goals[0]
         paths, estimates, total, ended = [info["start"]], [info["pose"]], 0.0, False
         while not ended:
             observation, reward, terminated, truncated, info = env.step(policy.act(observation))

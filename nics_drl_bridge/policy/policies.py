@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -238,19 +238,24 @@ def make_policy(
     return _backed(_acting(policy), name, fallback, task, model)
 
 
-def open_policy(name: str, model: SimulatorModel, fallback: str = "") -> tuple[Policy, Navigation]:
-    """Opens a policy, with a fallback if any, and its navigation task.
+def open_policy(
+    name: str, model: SimulatorModel, fallback: str = "", kind: str | None = None
+) -> tuple[Policy, Navigation]:
+    """Opens a policy, with a fallback if any, and its task: navigation, or one of a `kind`.
 
-    Raises ConfigError, and PolicyError if it was trained for another task.
+    A kind is path/to/file.py:ClassName. Raises ConfigError, and PolicyError for another task.
     """
     if not is_policy_file(name):
+        if kind is not None:
+            reason = "drives the task 'navigation' alone; leave it out, or --task"
+            raise ConfigError(f"policy {name!r} {reason}.")
         task = Navigation(model.robot, model.lidar)
         return _backed(POLICIES[name](task, model), name, fallback, task, model), task
     from nics_drl_bridge.policy.foreign import load_any
 
     policy = load_any(name, model)
-    found = policy.make_task(model)
-    if not isinstance(found, Navigation):
+    found: Any = policy.make_task(model, kind)  # of a kind it is any task
+    if kind is None and not isinstance(found, Navigation):
         reason = f"is {policy.contract.task.name!r}; this drives policies of 'navigation'."
         raise PolicyError(name, "task.name", reason)
     return _backed(_acting(policy), name, fallback, found, model), found

@@ -93,7 +93,7 @@ class PolicyFile:
         """Makes the policy's task for a robot; PolicyError names a field that does not fit."""
         name = self.contract.task.name
         if kind is None and name not in TASKS:
-            reason = f"{name!r} is no shipped task; give path/to/file.py:{name}."
+            reason = f"{name!r} is no shipped task; say --task path/to/file.py:{name}."
             raise PolicyError(str(self.path), "task.name", reason)
         self.check_fits(model)
         task = make_task(kind or name, model, self.task_options)
@@ -126,7 +126,9 @@ class PolicyFile:
             try:
                 plan_of(lidar, self.contract.scan)
             except ConfigError as error:
-                raise PolicyError(str(self.path), "scan", str(error)) from None
+                reason = f"sees more than this lidar does: {str(error).partition(';')[0]}"
+                fix = "use another lidar, or a policy that was trained for this one"
+                raise PolicyError(str(self.path), "scan", f"{reason}; {fix}.") from None
         self._compare(theirs)
 
     def _compare(self, theirs: Mapping[str, Any]) -> None:

@@ -1,7 +1,6 @@
 """Trains policies on the vector env, seed after seed, and evaluates them."""
 
 import dataclasses
-import json
 import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -17,7 +16,7 @@ from nics_drl_bridge.config import dump_yaml, load_yaml
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError, shortened
-from nics_drl_bridge.files import write_text
+from nics_drl_bridge.files import json_of, write_text
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.policy import train_checkpoint as checkpoints
 from nics_drl_bridge.policy.evaluation import FIRST_SEED, Outcomes, Summary, drive_worlds, summarise
@@ -206,7 +205,7 @@ def run(
         result = SeedResult(seed, trained, summaries)
         plain: dict[str, Any] = {"training_steps": trained.steps}
         plain |= {world: dataclasses.asdict(one) for world, one in summaries.items()}
-        write_text(folder / EVALUATION, json.dumps(plain, indent=2) + "\n")
+        write_text(folder / EVALUATION, json_of(plain, 2) + "\n")
         export(settings, result, order.command, folder / POLICY)
         done(result)
         results.append(result)

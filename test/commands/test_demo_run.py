@@ -8,7 +8,9 @@ import pytest
 from robots import direct_model
 
 from nics_drl_bridge import extensions
+from nics_drl_bridge.commands import demo_run
 from nics_drl_bridge.commands.demo_run import (
+    FAST,
     DemoEpisodes,
     DemoPlan,
     Learned,
@@ -109,3 +111,27 @@ def test_it_trains_in_the_world_and_simulator_of_the_plan(tmp_path):
     assert settings.robot == str(tmp_path / "model")
     assert settings.worlds == {"circles": 512}
     assert settings.steps == 7
+
+
+def test_without_ros_it_drives_in_process_alone_and_says_so(tmp_path, monkeypatch):
+    def drive_here(plan, place, policy, say):
+        assert place == FAST
+        return [episode(0)]
+
+    shown = []
+    monkeypatch.setattr(demo_run, "find_spec", lambda name: None)
+    monkeypatch.setattr(demo_run, "_generate", lambda plan, say: (direct_model(), None))
+    monkeypatch.setattr(demo_run, "learn", lambda *given: Learned("straight", "None was."))
+    monkeypatch.setattr(demo_run, "_evaluate", lambda *given: None)
+    monkeypatch.setattr(demo_run, "_drive", drive_here)
+    monkeypatch.setattr(demo_run, "sections_of", lambda *given: shown.append(given[-1]) or [])
+    said = list[str]()
+    line = demo_run.run(DemoPlan(tmp_path, episodes=1), said.append)
+    assert line == f"demo: in process 1/1, report {tmp_path / 'report.html'}"
+    assert said[0].startswith("in process alone: ")
+    assert "needs the module 'rclpy'" in said[0]
+    (of,) = shown
+    assert (of.there, of.live) == ([], None)
+    paths = demo_run._episodes(DemoPlan(tmp_path), direct_model(), of)
+    assert "1 of 1 episodes reached the goal in process." in "".join(paths)
+    assert "DDS" not in "".join(paths)

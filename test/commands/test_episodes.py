@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,6 +11,7 @@ import pytest
 
 pytest.importorskip("gymnasium")
 
+from nics_drl_bridge.commands import episodes
 from nics_drl_bridge.commands.conditions import NO_CONDITIONS, Conditions
 from nics_drl_bridge.commands.episodes import (
     FAST,
@@ -33,15 +36,44 @@ def order(*places):
 
 def test_a_robot_without_cmd_vel_is_driven_in_process_alone_and_that_is_said():
     said = []
-    assert _places(order(*PLACES), KART, said.append) == (FAST,)
+    assert _places(order(), KART.robot, said.append) == [FAST]
     assert said[0].startswith("in process alone: robot 'ackermann_throttle': the command 'throttl")
-    assert _places(order(FAST), KART, said.append) == (FAST,)
+    assert _places(order(FAST), KART.robot, said.append) == [FAST]
     assert len(said) == 1
 
 
 def test_to_ask_for_topics_with_such_a_robot_is_refused():
     with pytest.raises(ConfigError, match="names no field of cmd_vel"):
-        _places(order(FAST, "dds"), KART, print)
+        _places(order(FAST, "dds"), KART.robot, print)
+
+
+@pytest.mark.parametrize(
+    ("lacking", "robot", "places", "why"),
+    [
+        ("rclpy", "differential", [FAST], "in process alone: the world 'dds' needs the module"),
+        ("mujoco", "differential", [FAST, "dds"], "in process and over DDS alone: .*mujoco"),
+        ("", "tricycle", [FAST, "dds"], "in process and over DDS alone: .*no machine of the kind"),
+    ],
+)
+def test_without_in_an_evaluation_leaves_out_where_it_can_not_run_in_one_line(
+    monkeypatch, lacking, robot, places, why
+):
+    """With an explicit place it refuses."""
+    pytest.importorskip("rclpy")
+    if lacking == "mujoco":
+        monkeypatch.setitem(sys.modules, "mujoco", None)
+    elif lacking:
+        there = episodes.find_spec
+        monkeypatch.setattr(
+            episodes, "find_spec", lambda name: None if name == lacking else there(name)
+        )
+    said, spec = list[str](), load_robot(robot)
+    assert _places(order(), spec, said.append) == places
+    assert len(said) == 1
+    assert re.match(why, said[0])
+    with pytest.raises(ConfigError):
+        _places(order(*PLACES), spec, said.append)
+    assert len(said) == 1
 
 
 def contract(robot, **known):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import errno
+import json
 import re
+import signal
 import sys
 from pathlib import Path
 from unittest import mock
@@ -84,7 +86,7 @@ MISTAKES = {
     "generate drive.npz --out m --order five": "order is 'five'; it must be 1, 2, 3 or 4",
     "generate drive.npz --out m --alpha 2": "alpha",
     "generate drive.npz --out m --topic odom": "must be ROLE=TOPIC",
-    "evaluate differential --goal 1;2": "--goal '1;2': must be X,Y in metres",
+    "evaluate differential --shadow bag --goal 1;2": "--goal '1;2': must be X,Y in metres",
     "evaluate differential --episodes 0": "'--(steps|episodes)'",
     "world draw clutter --footprint -1": "--footprint -1: must be above 0 m",
     "record --out d.npz --preview --bound -1": "bound",
@@ -118,6 +120,24 @@ MISTAKES = {
     "evaluate differential ackermann": "evaluate them one by one",
     "doctor --model differential --policy differential": "give one of them",
     "record --out d.npz --preview --remap odom": "must be NAME:=OTHER",
+    "evaluate differential --goal 2,1 --in fast": "--goal: belongs to --hardware or --shadow; add",
+    "evaluate differential --arm": "--arm: belongs to --hardware; add that, or leave it out",
+    "evaluate differential --yes": "--yes: belongs to --hardware",
+    "evaluate differential --start present": "--start: belongs to --hardware",
+    "evaluate differential --namespace ant": "--namespace: belongs to --hardware",
+    "evaluate differential --pose-type odometry": "--pose-type: belongs to --hardware",
+    "evaluate differential --topic odom=/wheels": "--topic: belongs to --shadow",
+    "evaluate differential --ahead 2": "--ahead: belongs to --shadow",
+    # Numbers that are none.
+    "drive --robot differential --out m --duration nan": "--duration.*(finite|should)",
+    "doctor --duration inf": "--duration inf: must be a finite number",
+    "bag record bag --duration nan": "--duration.*(must be a finite number|Input should be)",
+    "bag replay bag --rate nan": "--rate.*(must be a finite number|Input should be)",
+    "world import house.world --start 0 nan 0": "--start nan: must be a finite number",
+    # What a policy sees, and where results go.
+    "evaluate differential --lidar hokuyo_ust_10lx --in fast": "sees more than this lidar does: .* "
+    "in base_link, the scan layout needs .*; use another lidar, or a policy that was trained for",
+    "evaluate straight --in fast --out text.txt": "text.txt is a file, not a folder",
 }
 MODULES = {
     (
@@ -127,7 +147,6 @@ MODULES = {
     ("train", "onnx"): r"training needs the module 'onnx'; pip install 'nics_drl_bridge\[deploy\]'",
     ("train", "onnxruntime"): r"pip install 'nics_drl_bridge\[deploy\]'",
     ("evaluate straight --in dds", "rclpy"): r"pip install 'nics_drl_bridge\[ros\]'",
-    ("demo", "rclpy"): r"pip install 'nics_drl_bridge\[ros\]'",
     ("train --engine ray", "ray"): r"pip install 'nics_drl_bridge\[train,distributed\]'",
 }
 
@@ -206,3 +225,31 @@ def test_ctrl_c_before_a_command_has_begun_is_one_sentence(capsys):
         start.main()
     assert end.value.code == 130
     assert capsys.readouterr().err == "nics: interrupted; nothing was started.\n"
+
+
+def test_where_no_kernel_can_be_kept_the_sentence_names_the_variable(capsys):
+    error = RuntimeError("cannot cache function 'step': no locator available for file 'kernels.py'")
+    with (
+        mock.patch("nics_drl_bridge.commands.cli.main", side_effect=error),
+        pytest.raises(SystemExit) as end,
+    ):
+        start.main()
+    assert end.value.code == 2
+    assert "set NUMBA_CACHE_DIR to a folder that can" in capsys.readouterr().err
+
+
+def test_ctrl_c_does_not_reach_the_processes_that_compile_ahead(tmp_path):
+    pools = mock.Mock(**{"return_value.Pool.side_effect": KeyboardInterrupt})
+    with mock.patch("nics_drl_bridge.commands.warmup.get_context", pools):
+        done = nics("warmup", cwd=tmp_path)
+    assert "interrupted" in sentence_of(done, code=130)
+    ignored = signal.signal, (signal.SIGINT, signal.SIG_IGN)
+    assert pools.return_value.Pool.call_args.args[1:] == ignored
+
+
+def test_columns_of_text_are_null_in_json(folder):
+    rows = "".join(f"2024-01-01 10:00:00.{k},{k}.0\n" for k in range(3))
+    (folder / "dates.csv").write_text(f"stamp,x\n{rows}", encoding="utf-8")
+    told = nics("inspect", "dates.csv", "--json", cwd=folder).stdout
+    (table,) = json.loads(told, parse_constant=pytest.fail)["tables"]
+    assert [None, None] in [column[1:] for column in table["columns"]]

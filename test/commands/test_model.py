@@ -1,10 +1,15 @@
 from __future__ import annotations
 
+import json
+
+import numpy as np
 import pytest
 from command_line import nics
 
 from nics_drl_bridge.generator import load_model
-from nics_drl_bridge.recording.recording import load_recording
+from nics_drl_bridge.recording.recording import load_recording, save_recording
+from nics_drl_bridge.recording.textbook import record
+from nics_drl_bridge.robot.spec import load_robot
 
 NARROW = """
 name: mine
@@ -26,9 +31,29 @@ def test_a_robots_file_becomes_a_model_and_a_recording_by_a_textbook_drive(tmp_p
     done = nics(*words, "--duration", "20", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.endswith("next: nics train --robot mine\n")
-    assert "the commands ask for" in done.stdout
-    assert "beyond its limits -10 and 10" in done.stdout
+    first = " ".join(done.stdout.partition("\n\n")[0].split())
+    assert "the commands ask for" in first
+    assert "beyond its limits -10 and 10" in first
     model = load_model(tmp_path / "mine")
     assert model.lidar.mount == (0.05, 0.0, 0.0)
     assert model.control_period == pytest.approx(0.18)  # that of the lidar, which scans at 5.5 Hz
     assert load_recording(tmp_path / "drive.npz").command.t[-1] == pytest.approx(20.0, abs=0.1)
+
+
+@pytest.mark.slow
+def test_a_drive_over_a_small_part_of_the_range_is_told_in_the_verdict(tmp_path):
+    whole = load_robot("differential")
+    few = {c.name: {"min": 0.1 * c.min, "max": 0.1 * c.max} for c in whole.command}
+    commands = tuple(c.model_copy(update=few[c.name]) for c in whole.command)
+    part = whole.model_copy(update={"command": commands})
+    save_recording(record(part, np.random.default_rng(0), 30.0), tmp_path / "drive.npz")
+    words = ("generate", "drive.npz", "--robot", "differential", "--out", "m")
+    done = nics(*words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    told = f"{whole.command[0].name} covers 10 % of its range"
+    assert told in " ".join(done.stdout.partition("\n\n")[0].split())
+    page = (tmp_path / "m" / "report.html").read_text(encoding="utf-8")
+    assert told in page
+    assert "taught all" not in page
+    facts = json.loads(nics(*words, "--json", cwd=tmp_path).stdout)
+    assert any(gap.startswith(told) for gap in facts["gaps"])

@@ -14,10 +14,13 @@ from nics_drl_bridge.commands import watch as module
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--ros", "--bag", "drive"], "leave one of them out"),
-        (["straight", "--bag", "drive"], "--bag shows what others drive"),
-        (["--ros", "--gate", "differential"], "--gate: --ros shows what others drive"),
-        (["--ros", "--record", "a.gif"], "nics bag record"),
+        (["--ros", "--bag", "drive"], "--bag does not go with --ros; leave out --bag, or --ros."),
+        (["straight", "--bag", "drive"], "a policy does not go with --bag"),
+        (["--ros", "--gate", "differential"], "--gate does not go with --ros"),
+        (["--ros", "--record", "a.gif"], "--record does not go with --ros"),
+        (["straight", "--topic", "odom=/wheels"], "--topic: belongs to --bag; add that, or leave"),
+        (["straight", "--namespace", "ant"], "--namespace: belongs to --ros"),
+        (["straight", "--episodes", "3"], "--episodes: belongs to --record"),
         (["--record", "a.avi"], "--record 'a.avi': "),
         (["--bag", "nowhere", "--world", "arena", "--world", "room"], "a robot is in one"),
         (["strait"], "did you mean 'straight'?"),

@@ -6,6 +6,7 @@ import ast
 import re
 import shlex
 import textwrap
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,12 @@ MAKE_TARGETS = set(
 FENCED = re.compile(r"^```(?P<kind>[a-z]*)\n(?P<text>.*?)^```$", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?<=\n\n)(?:    .*\n+)+")
 INLINE = re.compile(r"`((?:nics|make) [^`\n]+)`")
+FROM_INDEX = re.compile(r"pip install.*nics_drl_bridge\b")
+FOLDERS = "|".join(sorted(each.parent.name for each in ROOT.glob("nics_drl_bridge/*/__init__.py")))
+DOTTED = re.compile(
+    rf"`((?:(?:nics_drl_bridge\.)?(?:{FOLDERS})(?:\.\w+){{2,}})|[a-z_]+(?:\.[a-z_]+)+\.[A-Z]\w+)[`(]"
+)
+OPTIONAL = {"rclpy", "mujoco", "torch", "stable_baselines3", "pettingzoo", "onnx"}
 PLACEHOLDERS = {"...", "NAME"}
 
 
@@ -100,3 +107,43 @@ def test_every_page_and_file_that_a_page_names_exists(page):
     notebooks = {f"docs/notebooks/{p.stem}.md" for p in (ROOT / "docs/notebooks").glob("*.ipynb")}
     missing = [one for one in named if one not in made | notebooks and not (ROOT / one).exists()]
     assert not [one for one in missing if "NAME" not in one and "ROBOT" not in one]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_page_installs_from_the_folder_as_no_index_has_the_package(page):
+    """What the commands say is another matter: there it is installed, and pip adds the extra."""
+    lines = text_of(page).splitlines()
+    wrong = [line for line in lines if FROM_INDEX.search(line) and not line.startswith("    nics:")]
+    assert not wrong
+
+
+def resolved(name: str) -> object:
+    """What a dotted name stands for in the package, or else in a library."""
+    place, _, attribute = name.removeprefix("nics_drl_bridge.").rpartition(".")
+    if (ROOT / "nics_drl_bridge" / place.split(".")[0]).exists():
+        place = f"nics_drl_bridge.{place}"
+    return getattr(import_module(place), attribute)
+
+
+NAMES = sorted({(page, name) for page in PAGES for name in DOTTED.findall(text_of(page))})
+
+
+@pytest.mark.parametrize(("page", "name"), NAMES, ids=lambda value: str(value)[-60:])
+def test_every_name_of_the_package_that_a_page_gives_is_there(page, name):
+    try:
+        assert resolved(name)
+    except ModuleNotFoundError as error:
+        if error.name in OPTIONAL:
+            pytest.skip(f"needs {error.name}")
+        raise
+
+
+def test_names_are_found_and_one_that_is_not_there_is_noticed():
+    text = "`env.task.total`, `sim.device.Simulator` and `lidar.bake.bake(...)`, not `env.step(a)`"
+    names = ["env.task.total", "sim.device.Simulator", "lidar.bake.bake"]
+    assert DOTTED.findall(text) == names
+    assert resolved(names[0])
+    with pytest.raises(AttributeError):
+        resolved(names[1])
+    with pytest.raises(ModuleNotFoundError):
+        resolved("highfidelity.simulator.MujocoSimulator")

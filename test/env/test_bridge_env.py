@@ -1,12 +1,14 @@
 from __future__ import annotations
 
+import contextlib
 import warnings
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from robots import direct_model, field
+from robots import FOOTPRINT, circles, direct_model, field, lidar
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.env.bridge_env import BridgeEnv
@@ -16,6 +18,9 @@ from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError, ModelError
 from nics_drl_bridge.interface import Backend
+from nics_drl_bridge.lidar.bake import bake
+from nics_drl_bridge.lidar.shapes import Circle
+from nics_drl_bridge.sim.world_set import WorldSet
 
 STILL = np.zeros(3, np.float32)
 
@@ -345,3 +350,53 @@ def test_a_reset_option_that_does_not_fit_is_refused_by_name(options, sentence):
     for env in (BridgeEnv(), BridgeVectorEnv(2)):
         with pytest.raises(ConfigError, match=sentence):
             env.reset(seed=0, options=options)
+
+
+BLOCK = {"shapes": [{"kind": "rectangle", "size": [2.0, 1.0]}], "at": [[1.0, 1.0, 0.3]]}
+CORNER = [[0.0, 0.0], [2.0, 0.0], [2.0, 0.4], [0.4, 0.4], [0.4, 2.0], [0.0, 2.0]]
+NOTCHED = {"shapes": [{"kind": "polygon", "points": CORNER}], "at": [[-2.5, -2.5, 0.0]]}
+BLOCKED = field(obstacles=[BLOCK, NOTCHED])
+MODEL = replace(direct_model(), table=bake(lidar(), (*BLOCKED.shapes, Circle(radius=FOOTPRINT))))
+SETS = WorldSet("two", (BLOCKED, field(obstacles=[BLOCK, NOTCHED], clearance=0.11)))
+
+
+@pytest.mark.parametrize("world", [BLOCKED, SETS], ids=["world", "set"])
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"start": (2.9, 0.0, 0.0)}, r"'start': \(2.9, 0\) m is in a wall; the field is"),
+        ({"start": (2.6, -3.1, 0.0)}, "'start'.*lies outside the world"),
+        ({"start": (1.0, 1.0, 0.0)}, "'start'.*is on an obstacle; move it"),  # amid it
+        ({"start": (0.3, 1.4, 0.0)}, "'start'.*is on an obstacle; move it"),  # with its edge
+        ({"start": (-2.3, -1.0, 0.0)}, "'start'.*is on an obstacle; move it"),
+        ({"goal": (4.0, 0.0)}, "'goal'.*lies outside the world"),
+        ({"goal": (3.0, 0.0)}, "'goal'.*is in a wall"),
+    ],
+)
+def test_a_start_or_goal_where_something_stands_is_refused(world, options, sentence):
+    for env in (BridgeEnv(model=MODEL, world=world), BridgeVectorEnv(3, MODEL, world)):
+        with pytest.raises(ConfigError, match=sentence):
+            env.reset(seed=0, options=options)
+        env.reset(seed=0)
+
+
+@pytest.mark.parametrize("world", [BLOCKED, SETS], ids=["world", "set"])
+def test_a_start_beside_what_stands_is_taken(world):
+    for start in ((2.7, 0.0, 0.0), (-1.3, -1.3, 0.0), (1.0, 0.2, 0.0)):
+        options = {"start": start, "goal": (2.9, -2.9)}
+        for env in (BridgeEnv(model=MODEL, world=world), BridgeVectorEnv(3, MODEL, world)):
+            _, info = env.reset(seed=0, options=options)
+            assert np.reshape(info["start"], (-1, 3))[-1] == pytest.approx(start)
+
+
+def test_many_worlds_begin_at_a_start_where_an_obstacle_stands_in_some_of_them():
+    world = field(obstacles=[circles(8, (0.5,))])
+    model = replace(direct_model(), table=bake(lidar(), (*world.shapes, Circle(radius=FOOTPRINT))))
+    single, taken = BridgeEnv(model=model, world=world), []
+    for seed in range(16):
+        with contextlib.suppress(ConfigError):
+            single.reset(seed=seed, options={"start": (0.0, 0.0, 0.0)})
+            taken.append(seed)
+    assert 0 < len(taken) < 16
+    _, info = BridgeVectorEnv(16, model, world).reset(seed=0, options={"start": (0.0, 0.0, 0.0)})
+    assert not info["start"].any()

@@ -13,6 +13,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import TimeLimit
 from robots import direct_model, field
 
+from nics_drl_bridge.env import vector_env
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registry import ENVIRONMENTS, NAVIGATION
@@ -335,3 +336,10 @@ def test_actions_that_hold_nan_are_refused():
         env.step(np.full((2, 3), np.nan, np.float32))
     with pytest.raises(gymnasium.error.InvalidAction, match="shape"):
         env.step(np.zeros((3, 3), np.float32))
+
+
+def test_many_zeros_are_zeros_where_memory_can_not_be_mapped_privately_as_on_windows(monkeypatch):
+    monkeypatch.delattr(vector_env.mmap, "MAP_PRIVATE")
+    many = vector_env.zeros((vector_env.LARGE,), np.dtype(np.float32))
+    assert many.shape == (vector_env.LARGE,)
+    assert not many.any()

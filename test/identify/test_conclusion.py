@@ -75,5 +75,5 @@ def test_gaps_are_those_notes_that_tell_what_the_drive_could_not_teach(found):
     gap = "turn_command never moved."
     told = conclude(replace(found, notes=("Poses arrive in bursts.", Gap(gap))))
     assert told.gaps == (gap,)
-    assert "drive once more as said above" in told.advice
+    assert "first see to what is said above" in told.advice
     assert type(told.gaps[0]) is str  # a file takes no other

@@ -2,7 +2,8 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
+import re
+from dataclasses import asdict, replace
 
 import gymnasium
 import numpy as np
@@ -14,6 +15,7 @@ from scipy import stats
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.files import json_of
 from nics_drl_bridge.policy.evaluation import (
     ELSEWHERE,
     Episode,
@@ -311,3 +313,16 @@ def test_nothing_observed_leaves_everything_open():
     assert math.isnan(mean([]).value)
     assert mean([2.0]).value == 2.0
     assert mean([2.0]).high == math.inf
+
+
+@pytest.mark.parametrize("arrived", [0, 1, 2])
+def test_a_summary_shows_neither_nan_nor_inf_and_is_json_that_others_read(arrived):
+    train = pytest.importorskip("nics_drl_bridge.policy.train")
+    success, steps = np.arange(3) < arrived, np.full(3, 7)
+    told = summarise(
+        Outcomes(np.arange(3), success, np.zeros(3, bool), steps, steps * 0.1, steps * 1.0), 0.1
+    )
+    line = f"{train.line_of(told)} {told.length.text('m')}"
+    assert not re.search(r"\b(nan|inf)\b", line)
+    assert ("path" in line) == (arrived > 0)
+    assert json.loads(json_of(asdict(told)), parse_constant=pytest.fail)["length"] is not None

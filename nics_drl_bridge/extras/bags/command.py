@@ -1,6 +1,5 @@
 """`nics bag record|info|replay|export|salvage`."""
 
-import json
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -11,6 +10,7 @@ from typer import Argument, Option
 
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands.console import SalvageOption, intact, needs_ros, one_sentence
+from nics_drl_bridge.files import json_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 bag = typer.Typer(help="Records, describes, replays, exports and saves bags.", no_args_is_help=True)
@@ -28,12 +28,11 @@ def record(
     topics: Annotated[list[str] | None, Option(help="A topic to record; repeatable.")] = None,
     everything: Annotated[bool, Option("--all", help="Record every topic.")] = False,
     namespace: NamespaceOption = "",
-    duration: Annotated[
-        float | None, Option(min=0.0, help="Stop after so long [s]; else at Ctrl-C.")
-    ] = None,
+    duration: Annotated[float | None, Option(min=0.0,
+        help="Stop after so long [s]; else at Ctrl-C.")] = None,
     storage: StorageOption = "mcap",
     use_sim_time: Annotated[bool, Option("--use-sim-time", help="Receipts by /clock.")] = False,
-) -> None:
+) -> None:  # fmt: skip
     """Records the topics of a robot as they are, without driving it."""
     with one_sentence():
         kind = _storage(storage)
@@ -49,7 +48,7 @@ def record(
 @bag.command()
 def info(
     path: BagArgument, as_json: console.JsonOption = False, salvage: SalvageOption = False
-) -> None:
+) -> None:  # fmt: skip
     """Tells a bag's topics, rates and gaps, and whose clock stamped it."""
     with one_sentence():
         from nics_drl_bridge.extras.bags.info import bag_info
@@ -57,7 +56,7 @@ def info(
         with intact(path, salvage) as whole:
             told = bag_info(whole)
         if as_json:
-            typer.echo(json.dumps(asdict(told) | {"path": str(path)}))
+            typer.echo(json_of(asdict(told) | {"path": str(path)}))
             return
         span, size = f"{told.duration_s:.3f} s", f"{told.size_bytes / 1e6:.2f} MB"
         typer.echo(f"{path}: {told.messages} messages in {span}, {size}")
@@ -73,25 +72,17 @@ def replay(
     clock: Annotated[bool, Option(help="Publish the bag's time on /clock.")] = True,
     topics: Annotated[list[str] | None, Option(help="Play this topic only; repeatable.")] = None,
     namespace: Annotated[str, Option(help="Put in front of the topics' names.")] = "",
-    lockstep: Annotated[
-        str | None, Option(metavar="NODE", help="Wait after each message till this node has it.")
-    ] = None,
-    estimate: Annotated[
-        bool, Option("--estimate", help="Run the middleware on it in process instead.")
-    ] = False,
-    model: Annotated[
-        str, Option(help="For --estimate: folder of a model, or a shipped robot.")
-    ] = DEFAULT_ROBOT,
-    topic: Annotated[
-        list[str] | None,
-        Option(
-            metavar="ROLE=TOPIC",
-            help="For --estimate: as odom=/wheel_odom. Roles: scan, odom, cmd_vel, pose, imu.",
-        ),
-    ] = None,
+    lockstep: Annotated[str | None, Option(metavar="NODE",
+        help="Wait after each message till this node has it.")] = None,
+    estimate: Annotated[bool, Option("--estimate",
+        help="Run the middleware on it in process instead.")] = False,
+    model: Annotated[str, Option(help="For --estimate: folder of a model, or a shipped robot.")] =
+        DEFAULT_ROBOT,
+    topic: Annotated[list[str] | None, Option(metavar="ROLE=TOPIC",
+        help="For --estimate: as odom=/wheel_odom. Roles: scan, odom, cmd_vel, pose, imu.")] = None,
     out: Annotated[Path | None, Option(help="For --estimate: .npz or .csv to write.")] = None,
     salvage: SalvageOption = False,
-) -> None:
+) -> None:  # fmt: skip
     """Plays a bag over ROS 2, or gives the middleware's estimate of it."""
     with one_sentence(), intact(path, salvage) as whole:
         if estimate:
@@ -117,31 +108,23 @@ def replay(
 @bag.command()
 def export(
     path: BagArgument,
-    lerobot: Annotated[
-        Path | None, Option(metavar="FOLDER", help="Write a LeRobot dataset, format v3.0.")
-    ] = None,
-    mcap: Annotated[
-        Path | None, Option(metavar="FOLDER", help="Write a bag in MCAP, as Foxglove opens it.")
-    ] = None,
-    model: Annotated[
-        str | None,
-        Option(help="A model's folder, or a shipped robot: its commands, its lidar and its mount."),
-    ] = None,
-    topic: Annotated[
-        list[str] | None,
-        Option(metavar="ROLE=TOPIC", help="As odom=/car/odom. Roles: scan, odom, cmd_vel, pose."),
-    ] = None,
-    fps: Annotated[
-        int | None, Option(min=1, help="Frames per second; the commands' rate by default.")
-    ] = None,
+    lerobot: Annotated[Path | None, Option(metavar="FOLDER",
+        help="Write a LeRobot dataset, format v3.0.")] = None,
+    mcap: Annotated[Path | None, Option(metavar="FOLDER",
+        help="Write a bag in MCAP, as Foxglove opens it.")] = None,
+    model: Annotated[str | None,
+        Option(help="A model's folder, or a shipped robot: its commands, its lidar and its mount.")]
+        = None,
+    topic: Annotated[list[str] | None, Option(metavar="ROLE=TOPIC",
+        help="As odom=/car/odom. Roles: scan, odom, cmd_vel, pose.")] = None,
+    fps: Annotated[int | None, Option(min=1,
+        help="Frames per second; the commands' rate by default.")] = None,
     gap: Annotated[float, Option(help="Data older than this end an episode [s].")] = 0.5,
     task: Annotated[str, Option(help="What the robot was to do, in words.")] = TASK,
-    succeeded: Annotated[
-        str | None,
-        Option(metavar="all|none|NUMBERS", help="Episodes that succeeded, as 0,2,5; if known."),
-    ] = None,
+    succeeded: Annotated[str | None, Option(metavar="all|none|NUMBERS",
+        help="Episodes that succeeded, as 0,2,5; if known.")] = None,
     salvage: SalvageOption = False,
-) -> None:
+) -> None:  # fmt: skip
     """Writes a bag for others: as a dataset, or as MCAP to look at."""
     with one_sentence(), intact(path, salvage) as whole:
         from nics_drl_bridge.errors import ConfigError
@@ -177,7 +160,7 @@ def salvage(
     path: BagArgument,
     out: Annotated[Path, Argument(help="Folder of the bag to write.")],
     storage: StorageOption = "mcap",
-) -> None:
+) -> None:  # fmt: skip
     """Writes what is intact of a damaged bag as a new one."""
     with one_sentence():
         from nics_drl_bridge.recording.messages import check_libraries

@@ -6,14 +6,21 @@ from functools import partial
 from rclpy.context import Context
 from rclpy.node import Node
 
-from nics_drl_bridge.extras.mujoco.machines import Physics
+from nics_drl_bridge.extras.mujoco.machines import Physics, build_machine, load_mujoco
 from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.nodes.device_parameters import randomisation
 from nics_drl_bridge.nodes.parameters import FRICTION
 from nics_drl_bridge.nodes.runner import declare_row, run_node
 from nics_drl_bridge.nodes.simulator_node import DeviceNode, declare_renderer
+from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.world_set import AnyWorld
+
+
+def check(robot: RobotSpec) -> None:
+    """Raises ConfigError without MuJoCo, or for a robot of which it has no machine."""
+    load_mujoco()
+    build_machine(robot)
 
 
 def mujoco_simulator(
