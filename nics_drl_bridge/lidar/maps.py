@@ -94,19 +94,6 @@ class GridMap:
         steps = ndimage.distance_transform_edt(clear)[1::2, 1::2]
         return np.asarray(steps * (self.resolution / 2.0), dtype=np.float32)
 
-    def reachable(self, start: ArrayLike, radius: float) -> NDArray[np.bool_]:
-        """Finds the cells (rows, columns) that a disc [m] reaches from a start (2,) [m] if it fits.
-
-        It moves between the centres of neighbouring free cells (four each) and stays in the map.
-        """
-        fits = self.free & (self.distance_field > radius)
-        row, column = self.world_to_cell(start)
-        inside = 0 <= row < fits.shape[0] and 0 <= column < fits.shape[1]
-        if not inside or not fits[row, column]:
-            return np.zeros_like(fits)
-        labels, _ = ndimage.label(fits)
-        return np.asarray(labels == labels[row, column])
-
 
 MAX_CELLS = 64_000_000
 MAX_BYTES = 4 * MAX_CELLS + 2**20  # of an image file; larger files are not opened

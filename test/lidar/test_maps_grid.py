@@ -58,30 +58,3 @@ def test_the_distance_field_is_the_distance_to_the_nearest_square():
 
 def test_without_anything_blocked_the_distance_is_infinite():
     assert np.isinf(grid(["..", ".."]).distance_field).all()
-
-
-def test_a_disc_reaches_what_lies_behind_doors_wider_than_itself():
-    room = grid(
-        [
-            "..........",
-            "..........",
-            "...####...",
-            "..........",
-            "#####.####",
-            "..........",
-            "..........",
-        ],
-        origin=TURNED,
-    )
-    start = room.cell_to_world([6, 0])
-    assert room.reachable(start, 0.1)[0, 0]
-    through = room.reachable(start, 0.26)  # the door is a cell of 0.5 m wide
-    assert through[5, 0]
-    assert not through[0].any()
-
-
-def test_unknown_cells_and_cells_outside_are_not_reached():
-    room = grid(["..?.", "..?."])
-    assert room.reachable([0.25, 0.25], 0.1).tolist() == [[True, True, False, False]] * 2
-    assert not room.reachable([-0.25, 0.25], 0.1).any()
-    assert not grid(["#."]).reachable([0.25, 0.25], 0.1).any()
