@@ -17,7 +17,7 @@ from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SHAPE, SIN
 from nics_drl_bridge.lidar.shapes import Shape
 from nics_drl_bridge.seeds import GREATEST_SEED, checked_seeds
-from nics_drl_bridge.sim.collision_kernels import wall_distance
+from nics_drl_bridge.sim.collision_kernels import Outline, outline_point
 from nics_drl_bridge.sim.scenes import Scene
 from nics_drl_bridge.sim.world import room_at
 from nics_drl_bridge.sim.world_set import AnyWorld
@@ -131,12 +131,8 @@ def _on(x: float, y: float, radius: float, body: NDArray[Any], shapes: Sequence[
     if reach <= 0.0 or dx * dx + dy * dy >= (radius + reach) ** 2:
         return False
     shape = shapes[int(body[SHAPE]) % len(shapes)]  # in one of some sizes
-    corners = shape.outline * (reach / shape.radius)
-    sides = np.concatenate([corners, np.roll(corners, -1, axis=0)], axis=1)
-    (ax, ay, bx, by), px, py = sides.T, c * dx + s * dy, c * dy - s * dx
-    beside = (bx - ax) * (py - ay) > (px - ax) * (by - ay)
-    inside = ((ay > py) != (by > py)) & (beside == (by > ay))
-    return not len(sides) or wall_distance(px, py, sides) < radius or bool(inside.sum() % 2)
+    corners, at = shape.outline * (reach / shape.radius), (c * dx + s * dy, c * dy - s * dx)
+    return not len(corners) or outline_point(*at, Outline(corners, 0, len(corners))) < radius
 
 
 def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray[Any]:
