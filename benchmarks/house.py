@@ -38,7 +38,7 @@ BARS = {
     # Nav2's paths, a page showed episodes, topics and bags, reports concluded, launch files had a
     # module, and robots of one's own inherited trainings.
     "modules": 280,
-    "lines": 54_950,
+    "lines": 54_900,
     "single_importers": 71,
     "circles": 0,
     "max_arguments": 10,

@@ -67,8 +67,6 @@ TopicOption = Annotated[list[str] | None, Option(
     metavar="ROLE=TOPIC", help="Topic of one role, as cmd_vel=/car/drive; may be given several "
     "times. Roles: cmd_vel, pose, odom, joint_states, imu; none as a topic leaves a role out.")
 ]  # fmt: skip
-
-
 NEEDED: dict[str, dict[str, tuple[str, ...]]] = {  # options that do nothing without another
     "evaluate": dict.fromkeys(("start", "namespace", "pose_type", "yes", "arm"), ("hardware",))
     | {"topic": ("shadow",), "ahead": ("shadow",), "goal": ("hardware", "shadow")},

@@ -275,12 +275,9 @@ def _write_limits(robot: RobotSpec, path: Path) -> Path:
 
 
 def sections_of(
-    plan: DemoPlan,
-    model: SimulatorModel,
-    identified: Identified,
-    learned: Learned,
+    plan: DemoPlan, model: SimulatorModel, identified: Identified, learned: Learned,
     of: DemoEpisodes,
-) -> list[tuple[str, Sequence[str]]]:
+) -> list[tuple[str, Sequence[str]]]:  # fmt: skip
     """Sections of the report, the verdict first, each a heading and HTML blocks."""
     return [
         ("Verdict", _verdict(plan, learned, identified, of)),

@@ -137,12 +137,9 @@ def _run_watched(train_run: Any, order: Any, learn: Any, as_json: bool) -> None:
 
 
 def _run(
-    train_run: Any,
-    order: Any,
-    learn: Any,
-    as_json: bool,
+    train_run: Any, order: Any, learn: Any, as_json: bool,
     note: Callable[[str], None] = lambda _: None,
-) -> None:
+) -> None:  # fmt: skip
     def told(progress: Any) -> None:
         what = f"seed {progress.seed}: {progress.line}"
         if not math.isnan(progress.held_out):

@@ -49,13 +49,10 @@ def look(
 
 
 def _nearest(ranges: Ranges, lidar: MountedBeams) -> float:
-    """Distance of the robot to the nearest end of a beam (B,), of five in a row the middle one.
-
-    What is too close to be measured is at 0. One beam of hundreds nearly always errs by much.
-    """
+    """Distance [m] to the nearest end of the beams (B,): the middle one of five, as one may err."""
     angles = lidar.first + lidar.step * np.arange(len(ranges)) + lidar.heading
-    short = np.where(np.isneginf(ranges), 0.0, ranges)
+    short = np.where(np.isneginf(ranges), 0.0, ranges)  # too close to be measured
     ends = np.hypot(lidar.x + short * np.cos(angles), lidar.y + short * np.sin(angles))
-    ends[np.isnan(ends) | np.isinf(ends)] = np.inf
+    ends[np.isnan(ends)] = np.inf  # unknown
     beside = sliding_window_view(np.pad(ends, 2, constant_values=np.inf), 5)
     return float(np.median(beside, axis=1).min(initial=np.inf))

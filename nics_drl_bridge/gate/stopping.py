@@ -37,11 +37,9 @@ def gate_config(
 
 
 def shield_config(
-    model: SimulatorModel,
-    limits: Limits | None,
-    file: str | Path = "",
+    model: SimulatorModel, limits: Limits | None, file: str | Path = "",
     given: Mapping[str, float] | None = None,
-) -> tuple[ShieldConfig, str]:
+) -> tuple[ShieldConfig, str]:  # fmt: skip
     """Returns a robot's shield, and a sentence on its values; ConfigError: can't be used."""
     # It is the `shield` of a file of limits, else of model and limits; given values override it.
     path = find_config(file, "limits") if file else None

@@ -78,13 +78,9 @@ class Episode:
 
 
 def drive(
-    env: gymnasium.Env[Any, Any],
-    policy: Policy,
-    seed: int,
-    options: dict[str, Any] | None = None,
-    on_start: Callable[[], None] = lambda: None,
-    touched: Callable[[], bool] | None = None,
-) -> Episode:
+    env: gymnasium.Env[Any, Any], policy: Policy, seed: int, options: dict[str, Any] | None = None,
+    on_start: Callable[[], None] = lambda: None, touched: Callable[[], bool] | None = None,
+) -> Episode:  # fmt: skip
     """Drives one episode to its end; halts the robot if the policy or a callback raises."""
     try:
         observation, info = env.reset(seed=seed, options=options)
@@ -131,12 +127,10 @@ def truly_near(task: Any, poses: Array, goals: Array) -> Flags:
 
 
 def drive_all(
-    env: gymnasium.Env[Any, Any],
-    policy: Policy,
-    seeds: Iterable[int],
+    env: gymnasium.Env[Any, Any], policy: Policy, seeds: Iterable[int],
     on_episode: Callable[[Episode], None] = lambda _: None,
     touched: Callable[[], bool] | None = None,
-) -> list[Episode]:
+) -> list[Episode]:  # fmt: skip
     """Drives one episode per seed and calls `on_episode` as each ends."""
     episodes = []
     for seed in seeds:

@@ -148,10 +148,7 @@ def advantages_of(
 
 
 def loss_of(
-    networks: Networks,
-    raw: torch.Tensor,
-    values: torch.Tensor,
-    batch: Transitions,
+    networks: Networks, raw: torch.Tensor, values: torch.Tensor, batch: Transitions,
     ppo: PpoSettings,
 ) -> torch.Tensor:  # fmt: skip
     """The loss of PPO with clipped ratios, as in Stable-Baselines3.
@@ -354,10 +351,10 @@ class LeanPpo:
     def _advance(self, rollout: Transitions, watch: Watch) -> float:
         """Learns from a rollout, with the next one collected meanwhile."""
         rate = self._ppo.learning_rate * max(1.0 - self.steps / self._total, LEAST_RATE)
-        learn = partial(self.learner.learn, rollout, rate)
         self.steps += self._ppo.rollout * self.collector.env.num_envs
         self.collector.networks.load_state_dict(self.networks.state_dict())
         self.learner.core_is_free.clear()
+        learn = partial(self.learner.learn, rollout, rate)
         jobs: list[Callable[[], Any]] = [learn, self._collect]
         loss, *collected = run_parts(lambda job: job(), jobs[: 1 + (self.steps < self._total)])
         self._rollout = None

@@ -252,10 +252,9 @@ def _clock_lines(
 
 
 def _not_used(
-    tables: Sequence[TableSurvey],
-    pose: Guess | None,
+    tables: Sequence[TableSurvey], pose: Guess | None,
     commands: Mapping[str, tuple[TableSurvey, Survey]],
-) -> Iterator[str]:
+) -> Iterator[str]:  # fmt: skip
     """Yields a comment for each table that names the columns of values that a mapping lacks."""
     taken = {(id(table), column.name) for table, column in commands.values()}
     taken |= {(id(pose.table), each) for each in _columns_of(pose)} if pose else set()

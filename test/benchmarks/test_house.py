@@ -7,7 +7,7 @@ from .runs import asked, fails
 # No change makes these worse.
 AT_MOST = {
     "modules": 280,
-    "lines": 54_950,
+    "lines": 54_900,
     "single_importers": 71,  # the worlds of a benchmark, a net that learns, planners and imitation
     "circles": 0,
     "max_arguments": 10,

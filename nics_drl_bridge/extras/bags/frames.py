@@ -56,12 +56,9 @@ class BagFrames:
 
 
 def frames_of(
-    path: str | Path,
-    topics: Mapping[str, str],
-    model: SimulatorModel | None = None,
-    fps: int | None = None,
-    gap_s: float = 0.5,
-) -> BagFrames:
+    path: str | Path, topics: Mapping[str, str], model: SimulatorModel | None = None,
+    fps: int | None = None, gap_s: float = 0.5,
+) -> BagFrames:  # fmt: skip
     """Reads a bag as frames at `fps`, by default the rate of its commands in whole hertz.
 
     A frame has the newest datum of each topic that was received by its time, none older than

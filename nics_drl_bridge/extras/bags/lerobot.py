@@ -37,12 +37,9 @@ def check_output(folder: str | Path) -> None:
 
 
 def write_dataset(
-    frames: BagFrames,
-    folder: str | Path,
-    task: str,
-    robot: str | None = None,
+    frames: BagFrames, folder: str | Path, task: str, robot: str | None = None,
     succeeded: Collection[int] | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Writes a dataset, whole or not at all; it replaces one that is there. Raises ConfigError.
 
     `task` says in words what the robot was to do; `succeeded` are the numbers of the episodes in
