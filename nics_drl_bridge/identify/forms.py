@@ -16,6 +16,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import shooting
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.motion import as_smooth, half_width
 from nics_drl_bridge.identify.signals import taken
 from nics_drl_bridge.identify.terms import linear_fit, sided
 from nics_drl_bridge.identify.yardstick import structure_of
@@ -339,7 +340,7 @@ def _delayed(drive: Drive, calibration: Calibration, samples: Samples) -> tuple[
     one_clock = drive.recording.pose.clock == drive.recording.command.clock
     tries = np.arange(0.0, LONGEST_S, DELAY_STEP_S) - (0.0 if one_clock else LONGEST_S / 2.0)
     late = [problem.commands(np.append(delay, inputs.start[1:])) for delay in tries]
-    return tries, np.array(late)
+    return tries, np.array([as_smooth(each, samples.dt, half_width(drive)) for each in late])
 
 
 def _left(spec: RobotSpec, samples: Samples, command: Array) -> float:

@@ -68,6 +68,13 @@ def with_motion(drive: Drive, calibration: Calibration, grid: Array, width: floa
     return drive.part(replace(recording, state=state))
 
 
+def as_smooth(command: Array, step: float, width: float) -> Array:
+    """Returns commands (T, C) at uniform times as smooth as a twist that parabolas gave."""
+    sums = np.cumsum(command, axis=0) * step
+    rows = 2 * max(2, round(width / step)) + 1
+    return np.asarray(savgol_filter(sums, rows, 2, deriv=1, delta=step, axis=0))
+
+
 def _following(
     variable: StateVariable, drive: Drive, calibration: Calibration, grid: Array
 ) -> Array:

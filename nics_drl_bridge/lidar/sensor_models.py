@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import AfterValidator, Field
 
-from nics_drl_bridge.config import Schema, load_yaml
+from nics_drl_bridge.config import Schema
 
 Ranges = NDArray[np.float32]
 Function = Callable[[Ranges, NDArray[np.float64]], Ranges]
@@ -78,17 +77,6 @@ def _one_intensity(models: tuple[SensorModel, ...]) -> tuple[SensorModel, ...]:
 
 SensorModel = Annotated[IncidenceDropout | Intensity, Field(discriminator="kind")]
 SensorModels = Annotated[tuple[SensorModel, ...], AfterValidator(_one_intensity)]
-
-
-class SensorModelFile(Schema):
-    """The keys of a YAML file of sensor models."""
-
-    sensor_model: SensorModels = Field(min_length=1)
-
-
-def load_sensor_models(path: str | Path) -> tuple[SensorModel, ...]:
-    """Loads the sensor models of a YAML file. Raises ConfigError with file, key and fix."""
-    return load_yaml(path, SensorModelFile).sensor_model
 
 
 def returned(

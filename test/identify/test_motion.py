@@ -10,8 +10,10 @@ import pytest
 from identify.drives import slipping_car
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.motion import (
     WIDTHS_S,
+    as_smooth,
     by_motion,
     grid_of,
     half_width,
@@ -20,7 +22,9 @@ from nics_drl_bridge.identify.motion import (
     surrogate,
     with_motion,
 )  # fmt: skip
-from nics_drl_bridge.recording.recording import Stream
+from nics_drl_bridge.recording.recording import Recording, Stream
+from nics_drl_bridge.recording.textbook import record
+from nics_drl_bridge.robot.spec import load_robot, robot_from
 
 MOUNTED = Calibration(rotation_rad=-0.1, lever_arm_m=(0.08, 0.0))
 
@@ -89,3 +93,23 @@ def test_poses_that_are_known_to_be_doubtful_do_not_bend_the_motion(drive):
         found = known_state(with_motion(seen, MOUNTED, grid, 0.07)).values
         off.append(np.abs(found - truth).mean())
     assert off[1] < 0.1 * off[0]
+
+
+def test_commands_are_as_smooth_as_the_twist_so_that_they_begin_and_end_together():
+    step, width = 0.02, 0.25
+    speed = np.where(np.arange(400) * step < 4.0, 0.2, 0.6)[:, None]
+    smooth = as_smooth(speed, step, width)[:, 0]
+    changed = np.flatnonzero((smooth > 0.201) & (smooth < 0.599)) * step
+    assert changed[[0, -1]] == pytest.approx([4.0 - width, 4.0 + width], abs=0.05)
+    assert smooth[100:-100].mean() == pytest.approx(0.4, abs=0.01)
+
+
+@pytest.mark.slow
+def test_poses_ten_times_a_second_do_not_hide_when_a_robot_got_its_commands():
+    spec = robot_from({"kind": "differential", "footprint_radius": 0.15})
+    drive = record(load_robot("differential"), np.random.default_rng(2), 30.0, dt=0.02)
+    seen = [replace(s, t=s.t[::5], values=s.values[::5]) for s in (drive.command, drive.pose)]
+    found = identify(Recording(*seen, source="ten a second"), spec)
+    assert found.calibration.command_latency_s == pytest.approx(0.0, abs=0.03)
+    ends = found.judgement[-1]
+    assert ends.model.position_m < 0.02 * ends.path_m

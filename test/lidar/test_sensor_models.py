@@ -2,14 +2,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pydantic import Field
 
-from nics_drl_bridge.config import parse_yaml, validate
+from nics_drl_bridge.config import Schema, load_yaml, parse_yaml, validate
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.lidar.sensor_models import (
     IncidenceDropout,
     Intensity,
-    SensorModelFile,
-    load_sensor_models,
+    SensorModels,
     returned,
 )
 from nics_drl_bridge.lidar.shapes import Circle, ShapeFile, describe
@@ -18,6 +18,12 @@ from nics_drl_bridge.lidar.spec import LidarSpec
 RANGES = np.array([1.0, 1.0, 2.0, 2.0], np.float32)
 INCIDENCE = np.array([0.0, 1.2, 0.0, 1.2])
 INF = np.inf
+
+
+class SensorModelFile(Schema):
+    """The part of a lidar's file that is of surfaces."""
+
+    sensor_model: SensorModels = Field(min_length=1)
 
 
 def test_a_surface_at_a_right_angle_at_one_metre_returns_the_gain():
@@ -47,7 +53,7 @@ def test_a_file_of_sensor_models_reads_to_what_it_says(tmp_path):
         "  - {kind: incidence_dropout, greatest_incidence: 1.3}\n"
         "  - {kind: intensity, gain: 200.0, threshold: 0.5}\n"
     )
-    grazing, bright = load_sensor_models(path)
+    grazing, bright = load_yaml(path, SensorModelFile).sensor_model
     assert grazing == IncidenceDropout(greatest_incidence=1.3)
     assert bright == Intensity(gain=200.0, threshold=0.5)
     assert str(grazing) == "nothing from beyond 74.48 deg of incidence"

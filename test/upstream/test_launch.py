@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import re
 import subprocess
 import time
@@ -13,13 +12,12 @@ import pytest
 pytest.importorskip("ros2launch", reason="needs ros2: make test-upstream")
 
 from benchmarks.runs import BENCHMARKS
-from domains import claimed_domain
 from nodes.peer import Peer
 from rcl_interfaces.srv import GetParameters
 from rclpy.parameter import parameter_value_to_python
 
 from nics_drl_bridge.config import find_config
-from upstream.launched import PACKAGE, Launched
+from upstream.launched import PACKAGE
 
 pytestmark = [pytest.mark.ros, pytest.mark.process, pytest.mark.slow]
 
@@ -37,21 +35,6 @@ NODES = {
 SUFFIXES = ("py", "xml")
 FILES = [f"{name}.launch.{suffix}" for name, nodes in NODES.items() if nodes for suffix in SUFFIXES]
 TIMES, MOMENTS_S = 10, 4.0
-
-
-@pytest.fixture
-def launch(tmp_path):
-    """Starts a launch file, `launch(file, **arguments)`; it ends with the test."""
-    numbers = itertools.count()
-    with ExitStack() as started:
-        domain_id = started.enter_context(claimed_domain())
-
-        def start(file, **arguments):
-            folder = tmp_path / str(next(numbers))
-            folder.mkdir()
-            return started.enter_context(Launched(file, folder, domain_id, **arguments))
-
-        yield start
 
 
 @pytest.fixture
