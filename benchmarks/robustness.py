@@ -237,12 +237,13 @@ def draw(
     """One panel for each perturbation: success over multiples of the declared range, by robot."""
     amounts = [declared(of_training(robot)) for robot in success]
     perturbations = list(dict.fromkeys(each for own in success.values() for each in own))
-    rows, where = -(-len(perturbations) // 3), [0.0, *multiples]
+    rows, where = -(-len(perturbations) // 3), np.array([0.0, *multiples])
     figure, grid = style.panels(rows, 3, (10.0, 2.8 * rows), sharex=True, sharey=True)
     for axes, each in zip(grid, perturbations, strict=False):
         for (robot, own), marker in zip(success.items(), cycle(style.MARKERS)):
-            share = 100.0 * np.array(own[each])
-            axes.plot(where, share, marker=marker, markersize=4, label=robot)
+            share = 100.0 * np.array(own[each], np.float64)  # None where it was not driven
+            driven = ~np.isnan(share)
+            axes.plot(where[driven], share[driven], marker=marker, markersize=4, label=robot)
         axes.axvline(DECLARED, color=style.OTHER, linestyle="--", linewidth=1.0)
         told = " / ".join(dict.fromkeys(some[each] for some in amounts))
         axes.set_title(f"{each}\n{told}")
@@ -251,7 +252,8 @@ def draw(
         axes.set_xticks(where)
     for axes in grid[::3]:
         axes.set_ylabel("success [%]")
-    least = 100.0 * min(min(some) for own in success.values() for some in own.values())
+    shares = [share for own in success.values() for some in own.values() for share in some]
+    least = 100.0 * np.nanmin(np.array(shares, np.float64))
     grid[0].set_ylim(max(0.0, 5.0 * np.floor(least / 5.0) - 5.0), 102.0)
     write_bytes(file, style.png(figure, grid[0]))
 
