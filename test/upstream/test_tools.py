@@ -30,7 +30,7 @@ TOPICS = {
     "/scan": "sensor_msgs/msg/LaserScan",
     "/tf": "tf2_msgs/msg/TFMessage",
 }
-SPIN_S = "20"  # how long `ros2` may look for a node, without a daemon
+SPIN_S = "5"  # how long `ros2` looks around, without a daemon
 
 
 def ros2(*words: str, domain_id: int | None = None) -> str:
@@ -66,10 +66,11 @@ def test_ros2_run_starts_a_node_which_tells_of_itself(node: str) -> None:
 
 
 def test_ros2_topic_lists_and_hears_what_the_hardware_would_send(running):
-    listed = running("topic", "list", "-t", "--no-daemon", "--spin-time", SPIN_S)
+    look = ("--no-daemon", "--spin-time", SPIN_S)
+    listed = running("topic", "list", "-t", *look)
     for topic, kind in TOPICS.items():
         assert f"{topic} [{kind}]" in listed
-    assert "frame_id: odom" in running("topic", "echo", "--once", "/odom")
+    assert "frame_id: odom" in running("topic", "echo", "--once", *look, "/odom")
     assert "range_max: " in running("topic", "echo", "--once", "/scan", "sensor_msgs/msg/LaserScan")
 
 
