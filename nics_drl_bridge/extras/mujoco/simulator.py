@@ -263,7 +263,7 @@ class MujocoSimulator(DrivenSimulator):
             before, turned = turned, [rig.encoders(data) for rig in rigs]
             both, mean = zip(before, turned, strict=True), self._machine.state
             means = [mean(0.5 * (first + last), (last - first) / part_s) for first, last in both]
-            counted = self._twist(np.array(means))
+            counted = self._twist(np.array(means)) * self._machine.calibrated
             wheels = geometry.compose(wheels, geometry.exp(counted * part_s))
         readings = [rig.read(data) for rig in rigs]
         pose, twist, state = (np.array([getattr(r, n) for r in readings]) for n in MOTION)

@@ -10,6 +10,7 @@ pytest.importorskip("mujoco", reason="needs MuJoCo: the extra `mujoco`")
 
 import mujoco
 
+from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.extras.mujoco.machines import Physics
 from nics_drl_bridge.extras.mujoco.simulator import MujocoSimulator, divide
@@ -170,6 +171,19 @@ def test_odometry_drifts_where_the_wheels_slip():
         errors[floor] = float(np.hypot(*off[:2]))
     assert errors["dry"] < 0.05
     assert errors["ice"] > 3.0 * errors["dry"]
+
+
+def test_odometry_of_mecanum_wheels_is_calibrated_for_what_their_rollers_lose():
+    model = builtin_model("mecanum")
+    simulator = MujocoSimulator(model, load_world("empty"))
+    simulator.reset([0], starts=np.array([[[2.0, -2.0, 0.0]]]))
+    start, believed = simulator.data.pose[0, 0].copy(), simulator.wheels[0].copy()
+    command = np.array([[[-0.5, 0.6, 0.0]]])
+    drive(simulator, command, 50)
+    driven = geometry.between(start, simulator.data.pose[0, 0])
+    told = geometry.between(believed, simulator.wheels[0])
+    assert np.hypot(*driven[:2]) > 2.0
+    assert np.hypot(*(told - driven)[:2]) < 0.004 * np.hypot(*driven[:2])
 
 
 @pytest.mark.parametrize("name", NAMES)
