@@ -11,8 +11,6 @@ from pathlib import Path
 import pytest
 import yaml
 
-from docs import shown
-
 ROOT = Path(__file__).resolve().parents[1]
 OF_OTHERS = ("PYTHONPATH", "VIRTUAL_ENV", "LD_LIBRARY_PATH", "_ROS_WHEELS_BOOTSTRAP_COMPLETE")
 INSTRUCTIONS = {"FROM", "WORKDIR", "COPY", "RUN", "ENTRYPOINT", "CMD"}
@@ -48,37 +46,23 @@ def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module", params=["*.whl", "*.tar.gz"])
-def installed(dist, request, tmp_path_factory) -> Path:
-    """The command `nics` of an environment that holds a release and what it asks for."""
-    archive, folder = next(dist.glob(request.param)), tmp_path_factory.mktemp("environment")
-    uv, python = Path(sys.executable).with_name("uv"), folder / "venv" / "bin" / "python"
-    run(uv, "venv", "--python", sys.executable, folder / "venv", cwd=folder)
-    install = (uv, "pip", "install", "--python", python, "--constraints", ROOT / "constraints.txt")
-    run(*install, f"{archive}[ros,deploy,train,view]", cwd=folder)
-    where = run(python, "-c", "import nics_drl_bridge as n; print(n.__file__)", cwd=folder)
-    assert str(folder) in where
-    return python.with_name("nics")
-
-
 @pytest.mark.campaign
 @pytest.mark.process
 @pytest.mark.timeout(3600)
-def test_a_release_runs_the_demo_outside_of_the_repository(installed, tmp_path):
+@pytest.mark.parametrize("kind", ["*.whl", "*.tar.gz"])
+def test_a_release_runs_the_demo_outside_of_the_repository(dist, kind, tmp_path):
+    archive = next(dist.glob(kind))
+    uv, python = Path(sys.executable).with_name("uv"), tmp_path / "venv" / "bin" / "python"
+    run(uv, "venv", "--python", sys.executable, tmp_path / "venv", cwd=tmp_path)
+    install = (uv, "pip", "install", "--python", python, "--constraints", ROOT / "constraints.txt")
+    run(*install, f"{archive}[ros,deploy]", cwd=tmp_path)
+    where = run(python, "-c", "import nics_drl_bridge as n; print(n.__file__)", cwd=tmp_path)
+    assert str(tmp_path) in where
     words = ["demo", "--policy", "differential", "--episodes", "2", "--out", "demo"]
-    assert "in process 2/2, over DDS 2/2" in run(installed, *words, cwd=tmp_path)
+    told = run(python.with_name("nics"), *words, cwd=tmp_path)
+    assert "in process 2/2, over DDS 2/2" in told
     assert (tmp_path / "demo" / "paths.png").is_file()
     assert (tmp_path / "demo" / "report.html").is_file()
-
-
-@pytest.mark.campaign
-@pytest.mark.process
-@pytest.mark.timeout(3600)
-def test_a_release_runs_what_the_readme_shows(installed, tmp_path):
-    for line in filter(shown.runs_here, shown.lines_of(ROOT / "README.md")):
-        shown.supply(line, tmp_path)
-        run(installed, *shown.words_of(line, tmp_path), cwd=tmp_path)
-    assert (tmp_path / "runs" / "mine" / "seed_0" / "policy.onnx").is_file()
 
 
 def test_the_container_file_copies_what_there_is_and_runs_what_is_installed():

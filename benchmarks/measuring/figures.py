@@ -232,10 +232,10 @@ TRANSFER = Table(
     ),
 )  # fmt: skip
 ROBUSTNESS = Table(
-    ("success [%] without, and at the declared range", "declared range", *POLICIES.values()),
+    ("success [%] at 0, 1/2, 1, 2 times the range", "declared range", *POLICIES.values()),
     tuple(
         ("robustness", each, f"{{declared.differential.{each}}}", *(
-            ", ".join(f"{{success.{robot}.{each}.{k} x100|.0f}}" for k in (0, 2))
+            ", ".join(f"{{success.{robot}.{each}.{k} x100|.0f}}" for k in range(4))
             for robot in POLICIES
         ))
         for each in PERTURBATIONS
