@@ -38,7 +38,8 @@ def model_of(recording, out, robot, *words) -> SimulatorModel:
 def refused(*words: object) -> str:
     done = generate(*words)
     assert done.exit_code == 2, done.output
-    (sentence,) = done.stderr.splitlines()
+    *progress, sentence = done.stderr.splitlines()
+    assert all(line.endswith(" s)") for line in progress)  # of a slow machine
     return sentence
 
 

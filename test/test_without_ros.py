@@ -73,5 +73,7 @@ def test_a_world_over_dds_is_refused_in_one_sentence(tmp_path):
     words = ["evaluate", "differential", "--in", "dds", "--episodes", "1"]
     done = without_ros(NICS, *words, cwd=tmp_path)
     assert done.returncode == 2
-    assert len(done.stderr.strip().splitlines()) == 1
-    assert "rclpy" in done.stderr
+    *progress, sentence = done.stderr.splitlines()
+    assert all(line.endswith(" s)") for line in progress)  # of a slow machine
+    assert sentence.startswith("nics: ")
+    assert "rclpy" in sentence

@@ -89,7 +89,8 @@ def test_what_can_not_be_done_is_one_sentence(folder, tmp_path, words, sentence)
     done = nics(*words, cwd=tmp_path)
     assert done.returncode == 2
     assert sentence in done.stderr
-    assert len(done.stderr.splitlines()) == 1
+    *progress, _ = done.stderr.splitlines()
+    assert all(line.endswith(" s)") for line in progress)  # of a slow machine
     assert {path.name for path in tmp_path.iterdir()} == {"drive.csv", "my.yaml"}
 
 
