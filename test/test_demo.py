@@ -8,12 +8,13 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from html.parser import HTMLParser
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from browser import CHROMIUM, Browser
 from command_line import nics
 from domains import claimed_domain
 
@@ -136,6 +137,9 @@ def test_it_goes_the_whole_road_and_leaves_a_report(tmp_path):
     deviations = re.findall(DEVIATION, episodes)
     assert len(deviations) == 2
     assert max(map(float, deviations)) < 1e-6
+    if CHROMIUM:
+        with closing(Browser(tmp_path / "browser")) as browser:
+            assert browser.flaws((tmp_path / "out" / "report.html").as_uri()) == []
 
 
 @needs_ros

@@ -5,10 +5,15 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import threading
+from contextlib import closing
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
 import yaml
+from browser import Browser, needs_chromium
 
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.world import World
@@ -50,17 +55,49 @@ def test_every_page_of_the_reference_and_of_docs_is_in_the_navigation():
     assert yaml.safe_load(text)["site_dir"] == "build/docs"
 
 
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The folder of the site, built without a warning."""
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
 @pytest.mark.process
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_the_site_is_built_without_a_warning_and_asks_for_nothing_outside(tmp_path):
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+def test_the_site_asks_for_nothing_outside(site):
     asked = re.compile(r"""<(?:script|img|iframe)[^>]*\ssrc="https?:|<link[^>]*\shref="https?:""")
-    pages = list(tmp_path.rglob("*.html"))
+    pages = list(site.rglob("*.html"))
     assert len(pages) > 50
     canonical = re.compile(r'<link rel="canonical"[^>]*>')
     for page in pages:
         text = canonical.sub("", page.read_text(encoding="utf-8"))
         assert not asked.search(text), page
+
+
+class Quiet(SimpleHTTPRequestHandler):
+    """Serves files without a word."""
+
+    def log_message(self, *_):
+        pass
+
+
+@needs_chromium
+@pytest.mark.process
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_browser_shows_every_page_of_the_site_without_a_flaw(site, tmp_path):
+    with (
+        ThreadingHTTPServer(("127.0.0.1", 0), partial(Quiet, directory=str(site))) as server,
+        closing(Browser(tmp_path)) as browser,
+    ):
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        (tmp_path / "flawed.html").write_text("<img src=none.png><p style='width: 2000px'>x")
+        assert len(browser.flaws((tmp_path / "flawed.html").as_uri())) >= 3
+        for page in site.rglob("*.html"):
+            name = page.relative_to(site).as_posix()
+            assert browser.flaws(f"http://127.0.0.1:{server.server_port}/{name}") == []
+        server.shutdown()

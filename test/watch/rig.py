@@ -1,18 +1,15 @@
-"""A source whose every frame is known, a client of the page's socket, and a headless browser."""
+"""A source whose every frame is known, and a client of the page's socket."""
 
 from __future__ import annotations
 
 import json
-import re
-import shutil
-import subprocess
 import threading
 import time
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from browser import DEADLINE_S
 from robots import direct_model, field
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
@@ -21,12 +18,6 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.watch.episode import EpisodeSource
 from nics_drl_bridge.watch.server import PageServer
 from nics_drl_bridge.watch.show import show
-
-DEADLINE_S = 60.0
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
-needs_chromium = pytest.mark.skipif(
-    CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)"
-)
 
 
 def shot(**changes) -> Snapshot:
@@ -55,15 +46,6 @@ def source(count: int = 2, seed: int = 3, model=None) -> EpisodeSource:
         return env, Forward()
 
     return EpisodeSource(make, "forward", [field(count=count)], seed)
-
-
-def until(condition, what: str):
-    """The first value of a condition that holds."""
-    deadline = time.monotonic() + DEADLINE_S
-    while not (found := condition()):
-        assert time.monotonic() < deadline, f"never came: {what}"
-        time.sleep(0.005)
-    return found
 
 
 class Client:
@@ -101,79 +83,3 @@ def shown(of):
             yield server, client
     thread.join(DEADLINE_S)
     assert not thread.is_alive()
-
-
-class Browser:
-    """Headless Chromium by its DevTools protocol; `complaints` are errors of the page."""
-
-    FLAGS = (
-        "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-        "--disable-background-networking", "--disable-component-update", "--disable-sync",
-        "--remote-debugging-port=0", "about:blank",
-    )  # fmt: skip
-
-    def __init__(self, folder) -> None:
-        from websockets.sync.client import connect
-
-        command = [CHROMIUM, f"--user-data-dir={folder}", *self.FLAGS]
-        self._process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-        lines = (re.search(r"ws://\S+", line) for line in self._process.stderr)
-        self._open = ExitStack()
-        address = next(filter(None, lines))[0]
-        self._socket = self._open.enter_context(connect(address, max_size=None))
-        threading.Thread(target=self._process.stderr.read, daemon=True).start()
-        self._count, self._session, self.events = 0, {}, []
-        target = self.call("Target.createTarget", url="about:blank")["targetId"]
-        attached = self.call("Target.attachToTarget", targetId=target, flatten=True)
-        self._session = {"sessionId": attached["sessionId"]}
-        for domain in ("Page", "Runtime", "Log"):
-            self.call(f"{domain}.enable")
-
-    def call(self, method: str, **params):
-        self._count += 1
-        order = {"id": self._count, "method": method, "params": params, **self._session}
-        self._socket.send(json.dumps(order))
-        while True:
-            answer = json.loads(self._socket.recv(timeout=DEADLINE_S))
-            if answer.get("id") == self._count:
-                assert "error" not in answer, answer
-                return answer["result"]
-            self.events.append(answer)
-
-    def open(self, url: str, width: int, height: int) -> None:
-        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 760}
-        self.call("Emulation.setDeviceMetricsOverride", **size)
-        self.call("Page.navigate", url="about:blank")  # ends what shows an earlier server
-        self.ask("0")
-        self.events.clear()
-        self.call("Page.navigate", url=url)
-        until(lambda: self.ask("!!(window.nics && nics.counters.draws > 2)"), "a drawn frame")
-
-    def ask(self, expression: str):
-        how = {"returnByValue": True, "awaitPromise": True}
-        done = self.call("Runtime.evaluate", expression=expression, **how)
-        assert "exceptionDetails" not in done, done["exceptionDetails"]
-        return done["result"].get("value")
-
-    def mouse(self, kind: str, x: float, y: float) -> None:
-        count = {} if kind == "Moved" else {"clickCount": 1}
-        event = {"type": f"mouse{kind}", "x": x, "y": y, "button": "left", **count}
-        self.call("Input.dispatchMouseEvent", **event)
-
-    @property
-    def complaints(self) -> list:
-        self.ask("0")  # takes in what has come
-        bad = ("error", "warning", "assert")
-        return [
-            event["params"]
-            for event in self.events
-            if event["method"] == "Runtime.exceptionThrown"
-            or event.get("params", {}).get("entry", {}).get("level") in bad
-            or (event["method"] == "Runtime.consoleAPICalled" and event["params"]["type"] in bad)
-        ]
-
-    def close(self) -> None:
-        with suppress(Exception):
-            self._open.close()
-        self._process.terminate()
-        self._process.wait(DEADLINE_S)

@@ -5,12 +5,13 @@ import threading
 from contextlib import closing
 
 import numpy as np
+from browser import until
 from robots import direct_model, field
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.watch.human import HumanView
 from nics_drl_bridge.watch.server import Request
-from watch.rig import Client, until
+from watch.rig import Client
 
 
 def test_render_mode_human_tells_where_its_page_is_and_shows_each_step(monkeypatch, capsys):

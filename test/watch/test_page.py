@@ -6,11 +6,12 @@ import threading
 from contextlib import closing
 
 import pytest
+from browser import Browser, needs_chromium, until
 from robots import direct_model, lidar
 
 from nics_drl_bridge.watch.server import PageServer
 from nics_drl_bridge.watch.show import show
-from watch.rig import Browser, needs_chromium, source, until
+from watch.rig import source
 
 pytestmark = [needs_chromium, pytest.mark.process, pytest.mark.slow]
 SIZES = [(1280, 800), (390, 844)]

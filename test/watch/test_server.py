@@ -6,13 +6,14 @@ import urllib.request
 from contextlib import closing
 
 import pytest
+from browser import until
 from robots import direct_model, field
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.watch import server as module
 from nics_drl_bridge.watch.frame import Frame, Stage, WorldFrame
 from nics_drl_bridge.watch.server import PageServer
-from watch.rig import Client, shot, until
+from watch.rig import Client, shot
 
 STAGE = Stage("a title", direct_model(), (field(count=0),))
 

@@ -1,13 +1,14 @@
 from __future__ import annotations
 
 import pytest
+from browser import until
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.watch import show as module
 from nics_drl_bridge.watch.frame import Frame, WorldFrame
 from nics_drl_bridge.watch.server import Request
 from nics_drl_bridge.watch.show import Tempo, open_page
-from watch.rig import shot, shown, until
+from watch.rig import shot, shown
 from watch.test_server import STAGE
 
 

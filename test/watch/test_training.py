@@ -4,12 +4,13 @@ from contextlib import closing
 
 import numpy as np
 import pytest
+from browser import until
 from robots import direct_model, field
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.watch.server import PageServer
 from nics_drl_bridge.watch.training import TrainingView
-from watch.rig import Client, until
+from watch.rig import Client
 
 
 class Envs:
