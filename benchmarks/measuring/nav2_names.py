@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+from rclpy.duration import Infinite
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, qos_check_compatible
 
 # What nodes of Nav2 say to each other, and the frame of a lidar that its own simulator plays.
 OWN = {
@@ -59,7 +60,11 @@ def wanted(file: Path) -> tuple[set[str], set[str]]:
 
 
 HEARD = ("cmd_vel", "initialpose", "goal_pose", "speed_limit")  # the others are published
-LATCHED = ("map", "tf_static")
+# The other end, as Nav2 opens it: reliable, and for some with what was sent before.
+ENDLESS = {"depth": 1, "deadline": Infinite, "liveliness_lease_duration": Infinite}
+USUAL = QoSProfile(**ENDLESS)
+KEPT = QoSProfile(durability=DurabilityPolicy.TRANSIENT_LOCAL, **ENDLESS)
+LATCHED = {"map": KEPT, "tf_static": KEPT}
 ACTIONS = {
     "follow_path": "nav2_msgs/action/FollowPath",
     "navigate_to_pose": "nav2_msgs/action/NavigateToPose",
@@ -81,14 +86,12 @@ def _fault(node: Node, topic: str) -> str:
     kinds = {end.topic_type for end in ends}
     if not kinds & {kind, kind.replace("Twist", "TwistStamped")}:
         return f"{topic}: no {look} of {kind}, but {sorted(kinds) or 'none'}"
-    offers = [end.qos_profile for end in ends]
-    reliable = all(one.reliability == ReliabilityPolicy.RELIABLE for one in offers)
-    if topic not in HEARD and not reliable:
-        return f"{topic}: is not offered reliably"
-    if topic in LATCHED and not all(
-        one.durability == DurabilityPolicy.TRANSIENT_LOCAL for one in offers
-    ):
-        return f"{topic}: is not kept for late joiners"
+    asked = LATCHED.get(topic, USUAL)
+    for end in ends:
+        pair = (asked, end.qos_profile) if topic in HEARD else (end.qos_profile, asked)
+        fit, reason = qos_check_compatible(*pair)
+        if fit == QoSCompatibility.ERROR:
+            return f"{topic}: {reason.strip().rstrip(';')}"
     return ""
 
 
