@@ -123,13 +123,15 @@ def test_it_goes_the_whole_road_and_leaves_a_report(tmp_path):
     assert successes == ("2", "2")
     assert (tmp_path / "out" / "paths.png").is_file()
     assert any("the deployed nodes reached the goal" in line for line in running.lines)
+    perturbed = [line for line in running.lines if re.match("  (as it is|lidar): success", line)]
+    assert len(perturbed) == 2
     page = Sources()
     page.feed(text)
     assert page.tags.count("img") >= 8  # episodes, predictions, yardsticks, and what is folded
     assert page.loads  # all of it is inside
     assert all(source.startswith("data:image/png;base64,") for source in page.loads)
     assert "script" not in page.tags
-    for words in ("Verdict", "Fit report", "2 of 2 episodes", "The robot reached its goal"):
+    for words in ("Verdict", "Fit report", "2 of 2 episodes", "The robot reached its goal", "mild"):
         assert words in text
     # Commands go through a quaternion and back at most: the two drives are the same drive.
     episodes = section(text, "Paths in the world")

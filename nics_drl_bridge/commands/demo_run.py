@@ -1,7 +1,7 @@
 """The parts of the demo in sequence, and its report: one page with all results."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import astuple, dataclass
 from importlib.util import find_spec
@@ -35,12 +35,13 @@ from nics_drl_bridge.report import html, pictures
 from nics_drl_bridge.report.fit_page import fit_tile, model_blocks, path_blocks, verdict_blocks
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
+from nics_drl_bridge.sim.randomisation import load_randomisation
 from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.world import load_world
 
 RECORDING_SEED, TRAINING_SEED = 1, 0
 MANY = 500  # episodes of the evaluation in the fast simulator
-BASELINE = "dynamic_window"
+BASELINE, AS_IT_IS, PERTURBED = "dynamic_window", "as it is", "mild"
 LINES = 10  # number of progress reports of a training
 ARRIVE_S = 90.0  # time that the robot may take [s]; its policy may have to be compiled
 FULL_COMMAND_S, FULL_RATE_S = 0.3, 0.05  # of the demo's gate, from zero to greatest command, rate
@@ -80,10 +81,15 @@ class Learned:
 class DemoEpisodes:
     """DemoEpisodes of the demo: of the evaluation, and the same ones in process and over DDS."""
 
-    summary: Summary
+    summaries: Mapping[str, Summary]  # of the world as it is, and perturbed
     here: Sequence[Episode]  # in process
     there: Sequence[Episode]  # over DDS
     live: Episode | None  # deployed; None without ROS 2, with which `there` is empty, too
+
+    @property
+    def summary(self) -> Summary:
+        """Of the world as it is."""
+        return self.summaries[AS_IT_IS]
 
 
 def run(plan: DemoPlan, say: Say) -> str:
@@ -101,7 +107,7 @@ def run(plan: DemoPlan, say: Say) -> str:
 
     model, identified = timed("generating", _generate)
     learned = timed("learning", learn, model)
-    summary = timed("evaluating", _evaluate, model, learned.policy)
+    summaries = timed("evaluating", _evaluate, model, learned.policy)
     here = timed("driving in process", _drive, FAST, learned.policy)
     world, radius, paths = load_world(plan.world), model.robot.footprint_radius, "paths.png"
     write_bytes(plan.out / paths, pictures.trajectories({LABELS[FAST]: here}, world, radius))
@@ -111,7 +117,7 @@ def run(plan: DemoPlan, say: Say) -> str:
     given = model, learned.policy, next(arrived, 0)
     live = timed("deploying", _deploy, *given) if topics else None
     times = [(part, f"{s:.0f}") for part, s in {**took, "all": sum(took.values())}.items()]
-    episodes = DemoEpisodes(summary, here, there, live)
+    episodes = DemoEpisodes(summaries, here, there, live)
     sections = sections_of(plan, model, identified, learned, episodes)
     folded = html.details("Wall time", [html.table(("part", "wall time [s]"), times)])
     file = plan.out / "report.html"
@@ -194,16 +200,18 @@ def _trained(plan: DemoPlan, model: SimulatorModel, say: Say) -> Learned:
     return Learned(str(file), how, curve)
 
 
-def _evaluate(plan: DemoPlan, model: SimulatorModel, name: str, say: Say) -> Summary:
-    say(f"evaluating {name} in {MANY} unseen episodes, all at once")
+def _evaluate(plan: DemoPlan, model: SimulatorModel, name: str, say: Say) -> dict[str, Summary]:
+    say(f"evaluating {name} in {MANY} unseen episodes, all at once, then perturbed")
     policy, task = open_policy(name, model)
-    limit = pace_of(model, [load_world(plan.world)]).steps
-    env = BridgeVectorEnv(MANY, model, plan.world, task, max_episode_steps=limit)
-    outcomes = evaluation.drive_worlds(env, policy.act, range(FIRST_SEED, FIRST_SEED + MANY))
-    summary = evaluation.summarise(outcomes, model.control_period)
-    rates = (f"{name} {100 * share.value:.1f} %" for name, share in summary.shares.items())
-    say(f"  {', '.join(rates)}")
-    return summary
+    limit, found = pace_of(model, [load_world(plan.world)]).steps, {}
+    for what, drawn in {AS_IT_IS: None, **load_randomisation(PERTURBED).alone()}.items():
+        options: dict[str, Any] = {"max_episode_steps": limit, "randomisation": drawn}
+        env = BridgeVectorEnv(MANY, model, plan.world, task, **options)
+        outcomes = evaluation.drive_worlds(env, policy.act, range(FIRST_SEED, FIRST_SEED + MANY))
+        found[what] = summary = evaluation.summarise(outcomes, model.control_period)
+        rates = (f"{result} {100 * each.value:.1f} %" for result, each in summary.shares.items())
+        say(f"  {what.replace('_', ' ')}: {', '.join(rates)}")
+    return found
 
 
 def _drive(plan: DemoPlan, place: str, policy: str, say: Say) -> list[Episode]:
@@ -282,7 +290,7 @@ def sections_of(
     return [
         ("Verdict", _verdict(plan, learned, identified, of)),
         ("Paths in the world", _episodes(plan, model, of)),
-        ("The policy", _policy(plan, learned, of.summary)),
+        ("The policy", _policy(plan, learned, of)),
         ("Paths of the model", path_blocks(identified)),
         ("The model", model_blocks(model.robot, identified, model.report)),
     ]
@@ -322,12 +330,16 @@ def _verdict(
     )  # fmt: skip
 
 
-def _policy(plan: DemoPlan, learned: Learned, summary: Summary) -> list[str]:
-    blocks = [html.paragraph(learned.how)]
+def _policy(plan: DemoPlan, learned: Learned, of: DemoEpisodes) -> list[str]:
+    summary, drawn = of.summary, list[tuple[bytes, str]]()
     if learned.curve:
         caption = "Success and collisions while it explores; all episodes are new ones."
-        blocks.append(html.picture(pictures.training_curve(learned.curve), caption))
-    rows = []
+        drawn.append((pictures.training_curve(learned.curve), caption))
+    caption = f"Success as it is, and with each perturbation of {PERTURBED!r} alone (95 %)."
+    shares = {what: each.success for what, each in of.summaries.items()}
+    drawn.append((pictures.robustness(shares), caption))
+    blocks = [html.paragraph(learned.how), html.gallery(drawn)]
+    rows = list[tuple[str, ...]]()
     for name, share in summary.shares.items():
         rows.append((name, *(f"{100 * value:.1f} %" for value in astuple(share))))
     for name, amount in (("path [m]", summary.length), ("time [s]", summary.time)):

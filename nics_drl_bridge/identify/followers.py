@@ -10,24 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify import signals
+from nics_drl_bridge.identify import clocks, signals
 from nics_drl_bridge.identify.calibration import Calibration
-from nics_drl_bridge.identify.clocks import (
-    BOUNDS,
-    CERTAIN,
-    CLUSTER_S,
-    EXACT,
-    FEW_ROWS,
-    MIN_TIME_S,
-    STEP_S,
-    TOLD_S,
-    WITHIN_TICK,
-    Left,
-    TimingEstimate,
-    if_certain,
-    response_residual,
-    some_of,
-)
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.excitation import moving_dofs
 from nics_drl_bridge.identify.signals import Motors
@@ -70,7 +54,7 @@ class _Adjusted:
     motor_sigma: Array  # (S, 3) of fall, rise and dead zone
 
 
-def apart(drive: Drive, timing: TimingEstimate) -> TimingEstimate:
+def apart(drive: Drive, timing: clocks.TimingEstimate) -> clocks.TimingEstimate:
     """Sharpens a timing by a delay and a lag of each command of its own, and what motors do.
 
     What stands between command and motion beside one lag, as a servo of higher order, adds to a
@@ -83,21 +67,21 @@ def apart(drive: Drive, timing: TimingEstimate) -> TimingEstimate:
     delay, sigma = found.best.delays[moved], found.sigma
     if not np.isfinite(sigma).all():
         return timing
-    first = int(np.argmin(delay + CERTAIN * sigma[0]))
-    alike = np.abs(delay - delay[first]) <= CERTAIN * np.hypot(sigma[0], sigma[0, first])
+    first = int(np.argmin(delay + clocks.CERTAIN * sigma[0]))
+    alike = np.abs(delay - delay[first]) <= clocks.CERTAIN * np.hypot(sigma[0], sigma[0, first])
     told, motors = len(timing.sigma) > 1, found.best.motors  # True if wheels told the latency
     held = motors.limited
     if told and alike.all() and not (held.any() or motors.dead.any()):
         return timing
     least = float(np.average(delay[alike], weights=sigma[0, alike] ** -2.0))
-    sigma = np.hypot(sigma, WITHIN_TICK * STEP_S)
+    sigma = np.hypot(sigma, clocks.WITHIN_TICK * clocks.STEP_S)
     own = np.hypot(sigma[0], END * np.where(held[moved], delay - least, 0.0))
     unsure = END * (least if timing.separated and not told else max(DELAYS_S)) * held.any()
     errors = {n: float(np.hypot(sigma[0, first] if len(timing.sigma) == 1 else e, unsure))
               for n, e in timing.sigma.items()}  # fmt: skip
     if timing.separated and not told:
-        least = if_certain(max(least, 0.0), float(sigma[0, first]), MIN_TIME_S)
-    if timing.separated and errors["command_latency_s"] > TOLD_S:
+        least = clocks.if_certain(max(least, 0.0), float(sigma[0, first]), clocks.MIN_TIME_S)
+    if timing.separated and errors["command_latency_s"] > clocks.TOLD_S:
         names = (_of_sum(drive.spec.state[i].name) for i in moved)
         errors |= zip(names, map(float, sigma[1]), strict=True)
     lags, lag_sigma, further = timing.lags.copy(), timing.lag_sigma.copy(), 0.0 * timing.lags
@@ -117,7 +101,7 @@ def apart(drive: Drive, timing: TimingEstimate) -> TimingEstimate:
     )  # fmt: skip
 
 
-def late_inputs(spec: RobotSpec, timing: TimingEstimate) -> tuple[InputCurve, ...]:
+def late_inputs(spec: RobotSpec, timing: clocks.TimingEstimate) -> tuple[InputCurve, ...]:
     """Returns the curves of commands that have a dead zone, or act later than others."""
     dead = timing.motors.dead if timing.motors else np.zeros(len(timing.delays))
     rows = zip(spec.state, timing.delays.tolist(), dead.tolist(), strict=False)
@@ -125,7 +109,7 @@ def late_inputs(spec: RobotSpec, timing: TimingEstimate) -> tuple[InputCurve, ..
     return tuple(InputCurve(command=str(n), dead=zone, delay=d) for n, (d, zone) in each.items())
 
 
-def limits_of(spec: RobotSpec, timing: TimingEstimate) -> dict[str, tuple[float, float]]:
+def limits_of(spec: RobotSpec, timing: clocks.TimingEstimate) -> dict[str, tuple[float, float]]:
     """Returns the greatest fall and rise of states that have them, at a gain of one."""
     if timing.motors is None:
         return {}
@@ -147,25 +131,26 @@ def unlimited(samples: Samples, calibration: Calibration, spec: RobotSpec) -> Sa
     for i, response in enumerate(calibration.responses):
         if response.state in calibration.limits:
             target = response.gain * samples.x[:, len(spec.state) + names.index(response.command)]
-            share = -np.expm1(-samples.dt / max(response.lag_s, MIN_TIME_S))
+            share = -np.expm1(-samples.dt / max(response.lag_s, clocks.MIN_TIME_S))
             rates[:, 3 + i] = share * (target - samples.x[:, i]) / samples.dt
     return replace(samples, dq=rates)
 
 
-def _found(drive: Drive, timing: TimingEstimate, moved: NDArray[np.intp]) -> _Adjusted:
+def _found(drive: Drive, timing: clocks.TimingEstimate, moved: NDArray[np.intp]) -> _Adjusted:
     """Returns how moved states follow, with limits and dead zones if they clearly explain more."""
     twists, command, spec = drive.twists, drive.recording.command, drive.spec
-    rows, moving = some_of(len(twists.start), FEW_ROWS), list(moving_dofs(twists.twist))
+    rows = clocks.some_of(len(twists.start), clocks.FEW_ROWS)
+    moving = list(moving_dofs(twists.twist))
     begin, shift, size = twists.start[rows], timing.latency - timing.offset, len(timing.lags)
     start = _Following(timing.lags, np.full(size, shift), signals.free_motors(size))
     for _ in range(2):  # what commands do not explain hides what motors do
         target = (begin, twists.end[rows], twists.twist[rows][:, moving])
-        left = response_residual(command, spec, target, GREATEST_ORDER)
+        left = clocks.response_residual(command, spec, target, GREATEST_ORDER)
         unexplained = np.mean(left(*vars(start).values()).reshape(len(rows), -1) ** 2, axis=0)
         if (unexplained < EXPLAINED).all() or not (unexplained < EXPLAINED).any():
             break
         moving = [dof for dof, rest in zip(moving, unexplained, strict=True) if rest < EXPLAINED]
-    cluster = np.repeat(((begin - begin[0]) / CLUSTER_S).astype(np.intp), len(moving))
+    cluster = np.repeat(((begin - begin[0]) / clocks.CLUSTER_S).astype(np.intp), len(moving))
     best = _adjusted(left, start, moved, shift, cluster)
     for tries in (_with_limits, _with_dead_zones, _with_limits):  # what one does hides another
         for i in moved:
@@ -178,7 +163,7 @@ def _found(drive: Drive, timing: TimingEstimate, moved: NDArray[np.intp]) -> _Ad
     return best
 
 
-def _cost(left: Left, each: _Following) -> float:
+def _cost(left: clocks.Left, each: _Following) -> float:
     return float((left(each.lags, each.delays, each.motors) ** 2).sum())
 
 
@@ -204,8 +189,9 @@ def _put(values: Array, i: int, value: float) -> Array:
 
 
 def _adjusted(
-    left: Left, start: _Following, moved: NDArray[np.intp], shift: float, cluster: NDArray[np.intp]
-) -> _Adjusted:
+    left: clocks.Left, start: _Following, moved: NDArray[np.intp], shift: float,
+    cluster: NDArray[np.intp],
+) -> _Adjusted:  # fmt: skip
     """Adjusts delays and lags of moved states, and limits and dead zones where there are any."""
     count = len(moved)
     given = np.stack(start.motors, axis=1)  # (S, 3)
@@ -223,7 +209,7 @@ def _adjusted(
         return left(each.lags, each.delays, each.motors)
 
     reach = np.full(len(size), np.log(WIDER))
-    low, high = (np.repeat([shift + delay, log_lag], count) for delay, log_lag in BOUNDS)
+    low, high = (np.repeat([shift + delay, log_lag], count) for delay, log_lag in clocks.BOUNDS)
     begun = np.clip(np.append(start.delays[moved], np.log(start.lags[moved])), low, high)
     found, jacobian, rest = minimise(
         residual, np.append(begun, 0.0 * reach), np.full(len(begun) + len(reach), 0.1),
@@ -233,7 +219,7 @@ def _adjusted(
     by_lag = jacobian[:, count : 2 * count] / best.lags[moved]
     by_size = jacobian[:, 2 * count :] / np.abs(np.stack(best.motors, axis=1)[held])
     by_sum = np.concatenate([jacobian[:, :count] - by_lag, by_lag, by_size], axis=1)
-    sigma = np.maximum(clustered_errors(by_sum, rest, cluster), EXACT)
+    sigma = np.maximum(clustered_errors(by_sum, rest, cluster), clocks.EXACT)
     motor_sigma = np.zeros(given.shape)
     effect = np.linalg.norm(by_size, axis=0) * size
     sure = (effect > NO_EFFECT * np.linalg.norm(rest)) & (sigma[2 * count :] < size)

@@ -89,7 +89,7 @@ def write_fit_page(
     tile, model = fit_tile(identified), identified.model
     terms = str(model.terms_kept), f"terms of a model with a step of {model.dt:g} s", True
     assumed = len(model.assumed)
-    gaps = str(len(conclusion.gaps)), "things that the drive could not teach", not conclusion.gaps
+    gaps = str(len(conclusion.gaps)), "gaps in what the drive taught", not conclusion.gaps
     figures = [tile, gaps, terms]
     if assumed:
         figures.append((str(assumed), "of the terms are assumed from the textbook", False))

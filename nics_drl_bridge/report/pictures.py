@@ -1,6 +1,7 @@
 """Pictures of trajectories, drives, trainings, policies and worlds, each a PNG."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import astuple
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.env.rendering import draw_world
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, X, Y
-from nics_drl_bridge.policy.evaluation import Episode
+from nics_drl_bridge.policy.evaluation import ConfidenceInterval, Episode
 from nics_drl_bridge.policy.shadow import Shadow
 from nics_drl_bridge.recording.excite import Pattern
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -102,6 +103,17 @@ def training_curve(points: Sequence[Point]) -> bytes:
     return png(figure)
 
 
+def robustness(shares: Mapping[str, ConfidenceInterval]) -> bytes:
+    """Draws success [%] with its interval, by what was perturbed."""
+    figure, (axes,) = panels(1, 1, (5.2, 3.6))
+    value, low, high = 100.0 * np.array([astuple(share) for share in shares.values()]).T
+    names, ends = [name.replace("_", " ") for name in shares], (value - low, high - value)
+    axes.errorbar(value, names, xerr=ends, fmt="o", color=MODEL, capsize=3.0)
+    axes.invert_yaxis()
+    axes.set(xlabel="success [%]", xlim=(min(90.0, low.min() - 2.0), 100.5))
+    return png(figure)
+
+
 def shadow_picture(shadow: Shadow) -> bytes:
     """Draws each command over time, as driven and as chosen by the policy."""
     count = len(shadow.names)
@@ -177,12 +189,8 @@ def _movers(axes: Axes, motions: Sequence[Motion | None], scene: Scene) -> None:
 def _start(
     axes: Axes, pose: Array, footprint: float, outline: Sequence[tuple[float, float]] | None
 ) -> None:
-    look: dict[str, Any] = {
-        "facecolor": MEASURED,
-        "edgecolor": DARK,
-        "zorder": 4,
-        "label": "robot at its start",
-    }
+    look: dict[str, Any] = {"facecolor": MEASURED, "edgecolor": DARK, "zorder": 4}
+    look["label"] = "robot at its start"
     front = footprint if outline is None else np.max(outline, axis=0)[0]
     if outline is None:
         axes.add_patch(Circle((pose[0], pose[1]), footprint, **look))

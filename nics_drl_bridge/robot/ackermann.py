@@ -7,15 +7,7 @@ dead zone and slip are for a recording to show.
 """
 
 from nics_drl_bridge.geometry import Bicycle
-from nics_drl_bridge.robot.kinds import (
-    Drawing,
-    Pivot,
-    RobotKind,
-    Textbook,
-    Wheel,
-    steered,
-    steering_angle,
-)
+from nics_drl_bridge.robot import kinds
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
 from nics_drl_bridge.robot.template import SHARES, STEERED, STEERED_LAGS, Template, names_of, usual
 
@@ -26,16 +18,16 @@ THROTTLE = (usual("throttle", "1", SHARES), usual("steering", "1", SHARES))
 GAINS = {"speed_gain": 3.0, "greatest_steering": 0.4, "speed_lag": 0.5, "steering_lag": 0.1}
 
 
-def kinematics(spec: RobotSpec) -> Textbook:
+def kinematics(spec: RobotSpec) -> kinds.Textbook:
     """Curvature tan(angle) / wheelbase."""
-    return steered(spec, Bicycle(spec.parameters["wheelbase"]), names_of(STEERED))
+    return kinds.steered(spec, Bicycle(spec.parameters["wheelbase"]), names_of(STEERED))
 
 
-def by_throttle(spec: RobotSpec) -> Textbook:
+def by_throttle(spec: RobotSpec) -> kinds.Textbook:
     """The same, of shares of the greatest speed and steering angle."""
     p = spec.parameters
     gain = p["speed_gain"], p["greatest_steering"]
-    return steered(spec, Bicycle(p["wheelbase"]), names_of(THROTTLE), gain)
+    return kinds.steered(spec, Bicycle(p["wheelbase"]), names_of(THROTTLE), gain)
 
 
 def track_and_radius(parameters: dict[str, float]) -> tuple[float, float]:
@@ -44,21 +36,21 @@ def track_and_radius(parameters: dict[str, float]) -> tuple[float, float]:
     return parameters.get("track", 0.8 * base), parameters.get("wheel_radius", 0.18 * base)
 
 
-def drawing(spec: RobotSpec) -> Drawing:
+def drawing(spec: RobotSpec) -> kinds.Drawing:
     """A box on four wheels; the right front wheel follows the left one."""
-    wheelbase, angle = spec.parameters["wheelbase"], steering_angle(spec)
+    wheelbase, angle = spec.parameters["wheelbase"], kinds.steering_angle(spec)
     track, radius = track_and_radius(spec.parameters)
     wheels = []
     for side, y, suffix in (("left", 0.5 * track, ""), ("right", -0.5 * track, "_right")):
-        pivot = Pivot(f"{side}_knuckle", angle.name + suffix, angle) if angle else None
-        wheels.append(Wheel(f"rear_{side}_wheel", (0.0, y), radius))
-        wheels.append(Wheel(f"front_{side}_wheel", (wheelbase, y), radius, pivot=pivot))
-    return Drawing((1.3 * wheelbase, 0.7 * track), (0.45 * wheelbase, radius), tuple(wheels))
+        pivot = kinds.Pivot(f"{side}_knuckle", angle.name + suffix, angle) if angle else None
+        wheels.append(kinds.Wheel(f"rear_{side}_wheel", (0.0, y), radius))
+        wheels.append(kinds.Wheel(f"front_{side}_wheel", (wheelbase, y), radius, pivot=pivot))
+    return kinds.Drawing((1.3 * wheelbase, 0.7 * track), (0.45 * wheelbase, radius), tuple(wheels))
 
 
-KIND = RobotKind(kinematics, drawing, TEMPLATE)
+KIND = kinds.RobotKind(kinematics, drawing, TEMPLATE)
 VARIANTS = {
-    "ackermann_throttle": RobotKind(
+    "ackermann_throttle": kinds.RobotKind(
         by_throttle, drawing, Template((THROTTLE,), POSE_RATES, (), GAINS, LENGTHS)
     )
 }

@@ -4,15 +4,7 @@ Its commands are the front wheel's speed along its own direction [m/s] and steer
 """
 
 from nics_drl_bridge.geometry import Bicycle
-from nics_drl_bridge.robot.kinds import (
-    Drawing,
-    Pivot,
-    RobotKind,
-    Textbook,
-    Wheel,
-    steered,
-    steering_angle,
-)
+from nics_drl_bridge.robot import kinds
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.template import STEERED, STEERED_LAGS, STEERED_STATE, Template, names_of
 
@@ -23,22 +15,24 @@ TEMPLATE = Template(
 )  # fmt: skip
 
 
-def kinematics(spec: RobotSpec) -> Textbook:
+def kinematics(spec: RobotSpec) -> kinds.Textbook:
     """The front wheel pulls forward by its cosine, and turns the base by its sine."""
-    return steered(spec, Bicycle(spec.parameters["wheelbase"], front_drive=True), names_of(STEERED))
-
-
-def drawing(spec: RobotSpec) -> Drawing:
-    """A box on three wheels of one size."""
-    p, angle = spec.parameters, steering_angle(spec)
-    wheelbase, track, radius = p["wheelbase"], p["track"], p["wheel_radius"]
-    fork = Pivot("fork", angle.name, angle) if angle else None
-    wheels = (
-        Wheel("rear_left_wheel", (0.0, 0.5 * track), radius),
-        Wheel("rear_right_wheel", (0.0, -0.5 * track), radius),
-        Wheel("front_wheel", (wheelbase, 0.0), radius, pivot=fork),
+    return kinds.steered(
+        spec, Bicycle(spec.parameters["wheelbase"], front_drive=True), names_of(STEERED)
     )
-    return Drawing((wheelbase, 0.7 * track), (0.4 * wheelbase, 1.5 * radius), wheels)
 
 
-KIND = RobotKind(kinematics, drawing, TEMPLATE, front_drive=True)
+def drawing(spec: RobotSpec) -> kinds.Drawing:
+    """A box on three wheels of one size."""
+    p, angle = spec.parameters, kinds.steering_angle(spec)
+    wheelbase, track, radius = p["wheelbase"], p["track"], p["wheel_radius"]
+    fork = kinds.Pivot("fork", angle.name, angle) if angle else None
+    wheels = (
+        kinds.Wheel("rear_left_wheel", (0.0, 0.5 * track), radius),
+        kinds.Wheel("rear_right_wheel", (0.0, -0.5 * track), radius),
+        kinds.Wheel("front_wheel", (wheelbase, 0.0), radius, pivot=fork),
+    )
+    return kinds.Drawing((wheelbase, 0.7 * track), (0.4 * wheelbase, 1.5 * radius), wheels)
+
+
+KIND = kinds.RobotKind(kinematics, drawing, TEMPLATE, front_drive=True)

@@ -147,6 +147,12 @@ class Randomisation(Schema):
         rungs = self.obstacles.rungs if high > low else 1
         return tuple(np.linspace(low, high, rungs).tolist())
 
+    def alone(self) -> dict[str, Randomisation]:
+        """Each of the given ranges without the others, by the name of its field."""
+        given = {name: getattr(self, name) for name in type(self).model_fields}
+        names = (name for name in given if name in self.model_fields_set - {"name"})
+        return {name: Randomisation(**{"name": name, name: given[name]}) for name in names}
+
     @property
     def fingerprint(self) -> str:
         """Identifies the ranges: 16 digits of a SHA-256."""

@@ -11,12 +11,13 @@ from PIL import Image
 from robots import circles, field
 
 from nics_drl_bridge.lidar.shapes import place
-from nics_drl_bridge.policy.evaluation import Episode
+from nics_drl_bridge.policy.evaluation import Episode, rate
 from nics_drl_bridge.recording.excite import DrivePlan
 from nics_drl_bridge.report.pictures import (
     Point,
     draw_world,
     drive_picture,
+    robustness,
     training_curve,
     trajectories,
     world_picture,
@@ -177,3 +178,10 @@ def test_a_drive_is_drawn(name):
 )
 def test_a_training_is_drawn_from_its_first_rollout_on(points):
     assert training_curve(points).startswith(b"\x89PNG")
+
+
+def test_success_under_each_perturbation_is_drawn_as_low_as_it_is():
+    best, worst = rate(500, 500), rate(10, 500)
+    drawn = robustness({"as it is": best, "action_latency": worst})
+    assert drawn.startswith(b"\x89PNG")
+    assert drawn != robustness({"as it is": best, "action_latency": best})

@@ -101,6 +101,17 @@ def test_naming_one_range_does_not_shift_the_draws_of_another():
     assert np.array_equal(one.faults[..., column], more.faults[..., column])
 
 
+def test_each_range_alone_leaves_the_others_as_they_are():
+    whole = load_randomisation("mild")
+    alone = whole.alone()
+    named = ["kinematics", "action_latency", "observation_latency", "odometry", "lidar"]
+    assert list(alone) == named
+    for name, one in alone.items():
+        assert getattr(one, name) == getattr(whole, name)
+        assert one == Randomisation(**{"name": name, name: getattr(whole, name)})
+    assert given().alone() == {}
+
+
 def test_each_coefficient_is_scaled_evenly_and_on_its_own():
     drawn = Sampler(given(kinematics={"scale": [0.5, 2.0]}), builtin_model("ackermann")).draw(SEEDS)
     nominal = term_arrays(builtin_model("ackermann").kinematics).coefficient
