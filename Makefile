@@ -294,7 +294,7 @@ docs: setup ## build the site of docs/ into build/docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 	@echo "to read and search it: $(BIN)/python -m http.server -b 127.0.0.1 -d build/docs"
 
-reference: setup ## make docs/reference/ from the schemas of the files and from the commands
+reference: setup ## make docs/reference/ from the schemas of the files, the commands and the nodes
 	$(BIN)/python docs/site/reference.py
 
 notebooks: setup ## run docs/notebooks/ and keep their outputs

@@ -1,4 +1,4 @@
-"""Makes docs/reference/ from the schemas of the files, and from the commands: `make reference`.
+"""Makes docs/reference/ from the schemas of files, the commands and the nodes: `make reference`.
 
 A key's meaning is the comment beside its field in the code, so it has one home.
 """
@@ -20,6 +20,7 @@ from nics_drl_bridge.commands.cli import app
 from nics_drl_bridge.gate.limits import LimitsFile
 from nics_drl_bridge.lidar.maps import MapFile
 from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.nodes.parameters import NODES, STAMPED, Row
 from nics_drl_bridge.policy.foreign_mapping import ForeignPolicy
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 from nics_drl_bridge.recording.mapping import Mapping
@@ -218,12 +219,43 @@ def command_section(path: str, command: Any) -> str:
     return "\n".join([*lines, ""])
 
 
+def cell(text: str) -> str:
+    """A text as it stands in a table."""
+    return text.replace("|", "&#124;")
+
+
+def parameter_row(row: Row) -> str:
+    """What a node's parameter means, its default and its range."""
+    usual = row.shown or shown(row.default)
+    if row.name in (STAMPED, "stamped"):
+        usual = "true since Kilted"
+    span = "" if row.span is None else f"{row.span[0]:g} to {row.span[1]:g}"
+    told = row.about if row.fixed else f"{row.about} May be set while it runs."
+    return f"| `{row.name}` | {cell(usual)} | {span} | {cell(told)} |"
+
+
+def node_section(node: str) -> str:
+    """What a node does, its topics, services and parameters, and an example."""
+    facts = NODES[node]()
+    heads = ("subscribes to", "publishes", "services")
+    lines = [f"## {node}\n", facts.about, "", "| | |", "|---|---|"]
+    for head in heads:
+        if names := getattr(facts, head.split()[0]):
+            lines.append(f"| {head} | {', '.join(names)} |")
+    lines += ["", "| parameter | default | range | meaning |", "|---|---|---|---|"]
+    lines += map(parameter_row, facts.parameters)
+    command = f"ros2 run nics_drl_bridge {node} --ros-args {facts.example}"
+    return "\n".join([*lines, "", f"```bash\n{command}\n```", ""])
+
+
 def pages() -> dict[str, str]:
     """All pages of the reference by file name."""
     found = {f"{name}.md": page(kind) for name, kind in KINDS.items()}
     every = [command_section(*one) for one in commands(get_command(app), "nics")]
     head = "# Commands\n\nEvery command of `nics`, as `nics COMMAND --help` tells it.\n"
     found["commands.md"] = "\n".join([head, *every])
+    head = "# Nodes\n\nEvery node, as `ros2 run nics_drl_bridge NODE --help` tells it.\n"
+    found["nodes.md"] = "\n".join([head, *map(node_section, NODES)])
     return found
 
 
