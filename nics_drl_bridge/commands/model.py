@@ -294,9 +294,8 @@ def drive(
         import numpy as np
 
         from nics_drl_bridge.generator import check_place, generate, lidar_of, save_model
-        from nics_drl_bridge.recording.recording import save_recording
         from nics_drl_bridge.recording.textbook import record as record_textbook
-        from nics_drl_bridge.recording.write import check_out
+        from nics_drl_bridge.recording.write import check_out, write_drive
         from nics_drl_bridge.robot.spec import load_robot
 
         check_place(out)
@@ -307,7 +306,7 @@ def drive(
         with console.progress_bar(f"driving and generating {spec.name!r}"):
             driven = record_textbook(spec, np.random.default_rng(seed), duration)
             if recording is not None:
-                save_recording(driven, check_out(recording))
+                write_drive(driven, check_out(recording), spec)
             model, _ = generate(driven, spec, seen, ())
         save_model(model, out)
         typer.echo(model.report.rstrip())

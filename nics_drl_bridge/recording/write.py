@@ -7,6 +7,7 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -51,9 +52,9 @@ def check_out(path: str | Path) -> Path:
 
 
 def write_drive(recording: Recording, path: str | Path, spec: RobotSpec) -> None:
-    """Writes a recording, completely or not at all: `.npz`, or else a rosbag2 in MCAP."""
+    """Writes a recording, whole or not at all: `.npz`, which tells its robot, or a rosbag2."""
     if Path(path).suffix == NPZ:
-        save_recording(recording, path)
+        save_recording(replace(recording, robot=spec.model_dump(mode="json")), path)
     else:
         write_bag(recording, path, spec)
 

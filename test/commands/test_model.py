@@ -7,8 +7,10 @@ import pytest
 from command_line import nics
 
 from nics_drl_bridge.generator import load_model
+from nics_drl_bridge.recording.readers import robot_and_drive
 from nics_drl_bridge.recording.recording import load_recording, save_recording
 from nics_drl_bridge.recording.textbook import record
+from nics_drl_bridge.recording.topic_roles import TopicRoles
 from nics_drl_bridge.robot.spec import load_robot
 
 NARROW = """
@@ -38,6 +40,8 @@ def test_a_robots_file_becomes_a_model_and_a_recording_by_a_textbook_drive(tmp_p
     assert model.lidar.mount == (0.05, 0.0, 0.0)
     assert model.control_period == pytest.approx(0.18)  # that of the lidar, which scans at 5.5 Hz
     assert load_recording(tmp_path / "drive.npz").command.t[-1] == pytest.approx(20.0, abs=0.1)
+    spec, _ = robot_and_drive(tmp_path / "drive.npz", None, TopicRoles(), None)
+    assert spec == load_robot(tmp_path / "mine.yaml")  # a recording tells its robot
 
 
 @pytest.mark.slow
