@@ -1,10 +1,9 @@
-"""Runs of `nics evaluate`, each in a process and a ROS domain of its own, two at a time."""
+"""Runs of `nics evaluate`, each in a process of its own, two at a time."""
 
 from __future__ import annotations
 
 import json
 import os
-import random
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -17,7 +16,6 @@ from nics_drl_bridge.commands.conditions import NO_CONDITIONS, Conditions
 
 BENCHMARKS = Path(__file__).resolve().parents[1]
 AT_ONCE = 2
-DOMAINS = range(1, 102)
 
 
 @dataclass(frozen=True)
@@ -46,12 +44,8 @@ def evaluations(
     Raises:
         RuntimeError: one failed; its own words are in it.
     """
-    domains = random.sample(DOMAINS, len(runs))
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        waiting = {
-            name: pool.submit(_evaluate, run, domain)
-            for (name, run), domain in zip(runs.items(), domains, strict=True)
-        }
+        waiting = {name: pool.submit(_evaluate, run) for name, run in runs.items()}
         found = {}
         for name, future in waiting.items():
             found[name] = future.result()
@@ -59,7 +53,7 @@ def evaluations(
         return found
 
 
-def _evaluate(run: Run, domain: int) -> dict[str, Any]:
+def _evaluate(run: Run) -> dict[str, Any]:
     words: Sequence[object] = (
         "evaluate", run.policy, "--model", run.robot, "--world", run.world, "--episodes",
         run.episodes, "--seed", run.seed, "--out", run.out,
@@ -74,12 +68,11 @@ def _evaluate(run: Run, domain: int) -> dict[str, Any]:
         ["measuring.deceived", run.control] if run.control else ["nics_drl_bridge.commands.cli"]
     )
     paths = os.pathsep.join([str(BENCHMARKS), *filter(None, [os.environ.get("PYTHONPATH")])])
-    done = subprocess.run(
-        [sys.executable, "-m", *program, *map(str, words)],
-        env=os.environ | {"ROS_DOMAIN_ID": str(domain), "PYTHONPATH": paths},
-        capture_output=True,
-        text=True,
-    )
+    # Without a domain, the command takes one that nobody uses when it needs it.
+    kept = {name: value for name, value in os.environ.items() if name != "ROS_DOMAIN_ID"}
+    command = [sys.executable, "-m", *program, *map(str, words)]
+    env = kept | {"PYTHONPATH": paths}
+    done = subprocess.run(command, env=env, capture_output=True, text=True)
     if done.returncode:
         raise RuntimeError(f"nics {' '.join(map(str, words))}: {done.stderr.strip()}")
     told = json.loads((run.out / "evaluation.json").read_text(encoding="utf-8"))
