@@ -91,7 +91,8 @@ def test_the_report_begins_with_success_in_three_worlds_and_folds_the_figures(
     live = episode(0, "success" if arrived else "time-out")
     points = [Point(8192, 0.1, 0.8), Point(80_000, 0.9, 0.1)]
     learned = Learned("policy.onnx", "PPO learned it.", points)
-    of = DemoEpisodes(summary, [episode(0), episode(1)], [episode(0), episode(1)], live)
+    summaries = {"as it is": summary, "lidar": summary}
+    of = DemoEpisodes(summaries, [episode(0), episode(1)], [episode(0), episode(1)], live)
     sections = dict(sections_of(DemoPlan(tmp_path), model, identified, learned, of))
     assert next(iter(sections)) == "Verdict"
     verdict = "".join(sections["Verdict"])

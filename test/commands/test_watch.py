@@ -5,8 +5,9 @@ from contextlib import closing
 
 import pytest
 import typer
+from browser import until
 from command_line import nics
-from watch.rig import Client, source, until
+from watch.rig import Client, source
 
 from nics_drl_bridge.commands import watch as module
 
