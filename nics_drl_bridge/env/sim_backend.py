@@ -64,11 +64,11 @@ class SimBackend:
             middleware.command(self._now_ns, one)
         self.simulator.step(commands[None])
         self._now_ns += self._period_ns
-        told = {"stamp_ns": self._now_ns, **self._truth()}
-        if self._middlewares:
+        told, view = {"stamp_ns": self._now_ns, **self._truth()}, self._measure()
+        if self._middlewares:  # as of this view
             every = np.array([each.estimator.covariance[:3, :3] for each in self._middlewares])
             told["covariance"] = every[0] if len(every) == 1 else every
-        return self._measure(), told
+        return view, told
 
     def facts(self) -> BackendFacts:
         """Returns the truth, the obstacles and the draws; see `interface.Backend`."""
