@@ -43,15 +43,19 @@ class Belief(NamedTuple):
 
 
 class Foreseen(NamedTuple):
-    """Result of a prediction: time [ns], mean, covariance, and the expected twist measurement."""
+    """Result of a prediction: time [ns], mean, covariance, and the expected twist measurement.
+
+    If in advance, `gains` are what a twist corrects present and anchor by.
+    """
 
     time_ns: int
     mean: Array
     covariance: Array
     expected: tuple[Array, Array]
     error: Array  # see `Belief`
-    transition: Array  # (3 + S, 3 + S) derivative to the mean before
-    update: tuple[Array, Array] | None = None  # gain (3 + S, 3), covariance after; if in advance
+    since: Anchor | None  # at the time of the prediction
+    anchor: Anchor | None  # the same as of the predicted time
+    gains: tuple[tuple[Array, ...], tuple[Array, ...]] | None = None  # `kernels.gain`, `recall`
 
 
 def parted(covariance: Array) -> Array:

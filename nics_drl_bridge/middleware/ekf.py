@@ -1,10 +1,11 @@
 """The state estimator: filterpy's extended Kalman filter around the fitted model."""
 
+from typing import Any
+
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import ArrayLike, NDArray
 
-from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.middleware import kernels
@@ -62,11 +63,12 @@ class Estimator:
         }
         # Measured drift is motion that the model misses, wheels do not; an assumed one may be slip.
         missed = model.noise.drift(model.robot) ** 2 - model.noise.simulated_drift(model.robot) ** 2
-        self._slip = np.diag(np.maximum(missed[:3], LEAST_SLIP**2))
-        self._walk = self._noise[Kind.TWIST] * model.control_period
+        slip = np.diag(np.maximum(missed[:3], LEAST_SLIP**2))
+        walk = self._noise[Kind.TWIST] * model.control_period
+        self._wheels = kernels.Wheels(walk, slip, *self._limits)
         self.unseen = Unseen(model, self._process, self._noise[Kind.TWIST], self._news)
         self._observe_pose, self._suddenly = np.eye(3, 3 + size), np.eye(3 + size, size, -3)
-        self._filter, self._trial = (ExtendedKalmanFilter(3 + size, 3) for _ in range(2))
+        self._filter = ExtendedKalmanFilter(3 + size, 3)
         self._anchor: Anchor | None = None
         self._foreseen: Foreseen | None = None  # of the present belief and commands
         self.reset(0, np.zeros(3))
@@ -150,13 +152,12 @@ class Estimator:
         """Moves the estimate forward to a time; an earlier time changes nothing."""
         if time_ns <= self.time_ns:
             return
-        if self._foreseen is None or self._foreseen.time_ns != time_ns:
-            self._foreseen = self._forecast(time_ns)
-        self._lost = self._lost or time_ns - self.time_ns > self._motion.longest_ns
         here = self._foreseen
+        if here is None or here.time_ns != time_ns or here.since is not self._anchor:
+            here = self._foreseen = self._forecast(time_ns)
+        self._lost = self._lost or time_ns - self.time_ns > self._motion.longest_ns
         self.time_ns, self._filter.x, self._filter.P, self._error = *here[:3], here.error
-        if self._anchor is not None and self._anchor.cross is not None:
-            self._anchor = self._anchor._replace(cross=here.transition @ self._anchor.cross)
+        self._anchor = here.anchor
 
     def foresee(self, time_ns: int) -> None:
         """Computes in advance the prediction to a time and the update by a twist measured then.
@@ -165,20 +166,22 @@ class Estimator:
         """
         self._foreseen = None
         if time_ns > self.time_ns:
-            foreseen, trial = self._forecast(time_ns), self._trial
-            trial.x, trial.P, (twist, derivative) = foreseen[1:4]
-            # Gain and covariance do not depend on the value that is measured.
-            trial.update(twist, lambda _: derivative, lambda _: twist, R=self._noise[Kind.TWIST])
-            self._foreseen = foreseen._replace(update=(trial.K, trial.P))
+            # Gains and covariances do not depend on the value that is measured.
+            here = self._forecast(time_ns)
+            gains = self._gains(here.anchor, here.expected[1], here.covariance)
+            self._foreseen = here._replace(gains=gains)
 
     def _forecast(self, time_ns: int) -> Foreseen:
         own, motion, log, now = self._filter, self._motion, self._log, self.time_ns
-        mean, covariance, *rest = kernels.forecast(
+        mean, covariance, expected, error, transition = kernels.forecast(
             own.x, own.P, self._process, now, time_ns, motion, log
         )
         if time_ns - now > motion.longest_ns:
             covariance = self.unseen.doubted(covariance, (time_ns - now) / NS_PER_S)
-        return Foreseen(time_ns, mean, covariance, *rest)
+        since = anchor = self._anchor
+        if anchor is not None and anchor.cross is not None:
+            anchor = anchor._replace(cross=transition @ anchor.cross)
+        return Foreseen(time_ns, mean, covariance, expected, error, since, anchor)
 
     def update(self, kind: Kind, value: ArrayLike, std: ArrayLike | None = None) -> Judgement:
         """Corrects by a measured value (n,), with its standard deviations or the model's."""
@@ -195,17 +198,15 @@ class Estimator:
             if anchor and (bridged := self.unseen.bridged(anchor, odom, seconds)) is not None:
                 self._jump(*bridged)
                 self._foreseen = None
-        verdict = self._correct(measurement)
+        verdict = self._correct(measurement, odom is not None and not lost)
         if odom is not None:
-            if not lost and verdict.outcome is not Acceptance.OUTLIER:
-                self._retrace(odom, measurement.value)
-            self.anchor(odom, measurement.value)
+            self.anchor(np.array(odom), np.array(measurement.value))
         elif kind is Kind.POSE and verdict.outcome is not Acceptance.OUTLIER:
             self._lost = False
         return verdict
 
-    def _correct(self, measurement: Measurement) -> Judgement:
-        kind, value, noise, _ = measurement
+    def _correct(self, measurement: Measurement, follows: bool) -> Judgement:
+        kind, value, noise, odom = measurement
         noise = self._noise[kind] if noise is None else noise
         expected, derivative = self._expect(kind)
         residual = _between_poses if kind is Kind.POSE else np.subtract
@@ -217,52 +218,48 @@ class Estimator:
         if outcome is Acceptance.OUTLIER:
             self._count(kind, self._outliers[kind] + 1)
             return Judgement(distance, outcome)
-        self._recall(innovation, derivative, noise)
-        here = self._foreseen_here if kind is Kind.TWIST and outcome is Acceptance.USED else None
-        if kind is Kind.POSE and outcome is Acceptance.JUMP:
-            self._jump(value, noise)
-        elif here is not None and here.update is not None and noise is self._noise[kind]:
-            gain, self._filter.P = here.update
-            self._filter.x = self._filter.x + gain.dot(innovation)
+        anchor, own, way = self._anchor, self._filter, None
+        if follows and anchor is not None and anchor.cross is not None:
+            way = np.array(odom), np.array(value), self.time_ns, self._wheels, GATE[Kind.POSE]
+        if way and outcome is Acceptance.USED and noise is self._noise[kind]:
+            here = self._foreseen_here
+            ready = here.gains if here is not None and here.anchor is anchor else None
+            ready = ready or self._gains(anchor, derivative, own.P)
+            own.x, own.P = kernels.follow(own.x, innovation, *ready, anchor, *way)
         else:
-            self._filter.update(
-                value, lambda _: derivative, lambda _: expected, R=noise, residual=residual
-            )
+            self._recall(innovation, derivative, noise)
+            if kind is Kind.POSE and outcome is Acceptance.JUMP:
+                self._jump(value, noise)
+            else:
+                given = lambda _: derivative, lambda _: expected
+                own.update(value, *given, R=noise, residual=residual)
+            kernels.settle(own.x, own.P, *self._limits)
+            if way:
+                since: Any = self._anchor
+                done = np.zeros((own.dim_x, 3)), own.P  # nothing is left to correct but by the way
+                kept = np.zeros((3, 3)), since.covariance, since.cross
+                own.x, own.P = kernels.follow(own.x, STILL, done, kept, since, *way)
         if self._outliers[kind] and not (outcome is Acceptance.JUMP and kind is Kind.TWIST):
             self._count(kind, 0)
-        kernels.settle(self._filter.x, self._filter.P, *self._limits)
         self._foreseen = None
         return Judgement(distance, outcome)
+
+    def _gains(self, anchor: Anchor | None, derivative: Array, spread: Array) -> Any:
+        """Returns what a twist corrects present and newest odometry by; None without that."""
+        # A twist is but a moment's, the way between two odometries all that wheels did since.
+        if anchor is None or anchor.cross is None:
+            return None
+        noise = self._noise[Kind.TWIST]
+        recall = kernels.recall(anchor, derivative, spread, noise)
+        return kernels.gain(spread, derivative, noise), recall
 
     def _recall(self, innovation: Array, derivative: Array, noise: Array) -> None:
         """Corrects where the newest odometry was, by what is about to correct the present."""
         if (anchor := self._anchor) is not None and anchor.cross is not None:
-            mean, covariance = anchor.mean.copy(), anchor.covariance.copy()
-            mean[:3], covariance[:3, :3], cross = kernels.recall(
-                mean[:3].copy(), covariance[:3, :3].copy(), anchor.cross, innovation, derivative,
-                self._filter.P, noise,
-            )  # fmt: skip
+            spread, mean = self._filter.P, anchor.mean.copy()
+            gain, covariance, cross = kernels.recall(anchor, derivative, spread, noise)
+            mean[:3] += innovation @ gain
             self._anchor = anchor._replace(mean=mean, covariance=covariance, cross=cross)
-
-    def _retrace(self, odom: Array, twist: Array) -> None:
-        """Corrects by the way from the newest odometry to one of this time, if that is likely.
-
-        A twist is but a moment's, the way all that wheels did since, whatever the model expects.
-        Between two twists the robot may have had either.
-        """
-        anchor = self._anchor
-        if anchor is None or anchor.cross is None:
-            return
-        way = geometry.between(anchor.odom, odom)
-        seconds = (self.time_ns - anchor.time_ns) / NS_PER_S
-        pose, spread = anchor.mean[:3].copy(), anchor.covariance[:3, :3].copy()
-        then = pose, spread, anchor.cross, way, self._walk * seconds
-        slack = (0.5 * seconds * (twist - anchor.twist)) ** 2
-        mean, covariance, distance = kernels.retrace(self._filter.x, self._filter.P, *then, slack)
-        if distance <= GATE[Kind.POSE]:
-            self._filter.x, self._filter.P = mean, covariance
-            self._filter.P[:3, :3] += self._slip * seconds
-            kernels.settle(self._filter.x, self._filter.P, *self._limits)
 
     def _expect(self, kind: Kind) -> tuple[Array, Array]:
         if kind is Kind.POSE:

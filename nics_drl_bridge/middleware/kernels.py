@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.middleware.belief import Anchor
 from nics_drl_bridge.robot.kernels import (
     Terms,
     advance,
@@ -27,6 +28,15 @@ Array = NDArray[np.float64]
 RUNAWAY = 1e9  # Bound on poses, states and their derivatives; beyond, the model has diverged
 LEAST_PIVOT = 1e-12  # Lower bound on a variance given the variables before, as a share of its own
 LEAST_VARIANCE = 1e-18  # Absolute lower bound on that variance
+
+
+class Wheels(NamedTuple):
+    """Odometry's noise and slip (3, 3) in a second, and limits (S,) of the state."""
+
+    walk: Array
+    slip: Array
+    low: Array
+    high: Array
 
 
 class MotionModel(NamedTuple):
@@ -246,40 +256,74 @@ def distance(innovation, derivative, covariance, noise):  # type: ignore[no-unty
 
 
 @kernel(allocates=True)
-def recall(  # type: ignore[no-untyped-def]
-    pose, spread, cross, innovation, derivative, covariance, noise
-):  # fmt: skip
-    """Corrects an earlier pose (3,) by a present innovation (n,), of `derivative` (n, 3 + S).
-
-    Returns the pose, its covariance `spread` (3, 3), and the present mean's with it (3 + S, 3).
-    """
-    seen = derivative @ cross
-    gain = np.linalg.solve(derivative @ covariance @ derivative.T + noise, seen)
-    less = cross - covariance @ (derivative.T @ gain)
-    return pose + innovation @ gain, spread - seen.T @ gain, less
+def gain(covariance, derivative, noise):  # type: ignore[no-untyped-def]
+    """Kalman gain (3 + S, n) of a measurement, and the covariance after it, as filterpy's."""
+    shared = covariance @ derivative.T
+    weight = np.linalg.solve(derivative @ shared + noise, shared.T).T.copy()
+    left = np.eye(covariance.shape[0]) - weight @ derivative
+    return weight, left @ covariance @ left.T + weight @ noise @ weight.T
 
 
 @kernel(allocates=True)
-def retrace(mean, covariance, pose, spread, cross, way, noise, slack):  # type: ignore[no-untyped-def]
-    """Corrects by the `way` (3,) measured from an earlier pose, see `recall`, to the present one.
+def recall(anchor, derivative, covariance, noise):  # type: ignore[no-untyped-def]
+    """Corrects the `Anchor` by a present measurement of `derivative` (n, 3 + S) and noise (n, n).
 
-    Returns mean, covariance, and the squared, normalised innovation, with `slack` (3,) besides.
+    Returns the gain (n, 3) of its pose, its covariance, and the present mean's with that pose.
     """
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    x, y, size = mean[0] - pose[0], mean[1] - pose[1], mean.shape[0]
+    seen = derivative @ anchor.cross
+    gain = np.linalg.solve(derivative @ covariance @ derivative.T + noise, seen)
+    less, spread = anchor.cross - covariance @ (derivative.T @ gain), anchor.covariance.copy()
+    spread[:3, :3] -= seen.T @ gain
+    return gain.copy(), spread, less
+
+
+@kernel(allocates=True)
+def retrace(  # type: ignore[no-untyped-def]
+    mean, covariance, anchor, odom, twist, now, wheels, gate
+):  # fmt: skip
+    """Corrects by the way from the `Anchor` to odometry's pose and twist (3,), if that is likely.
+
+    Returns mean and covariance; `wheels` is `Wheels`.
+    """
+    seconds, then, size = (now - anchor.time_ns) / NS_PER_S, anchor.mean, mean.shape[0]
+    c, s = math.cos(anchor.odom[2]), math.sin(anchor.odom[2])
+    x, y = odom[0] - anchor.odom[0], odom[1] - anchor.odom[1]
+    along, aside, turned = c * x + s * y, c * y - s * x, odom[2] - anchor.odom[2]
+    c, s = math.cos(then[2]), math.sin(then[2])
+    x, y = mean[0] - then[0], mean[1] - then[1]
     ahead, before = c * x + s * y, c * y - s * x
     here, there = np.zeros((3, size)), np.zeros((3, 3))
     here[0, 0], here[0, 1], here[1, 0], here[1, 1], here[2, 2] = c, s, -s, c, 1.0
     there[0, 0], there[0, 1], there[1, 0], there[1, 1], there[2, 2] = -c, -s, s, -c, -1.0
     there[0, 2], there[1, 2] = before, -ahead
-    shared = covariance @ here.T + cross @ there.T
-    total = here @ shared + there @ (cross.T @ here.T + spread @ there.T) + noise
-    turn = wrap(way[2] - mean[2] + pose[2])
-    innovation = np.array([way[0] - ahead, way[1] - before, turn])
+    shared = covariance @ here.T + anchor.cross @ there.T
+    past = anchor.cross.T @ here.T + anchor.covariance[:3, :3].copy() @ there.T
+    total = here @ shared + there @ past + wheels.walk * seconds
+    turn = wrap(turned - mean[2] + then[2])
+    innovation = np.array([along - ahead, aside - before, turn])
+    # Between two twists the robot may have had either.
+    slack = np.diag((0.5 * seconds * (twist - anchor.twist)) ** 2)
+    if not innovation @ np.linalg.solve(total + slack, innovation) <= gate:
+        return mean, covariance
     gain = np.linalg.solve(total, shared.T)
-    less = covariance - shared @ gain
-    distance = innovation @ np.linalg.solve(total + np.diag(slack), innovation)
-    return mean + innovation @ gain, (less + less.T) * 0.5, distance
+    less, moved = covariance - shared @ gain, mean + innovation @ gain
+    less = (less + less.T) * 0.5
+    less[:3, :3] += wheels.slip * seconds
+    settle(moved, less, wheels.low, wheels.high)
+    return moved, less
+
+
+@kernel(allocates=True)
+def follow(  # type: ignore[no-untyped-def]
+    mean, innovation, update, recall, anchor, odom, twist, now, wheels, gate
+):  # fmt: skip
+    """Corrects by an innovation (3,) of a twist, by `gain` and `recall`, and then by `retrace`."""
+    weight, covariance = update[0], update[1].copy()
+    here, then = mean + weight @ innovation, anchor.mean.copy()
+    settle(here, covariance, wheels.low, wheels.high)
+    then[:3] += innovation @ recall[0]
+    since = Anchor(anchor.time_ns, anchor.odom, anchor.twist, then, recall[1], recall[2])
+    return retrace(here, covariance, since, odom, twist, now, wheels, gate)
 
 
 @kernel(allocates=True)

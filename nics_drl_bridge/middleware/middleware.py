@@ -180,8 +180,8 @@ class Middleware:
         The twist corrects the estimate, and so does the way between two poses; the pose, which
         drifts, bridges motion for which there are no other data.
         """
-        value = np.array(pose, dtype=np.float64), np.array(twist, dtype=np.float64)
-        if not (np.isfinite(value[0]).all() and np.isfinite(value[1]).all()):
+        value = np.array((pose, twist), dtype=np.float64)
+        if not np.isfinite(value).all():
             return self.cache.reject(f"{ODOM}: {NOT_FINITE}")
         if fault := self._stamps.fault(stamp_ns, None):
             return self.cache.reject(f"{ODOM}: {fault}")

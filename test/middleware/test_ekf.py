@@ -423,15 +423,28 @@ def test_what_is_foreseen_is_not_worked_out_again(monkeypatch):
         estimator.predict(PERIOD)  # a correction came between
 
     monkeypatch.undo()
+    odometry = Measurement(Kind.TWIST, np.zeros(3), odom=np.zeros(3))
+    estimator.anchor(np.zeros(3))
     estimator.foresee(PERIOD)
-    monkeypatch.setattr(kernels, "forecast", None)
-    monkeypatch.setattr(kernels, "expect", None)
+    for name in ("forecast", "expect", "gain", "recall"):
+        monkeypatch.setattr(kernels, name, None)
     estimator.predict(PERIOD)
-    monkeypatch.setattr(estimator._filter, "update", None)
-    assert estimator.update(Kind.TWIST, np.zeros(3)).outcome is Acceptance.USED
+    assert estimator.correct(odometry).outcome is Acceptance.USED
     assert estimator.time_ns == PERIOD
     with pytest.raises(TypeError):
-        estimator.update(Kind.TWIST, np.zeros(3))  # that was for one
+        estimator.correct(odometry)  # that was for one
+
+
+@pytest.mark.parametrize("robot", ["ackermann", "differential", "mecanum"])
+def test_a_twist_is_weighed_as_filterpy_weighs_it(robot):
+    estimator = driven(robot)
+    expected, derivative = estimator._expect(Kind.TWIST)
+    noise = estimator._noise[Kind.TWIST]
+    weight, covariance = kernels.gain(estimator.covariance, derivative, noise)
+    own = estimator._filter
+    own.update(expected, lambda _: derivative, lambda _: expected, R=noise)
+    np.testing.assert_allclose(weight, own.K, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(covariance, own.P, rtol=1e-9, atol=1e-15)
 
 
 def test_the_same_data_give_the_same_bits():
