@@ -6,7 +6,7 @@ import contextlib
 import inspect
 import itertools
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from typing import Any
@@ -49,6 +49,8 @@ class StandingExecutor(SingleThreadedExecutor):
             return
         # Before anything else: a peer may be waiting for the answer to a message.
         self._call(received)
+        if received:  # to take what arrived meanwhile costs less than to wait for it
+            self._call(self._come())
         due, asked = list[Any](), list[Callable[[], object]]()
         left = False
         try:
@@ -60,10 +62,8 @@ class StandingExecutor(SingleThreadedExecutor):
                 due, left = self._entities.due(), others or (woken and bool(self._tasks))
         except PARTS_MISSING as error:
             self._fall_back(error)
-        if (received or asked) and self._entities is not None and self.context.ok():
-            # To take what arrived while callbacks ran costs less than to wait for it. A message
-            # that was sent before a request is handled before it, too.
-            self._call(self._entities.come())
+        if asked:  # a message that was sent before a request is handled before it, too
+            self._call(self._come())
         for answer in asked:
             answer()
         self._changed |= bool(asked)  # it may have destroyed entities, which can't be waited for
@@ -82,6 +82,11 @@ class StandingExecutor(SingleThreadedExecutor):
         if not self.context.ok():
             raise ExternalShutdownException
         return entities.taken()
+
+    def _come(self) -> list[Received]:
+        if self._entities is None or not self.context.ok():  # a callback may have ended it
+            return []
+        return self._entities.come()
 
     def _call(self, received: Iterable[Received]) -> None:
         handed_over = False
@@ -143,19 +148,12 @@ class _Entities:
         subscriptions, others, timers, clients, services, self._waitables = self.all
         # A subscription's callback takes the message, or also its info.
         self._subscriptions = [(s, 1 if _takes(s.callback, None) else 2) for s in subscriptions]
-        self._timers = [
-            (i, one)
-            for i, one in enumerate(timers)
-            if _takes(one.callback) and not inspect.iscoroutinefunction(one.callback)
-        ]
-        self._services = [
-            (i, one)
-            for i, one in enumerate(services)
-            if not inspect.iscoroutinefunction(one.callback)
-        ]
-        self._clients = list(enumerate(clients))
-        direct = (*self._timers, *self._services, *self._clients)
-        self._own = {one.handle.pointer for _, one in direct}
+        self._clients = {one.handle.pointer: one for one in clients}
+        self._services, self._timers = (
+            {e.handle.pointer: e for e in each if not inspect.iscoroutinefunction(e.callback)}
+            for each in (services, [one for one in timers if _takes(one.callback)])
+        )
+        self._own = {*self._timers, *self._services, *self._clients}
         kinds = subscriptions, (*guards, *others), timers, clients, services
         self.opened = ExitStack()
         handles = (one.handle for one in itertools.chain(*kinds))
@@ -193,24 +191,19 @@ class _Entities:
 
     def asked(self) -> list[Callable[[], object]]:
         """Takes requests to services and answers to clients; returns how each is handled."""
-        is_ready = self._wait_set.is_ready
-        found = list[Callable[[], object]]()
-        for i, service in self._services:
-            if is_ready("service", i):
-                request, header = service.handle.service_take_request(service.srv_type.Request)
-                if header is not None:
-                    found.append(partial(_serve, service, request, header))
-        for i, client in self._clients:
-            if is_ready("client", i):
-                header, response = client.handle.take_response(client.srv_type.Response)
-                if header is not None:
-                    number = header.request_id.sequence_number
-                    found.append(partial(_answer, client, number, response))
+        ready, found = self._wait_set.get_ready_entities, list[Callable[[], object]]()
+        for service in _known(self._services, ready("service")):
+            request, header = service.handle.service_take_request(service.srv_type.Request)
+            if header is not None:
+                found.append(partial(_serve, service, request, header))
+        for client in _known(self._clients, ready("client")):
+            header, response = client.handle.take_response(client.srv_type.Response)
+            if header is not None:
+                found.append(partial(_answer, client, header.request_id.sequence_number, response))
         return found
 
     def due(self) -> list[Any]:
-        is_ready = self._wait_set.is_ready
-        return [timer for i, timer in self._timers if is_ready("timer", i)]
+        return _known(self._timers, self._wait_set.get_ready_entities("timer"))
 
     def others_ready(self, own: Any) -> tuple[bool, bool]:
         ready = self._wait_set.get_ready_entities
@@ -225,6 +218,10 @@ class _Entities:
             one not in self._own for kind in ("client", "service", "timer") for one in ready(kind)
         )
         return woken, others or any(each.is_ready(self._wait_set) for each in self._waitables)
+
+
+def _known(entities: Mapping[int, Any], pointers: Iterable[int]) -> list[Any]:
+    return [entities[pointer] for pointer in pointers if pointer in entities]
 
 
 def _serve(service: Any, request: Any, header: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
 import math
 import signal
@@ -66,6 +67,7 @@ class Link:
             stamped = self.hears_stamped(command_topic, patience_s)
         self.stamped, self._kind = stamped, TwistStamped if stamped else Twist
         self.commands = self.node.create_publisher(self._kind, command_topic, qos.COMMAND)
+        self._topic = self.commands.topic_name
         self._timeout = CommandTimeout(self.commands, self._kind, command_timeout_s)
         self._closing: weakref.finalize[Any, Any] | None = None
 
@@ -78,6 +80,7 @@ class Link:
 
     def begin(self) -> None:
         """Starts the executor's thread; call it once all subscriptions exist."""
+        gc.collect()  # now, as the next one may take a tenth of a second while the robot moves
         given = (self._context, self.node, self._timeout)
         thread = threading.Thread(target=_spin, args=given, daemon=True, name="dds_backend")
         thread.start()
@@ -88,7 +91,7 @@ class Link:
         if not all(map(math.isfinite, twist)):
             self.halt()
             fix = "finite, a zero was sent instead; look at what the task's `command` returns."
-            raise BackendError(f"command {twist} for {self.commands.topic_name}: must be {fix}")
+            raise BackendError(f"command {twist} for {self._topic}: must be {fix}")
         self._timeout.begin(moving=True)
         if self._kind is Twist:
             self.commands.publish(twist_to_bytes(twist))
@@ -120,13 +123,14 @@ class Link:
 
     def others_command(self) -> bool:
         """True if another node publishes commands too."""
-        return bool(self.node.count_publishers(self.commands.topic_name) > 1)
+        with self.node.handle:  # rclpy's own count first checks the name, each time
+            return bool(self.node.handle.get_count_publishers(self._topic) > 1)
 
     def check_alone(self) -> None:
         """Raises BackendError with the names of any other publishers of commands."""
         if not self.others_command():
             return
-        topic = self.commands.topic_name
+        topic = self._topic
         ends = self.node.get_publishers_info_by_topic(topic)
         names = sorted(name for end in ends if (name := qos.owner(end)) is not None)
         with contextlib.suppress(ValueError):
@@ -139,7 +143,7 @@ class Link:
         """Waits until all peers are matched. Raises BackendError with what is missing."""
         node, commands = self.node, self.commands
         needed = dict[str, Callable[[], Any]]()
-        needed[f"subscriber of {commands.topic_name}"] = commands.get_subscription_count
+        needed[f"subscriber of {self._topic}"] = commands.get_subscription_count
         for name in map(node.resolve_topic_name, topics):
             needed[f"publisher of {name}"] = partial(node.count_publishers, name)
         for client in clients:

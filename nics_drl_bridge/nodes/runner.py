@@ -1,6 +1,7 @@
 """All that every node needs: parameters, start, end, a single instance, and diagnostics."""
 
 import contextlib
+import gc
 import hashlib
 import signal
 import socket
@@ -91,11 +92,10 @@ def run_node(
             node = make(context)
             if hasattr(node, "start"):
                 node.start()
-        for sentence in unknown(node):  # rclpy ignores them silently
-            node.get_logger().warning(sentence)
+        gc.collect()  # now, as it may take a tenth of a second, and never again all of this
+        gc.freeze()
         started.set()
-        if getattr(node, "state", ACTIVE) == ACTIVE:
-            node.get_logger().info("running")
+        _introduce(node)
         spin(node, stopping)
     except (BridgeError, ParameterException, OSError) as error:
         sys.stderr.write(f"{_sentence(error)}\n")
@@ -110,6 +110,13 @@ def run_node(
             context.try_shutdown()
         alone.close()
     return node
+
+
+def _introduce(node: Any) -> None:
+    for sentence in unknown(node):  # rclpy ignores them silently
+        node.get_logger().warning(sentence)
+    if getattr(node, "state", ACTIVE) == ACTIVE:
+        node.get_logger().info("running")
 
 
 def _sentence(error: Exception) -> str:
