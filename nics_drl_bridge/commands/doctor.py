@@ -7,13 +7,7 @@ from typing import Annotated
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge.commands.console import (
-    JsonOption,
-    needs_ros,
-    one_sentence,
-    progress_bar,
-    table,
-)
+from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import json_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
@@ -31,10 +25,10 @@ def doctor(
     duration: Annotated[float, Option(min=1.0, help="How long to listen to a robot [s].")] = 5.0,
     install: Annotated[bool, Option("--install",
         help="Look at this machine instead: what works here.")] = False,
-    as_json: JsonOption = False,
+    as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Tells what of a robot or a bag does not fit; it sends nothing."""
-    with one_sentence():
+    with console.one_sentence():
         if install:
             _tell_installation(as_json)
             return
@@ -53,9 +47,9 @@ def doctor(
         if bag is not None:
             facts = facts_of_bag(bag, namespace)
         else:
-            with needs_ros("nics doctor"):
+            with console.needs_ros("nics doctor"):
                 from nics_drl_bridge.nodes.listen import listen
-            with progress_bar(f"listening for {duration:g} s"):
+            with console.progress_bar(f"listening for {duration:g} s"):
                 facts = listen(duration, namespace)
         findings = examine(facts, expected)
         if as_json:
@@ -64,7 +58,7 @@ def doctor(
         elif findings:
             heads = ("", "check", "where", "what does not fit", "what to do")
             rows = [(f.severity, f.check, f.where, f.what, f.fix) for f in findings]
-            typer.echo(table(heads, rows))
+            typer.echo(console.table(heads, rows))
         else:
             typer.echo(f"{facts.source}: all fits {policy or model or DEFAULT_ROBOT}.")
         if findings:
@@ -80,15 +74,15 @@ def _tell_installation(as_json: bool) -> None:
         return
     heads = ("", "part", "what there is", "what to do")
     rows = [("+" if c.works else "-", c.part, c.found, "" if c.works else c.fix) for c in found]
-    typer.echo(table(heads, rows))
+    typer.echo(console.table(heads, rows))
 
 
 def explain(
     file: Annotated[Path, Argument(help="What command_gate wrote at a stop, *.jsonl.")],
-    as_json: JsonOption = False,
+    as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Tells why command_gate stopped a robot, from what it wrote down."""
-    with one_sentence():
+    with console.one_sentence():
         from nics_drl_bridge.gate import black_box
 
         again = black_box.replay(file)

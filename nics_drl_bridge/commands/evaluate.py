@@ -7,19 +7,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge.commands.console import (
-    GateOption,
-    JsonOption,
-    OtherLidarOption,
-    RandomisationOption,
-    TaskOption,
-    completing,
-    needs_ros,
-    one_sentence,
-    progress_bar,
-    roles_of,
-    table,
-)
+from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import check_above, json_of, write_bytes, write_text
 
@@ -30,18 +18,18 @@ def evaluate(
         "(dynamic_window, mppi, straight, random).")],
     model: Annotated[str | None, Option(
         "--model", "--robot", help="A model's folder, or a shipped robot; else the policy's own.",
-        autocompletion=completing("robots"))] = None,
-    task: TaskOption = None,
+        autocompletion=console.completing("robots"))] = None,
+    task: console.TaskOption = None,
     world: Annotated[str, Option(
         "--world", "--scene", help="A shipped world (circles) or a YAML file.",
-        autocompletion=completing("worlds"))] = "circles",
+        autocompletion=console.completing("worlds"))] = "circles",
     places: Annotated[list[str] | None, Option(
         "--in", help="fast, dds or mujoco_dds; several times; else all that work here.")] = None,
     episodes: Annotated[int | None, Option(min=1, help="How many; 20, or 1 on a vehicle.")] = None,
     seed: Annotated[int, Option(min=0, help="Of the first episode.")] = 1_000_000,
-    lidar: OtherLidarOption = None,
-    randomisation: RandomisationOption = None,
-    gate: GateOption = None,
+    lidar: console.OtherLidarOption = None,
+    randomisation: console.RandomisationOption = None,
+    gate: console.GateOption = None,
     fallback: Annotated[str, Option(
         metavar="PLANNER", help="dynamic_window or mppi: acts where the policy asks for what can't "
         "be stopped before a touch.")] = "",
@@ -61,10 +49,10 @@ def evaluate(
     pose_type: Annotated[str, Option(help="For --hardware: type of `pose`, in map.")] = "none",
     yes: Annotated[bool, Option("--yes", help="For --hardware: ask no questions.")] = False,
     arm: Annotated[bool, Option("--arm", help="For --hardware: arm command_gate.")] = False,
-    as_json: JsonOption = False,
+    as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Drives policies through the same episodes, and compares them."""
-    with one_sentence():
+    with console.one_sentence():
         place = _point(goal)
         if backend not in (None, "dds"):
             raise ConfigError(f"--backend {backend!r}: must be dds; simulators are chosen by --in.")
@@ -87,16 +75,16 @@ def evaluate(
         )
         if hardware:
             options = {"start": start, "namespace": namespace, "pose_type": pose_type}
-            with needs_ros("nics evaluate --hardware"):
+            with console.needs_ros("nics evaluate --hardware"):
                 ask = partial(_ask, yes)
                 evaluated = [driving.drive_vehicle(order, place, arm, tell, ask, **options)]
         else:
-            with progress_bar("opening robot and policies") as advance:
+            with console.progress_bar("opening robot and policies") as advance:
                 evaluated = driving.evaluate(order, tell, advance)
         if as_json:
             typer.echo((out / driving.EVALUATION).read_text().rstrip())
             return
-        typer.echo(table(driving.HEADS, driving.rows_of(evaluated)))
+        typer.echo(console.table(driving.HEADS, driving.rows_of(evaluated)))
         for one in evaluated:
             typer.echo(driving.line_of(one))
         typer.echo(f"pictures and evaluation.json: {out}")
@@ -132,7 +120,7 @@ def _shadow(
     rows, lines, told = list[tuple[str, ...]](), list[str](), list[dict[str, Any]]()
     for policy in policies:
         name = model_name(model, contracts_of([policy], model))
-        made = shadow(bag, open_model(name), policy, roles_of(topics), goal, ahead)
+        made = shadow(bag, open_model(name), policy, console.roles_of(topics), goal, ahead)
         place, differences = out / f"shadow_{Path(policy).stem}", made.differences()
         write_bytes(place.with_suffix(".png"), shadow_picture(made))
         data = {
@@ -157,4 +145,6 @@ def _shadow(
         "policy", "command", "unit", "mean", "mean size", *(f"{q} %" for q in PERCENTILES),
         "greatest", "opposite sign",
     )  # fmt: skip
-    typer.echo("\n".join([table(heads, rows), *lines, f"pictures and shadow_*.json: {out}"]))
+    typer.echo(
+        "\n".join([console.table(heads, rows), *lines, f"pictures and shadow_*.json: {out}"])
+    )

@@ -9,15 +9,7 @@ import typer
 from typer import Argument, Option
 
 from nics_drl_bridge import extensions
-from nics_drl_bridge.commands.console import (
-    GateOption,
-    OtherLidarOption,
-    RandomisationOption,
-    TaskOption,
-    needs_ros,
-    one_sentence,
-    roles_of,
-)
+from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
@@ -33,10 +25,10 @@ def watch(
         "--world", "--scene", help="A shipped world (circles) or a YAML file; several times: side "
         "by side.")] = None,
     seed: Annotated[int, Option(min=0, help="Of the first episode.")] = 1_000_000,
-    lidar: OtherLidarOption = None,
-    randomisation: RandomisationOption = None,
-    gate: GateOption = None,
-    task: TaskOption = None,
+    lidar: console.OtherLidarOption = None,
+    randomisation: console.RandomisationOption = None,
+    gate: console.GateOption = None,
+    task: console.TaskOption = None,
     ros: Annotated[bool, Option("--ros", help="Show live topics instead.")] = False,
     namespace: Annotated[str, Option(help="For --ros: of the robot's topics.")] = "",
     bag: Annotated[Path | None, Option(help="Show a recorded drive instead.")] = None,
@@ -50,7 +42,7 @@ def watch(
     browser: Annotated[bool, Option(help="Open the page in a browser.")] = True,
 ) -> None:  # fmt: skip
     """Shows a policy, live topics or a bag on a page in the browser."""
-    with one_sentence():
+    with console.one_sentence():
         given = {"lidar": lidar, "randomisation": randomisation, "gate": gate}
         given["task"] = task
         if record is None:  # before the source is opened, which may take a while
@@ -60,7 +52,7 @@ def watch(
 
             check_file(record)
         if bag is not None:
-            source: Any = _bag(bag, model, world, roles_of(topic or []))
+            source: Any = _bag(bag, model, world, console.roles_of(topic or []))
         elif ros:
             source = _ros(model, world, namespace)
         else:
@@ -104,7 +96,7 @@ def _bag(bag: Path, name: str | None, worlds: list[str] | None, topics: dict[str
 def _ros(name: str | None, worlds: list[str] | None, namespace: str) -> Any:
     from nics_drl_bridge.generator import open_model
 
-    with needs_ros("nics watch --ros"):
+    with console.needs_ros("nics watch --ros"):
         from nics_drl_bridge.nodes.watching import RosSource
     return RosSource(open_model(name or DEFAULT_ROBOT), _only(worlds), namespace)
 

@@ -27,20 +27,9 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
-from nics_drl_bridge.nodes import device_parameters, qos, runner, wire
+from nics_drl_bridge.nodes import device_parameters, parameters, qos, runner, wire
 from nics_drl_bridge.nodes.conversions import is_rotation, sensor_from_ros, sensor_type
 from nics_drl_bridge.nodes.gate_log import GateLog
-from nics_drl_bridge.nodes.parameters import (
-    BLACK_BOX,
-    FOREIGN,
-    LIMITS,
-    PRIORITY,
-    RULES_IN_SECONDS,
-    SHIELD,
-    SHIELD_NUMBERS,
-    gate_rules,
-    stamped,
-)
 
 TWIST, TWIST_STAMPED = "Twist", "TwistStamped"
 STALE_S = 0.05  # a motion that was decided on longer ago than this is decided on again [s]
@@ -56,7 +45,7 @@ REFUSED = (
 
 def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
     """Declares and reads a gate's parameters, logs doubts; ConfigError if one can't be used."""
-    file = str(runner.declare_row(node, LIMITS))
+    file = str(runner.declare_row(node, parameters.LIMITS))
     limits = load_limits(file, model.robot) if file else None
     config = gate_config(
         model, limits, _declare_shield(node, model, limits, file),
@@ -71,14 +60,16 @@ def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
 def _declare_rules(node: Node, model: SimulatorModel) -> dict[str, Any]:
     scan_age = max(GateConfig.scan_age_s, SCAN_PERIODS / model.lidar.rate)
     return {
-        f"{row.name}_s" if row.name in RULES_IN_SECONDS else row.name: runner.declare_row(node, row)
-        for row in gate_rules(1.0 / model.control_period, scan_age)
+        f"{row.name}_s"
+        if row.name in parameters.RULES_IN_SECONDS
+        else row.name: runner.declare_row(node, row)
+        for row in parameters.gate_rules(1.0 / model.control_period, scan_age)
     }
 
 
 def declare_black_box(node: Node) -> Path:
     """Declares the folder of the recordings of stops, and returns that of the node's namespace."""
-    given = str(runner.declare_row(node, BLACK_BOX))
+    given = str(runner.declare_row(node, parameters.BLACK_BOX))
     home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
     # So that no gate of another namespace removes its files.
     namespace = str(node.get_namespace()).strip("/")
@@ -88,9 +79,9 @@ def declare_black_box(node: Node) -> Path:
 def _declare_shield(
     node: Node, model: SimulatorModel, limits: Limits | None, file: str
 ) -> ShieldConfig | None:
-    on = runner.declare_row(node, SHIELD)
+    on = runner.declare_row(node, parameters.SHIELD)
     values = {}
-    for row in SHIELD_NUMBERS:
+    for row in parameters.SHIELD_NUMBERS:
         value, name = float(runner.declare_row(node, row)), row.name.removeprefix("shield_")
         if not math.isnan(value):
             values[name] = value
@@ -185,19 +176,21 @@ class CommandGate(qos.QosWatch):
             logger.warning(f"e_stop_required is false: {risk}; set it on a vehicle.")
         if self._config.shield is not None:
             shield.rehearse()
-        self._stamped = bool(runner.declare_row(self, stamped("cmd_vel")))
-        runner.declare_row(self, FOREIGN)
+        self._stamped = bool(runner.declare_row(self, parameters.stamped("cmd_vel")))
+        runner.declare_row(self, parameters.FOREIGN)
         kind = TwistStamped if self._stamped else Twist
         self._out = self.create_publisher(kind, "cmd_vel", qos.COMMAND)
         self._listen()
         runner.steadily(self, PERIOD_S, lambda: self._decide(inputs.Tick()))
         runner.diagnose(self, "gate", self._look)
-        priority = runner.declare_row(self, PRIORITY)
+        priority = runner.declare_row(self, parameters.PRIORITY)
         if refused := take_priority(priority):  # once all threads exist
             logger.warning(refused)
 
     def _listen(self) -> None:
-        raw = device_parameters.choice(self, FOREIGN.name, ("none", TWIST, TWIST_STAMPED))
+        raw = device_parameters.choice(
+            self, parameters.FOREIGN.name, ("none", TWIST, TWIST_STAMPED)
+        )
         given = command if raw == "none" else partial(self._foreign, raw)
         readers: tuple[tuple[Any, str, Callable[[bytes], inputs.Input], Any], ...] = (
             (LaserScan, "scan", partial(scan, self._lidar), qos.SENSOR),

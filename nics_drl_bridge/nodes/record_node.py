@@ -22,17 +22,9 @@ from sensor_msgs.msg import Imu, JointState
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, BridgeError, RecordingError
 from nics_drl_bridge.interface import NS_PER_S, Array
-from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.parameters import drive
 from nics_drl_bridge.nodes.robot_topics import heard_stamped
-from nics_drl_bridge.nodes.runner import (
-    EXIT_BAD_INPUT,
-    declare_row,
-    given_values,
-    last_word,
-    run_node,
-    steadily,
-)
 from nics_drl_bridge.recording.bag_file import Message
 from nics_drl_bridge.recording.bag_reader import joint_streams
 from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S, DrivePlan
@@ -65,7 +57,7 @@ class DriveParameters:
 
 def declare_drive(node: Node) -> DriveParameters:
     """Declares the parameters of a drive, and reads them. Raises ConfigError."""
-    get = {row.name: partial(declare_row, node, row) for row in drive()}
+    get = {row.name: partial(runner.declare_row, node, row) for row in drive()}
     robot = load_robot(get["robot"]())
     robot.require_cmd_vel()
     out = check_out(Path(get["out"]()))
@@ -178,7 +170,7 @@ class RecordNode(qos.QosWatch):
         self._sim_time = bool(self.get_parameter("use_sim_time").value)
         self._steady_origin_ns = time.time_ns() - time.monotonic_ns()
         self._log = DriveLog(self._order.plan.robot, self._order.roles, self._now_ns)
-        self._chosen = "stamped" in given_values(self)
+        self._chosen = "stamped" in runner.given_values(self)
         self._topic: Publisher | None = None
         if self._chosen:
             self._speak(self._order.stamped)
@@ -191,7 +183,7 @@ class RecordNode(qos.QosWatch):
         self._pose: Array | None = None
         self._start: Array = np.zeros(3)
         # Steady: the robot's guard must not depend on the time source of the node.
-        steadily(self, POLL_S, self._on_time)
+        runner.steadily(self, POLL_S, self._on_time)
 
     def _speak(self, stamped: bool) -> None:
         self._stamped = stamped
@@ -317,7 +309,7 @@ class RecordNode(qos.QosWatch):
             self._send(zero)
             time.sleep(PERIOD_S)
         if self._topic is not None:
-            last_word(self._topic, self._message(np.zeros(3)))
+            runner.last_word(self._topic, self._message(np.zeros(3)))
 
     def _save(self) -> tuple[Recording | None, str]:
         try:
@@ -330,7 +322,7 @@ class RecordNode(qos.QosWatch):
 
 def record(given: dict[str, Any] | None = None, args: Sequence[str] | None = None) -> DriveResult:
     """Drives and records until the end, an error or a signal, with parameters beside `args`."""
-    node: RecordNode = run_node(partial(RecordNode, given=given), args, "record_node")
+    node: RecordNode = runner.run_node(partial(RecordNode, given=given), args, "record_node")
     return node.outcome or DriveResult(False, None, None, "interrupted: nothing was saved")
 
 
@@ -339,4 +331,4 @@ def main(args: list[str] | None = None) -> None:
     outcome = record(args=args)
     sys.stderr.write(f"record_node: {outcome.line}\n")
     if outcome.failure is not None:
-        raise SystemExit(EXIT_BAD_INPUT)
+        raise SystemExit(runner.EXIT_BAD_INPUT)

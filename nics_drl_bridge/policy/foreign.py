@@ -13,18 +13,10 @@ from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.files import sha256
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.lidar.sectors import layout_of
-from nics_drl_bridge.policy import leapp_bundle, onnx_graph
+from nics_drl_bridge.policy import leapp_bundle, onnx_graph, policy_file
 from nics_drl_bridge.policy.contract import MAPPINGS, SUFFIX, Rows, contract_of, golden_observations
 from nics_drl_bridge.policy.foreign_graph import Composer, Network
 from nics_drl_bridge.policy.foreign_mapping import ForeignPolicy
-from nics_drl_bridge.policy.policy_file import (
-    PERIOD_TOLERANCE,
-    PolicyFile,
-    in_turn,
-    load_policy,
-    open_session,
-    policy_of,
-)
 
 
 @dataclass(frozen=True)
@@ -37,19 +29,19 @@ class Order:
     sha256: str  # of the network's files
 
 
-def load_foreign(path: str | Path, model: SimulatorModel | None = None) -> PolicyFile:
+def load_foreign(path: str | Path, model: SimulatorModel | None = None) -> policy_file.PolicyFile:
     """Opens a foreign policy by its mapping, for a robot; None: the one that the mapping names.
 
     Raises ConfigError for a wrong mapping, PolicyError for what does not fit together.
     """
-    return policy_of(_content(_ordered(Path(path), model), model), Path(path))
+    return policy_file.policy_of(_content(_ordered(Path(path), model), model), Path(path))
 
 
-def load_any(path: str | Path, model: SimulatorModel | None = None) -> PolicyFile:
+def load_any(path: str | Path, model: SimulatorModel | None = None) -> policy_file.PolicyFile:
     """Loads a policy file, see `load_policy`, or makes one of the YAML file of a foreign policy."""
     if str(path).endswith(MAPPINGS):
         return load_foreign(Path(path), model)
-    return load_policy(path)
+    return policy_file.load_policy(path)
 
 
 def import_policy(source: str | Path, model: SimulatorModel | None = None) -> bytes:
@@ -106,7 +98,7 @@ def _content(order: Order, model: SimulatorModel | None) -> bytes:
             raise ConfigError(f"{source}: names no robot; {fix}")
         model = open_model(mapping.robot)
     period = model.control_period
-    if abs((mapping.control_period or period) - period) > PERIOD_TOLERANCE:
+    if abs((mapping.control_period or period) - period) > policy_file.PERIOD_TOLERANCE:
         reason = f"is {mapping.control_period:g} s, but the robot's is {period:g} s"
         raise PolicyError(source, "control_period", f"{reason}; use a model with that period.")
     try:
@@ -126,7 +118,7 @@ def _content(order: Order, model: SimulatorModel | None) -> bytes:
 
 def _golden(graph: Any, seen: Rows, size: int, source: str) -> dict[str, Rows]:
     onnx_graph.rows_at_once(graph, source, 1)  # before anything of it runs
-    session = open_session(graph.SerializeToString(), source)
+    session = policy_file.open_session(graph.SerializeToString(), source)
     names = (onnx_graph.INPUT, onnx_graph.STATE_IN)
     start = np.zeros(size, np.float32)
 
@@ -137,7 +129,7 @@ def _golden(graph: Any, seen: Rows, size: int, source: str) -> dict[str, Rows]:
             words = " ".join(str(error).split())[:120]
             raise PolicyError(source, "network", f"onnxruntime can't run it ({words}).") from None
 
-    rows = in_turn(run, seen, start) if size else _one_by_one(run, seen)
+    rows = policy_file.in_turn(run, seen, start) if size else _one_by_one(run, seen)
     if not all(np.isfinite(part).all() for part in rows):
         reason = "gives NaN or inf for ordinary observations; check scaling and weights."
         raise PolicyError(source, "network", reason)

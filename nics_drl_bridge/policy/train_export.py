@@ -15,15 +15,8 @@ from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.policy import onnx_graph
+from nics_drl_bridge.policy import onnx_graph, policy_file
 from nics_drl_bridge.policy.contract import GOLDEN, SUFFIX, contract_of, golden_observations
-from nics_drl_bridge.policy.policy_file import (
-    GOLDEN_TOLERANCE,
-    PolicyFile,
-    in_turn,
-    open_session,
-    policy_of,
-)
 from nics_drl_bridge.policy.train_memory import Memory
 
 Rows = NDArray[np.float32]
@@ -95,7 +88,7 @@ def export_policy(
     model: Any, task: Task, simulator_model: SimulatorModel, path: str | Path,
     normaliser: Normaliser | None = None, provenance: Mapping[str, Any] | None = None,
     max_episode_steps: int | None = None,
-) -> PolicyFile:  # fmt: skip
+) -> policy_file.PolicyFile:  # fmt: skip
     """Writes a trained model as a policy file, and loads it as a robot would.
 
     The normaliser is mean (O,), deviation (O,) and limit, or None. Raises ConfigError if the model
@@ -114,14 +107,14 @@ def export_policy(
     )  # fmt: skip
     onnx.helper.set_model_props(graph, {onnx_graph.KEY: text})
     data = onnx_graph.sealed(graph.SerializeToString(deterministic=True))
-    policy = policy_of(data, file)
+    policy = policy_file.policy_of(data, file)
     write_bytes(file, data)
     return policy
 
 
 def _golden(deployed: Deployed, graph: Any, task: Task, source: str) -> dict[str, Rows]:
     seen = golden_observations(task)
-    session = open_session(graph.SerializeToString(), source)
+    session = policy_file.open_session(graph.SerializeToString(), source)
     inputs, kept = (onnx_graph.INPUT, onnx_graph.STATE_IN), deployed.state
     start = None if kept is None else np.full(kept[0], kept[1], np.float32)
 
@@ -132,10 +125,10 @@ def _golden(deployed: Deployed, graph: Any, task: Task, source: str) -> dict[str
         with torch.no_grad():
             return [part.numpy() for part in deployed(*map(torch.as_tensor, given))]
 
-    out, wanted = (in_turn(run, seen, start) for run in (infer, compute))
+    out, wanted = (policy_file.in_turn(run, seen, start) for run in (infer, compute))
     for name, ours, theirs in zip(("actions", "commands"), out, wanted, strict=True):
         error = float(np.abs(ours - theirs).max())
-        if not error <= GOLDEN_TOLERANCE:
+        if not error <= policy_file.GOLDEN_TOLERANCE:
             reason = f"onnxruntime and torch differ by {error:.3g}; the model can't be exported."
             raise PolicyError(source, f"golden.{name}", reason)
     action = np.asarray(out[0], np.float32).reshape(GOLDEN, -1)

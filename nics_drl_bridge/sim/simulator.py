@@ -18,16 +18,7 @@ from nics_drl_bridge.lidar.shapes import place
 from nics_drl_bridge.robot import taylor
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import TaylorModel
-from nics_drl_bridge.sim import step_kernels
-from nics_drl_bridge.sim.allocation import (
-    STANDING,
-    Sizes,
-    allocate,
-    cells_of,
-    members_of,
-    part_of,
-    split,
-)
+from nics_drl_bridge.sim import allocation, step_kernels
 from nics_drl_bridge.sim.packing_kernels import pack
 from nics_drl_bridge.sim.randomisation import Draws, Randomisation, Sampler, load_randomisation
 from nics_drl_bridge.sim.scenes import Scenes, SetSampler
@@ -193,11 +184,11 @@ class FastSimulator:
         table = with_shapes(model.lidar, model.table, shapes)
         self._in_table = np.array([table.outlines.index_of(shape) for shape in shapes])
         self._scanner = Scanner(model.lidar, table, renderer)
-        self._sizes = Sizes(worlds, robots, self.sampler.count, delay, longest_age)
-        self.data = allocate(model, self._sizes)
+        self._sizes = allocation.Sizes(worlds, robots, self.sampler.count, delay, longest_age)
+        self.data = allocation.allocate(model, self._sizes)
         # Name of a further sensor -> (N, M, S) its readings, see `lidar.sensor`.
         self.readings = unread(model.sensors, worlds, robots)
-        self.parts = split(worlds, threads)  # the worlds that each thread steps
+        self.parts = allocation.split(worlds, threads)  # the worlds that each thread steps
         known = model.kinematics, model.robot, tell
         self._boxes = {part.start: CommandBox(*known) for part in self.parts}
 
@@ -205,7 +196,9 @@ class FastSimulator:
     def _members(self) -> Members:
         motions = self.sampler.motions
         outlines = self._scanner.table.outlines.arguments
-        return members_of(self.world.members, motions, outlines, self._sizes, self.data.member)
+        return allocation.members_of(
+            self.world.members, motions, outlines, self._sizes, self.data.member
+        )
 
     @property
     def moves(self) -> bool:
@@ -215,9 +208,9 @@ class FastSimulator:
     @cached_property
     def packed(self) -> dict[int, Any]:
         """Packed arguments of the kernels, by the first world of each part."""
-        cells = cells_of(self._sizes, self._members)
+        cells = allocation.cells_of(self._sizes, self._members)
         of = (self.data, self._members, self.model, self._scanner, self._sizes, cells)
-        parts = {part.start: pack(part_of(*of, part)) for part in self.parts}
+        parts = {part.start: pack(allocation.part_of(*of, part)) for part in self.parts}
         for part in self.parts:
             step_kernels.sort_worlds(parts[part.start], part.start, part.stop)
         return parts
@@ -303,7 +296,7 @@ class FastSimulator:
                 self._boxes[part.start].begin()
                 step_kernels.begin(self.packed[part.start], of_part)
                 self.sense(of_part)
-        if self.sampler.count < STANDING:
+        if self.sampler.count < allocation.STANDING:
             return scenes
         return Scenes(self._obstacles(chosen), scenes.starts, scenes.goals, scenes.member)
 
