@@ -86,7 +86,7 @@ def measure(
             backend="dds",
             model=robot,
             world=world,
-            backend_options={"domain_id": domain_id},
+            backend_options={"domain_id": domain_id, "timeout_s": 300.0},
         )
         if control is not None:
             there = Spoilt(there, control)
