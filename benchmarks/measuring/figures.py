@@ -12,6 +12,7 @@ def told(*rows: tuple[str, str, str]) -> Table:
     """Figures in words: run, what, figure."""
     of = {"training_differential": "training", "training_ackermann": "training"}
     of |= dict.fromkeys(("barn_five_fold", "barn_mujoco"), "barn")
+    of |= {f"transfer_{robot}": "transfer" for robot in POLICIES}
     of |= dict.fromkeys(("env_throughput_lidar", "env_throughput_obstacles"), "env_throughput")
     return Table(
         ("what", "script", "figure"),
@@ -107,14 +108,17 @@ README = told(
         "contacts of three robots with the shield in episodes of adversaries; without it",
         "{contacts} in {episodes|,}; {contacts_without} in {tried_without}",
     ),
-    (
-        "transfer",
-        "one policy file in process, over DDS, in MuJoCo over DDS, in all shipped worlds: true "
-        "success, with a real lidar, mild randomisation, gate and shield",
-        "in process {min success.*.*.fast x100|.0f} to {max success.*.*.fast|.0%}; over DDS "
-        "{min points_from_fast.*.*.dds|+.1f} to {max points_from_fast.*.*.dds|+.1f} points, in "
-        "MuJoCo {min points_from_fast.*.*.mujoco_dds|+.0f} to "
-        "{max points_from_fast.*.*.mujoco_dds|+.0f} (`docs/evaluation.md`)",
+    *(
+        (
+            f"transfer_{robot}",
+            f"{title}: one policy file in process, over DDS, in MuJoCo over DDS, in all shipped "
+            "worlds: true success, with a real lidar, mild randomisation, gate and shield",
+            "in process {min success.*.*.fast x100|.0f} to {max success.*.*.fast|.0%}; over DDS "
+            "{min points_from_fast.*.*.dds|+.1f} to {max points_from_fast.*.*.dds|+.1f} points, in "
+            "MuJoCo {min points_from_fast.*.*.mujoco_dds|+.0f} to "
+            "{max points_from_fast.*.*.mujoco_dds|+.0f} (`docs/evaluation.md`)",
+        )
+        for robot, title in POLICIES.items()
     ),
     (
         "robustness",
@@ -220,15 +224,14 @@ ESTIMATOR = Table(
     ),
 )  # fmt: skip
 TRANSFER = Table(
-    ("success [%], collision, believed", *POLICIES.values()),
+    ("success [%], collision, believed", "in process", "over DDS", "MuJoCo"),
     tuple(
-        ("transfer", f"`{world}`, {title}", *(
+        (f"transfer_{robot}", f"{title}, `{world}`", *(
             f"{{success.{at} x100|.0f}}, {{collision.{at} x100|.0f}}, {{believed.{at} x100|.0f}}"
-            for at in (f"{robot}.{world}.{place}" for robot in POLICIES)
+            for at in (f"{robot}.{world}.{place}" for place in ("fast", "dds", "mujoco_dds"))
         ))
+        for robot, title in POLICIES.items()
         for world in WORLDS
-        for place, title in (("fast", "in process"), ("dds", "over DDS"),
-                             ("mujoco_dds", "MuJoCo"))
     ),
 )  # fmt: skip
 ROBUSTNESS = Table(

@@ -88,7 +88,15 @@ RUNS: dict[str, Run] = {
         "--episodes 2 --worlds circles --robots differential",
         4 * HOUR,
     ),
-    "transfer": row("transfer", "", "--episodes 3 --worlds circles doorway", 6 * HOUR),
+    **{
+        f"transfer_{robot}": row(
+            "transfer",
+            f"--robots {robot}",
+            f"--robots {robot} --episodes 3 --worlds circles doorway",
+            2 * HOUR,
+        )
+        for robot in ("ackermann", "differential", "mecanum", "jackal")
+    },
 }
 
 
