@@ -16,12 +16,18 @@ from typer import Option
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.errors import MISSING_ROS, BridgeError, ConfigError, nearest
+from nics_drl_bridge.files import json_of
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 WIDEST = 10_000
 PATIENCE_S, REPEATED_S = 2.0, 10.0  # silence before the first line about work, and between lines
 Tell = Callable[[str, int, int], None]  # what is done, how much of it, of how much (0: unknown)
+
+
+def say(as_json: bool, line: str, **facts: Any) -> None:
+    """Prints a line, or the facts that it tells as one JSON object."""
+    typer.echo(json_of(facts) if as_json else line)
 
 
 def completing(kind: str) -> Callable[[str], list[str]]:

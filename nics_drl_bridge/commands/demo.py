@@ -1,12 +1,13 @@
 """`nics demo`."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from typer import Option
 
-from nics_drl_bridge.commands.console import WorldOption, one_sentence
+from nics_drl_bridge.commands import console
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 
@@ -16,15 +17,17 @@ def demo(
     robot: Annotated[str | None,
         Option(help=f"Shipped, or a YAML file; else the recording's own, or {DEFAULT_ROBOT}.")] =
         None,
-    world: WorldOption = "arena",
+    world: console.WorldOption = "arena",
     episodes: Annotated[int, Option(min=1, help="How many, in process and again over DDS.")] = 5,
     policy: Annotated[str | None,
         Option(help="Train none; drive by a policy file, a shipped one or a baseline.")] = None,
     train_steps: Annotated[int | None, Option(min=1, help="Environment steps to train.")] = None,
+    as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Goes the whole road once, from a recording to a report."""
-    with one_sentence():
+    with console.one_sentence():
         from nics_drl_bridge.commands.demo_run import DemoPlan, run
 
         plan = DemoPlan(out, robot, world, recording, episodes, policy, train_steps)
-        typer.echo(run(plan, typer.echo))
+        line = run(plan, partial(typer.echo, err=as_json))
+        console.say(as_json, line, told=line, report=str(out / "report.html"))

@@ -285,6 +285,7 @@ def drive(
     lidar: LidarOption = None,
     duration: Annotated[float, Option(min=5.0, max=3600.0, help="Of the drive [s].")] = 60.0,
     seed: Annotated[int, Option(min=0, help="Of the commands, which are random.")] = 0,
+    as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Drives a robot's textbook model and generates a simulator of it.
 
@@ -309,11 +310,11 @@ def drive(
                 write_drive(driven, check_out(recording), spec)
             model, _ = generate(driven, spec, seen, ())
         save_model(model, out)
-        typer.echo(model.report.rstrip())
-        if recording is not None:
-            typer.echo(f"recording written to {recording}")
-        typer.echo(f"model of the textbook {spec.name!r} with the lidar {seen.name!r}: {out}")
-        typer.echo(f"next: nics train --robot {out}")
+        kept = () if recording is None else (f"recording written to {recording}",)
+        made = f"model of the textbook {spec.name!r} with the lidar {seen.name!r}: {out}"
+        lines = model.report.rstrip(), *kept, made, f"next: nics train --robot {out}"
+        facts = {"model": str(out), "robot": spec.name, "lidar": seen.name}
+        console.say(as_json, "\n".join(lines), **facts, recording=recording and str(recording))
 
 
 def urdf(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge.commands.console import one_sentence
+from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
@@ -60,9 +60,10 @@ def import_(
         "--skip-unknown", help="Of SDF: leave out, and list, meshes and what else is no shape.")
     ] = False,
     resolution: Annotated[float | None, Option(help="Of a picture: side of a pixel [m].")] = None,
+    as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Makes worlds of Gazebo's worlds, of Nav2's maps, or of pictures."""
-    with one_sentence():
+    with console.one_sentence():
         from nics_drl_bridge.files import write_text
         from nics_drl_bridge.sim.sdf import read_sdf
 
@@ -84,7 +85,9 @@ def import_(
                 raise ConfigError(f"{each.path}: is there already; {fix}.")
         for each in made:
             write_text(each.path, each.text)
-            typer.echo(f"{each.path}: {each.line}")
+        lines = "\n".join(f"{each.path}: {each.line}" for each in made)
+        told = [{"file": str(each.path), "holds": each.line} for each in made]
+        console.say(as_json, lines, worlds=told)
 
 
 def _places(files: list[Path], out: Path | None, name: str | None) -> dict[Path, Path]:
@@ -192,12 +195,13 @@ def draw(
     seed: Annotated[int, Option(min=0, help="Of the episode.")] = 0,
     robot: Annotated[str, Option(help="A shipped robot or a YAML file.")] = DEFAULT_ROBOT,
     footprint: Annotated[float | None, Option(help="Instead: radius of a round robot [m].")] = None,
+    as_json: console.JsonOption = False,
 ) -> None:
     """Draws a world as an episode finds it, with start and goal.
 
     Of a set, such as barn or a folder of files, it is the world of the episode.
     """
-    with one_sentence():
+    with console.one_sentence():
         from nics_drl_bridge.files import write_bytes
         from nics_drl_bridge.report.pictures import world_picture
         from nics_drl_bridge.robot.spec import load_robot
@@ -214,7 +218,8 @@ def draw(
         if file.suffix != ".png":
             raise ConfigError(f"--out {file}: must end in .png.")
         write_bytes(file, world_picture(opened, radius, seed, outline))
-        typer.echo(f"{file}: the world {opened.name!r}, seed {seed}")
+        facts = {"file": str(file), "world": opened.name, "seed": seed}
+        console.say(as_json, f"{file}: the world {opened.name!r}, seed {seed}", **facts)
 
 
 @world.command("map")
@@ -224,13 +229,14 @@ def map_(
     seed: Annotated[int, Option(min=0, help="Of the episode.")] = 0,
     robot: Annotated[str, Option(help="A shipped robot or a YAML file.")] = DEFAULT_ROBOT,
     resolution: Annotated[float, Option(help="Greatest side of a cell [m].")] = 0.01,
+    as_json: console.JsonOption = False,
 ) -> None:
     """Writes the map of an episode, as Nav2's map_server reads it.
 
     Obstacles that move are left out. `nics world map room`, then
     `ros2 run nav2_map_server map_server --ros-args -p yaml_filename:=room_map.yaml`.
     """
-    with one_sentence():
+    with console.one_sentence():
         from nics_drl_bridge.lidar.maps import map_files
         from nics_drl_bridge.robot.spec import load_robot
         from nics_drl_bridge.sim.occupancy import occupancy, standing
@@ -251,4 +257,6 @@ def map_(
         map_files(grid, file)
         rows, columns = grid.cells.shape
         size = f"{columns} x {rows} cells of {grid.resolution:.4g} m"
-        typer.echo(f"{file}: the map of {opened.name!r}, seed {seed}, {size}")
+        facts = {"file": str(file), "world": opened.name, "seed": seed, "cells": [columns, rows]}
+        line = f"{file}: the map of {opened.name!r}, seed {seed}, {size}"
+        console.say(as_json, line, **facts, resolution_m=grid.resolution)

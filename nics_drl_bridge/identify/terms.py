@@ -13,13 +13,7 @@ from scipy.linalg import orth
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.excitation import (
-    STILL,
-    TOGETHER,
-    combinations,
-    terms_through_state,
-    unmoved_variables,
-)
+from nics_drl_bridge.identify import excitation
 from nics_drl_bridge.identify.fit import Fit, pruned, regress
 from nics_drl_bridge.identify.yardstick import structure_of
 from nics_drl_bridge.recording.recording import Samples
@@ -111,7 +105,7 @@ def through_state(powers: Powers, spec: RobotSpec, centred: bool) -> Mask:
     names, odd, order = spec.variable_names, mirrored(spec), powers.sum(axis=1)
     unmoved = [name for name, most in zip(names, powers.max(axis=0), strict=True) if most == 0]
     allowed = np.ones((len(spec.dof_names), len(powers)), dtype=np.bool_)
-    allowed[:3] = terms_through_state(powers, spec, tuple(unmoved))
+    allowed[:3] = excitation.terms_through_state(powers, spec, tuple(unmoved))
     if odd is not None and centred:
         aside = powers[:, [name in odd for name in names]].sum(axis=1) % 2 == 1
         allowed[0] &= ~aside
@@ -163,8 +157,8 @@ def linear_fit(
 ) -> Fit:
     """Fits all terms of the library of an order to the rates (Eq. 1); the twist by definition."""
     variables = (*spec.state, *spec.command)
-    unmoved, mean = unmoved_variables(samples, spec), samples.x.mean(axis=0)
-    least = STILL * np.array([v.max - v.min for v in variables])
+    unmoved, mean = excitation.unmoved_variables(samples, spec), samples.x.mean(axis=0)
+    least = excitation.STILL * np.array([v.max - v.min for v in variables])
     at = {
         v.name: float(value) * bool(abs(value) > some)
         for v, value, some in zip(variables, mean, least, strict=True)
@@ -214,12 +208,12 @@ def shared(model: TaylorModel, spec: RobotSpec, samples: Samples) -> TaylorModel
 
     By the least coefficients of all that make the same of these commands.
     """
-    still, command = combinations(samples, spec), samples.x[:, len(spec.state) :]
+    still, command = excitation.combinations(samples, spec), samples.x[:, len(spec.state) :]
     parts = np.abs(still).max(axis=0, initial=0.0) > NOTHING
     constant = still / np.maximum(command.std(axis=0), NOTHING)
     if len({c.unit for c, part in zip(spec.command, parts.tolist(), strict=True) if part}) != 1:
         return model
-    if np.abs(constant @ command.mean(axis=0)).max() > TOGETHER:
+    if np.abs(constant @ command.mean(axis=0)).max() > excitation.TOGETHER:
         return model
     normal = orth(constant.T)
     onto = np.eye(len(model.variables))

@@ -18,15 +18,8 @@ from nics_drl_bridge.interface import S_PER_NS, Array, RobotView
 from nics_drl_bridge.lidar.sectors import Reader
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
+from nics_drl_bridge.middleware import measurement
 from nics_drl_bridge.middleware.ekf import ANYWHERE, START_STD
-from nics_drl_bridge.middleware.measurement import (
-    CMD_VEL,
-    IMU,
-    ODOM,
-    POSE,
-    SCAN,
-    checked_covariance,
-)
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.initial_pose import INITIAL_POSE, initial_pose
@@ -80,10 +73,10 @@ class RobotTopics:
         self._subscriptions: list[Any] = []
         stamped = bool(node.get_parameter(STAMPED).value)
         command = TwistStamped if stamped else Twist
-        self._subscribe(CMD_VEL, command, self._take_command, qos.COMMAND)
+        self._subscribe(measurement.CMD_VEL, command, self._take_command, qos.COMMAND)
         heard: dict[str, tuple[Any, Callable[[Any], None]]] = {
-            SCAN: (LaserScan, self._take_scan),
-            ODOM: (Odometry, self._take_odometry),
+            measurement.SCAN: (LaserScan, self._take_scan),
+            measurement.ODOM: (Odometry, self._take_odometry),
         }
         pose_type = str(node.get_parameter("pose_type").value)
         self._posed = pose_type != NO_POSE
@@ -91,9 +84,9 @@ class RobotTopics:
             if pose_type not in POSE_TYPES:
                 fix = nearest(pose_type, (NO_POSE, *POSE_TYPES))
                 raise ConfigError(f"parameter 'pose_type': there is no {pose_type!r}; {fix}")
-            heard[POSE] = (KINDS_OF_POSE[pose_type], self._take_pose)
+            heard[measurement.POSE] = (KINDS_OF_POSE[pose_type], self._take_pose)
         if node.get_parameter("use_imu").value:
-            heard[IMU] = (Imu, self._take_imu)
+            heard[measurement.IMU] = (Imu, self._take_imu)
         for sensor in model.sensors:
             take_reading = partial(self._take_reading, sensor)
             heard[sensor.name] = (conversions.sensor_type(sensor), take_reading)
@@ -135,7 +128,9 @@ class RobotTopics:
             pose = initial_pose(message, str(self._node.get_parameter("map_frame").value))
             spread = START_STD**2 * np.eye(3)  # where nothing corrects it, it defines the map
             if self._posed:
-                given = checked_covariance(conversions.pose_from_ros(message)[1], 3, START_STD)
+                given = measurement.checked_covariance(
+                    conversions.pose_from_ros(message)[1], 3, START_STD
+                )
                 spread = spread if given is None else given
         except (ConfigError, ValueError) as error:
             logger.error(f"{str(error).removesuffix('.')}. The estimate stays as it is.")
@@ -147,7 +142,7 @@ class RobotTopics:
 
     def in_odom(self) -> Array | None:
         """Returns the robot's pose (3,) by odometry at the newest datum; None before any."""
-        newest = self.middleware.cache.newest.get(ODOM)
+        newest = self.middleware.cache.newest.get(measurement.ODOM)
         if newest is None:
             return None
         pose, twist = newest.value  # the robot has gone on since
@@ -163,7 +158,7 @@ class RobotTopics:
     def located(self) -> bool:
         """True if the robot's position in the map is known."""
         known = self._placed is not None or not self._posed
-        return known or POSE in self.middleware.cache.newest
+        return known or measurement.POSE in self.middleware.cache.newest
 
     def view(self) -> RobotView:
         """Returns the view at the stamp of the newest datum."""
@@ -175,7 +170,7 @@ class RobotTopics:
             return
         reader = self._reader_for(message)
         if reader is None:
-            self.middleware.cache.reject(f"{SCAN}: another lidar")
+            self.middleware.cache.reject(f"{measurement.SCAN}: another lidar")
             return
         ordered = reader.ordered(np.asarray(message.ranges, np.float32))
         ranges = from_device(np.ascontiguousarray(ordered), reader.lidar)
@@ -198,7 +193,7 @@ class RobotTopics:
             self._reader = reader
         except BridgeError as error:
             if str(error) != self._told:
-                self._node.get_logger().error(f"{SCAN} is not used: {error}")
+                self._node.get_logger().error(f"{measurement.SCAN} is not used: {error}")
             self._told = str(error)
         return self._reader
 
@@ -213,7 +208,7 @@ class RobotTopics:
                 self.middleware.place(*self._placed)
         used = self.middleware.odometry(stamp, self.now_ns(), pose, twist)
         newest = self.middleware.cache.newest
-        if used and self._on_odometry is not None and newest[ODOM].stamp_ns == stamp:
+        if used and self._on_odometry is not None and newest[measurement.ODOM].stamp_ns == stamp:
             self._on_odometry(stamp)
 
     def _take_pose(self, message: PoseStamped | PoseWithCovarianceStamped) -> None:
@@ -223,7 +218,7 @@ class RobotTopics:
     def _take_imu(self, message: Imu) -> None:
         stamp = conversions.stamp_from_ros(message.header.stamp)
         if (measured := conversions.imu_from_ros(message)) is None:
-            self.middleware.cache.reject(f"{IMU}: no angular velocity")
+            self.middleware.cache.reject(f"{measurement.IMU}: no angular velocity")
         else:
             self.middleware.imu(stamp, self.now_ns(), *measured)
 

@@ -42,6 +42,9 @@ def test_a_robots_file_becomes_a_model_and_a_recording_by_a_textbook_drive(tmp_p
     assert load_recording(tmp_path / "drive.npz").command.t[-1] == pytest.approx(20.0, abs=0.1)
     spec, _ = robot_and_drive(tmp_path / "drive.npz", None, TopicRoles(), None)
     assert spec == load_robot(tmp_path / "mine.yaml")  # a recording tells its robot
+    words = ("drive", "--robot", "mine.yaml", "--out", "again", "--duration", "10", "--json")
+    told = json.loads(nics(*words, cwd=tmp_path).stdout)
+    assert told == {"model": "again", "robot": "mine", "lidar": model.lidar.name, "recording": None}
 
 
 @pytest.mark.slow

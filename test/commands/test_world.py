@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import shutil
 from pathlib import Path
 
@@ -218,3 +219,15 @@ def test_a_map_that_can_not_be_written_is_one_sentence(tmp_path):
         assert ran.returncode == 2
         assert sentence in ran.stderr
         assert len(ran.stderr.strip().splitlines()) == 1
+
+
+def test_what_is_written_is_told_as_json_too(tmp_path):
+    drawn = json.loads(done("draw", "arena", "--seed", 1, "--json", cwd=tmp_path))
+    assert drawn == {"file": "arena.png", "world": "arena", "seed": 1}
+    words = "map", "arena", "--seed", 1, "--resolution", 0.05, "--json"
+    mapped = json.loads(done(*words, cwd=tmp_path))
+    assert (mapped["file"], mapped["cells"]) == ("arena_map.yaml", [122, 122])
+    assert mapped["resolution_m"] == pytest.approx(0.05, rel=0.01)
+    (imported,) = json.loads(done("import", "arena_map.yaml", "--json", cwd=tmp_path))["worlds"]
+    assert imported["file"] == "arena_map_world.yaml"
+    assert (tmp_path / imported["file"]).is_file()
