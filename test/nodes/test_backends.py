@@ -90,12 +90,13 @@ def episodes(env, seeds, steps, rng):
     told = []
     for seed in seeds:
         observation, info = env.reset(seed=seed)
-        told.append((observation, 0.0, False, info["pose"], info["start"]))
+        told.append((observation, 0.0, False, info["pose"], np.zeros((3, 3)), info["start"]))
         for _ in range(steps):
             observation, reward, ended, _, info = env.step(
                 rng.uniform(-1.0, 1.0, env.action_space.shape).astype(np.float32)
             )
-            told.append((observation, reward, ended, info["pose"], info["true_pose"]))
+            known = info["pose"], info["covariance"], info["true_pose"]
+            told.append((observation, reward, ended, *known))
     return [np.array(column, dtype=np.float64) for column in zip(*told, strict=True)]
 
 
@@ -135,7 +136,7 @@ def test_it_gives_the_numbers_of_the_simulator_in_process(simulator, model, aren
         there.close()
     assert len(told_here[0]) == len(seeds) * (steps + 1)
     *seen, truth = (np.abs(a - b).max() for a, b in zip(told_here, told_there, strict=True))
-    assert seen == [0.0] * 4  # observation, reward, end and estimate, to the bit
+    assert seen == [0.0] * 5  # observation, reward, end, estimate and covariance, to the bit
     assert truth < 1e-12  # a quaternion rounds its heading
 
 
@@ -152,7 +153,7 @@ def test_moving_obstacles_and_maps_are_the_same_over_topics(launch, domain_id, m
         there.close()
     assert np.array_equal(here.scene.bodies, there.scene.bodies)
     *seen, truth = (np.abs(a - b).max() for a, b in zip(told_here, told_there, strict=True))
-    assert seen == [0.0] * 4
+    assert seen == [0.0] * 5
     assert truth < 1e-12
 
 
@@ -170,7 +171,7 @@ def test_every_episode_over_topics_is_in_its_world_of_a_set(launch, domain_id, m
     finally:
         there.close()
     *seen, truth = (np.abs(a - b).max() for a, b in zip(told_here, told_there, strict=True))
-    assert seen == [0.0] * 4
+    assert seen == [0.0] * 5
     assert truth < 1e-12
 
 
