@@ -36,7 +36,7 @@ def row(script: str, full: str = "", quick: str = "", timeout_s: float = TIMEOUT
 
 HOUR = 3600.0
 RUNS: dict[str, Run] = {
-    "barn": row("barn", "", "--runs 1"),
+    "barn": row("barn", "", "--policy straight", HOUR),
     "barn_five_fold": row("barn", "--five-fold", "--policy straight", 3 * HOUR),
     "barn_mujoco": row("barn", "--in mujoco_dds", "--policy straight", HOUR),
     "baselines": row("baselines", "--episodes 200", "--episodes 20"),
