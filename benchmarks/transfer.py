@@ -4,8 +4,8 @@ The shipped policy of each robot, one file, drives the same episodes in three pl
 simulator in process, the fast simulator over DDS, and the robot's machine in MuJoCo over DDS. The
 conditions are those of a deployment: a real lidar, mild randomisation, the gate and its shield.
 What counts is where the robot truly ended and whether it truly touched something; what the robot
-itself took for a success is told beside it. Two robots are
-driven at a time, each in processes of its own.
+itself took for a success is told beside it. Two worlds
+are driven at a time, each in processes of its own.
 """
 
 from __future__ import annotations

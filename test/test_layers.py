@@ -236,7 +236,7 @@ def test_kernels_import_kernels_only_so_that_no_other_edit_compiles_them_anew():
                 files.add(file)
                 left += kernels.imports_of(file)
         others = {file.relative_to(kernels.PACKAGE).as_posix() for file in files} - LIGHT
-        heavy[path.name] = {name for name in others if not name.endswith("kernels.py")}
+        heavy[str(path)] = {name for name in others if not name.endswith("kernels.py")}
     assert {name: found for name, found in heavy.items() if found} == {}
 
 

@@ -10,6 +10,7 @@ from typer import Argument, Option
 
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.files import json_of, write_text
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 if TYPE_CHECKING:
@@ -64,7 +65,6 @@ def import_(
 ) -> None:  # fmt: skip
     """Makes worlds of Gazebo's worlds, of Nav2's maps, or of pictures."""
     with console.one_sentence():
-        from nics_drl_bridge.files import write_text
         from nics_drl_bridge.sim.sdf import read_sdf
 
         keys = {
@@ -85,9 +85,11 @@ def import_(
                 raise ConfigError(f"{each.path}: is there already; {fix}.")
         for each in made:
             write_text(each.path, each.text)
-        lines = "\n".join(f"{each.path}: {each.line}" for each in made)
-        told = [{"file": str(each.path), "holds": each.line} for each in made]
-        console.say(as_json, lines, worlds=told)
+            if not as_json:
+                typer.echo(f"{each.path}: {each.line}")
+        if as_json:
+            told = [{"file": str(each.path), "holds": each.line} for each in made]
+            typer.echo(json_of({"worlds": told}))
 
 
 def _places(files: list[Path], out: Path | None, name: str | None) -> dict[Path, Path]:

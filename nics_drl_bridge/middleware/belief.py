@@ -8,26 +8,12 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.middleware.kernels import Anchor
 
 Array = NDArray[np.float64]
 JITTER_S = 0.2  # Uncertainty of the unobserved time: transmission takes longer now and then [s]
 MARGIN = 1.2  # Factor by which odometry, through noise or slip, may exceed the greatest speed
 LEVELS, MOST_CORNERS = 3, 4096  # values tried per variable for the greatest speed; combinations
-
-
-class Anchor(NamedTuple):
-    """The newest odometry: time [ns], pose in `odom`, twist, mean and covariance after it.
-
-    What was measured since corrects them, too. `cross` (3 + S, 3) is the covariance of the present
-    mean with that pose; None if the pose was set anew since.
-    """
-
-    time_ns: int
-    odom: Array  # (3,)
-    twist: Array  # (3,)
-    mean: Array
-    covariance: Array
-    cross: Array | None = None
 
 
 class Belief(NamedTuple):

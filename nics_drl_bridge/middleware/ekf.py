@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.middleware import kernels
-from nics_drl_bridge.middleware.belief import Anchor, Belief, Foreseen, Unseen, parted
-from nics_drl_bridge.middleware.kernels import Log, MotionModel, log_of
+from nics_drl_bridge.middleware.belief import Belief, Foreseen, Unseen, parted
+from nics_drl_bridge.middleware.kernels import Anchor, Log, MotionModel, log_of
 from nics_drl_bridge.middleware.measurement import Acceptance, Judgement, Kind, Measurement
 from nics_drl_bridge.robot.kernels import SERIES, term_arrays, wrap
 

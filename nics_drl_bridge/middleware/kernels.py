@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.middleware.belief import Anchor
 from nics_drl_bridge.robot.kernels import (
     Terms,
     advance,
@@ -28,6 +27,21 @@ Array = NDArray[np.float64]
 RUNAWAY = 1e9  # Bound on poses, states and their derivatives; beyond, the model has diverged
 LEAST_PIVOT = 1e-12  # Lower bound on a variance given the variables before, as a share of its own
 LEAST_VARIANCE = 1e-18  # Absolute lower bound on that variance
+
+
+class Anchor(NamedTuple):
+    """The newest odometry: time [ns], pose in `odom`, twist, mean and covariance after it.
+
+    What was measured since corrects them, too. `cross` (3 + S, 3) is the covariance of the present
+    mean with that pose; None if the pose was set anew since.
+    """
+
+    time_ns: int
+    odom: Array  # (3,)
+    twist: Array  # (3,)
+    mean: Array
+    covariance: Array
+    cross: Array | None = None
 
 
 class Wheels(NamedTuple):

@@ -92,8 +92,7 @@ def run_node(
             node = make(context)
             if hasattr(node, "start"):
                 node.start()
-        gc.collect()  # now, as it may take a tenth of a second, and never again all of this
-        gc.freeze()
+        gc.collect()  # now, as the next one may take a tenth of a second while the robot moves
         started.set()
         _introduce(node)
         spin(node, stopping)

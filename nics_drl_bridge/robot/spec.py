@@ -255,10 +255,10 @@ class RobotSpec(Schema):
         """True if every command is a field of `cmd_vel`, which nodes need."""
         return all(command.cmd_vel is not None for command in self.command)
 
-    @cached_property
+    @property
     def takes_turn_rate(self) -> bool:
         """True if `angular.z` is a turn rate for a robot that is commanded a steering angle."""
-        return self.steers and self.angular_is == "turn_rate"
+        return self.angular_is == "turn_rate" and self.steers
 
     @property
     def knows_wheelbase(self) -> bool:

@@ -154,6 +154,7 @@ def car(**changes):
 def test_a_car_turns_by_its_own_wheelbase(changes):
     long = car(parameters={"wheelbase": 2.5, "speed_lag": 0.1, "steering_lag": 0.1}, **changes)
     speed, angle = long.command_high
+    assert not long.takes_turn_rate  # a copy of it that does is made of it
     twist = [speed, 0.0, speed * np.tan(angle) / 2.5]
     assert steady_twist(long, long.command_high) == pytest.approx(twist)
     planner = DynamicWindow(Navigation(long, lidar()))
