@@ -162,7 +162,7 @@ class Estimator:
     def foresee(self, time_ns: int) -> None:
         """Computes in advance the prediction to a time and the update by a twist measured then.
 
-        `predict`, `correct` take over the same bits; 1.14 times as many lock-step steps a second.
+        `predict` and `correct` take over the same bits.
         """
         self._foreseen = None
         if time_ns > self.time_ns:
