@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from nics_drl_bridge import interface
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate import inputs
 from nics_drl_bridge.gate.gate import decide
@@ -11,17 +12,8 @@ from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.gate.state import Decision, GateConfig, begin, replace
 from nics_drl_bridge.gate.stopping import gate_config, shield_config
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import (
-    NS_PER_S,
-    S_PER_NS,
-    Array,
-    Backend,
-    BackendFacts,
-    RobotView,
-    Start,
-)
 
-FIRST_NS = NS_PER_S  # the clock at the beginning of an episode
+FIRST_NS = interface.NS_PER_S  # the clock at the beginning of an episode
 
 
 class GatedBackend:
@@ -32,27 +24,27 @@ class GatedBackend:
     that stopped a command as `stopped_by`, else "", and as `shielded` if the shield reduced it.
     """
 
-    def __init__(self, backend: Backend, model: SimulatorModel, limits: str) -> None:
+    def __init__(self, backend: interface.Backend, model: SimulatorModel, limits: str) -> None:
         model.robot.require_cmd_vel()
         given = load_limits(limits, model.robot)
         shield, _ = shield_config(model, given, limits)
         self._backend, self._model = backend, model
-        self._period_ns = round(model.control_period * NS_PER_S)
+        self._period_ns = round(model.control_period * interface.NS_PER_S)
         self._config = gate_config(
             model, given, shield, simulated=True, e_stop_required=False, estimate_required=False
         )
-        if not self._period_ns * S_PER_NS < GateConfig.gap_s:
+        if not self._period_ns * interface.S_PER_NS < GateConfig.gap_s:
             slow = f"commands come every {model.control_period:g} s, and it stops after"
             raise ConfigError(f"the gate can't be simulated: {slow} {GateConfig.gap_s:g} s.")
 
-    def reset(self, start: Start) -> RobotView:
+    def reset(self, start: interface.Start) -> interface.RobotView:
         """Begins the episode of a seed; see `interface.Backend`."""
         # Arming is what a person does before: the data of that time are not driven again.
         self._state = replace(begin(self._config), armed=True)
         self._now_ns = FIRST_NS
         return self._seen(self._backend.reset(start))
 
-    def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
+    def step(self, command: interface.Array) -> tuple[interface.RobotView, dict[str, Any]]:
         """Applies what the gate makes of a command for one period; see `interface.Backend`."""
         robot = self._model.robot
         self._give(inputs.Command(self._now_ns, robot.to_cmd_vel(command)))
@@ -62,7 +54,7 @@ class GatedBackend:
         cause = "" if decision.cause is None else decision.cause.rule
         return self._seen(view), {**facts, "stopped_by": cause, "shielded": decision.shielded}
 
-    def _seen(self, view: RobotView) -> RobotView:
+    def _seen(self, view: interface.RobotView) -> interface.RobotView:
         lidar, now = self._model.lidar, self._now_ns
         self._give(inputs.Odometry(now, view.pose.copy(), view.twist.copy()))
         for sensor in self._model.sensors:
@@ -73,11 +65,11 @@ class GatedBackend:
         return view
 
     def _give(self, given: inputs.Input) -> Decision:
-        now = self._now_ns * S_PER_NS
+        now = self._now_ns * interface.S_PER_NS
         self._state, decision = decide(self._config, self._state, given, now)
         return decision
 
-    def facts(self) -> BackendFacts:
+    def facts(self) -> interface.BackendFacts:
         """Returns those of the backend behind the gate; see `interface.Backend`."""
         return self._backend.facts()
 

@@ -10,30 +10,12 @@ import numpy as np
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify import shooting
+from nics_drl_bridge.identify import forms, shooting, terms
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.excitation import unmoved_variables
 from nics_drl_bridge.identify.fit import Order
-from nics_drl_bridge.identify.forms import (
-    Form,
-    inputs_of,
-    likely_delays,
-    problem_of,
-    two_way,
-    with_back,
-    with_dead,
-)
 from nics_drl_bridge.identify.statistics import clustered_errors
-from nics_drl_bridge.identify.terms import (
-    Mask,
-    by_textbook,
-    defined,
-    linear_fit,
-    stable,
-    together,
-    tyres_slip,
-)  # fmt: skip
 from nics_drl_bridge.recording.recording import Samples
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -75,32 +57,32 @@ class Draft:
     """A form, and the prediction problem by which its models are fitted."""
 
     spec: RobotSpec
-    form: Form
+    form: forms.Form
     inputs: shooting.Inputs
     problem: shooting.Shooting
 
     def base(
-        self, inside: Mask | None = None, other: TaylorModel | None = None
+        self, inside: terms.Mask | None = None, other: TaylorModel | None = None
     ) -> shooting.Predictive:
         """Fits the textbook's terms, gains and lags; the search may start at another model."""
         samples, spec = self.problem.samples, self.spec
         samples = samples if inside is None else samples.rows(inside)
-        allowed = partial(by_textbook, tyres=self.form.tyres)
-        model = linear_fit(samples, spec, BASE_ORDER, allowed).model
-        model, first = (model, None) if other is None else together(model, other)
-        free = (model.coefficients != 0.0) & ~defined(spec)[:, None]
+        allowed = partial(terms.by_textbook, tyres=self.form.tyres)
+        model = terms.linear_fit(samples, spec, BASE_ORDER, allowed).model
+        model, first = (model, None) if other is None else terms.together(model, other)
+        free = (model.coefficients != 0.0) & ~terms.defined(spec)[:, None]
         found = shooting.fitted(
             self.problem, model, free, self.inputs, inside, BASE_EVALUATIONS, first=first
         )  # fmt: skip
-        return replace(found, model=stable(found.model, spec))
+        return replace(found, model=terms.stable(found.model, spec))
 
     def refined(
-        self, base: TaylorModel, linear: TaylorModel, inside: Mask | None = None,
+        self, base: TaylorModel, linear: TaylorModel, inside: terms.Mask | None = None,
         evaluations: int = shooting.EVALUATIONS, pull: float = shooting.PULL,
     ) -> shooting.Predictive:  # fmt: skip
         """Adjusts the terms of a linear fit, and those of a base to which they are pulled."""
-        base, first = together(base, linear)
-        free = ((base.coefficients != 0.0) | (first != 0.0)) & ~defined(self.spec)[:, None]
+        base, first = terms.together(base, linear)
+        free = ((base.coefficients != 0.0) | (first != 0.0)) & ~terms.defined(self.spec)[:, None]
         return shooting.fitted(
             self.problem, base, free, self.inputs, inside, evaluations, pull, first
         )  # fmt: skip
@@ -139,12 +121,12 @@ class Draft:
         )  # fmt: skip
 
     def models(
-        self, asked: tuple[Hypothesis, ...], inside: Mask
+        self, asked: tuple[Hypothesis, ...], inside: terms.Mask
     ) -> Iterator[tuple[Hypothesis, TaylorModel]]:
         """Yields the model of each hypothesis, fitted to the rows inside (T,)."""
         samples, base = self.problem.samples.rows(inside), self.base(inside).model
         orders = {order for order, _ in asked if order}
-        linear = {order: linear_fit(samples, self.spec, order).model for order in orders}
+        linear = {order: terms.linear_fit(samples, self.spec, order).model for order in orders}
         for order, pull in asked:
             found = base
             if order:
@@ -169,10 +151,10 @@ def base_of(
     Clear curves are not doubted. A known base is fitted anew, to other data.
     """
 
-    def fitted(form: Form, before: Base | None = None) -> Base:
-        inputs = inputs_of(drive, calibration.command_latency_s, samples, form)
+    def fitted(form: forms.Form, before: Base | None = None) -> Base:
+        inputs = forms.inputs_of(drive, calibration.command_latency_s, samples, form)
         inputs = inputs.begun_at(before.draft.inputs) if before else inputs
-        problem = problem_of(drive, calibration, samples, form, inputs)
+        problem = forms.problem_of(drive, calibration, samples, form, inputs)
         draft = Draft(drive.spec, form, inputs, replace(problem, spacing_s=SPACING_S))
         found = draft.base(other=before.found.model if before else None)
         inputs = replace(inputs, start=found.values)
@@ -183,10 +165,10 @@ def base_of(
 
     if known is not None:
         return fitted(replace(known.draft.form, curves=calibration.inputs))
-    best = fitted(Form(calibration.inputs))
+    best = fitted(forms.Form(calibration.inputs))
     error = error_of(best)
     if len(calibration.inputs) > len(clear):
-        plain = fitted(Form(clear))
+        plain = fitted(forms.Form(clear))
         if (other := error_of(plain)) < error or np.isinf(other):  # too short a drive tells nothing
             best, error = plain, other
     for change, worth in changes(drive, calibration, samples):
@@ -200,14 +182,14 @@ def base_of(
 
 def changes(
     drive: Drive, calibration: Calibration, samples: Samples
-) -> Iterator[tuple[Callable[[Form], Form], float]]:
+) -> Iterator[tuple[Callable[[forms.Form], forms.Form], float]]:
     """Yields changes of the form of a robot's motion, and to which share each takes the error."""
     # Drag and friction are hard to tell apart: both are tried, then each without the other.
     speeds = tuple(v.name for v in drive.spec.state if v.twist == "vx")
-    late = likely_delays(drive, calibration, samples)
+    late = forms.likely_delays(drive, calibration, samples)
     if late:  # a wrong time hides what else there is, and is hidden by it
         yield lambda form: replace(form, delays=late), WORTH
-    if tyres_slip(drive.spec):
+    if terms.tyres_slip(drive.spec):
         yield lambda form: replace(form, tyres=True), WORTH
     if speeds:
         yield lambda form: replace(form, drag=speeds, friction=speeds), WORTH
@@ -216,12 +198,12 @@ def changes(
     if late:
         yield lambda form: replace(form, delays=late), WORTH
     if speeds:
-        yield lambda form: with_dead(form, drive, samples), WORTH
+        yield lambda form: forms.with_dead(form, drive, samples), WORTH
         yield lambda form: replace(form, limits=speeds), WORTH
         if others := tuple(v.name for v in drive.spec.state if v.twist and not drive.spec.steers):
             yield lambda form: replace(form, limits=others), WORTH
-        if backwards := two_way(drive, samples):
-            yield lambda form: with_back(form, backwards), WORTH
+        if backwards := forms.two_way(drive, samples):
+            yield lambda form: forms.with_back(form, backwards), WORTH
 
 
 def hypotheses(order: Order) -> tuple[Hypothesis, ...]:

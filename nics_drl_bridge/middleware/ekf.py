@@ -199,9 +199,11 @@ class Estimator:
                 self._jump(*bridged)
                 self._foreseen = None
         verdict = self._correct(measurement, odom is not None and not lost)
+        if verdict.outcome is Acceptance.OUTLIER:
+            return verdict  # the next odometry's way then leads past this one
         if odom is not None:
             self.anchor(np.array(odom), np.array(measurement.value))
-        elif kind is Kind.POSE and verdict.outcome is not Acceptance.OUTLIER:
+        elif kind is Kind.POSE:
             self._lost = False
         return verdict
 

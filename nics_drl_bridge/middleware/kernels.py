@@ -25,6 +25,7 @@ from nics_drl_bridge.robot.kernels import (
 
 Array = NDArray[np.float64]
 RUNAWAY = 1e9  # Bound on poses, states and their derivatives; beyond, the model has diverged
+SHORT_S = 0.25  # longest time in which the way is that of the twists at its ends
 LEAST_PIVOT = 1e-12  # Lower bound on a variance given the variables before, as a share of its own
 LEAST_VARIANCE = 1e-18  # Absolute lower bound on that variance
 
@@ -297,12 +298,13 @@ def retrace(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Corrects by the way from the `Anchor` to odometry's pose and twist (3,), if that is likely.
 
-    Returns mean and covariance; `wheels` is `Wheels`.
+    If it is so by those twists alone, it replaces what was predicted. Returns mean and covariance;
+    `wheels` is `Wheels`.
     """
     seconds, then, size = (now - anchor.time_ns) / NS_PER_S, anchor.mean, mean.shape[0]
     c, s = math.cos(anchor.odom[2]), math.sin(anchor.odom[2])
     x, y = odom[0] - anchor.odom[0], odom[1] - anchor.odom[1]
-    along, aside, turned = c * x + s * y, c * y - s * x, odom[2] - anchor.odom[2]
+    along, aside, turned = c * x + s * y, c * y - s * x, wrap(odom[2] - anchor.odom[2])
     c, s = math.cos(then[2]), math.sin(then[2])
     x, y = mean[0] - then[0], mean[1] - then[1]
     ahead, before = c * x + s * y, c * y - s * x
@@ -317,11 +319,23 @@ def retrace(  # type: ignore[no-untyped-def]
     innovation = np.array([along - ahead, aside - before, turn])
     # Between two twists the robot may have had either.
     slack = np.diag((0.5 * seconds * (twist - anchor.twist)) ** 2)
-    if not innovation @ np.linalg.solve(total + slack, innovation) <= gate:
-        return mean, covariance
-    gain = np.linalg.solve(total, shared.T)
-    less, moved = covariance - shared @ gain, mean + innovation @ gain
-    less = (less + less.T) * 0.5
+    if innovation @ np.linalg.solve(total + slack, innovation) <= gate:
+        gain = np.linalg.solve(total, shared.T)
+        less, moved = covariance - shared @ gain, mean + innovation @ gain
+        less = (less + less.T) * 0.5
+    else:
+        arc = np.array([along + 0.5 * turned * aside, aside - 0.5 * turned * along, turned])
+        off, spread = arc - 0.5 * seconds * (twist + anchor.twist), wheels.walk * seconds + slack
+        spread[1, 1] += (0.25 * turned * along) ** 2  # of where on the way it turned
+        if seconds > SHORT_S or not off @ np.linalg.solve(spread, off) <= gate:
+            return mean, covariance
+        # The way is that of its twists: what was predicted is wrong.
+        moved, less, turning = mean.copy(), covariance.copy(), np.eye(3)
+        moved[0], moved[1] = then[0] + c * along - s * aside, then[1] + s * along + c * aside
+        moved[2], less[:3, 3:], less[3:, :3] = then[2] + turned, 0.0, 0.0
+        turning[0, 2], turning[1, 2] = then[1] - moved[1], moved[0] - then[0]
+        spread = anchor.covariance[:3, :3].copy()
+        less[:3, :3] = turning @ spread @ turning.T + wheels.walk * seconds
     less[:3, :3] += wheels.slip * seconds
     settle(moved, less, wheels.low, wheels.high)
     return moved, less

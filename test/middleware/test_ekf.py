@@ -340,6 +340,32 @@ def test_a_way_that_belies_the_twists_is_left_out():
     assert np.hypot(*moved[:2]) > 0.9 * np.hypot(*twist[:2])
 
 
+def test_a_twist_that_is_no_twist_of_the_robot_takes_no_way_with_it():
+    estimator = Estimator(model := builtin_model("differential"))
+    estimator.anchor(np.zeros(3))
+    estimator.command(0, model.robot.command_high)
+    stepped(estimator, PERIOD, [0.0, 0.15, 0.0], np.zeros(3))
+    assert estimator.belief.outliers[Kind.TWIST] == 1
+    stepped(estimator, 2 * PERIOD, np.zeros(3), np.zeros(3))
+    assert np.abs(estimator.at(2 * PERIOD)[0]).max() < 0.01
+
+
+@pytest.mark.parametrize("response", [0.8, 1.2])
+def test_a_car_that_obeys_later_than_its_model_is_where_odometry_is(response):
+    """At a reversal the model is far off, and steering can't be told from a twist near zero."""
+    late = Randomisation(
+        name="late", kinematics={"response": [response, response]}, action_latency=(1.0, 1.0)
+    )
+    given = {"estimator": True, "randomisation": late}
+    backend = SimBackend(builtin_model("ackermann"), field(60.0), **given)
+    for seed in range(3):
+        backend.reset(Start(seed, np.zeros(3)))
+        for step in range(60):
+            view, _ = backend.step(np.array([-0.5, -0.5] if step % 30 < 8 else [1.0, 0.5]))
+        odometry = backend.simulator.data.odom[0, 0]
+        assert np.abs(geometry.between(odometry, view.pose)).max() < 0.1
+
+
 @pytest.mark.parametrize("heading", [0.0, 0.3])
 def test_the_way_goes_on_from_a_pose_that_was_measured_in_between(heading):
     estimator = Estimator(direct_model())

@@ -22,6 +22,7 @@ ROTOR = 0.25  # inertia of a geared motor, relative to its share of the robot's
 # its convex contacts lift what slides so far that wheels hop off the floor.
 SKIDDING = 0.01
 STEERING_STIFFNESS = 1.0  # torque of a steering servo per error [N m/rad]
+STEEPEST = 0.6  # steering angle up to which a tie rod leads the wheels as it should [rad]
 STEERING_TORQUE = 1.0  # torque limit of a steering servo [N m], that of a small hobby servo
 THICKNESS = 0.25  # radius of a roller at its middle, relative to the radius of the wheel
 ROLLER_MASS = 0.005
@@ -147,13 +148,14 @@ def _ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
     wheelbase = p["wheelbase"]
     track, radius = track_and_radius(p)
     total = physics.mass + 4 * physics.wheel_mass
-    inertia = (total + 2 * physics.wheel_mass) * radius**2
+    rotor = ROTOR * 0.5 * physics.mass * radius**2
+    inertia = (total + 2 * physics.wheel_mass) * radius**2 + 2 * rotor
     engine = _motor('tendon="axle"', inertia, p["speed_lag"], radius, step, physics)
     centre, size = (0.45 * wheelbase, 0.0, 0.0), (1.3 * wheelbase, 0.7 * track, 0.04)
-    wheels = _car_wheels(wheelbase, track, radius, p["steering_lag"], physics)
+    wheels = _car_wheels(wheelbase, track, radius, p["steering_lag"], physics, rotor)
     robot = _chassis(physics.mass, centre, size) + wheels
-    xml = _document("ackermann", physics, radius, robot, _car_actuators(engine))
     half_ratio = 0.5 * track / wheelbase
+    xml = _document("ackermann", physics, radius, robot, _car_actuators(engine, half_ratio))
 
     def controls(state: Array) -> Array:
         speed, steering = state
@@ -170,10 +172,12 @@ def _ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
     return Machine(xml, joints, controls, measured)
 
 
-def _car_wheels(wheelbase: float, track: float, radius: float, lag: float, physics: Physics) -> str:
+def _car_wheels(
+    wheelbase: float, track: float, radius: float, lag: float, physics: Physics, rotor: float
+) -> str:
     parts = ""
     for side, y in (("left", 0.5 * track), ("right", -0.5 * track)):
-        rear = _wheel(f"rear_{side}", radius, 0.4 * radius, physics)
+        rear = _wheel(f"rear_{side}", radius, 0.4 * radius, physics, rotor=rotor)
         front = _wheel(f"front_{side}", radius, 0.4 * radius, physics, physics.bearing)
         parts += f"""
       <body pos="0 {y:.6g} 0">{rear}
@@ -188,7 +192,16 @@ def _car_wheels(wheelbase: float, track: float, radius: float, lag: float, physi
     return parts
 
 
-def _car_actuators(engine: str) -> str:
+def _tie_rod(half_ratio: float) -> str:
+    # Servos that are not joined pass through angles at which the wheels scrub.
+    middle = np.tan(np.linspace(-STEEPEST, STEEPEST, 101))
+    left, right = (np.arctan(middle / (1.0 + side * half_ratio * middle)) for side in (-1.0, 1.0))
+    row = " ".join(f"{each:.8g}" for each in np.polynomial.polynomial.polyfit(left, right, 4))
+    return f"""
+  <equality><joint joint1="steer_right" joint2="steer_left" polycoef="{row}"/></equality>"""
+
+
+def _car_actuators(engine: str, half_ratio: float) -> str:
     servos = "".join(
         f"""
     <position joint="steer_{side}" kp="{STEERING_STIFFNESS}"
@@ -201,17 +214,18 @@ def _car_actuators(engine: str) -> str:
     </fixed>
   </tendon>
   <actuator>{engine}{servos}
-  </actuator>"""
+  </actuator>{_tie_rod(half_ratio)}"""
 
 
 def _differential(p: Parameters, step: float, physics: Physics) -> Machine:
     radius, track = p["wheel_radius"], p["track"]
     behind, ball = -0.5 * track, 0.4 * radius
     total = physics.mass + 2 * physics.wheel_mass
-    inertia = 0.5 * (total + physics.wheel_mass) * radius**2
+    rotor = ROTOR * 0.5 * physics.mass * radius**2
+    inertia = 0.5 * (total + physics.wheel_mass) * radius**2 + rotor
     wheels = "".join(
         f"""
-      <body pos="0 {y:.6g} 0">{_wheel(side, radius, 0.4 * radius, physics)}
+      <body pos="0 {y:.6g} 0">{_wheel(side, radius, 0.4 * radius, physics, rotor=rotor)}
       </body>"""
         for side, y in (("left", 0.5 * track), ("right", -0.5 * track))
     )

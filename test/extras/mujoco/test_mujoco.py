@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.extras.mujoco.machines import Physics, build_machine, load_mujoco, roller_size
 from nics_drl_bridge.extras.mujoco.simulator import MujocoRobot, Reading, record
@@ -123,6 +124,22 @@ def test_the_encoders_agree_with_the_motion(robots, name):
     readings = [robot.step(command, 0.01) for _ in range(50)]
     state, twist = (np.mean([getattr(r, k) for r in readings], axis=0) for k in ("state", "twist"))
     assert np.allclose(textbook(robot.spec).twist(state), twist, rtol=0.1, atol=0.02)
+
+
+@needs_mujoco
+@pytest.mark.parametrize("name", ["ackermann", "differential"])
+def test_a_robot_that_turns_round_knows_where_it_is_by_its_encoders(robots, name):
+    """Wheels keep up with the floor while they accelerate, and those that steer do not scrub."""
+    robot, pose = robots[name], np.zeros(3)
+    low, high = robot.spec.command_low, robot.spec.command_high
+    reading = robot.reset(pose)
+    for step in range(200):
+        before, reading = reading, robot.step(high * [1.0, 0.0] if step > 100 else low, 0.01)
+        twist = textbook(robot.spec).twist(0.5 * (before.state + reading.state))
+        pose = geometry.compose(pose, geometry.exp(0.01 * twist))
+    off = geometry.between(reading.pose, pose)
+    assert np.hypot(*off[:2]) < 0.01
+    assert abs(off[2]) < 0.01
 
 
 @needs_mujoco
