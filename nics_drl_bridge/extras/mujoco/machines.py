@@ -237,8 +237,7 @@ def _differential(p: Parameters, step: float, physics: Physics) -> Machine:
         <joint type="ball" damping="{physics.bearing}"/>
         <geom class="tread" type="sphere" size="{ball:.6g}" mass="0.03"/>
       </body>{wheels}"""
-    names = ("left", "right")
-    motors = _motors(names, inertia, p["wheel_lag"], radius, step, physics)
+    motors = _motors(names := ("left", "right"), inertia, p["wheel_lag"], radius, step, physics)
     xml = _document("differential", physics, radius, robot, motors)
     return Machine(xml, names, lambda state: state, lambda _, speed: speed)
 
