@@ -191,14 +191,7 @@ def test_a_missing_file_is_named(saved, name):
         load_model(saved)
 
 
-KEYS = (
-    "control_period",
-    "robot",
-    "kinematics",
-    "calibration",
-    "lidar",
-    "noise",
-)
+KEYS = ("control_period", "robot", "kinematics", "calibration", "lidar", "noise")
 
 
 @pytest.mark.parametrize("key", KEYS)

@@ -204,9 +204,7 @@ def test_colcon_shares_config_launch_files_urdf_and_the_ament_marker(
     assert (share / "ament_index" / "resource_index" / "packages" / PACKAGE).is_file()
 
 
-def test_a_sourced_colcon_install_takes_version_and_config_from_itself(
-    install_space: Path,
-) -> None:
+def test_a_sourced_colcon_install_takes_version_and_config_from_itself(install_space: Path) -> None:
     sourced = f"source {install_space}/setup.bash && exec {sys.executable} -c '{WHERE_AM_I}'"
     answer = run("bash", "-c", sourced, cwd=install_space)
     version, module, share = answer.splitlines()

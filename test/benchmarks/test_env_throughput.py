@@ -104,8 +104,7 @@ def test_a_peer_that_is_as_fast_as_ours_misses_no_bar_but_the_ratios(benchmark, 
 
 
 @pytest.mark.parametrize(
-    ("given", "bar"),
-    [({"lidar": "hokuyo_ust_10lx"}, 0.75), ({"obstacles": 260}, 0.65)],
+    ("given", "bar"), [({"lidar": "hokuyo_ust_10lx"}, 0.75), ({"obstacles": 260}, 0.65)]
 )
 def test_another_lidar_or_more_obstacles_have_to_keep_their_share_of_the_usual_rate(
     benchmark, peers, given, bar

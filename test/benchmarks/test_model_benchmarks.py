@@ -22,8 +22,7 @@ def test_the_fitted_models_err_no_more_than_the_papers():
 
 @pytest.mark.campaign
 @pytest.mark.parametrize(
-    ("control", "bar"),
-    [("rounded", "rmse_x_m"), ("nan", "nan"), ("slow", "times plain Python's")],
+    ("control", "bar"), [("rounded", "rmse_x_m"), ("nan", "nan"), ("slow", "times plain Python's")]
 )
 def test_table1_fails_without_exact_or_fast_models(control, bar):
     assert control in {"rounded", "nan", "slow"}

@@ -30,10 +30,7 @@ def test_a_model_with_another_lidar_is_saved_where_a_node_can_read_it(tmp_path):
 
 @pytest.mark.parametrize(
     ("conditions", "said"),
-    [
-        (Conditions(lidar="rplidar_a9"), "rplidar_a9"),
-        (Conditions(randomisation="milt"), "mild"),
-    ],
+    [(Conditions(lidar="rplidar_a9"), "rplidar_a9"), (Conditions(randomisation="milt"), "mild")],
 )
 def test_an_unknown_condition_is_one_sentence(conditions, said, tmp_path):
     with pytest.raises(ConfigError, match=said):

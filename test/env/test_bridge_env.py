@@ -248,10 +248,7 @@ def test_facts_of_a_backend_of_ones_own_are_those_of_its_last_step_unless_it_has
 def test_a_randomised_backend_gives_the_same_episode_as_an_backendas_by_its_name():
     model, world, strong = direct_model(), field(count=4), "strong"
     backend = SimBackend(model, world, randomisation=strong)
-    given = (
-        BridgeEnv("sim", model, world, randomisation=strong),
-        BridgeEnv(backend, model, world),
-    )
+    given = (BridgeEnv("sim", model, world, randomisation=strong), BridgeEnv(backend, model, world))
     infos = [env.reset(seed=3)[1] for env in given]
     assert infos[0]["randomisation"]
     for name, value in infos[0].items():

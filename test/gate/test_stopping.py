@@ -8,13 +8,7 @@ import pytest
 from gate.rig import Rig, config
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate.limits import load_limits
-from nics_drl_bridge.gate.stopping import (
-    doubtful,
-    lag,
-    require_possible,
-    shield_config,
-    wheelbase,
-)
+from nics_drl_bridge.gate.stopping import doubtful, lag, require_possible, shield_config, wheelbase
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.robot.spec import load_robot
 

@@ -70,10 +70,7 @@ def test_shapes_are_added_at_the_density_of_the_table():
     assert more.density == SMALL
 
 
-@pytest.mark.parametrize(
-    "density",
-    [Density(distances=10_000, rotations=100_000, phases=8)],
-)
+@pytest.mark.parametrize("density", [Density(distances=10_000, rotations=100_000, phases=8)])
 def test_a_table_that_no_index_can_reach_is_refused(density, monkeypatch):
     monkeypatch.setattr("nics_drl_bridge.lidar.bake.MOST_NUMBERS", 1000)
     with pytest.raises(ConfigError, match="is too large; lower `distances`"):

@@ -144,11 +144,7 @@ def test_a_quantised_range_is_the_single_number_nearest_to_its_multiple():
 
 def test_faults_act_in_the_order_of_the_device():
     close = reported(
-        scan_at(-np.inf),
-        too_close="range_min",
-        noise_std=0.05,
-        quantisation=0.02,
-        dropout=0.5,
+        scan_at(-np.inf), too_close="range_min", noise_std=0.05, quantisation=0.02, dropout=0.5
     )
     assert np.isposinf(close).mean() == pytest.approx(0.5, abs=0.02)  # dropout after too_close
     values = np.unique(close[np.isfinite(close)]) / 0.02

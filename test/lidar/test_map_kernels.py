@@ -72,8 +72,7 @@ def by_shapely(grid, pose):
     rays = shapely.linestrings([[here, end] for end in ends])
     lines = np.array(lines, dtype=float) * grid.resolution
     hits = shapely.distance(
-        shapely.points(here),
-        shapely.intersection(rays[:, None], shapely.linestrings(lines)[None]),
+        shapely.points(here), shapely.intersection(rays[:, None], shapely.linestrings(lines)[None])
     )
     corners = shapely.points(np.unique(lines.reshape(-1, 2), axis=0))
     clear = (shapely.distance(rays[:, None], corners[None]) > EDGE).all(axis=1)

@@ -6,12 +6,7 @@ from pydantic import Field
 
 from nics_drl_bridge.config import Schema, load_yaml, parse_yaml, validate
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.lidar.sensor_models import (
-    IncidenceDropout,
-    Intensity,
-    SensorModels,
-    returned,
-)
+from nics_drl_bridge.lidar.sensor_models import IncidenceDropout, Intensity, SensorModels, returned
 from nics_drl_bridge.lidar.shapes import Circle, ShapeFile, describe
 from nics_drl_bridge.lidar.spec import LidarSpec
 

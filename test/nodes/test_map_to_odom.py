@@ -10,11 +10,7 @@ from nav_msgs.msg import Odometry
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.map_to_odom import (
-    odom_in_map,
-    transform_from_ros,
-    transform_to_ros,
-)
+from nics_drl_bridge.nodes.map_to_odom import odom_in_map, transform_from_ros, transform_to_ros
 from nodes.peer import stamp_ns
 
 pytestmark = pytest.mark.ros

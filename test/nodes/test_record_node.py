@@ -255,11 +255,7 @@ def test_a_recorded_drive_of_a_simulator_generates_it_again(
 ):
     save_model(builtin_model(name), tmp_path / "model")
     namespace = "bot" if "bot" in options else ""
-    parameters = {
-        "model": str(tmp_path / "model"),
-        "world": open_field(tmp_path),
-        **pace,
-    }
+    parameters = {"model": str(tmp_path / "model"), "world": open_field(tmp_path), **pace}
     launch("simulator_node", domain_id, namespace, **parameters)
     peer = meet(domain_id, namespace)
     odom, heard = peer.listen(Odometry, "odom"), peer.listen(Twist, "cmd_vel", qos.COMMAND)

@@ -36,11 +36,7 @@ def three():
     towards = np.zeros((SECTORS + 4, 1), np.float32)
     towards[:SECTORS, 0] = 0.02 * np.sin(np.arange(SECTORS))
     towards[SECTORS + 1], towards[SECTORS + 3] = 4.0, -0.1  # by bearing and turn rate
-    weights = {
-        "shape": np.int64([-1, SECTORS]),
-        "towards": towards,
-        "full": np.float32([[0.9]]),
-    }
+    weights = {"shape": np.int64([-1, SECTORS]), "towards": towards, "full": np.float32([[0.9]])}
     nodes = [
         helper.make_node("Reshape", ["scan", "shape"], ["beams"]),
         helper.make_node("Concat", ["beams", "goal", "velocity"], ["seen"], axis=1),
@@ -84,10 +80,7 @@ FLAT = 2 * SECTORS + 5
 def flat():
     """One vector of 64-bit numbers, fixed to one row, and a choice of five commands."""
     rng = np.random.default_rng(3)
-    weights = {
-        "first": rng.normal(0.0, 0.3, (FLAT, 8)),
-        "second": rng.normal(0.0, 1.0, (8, 5)),
-    }
+    weights = {"first": rng.normal(0.0, 0.3, (FLAT, 8)), "second": rng.normal(0.0, 1.0, (8, 5))}
     nodes = [
         helper.make_node("MatMul", ["obs", "first"], ["hidden"]),
         helper.make_node("Tanh", ["hidden"], ["bent"]),

@@ -17,12 +17,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.interface import RobotView
 from nics_drl_bridge.policy.evaluation import drive_all, drive_worlds, successes
-from nics_drl_bridge.policy.policies import (
-    POLICIES,
-    DynamicWindow,
-    RandomActions,
-    make_policy,
-)
+from nics_drl_bridge.policy.policies import POLICIES, DynamicWindow, RandomActions, make_policy
 from nics_drl_bridge.policy.stateful import Stateful, begin, resume
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.kinds import steady_twist

@@ -9,12 +9,7 @@ import numpy as np
 
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.recording.bag_file import Message, opened
-from nics_drl_bridge.recording.bag_reader import (
-    gather,
-    latency_of,
-    state_of,
-    wheels_of,
-)
+from nics_drl_bridge.recording.bag_reader import gather, latency_of, state_of, wheels_of
 from nics_drl_bridge.recording.readers import read_recording
 from nics_drl_bridge.recording.recording import load_recording, save_recording
 from nics_drl_bridge.recording.topic_roles import TopicRoles

@@ -350,8 +350,7 @@ def test_what_only_a_wrong_mapping_explains_is_refused_with_the_line_to_write(
 
 
 @pytest.mark.parametrize(
-    "pwm",
-    [np.where(np.arange(400) % 100 < 50, -127, 127), np.zeros(400), 5 * np.arange(400)],
+    "pwm", [np.where(np.arange(400) % 100 < 50, -127, 127), np.zeros(400), 5 * np.arange(400)]
 )
 def test_commands_in_whole_numbers_are_no_counters(tmp_path, pwm):
     columns = drive(400) | {"v": pwm + np.arange(400) % 2}

@@ -14,13 +14,7 @@ from nics_drl_bridge.lidar.sectors import ScanLayout
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.report.doctor import examine
-from nics_drl_bridge.report.doctor_facts import (
-    Endpoints,
-    Expected,
-    Facts,
-    facts_of_bag,
-    names_in,
-)
+from nics_drl_bridge.report.doctor_facts import Endpoints, Expected, Facts, facts_of_bag, names_in
 from nics_drl_bridge.robot.spec import load_robot
 
 SECONDS = 8.0

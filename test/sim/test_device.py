@@ -6,12 +6,7 @@ from robots import direct_model, lidar
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.sim.device import (
-    DrivenSimulator,
-    propagate,
-    step_covariance,
-    variances,
-)
+from nics_drl_bridge.sim.device import DrivenSimulator, propagate, step_covariance, variances
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import load_world

@@ -184,15 +184,9 @@ def test_a_range_that_the_model_cannot_take_is_one_sentence(kinematics, sentence
     ("data", "sentence"),
     [
         ({"kinematics": {"scale": [1.1, 0.9]}}, "key 'kinematics.scale': a range is [least"),
-        (
-            {"kinematics": {"scale": [0.0, 0.9]}},
-            "key 'kinematics.scale.0': input",
-        ),
+        ({"kinematics": {"scale": [0.0, 0.9]}}, "key 'kinematics.scale.0': input"),
         ({"kinematics": {"dofs": {"wz": [-1.0, 0.9]}}}, "key 'kinematics.dofs.wz.0'"),
-        (
-            {"action_latency": [-0.1, 0.9]},
-            "key 'action_latency.0'",
-        ),
+        ({"action_latency": [-0.1, 0.9]}, "key 'action_latency.0'"),
         ({"observation_latency": [0, 51]}, "less than or equal to 50"),
         ({"lidar": {"dropuot": [0, 1]}}, "did you mean 'dropout'?"),
         ({"lidar": {"dropout": [0, 0.6], "dropout_far": [0, 0.6]}}, "add up to at most 1"),

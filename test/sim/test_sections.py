@@ -134,11 +134,7 @@ def test_a_thousandth_of_a_radian_is_upright():
 
 def test_equal_shapes_are_one_group_and_the_bounds_hold_all_and_room_around_places():
     disc, bar = Circle(radius=0.5), Rectangle(size=(2.0, 0.2))
-    placed = (
-        (disc, (0.0, 0.0, 0.0)),
-        (bar, (4.0, 0.0, math.pi / 2.0)),
-        (disc, (1.0, 1.0, 0.0)),
-    )
+    placed = ((disc, (0.0, 0.0, 0.0)), (bar, (4.0, 0.0, math.pi / 2.0)), (disc, (1.0, 1.0, 0.0)))
     standing = Standing(placed, ())
     assert [len(group.at) for group in standing.obstacles] == [2, 1]
     assert standing.bounds() == pytest.approx((-0.5, -1.0, 4.1, 1.5))

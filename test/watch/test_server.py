@@ -61,10 +61,7 @@ def test_the_page_of_a_foreign_site_can_not_open_the_socket(server):
     from websockets.sync.client import connect
 
     address = f"{server.url.replace('http', 'ws')}socket"
-    with (
-        pytest.raises(InvalidStatus, match="403"),
-        connect(address, origin="https://evil.example"),
-    ):
+    with pytest.raises(InvalidStatus, match="403"), connect(address, origin="https://evil.example"):
         pass
     with connect(address, origin=server.url.rstrip("/")):
         pass
