@@ -31,7 +31,7 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.policy.evaluation import DRIFT_M, drive_worlds
-from nics_drl_bridge.policy.policies import POLICIES, open_policy, shipped_policies
+from nics_drl_bridge.policy.policies import POLICIES, open_policy
 from nics_drl_bridge.policy.stateful import Policy
 from nics_drl_bridge.policy.train import POLICY, TrainOrder, run
 from nics_drl_bridge.policy.training_settings import load_training
@@ -200,6 +200,8 @@ def opened(name: str, control: str | None) -> tuple[Policy, Navigation]:
 def drive_folds(settings: str, given: Mapping[int, Course], runs: int, control: str | None) -> Runs:
     """Learns `FOLDS` policies, each from the other worlds than those that it then drives in."""
     chosen, driven = load_training(settings), []
+    if BARN not in chosen.worlds:
+        raise ConfigError(f"{settings}: --five-fold replaces the world {BARN!r}, which it lacks.")
     numbers = list(given)
     for fold in range(FOLDS):
         held = {number: given[number] for number in numbers[fold::FOLDS]}
@@ -271,12 +273,9 @@ def main() -> None:
     parser.add_argument("--in", dest="place", choices=tuple(BARS), default=FAST)
     parser.add_argument("--policy", nargs="+", help="files or names; the shipped one, and planners")
     parser.add_argument(
-        "--five-fold",
-        metavar="SETTINGS",
-        nargs="?",
-        const=f"shipped_{ROBOT}",
+        "--five-fold", metavar="SETTINGS", nargs="?", const=f"shipped_{ROBOT}",
         help="learn from four fifths of the worlds, judge in the others",
-    )
+    )  # fmt: skip
     parser.add_argument("--runs", type=int, default=1, help="in each world")
     given = parser.parse_args()
     if given.control and given.place != FAST:
@@ -284,8 +283,7 @@ def main() -> None:
     found = courses(given.worlds)
     if given.place == MUJOCO:
         found = dict(list(found.items())[::EVERY])
-    own = [ROBOT] if ROBOT in shipped_policies() else []
-    policies = given.policy or [*own, *(name for name in POLICIES if name != "random")]
+    policies = given.policy or [ROBOT, *(name for name in POLICIES if name != "random")]
     figures = {}
     if given.five_fold:
         policies = [given.five_fold]

@@ -31,7 +31,7 @@ CONTROLS = {
     "standing": "a policy that stands still",
 }
 FLOORS = {
-    "circles": 0.97, "doorway": 0.97, "arena": 0.97,
+    "circles": 0.97, "doorway": 0.97, "arena": 0.97, "empty": 0.97,
     "clutter": 0.95, "corridor": 0.95, "crowd": 0.95, "room": 0.95,
 }  # fmt: skip
 """Least success in process, by world: what fails everywhere alike has not been transferred."""

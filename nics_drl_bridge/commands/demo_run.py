@@ -325,6 +325,7 @@ def _verdict(
         conclusion = conclusion._replace(advice=f"Next: {next_step}.")
     return verdict_blocks(
         tiles, conclusion,
+        f"nics watch {learned.policy} --model {plan.model} --world {plan.world}",
         f"nics evaluate {learned.policy} --model {plan.model} --world {plan.world}",
         "nics demo --recording DRIVE --robot ROBOT.yaml  # of your own robot",
     )  # fmt: skip

@@ -126,7 +126,7 @@ def _shadow(
         data = {
             "bag": str(bag), "policy": policy, "model": name, "goal": goal,
             "ahead_s": None if goal else ahead, "compared": len(made.time),
-            "skipped": dict(made.skipped), "commands": differences,
+            "skipped": dict(made.skipped), "resets": made.resets, "commands": differences,
         }  # fmt: skip
         write_text(place.with_suffix(".json"), json_of(data) + "\n")
         told.append(data)

@@ -278,7 +278,7 @@ def fit_facts(out: Path, robot: str, identified: "Identified") -> dict[str, Any]
 
 
 def drive(
-    out: Annotated[Path, Option(help="Folder of the model to write.")],
+    out: Annotated[Path | None, Option(help="The model's folder; the robot's name.")] = None,
     robot: RobotOption = DEFAULT_ROBOT,
     recording: Annotated[Path | None,
         Option(help="An .npz to keep the drive in, as one of a real robot.")] = None,
@@ -299,8 +299,8 @@ def drive(
         from nics_drl_bridge.recording.write import check_out, write_drive
         from nics_drl_bridge.robot.spec import load_robot
 
-        check_place(out)
         spec = load_robot(robot)
+        check_place(out := out or Path(spec.name))
         seen = lidar_of(spec, lidar)
         if recording is not None and recording.suffix != ".npz":
             raise ConfigError(f"--recording {recording}: must end in .npz.")

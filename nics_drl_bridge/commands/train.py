@@ -166,3 +166,5 @@ def _run(
         typer.echo(json_of({"out": str(folder), "seeds": list(map(_plain, results))}))
         return
     typer.echo(f"policy files, checkpoints and logs: {folder}; tensorboard --logdir {folder}")
+    policy, (world, *_) = folder / f"seed_{results[0].seed}" / "policy.onnx", results[0].summaries
+    typer.echo(f"see it drive: nics watch {policy} --world {world}")

@@ -23,7 +23,7 @@ class Belief(NamedTuple):
     mean: Array  # (3 + S,) x [m], y [m], heading [rad] in `map`, then the state of the RobotSpec
     covariance: Array
     outliers: tuple[int, ...]  # consecutive ones, by kind
-    anchor: Anchor | None  # None before the first odometry
+    anchor: Anchor | None  # None before the first odometry that was used
     lost: bool  # True if the robot may have moved unobserved since
     error: Array  # (3 + S, S) derivative to a constant error of the state's rates since before
 

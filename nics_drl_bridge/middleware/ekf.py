@@ -92,7 +92,8 @@ class Estimator:
         The robot may be anywhere within reach, unless odometry is `continuous`: then the next one's
         pose bridges the motion. The command (C,) is in effect.
         """
-        anchor = self._anchor or Anchor(0, STILL, STILL, self._filter.x, self._filter.P)
+        anchor = self._anchor or Anchor(self.time_ns, STILL, STILL, self._filter.x, self._filter.P)
+        seconds = max(seconds, (self.time_ns - anchor.time_ns) / NS_PER_S)  # after an outlier
         covariance = self.unseen.doubted(anchor.covariance, seconds)
         known = self._anchor is not None and continuous
         since = anchor._replace(time_ns=time_ns - round(seconds * NS_PER_S)) if known else None
@@ -199,7 +200,7 @@ class Estimator:
                 self._jump(*bridged)
                 self._foreseen = None
         verdict = self._correct(measurement, odom is not None and not lost)
-        if verdict.outcome is Acceptance.OUTLIER:
+        if verdict.outcome is Acceptance.OUTLIER and not (lost and odom is not None):
             return verdict  # the next odometry's way then leads past this one
         if odom is not None:
             self.anchor(np.array(odom), np.array(measurement.value))

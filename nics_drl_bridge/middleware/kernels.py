@@ -31,7 +31,7 @@ LEAST_VARIANCE = 1e-18  # Absolute lower bound on that variance
 
 
 class Anchor(NamedTuple):
-    """The newest odometry: time [ns], pose in `odom`, twist, mean and covariance after it.
+    """The newest odometry used: time [ns], pose in `odom`, twist, mean and covariance after it.
 
     What was measured since corrects them, too. `cross` (3 + S, 3) is the covariance of the present
     mean with that pose; None if the pose was set anew since.
@@ -298,8 +298,8 @@ def retrace(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Corrects by the way from the `Anchor` to odometry's pose and twist (3,), if that is likely.
 
-    If it is so by those twists alone, it replaces what was predicted. Returns mean and covariance;
-    `wheels` is `Wheels`.
+    One that is unlikely, but that of the twists at its ends, replaces what was predicted. Returns
+    mean and covariance; `wheels` is `Wheels`.
     """
     seconds, then, size = (now - anchor.time_ns) / NS_PER_S, anchor.mean, mean.shape[0]
     c, s = math.cos(anchor.odom[2]), math.sin(anchor.odom[2])
@@ -325,8 +325,9 @@ def retrace(  # type: ignore[no-untyped-def]
         less = (less + less.T) * 0.5
     else:
         arc = np.array([along + 0.5 * turned * aside, aside - 0.5 * turned * along, turned])
-        off, spread = arc - 0.5 * seconds * (twist + anchor.twist), wheels.walk * seconds + slack
-        spread[1, 1] += (0.25 * turned * along) ** 2  # of where on the way it turned
+        off = arc - 0.5 * seconds * (twist + anchor.twist)
+        spread = wheels.walk * seconds + 0.25 * slack
+        spread += np.diag((0.25 * turned * np.array([aside, along, 0.0])) ** 2)  # where it turned
         if seconds > SHORT_S or not off @ np.linalg.solve(spread, off) <= gate:
             return mean, covariance
         # The way is that of its twists: what was predicted is wrong.

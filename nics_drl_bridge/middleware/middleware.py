@@ -114,7 +114,7 @@ class Middleware:
         belief = self.estimator.belief
         mean, spread = belief.mean.copy(), parted(belief.covariance)
         mean[:3], spread[:3, :3] = pose, covariance
-        anchor = belief.anchor and belief.anchor._replace(mean=mean, covariance=spread)
+        anchor = belief.anchor and belief.anchor._replace(mean=mean, covariance=spread, cross=None)
         self.estimator.belief = belief._replace(mean=mean, covariance=spread, anchor=anchor)
         self._timeline.reset()
 

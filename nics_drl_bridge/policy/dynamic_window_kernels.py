@@ -7,14 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.policy.local_map_kernels import (
-    ARRIVED_M,
-    astray,
-    look,
-    room_at,
-    touching,
-    way_at,
-)
+from nics_drl_bridge.policy import local_map_kernels as kernels
 
 Array = NDArray[np.float64]
 
@@ -41,7 +34,7 @@ class TwistWeights(NamedTuple):
 def choose_all(out, scans, goals, twists, candidates, ahead, weights, sense):  # type: ignore[no-untyped-def]
     """Writes for N robots the index of the candidate that `choose` returns into out (N,)."""
     for n in range(out.shape[0]):
-        around = look(scans[n], goals[n], *sense)
+        around = kernels.look(scans[n], goals[n], *sense)
         out[n] = choose(around, twists[n], candidates, ahead, weights)
 
 
@@ -65,23 +58,23 @@ def cost_of(around, aimed, ahead, weights):  # type: ignore[no-untyped-def]
     """Cost of holding a twist (3,), which is inadmissible if it hits before it can be stopped."""
     period, steps, keep = ahead.period, ahead.steps, around.clearance
     x, y, heading, c, s = 0.0, 0.0, 0.0, 1.0, 0.0
-    least, near, free = way_at(x, y, around), math.inf, steps
-    limit = touching(around)
+    least, near, free = kernels.way_at(x, y, around), math.inf, steps
+    limit = kernels.touching(around)
     for step in range(steps):
         middle = heading + 0.5 * aimed[2] * period
         x += (aimed[0] * math.cos(middle) - aimed[1] * math.sin(middle)) * period
         y += (aimed[0] * math.sin(middle) + aimed[1] * math.cos(middle)) * period
         heading += aimed[2] * period
         c, s = math.cos(heading), math.sin(heading)
-        room = room_at(x, y, c, s, around)
+        room = kernels.room_at(x, y, c, s, around)
         if room < limit:
             free = step
             break
         near = min(near, room - keep.margin)
-        least = min(least, way_at(x, y, around))
-        if math.hypot(around.goal[0] - x, around.goal[1] - y) < ARRIVED_M:
+        least = min(least, kernels.way_at(x, y, around))
+        if math.hypot(around.goal[0] - x, around.goal[1] - y) < kernels.ARRIVED_M:
             break
-    turn = astray(x, y, c, s, way_at(x, y, around), around)
+    turn = kernels.astray(x, y, c, s, kernels.way_at(x, y, around), around)
     cost = weights.gap * least + weights.aim * turn * min(least, 1.0)
     cost += weights.clearance * (1.0 - min(max(near, 0.0), keep.soft) / keep.soft)
     cost += weights.time * (1.0 - free / steps)

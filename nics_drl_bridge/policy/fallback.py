@@ -46,9 +46,9 @@ class Fallback:
         action[risky] = self._planner.act(observation[risky])
         return action
 
-    def reset(self) -> None:
-        """Begins an episode of the policy."""
-        begin(self._policy)
+    def reset(self, *worlds: Any) -> None:
+        """Begins an episode of the policy; see `Stateful.reset`."""
+        begin(self._policy, *worlds)
 
     def resume(self, time_s: float) -> str:
         """See `stateful.resume`."""

@@ -6,14 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env.navigation import Navigation
-from nics_drl_bridge.policy.local_map_kernels import (
-    COARSE,
-    Clearance,
-    FootprintDiscs,
-    LocalMap,
-    MapScratch,
-    ScanRays,
-)
+from nics_drl_bridge.policy import local_map_kernels as kernels
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Array = NDArray[np.float64]
@@ -22,18 +15,18 @@ FINE_M, DEEP_M, BORDER_M = 0.02, 0.03, 0.08
 """Lattice of the discs, depth from which they cover all, and space of points on the border."""
 
 
-def rays_of(task: Navigation) -> ScanRays:
+def rays_of(task: Navigation) -> kernels.ScanRays:
     """The rays of a task's scan parts."""
     sight = task.sight
     directions = np.stack([np.cos(sight.angles), np.sin(sight.angles)], axis=-1)
-    return ScanRays(directions, sight.origin, float(sight.range_max))
+    return kernels.ScanRays(directions, sight.origin, float(sight.range_max))
 
 
-def outline_of(robot: RobotSpec) -> FootprintDiscs:
+def outline_of(robot: RobotSpec) -> kernels.FootprintDiscs:
     """The footprint of a robot as discs: some that fill it, and points along its border."""
     if robot.footprint is None:
         radius = robot.footprint_radius
-        return FootprintDiscs(np.zeros((0, 3)), np.zeros(2), radius, radius)
+        return kernels.FootprintDiscs(np.zeros((0, 3)), np.zeros(2), radius, radius)
     corners = np.array(robot.footprint)
     low, high = corners.min(axis=0), corners.max(axis=0)
     axes = (np.arange(a + FINE_M / 2, b, FINE_M) for a, b in zip(low, high, strict=True))
@@ -52,7 +45,7 @@ def outline_of(robot: RobotSpec) -> FootprintDiscs:
         chosen += [np.array([*(corner + side * k / count), 0.0]) for k in range(count)]
     reach = np.linalg.norm(lattice[:, None] - corners, axis=-1).max(axis=1)
     middle = int(reach.argmin())
-    return FootprintDiscs(
+    return kernels.FootprintDiscs(
         np.array(chosen), lattice[middle], float(depth.max()), float(reach[middle])
     )
 
@@ -72,11 +65,13 @@ def depths(points: Array, corners: Array) -> Array:
 
 
 def scratch_of(
-    parts: int, outline: FootprintDiscs, clearance: Clearance, half: float
-) -> MapScratch:
+    parts: int, outline: kernels.FootprintDiscs, clearance: kernels.Clearance, half: float
+) -> kernels.MapScratch:
     """Memory for maps of scans of P parts that reach `half` [m] to each side, `MOST_M` at most."""
-    coarse = 2 * math.ceil(min(half, MOST_M) / (COARSE * CELL_M))
-    distances = np.zeros((COARSE * coarse, COARSE * coarse), np.float32)
+    coarse = 2 * math.ceil(min(half, MOST_M) / (kernels.COARSE * CELL_M))
+    distances = np.zeros((kernels.COARSE * coarse, kernels.COARSE * coarse), np.float32)
     ways, prices = np.zeros((2, coarse, coarse), np.float32)
     reach = outline.outer + clearance.margin + clearance.soft + CELL_M
-    return MapScratch(np.zeros((parts, 2)), LocalMap(distances, ways, CELL_M, reach), prices)
+    return kernels.MapScratch(
+        np.zeros((parts, 2)), kernels.LocalMap(distances, ways, CELL_M, reach), prices
+    )

@@ -59,11 +59,11 @@ class Stateful:
         return action
 
 
-def begin(policy: Any) -> None:
-    """Tells a policy, or whose method `act` this is, that episodes begin; few need to know."""
+def begin(policy: Any, *worlds: Any) -> None:
+    """Tells a policy, or whose method `act` this is, that episodes begin; see `Stateful.reset`."""
     reset = getattr(getattr(policy, "__self__", policy), "reset", None)
     if reset is not None:
-        reset()
+        reset(*worlds)
 
 
 def resume(policy: Policy, time_s: float) -> str:

@@ -350,6 +350,18 @@ def test_a_twist_that_is_no_twist_of_the_robot_takes_no_way_with_it():
     assert np.abs(estimator.at(2 * PERIOD)[0]).max() < 0.01
 
 
+def test_an_outlier_after_a_silence_is_where_the_next_way_begins():
+    """A way from before the silence, which nothing bridged, must not come back."""
+    estimator = Estimator(builtin_model("differential"))
+    estimator.anchor(np.array([3.0, 2.0, 1.0]))
+    late = 11 * SECOND
+    stepped(estimator, late, [0.0, 0.5, 0.0], [500.0, 0.0, 0.0])
+    assert estimator.belief.outliers[Kind.TWIST] == 1
+    before = estimator.at(late)[0]
+    stepped(estimator, late + PERIOD, np.zeros(3), [500.0, 0.0, 0.0])
+    assert estimator.at(late + PERIOD)[0] == pytest.approx(before, abs=0.05)
+
+
 @pytest.mark.parametrize("response", [0.8, 1.2])
 def test_a_car_that_obeys_later_than_its_model_is_where_odometry_is(response):
     """At a reversal the model is far off, and steering can't be told from a twist near zero."""

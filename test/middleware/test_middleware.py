@@ -14,6 +14,18 @@ from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.middleware.middleware import Middleware, TopicCache, rehearse
 
 
+def test_a_pose_that_is_set_stays_when_the_next_odometry_comes():
+    middleware = Middleware(builtin_model("differential"))
+    middleware.reset(0, np.zeros(3), 0.3)
+    for step in range(2):
+        middleware.odometry(step * PERIOD, 0, np.zeros(3), np.zeros(3))
+    there = np.array([2.0, 1.0, 0.5])
+    middleware.place(there, 1e-6 * np.eye(3))
+    middleware.odometry(2 * PERIOD, 0, [0.0, 0.0, 0.02], np.zeros(3))
+    assert middleware.view(2 * PERIOD).pose == pytest.approx(there, abs=5e-3)
+    assert np.diag(middleware.estimator.covariance)[:3].max() < 1e-3
+
+
 def test_before_any_datum_the_view_says_that_nothing_is_known(middleware):
     view = middleware.view(SECOND)
     assert view.pose == pytest.approx([1.0, 2.0, 0.5])

@@ -182,6 +182,7 @@ def test_a_state_goes_on_while_the_planner_acts_and_begins_anew_with_the_episode
         policy.act(seen)
     assert policy.acted == 2
     begin(policy.act)
+    policy.reset(np.array([True]))
     policy.act(far)
     assert resume(policy, 10.0) == ""
     assert "longer than the 0.5 s" in resume(policy, 11.0)

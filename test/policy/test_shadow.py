@@ -189,5 +189,6 @@ def test_the_command_writes_a_table_a_picture_and_json(recorded, tmp_path):
     assert done.returncode == 0, done.stderr
     assert f"compared at {count} times" in done.stdout
     told = json.loads((tmp_path / "out" / "shadow_dynamic_window.json").read_text(encoding="utf-8"))
+    assert told["resets"] == 0
     assert told["commands"]["speed_command"]["greatest"] < 1e-4
     assert (tmp_path / "out" / "shadow_dynamic_window.png").read_bytes().startswith(b"\x89PNG")

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.polynomial import polynomial
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import Array
@@ -22,7 +23,7 @@ ROTOR = 0.25  # inertia of a geared motor, relative to its share of the robot's
 # its convex contacts lift what slides so far that wheels hop off the floor.
 SKIDDING = 0.01
 STEERING_STIFFNESS = 1.0  # torque of a steering servo per error [N m/rad]
-STEEPEST = 0.6  # steering angle up to which a tie rod leads the wheels as it should [rad]
+MISFIT = 0.01  # greatest error of the angle to which a tie rod leads a wheel [rad]
 STEERING_TORQUE = 1.0  # torque limit of a steering servo [N m], that of a small hobby servo
 THICKNESS = 0.25  # radius of a roller at its middle, relative to the radius of the wheel
 ROLLER_MASS = 0.005
@@ -136,7 +137,9 @@ def build_machine(spec: RobotSpec, physics: Physics | None = None) -> Machine:
         raise ConfigError(f"robot {spec.name!r}: {fault}; correct `state:`.")
     try:
         step = max(c.max - c.min for c in spec.command if not c.turns)
-        return _BUILDERS[kind](spec.parameters, step, physics or Physics())
+        steepest = max((max(-v.min, v.max) for v in spec.state if v.unit == "rad"), default=0.0)
+        given = {**spec.parameters, "steepest": steepest}, step, physics or Physics()
+        return _BUILDERS[kind](*given)
     except KeyError as error:
         reason = f"the {kind} machine needs the parameter {error}; add it under `parameters:`."
         raise ConfigError(f"robot {spec.name!r}: {reason}") from None
@@ -155,7 +158,8 @@ def _ackermann(p: Parameters, step: float, physics: Physics) -> Machine:
     wheels = _car_wheels(wheelbase, track, radius, p["steering_lag"], physics, rotor)
     robot = _chassis(physics.mass, centre, size) + wheels
     half_ratio = 0.5 * track / wheelbase
-    xml = _document("ackermann", physics, radius, robot, _car_actuators(engine, half_ratio))
+    actuators = _car_actuators(engine) + _tie_rod(half_ratio, p["steepest"])
+    xml = _document("ackermann", physics, radius, robot, actuators)
 
     def controls(state: Array) -> Array:
         speed, steering = state
@@ -192,16 +196,19 @@ def _car_wheels(
     return parts
 
 
-def _tie_rod(half_ratio: float) -> str:
+def _tie_rod(half_ratio: float, steepest: float) -> str:
     # Servos that are not joined pass through angles at which the wheels scrub.
-    middle = np.tan(np.linspace(-STEEPEST, STEEPEST, 101))
-    left, right = (np.arctan(middle / (1.0 + side * half_ratio * middle)) for side in (-1.0, 1.0))
-    row = " ".join(f"{each:.8g}" for each in np.polynomial.polynomial.polyfit(left, right, 4))
+    middle = np.tan(np.linspace(-steepest, steepest, 101))
+    left, right = (np.arctan2(middle, 1.0 + side * half_ratio * middle) for side in (-1.0, 1.0))
+    row = polynomial.polyfit(left, right, [1, 2, 3, 4])
+    if np.abs(polynomial.polyval(left, row) - right).max() > MISFIT:
+        return ""
+    given = " ".join(f"{each:.8g}" for each in row)
     return f"""
-  <equality><joint joint1="steer_right" joint2="steer_left" polycoef="{row}"/></equality>"""
+  <equality><joint joint1="steer_right" joint2="steer_left" polycoef="{given}"/></equality>"""
 
 
-def _car_actuators(engine: str, half_ratio: float) -> str:
+def _car_actuators(engine: str) -> str:
     servos = "".join(
         f"""
     <position joint="steer_{side}" kp="{STEERING_STIFFNESS}"
@@ -214,7 +221,7 @@ def _car_actuators(engine: str, half_ratio: float) -> str:
     </fixed>
   </tendon>
   <actuator>{engine}{servos}
-  </actuator>{_tie_rod(half_ratio)}"""
+  </actuator>"""
 
 
 def _differential(p: Parameters, step: float, physics: Physics) -> Machine:
