@@ -284,7 +284,8 @@ test-release: setup ## wheel and source archive, installed into an environment o
 
 # To its end whatever one of them says; each is told with machine, commit and load.
 benchmark: setup ## run every benchmark, write benchmarks/results.json: make benchmark [BENCHMARKS="parity files"] [QUICK=1] [OUT=file]
-	@cd benchmarks && ../$(BIN)/python -m measuring.run_all \
+	@if [ -e $(MESSAGES)/setup.bash ]; then source $(MESSAGES)/setup.bash; fi; \
+		cd benchmarks && ../$(BIN)/python -m measuring.run_all \
 		$(if $(BENCHMARKS),--only $(BENCHMARKS)) $(if $(QUICK),--quick) $(if $(OUT),--out "$(abspath $(OUT))")
 
 tables: setup ## make the tables of README and docs from benchmarks/results.json

@@ -162,10 +162,8 @@ def missed_of(result: dict[str, Any]) -> list[str]:
     return [*missed, *result.get("failed", [])]
 
 
-NOT_BUILT = (
-    "simulation_interfaces is not installed: run `make test-messages`, and source "
-    ".venv-messages/setup.bash"
-)
+NOT_BUILT = "simulation_interfaces: run `make test-messages`, then source .venv-messages/setup.bash"
+SIMULATION = ("sim_features", "sim_conformance_failed", "client_overhead")
 PARTS = ("simulation_interfaces", "leapp", "nav2")
 
 
@@ -176,7 +174,7 @@ def measure(given: Any) -> dict[str, Any]:
         folder = Path(name)
         built = importlib.util.find_spec("simulation_interfaces") is not None
         if "simulation_interfaces" in given.parts and not built:
-            result["failed"] = [NOT_BUILT]
+            result |= dict.fromkeys(SIMULATION, np.nan) | {"failed": [NOT_BUILT]}
         elif "simulation_interfaces" in given.parts:
             result |= conformance(domain_id, folder, given.control)
             result |= overhead(domain_id, folder, given.control, given.chunks, given.size)

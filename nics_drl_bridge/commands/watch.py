@@ -74,13 +74,13 @@ def _episodes(
     from nics_drl_bridge.watch.episode import EpisodeSource
 
     under = Conditions(given["lidar"], given["randomisation"], given["gate"], kind=given["task"])
-    contracts = driving.contracts_of([policy])
-    own = [driving.robot_of(*each) for each in contracts.items()]  # a baseline has none
+    own = [driving.robot_of(*each) for each in driving.contracts_of([policy]).items()]
     model = open_model(name or (own or [DEFAULT_ROBOT])[0], under.lidar)
 
     def make(policy: str, world: Any) -> Any:
         options = {"estimator": True, "randomisation": under.ranges}
-        return driving.env_of(policy, model, world, "sim", under, **options)
+        within = driving.limited(under, driving.contracts_of([policy]), model, world, typer.echo)
+        return driving.env_of(policy, model, world, "sim", within, **options)
 
     return EpisodeSource(make, policy, [load_worlds(each) for each in worlds], seed)
 

@@ -114,3 +114,17 @@ def test_a_control_that_would_drive_all_the_same_is_refused():
     )  # fmt: skip
     assert done.returncode == 2
     assert "stands in the fast simulator alone; leave out --in" in done.stderr
+
+
+def test_each_bar_can_be_missed_in_each_place(barn):
+    good, bad = {"success": 0.97, "collision": 0.01, "score": 0.46}, (0.94, 0.03, 0.39)
+    for place, bars in barn.BARS.items():
+        assert barn.missed(place, good, "jackal") == []
+        for name, value in zip(good, bad, strict=True):
+            said = barn.missed(place, good | {name: value}, "jackal")
+            assert bool(said) == (name in bars)
+
+
+def test_settings_whose_worlds_no_fold_could_leave_out_are_refused(barn):
+    with pytest.raises(ConfigError, match="replaces the world 'barn'"):
+        barn.drive_folds("navigation_differential", {}, 1, None)

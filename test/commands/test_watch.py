@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import threading
 from contextlib import closing
+from types import SimpleNamespace
 
 import pytest
 import typer
@@ -9,6 +10,7 @@ from browser import until
 from command_line import nics
 from watch.rig import Client, source
 
+from nics_drl_bridge.commands import episodes as driving
 from nics_drl_bridge.commands import watch as module
 
 
@@ -42,6 +44,20 @@ def test_a_page_without_its_library_is_refused_before_a_robot_is_opened(monkeypa
     with pytest.raises(typer.Exit):
         module.watch("straight")
     assert "pip install 'nics_drl_bridge[view]'" in capsys.readouterr().err
+
+
+def test_an_episode_has_the_time_that_its_policy_was_learnt_with(monkeypatch):
+    learnt = SimpleNamespace(
+        provenance={}, robot=SimpleNamespace(name="differential"), max_episode_steps=777
+    )
+    driven, env_of = [], driving.env_of
+    monkeypatch.setattr(driving, "contracts_of", lambda policies: dict.fromkeys(policies, learnt))
+    monkeypatch.setattr(
+        driving, "env_of", lambda *given, **more: driven.append(given[4]) or env_of(*given, **more)
+    )
+    under = dict.fromkeys(("lidar", "randomisation", "gate", "task"))
+    with closing(module._episodes("straight", None, ["circles"], 0, under)):
+        assert [each.steps for each in driven] == [777]
 
 
 def test_a_training_of_other_processes_can_not_be_watched(tmp_path):

@@ -14,8 +14,9 @@ from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.generator import builtin_model, open_model
 from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.policy import policies
 from nics_drl_bridge.policy.evaluation import drive_all, drive_worlds, successes
 from nics_drl_bridge.policy.policies import POLICIES, DynamicWindow, RandomActions, make_policy
 from nics_drl_bridge.policy.stateful import Stateful, begin, resume
@@ -218,3 +219,15 @@ def test_after_a_gap_a_state_begins_anew_and_one_sentence_says_so():
     assert told[3].startswith("nothing was observed for 0.6 s, longer than the 0.5 s")
     policy.reset()
     assert resume(policy, 99.0) == ""  # an episode begins, so there was no gap
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ackermann", "differential", "jackal", "mecanum"])
+def test_a_shipped_policy_drives_where_it_was_learnt_to(name):
+    """As one who installs the package calls it, with its robot's own lidar or a real one."""
+    model = open_model(name, None if load_robot(name).lidar else "rplidar_a2")
+    policy, task = policies.open_policy(name, model)
+    env = BridgeVectorEnv(50, model, "circles", task, max_episode_steps=300)
+    found = drive_worlds(env, policy.act, range(50))
+    assert found.success.mean() >= 0.9
+    assert found.collision.mean() <= 0.04
