@@ -38,7 +38,7 @@ HOUR = 3600.0
 RUNS: dict[str, Run] = {
     "barn": row("barn", "", "--policy straight", HOUR),
     "barn_five_fold": row("barn", "--five-fold", "--policy straight", 3 * HOUR),
-    "barn_mujoco": row("barn", "--in mujoco_dds", "--policy straight", HOUR),
+    "barn_mujoco": row("barn", "--in mujoco_dds --policy jackal", "--policy straight", HOUR),
     "baselines": row("baselines", "--episodes 200", "--episodes 20"),
     "env_scaling": row("env_scaling", "", "--ends-only --repeats 5"),
     "env_throughput": row("env_throughput", "", "--worlds 256 --repeats 2"),
