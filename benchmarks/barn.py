@@ -31,6 +31,7 @@ from nics_drl_bridge.env.teaching import Teaching
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.generator import open_model
+from nics_drl_bridge.lidar.shapes import Circle
 from nics_drl_bridge.policy.evaluation import DRIFT_M, drive_worlds
 from nics_drl_bridge.policy.policies import POLICIES, open_policy
 from nics_drl_bridge.policy.stateful import Policy
@@ -77,6 +78,7 @@ class Runs:
 
     numbers: NDArray[np.int64]
     success: NDArray[np.bool_]
+    believed: NDArray[np.bool_]
     collision: NDArray[np.bool_]
     time_s: Array
     score: Array
@@ -87,6 +89,7 @@ class Runs:
         time = self.time_s[rows][success]
         return {
             "success": float(success.mean()),
+            "believed": float(self.believed[rows].mean()),
             "collision": float(collision.mean()),
             "time_out": float((~success & ~collision).mean()),
             "time_s": float(time.mean()) if len(time) else None,
@@ -137,8 +140,11 @@ def read_cylinders(folder: Path) -> dict[int, Array]:
     found = read_csv(folder / "cylinders.csv")
     for file in folder.glob("*.world"):
         number = int("".join(filter(str.isdigit, file.stem)) or -1)
-        poses = [pose[:2] for group in read_sdf(file, HEIGHT).obstacles for pose in group.at]
-        found[number] = np.array(poses)
+        groups = read_sdf(file, HEIGHT).obstacles
+        if any(shape != Circle(radius=barn.RADIUS) for group in groups for shape in group.shapes):
+            wanted = f"cylinders with a radius of {barn.RADIUS:g} m, as the challenge has them"
+            raise ConfigError(f"{file}: holds something else than {wanted}; leave it out.")
+        found[number] = np.array([pose[:2] for group in groups for pose in group.at])
     if not found:
         raise ConfigError(f"{folder}: holds neither cylinders.csv nor world files; name another.")
     return dict(sorted(found.items()))
@@ -167,15 +173,16 @@ def seeds_of(world: AnyWorld, runs: int) -> NDArray[np.int64]:
 
 
 def judged(
-    given: Mapping[int, Course], runs: int, success: Sequence[bool], collision: Sequence[bool],
-    time_s: Sequence[float],
-) -> Runs:  # fmt: skip
-    """Scores the runs in each of the courses, one course after another."""
+    given: Mapping[int, Course], runs: int, flags: Sequence[Sequence[bool]], time_s: Sequence[float]
+) -> Runs:
+    """Scores the runs in each of the courses, one course after another.
+
+    Flags are those of `Runs`: success, what the robot believed, and collision.
+    """
     numbers = np.repeat(list(given), runs)
     best = np.repeat([course.best_s for course in given.values()], runs)
-    score = np.asarray(success) * best / np.clip(time_s, 2.0 * best, 8.0 * best)
-    flags = np.asarray(success, np.bool_), np.asarray(collision, np.bool_)
-    return Runs(numbers, *flags, np.asarray(time_s, np.float64), score)
+    score = np.asarray(flags[0]) * best / np.clip(time_s, 2.0 * best, 8.0 * best)
+    return Runs(numbers, *np.asarray(flags, np.bool_), np.asarray(time_s, np.float64), score)
 
 
 def drive_fast(name: str, given: Mapping[int, Course], runs: int, control: str | None) -> Runs:
@@ -188,7 +195,8 @@ def drive_fast(name: str, given: Mapping[int, Course], runs: int, control: str |
     env = BridgeVectorEnv(len(seeds), model, world, task, max_episode_steps=steps)
     env.teach(Teaching(contact=0.0))  # which ends an episode at a true contact
     out = drive_worlds(env, policy.act, seeds.tolist())
-    return judged(given, runs, out.success, out.collision, out.steps * model.control_period)
+    flags = out.success, out.believed, out.collision
+    return judged(given, runs, flags, out.steps * model.control_period)
 
 
 def opened(name: str, control: str | None) -> tuple[Policy, Navigation]:
@@ -246,10 +254,10 @@ def drive_mujoco(name: str, given: Mapping[int, Course]) -> Runs:
         conditions = Conditions(steps=round(TIME_OUT_S / model.control_period), task=OPTIONS)
         told = Path(folder), lambda _: None
         episodes = drive_in(MUJOCO, name, ROBOT, worlds, seeds, *told, conditions=conditions)
-    success = [one.result == "success" for one in episodes]
-    collision = [one.result == "collision" for one in episodes]
-    steps = [one.steps for one in episodes]
-    return judged(given, 1, success, collision, [model.control_period * n for n in steps])
+    results = np.array([one.result for one in episodes])
+    believed = [one.believed_success for one in episodes]
+    flags = results == "success", believed, results == "collision"
+    return judged(given, 1, flags, [model.control_period * one.steps for one in episodes])
 
 
 def missed(place: str, figures: Mapping[str, Any], policy: str) -> list[str]:
@@ -264,7 +272,7 @@ def missed(place: str, figures: Mapping[str, Any], policy: str) -> list[str]:
 
 def table_of(figures: Mapping[str, Mapping[str, Any]]) -> str:
     """A line for each policy."""
-    names = ("success", "collision", "time_out", "time_s", "score")
+    names = ("success", "believed", "collision", "time_out", "time_s", "score")
     text = f"{'':<24}" + "".join(f"{name:>11}" for name in names) + "\n"
     for policy, told in figures.items():
         values = (told[name] for name in names)

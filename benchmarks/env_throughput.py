@@ -13,6 +13,7 @@ writing as many bytes as the observations have, and to a step of Gymnasium's Car
 
 With another `--lidar`, as `hokuyo_ust_10lx`, or more `--obstacles`, in a field as crowded, only our
 envs are timed, beside the usual one: `share_of_usual` is what is left of its steps per second.
+`times_as_long_as_clean` compares a lidar with its copy that has neither noise nor other faults.
 """
 
 from __future__ import annotations
@@ -25,18 +26,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from measuring.peers import (
-    CIRCLES,
-    MODEL,
-    PEERS,
-    WORLD,
-    Measured,
-    block_of,
-    measure,
-    missed_by,
-    missed_by_robots,
-    scenes,
-)
+from measuring import peers
 from measuring.verdict import answer, parser_of
 from numpy.typing import NDArray
 
@@ -44,6 +34,7 @@ from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.bake import bake
+from nics_drl_bridge.lidar.faults import LidarFaults
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.sim.world import World
 
@@ -61,6 +52,7 @@ SINGLE_BAR, ESTIMATOR_BAR = 0.04, 0.007
 """Of the rate of CartPole, a single env that calculates next to nothing."""
 SHARES_OF_USUAL = {"lidar": 0.75, "obstacles": 0.65}
 """Of the env steps per second of the usual env, on one thread, at least."""
+CLEAN_BAR = 1.3
 SCENES = 50
 """That the peers go through, one for each episode."""
 ACTIONS, CHUNK, SINGLE_CHUNK, WRITES = 64, 50, 500, 50
@@ -71,31 +63,34 @@ class Case:
     """What is timed; the usual one by default."""
 
     lidar: str | None = None  # name or file
-    obstacles: int = CIRCLES
+    obstacles: int = peers.CIRCLES
     control: str | None = None
+    clean: bool = False  # without the faults of the lidar
 
     @property
     def is_usual(self) -> bool:
         """True if peers do the same."""
-        return self.lidar is None and self.obstacles == CIRCLES
+        return self.lidar is None and self.obstacles == peers.CIRCLES
 
     @property
     def model(self) -> SimulatorModel:
         """The robot, whose lidar may be next to blind."""
-        lidar = MODEL.lidar if self.lidar is None else load_lidar(self.lidar)
+        lidar = peers.MODEL.lidar if self.lidar is None else load_lidar(self.lidar)
         if self.control == "blind":
             lidar = lidar.model_copy(update={"beams": FEW_BEAMS})
-        if lidar == MODEL.lidar:
-            return MODEL
-        return replace(MODEL, lidar=lidar, table=bake(lidar, MODEL.table.shapes))
+        if self.clean:
+            lidar = lidar.model_copy(update={"noise_std": 0.0, "faults": LidarFaults()})
+        if lidar == peers.MODEL.lidar:
+            return peers.MODEL
+        return replace(peers.MODEL, lidar=lidar, table=bake(lidar, peers.MODEL.table.shapes))
 
     @property
     def world(self) -> World:
         """The field, as much larger as there are more obstacles."""
-        side = WORLD.size[0] * (self.obstacles / CIRCLES) ** 0.5 if WORLD.size else 0.0
-        (group,) = WORLD.obstacles
+        side = (peers.WORLD.size or (0.0,))[0] * (self.obstacles / peers.CIRCLES) ** 0.5
+        (group,) = peers.WORLD.obstacles
         more = group.model_copy(update={"count": self.obstacles})
-        return WORLD.model_copy(update={"size": (side, side), "obstacles": (more,)})
+        return peers.WORLD.model_copy(update={"size": (side, side), "obstacles": (more,)})
 
 
 USUAL = Case()
@@ -105,7 +100,7 @@ def actions_for(space: gymnasium.Space[Any], control: str | None) -> NDArray[np.
     """(ACTIONS, ...) random actions, or those of no motion."""
     size = (ACTIONS, *(space.shape or ()))
     if control == "standing":
-        low, high = MODEL.robot.command_low, MODEL.robot.command_high
+        low, high = peers.MODEL.robot.command_low, peers.MODEL.robot.command_high
         return np.broadcast_to(-(low + high) / (high - low), size).astype(np.float32)
     return np.random.default_rng(0).uniform(-1.0, 1.0, size).astype(np.float32)
 
@@ -221,8 +216,8 @@ def memory_per_env(worlds: int, case: Case) -> float:
 
 
 def run(
-    worlds: int, threads: int, repeats: int, peers: tuple[str, ...], case: Case
-) -> tuple[dict[str, Any], Measured]:
+    worlds: int, threads: int, repeats: int, rivals: tuple[str, ...], case: Case
+) -> tuple[dict[str, Any], peers.Measured]:
     """All figures; `None` for a peer that can't be installed or was not asked for."""
     register_envs()
     ours: dict[str, Worlds | Alone] = {
@@ -233,19 +228,20 @@ def run(
     }
     if not case.is_usual:
         ours["usual"] = Worlds(worlds, 1, USUAL)
+        ours["clean"] = Worlds(worlds, 1, replace(case, clean=True, control=None))
     yardsticks = {
         "write": write_chunk(worlds, case.model.lidar.beams),
         "cartpole": cartpole_chunk(),
     }
     calls: dict[str, Callable[[], object]] = {name: one.chunk for name, one in ours.items()}
-    found = measure({**calls, **yardsticks}, peers, scenes(SCENES), repeats)
+    found = peers.measure({**calls, **yardsticks}, rivals, peers.scenes(SCENES), repeats)
     rate = {name: one.steps / found.seconds[name] for name, one in ours.items()}
     rate["all"] = ours["all"].steps / found.wall["all"]
     write = WRITES * worlds / found.seconds["write"]
     cartpole = SINGLE_CHUNK / found.seconds["cartpole"]
     whole = {name: 1.0 / one["period_with_ten_scans_s"] for name, one in found.peers.items()}
     equal = {name: 1.0 / one["period_with_one_scan_s"] for name, one in found.peers.items()}
-    nobody = dict.fromkeys(PEERS)
+    nobody = dict.fromkeys(peers.PEERS)
     result: dict[str, Any] = {
         "times_as_fast_at_equal_work": {name: rate["one"] / one for name, one in equal.items()},
         "times_as_fast_with_ten_scans": {name: rate["one"] / one for name, one in whole.items()},
@@ -256,7 +252,7 @@ def run(
         "single_env_with_estimator_steps_per_s": rate["estimator"],
         "peers_with_one_scan": {**nobody, **equal},
         "peers": {**nobody, **whole},
-        **block_of(found),
+        **peers.block_of(found),
         "share_of_write_limit": rate["one"] / write,
         "share_of_cartpole": rate["plain"] / cartpole,
         "share_of_cartpole_with_estimator": rate["estimator"] / cartpole,
@@ -267,10 +263,11 @@ def run(
     }
     if not case.is_usual:
         result["share_of_usual"] = rate["one"] / rate["usual"]
+        result["times_as_long_as_clean"] = rate["clean"] / rate["one"]
     return result, found
 
 
-def judge(result: dict[str, Any], found: Measured, case: Case = USUAL) -> list[str]:
+def judge(result: dict[str, Any], found: peers.Measured, case: Case = USUAL) -> list[str]:
     """The bars that were missed."""
     bars = [
         ("share_of_write_limit", WRITE_BAR),
@@ -282,15 +279,17 @@ def judge(result: dict[str, Any], found: Measured, case: Case = USUAL) -> list[s
                  if getattr(case, name) != getattr(USUAL, name)]  # fmt: skip
         bars = [("share_of_usual", float(np.prod(least)))]
     missed = [f"{key}: {result[key]:.4f}, bar {bar}" for key, bar in bars if not result[key] >= bar]
+    if not result.get(key := "times_as_long_as_clean", 1.0) <= CLEAN_BAR:
+        missed.append(f"{key}: {result[key]:.3f}, bar {CLEAN_BAR}")
     for name, ratio in result["times_as_fast_at_equal_work"].items():
         if not ratio >= EQUAL_WORK_BARS[name]:
             missed.append(
                 f"times_as_fast_at_equal_work: {ratio:.0f} times {name}, "
                 f"bar {EQUAL_WORK_BARS[name]:.0f}"
             )
-    missed += missed_by(found)
+    missed += peers.missed_by(found)
     for name, drove in result["drove"].items():
-        missed += missed_by_robots(f"our env {name!r}", drove)
+        missed += peers.missed_by_robots(f"our env {name!r}", drove)
     return missed
 
 
@@ -318,6 +317,8 @@ def table_of(result: dict[str, Any]) -> str:
         text += f"{name}: {reason}\n"
     if "share_of_usual" in result:
         text += row.format("share of the usual env's rate", f"{result['share_of_usual']:.3g}")
+        clean = result["times_as_long_as_clean"]
+        text += row.format("times as long as without the lidar's faults", f"{clean:.3g}")
     return text + f"memory: {result['memory_bytes_per_env'] / 1e3:.1f} kB per world\n"
 
 
@@ -328,12 +329,12 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--repeats", type=int, default=10, help="timed chunks of steps")
     parser.add_argument("--lidar", help="name or file of another lidar; without peers")
-    parser.add_argument("--obstacles", type=int, default=CIRCLES, help="more; without peers")
+    parser.add_argument("--obstacles", type=int, default=peers.CIRCLES, help="more; without peers")
     parser.add_argument("--without-peers", action="store_true", help="install nothing")
     given = parser.parse_args()
     case = Case(given.lidar, given.obstacles, given.control)
-    peers = () if given.without_peers or not case.is_usual else tuple(PEERS)
-    result, found = run(given.worlds, given.threads, given.repeats, peers, case)
+    rivals = () if given.without_peers or not case.is_usual else tuple(peers.PEERS)
+    result, found = run(given.worlds, given.threads, given.repeats, rivals, case)
     answer(result, judge(result, found, case), table_of(result), given.json)
 
 

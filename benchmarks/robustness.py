@@ -150,8 +150,8 @@ def real_model(robot: str) -> SimulatorModel:
     return replace(model, lidar=lidar, table=bake(lidar, model.table.shapes))
 
 
-def reached(job: Job, perturbation: str | None, times: float) -> int:
-    """How many episodes of a job succeed under a perturbation; None for none."""
+def reached(job: Job, perturbation: str | None, times: float) -> tuple[int, int]:
+    """How many episodes of a job succeed under a perturbation, or none, truly and to the robot."""
     model, world = real_model(job.robot), load_world(job.world)
     policy, task = open_policy(job.robot, model)
     driver = Standing(task) if job.control == "standing" else policy
@@ -165,10 +165,11 @@ def reached(job: Job, perturbation: str | None, times: float) -> int:
     gated = GatedBackend(backend, model, job.robot)
     env = gymnasium.make(NAVIGATION, backend=gated, model=model, world=world, task=task)
     with closing(env):
-        return successes(drive_all(env, driver, range(FIRST_SEED, FIRST_SEED + job.episodes)))
+        driven = drive_all(env, driver, range(FIRST_SEED, FIRST_SEED + job.episodes))
+    return successes(driven), sum(one.believed_success for one in driven)
 
 
-def curves(job: Job) -> tuple[Job, dict[str, list[int]]]:
+def curves(job: Job) -> tuple[Job, dict[str, list[tuple[int, int]]]]:
     """Successes of a job under each perturbation: without any, and at each of the multiples."""
     nothing = reached(job, None, 0.0)
     return job, {
@@ -177,8 +178,11 @@ def curves(job: Job) -> tuple[Job, dict[str, list[int]]]:
     }
 
 
-def measure(jobs: Sequence[Job]) -> dict[str, dict[str, list[float]]]:
-    """Mean success over the worlds: robot -> perturbation -> at 0 and at each of the multiples."""
+def measure(jobs: Sequence[Job]) -> list[dict[str, dict[str, list[float]]]]:
+    """Mean success over the worlds, true and believed.
+
+    Each is robot -> perturbation -> at 0 and at each of the multiples.
+    """
     counts: dict[str, dict[str, Any]] = {}
     with ProcessPoolExecutor(AT_ONCE, mp_context=get_context("spawn")) as pool:
         for job, found in pool.map(curves, jobs):
@@ -189,10 +193,13 @@ def measure(jobs: Sequence[Job]) -> dict[str, dict[str, list[float]]]:
     driven: dict[str, int] = {}
     for job in jobs:
         driven[job.robot] = driven.get(job.robot, 0) + job.episodes
-    return {
-        robot: {each: (some / driven[robot]).tolist() for each, some in own.items()}
-        for robot, own in counts.items()
-    }
+    return [
+        {
+            robot: {each: (some[:, k] / driven[robot]).tolist() for each, some in own.items()}
+            for robot, own in counts.items()
+        }
+        for k in range(2)
+    ]
 
 
 def losses(
@@ -289,13 +296,13 @@ def main() -> None:
         Job, episodes=given.episodes, perturbations=tuple(given.only), multiples=multiples,
         control=given.control,
     )  # fmt: skip
-    success = measure([job(*each) for each in product(given.robots, given.worlds)])
+    success, believed = measure([job(*each) for each in product(given.robots, given.worlds)])
     if given.picture:
         draw(success, given.picture, multiples)
     lost = losses(success, multiples)
     result = {
         "declared": {robot: declared(of_training(robot)) for robot in success},
-        "multiples": [0.0, *multiples], "success": success,
+        "multiples": [0.0, *multiples], "success": success, "believed": believed,
         "lost_points": lost, "worst": worst(lost), "episodes": given.episodes * len(given.worlds),
     }  # fmt: skip
     table = table_of(success, multiples, time.perf_counter() - begin)

@@ -60,6 +60,7 @@ class Run:
         return {
             "success_rate": success.value,
             "success_95ci": [success.low, success.high],
+            "believed_rate": self.summary.believed.value,
             "collision_rate": self.summary.collision.value,
             "wall_s": self.wall_s,
             "env_steps": self.steps,

@@ -42,11 +42,16 @@ RUNS: dict[str, Run] = {
     "baselines": row("baselines", "--episodes 200", "--episodes 20"),
     "env_scaling": row("env_scaling", "", "--ends-only --repeats 5"),
     "env_throughput": row("env_throughput", "", "--worlds 256 --repeats 2"),
-    "env_throughput_lidar": row(
-        "env_throughput",
-        "--lidar hokuyo_ust_10lx",
-        "--lidar hokuyo_ust_10lx --worlds 256 --repeats 2",
-    ),
+    **{
+        f"env_throughput_{name}": row(
+            "env_throughput", f"--lidar {lidar}", f"--lidar {lidar} --worlds 256 --repeats 2"
+        )
+        for name, lidar in (
+            ("lidar", "hokuyo_ust_10lx"),
+            ("rplidar", "rplidar_a2"),
+            ("sick", "sick_tim571"),
+        )
+    },
     "env_throughput_obstacles": row(
         "env_throughput", "--obstacles 260", "--obstacles 260 --worlds 256 --repeats 2"
     ),

@@ -160,6 +160,7 @@ class Outcomes:
     steps: NDArray[np.int64]  # control periods
     length: Array  # of the true path [m]; for a team, the mean over its robots
     reward: Array  # sum over the episode
+    believed: Flags  # by the robot itself, the goal was reached and nothing touched
 
     @property
     def time_out(self) -> Flags:
@@ -180,12 +181,12 @@ def drive_worlds(env: BridgeVectorEnv, act: Act, seeds: Sequence[int]) -> Outcom
 
 
 def _drive_once(env: BridgeVectorEnv, act: Act, seeds: NDArray[np.int64]) -> tuple[Any, ...]:
-    """Drives one episode in each world: success, collision, steps, length, reward, each (N,)."""
+    """Drives one episode in each world: the fields of `Outcomes` but seeds, each (N,)."""
     count = env.num_envs
     observation, info = env.reset(seed=list(seeds))
     begin(act)
     where = np.reshape(info["start"], (count, -1, 3))[..., :2]
-    success, collision = np.zeros((2, count), np.bool_)
+    success, collision, believed = np.zeros((3, count), np.bool_)
     steps, (length, reward) = np.zeros(count, np.int64), np.zeros((2, count))
     running = np.ones(count, np.bool_)
     while running.any():
@@ -200,13 +201,14 @@ def _drive_once(env: BridgeVectorEnv, act: Act, seeds: NDArray[np.int64]) -> tup
         seen = _robots(info, "collision").any(axis=1)
         hit = _robots(info, "true_collision" if "true_collision" in info else "collision")
         collision |= ended & hit.any(axis=1)
-        arrived = _robots(info, "is_success").all(axis=1)
+        arrived = ended & ~seen & _robots(info, "is_success").all(axis=1)
+        believed |= arrived
         if arrived.any() and "goal" in info:
             near = truly_near(env.task, info["true_pose"], info["goal"])
             arrived = arrived & near.reshape(count, -1).all(axis=1)
-        success |= ended & ~seen & ~hit.any(axis=1) & arrived
+        success |= arrived & ~hit.any(axis=1)
         running &= ~ended
-    return success, collision, steps, length, reward
+    return success, collision, steps, length, reward, believed
 
 
 def _robots(info: dict[str, Any], name: str) -> Flags:
@@ -263,19 +265,23 @@ class Summary:
     success: ConfidenceInterval
     collision: ConfidenceInterval
     time_out: ConfidenceInterval
+    believed: ConfidenceInterval  # share that the robot itself believed successful
     length: ConfidenceInterval
     time: ConfidenceInterval
 
     @property
     def shares(self) -> dict[str, ConfidenceInterval]:
         """The shares by the name of the result."""
-        return {"success": self.success, "collision": self.collision, "time-out": self.time_out}
+        return {
+            "success": self.success, "believed": self.believed, "collision": self.collision,
+            "time-out": self.time_out,
+        }  # fmt: skip
 
 
 def summarise(outcomes: Outcomes, control_period: float) -> Summary:
     """Summarises episodes; `control_period` [s]."""
     count, arrived = len(outcomes.seeds), outcomes.success
-    flags = arrived, outcomes.collision, outcomes.time_out
+    flags = arrived, outcomes.collision, outcomes.time_out, outcomes.believed
     length, time = outcomes.length[arrived], outcomes.steps[arrived] * control_period
     shares = (rate(int(one.sum()), count) for one in flags)
     return Summary(count, *shares, *map(mean, (length, time)))
@@ -288,7 +294,6 @@ class Tally(Summary):
     same: float  # share of the episodes that ended as in the first world
     deviation: ConfidenceInterval
     greatest_deviation: float  # maximum over all episodes [m]
-    believed: ConfidenceInterval  # share of episodes that the robot itself believed successful
     fallback: float  # share of the actions that were the fallback's, NaN without one
 
     def figures(self) -> dict[str, Any]:
@@ -305,7 +310,9 @@ def tallies(runs: Mapping[str, Sequence[Episode]], control_period: float) -> dic
     """Computes the figures of each world, compared with the same seeds in the first."""
     first, found = next(iter(runs.values())), {}
     for place, episodes in runs.items():
-        rows = ((e.seed, e.result, e.steps, e.length, e.reward) for e in episodes)
+        rows = (
+            (e.seed, e.result, e.steps, e.length, e.reward, e.believed_success) for e in episodes
+        )
         seeds, results, *figures = map(np.array, zip(*rows, strict=True))
         outcomes = Outcomes(seeds, results == "success", results == "collision", *figures)
         pairs = list(zip(episodes, first, strict=True))
@@ -315,7 +322,6 @@ def tallies(runs: Mapping[str, Sequence[Episode]], control_period: float) -> dic
             same=sum(one.result == other.result for one, other in pairs) / len(pairs),
             deviation=mean(gaps),
             greatest_deviation=max(gaps),
-            believed=rate(sum(episode.believed_success for episode in episodes), len(pairs)),
             fallback=_planned_share(episodes),
         )
     return found

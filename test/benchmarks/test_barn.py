@@ -80,11 +80,18 @@ def test_a_folder_without_worlds_is_refused(barn, tmp_path):
         barn.courses(tmp_path)
 
 
+def test_a_world_of_other_shapes_is_refused(barn, tmp_path):
+    wide = CYLINDER.format(0, 1.0, 5.0).replace("0.075", "0.5")
+    (tmp_path / "world_7.world").write_text(SDF.format(wide))
+    with pytest.raises(ConfigError, match=r"world_7\.world: holds something else than cylinders"):
+        barn.courses(tmp_path)
+
+
 def test_a_score_is_half_for_twice_the_best_time_and_falls_with_more(barn):
     course = barn.courses(None)[1]
     times = [course.best_s * k for k in (1.0, 2.0, 4.0, 20.0, 2.0)]
     flags = [True, True, True, True, False]
-    told = barn.judged(dict.fromkeys(range(5), course), 1, flags, [False] * 5, times)
+    told = barn.judged(dict.fromkeys(range(5), course), 1, [flags, flags, [False] * 5], times)
     np.testing.assert_allclose(told.score, [0.5, 0.5, 0.25, 0.125, 0.0])
 
 
@@ -98,7 +105,7 @@ def test_a_robot_that_stands_misses_every_bar(folder):
 def test_each_world_has_its_figures(folder):
     _, told = asked("barn.py", "--worlds", str(folder), "--policy", "straight", "--runs", "2")
     assert set(told["worlds"]) == {str(n) for n in NUMBERS}
-    keys = {"success", "collision", "time_out", "time_s", "score"}
+    keys = {"success", "believed", "collision", "time_out", "time_s", "score"}
     assert keys == set(told["worlds"]["1"]) < set(told)
     means = np.mean(
         [[one[key] for key in ("success", "score")] for one in told["worlds"].values()], axis=0

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import replace
 
 import pytest
 
@@ -116,13 +117,26 @@ def test_another_lidar_or_more_obstacles_have_to_keep_their_share_of_the_usual_r
         assert [line.split(":")[0] for line in missed] == ([] if enough else ["share_of_usual"])
 
 
+def test_faults_that_make_a_scan_half_as_long_again_are_a_missed_bar(benchmark, peers):
+    result = {"share_of_usual": 1.0, "drove": {}, "times_as_fast_at_equal_work": {}}
+    for times, enough in ((1.3, True), (1.5, False), (float("nan"), False)):
+        found = {**result, "times_as_long_as_clean": times}
+        missed = benchmark.judge(found, measured(peers), benchmark.Case(lidar="rplidar_a2"))
+        assert [line.split(":")[0] for line in missed] == (
+            [] if enough else ["times_as_long_as_clean"]
+        )
+
+
 def test_another_case_is_of_another_lidar_or_as_dense_with_more_obstacles(benchmark):
     assert benchmark.USUAL.is_usual
     case = benchmark.Case(lidar="hokuyo_ust_10lx")
-    assert (case.is_usual, case.model.lidar.beams, case.world) == (False, 1081, benchmark.WORLD)
+    assert (case.is_usual, case.world) == (False, benchmark.peers.WORLD)
+    assert case.model.lidar.beams == 1081
+    clean = replace(case, clean=True).model.lidar
+    assert (clean.beams, clean.noise_std, clean.faults.quantisation) == (1081, 0.0, 0.0)
     case = benchmark.Case(obstacles=40)
     assert not case.is_usual
-    assert case.model is benchmark.MODEL
+    assert case.model is benchmark.peers.MODEL
     assert case.world.obstacles[0].counts == (40, 40)
     assert case.world.size == pytest.approx((12.0, 12.0))
 

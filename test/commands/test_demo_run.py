@@ -85,7 +85,7 @@ def test_the_report_begins_with_success_in_three_worlds_and_folds_the_figures(
     drive = record(robot, np.random.default_rng(0), 30.0)
     model, identified = generate(drive, robot, lidar_of(robot), ())
     arrivals = int(500 * share)
-    rates = [rate(count, 500) for count in (arrivals, 500 - arrivals, 0)]
+    rates = [rate(count, 500) for count in (arrivals, 500 - arrivals, 0, arrivals)]
     length = ConfidenceInterval(3.0, 2.9, 3.1)
     summary = Summary(500, *rates, length, length)
     live = episode(0, "success" if arrived else "time-out")

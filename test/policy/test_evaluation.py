@@ -221,7 +221,8 @@ def test_arrived_is_who_truly_is_there():
         )
     )
     assert honest.success.any()
-    assert lied.success.sum() < honest.success.sum()
+    assert lied.success.sum() < honest.success.sum() == honest.believed.sum()
+    assert lied.believed.tolist() == honest.believed.tolist()
     assert lied.collision.tolist() == honest.collision.tolist()
 
 
@@ -237,13 +238,14 @@ def test_time_and_length_are_those_of_the_successful():
     flags = np.array([True, False, True, False])
     outcomes = Outcomes(
         np.arange(4), flags, np.array([False, True, False, False]), np.array([10, 99, 30, 300]),
-        np.array([1.0, 50.0, 2.0, 60.0]), np.zeros(4),
+        np.array([1.0, 50.0, 2.0, 60.0]), np.zeros(4), np.array([True, False, True, True]),
     )  # fmt: skip
     summary = summarise(outcomes, 0.1)
     assert summary.episodes == 4
     assert (summary.success.value, summary.collision.value, summary.time_out.value) == (
         0.5, 0.25, 0.25,
     )  # fmt: skip
+    assert summary.believed.value == 0.75
     assert summary.length.value == pytest.approx(1.5)
     assert summary.time.value == pytest.approx(2.0)
 
@@ -319,9 +321,8 @@ def test_nothing_observed_leaves_everything_open():
 def test_a_summary_shows_neither_nan_nor_inf_and_is_json_that_others_read(arrived):
     train = pytest.importorskip("nics_drl_bridge.policy.train")
     success, steps = np.arange(3) < arrived, np.full(3, 7)
-    told = summarise(
-        Outcomes(np.arange(3), success, np.zeros(3, bool), steps, steps * 0.1, steps * 1.0), 0.1
-    )
+    figures = steps, steps * 0.1, steps * 1.0
+    told = summarise(Outcomes(np.arange(3), success, np.zeros(3, bool), *figures, success), 0.1)
     line = f"{train.line_of(told)} {told.length.text('m')}"
     assert not re.search(r"\b(nan|inf)\b", line)
     assert ("path" in line) == (arrived > 0)
