@@ -17,15 +17,8 @@ from nics_drl_bridge.interface import S_PER_NS, Array
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.nodes import conversions, qos, runner
+from nics_drl_bridge.nodes import held_action as held
 from nics_drl_bridge.nodes.goal_frames import GoalFrames
-from nics_drl_bridge.nodes.held_action import (
-    ABORT,
-    CANCELED,
-    SUCCEED,
-    HeldActionServer,
-    duration_to_ros,
-    result_of,
-)
 from nics_drl_bridge.nodes.nav2_parameters import ControllerParameters, chosen
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
 from nics_drl_bridge.policy.follow import GoalChecker, Place, PlannedPath, ProgressChecker
@@ -60,7 +53,7 @@ class Goal(NamedTuple):
 
     name: str  # of its action
     kind: Any  # its type
-    server: HeldActionServer
+    server: held.HeldActionServer
     handle: Any
 
     @property
@@ -101,7 +94,7 @@ class PathActions:
         self._limit = math.inf  # of the speed [m/s]
         self._period_s = model.control_period
         self._undo: list[Callable[[], Any]] = []
-        self._servers: dict[str, HeldActionServer] = {}
+        self._servers: dict[str, held.HeldActionServer] = {}
         self._kinds = {name: conversions.message_type(kind) for name, kind in KINDS.items()}
         if None in self._kinds.values():
             why = "the package nav2_msgs is not installed, so that its actions are not served"
@@ -126,7 +119,7 @@ class PathActions:
         def take(handle: Any) -> None:
             self._accept(Goal(name, kind, self._servers[name], handle), begin)
 
-        self._servers[name] = HeldActionServer(self._node, kind, name, self._open, take)
+        self._servers[name] = held.HeldActionServer(self._node, kind, name, self._open, take)
 
     def close(self) -> None:
         """Ends all goals and topics."""
@@ -188,9 +181,9 @@ class PathActions:
             if before is None or not np.array_equal(before.path.end, run.path.end):
                 self._anew()  # not where the same way is planned again
         except Refusal as refusal:
-            self._end(goal, ABORT, refusal.code, str(refusal))
+            self._end(goal, held.ABORT, refusal.code, str(refusal))
         if before is not None:
-            self._end(before.goal, ABORT, "UNKNOWN", "a newer goal has taken its place.")
+            self._end(before.goal, held.ABORT, "UNKNOWN", "a newer goal has taken its place.")
 
     def _follow(self, goal: Goal) -> Run:
         asked, known, names = goal.handle.request, self._parameters, []
@@ -284,7 +277,7 @@ class PathActions:
             return False
         if run.goal.handle.is_cancel_requested:
             self._run = None
-            self._end(run.goal, CANCELED, "NONE")
+            self._end(run.goal, held.CANCELED, "NONE")
             return True
         longest = self._parameters.number("costmap_update_timeout")
         longest = max(longest, PATIENT_PERIODS * self._period_s)
@@ -296,7 +289,7 @@ class PathActions:
         if silent and time.monotonic() - run.started_s > longest:
             self._run = None
             told = f"nothing on {' and '.join(silent)} for {longest:g} s."
-            self._end(run.goal, ABORT, "CONTROLLER_TIMED_OUT", told)
+            self._end(run.goal, held.ABORT, "CONTROLLER_TIMED_OUT", told)
             return True
         return False
 
@@ -308,7 +301,7 @@ class PathActions:
             return self._steer(run)
         except Refusal as refusal:
             self._run = None
-            self._end(run.goal, ABORT, refusal.code, str(refusal))
+            self._end(run.goal, held.ABORT, refusal.code, str(refusal))
             return np.zeros(3)
 
     def _steer(self, run: Run) -> Array:
@@ -317,7 +310,7 @@ class PathActions:
         turn = run.arrival.turn_left(place, robot, run.path.end)
         if turn == 0.0:
             self._run = None
-            self._end(run.goal, SUCCEED, "NONE")
+            self._end(run.goal, held.SUCCEED, "NONE")
             return np.zeros(3)
         now_s = self._topics.newest_ns * S_PER_NS
         if run.progress.stuck(now_s, robot):
@@ -365,8 +358,8 @@ class PathActions:
             "position_tracking_error": place.left, "heading_tracking_error": place.turned,
             "current_path_index": place.nearest, "remaining_path_length": place.remaining,
             "current_pose": pose, "distance_remaining": place.remaining, "header": pose.header,
-            "navigation_time": duration_to_ros(times[0]),
-            "estimated_time_remaining": duration_to_ros(times[1]),
+            "navigation_time": held.duration_to_ros(times[0]),
+            "estimated_time_remaining": held.duration_to_ros(times[1]),
         }  # fmt: skip
         feedback = run.goal.kind.Feedback()
         for part in (feedback, getattr(feedback, "tracking_feedback", None)):
@@ -378,16 +371,18 @@ class PathActions:
         """Aborts the goal, if there is one."""
         run, self._run = self._run, None
         if run is not None:
-            self._end(run.goal, ABORT, "UNKNOWN", f"{why}.")
+            self._end(run.goal, held.ABORT, "UNKNOWN", f"{why}.")
 
     def _end(self, goal: Goal, end: str, code: str, sentence: str = "") -> None:
         if goal.handle.is_cancel_requested:
-            end = CANCELED
-        if end == ABORT:
+            end = held.CANCELED
+        if end == held.ABORT:
             self._node.get_logger().warning(f"goal aborted: {sentence}")
         else:
-            self._node.get_logger().info("goal reached" if end == SUCCEED else "goal cancelled")
-        goal.server.finish(goal.handle, end, result_of(goal.kind, code, sentence))
+            self._node.get_logger().info(
+                "goal reached" if end == held.SUCCEED else "goal cancelled"
+            )
+        goal.server.finish(goal.handle, end, held.result_of(goal.kind, code, sentence))
 
 
 def _pose_of(pose: Any) -> Array:

@@ -272,10 +272,8 @@ class Summary:
     @property
     def shares(self) -> dict[str, ConfidenceInterval]:
         """The shares by the name of the result."""
-        return {
-            "success": self.success, "believed": self.believed, "collision": self.collision,
-            "time-out": self.time_out,
-        }  # fmt: skip
+        names = "success", "believed", "collision", "time_out"
+        return {name.replace("_", "-"): getattr(self, name) for name in names}
 
 
 def summarise(outcomes: Outcomes, control_period: float) -> Summary:
