@@ -13,7 +13,7 @@ def told(*rows: tuple[str, str, str]) -> Table:
     of = {"training_differential": "training", "training_ackermann": "training"}
     of |= dict.fromkeys(("barn_five_fold", "barn_mujoco"), "barn")
     of |= {f"transfer_{robot}": "transfer" for robot in POLICIES}
-    of |= dict.fromkeys(("env_throughput_lidar", "env_throughput_obstacles"), "env_throughput")
+    of |= {f"env_throughput_{what}": "env_throughput" for what in ("lidar", "obstacles")}
     return Table(
         ("what", "script", "figure"),
         tuple((run, what, f"`{of.get(run, run)}.py`", text) for run, what, text in rows),
@@ -22,7 +22,7 @@ def told(*rows: tuple[str, str, str]) -> Table:
 
 ROBOTS = {"ackermann": "Ackermann", "differential": "differential", "mecanum": "mecanum"}
 POLICIES = {**ROBOTS, "jackal": "Jackal"}
-WORLDS = ("arena", "circles", "doorway", "clutter", "corridor", "crowd", "room")
+WORLDS = ("empty", "arena", "circles", "doorway", "clutter", "corridor", "crowd", "room")
 PERTURBATIONS = ("noise", "drop-out", "latency", "response", "drift", "footprint")
 README = told(
     (
@@ -71,7 +71,8 @@ README = told(
     (
         "env_throughput_lidar",
         "the same on one thread with a Hokuyo UST-10LX: 1,081 beams up to 10 m, noise, millimetres",
-        "{single_thread_env_steps_per_s|.1e}, {share_of_usual|.0%} of the 720 beams' in that run",
+        "{single_thread_env_steps_per_s|.1e}, {share_of_usual|.0%} of the 720 beams' in that run; "
+        "{times_as_long_as_clean|.2f} times as long as without its noise",
     ),
     (
         "env_throughput_obstacles",
@@ -200,16 +201,27 @@ THROUGHPUT = Table(
         )
     ),
 )  # fmt: skip
+REAL_LIDARS = Table(
+    ("lidar", "env steps per second, one thread", "of the usual env's", "times as long as clean"),
+    tuple(
+        (f"env_throughput_{run}", title, "{single_thread_env_steps_per_s|.1e}",
+         "{share_of_usual|.0%}", "{times_as_long_as_clean|.2f}")
+        for run, title in (
+            ("lidar", "Hokuyo UST-10LX"), ("rplidar", "RPLIDAR A2"), ("sick", "SICK TiM571"),
+        )
+    ),
+)  # fmt: skip
 SCALING = Table(
     ("",) * 6,
     tuple(
-        ("env_scaling", title, *(f"{{{key}.{k}{how}}}" for k in indices))
+        ("env_scaling", title, *(f"{{{key}.{k}{how}}}" if k >= 0 else "" for k in indices))
         for sizes, name, key, indices in (
             ("worlds", "µs per env step", "worlds_us", (0, 2, 4, 5, 7)),
             ("robots in each world", "µs per robot and step", "robots_us_per_robot",
              (0, 2, 4, 5, 6)),
             ("obstacles", "µs per env step", "obstacles_us", (0, 1, 2, 3, 4)),
             ("beams", "µs per env step", "beams_us", (0, 2, 4, 5, 6)),
+            ("members of the set", "µs per env step", "members_us", (0, 1, 2, 3, -1)),
         )
         for title, key, how in ((sizes, sizes.split()[0], ""), (name, key, "|.1f"))
     ),
@@ -339,6 +351,7 @@ TABLES: Mapping[str, Table] = {
     "safety": SAFETY,
     "lidar_peers": lidar.PEERS,
     "env_throughput": THROUGHPUT,
+    "real_lidars": REAL_LIDARS,
     "env_scaling": SCALING,
     "table1": TABLE1,
     "table2": lidar.TABLE2,

@@ -6,6 +6,7 @@ from importlib.util import find_spec
 
 import pytest
 
+from nics_drl_bridge.config import shipped_names
 from nics_drl_bridge.policy.policies import shipped_policies
 
 from .runs import BENCHMARKS, asked, fails
@@ -55,6 +56,10 @@ def test_success_has_a_floor_in_each_world_and_may_be_two_and_four_points_off(
     assert len(missed) == len(bars)
     assert all(bar in line for bar, line in zip(bars, missed, strict=True))
     assert all(line.startswith(f"differential in {world}") for line in missed)
+
+
+def test_every_world_that_comes_with_the_package_is_driven(transfer):
+    assert set(transfer.FLOORS) == set(shipped_names("worlds"))
 
 
 def test_no_robot_is_no_transfer(transfer):
