@@ -9,7 +9,8 @@
 - Nav2: what `nav2_standards` measures, by its bars; its control is its own.
 
 Bars: no check fails, a step over the standard takes a tenth longer at most, and both policies give
-the same actions. The controls announce a feature that is not there, or let each step rest.
+the same actions. The controls announce a feature that is not there, do nothing of what is asked
+for, let each step rest, or round what LEAPP is given.
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 
 CONTROLS = {
     "claims": "conformance: a feature that is not there counts as announced",
+    "idle": "conformance: nothing that is asked for is done, and all is answered as done",
     "slow": "overhead: each step over the standard rests",
+    "coarse": "the bundle: it is given observations in steps of a hundredth",
 }
 BARS = {"sim_conformance_failed": 0, "client_overhead": 0.1, "leapp_max_abs_difference": 1e-6}
 ROBOT, WORLD, CLAIMED = "ackermann", "circles", "NAMED_POSES"
@@ -52,11 +55,11 @@ def simulator(domain_id: int, folder: Path, namespace: str, mode: str) -> Iterat
 
 def conformance(domain_id: int, folder: Path, control: str | None) -> dict[str, Any]:
     """How many features are announced, and the sentences about those that fail."""
-    from measuring.conformance import Client, announced, failures
+    from measuring.conformance import Client, Idle, announced, failures
 
     namespace = f"conformance_{os.getpid()}"
     with simulator(domain_id, folder / "conformance", namespace, "realtime"):
-        client = Client(domain_id, f"/{namespace}")
+        client = (Idle if control == "idle" else Client)(domain_id, f"/{namespace}")
         try:
             told = announced(client)
             claimed = told | {CLAIMED} if control == "claims" else told
@@ -118,7 +121,7 @@ def overhead(
     }  # fmt: skip
 
 
-def leapp(folder: Path) -> dict[str, float]:
+def leapp(folder: Path, control: str | None) -> dict[str, float]:
     """Greatest difference of what a shipped policy and its bundle, run by LEAPP, do."""
     import torch
     from leapp import InferenceManager
@@ -141,7 +144,9 @@ def leapp(folder: Path) -> dict[str, float]:
             "angular_velocity": np.concatenate([zero, zero, velocity[2:]]),
         }  # fmt: skip
         given = {
-            f"policy/{name}": torch.as_tensor(each.astype(np.float32)[None])
+            f"policy/{name}": torch.as_tensor(
+                each.round(2 if control == "coarse" else 9).astype(np.float32)[None]
+            )
             for name, each in pieces.items()
         }
         theirs = manager(given)
@@ -179,9 +184,9 @@ def measure(given: Any) -> dict[str, Any]:
             result |= conformance(domain_id, folder, given.control)
             result |= overhead(domain_id, folder, given.control, given.chunks, given.size)
         if "leapp" in given.parts:
-            result |= leapp(folder)
+            result |= leapp(folder, given.control)
         if "nav2" in given.parts:
-            result |= nav2_standards.figures()
+            result |= nav2_standards.figures(parameters=given.parameters)
     return result
 
 
@@ -189,6 +194,7 @@ def main() -> None:
     """Prints a table, or one JSON object; ends with 1 where a bar was missed."""
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--parameters", type=Path, help="another parameter file of Nav2")
     parser.add_argument("--chunks", type=int, default=30)
     parser.add_argument("--size", type=int, default=100, help="steps in a chunk")
     given = parser.parse_args()

@@ -66,6 +66,7 @@ RUNS: dict[str, Run] = {
     "lidar_peers": row("lidar_peers", "", "--scans 128 --scenes 5 --repeats 2"),
     "lidar_sensor_models": row("lidar_sensor_models", "", "--scans 128 --repeats 10"),
     "node_endings": row("node_endings", "", "--times 1 --phases starting running", HOUR),
+    "node_first_lines": row("node_endings", "--loops 0 --phases starting", "--loops 0 --times 1"),
     "packet_loss": row("packet_loss", "", "--seconds 5"),
     "paper_fig7": row("paper_fig7", "", "--episodes 1"),
     "parity": row("parity", "", "--steps 50"),

@@ -18,7 +18,10 @@ def test_every_feature_is_called_and_a_step_is_compared():
     _, result = asked(SCRIPT, *SHORT)
     assert result["sim_features"] == 30
     assert result["sim_conformance_failed"] == 0, result["failed"]
-    assert result["client_overhead"] > -1.0
+    assert 0.0 < result["own_step_ms"] < result["standard_step_ms"] * 2.0
+    assert result["client_overhead"] == pytest.approx(
+        result["standard_step_ms"] / result["own_step_ms"] - 1.0, abs=1e-3
+    )
 
 
 def test_a_feature_that_is_only_claimed_fails():
@@ -26,5 +29,18 @@ def test_a_feature_that_is_only_claimed_fails():
     assert any(line.startswith("sim_conformance_failed 1") for line in missed)
 
 
+def test_what_is_answered_as_done_without_being_done_fails():
+    missed = fails(SCRIPT, "idle", *SHORT)
+    for name in ("SPAWNING", "ENTITY_STATE_SETTING", "SIMULATION_STATE_PAUSE", "WORLD_LOADING"):
+        assert f"{name} is announced, but does not do what the standard says" in missed
+
+
 def test_a_client_that_rests_in_each_step_is_too_slow():
-    assert any(line.startswith("client_overhead") for line in fails(SCRIPT, "slow", *SHORT))
+    (line,) = [each for each in fails(SCRIPT, "slow", *SHORT) if each.startswith("client_over")]
+    assert float(line.split()[1].rstrip(":")) > 1.0  # it rests for longer than a step takes
+
+
+def test_a_bundle_that_is_given_something_else_differs():
+    pytest.importorskip("leapp", reason="needs LEAPP")
+    (line,) = fails(SCRIPT, "coarse", "--parts", "leapp")
+    assert line.startswith("leapp_max_abs_difference")
