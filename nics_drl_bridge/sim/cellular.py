@@ -69,24 +69,25 @@ def grow(given: Cellular, number: int) -> World:
 def _field(given: Cellular, rng: np.random.Generator) -> NDArray[np.bool_]:
     share = rng.uniform(*given.fill)
     filled = rng.random((given.rows, given.columns)) < share
-    around = np.ones((3, 3), np.int64)
-    around[1, 1] = 0
+    around = np.zeros((given.rows + 2, given.columns + 2), np.uint8)
+    around[1:-1] = 1  # the walls at both sides
     for _ in range(rng.integers(given.smoothing[0], given.smoothing[1] + 1)):
-        beside = np.pad(filled.astype(np.int64), ((0, 0), (1, 1)), constant_values=1)  # the walls
-        neighbours = ndimage.convolve(beside, around, mode="constant")[:, 1:-1]
+        around[1:-1, 1:-1] = filled
+        three = around[:-2] + around[1:-1] + around[2:]
+        neighbours = three[:, :-2] + three[:, 1:-1] + three[:, 2:] - filled
         filled = (neighbours >= FILLED) | (filled & (neighbours > EMPTIED))
     return filled
 
 
 def _has_way(filled: NDArray[np.bool_], given: Cellular) -> bool:
     """True if a disc of the passage's width gets from before the field to behind it."""
-    fine = np.repeat(np.repeat(filled, FINE, axis=0), FINE, axis=1)
-    ahead = math.ceil(given.margin / given.cell) * FINE
-    walled = np.pad(np.pad(fine, ((ahead, ahead), (0, 0))), ((0, 0), (1, 1)), constant_values=True)
-    away = ndimage.distance_transform_edt(~walled) * given.cell / FINE
+    ahead = FINE * (1 + math.ceil(given.passage / 2.0 / given.cell))  # beyond, all is free
+    free = np.ones((FINE * given.rows + 2 * ahead, FINE * given.columns + 2), np.bool_)
+    free[:, [0, -1]] = False  # the walls at both sides
+    free[ahead:-ahead, 1:-1] = ~np.repeat(np.repeat(filled, FINE, axis=0), FINE, axis=1)
+    away = ndimage.distance_transform_edt(free) * given.cell / FINE
     areas, _ = ndimage.label(away > given.passage / 2.0)
-    middle = areas.shape[1] // 2
-    start, goal = areas[ahead // 2, middle], areas[-1 - ahead // 2, middle]
+    start, goal = areas[[0, -1], areas.shape[1] // 2].tolist()
     return bool(start > 0 and start == goal)
 
 
