@@ -11,15 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.policy.local_map_kernels import (
-    ARRIVED_M,
-    astray,
-    look,
-    look_near,
-    room_at,
-    touching,
-    way_at,
-)
+from nics_drl_bridge.policy import local_map_kernels as maps
 from nics_drl_bridge.random_kernels import PLANNER_STREAM, normal, uniform
 from nics_drl_bridge.robot.kernels import Terms, advance, bend, rates, run
 
@@ -107,7 +99,7 @@ def draw(offers, noise, rest, seed):  # type: ignore[no-untyped-def]
 def plan_all(out, scans, goals, twists, sense, plant, sampling, worth, lanes):  # type: ignore[no-untyped-def]
     """Writes the actions (N, C) of N robots, by scans (N, P), goals (N, 2), twists (N, 3)."""
     for n in range(out.shape[0]):
-        around = look(scans[n], goals[n], *sense)
+        around = maps.look(scans[n], goals[n], *sense)
         _plan(out[n], twists[n], around, plant, sampling, worth, lanes)
 
 
@@ -143,7 +135,7 @@ def stops_all(out, commands, scans, twists, sense, plant, halt, lanes):  # type:
     """
     nowhere = np.zeros(2)
     for n in range(out.shape[0]):
-        around = look_near(scans[n], nowhere, *sense)
+        around = maps.look_near(scans[n], nowhere, *sense)
         out[n] = _stops(commands[n], twists[n], around, plant, halt, lanes)
 
 
@@ -155,14 +147,14 @@ def _stops(command, twist, around, plant, halt, lanes):  # type: ignore[no-untyp
             return False
     _wait(twist, plant, lanes)
     _put(lanes, plant.settled.shape[0])
-    states, limit = plant.settled.shape[0], touching(around)
+    states, limit = plant.settled.shape[0], maps.touching(around)
     for t in range(1 + halt.most):
         for c in range(command.shape[0]):
             given = command[c] if t == 0 or halt.holds[c] else halt.rest[c]
             lanes.x[states + c, 0] = bend(given, plant.single.curves[c])
         run(lanes.pose, lanes.x, lanes.dq, plant.terms, plant.series, plant.dt, plant.substeps)
         pose = lanes.pose
-        if room_at(pose[0, 0], pose[1, 0], pose[2, 0], pose[3, 0], around) < limit:
+        if maps.room_at(pose[0, 0], pose[1, 0], pose[2, 0], pose[3, 0], around) < limit:
             return False
         dq = lanes.dq
         fastest = math.hypot(dq[0, 0], dq[1, 0]) + around.outline.outer * abs(dq[2, 0])
@@ -243,7 +235,7 @@ def _roll(around, plant, sampling, worth, lanes):  # type: ignore[no-untyped-def
     """Rolls out the actions of all lanes; writes their costs and returns the cheapest."""
     _begin(around, plant, worth, lanes)
     states, periods = plant.settled.shape[0], sampling.between.shape[0]
-    limit = touching(around)
+    limit = maps.touching(around)
     for t in range(periods):
         for c in range(plant.low.shape[0]):
             middle = 0.5 * (plant.low[c] + plant.high[c])
@@ -299,7 +291,7 @@ def _put(lanes, states):  # type: ignore[no-untyped-def]
 def _judge(k, t, periods, limit, around, worth, lanes):  # type: ignore[no-untyped-def]
     """Adds what period t of lane k costs."""
     x, y, c, s = lanes.pose[0, k], lanes.pose[1, k], lanes.pose[2, k], lanes.pose[3, k]
-    room, way = room_at(x, y, c, s, around), way_at(x, y, around)
+    room, way = maps.room_at(x, y, c, s, around), maps.way_at(x, y, around)
     lanes.way[k] = way
     lanes.cost[k] += worth.early * way / periods
     if room < limit:
@@ -309,7 +301,7 @@ def _judge(k, t, periods, limit, around, worth, lanes):  # type: ignore[no-untyp
     keep = around.clearance
     near = max(keep.margin + keep.soft - room, 0.0) / keep.soft
     lanes.cost[k] += worth.near * near * near / periods
-    if math.hypot(around.goal[0] - x, around.goal[1] - y) < ARRIVED_M:
+    if math.hypot(around.goal[0] - x, around.goal[1] - y) < maps.ARRIVED_M:
         lanes.ended[k], lanes.way[k] = t, 0.0
     elif t == periods - 1:
-        lanes.cost[k] += worth.astray * astray(x, y, c, s, way, around) * min(way, 1.0)
+        lanes.cost[k] += worth.astray * maps.astray(x, y, c, s, way, around) * min(way, 1.0)
