@@ -4,6 +4,7 @@ import hashlib
 import re
 import sys
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, requires, version
@@ -38,10 +39,17 @@ def load(group: str, name: str) -> Any:
     extensions = known(group)
     if name not in extensions:
         raise ConfigError(f"unknown {group.rstrip('s')} {name!r}; {nearest(name, extensions)}")
-    try:
+    with needed_by(f"{group.rstrip('s')} {name!r}"):
         return extensions[name].load()
+
+
+@contextmanager
+def needed_by(what: str) -> Iterator[None]:
+    """Raises ConfigError, with the command to mend it, for a module that a block can't import."""
+    try:
+        yield
     except ModuleNotFoundError as error:
-        raise ConfigError(f"{group.rstrip('s')} {name!r} {missing(error.name or '')}") from None
+        raise ConfigError(f"{what} {missing(error.name or '')}") from None
 
 
 def missing(module: str) -> str:

@@ -6,8 +6,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
-from pettingzoo import ParallelEnv
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, BridgeEnv
 from nics_drl_bridge.env.guard import halts_on_error
 from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS
@@ -17,6 +17,9 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world_set import AnyWorld
+
+with extensions.needed_by("BridgeParallelEnv"):
+    from pettingzoo import ParallelEnv
 
 Observations = dict[str, NDArray[np.float32]]
 

@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
-import torch
 from numpy.typing import ArrayLike, NDArray
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.files import write_bytes
@@ -18,6 +17,10 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy import onnx_graph, policy_file
 from nics_drl_bridge.policy.contract import GOLDEN, SUFFIX, contract_of, golden_observations
 from nics_drl_bridge.policy.train_memory import Memory
+
+with extensions.needed_by("the export of a policy"):
+    import onnx
+    import torch
 
 Rows = NDArray[np.float32]
 Normaliser = tuple[ArrayLike, ArrayLike, float]

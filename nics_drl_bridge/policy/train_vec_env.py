@@ -9,10 +9,13 @@ import gymnasium
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnv
 
+from nics_drl_bridge import extensions
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
+
+with extensions.needed_by("TrainVecEnv"):
+    from stable_baselines3.common.vec_env import VecEnv
 
 Observation = NDArray[np.float32]
 
