@@ -120,6 +120,23 @@ def test_nics_says_in_one_sentence_what_a_command_needs(tmp_path):
 
 
 @pytest.mark.process
+@pytest.mark.parametrize(
+    ("module", "what", "library", "extra"),
+    [
+        ("env.pettingzoo_env", "BridgeParallelEnv", "pettingzoo", "multi"),
+        ("policy.train_vec_env", "TrainVecEnv", "stable_baselines3", "train"),
+        ("policy.train_export", "the export of a policy", "onnx", "deploy"),
+    ],
+)
+def test_a_module_whose_extra_is_missing_names_it(module, what, library, extra):
+    code = WITHOUT.replace(repr(FOREIGN), repr((library,)))
+    done = python(f"{code}\nimport nics_drl_bridge.{module}")
+    fix = f"pip install 'nics_drl_bridge[{extra}]'."
+    last = done.stderr.splitlines()[-1]
+    assert last.endswith(f"ConfigError: {what} needs the module {library!r}; {fix}")
+
+
+@pytest.mark.process
 @pytest.mark.parametrize("start", ["commands.start", "nodes.start"])
 def test_an_old_library_is_one_sentence(tmp_path, start):
     (tmp_path / "pydantic").mkdir()

@@ -12,16 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.kernels import kernel
-from nics_drl_bridge.robot.kernels import (
-    Terms,
-    advance,
-    bounds_of,
-    emf_of,
-    next_state,
-    put_command,
-    rates,
-    wrap,
-)
+from nics_drl_bridge.robot import kernels as robot
 
 Array = NDArray[np.float64]
 RUNAWAY = 1e9  # Bound on poses, states and their derivatives; beyond, the model has diverged
@@ -57,7 +48,7 @@ class Wheels(NamedTuple):
 class MotionModel(NamedTuple):
     """Model of the motion."""
 
-    terms: Terms  # `terms`, `series`: see `robot.kernels`
+    terms: robot.Terms  # `terms`, `series`: see `robot.kernels`
     series: Array
     step_ns: int  # the model's step [ns]
     longest_ns: int  # longest gap that is predicted [ns]
@@ -94,7 +85,7 @@ def rates_jacobian(jacobian, x, terms):  # type: ignore[no-untyped-def]
                     product *= x[factors[k, other]]
             jacobian[dof[k], factors[k, f]] += product
     for i in range(terms.emf.shape[0]):
-        jacobian[3 + i, i] -= emf_of(i, x, terms)
+        jacobian[3 + i, i] -= robot.emf_of(i, x, terms)
 
 
 @kernel
@@ -109,10 +100,10 @@ def predict(mean, transition, command, dt, steps, motion):  # type: ignore[no-un
     size, width = mean.shape[0] - 3, command.shape[0]
     x, dq = np.ones(size + width + 1), np.zeros(3 + size)
     jacobian, step = np.zeros((3 + size, size + width)), np.eye(3 + size)
-    put_command(x, command, motion.terms)
+    robot.put_command(x, command, motion.terms)
     for _ in range(steps):
         x[:size] = mean[3:]
-        rates(dq, x, motion.terms)
+        robot.rates(dq, x, motion.terms)
         rates_jacobian(jacobian, x, motion.terms)
         # The arc is short, so the derivative at its middle heading is good to second order.
         middle = mean[2] + dq[2] * dt / 2.0
@@ -133,9 +124,10 @@ def predict(mean, transition, command, dt, steps, motion):  # type: ignore[no-un
         transition[:] = step @ transition
         for i in range(size):
             transition[3 + i, 3 + size + i] += dt
-        advance(mean[:3], dq, dt, motion.series)
+        robot.advance(mean[:3], dq, dt, motion.series)
         for i in range(size):
-            mean[3 + i] = next_state(mean[3 + i], dq[3 + i], dt, bounds_of(motion.terms, i))
+            bounds = robot.bounds_of(motion.terms, i)
+            mean[3 + i] = robot.next_state(mean[3 + i], dq[3 + i], dt, bounds)
 
 
 @kernel(allocates=True)
@@ -230,8 +222,8 @@ def expect(mean, now, motion, log):  # type: ignore[no-untyped-def]
     x, dq = np.ones(size + width + 1), np.zeros(3 + size)
     jacobian, derivative = np.zeros((3 + size, size + width)), np.zeros((3, 3 + size))
     x[:size] = mean[3:]
-    put_command(x, command, motion.terms)
-    rates(dq, x, motion.terms)
+    robot.put_command(x, command, motion.terms)
+    robot.rates(dq, x, motion.terms)
     rates_jacobian(jacobian, x, motion.terms)
     derivative[:, 3:] = jacobian[:3, :size]
     return dq[:3].copy(), derivative
@@ -304,7 +296,7 @@ def retrace(  # type: ignore[no-untyped-def]
     seconds, then, size = (now - anchor.time_ns) / NS_PER_S, anchor.mean, mean.shape[0]
     c, s = math.cos(anchor.odom[2]), math.sin(anchor.odom[2])
     x, y = odom[0] - anchor.odom[0], odom[1] - anchor.odom[1]
-    along, aside, turned = c * x + s * y, c * y - s * x, wrap(odom[2] - anchor.odom[2])
+    along, aside, turned = c * x + s * y, c * y - s * x, robot.wrap(odom[2] - anchor.odom[2])
     c, s = math.cos(then[2]), math.sin(then[2])
     x, y = mean[0] - then[0], mean[1] - then[1]
     ahead, before = c * x + s * y, c * y - s * x
@@ -315,7 +307,7 @@ def retrace(  # type: ignore[no-untyped-def]
     shared = covariance @ here.T + anchor.cross @ there.T
     past = anchor.cross.T @ here.T + anchor.covariance[:3, :3].copy() @ there.T
     total = here @ shared + there @ past + wheels.walk * seconds
-    turn = wrap(turned - mean[2] + then[2])
+    turn = robot.wrap(turned - mean[2] + then[2])
     innovation = np.array([along - ahead, aside - before, turn])
     # Between two twists the robot may have had either.
     slack = np.diag((0.5 * seconds * (twist - anchor.twist)) ** 2)
@@ -359,7 +351,7 @@ def follow(  # type: ignore[no-untyped-def]
 def settle(mean, covariance, low, high):  # type: ignore[no-untyped-def]
     """Wraps the heading, clips the state to [low, high] (S,), repairs the covariance's rounding."""
     size = mean.shape[0]
-    mean[2] = wrap(mean[2])
+    mean[2] = robot.wrap(mean[2])
     for i in range(3, size):
         mean[i] = min(max(mean[i], low[i - 3]), high[i - 3])
     factor = np.zeros((size, size))

@@ -12,13 +12,7 @@ from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import (
-    PoseStamped,
-    PoseWithCovarianceStamped,
-    Quaternion,
-    Twist,
-    TwistStamped,
-)
+from geometry_msgs import msg as geometry
 from nav_msgs.msg import OccupancyGrid, Odometry
 from numpy.typing import ArrayLike, NDArray
 from rclpy.serialization import deserialize_message
@@ -49,9 +43,9 @@ def stamp_from_ros(stamp: Time) -> int:
     return int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
 
 
-def heading_to_ros(heading: float) -> Quaternion:
+def heading_to_ros(heading: float) -> geometry.Quaternion:
     """Returns a heading [rad] as a quaternion."""
-    return Quaternion(z=math.sin(heading / 2.0), w=math.cos(heading / 2.0))
+    return geometry.Quaternion(z=math.sin(heading / 2.0), w=math.cos(heading / 2.0))
 
 
 def heading_of(x: float, y: float, z: float, w: float) -> float:
@@ -64,21 +58,21 @@ def is_rotation(x: float, y: float, z: float, w: float) -> bool:
     return abs(w * w + x * x + y * y + z * z - 1.0) < QUATERNION_TOLERANCE
 
 
-def twist_to_ros(twist: ArrayLike) -> Twist:
+def twist_to_ros(twist: ArrayLike) -> geometry.Twist:
     """Returns linear.x, linear.y, angular.z (3,) as a Twist."""
-    message = Twist()
+    message = geometry.Twist()
     message.linear.x, message.linear.y, message.angular.z = np.asarray(twist, np.float64).tolist()
     return message
 
 
-def stamped_to_ros(twist: ArrayLike, time_ns: int, frame: str) -> TwistStamped:
+def stamped_to_ros(twist: ArrayLike, time_ns: int, frame: str) -> geometry.TwistStamped:
     """Returns linear.x, linear.y, angular.z (3,) as a TwistStamped."""
-    message = TwistStamped(twist=twist_to_ros(twist))
+    message = geometry.TwistStamped(twist=twist_to_ros(twist))
     message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
     return message
 
 
-def twist_from_ros(message: Twist | TwistStamped) -> Array:
+def twist_from_ros(message: geometry.Twist | geometry.TwistStamped) -> Array:
     """Returns linear.x, linear.y, angular.z (3,) of a Twist, stamped or not."""
     return np.array(messages.command_row(message))
 
@@ -127,17 +121,19 @@ def covariance_to_ros(planar: Array) -> Array:
     return whole.ravel()
 
 
-def pose_from_ros(message: PoseStamped | PoseWithCovarianceStamped) -> tuple[Array, Array | None]:
+def pose_from_ros(
+    message: geometry.PoseStamped | geometry.PoseWithCovarianceStamped,
+) -> tuple[Array, Array | None]:
     """Returns the pose (3,) of a message and its covariance (3, 3); None if it carries none."""
-    known = isinstance(message, PoseWithCovarianceStamped)
+    known = isinstance(message, geometry.PoseWithCovarianceStamped)
     covariance = np.reshape(message.pose.covariance, (6, 6))[PLANAR] if known else None
     return np.array(messages.pose_row(message)), covariance
 
 
-def pose_to_ros(pose: ArrayLike, time_ns: int, frame: str) -> PoseStamped:
+def pose_to_ros(pose: ArrayLike, time_ns: int, frame: str) -> geometry.PoseStamped:
     """Returns a pose (3,) in a frame as a PoseStamped."""
     x, y, heading = np.asarray(pose, np.float64).tolist()
-    message = PoseStamped()
+    message = geometry.PoseStamped()
     message.header.stamp, message.header.frame_id = stamp_to_ros(time_ns), frame
     message.pose.position.x, message.pose.position.y = x, y
     message.pose.orientation = heading_to_ros(heading)
