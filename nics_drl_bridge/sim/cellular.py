@@ -23,7 +23,6 @@ from nics_drl_bridge.sim.world import Goals, Obstacles, Starts, World
 MOST_CELLS = 10_000
 TRIES = 200  # fields drawn for one world, until there is a way through
 FILLED, EMPTIED = 5, 1  # at least, at most so many of a cell's 8 neighbours are filled
-KEPT = 2048  # worlds that are not grown again, as a training opens each of them several times
 FINE = 2  # points of the search for a way, along a cell
 
 
@@ -52,7 +51,7 @@ class Cellular(Schema):
         return self
 
 
-@lru_cache(KEPT)
+@lru_cache(2048)  # a training opens each of them several times
 def grow(given: Cellular, number: int) -> World:
     """Returns one of the worlds; the same for the same parameters. ConfigError if none has a way.
 
