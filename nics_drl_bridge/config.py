@@ -161,8 +161,9 @@ def share_folder() -> Path:
 
 
 def shipped_names(kind: str) -> list[str]:
-    """Names of the YAML files in `config/KIND`, sorted."""
-    return sorted(file.stem for file in (share_folder() / "config" / kind).glob("*.yaml"))
+    """Names of the YAML files, or policies, in `config/KIND`, sorted."""
+    files = (share_folder() / "config" / kind).glob("*.*")
+    return sorted(file.stem for file in files if file.suffix in (".yaml", ".onnx"))
 
 
 def find_config(name: str | Path, kind: str) -> Path:

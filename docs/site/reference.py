@@ -207,7 +207,7 @@ def command_section(path: str, command: Any) -> str:
     """What a command does, and a table of what it takes."""
     lines = [f"## {path}\n", inspect.cleandoc(command.help or "").replace("\b", ""), ""]
     lines += ["| argument | default | meaning |", "|---|---|---|"]
-    for one in command.params:
+    for one in (each for each in command.params if not getattr(each, "hidden", False)):
         if one.name == "help":
             continue
         names = [*one.opts, *one.secondary_opts] if one.param_type_name == "option" else [one.name]

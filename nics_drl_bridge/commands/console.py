@@ -30,7 +30,7 @@ def say(as_json: bool, line: str, **facts: Any) -> None:
     typer.echo(json_of(facts) if as_json else line)
 
 
-def completing(kind: str) -> Callable[[str], list[str]]:
+def completing(*kinds: str) -> Callable[[str], list[str]]:
     """Completion of a shell for an option that takes a name in `config/KIND`, or a path."""
 
     def complete(incomplete: str) -> list[str]:
@@ -38,37 +38,35 @@ def completing(kind: str) -> Callable[[str], list[str]]:
 
         places = (Path(one) for one in sorted(glob(f"{incomplete}*")))
         paths = [str(one) for one in places if one.is_dir() or one.suffix in (".yaml", ".onnx")]
-        return [name for name in shipped_names(kind) if name.startswith(incomplete)] + paths
+        names = (name for kind in kinds for name in shipped_names(kind))
+        return [name for name in names if name.startswith(incomplete)] + paths
 
     return complete
 
 
-RobotOption = Annotated[str, Option(
-    help="A shipped robot (see nics list robots) or a YAML file.",
-    autocompletion=completing("robots"))]  # fmt: skip
-LidarOption = Annotated[str | None, Option(
-    help="A shipped lidar or a YAML file; else the robot's own, or paper.",
-    autocompletion=completing("lidars"))]  # fmt: skip
-WorldOption = Annotated[str, Option(
-    "--world", "--scene", help="A shipped world (arena) or a YAML file.",
-    autocompletion=completing("worlds"))]  # fmt: skip
+ROBOTS, WORLDS = completing("robots"), completing("worlds", "world_sets")
+POLICIES = completing("policies")
+RobotOption = Annotated[str, Option(autocompletion=ROBOTS,
+    help="A shipped robot (see nics list robots) or a YAML file.")]  # fmt: skip
+LidarOption = Annotated[str | None, Option(autocompletion=completing("lidars"),
+    help="A shipped lidar or a YAML file; else the robot's own, or paper.")]  # fmt: skip
+WorldOption = Annotated[str, Option("--world", "--scene", autocompletion=WORLDS,
+    help="A shipped world (arena) or a YAML file.")]  # fmt: skip
 JsonOption = Annotated[bool, Option("--json", help="Print one JSON object instead.")]
 TopicsOption = Annotated[Path | None, Option(help="YAML file: a bag's topic for each role.")]
 SalvageOption = Annotated[
     bool, Option("--salvage", help="Take what is intact of a damaged bag, and tell the rest.")
 ]
-OtherLidarOption = Annotated[
-    str | None, Option(help="A shipped lidar (rplidar_a2) or a YAML file, instead of the model's.")
-]
-RandomisationOption = Annotated[
-    str | None, Option(help="Drawn in each episode: a shipped one (mild) or a YAML file.")
-]
+OtherLidarOption = Annotated[str | None, Option(autocompletion=completing("lidars"),
+    help="A shipped lidar (rplidar_a2) or a YAML file, instead of the model's.")]  # fmt: skip
+RandomisationOption = Annotated[str | None, Option(autocompletion=completing("randomisation"),
+    help="Drawn in each episode: a shipped one (mild) or a YAML file.")]  # fmt: skip
 TaskOption = Annotated[
     str | None, Option(help="path/to/file.py:ClassName, of a policy of a task of your own.")
 ]
 GateOption = Annotated[str | None, Option(
     metavar="LIMITS", help="Drive through the gate and its shield, with these limits: shipped ones "
-    "(differential) or a YAML file.")]  # fmt: skip
+    "(differential) or a YAML file.", autocompletion=completing("limits"))]  # fmt: skip
 TopicOption = Annotated[list[str] | None, Option(
     metavar="ROLE=TOPIC", help="Topic of one role, as cmd_vel=/car/drive; may be given several "
     "times. Roles: cmd_vel, pose, odom, joint_states, imu; none as a topic leaves a role out.")

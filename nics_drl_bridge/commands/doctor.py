@@ -17,9 +17,8 @@ EXIT_FINDINGS = 1
 
 def doctor(
     bag: Annotated[Path | None, Argument(help="A bag to look at; else the live robot.")] = None,
-    model: Annotated[str | None,
-        Option(help=f"What it must fit: a model's folder, or a shipped robot ({DEFAULT_ROBOT}).")] =
-        None,
+    model: Annotated[str | None, Option(autocompletion=console.ROBOTS,
+        help=f"What it must fit: a model's folder, or a shipped robot ({DEFAULT_ROBOT}).")] = None,
     policy: Annotated[str | None, Option(help="What it must fit instead: a policy file.")] = None,
     namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
     duration: Annotated[float, Option(min=1.0, help="How long to listen to a robot [s].")] = 5.0,

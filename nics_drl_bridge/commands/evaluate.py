@@ -15,14 +15,12 @@ from nics_drl_bridge.files import check_above, json_of, write_bytes, write_text
 def evaluate(
     policies: Annotated[list[str], Argument(
         metavar="POLICY...", help="Policy files, shipped policies (differential), or baselines "
-        "(dynamic_window, mppi, straight, random).")],
-    model: Annotated[str | None, Option(
-        "--model", "--robot", help="A model's folder, or a shipped robot; else the policy's own.",
-        autocompletion=console.completing("robots"))] = None,
+        "(dynamic_window, mppi, straight, random).", autocompletion=console.POLICIES)],
+    model: Annotated[str | None, Option("--model", "--robot", autocompletion=console.ROBOTS,
+        help="A model's folder, or a shipped robot; else the policy's own.")] = None,
     task: console.TaskOption = None,
-    world: Annotated[str, Option(
-        "--world", "--scene", help="A shipped world (circles) or a YAML file.",
-        autocompletion=console.completing("worlds"))] = "circles",
+    world: Annotated[str, Option("--world", "--scene", autocompletion=console.WORLDS,
+        help="A shipped world (circles) or a YAML file.")] = "circles",
     places: Annotated[list[str] | None, Option(
         "--in", help="fast, dds or mujoco_dds; several times; else all that work here.")] = None,
     episodes: Annotated[int | None, Option(min=1, help="How many; 20, or 1 on a vehicle.")] = None,

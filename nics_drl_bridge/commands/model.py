@@ -9,13 +9,6 @@ import typer
 from typer import Argument, Option
 
 from nics_drl_bridge.commands import console
-from nics_drl_bridge.commands.console import (
-    LidarOption,
-    RobotOption,
-    intact,
-    needs_ros,
-    one_sentence,
-)
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.files import json_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
@@ -27,7 +20,7 @@ if TYPE_CHECKING:
 
 def record(
     out: Annotated[Path, Option(help="An .npz file, or the folder of a rosbag2, to write.")],
-    robot: RobotOption = DEFAULT_ROBOT,
+    robot: console.RobotOption = DEFAULT_ROBOT,
     bound: Annotated[float, Option(help="Radius around the start to keep within [m].")] = 2.0,
     duration: Annotated[float, Option(help="Of the drive [s].")] = 60.0,
     speed: Annotated[float, Option(help="Share of the greatest speeds to use.")] = 1.0,
@@ -41,14 +34,16 @@ def record(
     yes: Annotated[bool, Option("--yes", help="Do not ask before the robot moves.")] = False,
 ) -> None:  # fmt: skip
     """Drives a robot so that it shows its whole motion; records it."""
-    with one_sentence():
+    with console.one_sentence():
         arguments = node_arguments(namespace, remap or ())
         given = {
             "robot": robot, "out": str(out), "bound": bound, "duration": duration, "speed": speed,
             "seed": seed, "topics": str(topics or ""), "use_sim_time": use_sim_time,
         } | ({} if stamped is None else {"stamped": stamped})  # fmt: skip
         if not preview:
-            with needs_ros("nics record"):  # first: with ROS 2 from wheels it restarts Python
+            with console.needs_ros(
+                "nics record"
+            ):  # first: with ROS 2 from wheels it restarts Python
                 from nics_drl_bridge.nodes.record_node import record as drive
         for line in preview_lines(given):
             typer.echo(line)
@@ -119,7 +114,7 @@ def inspect(
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Lists what a recording of any form holds and begins its mapping."""
-    with one_sentence():
+    with console.one_sentence():
         from nics_drl_bridge.files import write_text
         from nics_drl_bridge.recording.guess import NOT_USED, first_mapping
         from nics_drl_bridge.recording.readers import open_source
@@ -156,7 +151,7 @@ def import_(
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Keeps a recording of any form as an .npz, read by its mapping."""
-    with one_sentence():
+    with console.one_sentence():
         from nics_drl_bridge.recording.readers import read_recording
         from nics_drl_bridge.recording.recording import save_recording
         from nics_drl_bridge.recording.write import check_out
@@ -207,7 +202,7 @@ def generate(
     topics: console.TopicsOption = None,
     topic: console.TopicOption = None,
     world: console.WorldOption = "arena",
-    lidar: LidarOption = None,
+    lidar: console.LidarOption = None,
     sensor: Annotated[list[Path] | None,
         Option(help="YAML of a further sensor, docs/sensors.md; repeatable.")] = None,
     order: Annotated[str, Option(help="Order of the Taylor model, 1 to 4, or auto.")] = "auto",
@@ -222,7 +217,7 @@ def generate(
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Generates a simulator from a recording, and writes its folder."""
-    with one_sentence():
+    with console.one_sentence():
         from nics_drl_bridge.generator import check_place, lidar_of, save_model
         from nics_drl_bridge.generator import generate as generate_model
         from nics_drl_bridge.identify.fit import parse_alpha, parse_order
@@ -238,7 +233,10 @@ def generate(
             load_lidar(lidar)
         further = tuple(load_sensor(file) for file in sensor or ())
         shapes = load_world(world).shapes
-        with intact(recording, salvage) as whole, console.progress_bar(f"reading {recording}"):
+        with (
+            console.intact(recording, salvage) as whole,
+            console.progress_bar(f"reading {recording}"),
+        ):
             roles = topic_roles(topics, topic or ())
             spec, drive = robot_and_drive(whole, robot, roles, mapping)
         drive = replace(drive, source=str(recording))
@@ -279,10 +277,10 @@ def fit_facts(out: Path, robot: str, identified: "Identified") -> dict[str, Any]
 
 def drive(
     out: Annotated[Path | None, Option(help="The model's folder; the robot's name.")] = None,
-    robot: RobotOption = DEFAULT_ROBOT,
+    robot: console.RobotOption = DEFAULT_ROBOT,
     recording: Annotated[Path | None,
         Option(help="An .npz to keep the drive in, as one of a real robot.")] = None,
-    lidar: LidarOption = None,
+    lidar: console.LidarOption = None,
     duration: Annotated[float, Option(min=5.0, max=3600.0, help="Of the drive [s].")] = 60.0,
     seed: Annotated[int, Option(min=0, help="Of the commands, which are random.")] = 0,
     as_json: console.JsonOption = False,
@@ -291,7 +289,7 @@ def drive(
 
     For training before there is a recording; with one, `nics generate` makes a truer simulator.
     """
-    with one_sentence():
+    with console.one_sentence():
         import numpy as np
 
         from nics_drl_bridge.generator import check_place, generate, lidar_of, save_model
@@ -318,11 +316,12 @@ def drive(
 
 
 def urdf(
-    model: Annotated[str, Argument(help="A shipped robot, or the folder of a model.")],
+    model: Annotated[str, Argument(autocompletion=console.ROBOTS,
+        help="A shipped robot, or the folder of a model.")],
     out: Annotated[Path | None, Option(help="The file to write; <robot>.urdf.")] = None,
-) -> None:
+) -> None:  # fmt: skip
     """Writes a robot's URDF, for RViz and robot_state_publisher."""
-    with one_sentence():
+    with console.one_sentence():
         from nics_drl_bridge.files import write_text
         from nics_drl_bridge.generator import open_model
         from nics_drl_bridge.robot.urdf import urdf_of

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge.commands.console import JsonOption, one_sentence
+from nics_drl_bridge.commands.console import POLICIES, ROBOTS, JsonOption, one_sentence
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import json_of, write_bytes
 
@@ -21,8 +21,8 @@ def _group() -> None:
 
 @policy.command()
 def info(
-    file: Annotated[str,
-        Argument(help="A policy file, the name of a shipped one, or a foreign one's mapping.")],
+    file: Annotated[str, Argument(autocompletion=POLICIES,
+        help="A policy file, the name of a shipped one, or a foreign one's mapping.")],
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
     """Checks a policy file and tells what it was trained on and needs."""
@@ -37,7 +37,8 @@ def info(
 
 @policy.command()
 def export(
-    file: Annotated[str, Argument(help="A policy file, or the name of a shipped one.")],
+    file: Annotated[str, Argument(autocompletion=POLICIES,
+        help="A policy file, or the name of a shipped one.")],
     leapp: Annotated[Path, Option(help="Folder of the bundle: network, YAML file, start values.")],
 ) -> None:  # fmt: skip
     """Writes a policy file in a format of others: Isaac's LEAPP."""
@@ -53,7 +54,7 @@ def import_(
     source: Annotated[Path,
         Argument(help="A LEAPP bundle, or the mapping (YAML) of a foreign policy.")],
     out: Annotated[Path, Option("--out", "-o", help="The policy file to write (*.onnx).")],
-    robot: Annotated[str | None, Option("--robot", "--model",
+    robot: Annotated[str | None, Option("--robot", "--model", autocompletion=ROBOTS,
         help="A shipped robot, or the folder of a model.")] = None,
 ) -> None:  # fmt: skip
     """Makes a policy file of somebody else's policy."""

@@ -14,7 +14,7 @@ import typer
 from typer import Argument, Option
 
 from nics_drl_bridge import extensions
-from nics_drl_bridge.commands.console import JsonOption, completing, one_sentence, progress_bar
+from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.files import json_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
@@ -25,16 +25,14 @@ OWN = ("lean", "sb3")  # the engines of PPO in this process, see `training_setti
 def train(
     more_seeds: Annotated[list[int] | None, Argument(hidden=True)] = None,
     task: Annotated[str, Option(help="A task, or path/to/file.py:ClassName.")] = "navigation",
-    robot: Annotated[str | None,
-        Option(help=f"A shipped robot ({DEFAULT_ROBOT}), a YAML file, or the folder of a model.",
-        autocompletion=completing("robots"))] = None,
+    robot: Annotated[str | None, Option(autocompletion=console.ROBOTS,
+        help=f"A shipped robot ({DEFAULT_ROBOT}), a YAML file, or the folder of a model.")] = None,
     settings: Annotated[str | None,
         Option(help="Shipped settings (navigation_differential), or a YAML file; else those of the "
         "robot, or of the shipped robot that moves like it.",
-        autocompletion=completing("training"))] = None,
-    world: Annotated[list[str] | None,
-        Option(help="Train in this world only; several times: in all of them.",
-        autocompletion=completing("worlds"))] = None,
+        autocompletion=console.completing("training"))] = None,
+    world: Annotated[list[str] | None, Option(autocompletion=console.WORLDS,
+        help="Train in this world only; several times: in all of them.")] = None,
     algorithm: Annotated[str | None, Option(help="ppo or sac.")] = None,
     seeds: Annotated[list[int] | None, Option(help="One or more, as --seeds 0 1 2.")] = None,
     steps: Annotated[int | None, Option(min=1, help="Environment steps.")] = None,
@@ -47,12 +45,12 @@ def train(
         Option(help="Ray cluster: auto (this machine's), HOST:PORT; else started here.")] = None,
     env_runners: Annotated[int | None, Option(min=1,
         help="Ray processes that share the worlds; default: one per CPU.")] = None,
-    as_json: JsonOption = False,
+    as_json: console.JsonOption = False,
     watch: Annotated[bool, Option("--watch",
         help="Show some of the worlds on a page, as nics watch does.")] = False,
 ) -> None:  # fmt: skip
     """Trains policies in the fast simulator, and evaluates them."""
-    with one_sentence():
+    with console.one_sentence():
         given = {"robot": robot, "algorithm": algorithm, "steps": steps, "world": world}
         given["engine"] = engine if engine in OWN else None
         named = {name: value for name, value in given.items() if value}
@@ -65,7 +63,7 @@ def train(
             reason = "worlds of other processes are not shown; leave out --watch, or --engine"
             raise ConfigError(f"--watch --engine {engine}: {reason}.")
         extensions.require("training", *extensions.TRAINING)
-        with progress_bar("loading PyTorch"):
+        with console.progress_bar("loading PyTorch"):
             from nics_drl_bridge.policy import train as train_run
 
         resumed = train_run.settings_of(out) if resume and out is not None else None
@@ -155,7 +153,7 @@ def _run(
         for world, summary in result.summaries.items():
             typer.echo(f"  {world}: {train_run.line_of(summary)}")
 
-    with progress_bar("starting the worlds") as tell:
+    with console.progress_bar("starting the worlds") as tell:
 
         def evaluating(world: str) -> None:
             tell(f"evaluating in {world}", 0, 0)

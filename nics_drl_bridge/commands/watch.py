@@ -17,13 +17,12 @@ from nics_drl_bridge.robot import DEFAULT_ROBOT
 def watch(
     policy: Annotated[str | None, Argument(
         help=f"A policy file, a shipped policy ({DEFAULT_ROBOT}, the default) or a baseline "
-        "(dynamic_window).")] = None,
-    model: Annotated[str | None, Option(
-        "--model", "--robot", help="A model's folder, or a shipped robot; else the policy's own.")
-    ] = None,
+        "(dynamic_window).", autocompletion=console.POLICIES)] = None,
+    model: Annotated[str | None, Option("--model", "--robot", autocompletion=console.ROBOTS,
+        help="A model's folder, or a shipped robot; else the policy's own.")] = None,
     world: Annotated[list[str] | None, Option(
         "--world", "--scene", help="A shipped world (circles) or a YAML file; several times: side "
-        "by side.")] = None,
+        "by side.", autocompletion=console.WORLDS)] = None,
     seed: Annotated[int, Option(min=0, help="Of the first episode.")] = 1_000_000,
     lidar: console.OtherLidarOption = None,
     randomisation: console.RandomisationOption = None,

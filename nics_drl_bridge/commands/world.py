@@ -26,6 +26,9 @@ CLEARANCE = 0.1  # default [m]: fields of others are often narrow
 NEAREST = 2.0  # default of the least distance from start to goal [m]
 NAV2 = {"origin": [0.0, 0.0, 0.0], "negate": 0, "occupied_thresh": 0.65, "free_thresh": 0.25}
 Keys = dict[str, Any]  # of a YAML file
+Shown = Annotated[str, Argument(
+    metavar="WORLD", help="A shipped one, a YAML file, or a set.", autocompletion=console.WORLDS
+)]  # fmt: skip
 
 
 class Written(NamedTuple):
@@ -192,10 +195,10 @@ def _flow(value: Any) -> str:
 
 @world.command()
 def draw(
-    name: Annotated[str, Argument(metavar="WORLD", help="A shipped one, a YAML file, or a set.")],
+    name: Shown,
     out: Annotated[Path | None, Option(help="The .png to write; <world>.png.")] = None,
     seed: Annotated[int, Option(min=0, help="Of the episode.")] = 0,
-    robot: Annotated[str, Option(help="A shipped robot or a YAML file.")] = DEFAULT_ROBOT,
+    robot: console.RobotOption = DEFAULT_ROBOT,
     footprint: Annotated[float | None, Option(help="Instead: radius of a round robot [m].")] = None,
     as_json: console.JsonOption = False,
 ) -> None:
@@ -226,10 +229,10 @@ def draw(
 
 @world.command("map")
 def map_(
-    name: Annotated[str, Argument(metavar="WORLD", help="A shipped one, a YAML file, or a set.")],
+    name: Shown,
     out: Annotated[Path | None, Option(help="The .yaml to write; <world>_map.yaml.")] = None,
     seed: Annotated[int, Option(min=0, help="Of the episode.")] = 0,
-    robot: Annotated[str, Option(help="A shipped robot or a YAML file.")] = DEFAULT_ROBOT,
+    robot: console.RobotOption = DEFAULT_ROBOT,
     resolution: Annotated[float, Option(help="Greatest side of a cell [m].")] = 0.01,
     as_json: console.JsonOption = False,
 ) -> None:

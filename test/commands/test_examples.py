@@ -60,3 +60,15 @@ def test_options_complete_to_what_is_shipped_and_to_files(tmp_path, monkeypatch)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "diff_mine.yaml").write_text("")
     assert completing("robots")("diff") == ["differential", "diff_mine.yaml"]
+    assert completing("policies")("diff") == ["differential", "diff_mine.yaml"]
+    assert {"cellular", "circles"} <= set(completing("worlds", "world_sets")("c"))
+
+
+def test_every_option_that_takes_a_shipped_name_completes():
+    lacking = [
+        f"{' '.join(words)} {one.name}"
+        for words, command in KNOWN.items()
+        for one in command.params
+        if "shipped" in (getattr(one, "help", "") or "") and one._custom_shell_complete is None
+    ]
+    assert lacking == []

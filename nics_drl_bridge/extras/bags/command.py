@@ -76,8 +76,8 @@ def replay(
         help="Wait after each message till this node has it.")] = None,
     estimate: Annotated[bool, Option("--estimate",
         help="Run the middleware on it in process instead.")] = False,
-    model: Annotated[str, Option(help="For --estimate: folder of a model, or a shipped robot.")] =
-        DEFAULT_ROBOT,
+    model: Annotated[str, Option(autocompletion=console.ROBOTS,
+        help="For --estimate: folder of a model, or a shipped robot.")] = DEFAULT_ROBOT,
     topic: Annotated[list[str] | None, Option(metavar="ROLE=TOPIC",
         help="For --estimate: as odom=/wheel_odom. Roles: scan, odom, cmd_vel, pose, imu.")] = None,
     out: Annotated[Path | None, Option(help="For --estimate: .npz or .csv to write.")] = None,
@@ -113,8 +113,8 @@ def export(
     mcap: Annotated[Path | None, Option(metavar="FOLDER",
         help="Write a bag in MCAP, as Foxglove opens it.")] = None,
     model: Annotated[str | None,
-        Option(help="A model's folder, or a shipped robot: its commands, its lidar and its mount.")]
-        = None,
+        Option(help="A model's folder, or a shipped robot: its commands, its lidar and its mount.",
+        autocompletion=console.ROBOTS)] = None,
     topic: Annotated[list[str] | None, Option(metavar="ROLE=TOPIC",
         help="As odom=/car/odom. Roles: scan, odom, cmd_vel, pose.")] = None,
     fps: Annotated[int | None, Option(min=1,
