@@ -58,6 +58,14 @@ def test_the_same_episodes_are_driven_in_three_worlds(tmp_path):
     assert "dynamic_window: success in process " in done.stdout.splitlines()[-2]
 
 
+def test_an_evaluation_in_the_folder_of_another_says_that_it_replaces_it(tmp_path):
+    words = ("evaluate", "straight", "--in", "fast", "--episodes", "1", "--world", "empty")
+    first, second = (nics(*words, "--out", "out", cwd=tmp_path) for _ in range(2))
+    assert (first.returncode, second.returncode) == (0, 0)
+    assert "replacing" not in first.stderr
+    assert "out: replacing the evaluation that is there" in second.stderr
+
+
 @pytest.mark.ros
 @pytest.mark.process
 @pytest.mark.slow

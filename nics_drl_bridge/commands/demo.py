@@ -28,6 +28,8 @@ def demo(
     with console.one_sentence():
         from nics_drl_bridge.commands.demo_run import DemoPlan, run
 
+        if (out / "report.html").exists():
+            typer.echo(f"{out}: replacing the report that is there", err=True)
         plan = DemoPlan(out, robot, world, recording, episodes, policy, train_steps)
         line = run(plan, partial(typer.echo, err=as_json))
         console.say(as_json, line, told=line, report=str(out / "report.html"))

@@ -71,6 +71,8 @@ def evaluate(
         order = driving.EvaluationOrder(
             policies, out, model, world, count, seed, tuple(dict.fromkeys(places or ())), under
         )
+        if (out / driving.EVALUATION).exists():
+            tell(f"{out}: replacing the evaluation that is there")
         if hardware:
             options = {"start": start, "namespace": namespace, "pose_type": pose_type}
             with console.needs_ros("nics evaluate --hardware"):

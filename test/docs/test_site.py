@@ -78,6 +78,15 @@ def test_the_site_asks_for_nothing_outside(site):
         assert not asked.search(text), page
 
 
+@pytest.mark.process
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_every_page_is_in_the_index_that_the_site_searches_by_itself(site):
+    index = (site / "search" / "search_index.js").read_text(encoding="utf-8")
+    for page in (ROOT / "docs").glob("*.md"):
+        assert page.stem == "index" or f'"{page.stem}.html' in index, page.name
+
+
 class Quiet(SimpleHTTPRequestHandler):
     """Serves files without a word."""
 
