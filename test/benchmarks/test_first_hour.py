@@ -1,0 +1,56 @@
+"""The roads of a newcomer, by the commands of the pages."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+import pytest
+from PIL import Image
+
+from .runs import BENCHMARKS, fails
+
+SCRIPT = "first_hour.py"
+GOOD = {
+    "seconds": {"picture": 100.0, "robot": 300.0, "recording": 60.0, "task": 200.0},
+    "success": {"robot": 0.95, "task": 0.9},
+    "moved_pixels": 200,
+    "report_bytes": 9000,
+}
+
+
+@pytest.fixture
+def first_hour(monkeypatch):
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    return import_module("first_hour")
+
+
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        ({}, None),
+        ({"seconds": {"picture": 200.0}}, "picture: took 200 s"),
+        ({"success": {"robot": 0.88}}, "robot: success 88.0%"),
+        ({"moved_pixels": 3}, "picture: 3 pixels differ"),
+        ({"report_bytes": 0}, "recording: there is no report"),
+    ],
+)
+def test_each_bar_can_be_missed(first_hour, changed, sentence):
+    missed = first_hour.missed_of(GOOD | changed)
+    assert [line[: len(sentence)] for line in missed] == ([] if sentence is None else [sentence])
+
+
+def test_a_picture_moves_if_its_ends_differ(first_hour, tmp_path):
+    still, shifted = (Image.new("RGB", (100, 80), "white") for _ in range(2))
+    still.paste("black", (10, 10, 20, 20))
+    shifted.paste("black", (60, 30, 70, 40))
+    for name, last, extent in (("moving.gif", shifted, 60), ("still.gif", still.copy(), 0)):
+        still.save(tmp_path / name, save_all=True, append_images=[shifted, last])
+        assert first_hour.moved(tmp_path / name) == extent
+
+
+@pytest.mark.process
+@pytest.mark.campaign
+@pytest.mark.timeout(3600)
+def test_a_policy_that_has_not_learnt_does_not_get_there():
+    missed = fails(SCRIPT, "untrained", "--roads", "robot", timeout_s=3000.0)
+    assert missed[0].startswith("robot: success")
