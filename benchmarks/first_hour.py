@@ -24,7 +24,7 @@ CONTROLS = {"untrained": "the learning: a policy is trained for 2,048 steps"}
 BARS = {"picture": 180.0, "robot": 600.0, "recording": 600.0, "task": 600.0}
 """Longest time [s], the set-up included in that of the picture; typing has 5 minutes more."""
 SUCCESS, MOVED = {"robot": 0.9, "task": 0.5}, 20
-"""Least success, and least extent of what differs between the first picture and the last [pixels]."""
+"""Least success, and least extent of what differs between first and last picture [pixels]."""
 BURGER = """name: my_robot
 kind: differential
 footprint: [[0.04, 0.1], [-0.1, 0.1], [-0.1, -0.1], [0.04, -0.1]]
