@@ -77,6 +77,23 @@ def test_a_goal_by_topic_is_driven_to_and_stopped_at(driving):
     assert [raw.twist for raw in said["cmd_vel_raw"][known:]] == [Twist()] * 10
 
 
+def test_a_goal_in_the_robots_frame_lies_ahead_of_it_and_one_in_no_known_frame_is_refused(driving):
+    peer, said, goals, policy = driving
+    before = conversions.odometry_from_ros(said["ground_truth"][-1])[0]
+    ahead = PoseStamped()
+    ahead.header.frame_id, ahead.pose.position.x = "car", 1.2
+    goals.publish(ahead)
+    peer.until(lambda: speed(said) > 0.1, "driving")
+    ahead.header.frame_id = "kitchen"
+    goals.publish(ahead)
+    peer.until(lambda: "'kitchen' is refused" in policy.log.read_text(), "a refusal")
+    assert "The goal before it stays" in policy.log.read_text()
+    peer.until(lambda: speed(said) == 0.0, "a stop")
+    truth = conversions.odometry_from_ros(said["ground_truth"][-1])[0]
+    wanted = before[:2] + 1.2 * np.array([math.cos(before[2]), math.sin(before[2])])
+    assert math.dist(truth[:2], wanted) < 0.5
+
+
 def test_a_goal_that_is_no_number_stops_it_and_the_next_one_moves_it(driving):
     peer, said, goals, _ = driving
     goal = PoseStamped()
