@@ -225,5 +225,5 @@ def test_a_lidar_with_a_blind_side_fills_the_sectors_that_it_sees():
     spec = load_lidar("sick_tim571")
     plan = plan_of(spec, LAYOUTS["front"])
     assert plan.hits.min() >= 1
-    with pytest.raises(ConfigError, match="looks from -135 to 135 deg"):
+    with pytest.raises(ConfigError, match=r"looks from -135 to 135 deg.*say `scan: front`"):
         plan_of(spec, LAYOUTS["around"])

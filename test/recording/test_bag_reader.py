@@ -175,6 +175,14 @@ def test_a_quaternion_that_is_none_is_named(tmp_path, length):
     assert "message 3: the quaternion has the length" in refused(tmp_path, topics)
 
 
+def test_quaternions_with_w_first_are_suspected_as_such(tmp_path):
+    topics = bags.drive()
+    for _, message in topics["/pose"]:
+        now = message.pose.orientation
+        now.x, now.y, now.z, now.w = now.w, now.x, now.y, now.z
+    assert "look like w, x, y, z of a level body" in refused(tmp_path, topics)
+
+
 def test_a_topic_of_a_type_that_nobody_knows_is_left_alone(tmp_path):
     bag = tmp_path / "bag"
     with bags.Writer(bag, version=9, storage_plugin=bags.StoragePlugin.MCAP) as writer:
