@@ -228,7 +228,9 @@ def run(
     }
     if not case.is_usual:
         ours["usual"] = Worlds(worlds, 1, USUAL)
-        ours["clean"] = Worlds(worlds, 1, replace(case, clean=True, control=None))
+    if case.lidar is not None:
+        same = None if case.control == "slow" else case.control
+        ours["clean"] = Worlds(worlds, 1, replace(case, clean=True, control=same))
     yardsticks = {
         "write": write_chunk(worlds, case.model.lidar.beams),
         "cartpole": cartpole_chunk(),
@@ -263,6 +265,7 @@ def run(
     }
     if not case.is_usual:
         result["share_of_usual"] = rate["one"] / rate["usual"]
+    if case.lidar is not None:
         result["times_as_long_as_clean"] = rate["clean"] / rate["one"]
     return result, found
 
@@ -317,6 +320,7 @@ def table_of(result: dict[str, Any]) -> str:
         text += f"{name}: {reason}\n"
     if "share_of_usual" in result:
         text += row.format("share of the usual env's rate", f"{result['share_of_usual']:.3g}")
+    if "times_as_long_as_clean" in result:
         clean = result["times_as_long_as_clean"]
         text += row.format("times as long as without the lidar's faults", f"{clean:.3g}")
     return text + f"memory: {result['memory_bytes_per_env'] / 1e3:.1f} kB per world\n"

@@ -1,4 +1,4 @@
-"""How far does a newcomer come within the first hour, from a clean clone and a fresh environment?
+"""How far does a newcomer get within the first hour, from a clean clone and a fresh environment?
 
 `make setup` in a clone, then four roads, each in a folder of its own, by the commands of the pages:
 a picture of a robot that moves; a robot of one's own, a TurtleBot3 Burger by its YAML file, to a
@@ -22,7 +22,8 @@ from PIL import Image, ImageChops
 
 CONTROLS = {"untrained": "the learning: a policy is trained for 2,048 steps"}
 BARS = {"picture": 180.0, "robot": 600.0, "recording": 600.0, "task": 600.0}
-"""Longest time [s], the set-up included in that of the picture; typing has 5 minutes more."""
+"""Longest time [s], the set-up included in that of the picture; a reader may type for 5 minutes
+on top of that of the robot."""
 SUCCESS, MOVED = {"robot": 0.9, "task": 0.5}, 20
 """Least success, and least extent of what differs between first and last picture [pixels]."""
 BURGER = """name: my_robot
@@ -44,7 +45,7 @@ ROADS = {
     ),
     "recording": (
         "nics drive --robot my_robot.yaml --recording drive.npz --out textbook",
-        "nics inspect drive.npz --robot my_robot.yaml",
+        "nics inspect drive.npz",
         "nics generate drive.npz --robot my_robot.yaml --world arena --out my_robot",
     ),
     "task": (

@@ -55,13 +55,14 @@ def simulator(domain_id: int, folder: Path, namespace: str, mode: str) -> Iterat
 
 def conformance(domain_id: int, folder: Path, control: str | None) -> dict[str, Any]:
     """How many features are announced, and the sentences about those that fail."""
-    from measuring.conformance import Client, Idle, announced, failures
+    from measuring.conformance import Client, announced, failures
 
     namespace = f"conformance_{os.getpid()}"
     with simulator(domain_id, folder / "conformance", namespace, "realtime"):
-        client = (Idle if control == "idle" else Client)(domain_id, f"/{namespace}")
+        client = Client(domain_id, f"/{namespace}")
         try:
             told = announced(client)
+            client.idle = control == "idle"
             claimed = told | {CLAIMED} if control == "claims" else told
             failed = failures(client, "empty", claimed)
         finally:
@@ -143,10 +144,10 @@ def leapp(folder: Path, control: str | None) -> dict[str, float]:
             "linear_velocity": np.concatenate([velocity[:2], zero]),
             "angular_velocity": np.concatenate([zero, zero, velocity[2:]]),
         }  # fmt: skip
+        if control == "coarse":
+            pieces = {name: each.round(2) for name, each in pieces.items()}
         given = {
-            f"policy/{name}": torch.as_tensor(
-                each.round(2 if control == "coarse" else 9).astype(np.float32)[None]
-            )
+            f"policy/{name}": torch.as_tensor(each.astype(np.float32)[None])
             for name, each in pieces.items()
         }
         theirs = manager(given)

@@ -62,8 +62,8 @@ def test_an_evaluation_in_the_folder_of_another_says_that_it_replaces_it(tmp_pat
     words = ("evaluate", "straight", "--in", "fast", "--episodes", "1", "--world", "empty")
     first, second = (nics(*words, "--out", "out", cwd=tmp_path) for _ in range(2))
     assert (first.returncode, second.returncode) == (0, 0)
-    assert "replacing" not in first.stderr
-    assert "out: replacing the evaluation that is there" in second.stderr
+    assert "replaced" not in first.stderr
+    assert "out: the evaluation that is there will be replaced" in second.stderr
 
 
 @pytest.mark.ros

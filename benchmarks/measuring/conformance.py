@@ -27,12 +27,16 @@ FAILED, NOT_FOUND = msg.Result.RESULT_OPERATION_FAILED, msg.Result.RESULT_NOT_FO
 STATES = msg.SimulationState
 SHAPE = "kind: circle\nradius: 0.15\n"
 WORLD = "name: text\nsize: [5.0, 4.0]\ngoal_distance: [1.0, 3.0]\n"
+PATIENCE_S, IDLE_S = 300.0, 10.0
 
 
 class Client:
-    """Calls the services of a simulator, as anybody's client would."""
+    """Calls the services of a simulator, as anybody's client would.
 
-    patience_s = 300.0
+    One that is `idle` takes all that it asks for as done, while nothing is.
+    """
+
+    idle = False
 
     def __init__(self, domain_id: int | None = None, prefix: str = "") -> None:
         self.context = open_context(domain_id=domain_id)
@@ -47,10 +51,11 @@ class Client:
 
     def until(self, holds: Callable[[], Any], what: str) -> None:
         """Spins until a condition holds. Raises TimeoutError."""
-        deadline = time.monotonic() + self.patience_s
+        patience_s = IDLE_S if self.idle else PATIENCE_S
+        deadline = time.monotonic() + patience_s
         while not holds():
             if time.monotonic() > deadline:
-                raise TimeoutError(f"not within {self.patience_s:g} s: {what}")
+                raise TimeoutError(f"not within {patience_s:g} s: {what}")
             self._executor.spin_once(timeout_sec=0.05)
 
     def wait(self, future: Any, what: str) -> Any:
@@ -61,6 +66,8 @@ class Client:
     def __call__(self, name: str, /, **fields: Any) -> Any:
         """Returns the response of a service, by the name of its type."""
         kind = getattr(srv, name)
+        if self.idle and not name.startswith("Get"):
+            return kind.Response(result=msg.Result(result=OK))
         if name not in self._clients:
             topic = f"{self._prefix}{snake_case(name)}"
             self._clients[name] = self.node.create_client(kind, topic)
@@ -115,18 +122,6 @@ class Client:
         self._executor.shutdown(timeout_sec=1.0)
         self.node.destroy_node()
         self.context.try_shutdown()
-
-
-class Idle(Client):
-    """A client to which everything is done that it asks for, while nothing is."""
-
-    patience_s = 5.0
-
-    def __call__(self, name: str, /, **fields: Any) -> Any:
-        """Returns the response of a service that only tells, and of any other that all is well."""
-        if name.startswith("Get"):
-            return super().__call__(name, **fields)
-        return getattr(srv, name).Response(result=msg.Result(result=OK))
 
 
 def category(name: str) -> Any:

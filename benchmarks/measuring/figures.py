@@ -72,7 +72,7 @@ README = told(
         "env_throughput_lidar",
         "the same on one thread with a Hokuyo UST-10LX: 1,081 beams up to 10 m, noise, millimetres",
         "{single_thread_env_steps_per_s|.1e}, {share_of_usual|.0%} of the 720 beams' in that run; "
-        "{times_as_long_as_clean|.2f} times as long as without its noise",
+        "{times_as_long_as_clean|.2f} times as long as without its faults",
     ),
     (
         "env_throughput_obstacles",
@@ -202,7 +202,8 @@ THROUGHPUT = Table(
     ),
 )  # fmt: skip
 REAL_LIDARS = Table(
-    ("lidar", "env steps per second, one thread", "of the usual env's", "times as long as clean"),
+    ("lidar", "env steps per second, one thread", "of the usual env's",
+     "step time, of a copy without faults"),
     tuple(
         (f"env_throughput_{run}", title, "{single_thread_env_steps_per_s|.1e}",
          "{share_of_usual|.0%}", "{times_as_long_as_clean|.2f}")

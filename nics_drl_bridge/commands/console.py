@@ -17,6 +17,7 @@ from typer import Option
 from nics_drl_bridge import extensions
 from nics_drl_bridge.errors import MISSING_ROS, BridgeError, ConfigError, nearest
 from nics_drl_bridge.files import json_of
+from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
@@ -30,7 +31,7 @@ def say(as_json: bool, line: str, **facts: Any) -> None:
     typer.echo(json_of(facts) if as_json else line)
 
 
-def completing(*kinds: str) -> Callable[[str], list[str]]:
+def completing(*kinds: str, also: Sequence[str] = ()) -> Callable[[str], list[str]]:
     """Completion of a shell for an option that takes a name in `config/KIND`, or a path."""
 
     def complete(incomplete: str) -> list[str]:
@@ -38,16 +39,18 @@ def completing(*kinds: str) -> Callable[[str], list[str]]:
 
         places = (Path(one) for one in sorted(glob(f"{incomplete}*")))
         paths = [str(one) for one in places if one.is_dir() or one.suffix in (".yaml", ".onnx")]
-        names = (name for kind in kinds for name in shipped_names(kind))
+        names = (*(name for kind in kinds for name in shipped_names(kind)), *also)
         return [name for name in names if name.startswith(incomplete)] + paths
 
     return complete
 
 
-ROBOTS, WORLDS = completing("robots"), completing("worlds", "world_sets")
-POLICIES = completing("policies")
+ROBOTS, WORLDS = completing("robots"), completing("worlds", "world_sets", also=("barn",))
+POLICIES = completing("policies", also=("dynamic_window", "mppi", "random", "straight"))
 RobotOption = Annotated[str, Option(autocompletion=ROBOTS,
     help="A shipped robot (see nics list robots) or a YAML file.")]  # fmt: skip
+DrivenRobotOption = Annotated[str | None, Option(autocompletion=ROBOTS,
+    help=f"Shipped, or a YAML file; else the recording's own, or {DEFAULT_ROBOT}.")]  # fmt: skip
 LidarOption = Annotated[str | None, Option(autocompletion=completing("lidars"),
     help="A shipped lidar or a YAML file; else the robot's own, or paper.")]  # fmt: skip
 WorldOption = Annotated[str, Option("--world", "--scene", autocompletion=WORLDS,

@@ -8,15 +8,12 @@ import typer
 from typer import Option
 
 from nics_drl_bridge.commands import console
-from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 
 def demo(
     recording: Annotated[Path | None, Option(help="A drive; by default a textbook one.")] = None,
     out: Annotated[Path, Option(help="Folder for everything the demo writes.")] = Path("runs/demo"),
-    robot: Annotated[str | None,
-        Option(help=f"Shipped, or a YAML file; else the recording's own, or {DEFAULT_ROBOT}.")] =
-        None,
+    robot: console.DrivenRobotOption = None,
     world: console.WorldOption = "arena",
     episodes: Annotated[int, Option(min=1, help="How many, in process and again over DDS.")] = 5,
     policy: Annotated[str | None, Option(autocompletion=console.POLICIES,
@@ -29,7 +26,7 @@ def demo(
         from nics_drl_bridge.commands.demo_run import DemoPlan, run
 
         if (out / "report.html").exists():
-            typer.echo(f"{out}: replacing the report that is there", err=True)
+            typer.echo(f"{out}: the report that is there will be replaced", err=True)
         plan = DemoPlan(out, robot, world, recording, episodes, policy, train_steps)
         line = run(plan, partial(typer.echo, err=as_json))
         console.say(as_json, line, told=line, report=str(out / "report.html"))

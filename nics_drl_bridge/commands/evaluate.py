@@ -72,7 +72,7 @@ def evaluate(
             policies, out, model, world, count, seed, tuple(dict.fromkeys(places or ())), under
         )
         if (out / driving.EVALUATION).exists():
-            tell(f"{out}: replacing the evaluation that is there")
+            tell(f"{out}: the evaluation that is there will be replaced")
         if hardware:
             options = {"start": start, "namespace": namespace, "pose_type": pose_type}
             with console.needs_ros("nics evaluate --hardware"):

@@ -194,9 +194,7 @@ def stream_facts(drive: "Recording") -> list[dict[str, Any]]:
 def generate(
     recording: Annotated[Path, Argument(help="A bag, an .npz recording, or tables with a --map.")],
     out: Annotated[Path, Option(help="Folder of the model to write.")],
-    robot: Annotated[str | None,
-        Option(help=f"Shipped, or a YAML file; else the recording's own, or {DEFAULT_ROBOT}.")] =
-        None,
+    robot: console.DrivenRobotOption = None,
     mapping: Annotated[Path | None, Option("--map",
         help="YAML: what is what in the recording, docs/recordings.md.")] = None,
     topics: console.TopicsOption = None,

@@ -15,13 +15,13 @@ from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy.contract import GOLDEN, SUFFIX, contract_of, golden_observations
-from nics_drl_bridge.policy.train_memory import Memory
 
 with extensions.needed_by("the export of a policy"):
     import onnx
     import torch
 
     from nics_drl_bridge.policy import onnx_graph, policy_file
+    from nics_drl_bridge.policy.train_memory import Memory
 
 Rows = NDArray[np.float32]
 Normaliser = tuple[ArrayLike, ArrayLike, float]

@@ -46,6 +46,8 @@ class Cellular(Schema):
             raise ValueError(f"columns times rows may be {MOST_CELLS}")
         if not 0.0 <= self.fill[0] <= self.fill[1] < 1.0:
             raise ValueError("fill must be [least, greatest], from 0 to below 1")
+        if self.passage > self.margin:
+            raise ValueError("passage may be as wide as margin, in whose middle the robot starts")
         if not 0 <= self.smoothing[0] <= self.smoothing[1] <= 100:
             raise ValueError("smoothing must be [least, greatest], from 0 to 100")
         return self

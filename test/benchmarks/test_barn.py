@@ -131,6 +131,15 @@ def test_each_bar_can_be_missed_in_each_place(barn):
         for name, value in zip(good, bad, strict=True):
             said = barn.missed(place, good | {name: value}, "jackal")
             assert bool(said) == (name in bars)
+    for seconds, told in ((599.0, 0), (601.0, 1), (float("nan"), 1)):
+        assert len(barn.missed("fast", good, "jackal", seconds)) == told
+
+
+@pytest.mark.parametrize("text", ["world,x_m\n1,2.0\n", "world,x_m,y_m\n1,2.0,near\n"])
+def test_a_table_of_cylinders_that_lacks_numbers_is_refused(barn, tmp_path, text):
+    (tmp_path / "cylinders.csv").write_text(text)
+    with pytest.raises(ConfigError, match=r"cylinders\.csv: line 2 lacks numbers in the columns"):
+        barn.courses(tmp_path)
 
 
 def test_settings_whose_worlds_no_fold_could_leave_out_are_refused(barn):

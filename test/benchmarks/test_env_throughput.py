@@ -147,7 +147,8 @@ def test_another_case_is_told_beside_the_usual_one_and_one_that_is_slow_misses_i
     _, found = asked(SCRIPT, *FEW, *option)
     assert found["share_of_usual"] > 0.0
     assert "usual" in found["drove"]
-    assert not [line for line in found["failures"] if not line.startswith("share_of_")]
+    speed = "share_of_", "times_as_long_as_clean"
+    assert not [line for line in found["failures"] if not line.startswith(speed)]
     missed = fails(SCRIPT, "slow", *FEW, *option)
     assert any(line.startswith("share_of_usual: ") for line in missed), missed
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shlex
 from importlib import import_module
 
 import pytest
+from docs.test_pages import check_options
 from PIL import Image
 
 from .runs import BENCHMARKS, fails
@@ -46,6 +48,12 @@ def test_a_picture_moves_if_its_ends_differ(first_hour, tmp_path):
     for name, last, extent in (("moving.gif", shifted, 60), ("still.gif", still.copy(), 0)):
         still.save(tmp_path / name, save_all=True, append_images=[shifted, last])
         assert first_hour.moved(tmp_path / name) == extent
+
+
+def test_every_command_and_option_of_a_road_exists(first_hour):
+    for lines in first_hour.ROADS.values():
+        for line in lines:
+            check_options(shlex.split(line)[1:])
 
 
 @pytest.mark.process

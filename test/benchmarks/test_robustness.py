@@ -80,6 +80,12 @@ def test_the_ranges_are_those_of_the_training_of_each_policy(robustness):
     assert robustness.declared(MILD)["noise"] == "20 mm on each range"
 
 
+def test_time_constants_are_longer_even_where_no_training_drew_them(robustness):
+    for times, slow in ((1.0, 1.25), (2.0, 1.5)):
+        assert robustness.ranges(MILD, "response", times).kinematics.response == (slow, slow)
+    assert robustness.declared(MILD)["response"].startswith("time constants x 1.25")
+
+
 def test_a_lidar_keeps_the_noise_that_it_has_anyway(robustness):
     assert robustness.ranges(MILD, "noise", 1.0, 0.03).lidar.noise_std == (0.03, 0.03)
 
@@ -113,6 +119,7 @@ def test_it_draws_its_curves_and_prints_one_json_object(tmp_path):
     code, told = asked("robustness.py", *ONE, "--picture", str(picture), "--only", "drop-out")
     assert set(told["success"]["differential"]) == {"drop-out"}
     assert len(told["success"]["differential"]["drop-out"]) == len(told["multiples"]) == 4
+    assert len(told["believed"]["differential"]["drop-out"]) == 4
     assert set(told["declared"]["differential"]) == set(NAMES)
     assert code == bool(told["failures"])
     assert picture.read_bytes().startswith(b"\x89PNG")

@@ -1,13 +1,16 @@
 from __future__ import annotations
 
 import shlex
+from string import ascii_lowercase
 
 import pytest
 import typer
 from command_line import nics
 
+from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands.cli import app
 from nics_drl_bridge.commands.examples import EXAMPLES
+from nics_drl_bridge.policy import policies
 
 
 def commands(group, before=()):
@@ -55,13 +58,13 @@ def test_units_survive_in_the_heads_of_tables(tmp_path):
 
 
 def test_options_complete_to_what_is_shipped_and_to_files(tmp_path, monkeypatch):
-    from nics_drl_bridge.commands.console import completing
-
     monkeypatch.chdir(tmp_path)
+    assert {"cellular", "circles"} <= set(console.WORLDS("c"))
+    assert console.WORLDS("barn") == ["barn"]
+    offered = {each for letter in ascii_lowercase for each in console.POLICIES(letter)}
+    assert offered == {*policies.POLICIES, *policies.shipped_policies()}
     (tmp_path / "diff_mine.yaml").write_text("")
-    assert completing("robots")("diff") == ["differential", "diff_mine.yaml"]
-    assert completing("policies")("diff") == ["differential", "diff_mine.yaml"]
-    assert {"cellular", "circles"} <= set(completing("worlds", "world_sets")("c"))
+    assert console.ROBOTS("diff") == ["differential", "diff_mine.yaml"]
 
 
 def test_every_option_that_takes_a_shipped_name_completes():
@@ -69,6 +72,7 @@ def test_every_option_that_takes_a_shipped_name_completes():
         f"{' '.join(words)} {one.name}"
         for words, command in KNOWN.items()
         for one in command.params
-        if "shipped" in (getattr(one, "help", "") or "") and one._custom_shell_complete is None
+        if "shipped" in (getattr(one, "help", "") or "").lower()
+        and one._custom_shell_complete is None
     ]
     assert lacking == []

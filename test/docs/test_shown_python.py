@@ -24,7 +24,9 @@ envs = gymnasium.make_vec("NicsBridge/Navigation-v0", num_envs=2, autoreset_mode
 agent = PPO("MlpPolicy", TrainVecEnv(envs.unwrapped), n_steps=8, batch_size=8, device="cpu")
 """
 BEFORE = {
-    ("policy_file.md", 0): AGENT,
+    ("policy_file.md", 0): AGENT.replace(
+        ", num_envs", ", task_options={'scan': 'around'}, num_envs"
+    ),
     ("policy_file.md", 1): "observation, _ = env.reset(seed=0)\n",
     ("howto.md", 0): AGENT,
     ("tasks.md", 0): "import gymnasium\nimport nics_drl_bridge\n",
@@ -32,6 +34,7 @@ BEFORE = {
 """What a reader has by then."""
 ELSEWHERE = {
     ("howto.md", 1): "needs a simulator in another process",
+    ("policy_file.md", 3): "needs a policy with a state",
     ("tasks.md", 3): "is a method of the class above",
 }
 SAVED = {("tasks.md", 1): "my_task.py"}
