@@ -221,7 +221,8 @@ def drive_folds(
     chosen, driven, longest_s = load_training(settings), [], 0.0
     if BARN not in chosen.worlds:
         raise ConfigError(f"{settings}: --five-fold replaces the world {BARN!r}, which it lacks.")
-    numbers = list(given)
+    if len(numbers := list(given)) < FOLDS:
+        raise ConfigError(f"--five-fold needs {FOLDS} worlds, not {len(numbers)}; name more.")
     for fold in range(FOLDS):
         held = {number: given[number] for number in numbers[fold::FOLDS]}
         with tempfile.TemporaryDirectory() as folder:

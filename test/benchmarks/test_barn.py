@@ -10,7 +10,9 @@ from importlib import import_module
 import numpy as np
 import pytest
 
+from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.policy.training_settings import load_training
 from nics_drl_bridge.sim import barn as worlds
 
 from .runs import BENCHMARKS, asked, fails
@@ -33,11 +35,11 @@ def cylinders(number):
     return [(x, y) for x, y, _ in group.at]
 
 
-def write(file, points):
+def write(file, points, numbers=NUMBERS):
     with file.open("w", newline="") as lines:
         rows = csv.writer(lines)
         rows.writerow(("world", "x_m", "y_m"))
-        rows.writerows((n, x, y) for n in NUMBERS for x, y in points(n))
+        rows.writerows((n, x, y) for n in numbers for x, y in points(n))
 
 
 @pytest.fixture
@@ -113,6 +115,37 @@ def test_each_world_has_its_figures(folder):
     np.testing.assert_allclose(means, [told["success"], told["score"]])
 
 
+@pytest.mark.slow
+@pytest.mark.process
+@pytest.mark.timeout(600)
+def test_each_fold_learns_anew_and_is_judged_in_worlds_that_it_did_not_see(tmp_path):
+    pytest.importorskip("torch", reason="needs the extra train")
+    numbers = worlds.barn_numbers()[:6]
+    write(tmp_path / "cylinders.csv", cylinders, numbers)
+    write(tmp_path / "reference_paths.csv", lambda n: worlds.barn_path(n).tolist(), numbers)
+    tiny = load_training("shipped_jackal").model_copy(
+        update={"worlds": {"barn": 4, "circles": 2}, "steps": 192, "hidden": (8,)}
+    )
+    (tmp_path / "tiny.yaml").write_text(dump_yaml(tiny.model_dump(mode="json")))
+    words = ("--five-fold", str(tmp_path / "tiny.yaml"), "--worlds", str(tmp_path))
+    code, told = asked("barn.py", *words)
+    assert code == 1  # it has hardly learnt
+    assert set(told["worlds"]) == set(map(str, numbers))
+    assert 0.0 < told["training_s"] < 600.0
+
+
+@pytest.mark.ros
+@pytest.mark.process
+@pytest.mark.campaign
+def test_a_planner_that_heeds_no_obstacle_misses_the_score_in_mujoco(folder):
+    pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+    pytest.importorskip("mujoco", reason="needs the extra mujoco")
+    words = ("--in", "mujoco_dds", "--policy", "straight", "--worlds", str(folder))
+    code, told = asked("barn.py", *words)
+    assert (code, list(told["worlds"])) == (1, [str(NUMBERS[0])])
+    assert told["failures"][0].startswith("straight: score")
+
+
 @pytest.mark.parametrize("word", ["--control", "--five-fold"])
 def test_what_is_not_done_in_mujoco_is_refused(word):
     words = (word, "--in", "mujoco_dds")
@@ -145,3 +178,8 @@ def test_a_table_of_cylinders_that_lacks_numbers_is_refused(barn, tmp_path, text
 def test_settings_whose_worlds_no_fold_could_leave_out_are_refused(barn):
     with pytest.raises(ConfigError, match="replaces the world 'barn'"):
         barn.drive_folds("navigation_differential", {}, 1, None)
+
+
+def test_folds_of_too_few_worlds_are_refused(barn, folder):
+    with pytest.raises(ConfigError, match="needs 5 worlds, not 3"):
+        barn.drive_folds("shipped_jackal", barn.courses(folder), 1, None)

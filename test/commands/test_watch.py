@@ -1,7 +1,12 @@
 from __future__ import annotations
 
+import os
+import re
+import signal
+import subprocess
+import sys
 import threading
-from contextlib import closing
+from contextlib import closing, contextmanager
 from types import SimpleNamespace
 
 import pytest
@@ -100,3 +105,47 @@ def test_the_page_is_served_until_it_is_interrupted(monkeypatch):
             seen.set()
         serving.join()
     assert servers[0].closed
+
+
+@contextmanager
+def serving(*words, cwd):
+    """A command in a process of its own, once it says where its page is; and a client of it."""
+    command = [sys.executable, "-m", "nics_drl_bridge.commands.cli", *words]
+    environment = os.environ | {"DISPLAY": "", "WAYLAND_DISPLAY": ""}
+    process = subprocess.Popen(
+        command, cwd=cwd, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
+        text=True,
+    )  # fmt: skip
+    try:
+        lines = iter(process.stderr.readline, "")
+        place = next(filter(None, (re.match(r"watch: (http://\S+)", line) for line in lines)), None)
+        assert place is not None, "it ended without a page"
+        with closing(Client(SimpleNamespace(url=place[1]))) as client:
+            yield process, client
+    finally:
+        process.kill()
+        process.stderr.close()
+        process.wait()
+
+
+@pytest.mark.process
+def test_the_command_shows_a_policy_driving_until_ctrl_c(tmp_path):
+    words = ("watch", "straight", "--world", "circles", "--port", "0")
+    with serving(*words, cwd=tmp_path) as (process, client):
+        assert "straight" in client.next("stage")["title"]
+        first = client.next("frame")
+        client.next("frame", lambda frame: frame != first)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30.0) in (0, 130)
+
+
+@pytest.mark.process
+@pytest.mark.slow
+def test_a_training_shows_its_worlds(tmp_path):
+    pytest.importorskip("torch", reason="needs the extra train")
+    words = ("train", "--world", "circles", "--steps", "200000", "--watch")
+    with serving(*words, cwd=tmp_path) as (process, client):
+        frame = client.next("frame", lambda frame: frame.get("worlds"))
+        assert len(frame["worlds"]) > 1
+        process.send_signal(signal.SIGINT)
+        assert process.wait(60.0) == 130
