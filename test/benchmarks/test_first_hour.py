@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import shlex
 from importlib import import_module
+from textwrap import dedent
 
 import pytest
-from docs.test_pages import check_options
+from docs.test_pages import INDENTED, ROOT, check_options, text_of
+from nics_drl_bridge.robot.spec import load_robot
 from PIL import Image
 
 from .runs import BENCHMARKS, fails
@@ -54,6 +56,14 @@ def test_every_command_and_option_of_a_road_exists(first_hour):
     for lines in first_hour.ROADS.values():
         for line in lines:
             check_options(shlex.split(line)[1:])
+
+
+def test_the_robot_is_that_of_the_page(first_hour, tmp_path):
+    text = text_of(ROOT / "docs" / "robots.md")
+    (shown,) = [block for block in INDENTED.findall(text) if "name: my_robot" in block]
+    for name, content in (("page.yaml", dedent(shown)), ("road.yaml", first_hour.BURGER)):
+        (tmp_path / name).write_text(content)
+    assert load_robot(tmp_path / "page.yaml") == load_robot(tmp_path / "road.yaml")
 
 
 @pytest.mark.process
