@@ -8,8 +8,9 @@ from textwrap import dedent
 
 import pytest
 from docs.test_pages import INDENTED, ROOT, check_options, text_of
-from nics_drl_bridge.robot.spec import load_robot
 from PIL import Image
+
+from nics_drl_bridge.robot.spec import load_robot
 
 from .runs import BENCHMARKS, fails
 
