@@ -160,6 +160,12 @@ def one_sentence() -> Iterator[None]:
         raise typer.Exit(EXIT_INTERRUPTED) from None
 
 
+def tell_replaced(file: Path) -> None:
+    """Says so if a file that is there will be replaced."""
+    if file.exists():
+        typer.echo(f"{file.parent}: the {file.name} that is there will be replaced", err=True)
+
+
 @contextmanager
 def needs_ros(what: str) -> Iterator[None]:
     """Turns a failed import of the nodes, for lack of ROS 2, into a one-sentence error."""

@@ -25,8 +25,7 @@ def demo(
     with console.one_sentence():
         from nics_drl_bridge.commands.demo_run import DemoPlan, run
 
-        if (out / "report.html").exists():
-            typer.echo(f"{out}: the report that is there will be replaced", err=True)
+        console.tell_replaced(out / "report.html")
         plan = DemoPlan(out, robot, world, recording, episodes, policy, train_steps)
         line = run(plan, partial(typer.echo, err=as_json))
         console.say(as_json, line, told=line, report=str(out / "report.html"))

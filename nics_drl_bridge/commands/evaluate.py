@@ -71,13 +71,12 @@ def evaluate(
         order = driving.EvaluationOrder(
             policies, out, model, world, count, seed, tuple(dict.fromkeys(places or ())), under
         )
-        if (out / driving.EVALUATION).exists():
-            tell(f"{out}: the evaluation that is there will be replaced")
+        console.tell_replaced(out / driving.EVALUATION)
         if hardware:
             options = {"start": start, "namespace": namespace, "pose_type": pose_type}
+            told = tell, partial(_ask, yes)
             with console.needs_ros("nics evaluate --hardware"):
-                ask = partial(_ask, yes)
-                evaluated = [driving.drive_vehicle(order, place, arm, tell, ask, **options)]
+                evaluated = [driving.drive_vehicle(order, place, arm, *told, **options)]
         else:
             with console.progress_bar("opening robot and policies") as advance:
                 evaluated = driving.evaluate(order, tell, advance)

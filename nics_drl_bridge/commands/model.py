@@ -41,9 +41,8 @@ def record(
             "seed": seed, "topics": str(topics or ""), "use_sim_time": use_sim_time,
         } | ({} if stamped is None else {"stamped": stamped})  # fmt: skip
         if not preview:
-            with console.needs_ros(
-                "nics record"
-            ):  # first: with ROS 2 from wheels it restarts Python
+            # First: with ROS 2 from wheels it restarts Python.
+            with console.needs_ros("nics record"):
                 from nics_drl_bridge.nodes.record_node import record as drive
         for line in preview_lines(given):
             typer.echo(line)
@@ -231,12 +230,9 @@ def generate(
             load_lidar(lidar)
         further = tuple(load_sensor(file) for file in sensor or ())
         shapes = load_world(world).shapes
-        with (
-            console.intact(recording, salvage) as whole,
-            console.progress_bar(f"reading {recording}"),
-        ):
-            roles = topic_roles(topics, topic or ())
-            spec, drive = robot_and_drive(whole, robot, roles, mapping)
+        reading = console.progress_bar(f"reading {recording}")
+        with console.intact(recording, salvage) as whole, reading:
+            spec, drive = robot_and_drive(whole, robot, topic_roles(topics, topic or ()), mapping)
         drive = replace(drive, source=str(recording))
         with console.progress_bar("generating"):
             model, identified = generate_model(
