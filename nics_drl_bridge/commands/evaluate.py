@@ -74,9 +74,9 @@ def evaluate(
         console.tell_replaced(out / driving.EVALUATION)
         if hardware:
             options = {"start": start, "namespace": namespace, "pose_type": pose_type}
-            told = tell, partial(_ask, yes)
+            driven = partial(driving.drive_vehicle, order, place, arm, tell, partial(_ask, yes))
             with console.needs_ros("nics evaluate --hardware"):
-                evaluated = [driving.drive_vehicle(order, place, arm, *told, **options)]
+                evaluated = [driven(**options)]
         else:
             with console.progress_bar("opening robot and policies") as advance:
                 evaluated = driving.evaluate(order, tell, advance)
