@@ -123,9 +123,10 @@ def test_each_fold_learns_anew_and_is_judged_in_worlds_that_it_did_not_see(tmp_p
     numbers = worlds.barn_numbers()[:6]
     write(tmp_path / "cylinders.csv", cylinders, numbers)
     write(tmp_path / "reference_paths.csv", lambda n: worlds.barn_path(n).tolist(), numbers)
-    tiny = load_training("shipped_jackal").model_copy(
-        update={"worlds": {"barn": 4, "circles": 2}, "steps": 192, "hidden": (8,)}
-    )
+    shipped = load_training("shipped_jackal")
+    given = {"worlds": {"barn": 4, "circles": 2}, "steps": 192, "hidden": (8,)}
+    ppo = shipped.ppo.model_copy(update={"batch": 96})
+    tiny = shipped.model_copy(update={**given, "ppo": ppo})
     (tmp_path / "tiny.yaml").write_text(dump_yaml(tiny.model_dump(mode="json")))
     words = ("--five-fold", str(tmp_path / "tiny.yaml"), "--worlds", str(tmp_path))
     code, told = asked("barn.py", *words)
