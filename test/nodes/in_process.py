@@ -73,7 +73,8 @@ class NodeThread(AbstractContextManager["NodeThread", None]):
 
     def wait(self, seconds: float = ENDS_S) -> int | None:
         self._thread.join(seconds)
-        assert not self._thread.is_alive(), f"{self.node} did not end within {seconds} s: {self.lines}"
+        told = f"{self.node} did not end within {seconds} s: {self.lines}"
+        assert not self._thread.is_alive(), told
         return self.returncode
 
     def send_signal(self, number: int) -> None:
