@@ -32,6 +32,7 @@ def record(
     use_sim_time: Annotated[bool, Option("--use-sim-time", help="Take time from /clock.")] = False,
     preview: Annotated[bool, Option("--preview", help="Show the drive's plan, and stop.")] = False,
     yes: Annotated[bool, Option("--yes", help="Do not ask before the robot moves.")] = False,
+    as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Drives a robot so that it shows its whole motion; records it."""
     with console.one_sentence():
@@ -44,19 +45,23 @@ def record(
             # First: with ROS 2 from wheels it restarts Python.
             with console.needs_ros("nics record"):
                 from nics_drl_bridge.nodes.record_node import record as drive
-        for line in preview_lines(given):
-            typer.echo(line)
+        lines = preview_lines(given)
+        told: dict[str, Any] = {"out": str(out), "robot": robot}
         if preview:
+            console.say(as_json, "\n".join(lines), **told, told=lines)
             return
-        if not yes and not typer.confirm("Drive the robot now?"):
-            typer.echo("nothing was driven or recorded.")
+        typer.echo("\n".join(lines), err=as_json)
+        if not yes and not typer.confirm("Drive the robot now?", err=as_json):
+            console.say(as_json, "nothing was driven or recorded.", **told, recorded=False)
             return
         driven = drive(given, arguments)
         if driven.failure is not None:
             raise BackendError(driven.line)
-        typer.echo(driven.line)
-        if driven.recording is not None:
-            typer.echo("\n".join(drive_summary(driven.recording, given)))
+        recording, lines = driven.recording, (driven.line,)
+        if recording is not None:
+            lines += drive_summary(recording, given)
+        told |= {"recorded": recording is not None, "complete": driven.complete}
+        console.say(as_json, "\n".join(lines), **told, told=lines)
         if not driven.complete:
             raise typer.Exit(console.EXIT_INTERRUPTED)
 
@@ -313,6 +318,7 @@ def urdf(
     model: Annotated[str, Argument(autocompletion=console.ROBOTS,
         help="A shipped robot, or the folder of a model.")],
     out: Annotated[Path | None, Option(help="The file to write; <robot>.urdf.")] = None,
+    as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Writes a robot's URDF, for RViz and robot_state_publisher."""
     with console.one_sentence():
@@ -324,4 +330,5 @@ def urdf(
         file = out or Path(f"{opened.robot.name}.urdf")
         lidar, further = opened.lidar, {each.frame: each.mount for each in opened.sensors}
         write_text(file, urdf_of(opened.robot, lidar.mount, lidar.frame, further=further))
-        typer.echo(f"{file}: the URDF of {opened.robot.name}")
+        name = opened.robot.name
+        console.say(as_json, f"{file}: the URDF of {name}", file=str(file), robot=name)

@@ -7,9 +7,9 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge.commands.console import POLICIES, ROBOTS, JsonOption, one_sentence
+from nics_drl_bridge.commands.console import POLICIES, ROBOTS, JsonOption, one_sentence, say
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.files import json_of, write_bytes
+from nics_drl_bridge.files import write_bytes
 
 policy = typer.Typer(help="Policy files.", no_args_is_help=True)
 
@@ -32,7 +32,7 @@ def info(
 
         facts = summary(load_any(file))
         lines = (f"{name:<18} {value}" for name, value in _lines(facts))
-        typer.echo(json_of(facts) if as_json else "\n".join(lines))
+        say(as_json, "\n".join(lines), **facts)
 
 
 @policy.command()
@@ -40,13 +40,15 @@ def export(
     file: Annotated[str, Argument(autocompletion=POLICIES,
         help="A policy file, or the name of a shipped one.")],
     leapp: Annotated[Path, Option(help="Folder of the bundle: network, YAML file, start values.")],
+    as_json: JsonOption = False,
 ) -> None:  # fmt: skip
     """Writes a policy file in a format of others: Isaac's LEAPP."""
     with one_sentence():
         from nics_drl_bridge.policy.foreign import load_any
         from nics_drl_bridge.policy.leapp import export_bundle
 
-        typer.echo(f"wrote {export_bundle(load_any(file), leapp)}")
+        written = str(export_bundle(load_any(file), leapp))
+        say(as_json, f"wrote {written}", file=written)
 
 
 @policy.command(name="import")
@@ -56,6 +58,7 @@ def import_(
     out: Annotated[Path, Option("--out", "-o", help="The policy file to write (*.onnx).")],
     robot: Annotated[str | None, Option("--robot", "--model", autocompletion=ROBOTS,
         help="A shipped robot, or the folder of a model.")] = None,
+    as_json: JsonOption = False,
 ) -> None:  # fmt: skip
     """Makes a policy file of somebody else's policy."""
     with one_sentence():
@@ -69,7 +72,9 @@ def import_(
         data = import_policy(source, None if robot is None else open_model(robot))
         contract = policy_of(data, out).contract  # what can't be loaded is not written
         write_bytes(out, data)
-        typer.echo(f"wrote {out}, a policy of {contract.robot.name!r}; see nics policy info {out}")
+        name = contract.robot.name
+        line = f"wrote {out}, a policy of {name!r}; see nics policy info {out}"
+        say(as_json, line, file=str(out), robot=name)
 
 
 def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:

@@ -10,32 +10,16 @@ import numpy as np
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import clocks as timings
-from nics_drl_bridge.identify import followers, hypotheses, shooting, verdict
+from nics_drl_bridge.identify import fit as fitting
+from nics_drl_bridge.identify import followers, hypotheses, open_loop, shooting, verdict
 from nics_drl_bridge.identify import motion as motions
 from nics_drl_bridge.identify.assume import assume_textbook
 from nics_drl_bridge.identify.calibration import Calibration, Response, align
 from nics_drl_bridge.identify.drive import Drive, Settings
-from nics_drl_bridge.identify.fit import (
-    ALPHA,
-    ORDER,
-    Alpha,
-    Fit,
-    Order,
-    Regression,
-    pruned,
-    regress,
-)  # fmt: skip
 from nics_drl_bridge.identify.forms import curve_of, likely_delay, reached
 from nics_drl_bridge.identify.judgement import bands_of, judged, shortfall
 from nics_drl_bridge.identify.mounting import Mounting, mounted, mounting_of
 from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
-from nics_drl_bridge.identify.open_loop import (
-    SPACING_S,
-    OpenLoop,
-    open_loop_error,
-    predict,
-    windows,
-)  # fmt: skip
 from nics_drl_bridge.identify.refine import refined
 from nics_drl_bridge.identify.repair import check_axes, check_commands, check_units, repaired
 from nics_drl_bridge.identify.signals import speed_index
@@ -73,13 +57,13 @@ class Findings:
     clear: tuple[InputCurve, ...] = ()  # input curves beyond doubt, of `inputs`
     base: hypotheses.Base | None = None  # of the textbook's terms, of `fit`
     trials: tuple[hypotheses.Trial, ...] = ()  # of orders, on parts of the training part, of `fit`
-    regression: Regression | None = None  # on all features (Eq. 1), of `fit`
-    linear: Fit | None = None  # the pruned fit (Eq. 2), of `prune`
+    regression: fitting.Regression | None = None  # on all features (Eq. 1), of `fit`
+    linear: fitting.Fit | None = None  # the pruned fit (Eq. 2), of `prune`
     model: TaylorModel | None = None  # of `prune`; then of `refine` and `complete`
     refinement: tuple[str, ...] = ()  # sentences of `refine`
     assumptions: tuple[str, ...] = ()  # sentences of `complete`
     unseen: Samples | None = None  # of the part that the fit did not see, of `judge`
-    held_out: OpenLoop | None = None  # open-loop errors on that part, of `judge`
+    held_out: open_loop.OpenLoop | None = None  # open-loop errors on that part, of `judge`
     structure: tuple[str, ...] = ()  # sentences on residuals that depend on X, of `judge`
     judgement: tuple[HorizonErrors, ...] = ()  # on that part, beside yardsticks, of `judge`
     notes: tuple[str, ...] = ()  # all sentences, of `judge`
@@ -96,7 +80,7 @@ def known(found: T | None, name: str, stage: str) -> T:
     return found
 
 
-def _fitted(findings: Findings) -> tuple[Fit, TaylorModel]:
+def _fitted(findings: Findings) -> tuple[fitting.Fit, TaylorModel]:
     name = "the pruned fit"
     return known(findings.linear, name, "prune"), known(findings.model, name, "prune")
 
@@ -239,12 +223,12 @@ def fit(drive: Drive, findings: Findings) -> Findings:
     inferred = drive.recording.state is None and not calibration.is_exact
     if settings.order == "auto" and inferred and not trials:  # a refit knows them
         trials = _trials_of_orders(drive, findings)
-    order = ORDER if settings.order == "auto" else settings.order
+    order = fitting.ORDER if settings.order == "auto" else settings.order
     order = hypotheses.chosen(list(trials)).order if trials else order
     centred = "lever_arm_y_m" in calibration.uncertainty
     library = partial(through_state, centred=centred) if inferred else None
     try:
-        regression = regress(samples, spec, order, not calibration.is_exact, library)
+        regression = fitting.regress(samples, spec, order, not calibration.is_exact, library)
     except FitError as error:
         raise FitError(f"{drive.recording.source}: {error}") from None
     if settings.strict:
@@ -255,8 +239,8 @@ def fit(drive: Drive, findings: Findings) -> Findings:
 def _trials_of_orders(drive: Drive, findings: Findings) -> tuple[hypotheses.Trial, ...]:
     """Tries each order on parts of the training part that its fits did not see."""
     training, trials = findings.training, []
-    span = 0.0, training.duration_s, hypotheses.HORIZON_S, SPACING_S
-    path = windows(training, findings.calibration, *span).path
+    span = 0.0, training.duration_s, hypotheses.HORIZON_S, open_loop.SPACING_S
+    path = open_loop.windows(training, findings.calibration, *span).path
     for order in ORDERS_OF_INFERRED:
         errors = _left_out(drive, findings, order)
         if hypotheses.HORIZON_S not in errors:
@@ -271,7 +255,7 @@ def prune(drive: Drive, findings: Findings) -> Findings:
     regression = known(findings.regression, "the fit of all terms", "fit")
     if findings.width is not None:  # what a mirror allows is kept: the predictions weigh it
         return findings
-    linear = pruned(regression, drive.spec, drive.settings.alpha)
+    linear = fitting.pruned(regression, drive.spec, drive.settings.alpha)
     limits = followers.scaled_limits(findings.calibration, drive.spec)
     model = replace(linear.model, inputs=findings.calibration.inputs, limits=limits)
     return replace(findings, linear=replace(linear, model=model), model=model)
@@ -413,9 +397,11 @@ def _left_out(drive: Drive, findings: Findings, order: int | None = None) -> dic
             return {}
         part = training.part(replace(training.recording, pose=pose.rows(block)))
         for horizon, errors_at in errors.items():
-            chosen = windows(part, found.calibration, 0.0, part.duration_s, horizon, SPACING_S)
+            chosen = open_loop.windows(
+                part, found.calibration, 0.0, part.duration_s, horizon, open_loop.SPACING_S
+            )
             if len(chosen.start_t):
-                ends = predict(_fitted(found)[1], found.calibration, part, chosen)
+                ends = open_loop.predict(_fitted(found)[1], found.calibration, part, chosen)
                 errors_at.append(np.hypot(*(ends - chosen.end)[:, :2].T))
     return {h: np.concatenate(each) for h, each in errors.items() if each}
 
@@ -431,7 +417,7 @@ def refit(drive: Drive, findings: Findings) -> Findings:
         stages = (motion, fit, prune, refine, complete)
         final = run(stages, replace(drive, settings=settings), start)
         error, before = (
-            open_loop_error(_fitted(each)[1], each.calibration, each.whole, 0.0, until)
+            open_loop.open_loop_error(_fitted(each)[1], each.calibration, each.whole, 0.0, until)
             for each in (final, findings)
         )
         worse = error.mean_position_error_m > verdict.WORSE * before.mean_position_error_m
@@ -495,10 +481,10 @@ class Identified:
     drive: Drive  # the whole drive, repaired
     model: TaylorModel  # refined and, on request, completed; with standard errors and quality
     calibration: Calibration
-    fit: Fit  # the linear fit, before refinement
+    fit: fitting.Fit  # the linear fit, before refinement
     samples: Samples  # that the fit used
     unseen: Samples | None  # of the part that the trial did not see; None if there are too few
-    held_out: OpenLoop | None  # its open-loop errors on that part; None if it was too short
+    held_out: open_loop.OpenLoop | None  # its open-loop errors there; None if it was too short
     noise: Noise  # of sensors and motion, each level measured or assumed
     findings: Findings  # of all stages, of the trial
     notes: tuple[str, ...]  # sentences on findings, on what was not learnt, and on assumptions
@@ -549,7 +535,7 @@ class Identified:
         return max(zones)
 
     @property
-    def alpha(self) -> Alpha:
+    def alpha(self) -> fitting.Alpha:
         """Threshold of the pruning; `auto` for the knee of the accuracy curve."""
         return self.drive.settings.alpha
 
@@ -557,8 +543,9 @@ class Identified:
 @one_blas_thread
 @np.errstate(over="ignore", invalid="ignore")  # a diverging model shows in its figures
 def identify(
-    recording: Recording, spec: RobotSpec, order: Order = "auto", alpha: Alpha = ALPHA,
-    train_until: float | None = None, assume: bool = False, strict: bool = False,
+    recording: Recording, spec: RobotSpec, order: fitting.Order = "auto",
+    alpha: fitting.Alpha = fitting.ALPHA, train_until: float | None = None, assume: bool = False,
+    strict: bool = False,
 ) -> Identified:  # fmt: skip
     """Learns a motion up to `train_until` [s], and tests it on the rest; see `Settings`."""
     # Default: two thirds. RecordingError: unusable for this robot. FitError: it shows too little.

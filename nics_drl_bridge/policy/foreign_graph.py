@@ -11,23 +11,14 @@ from onnx import TensorProto
 
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import PolicyError, nearest
-from nics_drl_bridge.policy import onnx_graph
-from nics_drl_bridge.policy.foreign_mapping import (
-    TWIST,
-    Choices,
-    ForeignPolicy,
-    ForeignState,
-    InputPart,
-    OutputCommand,
-    Scaled,
-)
+from nics_drl_bridge.policy import foreign_mapping, onnx_graph
 from nics_drl_bridge.policy.graph_builder import Builder
 from nics_drl_bridge.robot.spec import RobotSpec
 
 THEIRS = "network/"  # before every name of the foreign graph
 OLDEST_OPSET = 8  # from which on the operators used here broadcast
 SLOWEST = 1e-6  # speed below which a steering angle is 0 [m/s]
-FIELDS = dict(zip(TWIST, ("linear.x", "linear.y", "angular.z"), strict=True))
+FIELDS = dict(zip(foreign_mapping.TWIST, ("linear.x", "linear.y", "angular.z"), strict=True))
 
 
 @dataclass(frozen=True)
@@ -35,7 +26,7 @@ class Network:
     """A foreign network, and its states as far as its own files tell them."""
 
     model: Any  # onnx.ModelProto
-    states: Mapping[str, ForeignState] = field(default_factory=dict)  # by input
+    states: Mapping[str, foreign_mapping.ForeignState] = field(default_factory=dict)  # by input
 
     @property
     def inputs(self) -> dict[str, Any]:
@@ -53,7 +44,11 @@ class Composer:
     """Builds the graph of a policy file around a foreign network, for one observation at once."""
 
     def __init__(
-        self, network: Network, mapping: ForeignPolicy, task: Navigation, source: str
+        self,
+        network: Network,
+        mapping: foreign_mapping.ForeignPolicy,
+        task: Navigation,
+        source: str,
     ) -> None:
         self._network, self._mapping, self._task, self._source = network, mapping, task, source
         self._states = {**network.states, **mapping.states}
@@ -170,7 +165,7 @@ class Composer:
             return None
         return sum(map(self._part_size, self._mapping.inputs[name].parts))
 
-    def _part_size(self, part: InputPart) -> int:
+    def _part_size(self, part: foreign_mapping.InputPart) -> int:
         size = 1
         if part.of == "scan":
             size = self._task.scan_parts
@@ -195,7 +190,7 @@ class Composer:
         for name, one in self._mapping.inputs.items():
             for k, part in enumerate(one.parts):
                 if part.of.startswith("last.") and part.output is None:
-                    sizes["twist"] = len(TWIST)
+                    sizes["twist"] = len(foreign_mapping.TWIST)
                 if part.output is not None:
                     sizes[f"output {part.output}"] = self._output_size(part.output)
                 if part.history > 1:
@@ -221,7 +216,7 @@ class Composer:
             row = build.add("Reshape", row, shape)
             build.add("Cast", row, name=THEIRS + name, to=taken[THEIRS + name])
 
-    def _check_scaled(self, scaled: Scaled, size: int, place: str) -> None:
+    def _check_scaled(self, scaled: foreign_mapping.Scaled, size: int, place: str) -> None:
         for key in ("subtract", "divide"):
             values = getattr(scaled, key)
             if isinstance(values, tuple) and len(values) != size:
@@ -237,7 +232,7 @@ class Composer:
             return past
         return self._build.blend(self._past["begun"], past, self._build.constant([start]))
 
-    def _part(self, name: str, k: int, part: InputPart) -> str:
+    def _part(self, name: str, k: int, part: foreign_mapping.InputPart) -> str:
         build, size = self._build, self._part_size(part) // part.history
         self._check_scaled(part, size, f"inputs.{name}.parts.{k}")
         row = build.scale(self._quantity(name, part), part)
@@ -253,7 +248,7 @@ class Composer:
             rows = build.pick(rows, places.tolist())
         return rows
 
-    def _quantity(self, name: str, part: InputPart) -> str:
+    def _quantity(self, name: str, part: foreign_mapping.InputPart) -> str:
         """A row of a quantity in SI units."""
         build, scan = self._build, self._task.scan_parts
         of, _, which = part.of.partition(".")
@@ -264,14 +259,14 @@ class Composer:
         if of == "constant":
             return build.constant(np.reshape(np.asarray(part.value, np.float32), (1, -1)))
         if of == "velocity":
-            return build.pick(onnx_graph.INPUT, [scan + 3 + TWIST.index(which)])
+            return build.pick(onnx_graph.INPUT, [scan + 3 + foreign_mapping.TWIST.index(which)])
         if part.output is not None:
             return self._past[f"output {part.output}"]
         if of == "last":
             if not self._commands_twist():
                 reason = "is known of policies that command forward, left and turn alone."
                 raise self._fault(f"inputs.{name}", f"{part.of} {reason}")
-            return build.pick(self._past["twist"], [TWIST.index(which)])
+            return build.pick(self._past["twist"], [foreign_mapping.TWIST.index(which)])
         distance, cosine, sine = (build.pick(onnx_graph.INPUT, [scan + k]) for k in range(3))
         if which == "bearing":
             return build.angle(cosine, sine)
@@ -284,7 +279,7 @@ class Composer:
     def _commands_twist(self) -> bool:
         choices = self._mapping.choices
         rows = [self._mapping.outputs] if choices is None else choices.commands
-        return all(name in TWIST for row in rows for name in row)
+        return all(name in foreign_mapping.TWIST for row in rows for name in row)
 
     def _flat(self, name: str) -> str:
         """An output as a row of float32."""
@@ -301,10 +296,13 @@ class Composer:
             return self._chosen(self._mapping.choices)
         outputs, robot = self._mapping.outputs, self._task.robot
         names = self._names(outputs, "outputs")
-        if names == TWIST:
+        if names == foreign_mapping.TWIST:
             self._check_twist(outputs)
-        rows = [self._element(name, outputs.get(name, OutputCommand())) for name in names]
-        if names != TWIST:
+        rows = [
+            self._element(name, outputs.get(name, foreign_mapping.OutputCommand()))
+            for name in names
+        ]
+        if names != foreign_mapping.TWIST:
             return self._build.join(rows)
         self._next["twist"] = self._build.join(rows)
         return self._of_twist(rows, robot)
@@ -313,21 +311,21 @@ class Composer:
         """The names of commands among which the given ones are: of a twist, or the robot's own."""
         robot = self._task.robot
         own = tuple(command.name for command in robot.command)
-        if all(name in TWIST for name in given):
+        if all(name in foreign_mapping.TWIST for name in given):
             if not robot.takes_cmd_vel:
                 reason = f"the robot {robot.name!r} is not driven by cmd_vel; map {', '.join(own)}."
                 raise self._fault(place, reason)
-            return TWIST
+            return foreign_mapping.TWIST
         for name in given:
             if name not in own:
-                fix = nearest(name, (*TWIST, *own))
+                fix = nearest(name, (*foreign_mapping.TWIST, *own))
                 raise self._fault(f"{place}.{name}", f"the robot has no such command; {fix}")
         for name in own:
             if name not in given and place == "outputs":
                 raise self._fault(f"{place}.{name}", "is missing; say which output it is.")
         return own
 
-    def _check_twist(self, outputs: Mapping[str, OutputCommand]) -> None:
+    def _check_twist(self, outputs: Mapping[str, foreign_mapping.OutputCommand]) -> None:
         fields = [command.cmd_vel for command in self._task.robot.command]
         for name in ("forward", "turn"):
             if name not in outputs:
@@ -337,7 +335,7 @@ class Composer:
                 reason = f"the robot {self._task.robot.name!r} has no command for it; remove it."
                 raise self._fault(f"outputs.{name}", reason)
 
-    def _element(self, name: str, command: OutputCommand) -> str:
+    def _element(self, name: str, command: foreign_mapping.OutputCommand) -> str:
         build = self._build
         if command.of is None:
             return build.cut(build.constant([[command.add]]), command.clip)
@@ -365,7 +363,7 @@ class Composer:
                 rows["linear.x"] = build.add("Mul", speed, sign)
         return build.join([rows[str(command.cmd_vel)] for command in robot.command])
 
-    def _chosen(self, choices: Choices) -> str:
+    def _chosen(self, choices: foreign_mapping.Choices) -> str:
         """The command by the greatest element of an output, or by a whole number."""
         build, robot = self._build, self._task.robot
         known = {name: 0.0 for row in choices.commands for name in row}
@@ -382,7 +380,7 @@ class Composer:
             reason = f"are {len(rows)}, but the output {choices.of!r} has {size} elements."
             raise self._fault("choices.commands", reason)
         commands = rows
-        if names == TWIST:
+        if names == foreign_mapping.TWIST:
             self._next["twist"] = build.add("Gather", build.constant(rows), index, axis=0)
             if robot.steers:
                 speed, angle = robot.bicycle.command(rows)

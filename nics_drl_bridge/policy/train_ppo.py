@@ -23,14 +23,7 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.logger import Logger
 
-from nics_drl_bridge.policy import train_imitation
-from nics_drl_bridge.policy.train_algorithms import (
-    LEAST_RATE,
-    Actor,
-    act_of,
-    check_serves,
-    layers_of,
-)
+from nics_drl_bridge.policy import train_algorithms, train_imitation
 from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch
 from nics_drl_bridge.policy.train_memory import memory_of
 from nics_drl_bridge.policy.train_mirror import Reflection
@@ -90,10 +83,14 @@ class Layers:
 class Networks(torch.nn.Module):
     """Actor and critic of normalised observations, and the spread of continuous actions."""
 
-    def __init__(self, actor: Actor, hidden: tuple[int, ...], log_std: float) -> None:
+    def __init__(
+        self, actor: train_algorithms.Actor, hidden: tuple[int, ...], log_std: float
+    ) -> None:
         super().__init__()
         self.actor = actor
-        self.critic = layers_of([actor.layers[0].in_features, *hidden, 1], 1.0, torch.nn.ReLU)
+        self.critic = train_algorithms.layers_of(
+            [actor.layers[0].in_features, *hidden, 1], 1.0, torch.nn.ReLU
+        )
         outputs = actor.layers[-1].out_features
         self.log_std = torch.nn.Parameter(torch.full((0 if actor.discrete else outputs,), log_std))
 
@@ -298,7 +295,7 @@ class LeanPpo:
         self, settings: TrainingSettings, env: TrainVecEnv, seed: int,
         normaliser: tuple[Array, Array],
     ) -> None:  # fmt: skip
-        check_serves(settings, env)
+        train_algorithms.check_serves(settings, env)
         torch.set_num_threads(settings.threads)
         torch.manual_seed(seed)
         self._total, self._ppo, hidden = settings.steps, settings.ppo, settings.hidden
@@ -308,7 +305,7 @@ class LeanPpo:
         if self._ppo.mirror:
             reflection = Reflection(env.envs[0].task.mirror(), memory.extra, parts)
             normaliser = reflection.balanced(*normaliser)
-        actor = Actor(*spaces, hidden, normaliser, torch.nn.ReLU, memory)
+        actor = train_algorithms.Actor(*spaces, hidden, normaliser, torch.nn.ReLU, memory)
         self.networks = Networks(actor, hidden, self._ppo.log_std)
         seeds = np.random.SeedSequence(seed).generate_state(3)
         self.collector = Collector(env, self.networks, self._ppo, int(seeds[0]), reflection)
@@ -327,7 +324,7 @@ class LeanPpo:
             self._take(watch, *self.collector.collect())
         while self._rollout:
             watch.keep(self.steps)
-            if watch.ends(self.steps, act_of(self.policy), logger):
+            if watch.ends(self.steps, train_algorithms.act_of(self.policy), logger):
                 watch.report(self.steps, self._successes, logger)
                 return
             loss = self._advance(self._rollout, watch)
@@ -350,7 +347,9 @@ class LeanPpo:
 
     def _advance(self, rollout: Transitions, watch: Watch) -> float:
         """Learns from a rollout, with the next one collected meanwhile."""
-        rate = self._ppo.learning_rate * max(1.0 - self.steps / self._total, LEAST_RATE)
+        rate = self._ppo.learning_rate * max(
+            1.0 - self.steps / self._total, train_algorithms.LEAST_RATE
+        )
         self.steps += self._ppo.rollout * self.collector.env.num_envs
         self.collector.networks.load_state_dict(self.networks.state_dict())
         self.learner.core_is_free.clear()

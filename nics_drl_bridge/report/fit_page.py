@@ -9,14 +9,7 @@ from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.judgement import shortfall, usual
 from nics_drl_bridge.identify.report import COMPARED, HEADS, equations_with_errors, judgement_rows
 from nics_drl_bridge.identify.verdict import doubts
-from nics_drl_bridge.report import html
-from nics_drl_bridge.report.fit_pictures import (
-    CAPTIONS,
-    calibration_pictures,
-    fit_pictures,
-    unseen_paths,
-    yardsticks,
-)
+from nics_drl_bridge.report import fit_pictures, html
 from nics_drl_bridge.robot.spec import RobotSpec
 
 PATHS_SHOWN = 3
@@ -54,7 +47,7 @@ def path_blocks(identified: Identified) -> Blocks:
     """Predicted paths beside the measured ones, and errors beside those of the yardsticks."""
     if identified.held_out is None or not identified.judgement:
         return [html.paragraph("The drive is too short to hold data out.")]
-    drawn = [(each, "") for each in unseen_paths(identified.trial, PATHS_SHOWN)]
+    drawn = [(each, "") for each in fit_pictures.unseen_paths(identified.trial, PATHS_SHOWN)]
     caption = (
         "Mean errors of predictions of unseen data: of a good model they are below the others."
     )
@@ -63,16 +56,16 @@ def path_blocks(identified: Identified) -> Blocks:
     rows = html.table(HEADS, judgement_rows(identified.judgement))
     return [
         html.gallery(drawn),
-        html.picture(yardsticks(identified), caption),
+        html.picture(fit_pictures.yardsticks(identified), caption),
         html.details("The same in figures", [html.paragraph(COMPARED), rows]),
     ]
 
 
 def model_blocks(spec: RobotSpec, identified: Identified, report: str) -> Blocks:
     """The equations, and folded all figures and pictures of fit and calibration."""
-    fit = fit_pictures(spec, identified, paths=False)
-    drawn = {**fit, **calibration_pictures(spec, identified)}
-    pictures = [html.picture(png, CAPTIONS[name]) for name, png in drawn.items()]
+    fit = fit_pictures.fit_pictures(spec, identified, paths=False)
+    drawn = {**fit, **fit_pictures.calibration_pictures(spec, identified)}
+    pictures = [html.picture(png, fit_pictures.CAPTIONS[name]) for name, png in drawn.items()]
     equations = "\n".join(equations_with_errors(identified.model))
     return [
         html.code(equations),

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from typer.testing import CliRunner
 from nics_drl_bridge.commands import cli, model
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.recording.textbook import record
+from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.robot.spec import load_robot
 
 CAR = load_robot("ackermann")
@@ -41,6 +43,9 @@ def test_a_preview_tells_and_draws_the_drive_and_does_no_more(tmp_path):
     assert told[-1] == "its path is drawn in new/drive_preview.png"
     assert (tmp_path / "new" / "drive_preview.png").read_bytes().startswith(PNG)
     assert os.listdir(tmp_path / "new") == ["drive_preview.png"]
+    words = ("--preview", "--out", "new/drive.npz", "--json")
+    facts = json.loads(nics(*words, cwd=tmp_path, PYTHONPATH=str(tmp_path)).stdout)
+    assert facts == {"out": "new/drive.npz", "robot": DEFAULT_ROBOT, "told": told}
 
 
 @pytest.mark.ros
@@ -50,6 +55,8 @@ def test_it_asks_before_the_robot_moves(tmp_path):
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("preview of ") == 1
     assert done.stdout.endswith("Drive the robot now? [y/N]: nothing was driven or recorded.\n")
+    facts = json.loads(nics("--out", "drive.npz", "--json", cwd=tmp_path).stdout)
+    assert facts == {"out": "drive.npz", "robot": DEFAULT_ROBOT, "recorded": False}
 
 
 @pytest.mark.slow

@@ -1,15 +1,18 @@
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 
 import bags
 
+from nics_drl_bridge.commands.cli import app
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.generator import builtin_model
 from nics_drl_bridge.middleware.playback import estimate, write_estimate
@@ -67,6 +70,15 @@ def test_a_drive_gives_the_same_estimate_bit_for_bit_in_every_process(bag):
     assert len(other) == 64
     assert other == estimate(bag, MODEL, {"pose": "/pose"}).digest
     assert other != estimate(bag, MODEL, {}).digest
+
+
+def test_an_estimate_of_the_command_line_is_that_of_the_library(bag):
+    words = ["bag", "replay", str(bag), "--estimate", "--model", "ackermann", "--json"]
+    told = json.loads(CliRunner().invoke(app, words).stdout)
+    made = estimate(bag, MODEL, {})
+    assert told["sha256"] == made.digest
+    assert told["last"] == made.pose[-1].tolist()
+    assert told["estimates"] == len(made.pose)
 
 
 def test_the_storage_makes_no_difference(tmp_path):

@@ -90,7 +90,7 @@ class Robot:
 
 def test_a_recorder_writes_a_whole_bag_at_ctrl_c(meet, domain_id, tmp_path):
     robot = Robot(meet(domain_id))
-    recorder = nics(domain_id, "bag", "record", tmp_path / "drive")
+    recorder = nics(domain_id, "bag", "record", tmp_path / "drive", "--json")
     robot.until(lambda: robot.odom.get_subscription_count() > 0, "a recorder of odom")
     robot.until(lambda: robot.command.get_subscription_count() > 0, "a recorder of cmd_vel")
     until = robot.sent + 40
@@ -98,8 +98,10 @@ def test_a_recorder_writes_a_whole_bag_at_ctrl_c(meet, domain_id, tmp_path):
     recorder.send_signal(signal.SIGINT)
     out, err, code = ended(recorder)
     assert code == 0, err
-    assert "bag written to" in out
+    told = json.loads(out)
+    assert told["path"] == str(tmp_path / "drive")
     counts = {topic.topic: topic.count for topic in bag_info(tmp_path / "drive").topics}
+    assert counts == told["messages"]
     assert min(counts["/odom"], counts["/cmd_vel"]) >= 30
     with opened(tmp_path / "drive") as bag:
         assert [offer.reliable for offer in bag.offers("/odom")] == [False]
@@ -140,10 +142,11 @@ def test_a_bag_is_published_with_its_time_on_the_clock(meet, domain_id, tmp_path
     bag = small_drive(tmp_path / "bag")
     peer = meet(domain_id)
     odom, clock = peer.listen(Odometry, "odom", 100), peer.listen(Clock, "/clock", 1000)
-    player = nics(domain_id, "bag", "replay", bag, "--rate", "0.5")
+    player = nics(domain_id, "bag", "replay", bag, "--rate", "0.5", "--json")
     peer.until(lambda: len(odom) >= 40, "the whole bag", ENDS_S)
     out, err, code = ended(player)
-    assert (code, out) == (0, "60 messages were published\n"), err
+    assert code == 0, err
+    assert json.loads(out) == {"published": 60}
     assert [stamp_ns(message) for message in odom] == [bags.ns(t) for t in bags.times(0.05, 2.0)]
     ticks = [conversions.stamp_from_ros(message.clock) for message in clock]
     assert ticks == sorted(ticks)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 
 import numpy as np
 import onnx
@@ -99,10 +100,12 @@ def test_nics_policy_exports_and_imports_what_is_shipped(tmp_path):
     for file in sorted(shipped().glob("*.onnx")):
         export_bundle(load_policy(file.stem), tmp_path / file.stem)
         assert import_policy(tmp_path / file.stem) == file.read_bytes()
-    done = nics("policy", "export", "differential", "--leapp", "bundle", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    done = nics("policy", "import", "bundle", "-o", "back.onnx", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    words = ("policy", "export", "differential", "--leapp", "bundle", "--json")
+    (written,) = json.loads(nics(*words, cwd=tmp_path).stdout).values()
+    assert (tmp_path / written).parent.name == "bundle"
+    words = ("policy", "import", "bundle", "-o", "back.onnx", "--json")
+    told = json.loads(nics(*words, cwd=tmp_path).stdout)
+    assert told == {"file": "back.onnx", "robot": "differential"}
     assert (tmp_path / "back.onnx").read_bytes() == (shipped() / "differential.onnx").read_bytes()
     done = nics("policy", "import", "bundle", "-o", "back.pt", cwd=tmp_path)
     assert done.returncode == 2

@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from nics_drl_bridge.commands.cli import app
 from nics_drl_bridge.generator import lidar_of
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 from nics_drl_bridge.robot.urdf import urdf_of
@@ -44,6 +47,13 @@ def test_the_shipped_files_are_those_of_the_shipped_robots(name: str) -> None:
     lidar = lidar_of(load_robot(name))
     file = ROOT / "urdf" / f"{name}.urdf"
     assert file.read_text(encoding="utf-8") == urdf_of(load_robot(name), lidar.mount, lidar.frame)
+
+
+def test_the_command_tells_the_file_that_it_wrote(tmp_path: Path) -> None:
+    file = str(tmp_path / "car.urdf")
+    told = CliRunner().invoke(app, ["urdf", "ackermann", "--out", file, "--json"])
+    assert json.loads(told.stdout) == {"file": file, "robot": "ackermann"}
+    assert Path(file).is_file()
 
 
 @pytest.mark.parametrize("name", ROBOTS)

@@ -32,6 +32,7 @@ def record(
         help="Stop after so long [s]; else at Ctrl-C.")] = None,
     storage: StorageOption = "mcap",
     use_sim_time: Annotated[bool, Option("--use-sim-time", help="Receipts by /clock.")] = False,
+    as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Records the topics of a robot as they are, without driving it."""
     with one_sentence():
@@ -40,9 +41,10 @@ def record(
             from nics_drl_bridge.extras.bags.live import BagOrder, record_bag
         names, say = tuple(topics or ()), partial(typer.echo, err=True)
         order = BagOrder(out, names, everything, namespace, duration, kind, use_sim_time)
-        for topic, count in sorted(record_bag(order, say).items()):
-            typer.echo(f"{topic}: {count} messages")
-        typer.echo(f"bag written to {out}")
+        counts = dict(sorted(record_bag(order, say).items()))
+        lines = [f"{topic}: {count} messages" for topic, count in counts.items()]
+        lines.append(f"bag written to {out}")
+        console.say(as_json, "\n".join(lines), path=str(out), messages=counts)
 
 
 @bag.command()
@@ -82,6 +84,7 @@ def replay(
         help="For --estimate: as odom=/wheel_odom. Roles: scan, odom, cmd_vel, pose, imu.")] = None,
     out: Annotated[Path | None, Option(help="For --estimate: .npz or .csv to write.")] = None,
     salvage: SalvageOption = False,
+    as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Plays a bag over ROS 2, or gives the middleware's estimate of it."""
     with one_sentence(), intact(path, salvage) as whole:
@@ -92,17 +95,19 @@ def replay(
             made = playback.estimate(whole, open_model(model), console.roles_of(topic or []))
             if out is not None:
                 playback.write_estimate(made, out)
-            for reason, count in sorted(made.rejected.items()):
-                typer.echo(f"not used: {count} of {reason}")
-            (x, y, heading), number = made.pose[-1], len(made.stamp_ns)
-            typer.echo(f"{number} estimates; the last is {x:.3f} m, {y:.3f} m, {heading:.3f}")
-            typer.echo(f"sha256 {made.digest}")
+            rejected, number = dict(sorted(made.rejected.items())), len(made.stamp_ns)
+            x, y, heading = last = made.pose[-1].tolist()
+            lines = [f"not used: {count} of {reason}" for reason, count in rejected.items()]
+            lines.append(f"{number} estimates; the last is {x:.3f} m, {y:.3f} m, {heading:.3f}")
+            told = {"estimates": number, "last": last, "not_used": rejected}
+            line = "\n".join((*lines, f"sha256 {made.digest}"))
+            console.say(as_json, line, **told, sha256=made.digest)
             return
         with needs_ros("nics bag replay"):
             from nics_drl_bridge.extras.bags.live import play_bag
         say = partial(typer.echo, err=True)
         sent = play_bag(whole, topics or (), rate, loop, clock, namespace, lockstep, say)
-        typer.echo(f"{sent} messages were published")
+        console.say(as_json, f"{sent} messages were published", published=sent)
 
 
 @bag.command()
@@ -124,6 +129,7 @@ def export(
     succeeded: Annotated[str | None, Option(metavar="all|none|NUMBERS",
         help="Episodes that succeeded, as 0,2,5; if known.")] = None,
     salvage: SalvageOption = False,
+    as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Writes a bag for others: as a dataset, or as MCAP to look at."""
     with one_sentence(), intact(path, salvage) as whole:
@@ -133,33 +139,37 @@ def export(
         if lerobot is None and mcap is None:
             raise ConfigError("nothing to write; say --lerobot FOLDER or --mcap FOLDER.")
         known = None if model is None else open_model(model)
+        lines, told = [], dict[str, Any]()
         if mcap is not None:
             from nics_drl_bridge.extras.bags.convert import convert
 
-            added = convert(whole, mcap, known)
+            added = told["added"] = convert(whole, mcap, known)
+            told["mcap"] = str(mcap)
             also = f", with {' and '.join(added)} added" if added else ""
-            typer.echo(f"bag written to {mcap}{also}")
-        if lerobot is None:
-            return
-        from nics_drl_bridge.extras.bags.frames import frames_of
-        from nics_drl_bridge.extras.bags.lerobot import check_output, write_dataset
+            lines.append(f"bag written to {mcap}{also}")
+        if lerobot is not None:
+            from nics_drl_bridge.extras.bags.frames import frames_of
+            from nics_drl_bridge.extras.bags.lerobot import check_output, write_dataset
 
-        check_output(lerobot)
-        frames = frames_of(whole, console.roles_of(topic or []), known, fps, gap)
-        episodes = len(frames.lengths)
-        reached = _numbers(succeeded, episodes)
-        write_dataset(frames, lerobot, task, known.robot.name if known else None, reached)
-        if frames.dropped:
-            typer.echo(f"left out: {frames.dropped} episodes of a single frame", err=True)
-        total = int(frames.lengths.sum())
-        typer.echo(f"{episodes} episodes, {total} frames at {frames.fps} Hz, written to {lerobot}")
+            check_output(lerobot)
+            frames = frames_of(whole, console.roles_of(topic or []), known, fps, gap)
+            episodes, total = len(frames.lengths), int(frames.lengths.sum())
+            reached = _numbers(succeeded, episodes)
+            write_dataset(frames, lerobot, task, known.robot.name if known else None, reached)
+            if frames.dropped:
+                typer.echo(f"left out: {frames.dropped} episodes of a single frame", err=True)
+            told |= {"lerobot": str(lerobot), "episodes": episodes, "frames": total,
+                     "fps": frames.fps, "left_out": frames.dropped}  # fmt: skip
+            counts = f"{episodes} episodes, {total} frames at {frames.fps} Hz"
+            lines.append(f"{counts}, written to {lerobot}")
+        console.say(as_json, "\n".join(lines), **told)
 
 
 @bag.command()
 def salvage(
     path: BagArgument,
     out: Annotated[Path, Argument(help="Folder of the bag to write.")],
-    storage: StorageOption = "mcap",
+    storage: StorageOption = "mcap", as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Writes what is intact of a damaged bag as a new one."""
     with one_sentence():
@@ -168,9 +178,9 @@ def salvage(
         check_libraries(path, "reading")
         from nics_drl_bridge.extras.bags.salvage import salvage as salvage_bag
 
-        for line in salvage_bag(path, out, _storage(storage)).lines():
-            typer.echo(line)
-        typer.echo(f"bag written to {out}")
+        lines = salvage_bag(path, out, _storage(storage)).lines()
+        line = "\n".join((*lines, f"bag written to {out}"))
+        console.say(as_json, line, path=str(out), told=lines)
 
 
 def _storage(name: str) -> Any:

@@ -70,6 +70,9 @@ def test_what_is_intact_is_saved_and_the_loss_is_told(damaged, tmp_path):
     assert told.exit_code == 0, told.output
     assert "of 360 are lost" in told.stdout
     assert nics("bag", "info", tmp_path / "saved").exit_code == 0
+    facts = json.loads(nics("bag", "salvage", damaged, tmp_path / "anew", "--json").stdout)
+    assert facts["path"] == str(tmp_path / "anew")
+    assert facts["told"] == told.stdout.splitlines()[:-1]
     looked = nics("bag", "info", damaged, "--salvage")
     assert looked.exit_code == 0
     assert "of 360 are lost" in looked.stderr

@@ -274,8 +274,11 @@ def messages_in(folder):
 def test_the_mcap_tells_all_that_a_viewer_needs(tmp_path, storage):
     topics = drive()
     bag = bags.write(tmp_path / "bag", topics, storage)
-    told = export(bag, "--mcap", tmp_path / "shown", "--model", "ackermann")
-    assert told.exit_code == 0, told.output
+    both = ("--mcap", tmp_path / "shown", "--lerobot", tmp_path / "set")
+    told = json.loads(export(bag, *both, "--model", "ackermann", "--json").stdout)
+    assert {told["mcap"], told["lerobot"]} == {str(tmp_path / "shown"), str(tmp_path / "set")}
+    assert (told["episodes"], told["left_out"], told["fps"]) == (1, 0, FPS)
+    assert len(told["added"]) == 2
     found = messages_in(tmp_path / "shown")
     assert found.keys() == {*topics, "/tf", "/tf_static"}
     assert [len(found[topic]) for topic in topics] == [len(rows) for rows in topics.values()]
