@@ -60,7 +60,8 @@ def _coerced_to_numbers(given: Any, found: Any, place: str = "") -> Iterator[tup
 
 
 _UNKNOWN = ("extra_forbidden", "unexpected_keyword_argument")  # keys of a model, of a dataclass
-_NO_KEYS = ("model_type", "dict_type", "dataclass_type")
+_NO_KEYS = ("model_type", "model_attributes_type", "dict_type", "dataclass_type")
+_NO_LIST, _COUNT = ("tuple_type", "list_type"), ("too_short", "too_long")
 _SHORT = reprlib.Repr()  # a value made of YAML aliases may not fit into memory in full
 _SHORT.maxstring = _SHORT.maxother = 80
 
@@ -82,6 +83,12 @@ def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
         return f"the key {key!r} is missing; add it."
     if first["type"] in _NO_KEYS:
         return f"key {key!r}: must hold `key: value` pairs, not {_SHORT.repr(first['input'])}."
+    if first["type"] in _NO_LIST:
+        return f"key {key!r}: must be a list, as [a, b], not {_SHORT.repr(first['input'])}."
+    if first["type"] in _COUNT:
+        least, most, found = map(first["ctx"].get, ("min_length", "max_length", "actual_length"))
+        told = f"at most {most}" if least is None else f"at least {least}"
+        return f"key {key!r}: must have {told} entries, not {found}."
     message = first["msg"].removeprefix("Value error, ").rstrip(".")
     message = message[0].lower() + message[1:]
     if not key:  # an error of several keys, which the message names

@@ -177,7 +177,7 @@ def open_model(name: str | Path, lidar: str | None = None) -> SimulatorModel:
     name = str(name)
     if Path(name).is_dir():
         return load_model(name)
-    if "/" in name and not name.endswith(".yaml"):
+    if "/" in name and not name.endswith((".yaml", ".yml")):
         raise ModelError(f"{name}: no such folder; make one with `nics generate`.")
     try:
         return builtin_model(name)

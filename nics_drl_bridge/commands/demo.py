@@ -21,7 +21,7 @@ def demo(
     train_steps: Annotated[int | None, Option(min=1, help="Environment steps to train.")] = None,
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
-    """Goes the whole road once, from a recording to a report."""
+    """Runs the whole chain once, from a recording to a report."""
     with console.one_sentence():
         from nics_drl_bridge.commands.demo_run import DemoPlan, run
 

@@ -194,7 +194,7 @@ def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
 
             given = place, policy, name, order.world, seeds, logs
             runs[place] = drive_in(*given, on_episode, say, under)
-        evaluated.append(judged(policy, runs, model, world, order.out, PANELS))
+        evaluated.append(judged(policy, runs, model, world, order.out, PANELS, order.policies))
     write_evaluation(replace(order, conditions=under), name, model, evaluated)
     return evaluated
 
@@ -229,13 +229,20 @@ def _places(order: EvaluationOrder, robot: RobotSpec, say: Say) -> Sequence[str]
 
 def judged(
     policy: str, runs: Mapping[str, Sequence[Episode]], model: SimulatorModel, world: AnyWorld,
-    out: Path, panels: int | None = None,
+    out: Path, panels: int | None = None, among: Sequence[str] = (),
 ) -> Evaluated:  # fmt: skip
     """Judges the runs of a policy by place, and draws their first episodes into a folder."""
     shown = {LABELS[place]: some[:panels] for place, some in runs.items()}
     picture = trajectories(shown, world, model.robot.footprint_radius)
-    write_bytes(out / f"trajectories_{Path(policy).stem}.png", picture)
+    write_bytes(out / f"trajectories_{short_name(policy, among)}.png", picture)
     return Evaluated(policy, runs, evaluation.tallies(runs, model.control_period))
+
+
+def short_name(policy: str, among: Sequence[str]) -> str:
+    """Returns the stem of a policy's path; where others have the same, folders before it, too."""
+    own, *others = (Path(one).with_suffix("").parts for one in (policy, *({*among} - {policy})))
+    alone = (k for k in range(1, len(own)) if all(one[-k:] != own[-k:] for one in others))
+    return "_".join(own[-next(alone, 1) :])
 
 
 def model_name(model: str | None, contracts: Mapping[str, Contract]) -> str:

@@ -24,7 +24,7 @@ def evaluate(
     places: Annotated[list[str] | None, Option(
         "--in", help="fast, dds or mujoco_dds; several times; else all that work here.")] = None,
     episodes: Annotated[int | None, Option(min=1, help="How many; 20, or 1 on a vehicle.")] = None,
-    seed: Annotated[int, Option(min=0, help="Of the first episode.")] = 1_000_000,
+    seed: Annotated[int, Option(min=0, help="Seed of the first episode.")] = 1_000_000,
     lidar: console.OtherLidarOption = None,
     randomisation: console.RandomisationOption = None,
     gate: console.GateOption = None,
@@ -111,7 +111,7 @@ def _shadow(
     bag: Path, policies: list[str], model: str | None, topics: list[str],
     goal: tuple[float, float] | None, ahead: float, out: Path, as_json: bool,
 ) -> None:  # fmt: skip
-    from nics_drl_bridge.commands.episodes import contracts_of, model_name
+    from nics_drl_bridge.commands.episodes import contracts_of, model_name, short_name
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.policy.shadow import PERCENTILES, shadow
     from nics_drl_bridge.report.pictures import shadow_picture
@@ -120,7 +120,7 @@ def _shadow(
     for policy in policies:
         name = model_name(model, contracts_of([policy], model))
         made = shadow(bag, open_model(name), policy, console.roles_of(topics), goal, ahead)
-        place, differences = out / f"shadow_{Path(policy).stem}", made.differences()
+        place, differences = out / f"shadow_{short_name(policy, policies)}", made.differences()
         write_bytes(place.with_suffix(".png"), shadow_picture(made))
         data = {
             "bag": str(bag), "policy": policy, "model": name, "goal": goal,

@@ -13,7 +13,7 @@ EXAMPLES = {
     "import": ("nics import drive.csv --map drive.yaml --out drive.npz",),
     "record": ("nics record --robot my_robot.yaml --out drive.npz --preview",
         "nics record --robot my_robot.yaml --out drive.npz --bound 2 --speed 0.3"),
-    "explain": ("nics explain black_box/stop.jsonl",),
+    "explain": ("nics explain ~/.ros/black_box/stop.jsonl",),
     "doctor": ("nics doctor --install", "nics doctor drive_bag --model my_robot",
         "nics doctor --policy policy.onnx --namespace robot1"),
     "urdf": ("nics urdf my_robot --out my_robot.urdf",),

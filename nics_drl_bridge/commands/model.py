@@ -22,9 +22,9 @@ def record(
     out: Annotated[Path, Option(help="An .npz file, or the folder of a rosbag2, to write.")],
     robot: console.RobotOption = DEFAULT_ROBOT,
     bound: Annotated[float, Option(help="Radius around the start to keep within [m].")] = 2.0,
-    duration: Annotated[float, Option(help="Of the drive [s].")] = 60.0,
+    duration: Annotated[float, Option(help="Duration of the drive [s].")] = 60.0,
     speed: Annotated[float, Option(help="Share of the greatest speeds to use.")] = 1.0,
-    seed: Annotated[int, Option(help="Of the pattern.")] = 0,
+    seed: Annotated[int, Option(help="Seed of the pattern.")] = 0,
     namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
     remap: Annotated[list[str] | None, Option(help="A topic's other name: odom:=/wheels.")] = None,
     topics: Annotated[Path | None, Option(help="YAML file of the state's, wheels' joints.")] = None,
@@ -128,8 +128,12 @@ def inspect(
             raise ConfigError(f"--map {mapping}: is there already; give another name.")
         with open_source(source) as opened, console.progress_bar(f"reading {source}"):
             tables = survey(opened)
+        text = first_mapping(tables)
+        if mapping is not None:
+            write_text(mapping, text)
         if as_json:
-            typer.echo(json_of({"tables": [asdict(table) for table in tables]}))
+            facts = {"tables": [asdict(table) for table in tables]}
+            typer.echo(json_of(facts | {"mapping": mapping and str(mapping)}))
             return
         for table in tables:
             found = "".join(f"\n  {finding}" for finding in table.regularity + table.findings)
@@ -137,11 +141,9 @@ def inspect(
             rows = [(c.name, f"{c.low:.6g}", f"{c.high:.6g}") for c in table.columns]
             if rows:
                 typer.echo(console.table(("column", "least", "greatest"), rows))
-        text = first_mapping(tables)
         if mapping is None:
             typer.echo(f"A first mapping, to edit; --map FILE writes it:\n\n{text}")
             return
-        write_text(mapping, text)
         for line in text.splitlines():
             if line.startswith(NOT_USED):
                 typer.echo(line.removeprefix("# "))
@@ -256,8 +258,9 @@ def generate(
         if as_json:
             typer.echo(json_of(fit_facts(out, spec.name, identified)))
             return
-        typer.echo(opening(model.report))
-        typer.echo(f"\nall figures: {out / 'report.txt'}, with pictures: {out / 'report.html'}")
+        named = "" if lidar or spec.lidar else ", as none is named: --lidar says which"
+        typer.echo(f"{opening(model.report)}\n\nits lidar: {model.lidar.name!r}{named}")
+        typer.echo(f"all figures: {out / 'report.txt'}, with pictures: {out / 'report.html'}")
         typer.echo(f"model written to {out}")
 
 
@@ -280,8 +283,8 @@ def drive(
     recording: Annotated[Path | None,
         Option(help="An .npz to keep the drive in, as one of a real robot.")] = None,
     lidar: console.LidarOption = None,
-    duration: Annotated[float, Option(min=5.0, max=3600.0, help="Of the drive [s].")] = 60.0,
-    seed: Annotated[int, Option(min=0, help="Of the commands, which are random.")] = 0,
+    duration: Annotated[float, Option(min=5.0, max=3600.0, help="Duration [s].")] = 60.0,
+    seed: Annotated[int, Option(min=0, help="Seed of the random commands.")] = 0,
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Drives a robot's textbook model and generates a simulator of it.

@@ -36,7 +36,7 @@ def train(
     algorithm: Annotated[str | None, Option(help="ppo or sac.")] = None,
     seeds: Annotated[list[int] | None, Option(help="One or more, as --seeds 0 1 2.")] = None,
     steps: Annotated[int | None, Option(min=1, help="Environment steps.")] = None,
-    episodes: Annotated[int, Option(min=1, help="Of the evaluation, in each world.")] = 500,
+    episodes: Annotated[int, Option(min=1, help="Evaluation episodes in each world.")] = 500,
     out: Annotated[Path | None, Option(help="Folder of the run.")] = None,
     resume: Annotated[bool, Option(help="Go on where --out was interrupted.")] = False,
     engine: Annotated[str | None,
@@ -70,7 +70,8 @@ def train(
         chosen = resumed or _told(task, settings, named)
         folder = out or Path("runs") / chosen.title
         command = shlex.join(["nics", *sys.argv[1:]])
-        every = [*(seeds or [0]), *(more_seeds or [])]
+        begun = train_run.seeds_of(folder) if resume else []
+        every = [*(seeds or begun or [0]), *(more_seeds or [])]
         order = train_run.TrainOrder(chosen, every, folder, episodes, resume, command)
         with _learner(engine, address, env_runners, chosen.num_envs) as learn:
             (_run_watched if watch else _run)(train_run, order, learn, as_json)

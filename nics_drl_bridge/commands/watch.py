@@ -23,7 +23,7 @@ def watch(
     world: Annotated[list[str] | None, Option(
         "--world", "--scene", help="A shipped world (circles) or a YAML file; several times: side "
         "by side.", autocompletion=console.WORLDS)] = None,
-    seed: Annotated[int, Option(min=0, help="Of the first episode.")] = 1_000_000,
+    seed: Annotated[int, Option(min=0, help="Seed of the first episode.")] = 1_000_000,
     lidar: console.OtherLidarOption = None,
     randomisation: console.RandomisationOption = None,
     gate: console.GateOption = None,
@@ -37,7 +37,7 @@ def watch(
         metavar="FILE", help="Write .mp4, .gif or .rrd (Rerun) instead of a page.")] = None,
     episodes: Annotated[int, Option(min=1, help="For --record: how many.")] = 1,
     port: Annotated[int | None, Option(
-        min=0, max=65535, help="Of the page; 0 takes any (default 8765).")] = None,
+        min=0, max=65535, help="Port of the page; 0 takes any (default 8765).")] = None,
     browser: Annotated[bool, Option(help="Open the page in a browser.")] = True,
 ) -> None:  # fmt: skip
     """Shows a policy, live topics or a bag on a page in the browser."""

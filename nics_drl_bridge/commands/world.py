@@ -45,7 +45,7 @@ def import_(
         metavar="FILE...", help="Gazebo's .world or .sdf, Nav2's map .yaml, or a picture.")],
     out: Annotated[Path | None, Option(
         help="The .yaml to write, or a folder; by default named after the file, here.")] = None,
-    name: Annotated[str | None, Option(help="Of the world; by default that of the file.")] = None,
+    name: Annotated[str | None, Option(help="Name of the world; else that of the file.")] = None,
     start: Annotated[tuple[float, float, float] | None, Option(
         metavar="X Y HEADING", help="Where robots start [m, rad]; else anywhere.")] = None,
     goal: Annotated[tuple[float, float] | None, Option(
@@ -197,7 +197,7 @@ def _flow(value: Any) -> str:
 def draw(
     name: Shown,
     out: Annotated[Path | None, Option(help="The .png to write; <world>.png.")] = None,
-    seed: Annotated[int, Option(min=0, help="Of the episode.")] = 0,
+    seed: Annotated[int, Option(min=0, help="Seed of the episode.")] = 0,
     robot: console.RobotOption = DEFAULT_ROBOT,
     footprint: Annotated[float | None, Option(help="Instead: radius of a round robot [m].")] = None,
     as_json: console.JsonOption = False,
@@ -231,7 +231,7 @@ def draw(
 def map_(
     name: Shown,
     out: Annotated[Path | None, Option(help="The .yaml to write; <world>_map.yaml.")] = None,
-    seed: Annotated[int, Option(min=0, help="Of the episode.")] = 0,
+    seed: Annotated[int, Option(min=0, help="Seed of the episode.")] = 0,
     robot: console.RobotOption = DEFAULT_ROBOT,
     resolution: Annotated[float, Option(help="Greatest side of a cell [m].")] = 0.01,
     as_json: console.JsonOption = False,

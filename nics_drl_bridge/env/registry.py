@@ -31,9 +31,8 @@ def make_task(
     """
     if isinstance(task, Task):
         return _checked(task, model, options)
-    found = task if isinstance(task, type) else _class_of(task)
     options = dict(options or {})
-    _check_options(found, options)
+    found = class_for(task, options)
     if "scan" in options:
         options["scan"] = layout_of(options["scan"], model.lidar)
     if "sensors" in options:
@@ -54,7 +53,9 @@ def _sensor(name: Any, model: SimulatorModel) -> Sensor:
     return known[given]
 
 
-def _check_options(found: type[Task], options: dict[str, Any]) -> None:
+def class_for(task: str | type[Task], options: dict[str, Any]) -> type[Task]:
+    """Returns a task's class; ConfigError if there is none, or it does not take the options."""
+    found = task if isinstance(task, type) else _class_of(task)
     known = signature(found).parameters
     free = any(one.kind is Parameter.VAR_KEYWORD for one in known.values())
     for name, value in options.items():
@@ -62,9 +63,10 @@ def _check_options(found: type[Task], options: dict[str, Any]) -> None:
             hint = nearest(name, set(known) - {"robot", "lidar"})
             raise ConfigError(f"task {found.__name__}: unknown task option {name!r}; {hint}")
         annotation = known[name].annotation if name in known else None
-        kind = str(getattr(annotation, "__name__", annotation))
-        if kind in KINDS and not _fits(value, kind):
+        kind, none, _ = str(getattr(annotation, "__name__", annotation)).partition(" | None")
+        if kind in KINDS and not (_fits(value, kind) or (none and value is None)):
             raise ConfigError(f"task option {name}={value!r}: must be {KINDS[kind][1]}.")
+    return found
 
 
 KINDS: dict[str, tuple[tuple[type, ...], str]] = {  # annotation -> types, name in errors

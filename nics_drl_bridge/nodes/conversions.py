@@ -111,7 +111,13 @@ def odometry_to_ros(
 
 def odometry_from_ros(message: Odometry) -> tuple[Array, Array]:
     """Returns pose (3,) and body twist (3,) of an Odometry message."""
-    return np.array(messages.pose_row(message)), np.array(messages.twist_row(message))
+    return _pose_of(message), np.array(messages.twist_row(message))
+
+
+def _pose_of(message: Any) -> Array:
+    """Returns the pose (3,) of a message; NaN where its orientation was never filled in."""
+    whole = is_rotation(*messages.quaternion(message))
+    return np.array(messages.pose_row(message)) if whole else np.full(3, np.nan)
 
 
 def covariance_to_ros(planar: Array) -> Array:
@@ -127,7 +133,7 @@ def pose_from_ros(
     """Returns the pose (3,) of a message and its covariance (3, 3); None if it carries none."""
     known = isinstance(message, geometry.PoseWithCovarianceStamped)
     covariance = np.reshape(message.pose.covariance, (6, 6))[PLANAR] if known else None
-    return np.array(messages.pose_row(message)), covariance
+    return _pose_of(message), covariance
 
 
 def pose_to_ros(pose: ArrayLike, time_ns: int, frame: str) -> geometry.PoseStamped:

@@ -1,5 +1,6 @@
 """Nav2's actions `follow_path` and `navigate_to_pose`, served by a policy."""
 
+import contextlib
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -8,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from nav_msgs.msg import OccupancyGrid
-from rclpy.node import Node
+from rclpy.node import Node, NodeNameNonExistentError
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
@@ -144,13 +145,15 @@ class PathActions:
         own = self._node.get_name(), self._node.get_namespace()
         for name, space in self._node.get_node_names_and_namespaces():
             if (name, space) != own:
-                served = self._node.get_service_names_and_types_by_node(name, space)
-                if any(each == wanted for each, _ in served):
-                    return True
+                with contextlib.suppress(NodeNameNonExistentError):  # it has just ended
+                    served = self._node.get_service_names_and_types_by_node(name, space)
+                    if any(each == wanted for each, _ in served):
+                        return True
         return False
 
     def _look(self) -> None:
-        if NAVIGATE in self._servers and self.led:
+        own = NAVIGATE in self._servers and (self._run is None or self._run.goal.name == FOLLOW)
+        if own and self.led:
             told = f"another node serves {NAVIGATE}, so this one does not any more"
             self._node.get_logger().info(told)
             self._servers.pop(NAVIGATE).destroy()
@@ -178,6 +181,10 @@ class PathActions:
         before, self._run = self._run, None
         try:
             run = self._run = begin(goal)
+            if before is not None and before.frame == run.frame:
+                run.valid_s = before.valid_s  # a way that is planned again is no way got on
+                if before.progress.check == run.progress.check:
+                    run.progress = before.progress
             if before is None or not np.array_equal(before.path.end, run.path.end):
                 self._anew()  # not where the same way is planned again
         except Refusal as refusal:
@@ -193,8 +200,9 @@ class PathActions:
             ("progress_checker", known.progress),
         ):
             name, wrong = chosen(what.replace("_", " "), getattr(asked, f"{what}_id", ""), those)
-            if wrong:
-                raise Refusal("INVALID_CONTROLLER", f"{FOLLOW}: {wrong}")
+            if wrong:  # the code of Nav2's own server
+                code = "INVALID_CONTROLLER" if what == "controller" else "UNKNOWN"
+                raise Refusal(code, f"{FOLLOW}: {wrong}")
             names.append(name)
         poses = np.array([_pose_of(each.pose) for each in asked.path.poses]).reshape(-1, 3)
         headers = [asked.path.header, *(each.header for each in asked.path.poses[:1])]
@@ -209,11 +217,11 @@ class PathActions:
             raise Refusal("FAILED_TO_LOAD_BEHAVIOR_TREE", f"{NAVIGATE}: {reason}")
         end = _pose_of(asked.pose.pose)[None]
         frame, end = self._placed(goal, asked.pose.header.frame_id, end)
+        self._planned(goal, end)
         try:
-            PlannedPath(end)
             way = self._way(frame, self._robot_in(NAVIGATE, frame), end[0])
         except ConfigError as error:
-            raise Refusal("UNKNOWN", f"{NAVIGATE}: {error}") from None
+            raise Refusal(goal.code, f"{NAVIGATE}: {error}") from None
         return self._begin(
             goal, frame, way, (self._parameters.goals[0], self._parameters.progress[0])
         )
@@ -239,17 +247,21 @@ class PathActions:
         return robot
 
     def _begin(self, goal: Goal, frame: str, poses: Array, checks: Sequence[str]) -> Run:
-        try:
-            PlannedPath(poses)
-        except ConfigError as error:
-            raise Refusal(goal.code, f"{goal.name}: {error}") from None
+        self._planned(goal, poses)
         frame, poses = self._placed(goal, frame, poses)
+        path = self._planned(goal, poses)
         self._robot_in(goal.name, frame)
         self._require_on_map(goal, frame, poses)
         arrival, progress = self._parameters.checks(*checks)
         checkers = GoalChecker(arrival, not self._robot.steers), ProgressChecker(progress)
         now_s = time.monotonic()
-        return Run(goal, frame, PlannedPath(poses), *checkers, now_s, now_s)
+        return Run(goal, frame, path, *checkers, now_s, now_s)
+
+    def _planned(self, goal: Goal, poses: Array) -> PlannedPath:
+        try:
+            return PlannedPath(poses)
+        except ConfigError as error:
+            raise Refusal(goal.code, f"{goal.name}: {error}") from None
 
     def _require_on_map(self, goal: Goal, frame: str, poses: Array) -> None:
         if self._map is None:
@@ -286,7 +298,7 @@ class PathActions:
             topic for topic in (SCAN, ODOM)
             if topic not in newest or (now_ns - newest[topic].arrival_ns) * S_PER_NS > longest
         ]  # fmt: skip
-        if silent and time.monotonic() - run.started_s > longest:
+        if silent and time.monotonic() - run.valid_s > longest:
             self._run = None
             told = f"nothing on {' and '.join(silent)} for {longest:g} s."
             self._end(run.goal, held.ABORT, "CONTROLLER_TIMED_OUT", told)

@@ -21,7 +21,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes.parameters import BASE_FRAME, MODEL, STAMPED
 
 STATE_PUBLISHER = "robot_state_publisher"
-TRANSFORMS = ("tf", "tf_static")
+TRANSFORMS = ("/tf", "/tf_static")
 # RViz names topics absolutely; here they are those of the robot's namespace.
 SHOWN = ("scan", "odom", "odometry/filtered", "ground_truth", "goal_pose", "robot_description")
 
@@ -93,10 +93,11 @@ class Setup:
         words: Sequence[str] = (), remapped: Sequence[tuple[str, str]] = (), **more: Any,
     ) -> Node:  # fmt: skip
         """Returns a node with the parameters that are given, of ours over those of the file."""
-        # As in Nav2, transforms stay in a namespace; those of a fleet in the one of all.
+        # As in Nav2, transforms stay in a namespace; those of a fleet, and its map, in that of all.
         own = robot.transforms == robot.namespace
         place = "" if own else f"/{robot.transforms}/".replace("//", "/")
-        remapped = [*((f"/{each}", f"{place}{each}") for each in TRANSFORMS), *remapped]
+        moved = TRANSFORMS if own else (*TRANSFORMS, "map")
+        remapped = [*((each, f"{place}{each.strip('/')}") for each in moved), *remapped]
         files = [self["params_file"]] if package == PACKAGE else []
         return Node(
             package=package, executable=name, name=name, namespace=robot.namespace,
@@ -125,7 +126,9 @@ def names_of(robots: Any) -> tuple[str, ...]:
     else:
         words = re.findall(r"[^\s,\[\]'\"]+", robots)
     if len(words) == 1 and words[0].isdecimal():
-        count = int(words[0])
+        if (count := int(words[0])) < 1:
+            fix = "give a count from 1, or namespaces, as in robots:='[ant, bee]'"
+            raise ConfigError(f"launch argument 'robots' is {count}; {fix}.")
         return tuple(f"robot{k + 1}" for k in range(count)) if count > 1 else ()
     return tuple(words)
 
@@ -146,7 +149,9 @@ def numbers_of(start: str) -> list[float] | None:
 def simulator(setup: Setup) -> Iterator[Any]:
     """Starts the simulator of all robots."""
     space = setup["namespace"].strip("/")
-    robots = value(str(list(setup.fleet)) if setup.fleet else "", list[str])
+    robots = value(setup["robots"] and "1", int)
+    if setup.fleet:
+        robots = value(str(list(setup.fleet)), list[str])
     given = {
         "model": value(setup["model"]), "world": value(setup["world"]), "robots": robots,
         "episode_start": numbers_of(setup["start"]), STAMPED: value(setup["stamped"], bool),

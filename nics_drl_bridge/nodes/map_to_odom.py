@@ -49,7 +49,7 @@ class MapToOdom:
 
     def __init__(self, node: Node, tolerance_s: float) -> None:
         self._node, self._ahead_ns = node, round(tolerance_s * NS_PER_S)
-        self._own: deque[tuple[int, int]] = deque(maxlen=KEPT)  # stamps
+        self._own: deque[Any] = deque(maxlen=KEPT)  # transforms
         self._frames, self._heard_s = ("", ""), -math.inf
         self._kind: Any = conversions.message_type("tf2_msgs/msg/TFMessage")
         if self._kind is None:
@@ -72,15 +72,14 @@ class MapToOdom:
         if self._kind is None or time.monotonic() - self._heard_s < QUIET_S or not all(frames):
             return
         stamp = conversions.stamp_to_ros(stamp_ns + self._ahead_ns)
-        self._own.append((stamp.sec, stamp.nanosec))
         one = transform_to_ros(*frames, odom, stamp)
+        self._own.append(one)
         self._publisher.publish(self._kind(transforms=[one]))
 
     def _take(self, message: Any) -> None:
         for each in message.transforms:
-            stamp, parent = each.header.stamp, each.header.frame_id.strip("/")
-            own = (stamp.sec, stamp.nanosec) in self._own
-            if own or (parent, each.child_frame_id.strip("/")) != self._frames:
+            frames = each.header.frame_id.strip("/"), each.child_frame_id.strip("/")
+            if frames != self._frames or each in self._own:
                 continue
             if time.monotonic() - self._heard_s > QUIET_S:
                 told = f"another node publishes {' -> '.join(self._frames)}, so this one does not"

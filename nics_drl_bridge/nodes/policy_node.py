@@ -128,6 +128,9 @@ class PolicyNode(ManagedNode):
         if not newest.keys() >= set(needed):
             return
         scan_ns = newest[SCAN].stamp_ns
+        if scan_ns < self._acted_ns:  # a simulation's clock was set back
+            self._acted_ns = 0
+            begin(self._policy)
         fresh = newest[ODOM].stamp_ns >= scan_ns > self._acted_ns
         if not fresh or not self._pace.due(begin_s):
             return

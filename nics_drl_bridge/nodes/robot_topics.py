@@ -108,7 +108,7 @@ class RobotTopics:
 
     def restart(self) -> None:
         """Clears all state; the next odometry starts anew."""
-        self._started, self._since_ns = False, 0
+        self._started, self._since_ns, self._placed = False, 0, None
         self.frames = ("", "")  # of the newest odometry: its own, and the robot's
         self.middleware.reset(0, np.zeros(3))
 

@@ -117,14 +117,13 @@ class ProgressChecker:
     """Judges whether a robot gets on."""
 
     def __init__(self, check: ProgressCheck) -> None:
-        self._check = check
+        self.check = check
         self._base: tuple[float, Array] | None = None
 
     def stuck(self, time_s: float, pose: Array) -> bool:
         """True if a robot, at a pose (3,) at a time, has not moved enough for too long."""
-        check = self._check
-        if self._base is None or (
-            math.dist(pose[:2], self._base[1][:2]) > check.required_movement_radius
-        ):
-            self._base = time_s, pose
-        return time_s - self._base[0] > check.movement_time_allowance
+        check = self.check
+        since, place = self._base or (math.inf, pose)  # later than now if the clock was set back
+        if time_s < since or math.dist(pose[:2], place[:2]) > check.required_movement_radius:
+            self._base = since, _ = time_s, pose
+        return time_s - since > check.movement_time_allowance

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from nics_drl_bridge.config import shipped_names
-from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS
+from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS, class_for
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.lidar.sectors import covers
@@ -117,6 +117,7 @@ def fitted(settings: TrainingSettings, model: SimulatorModel, inherited: bool) -
     """
     options, told = dict(settings.task_options), list[str]()
     worlds = [load_worlds(world) for world in settings.worlds]
+    class_for(settings.task, options)
     pace = pace_of(model, worlds, options.get("top_speed"))
     changed: dict[str, Any] = {}
     if inherited and options.get("scan") == "around" and not covers(model.lidar, "around"):

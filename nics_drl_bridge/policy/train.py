@@ -236,7 +236,15 @@ def _check(settings: TrainingSettings, seeds: Sequence[int], out: Path, resumed:
         fix = "choose another --out, or remove it."
         raise ConfigError(f"{out}: holds a run with other settings; {fix}")
     if resumed and not begun:
-        raise ConfigError(f"{out}: holds no checkpoint of these seeds; leave out --resume.")
+        found = seeds_of(out)
+        fix = f"name one of {found} with --seeds" if found else "leave out --resume"
+        raise ConfigError(f"{out}: holds no checkpoint of these seeds; {fix}.")
+
+
+def seeds_of(out: Path) -> list[int]:
+    """Returns the seeds whose training was begun in the folder of a run."""
+    begun = (path.parent.name.removeprefix("seed_") for path in out.glob(f"seed_*/{CHECKPOINT}"))
+    return sorted(int(seed) for seed in begun if seed.isdecimal())
 
 
 def settings_of(out: Path) -> TrainingSettings:

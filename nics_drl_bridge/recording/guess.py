@@ -128,11 +128,15 @@ def _unnamed(table: TableSurvey) -> Iterator[Guess]:
     columns = [table.data[name].astype(np.float64) for name in names]
     for k in range(3, len(names) - 3):
         four = columns[k : k + 4]
+        if len({len(each) for each in four}) > 1:
+            continue  # of several streams
         turns = any(np.ptp(each) > 0.0 for each in four)
         if turns and np.nanmax(np.abs(np.linalg.norm(four, axis=0) - 1.0)) < UNIT_LENGTH:
             quaternion = f"[{', '.join(names[k : k + 4])}]"
             yield Guess(table, {"x": names[k - 3], "y": names[k - 2], "quaternion": quaternion})
     for k in range(len(names) - 2):
+        if len({len(each) for each in columns[k : k + 3]}) > 1:
+            continue
         pose = np.stack(columns[k : k + 3], axis=1)
         pose = pose[np.isfinite(pose).all(axis=1)][:: max(1, len(pose) // 200)]
         shares = [led_along(pose, scale) for scale in (1.0, np.pi / 180.0)] if len(pose) else [0.0]
@@ -278,8 +282,8 @@ def _columns_of(pose: Guess) -> list[str]:
 def _unit_keys(name: str, table: TableSurvey, column: Survey) -> Iterator[str]:
     words, unit = unit_in(column.name)
     if {*words} & TICKS:
-        counters = [c.name for c in table.numbers if {*words_of(c.name)} & TICKS]
-        step = np.abs(np.diff([table.data[name].astype(np.float64) for name in counters]))
+        counters = [table.data[c.name] for c in table.numbers if {*words_of(c.name)} & TICKS]
+        step = np.abs(np.concatenate([np.diff(each.astype(np.float64)) for each in counters]))
         yield "unit: ticks"
         if "steer" in name:
             yield "differentiate: false"

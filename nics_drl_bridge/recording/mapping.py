@@ -56,8 +56,8 @@ RATES = {"m": "m/s", "rad": "rad/s", "ticks": "ticks/s", "m/s": "m/s^2", "rad/s"
 
 def known_unit(name: str) -> str:
     """Returns the name of a unit; ValueError tells the nearest known one."""
-    if name not in UNITS:
-        raise ValueError(f"is no known unit ({nearest(name, UNITS)})")
+    if str(name) not in UNITS:
+        raise ValueError(f"is no known unit ({nearest(str(name), UNITS)})")
     return name
 
 

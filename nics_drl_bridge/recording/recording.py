@@ -225,7 +225,7 @@ def load_recording(path: str | Path) -> Recording:
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file; check the path.") from None
     except (AttributeError, KeyError, RecursionError, TypeError) as error:
-        advice = "write it with nics_drl_bridge.recording.recording.save_recording"
+        advice = "say what is what in it with --map, or write it with save_recording"
         said = f"{path}: is not a recording of this package ({error}); {advice}."
         raise RecordingError(said) from None
     except (ValueError, OSError) as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -109,8 +110,8 @@ def flattened(arrays: Mapping[str, Column]) -> Iterator[tuple[str, Column]]:
             inner = {f"{name}.{field}".lstrip("."): array[field] for field in array.dtype.names}
             yield from flattened(inner)
         elif array.ndim == 1:
-            yield name, array
+            yield name, array.astype(str) if array.dtype.kind in "mM" else array
         elif array.ndim > 1:
-            flat = array.reshape(len(array), -1)
+            flat = array.reshape(len(array), math.prod(array.shape[1:]))
             for k in range(flat.shape[1]):
                 yield (f"{name}[{k}]" if name else ""), flat[:, k]

@@ -356,10 +356,11 @@ def _circumscribed(data: dict[str, Any]) -> dict[str, Any]:
     outline = data.get("footprint")
     if outline is None or "footprint_radius" in data:
         return data
+    radius = LARGEST
     with suppress(OverflowError, TypeError, ValueError):  # the field's own check reports it
         if len(outline) <= MOST_CORNERS:
-            data = data | {"footprint_radius": _reach(outline)}
-    return data
+            radius = _reach(outline)
+    return data | {"footprint_radius": radius}
 
 
 def _reach(outline: ArrayLike) -> float:

@@ -98,7 +98,8 @@ class Template:
         known = {one["name"]: one for one in way}
         known |= {name.removesuffix("_command"): one for name, one in known.items()}
         if own is None and way and ranges and not _are(way, [known.get(name) for name in names]):
-            fault = f"commands of the kind {kind!r} are {_list(known)}, not {_list(names)}"
+            usual = _list(name for name in known if not name.endswith("_command"))
+            fault = f"commands of the kind {kind!r} are {usual}, not {_list(names)}"
             fix = "name them so, or list them in that order under `command:` of the robot"
             raise ConfigError(f"robot {given.get('name', kind)!r}: {fault}; {fix}.")
         if own is None:
@@ -129,7 +130,11 @@ class Template:
 
 
 def _mappings(own: Any) -> bool:
-    return isinstance(own, list | tuple) and all(isinstance(one, Mapping) for one in own)
+    """True for mappings whose names, units and places are words."""
+    return isinstance(own, list | tuple) and all(
+        isinstance(one, Mapping) and not any(isinstance(v, list | dict) for v in one.values())
+        for one in own
+    )
 
 
 def _alike(way: Sequence[Given], names: Sequence[Any], own: Any) -> int:
@@ -143,7 +148,7 @@ def _are(way: Sequence[Given], found: Sequence[Given | None]) -> bool:
 
 
 def _list(names: Any) -> str:
-    return ", ".join(repr(str(name)) for name in names if not str(name).endswith("_command"))
+    return ", ".join(repr(str(name)) for name in names)
 
 
 def _whole(template: Given, own: Given, ranges: Ranges) -> dict[str, Any]:

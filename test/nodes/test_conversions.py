@@ -8,6 +8,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Quaternion
+from nav_msgs.msg import Odometry
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import Imu, LaserScan
 
@@ -185,3 +186,12 @@ def test_a_planar_covariance_survives_the_way_through_a_message():
     whole = np.reshape(message.pose.covariance, (6, 6))
     assert (np.linalg.eigvalsh(whole) > 0.0).all()
     assert whole[2, 2] == whole[3, 3] == whole[4, 4] == conversions.UNUSED_VARIANCE
+
+
+@pytest.mark.parametrize("kind", [Odometry, PoseStamped])
+def test_an_orientation_that_was_never_filled_in_is_no_heading(kind):
+    message = kind()
+    inner = message.pose if kind is PoseStamped else message.pose.pose
+    inner.orientation.w = 0.0
+    read = conversions.pose_from_ros if kind is PoseStamped else conversions.odometry_from_ros
+    assert np.isnan(read(message)[0]).all()

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 import tarfile
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,9 +15,12 @@ from nav2_msgs.action import FollowPath, NavigateToPose
 from nav2_msgs.msg import SpeedLimit
 from nav_msgs.msg import Odometry, Path
 from rclpy.action import ActionClient, ActionServer
+from rclpy.node import NodeNameNonExistentError
 from test_packaging import ROOT
 
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, policy_node, qos
+from nics_drl_bridge.nodes.follow_path import FOLLOW, NAVIGATE, PathActions
 from nics_drl_bridge.nodes.policy_node import PolicyNode
 from nics_drl_bridge.nodes.runner import open_context, unknown
 
@@ -120,7 +124,8 @@ REFUSED = [
     (path((0.0, 0.0), (9.0, 0.0)), CODES.INVALID_PATH, "(9.00, 0.00) m, is off the map"),
     (path((0.0, 0.0), frame="kitchen"), CODES.TF_ERROR, "'kitchen' is refused, which is not known"),
     (by(controller_id="DWB"), CODES.INVALID_CONTROLLER, "'DWB'; name one of 'FollowPath'"),
-    (by(goal_checker_id="exact"), CODES.INVALID_CONTROLLER, "no goal checker 'exact'"),
+    (by(goal_checker_id="exact"), CODES.UNKNOWN, "no goal checker 'exact'"),
+    (path((1e5, 0.0), frame="base_link"), CODES.INVALID_PATH, "pose 0 of the path"),
 ]
 
 
@@ -176,6 +181,22 @@ def test_a_speed_limit_is_kept_and_a_robot_that_does_not_get_on_is_given_up(tree
     tree.limits.publish(SpeedLimit())
 
 
+def test_a_robot_that_stands_is_given_up_although_its_path_is_planned_again(tree):
+    def now_s():
+        return conversions.stamp_from_ros(tree.truths[-1].header.stamp) / NS_PER_S
+
+    tree.limits.publish(SpeedLimit(percentage=True, speed_limit=1.0))
+    tree.peer.within(0.5, lambda: False)
+    way, since_s, codes = path(tree.pose[:2].tolist(), (-2.0, 2.0)), now_s(), []
+    while not codes and now_s() - since_s < 30.0:
+        future, sent_s = tree.send(way).get_result_async(), now_s()
+        tree.until(lambda f=future, s=sent_s: f.done() or now_s() - s > 3.0, "3 s, or an end")
+        if future.done():
+            codes.append(future.result().result.error_code)
+    assert codes == [CODES.FAILED_TO_MAKE_PROGRESS]
+    tree.limits.publish(SpeedLimit())
+
+
 def test_navigate_to_pose_drives_to_a_goal_and_knows_no_trees(tree):
     goal = NavigateToPose.Goal()
     goal.pose.header.frame_id, goal.behavior_tree = "map", "mine.xml"
@@ -196,6 +217,30 @@ def test_navigate_to_pose_is_left_to_another_node_that_serves_it(tree):
     log = tree.policy.log
     tree.until(lambda: "another node serves navigate_to_pose" in log.read_text(), "a sentence")
     other.destroy()
+
+
+@pytest.mark.parametrize("driven", [NAVIGATE, FOLLOW])
+def test_a_goal_that_is_driven_to_keeps_its_server_until_its_end(driven):
+    dropped, run = [], SimpleNamespace(goal=SimpleNamespace(name=driven))
+    server, logger = SimpleNamespace(destroy=lambda: dropped.append(1)), SimpleNamespace(info=str)
+    actions = SimpleNamespace(
+        _servers={NAVIGATE: server}, led=True, _run=run,
+        _node=SimpleNamespace(get_logger=lambda: logger),
+    )  # fmt: skip
+    PathActions._look(actions)
+    assert bool(dropped) == (driven == FOLLOW)
+
+
+def test_a_node_that_ends_while_others_are_asked_is_none_that_leads():
+    def ended(*_):
+        raise NodeNameNonExistentError("it has ended")
+
+    node = SimpleNamespace(
+        resolve_topic_name=str, get_name=lambda: "policy_node", get_namespace=lambda: "/",
+        get_node_names_and_namespaces=lambda: [("echo", "/")],
+        get_service_names_and_types_by_node=ended,
+    )  # fmt: skip
+    assert not PathActions.led.fget(SimpleNamespace(_node=node))
 
 
 @pytest.mark.skipif(not ARCHIVE.is_file(), reason="the sources of Nav2 do not lie there")

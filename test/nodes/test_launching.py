@@ -9,6 +9,7 @@ pytest.importorskip("launch_ros", reason="needs launch: make test-upstream")
 from nics_drl_bridge.config import find_config
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model, save_model
+from nics_drl_bridge.nodes import launching
 from nics_drl_bridge.nodes.launching import Robot, Setup, names_of, numbers_of
 
 pytestmark = pytest.mark.ros
@@ -30,6 +31,33 @@ def setup_of(**given):
 )  # fmt: skip
 def test_robots_are_a_count_or_names(robots, names):
     assert names_of(robots) == names
+
+
+def test_no_robots_at_all_are_refused():
+    with pytest.raises(ConfigError, match="launch argument 'robots' is 0; give a count from 1"):
+        names_of("0")
+
+
+def test_one_robot_of_an_argument_goes_before_the_fleet_of_a_file(tmp_path, monkeypatch):
+    file = tmp_path / "fleet.yaml"
+    file.write_text("simulator_node:\n  ros__parameters:\n    robots: [ant, bee]\n")
+    monkeypatch.setattr(launching, "Node", dict)
+
+    def robots(given):
+        (node,) = launching.simulator(setup_of(robots=given, params_file=str(file)))
+        return node["parameters"][-1].get("robots")
+
+    assert robots("1").value[0].text == "1"
+    assert "ant" in robots("").value[0].text
+
+
+def test_the_policies_of_a_fleet_hear_the_map_of_all(monkeypatch):
+    monkeypatch.setattr(launching, "Node", dict)
+    fleet = setup_of(namespace="hall", robots="[ant, bee]")
+    for node in launching.bridge(fleet):
+        assert ("map", "/hall/map") in node["remappings"]
+    for node in launching.bridge(setup_of(namespace="hall", robots="")):
+        assert "map" not in dict(node["remappings"])
 
 
 @pytest.mark.parametrize("start", ["1 0 1.5", "[1, 0, 1.5]", "1.0,0.0,1.5"])

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -11,6 +12,7 @@ from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
 from sensor_msgs.msg import LaserScan
 
+from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
 from nodes.peer import stamp_ns
 
@@ -136,4 +138,30 @@ def test_with_a_pose_sensor_it_waits_until_it_knows_where_in_the_map_it_is(launc
 
     peer.until(goes, "driving")
     simulator.check()
+    policy.check()
+
+
+def test_it_goes_on_after_a_simulation_has_set_the_clock_back(launch, meet, domain_id, model):
+    policy, peer = launch("policy_node", domain_id, rate=0.0), meet(domain_id)
+    commands = peer.listen(TwistStamped, "cmd_vel_raw", qos.EVERY_COMMAND)
+    odom, scans = peer.speak(Odometry, "odom"), peer.speak(LaserScan, "scan")
+    goals = peer.speak(PoseStamped, "goal_pose")
+    goals.publish(conversions.pose_to_ros([3.0, 0.0, 0.0], 0, "map"))
+    ranges = np.full(model.lidar.beams, np.inf, np.float32)
+    tenths = itertools.count(1000)
+
+    def drives():
+        """A tenth of a second of a robot that stands; True once it is commanded to drive."""
+        stamp = next(tenths) * NS_PER_S // 10
+        frames, spread = ("odom", "base_link"), (1e-4,) * 4
+        odom.publish(conversions.odometry_to_ros(np.zeros(3), np.zeros(3), stamp, frames, spread))
+        scans.publish(conversions.scan_to_ros(model.lidar, ranges, stamp, "laser"))
+        peer.within(0.05, lambda: False)
+        return commands and commands[-1].twist.linear.x > 0.0
+
+    peer.until(drives, "it drives")
+    tenths = itertools.count(1)
+    commands.clear()
+    peer.until(drives, "it drives on")
+    assert stamp_ns(commands[-1]) < 100 * NS_PER_S
     policy.check()

@@ -98,3 +98,5 @@ def test_a_robot_that_does_not_get_on_is_stuck():
     assert checker.stuck(10.5, np.array([0.4, 0.0, 0.0]))
     assert not checker.stuck(10.6, np.array([0.6, 0.0, 0.0]))
     assert not checker.stuck(20.0, np.array([0.6, 0.0, 0.0]))
+    assert not checker.stuck(1.0, np.array([0.6, 0.0, 0.0]))  # the clock was set back
+    assert checker.stuck(11.5, np.array([0.6, 0.0, 0.0]))
