@@ -46,21 +46,9 @@ def _options(
 
 
 for command in (
-    list_,
-    drive,
-    generate,
-    inspect,
-    import_,
-    record,
-    explain,
-    doctor,
-    urdf,
-    train,
-    evaluate,
-    watch,
-    demo,
-    warmup,
-):
+    list_, drive, generate, inspect, import_, record, explain, doctor, urdf, train, evaluate, watch,
+    demo, warmup,
+):  # fmt: skip
     app.command(command.__name__.rstrip("_"))(command)
 app.add_typer(policy, name="policy")
 app.add_typer(world, name="world")

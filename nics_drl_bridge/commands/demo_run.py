@@ -290,10 +290,9 @@ def sections_of(
     return [
         ("Verdict", _verdict(plan, learned, identified, of)),
         ("Paths in the world", _episodes(plan, model, of)),
-        ("The policy", _policy(plan, learned, of)),
-        ("Paths of the model", path_blocks(identified)),
+        ("The policy", _policy(plan, learned, of)), ("Paths of the model", path_blocks(identified)),
         ("The model", model_blocks(model.robot, identified, model.report)),
-    ]
+    ]  # fmt: skip
 
 
 def _verdict(

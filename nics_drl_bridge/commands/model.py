@@ -260,8 +260,8 @@ def generate(
             return
         named = "" if lidar or spec.lidar else ", as none is named: --lidar says which"
         typer.echo(f"{opening(model.report)}\n\nits lidar: {model.lidar.name!r}{named}")
-        typer.echo(f"all figures: {out / 'report.txt'}, with pictures: {out / 'report.html'}")
-        typer.echo(f"model written to {out}")
+        figures = f"{out / 'report.txt'}, with pictures: {out / 'report.html'}"
+        typer.echo(f"all figures: {figures}\nmodel written to {out}")
 
 
 def fit_facts(out: Path, robot: str, identified: "Identified") -> dict[str, Any]:

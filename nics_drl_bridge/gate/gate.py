@@ -166,13 +166,10 @@ def command_implausible(config: GateConfig, command: inputs.Command) -> str:
 
 
 REFUSALS: tuple[tuple[type, Callable[[GateConfig, Any], str]], ...] = (
-    (inputs.Scan, scan_malformed),
-    (inputs.Odometry, odom_malformed),
-    (inputs.SensorReading, reading_malformed),
-    (inputs.Estimate, estimate_malformed),
-    (inputs.Command, command_not_finite),
-    (inputs.Command, command_implausible),
-)
+    (inputs.Scan, scan_malformed), (inputs.Odometry, odom_malformed),
+    (inputs.SensorReading, reading_malformed), (inputs.Estimate, estimate_malformed),
+    (inputs.Command, command_not_finite), (inputs.Command, command_implausible),
+)  # fmt: skip
 """By the type of the input, in order: what is wrong with it; empty if nothing is."""
 
 
@@ -371,19 +368,15 @@ def _e_stop(config: GateConfig, state: GateState, request: inputs.Arm, now: floa
 
 
 CHECKS: tuple[tuple[str, Check], ...] = (
-    ("limits_set", _limits),
-    ("nothing_latched", _latched),
-    ("e_stop_released", _e_stop),
+    ("limits_set", _limits), ("nothing_latched", _latched), ("e_stop_released", _e_stop),
     ("scan_fresh", lambda c, s, _, now: _fresh(SCAN, s.scans, c.scan_age_s, c, now)),
     ("scan_rate", lambda c, s, _, now: _rate(SCAN, s.scans, c.scan_rate, c, now)),
     ("sensors_fresh", _sensors),
     ("odom_fresh", lambda c, s, _, now: _fresh(ODOM, s.odometries, c.odom_age_s, c, now)),
     ("odom_rate", lambda c, s, _, now: _rate(ODOM, s.odometries, c.odom_rate, c, now)),
-    ("clocks_agree", _clocks),
-    ("estimator_converged", _estimator),
-    ("one_publisher", _publishers),
+    ("clocks_agree", _clocks), ("estimator_converged", _estimator), ("one_publisher", _publishers),
     ("standing_still", _standing),
-)
+)  # fmt: skip
 
 
 class Rule(NamedTuple):
@@ -404,24 +397,13 @@ def disarmed(config: GateConfig, state: GateState, now: float) -> Cause | None:
 
 
 STOPS: tuple[Rule, ...] = (
-    Rule(stops.e_stop_pressed, latches=True),
-    Rule(latched),
-    Rule(disarmed),
-    Rule(stops.own_clock),
-    Rule(stops.e_stop_silent, latches=True),
-    Rule(stops.stamps_jumped, latches=True),
-    Rule(frozen.odom_jumped, latches=True),
-    Rule(frozen.scan_frozen, latches=True),
-    Rule(frozen.no_motion, latches=True),
-    Rule(stops.scan_silent),
-    Rule(stops.sensor_silent),
-    Rule(stops.odom_silent),
-    Rule(stops.command_malformed),
-    Rule(stops.command_missing),
-    Rule(stops.command_silent),
-    Rule(stops.scan_behind_unknown),
-    Rule(stops.scan_behind_old),
-)
+    Rule(stops.e_stop_pressed, latches=True), Rule(latched), Rule(disarmed), Rule(stops.own_clock),
+    Rule(stops.e_stop_silent, latches=True), Rule(stops.stamps_jumped, latches=True),
+    Rule(frozen.odom_jumped, latches=True), Rule(frozen.scan_frozen, latches=True),
+    Rule(frozen.no_motion, latches=True), Rule(stops.scan_silent), Rule(stops.sensor_silent),
+    Rule(stops.odom_silent), Rule(stops.command_malformed), Rule(stops.command_missing),
+    Rule(stops.command_silent), Rule(stops.scan_behind_unknown), Rule(stops.scan_behind_old),
+)  # fmt: skip
 """In order of evaluation; the first rule that returns a cause names the stop."""
 
 

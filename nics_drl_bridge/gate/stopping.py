@@ -59,17 +59,12 @@ def shield_config(
             raise ConfigError(f"parameter 'shield_{name}' is {value:g}; it must be {least}.")
     lidar = model.lidar
     config = ShieldConfig(
-        latency_s=values.latency,
-        deceleration=values.deceleration,
-        margin=values.margin,
-        hold_s=GateConfig.gap_s,
-        footprint_radius=model.robot.footprint_radius,
-        wheelbase=wheelbase(model.robot),
-        obstacle_speed=values.obstacle_speed,
-        range_max=lidar.range_max,
-        range_noise=(lidar.noise_std, lidar.faults.noise_proportional),
+        latency_s=values.latency, deceleration=values.deceleration, margin=values.margin,
+        hold_s=GateConfig.gap_s, footprint_radius=model.robot.footprint_radius,
+        wheelbase=wheelbase(model.robot), obstacle_speed=values.obstacle_speed,
+        range_max=lidar.range_max, range_noise=(lidar.noise_std, lidar.faults.noise_proportional),
         outline=model.robot.footprint or (),
-    )
+    )  # fmt: skip
     source = f"by {path}" if measured is not None else "derived from model and limits"
     if given:
         source += f", but {', '.join(sorted(given))} by parameter"

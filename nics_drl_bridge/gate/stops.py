@@ -44,15 +44,10 @@ def arrived(
         lowest, highest = arrivals.envelope - fall * passed, arrivals.envelope + DRIFT * passed
         envelope = min(max(lead, lowest), highest)
     return Arrivals(
-        (*arrivals.stamps_ns[1 - KEPT :], stamp_ns),
-        (*arrivals.times[1 - KEPT :], now),
-        (*arrivals.late[1 - KEPT :], max(0.0, envelope - lead)),
-        arrivals.origin,
-        arrivals.count + 1,
-        envelope,
-        now if passed > gap_s else arrivals.unbroken_s,
-        marks,
-    ), ""
+        (*arrivals.stamps_ns[1 - KEPT :], stamp_ns), (*arrivals.times[1 - KEPT :], now),
+        (*arrivals.late[1 - KEPT :], max(0.0, envelope - lead)), arrivals.origin,
+        arrivals.count + 1, envelope, now if passed > gap_s else arrivals.unbroken_s, marks,
+    ), ""  # fmt: skip
 
 
 def _marked(

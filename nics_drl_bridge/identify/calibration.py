@@ -117,11 +117,9 @@ def align(drive: Drive, calibration: Calibration) -> Samples:
     )
     begin = grid - calibration.command_latency_s
     samples = samples_on_one_clock(
-        grid,
-        calibration.to_base(tracked),
-        states_at(drive, calibration, grid),
+        grid, calibration.to_base(tracked), states_at(drive, calibration, grid),
         taken(recording.command, drive.spec, calibration.inputs, begin, begin + step),
-    )
+    )  # fmt: skip
     known = outside_gaps(samples.t, t, step)
     if recording.state is not None:
         known &= outside_gaps(samples.t, recording.state.t, step, STATE_GAP, 0.0)

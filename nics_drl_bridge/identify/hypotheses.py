@@ -276,10 +276,8 @@ def about_forms(base: Base, trials: Sequence[Trial]) -> Iterator[str]:
     parts = [f"an input curve of {curve.command}" for curve in form.curves if curve.bends]
     parts += ["a delay of each command"] * bool(form.delays)
     words = (
-        ("drag and back-EMF", form.drag),
-        ("dry friction", form.friction),
-        ("limits", form.limits),
-    )
+        ("drag and back-EMF", form.drag), ("dry friction", form.friction), ("limits", form.limits),
+    )  # fmt: skip
     parts += [f"{word} of {', '.join(names)}" for word, names in words if names]
     parts += ["tyres that slip"] * form.tyres
     shares = f"{trials[0].error:.1%} of the path away" + " by that" * (best.order > 0)

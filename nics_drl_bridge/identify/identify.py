@@ -351,19 +351,14 @@ def _notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
     linear, _ = _fitted(findings)
     spec, calibration = drive.spec, findings.calibration
     return (
-        *shortfall(findings.judgement),
-        *drive.recording.repairs,
-        *findings.repairs,
-        *_sentences(findings),
-        *findings.refinement,
+        *shortfall(findings.judgement), *drive.recording.repairs, *findings.repairs,
+        *_sentences(findings), *findings.refinement,
         *verdict.mirror_note(known(findings.samples, "the training part", "fit"), spec),
-        *verdict.unlearnt(linear, calibration, spec),
-        *findings.structure,
+        *verdict.unlearnt(linear, calibration, spec), *findings.structure,
         *(verdict.doubts_of_fit(linear, calibration.is_exact) if findings.width is None else ()),
-        *verdict.doubts(findings.held_out),
-        *verdict.untried(drive, findings.held_out),
+        *verdict.doubts(findings.held_out), *verdict.untried(drive, findings.held_out),
         *findings.assumptions,
-    )
+    )  # fmt: skip
 
 
 def structure(findings: Findings) -> tuple[str, ...]:
@@ -442,12 +437,11 @@ def _plain(found: Findings) -> tuple[str, ...]:
 def _sentences(found: Findings) -> tuple[str, ...]:
     drive, calibration = found.training, found.calibration
     return (
-        *verdict.about_stamps(drive),
-        *verdict.about_clocks(drive, calibration, found.timing),
+        *verdict.about_stamps(drive), *verdict.about_clocks(drive, calibration, found.timing),
         *followers.about_sums(calibration),
         *verdict.about_mounting(drive, calibration, found.mounting),
         *verdict.about_responses(drive, calibration, found.timing),
-    )
+    )  # fmt: skip
 
 
 STAGES: tuple[Stage, ...] = (

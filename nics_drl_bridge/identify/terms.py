@@ -195,12 +195,9 @@ def _by_definition(model: TaylorModel, spec: RobotSpec, at: dict[str, float]) ->
     kept = coefficients.any(axis=0)
     none = np.zeros((0, 0))
     return replace(
-        model,
-        powers=powers[kept],
-        coefficients=coefficients[:, kept],
-        std_errors=none,
+        model, powers=powers[kept], coefficients=coefficients[:, kept], std_errors=none,
         bounded=True,
-    )
+    )  # fmt: skip
 
 
 def shared(model: TaylorModel, spec: RobotSpec, samples: Samples) -> TaylorModel:

@@ -49,16 +49,9 @@ class FurtherLidar(Sensor):
         def render(out: Readings, worlds: NDArray[np.int64]) -> None:
             lanes, cells = scan_kernels.scan_lanes(), body_cells(0, state.bodies.shape[1])
             scan_kernels.scan_worlds(
-                out,
-                state.pose,
-                worlds,
-                state.bodies,
-                around.first,
-                around.fixtures,
-                lidar,
-                cells,
+                out, state.pose, worlds, state.bodies, around.first, around.fixtures, lidar, cells,
                 lanes,
-            )
+            )  # fmt: skip
             fault_kernels.distort_worlds(
                 out, worlds, limits, faults, state.seeds ^ salt, state.steps
             )

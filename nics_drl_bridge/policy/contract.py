@@ -177,11 +177,10 @@ def observation_entry(task: Task) -> dict[str, Any]:
     """Observation of a task, as the entries of `ObservationEntry`."""
     space, parts = task.observation_space, task.scan_parts
     return {
-        "size": int(space.shape[0]),
-        "scan_parts": parts,
+        "size": int(space.shape[0]), "scan_parts": parts,
         "rest_low": [float(value) for value in space.low[parts:]],
         "rest_high": [float(value) for value in space.high[parts:]],
-    }
+    }  # fmt: skip
 
 
 def _task_hash(entry: Mapping[str, Any], observation: Mapping[str, Any]) -> str:

@@ -65,16 +65,11 @@ class Episode:
     def plain(self) -> dict[str, Any]:
         """The episode as plain data."""
         return {
-            "seed": self.seed,
-            "result": self.result,
-            "believed": self.believed,
-            "goal_distance_m": round(self.miss, 4),
-            "steps": self.steps,
-            "length_m": round(self.length, 4),
-            "fallback_actions": self.planned,
-            "goal": self.goal.tolist(),
-            "path": np.round(self.path, 4).tolist(),
-        }
+            "seed": self.seed, "result": self.result, "believed": self.believed,
+            "goal_distance_m": round(self.miss, 4), "steps": self.steps,
+            "length_m": round(self.length, 4), "fallback_actions": self.planned,
+            "goal": self.goal.tolist(), "path": np.round(self.path, 4).tolist(),
+        }  # fmt: skip
 
 
 def drive(
@@ -318,10 +313,8 @@ def tallies(runs: Mapping[str, Sequence[Episode]], control_period: float) -> dic
         found[place] = Tally(
             **vars(summarise(outcomes, control_period)),
             same=sum(one.result == other.result for one, other in pairs) / len(pairs),
-            deviation=mean(gaps),
-            greatest_deviation=max(gaps),
-            fallback=_planned_share(episodes),
-        )
+            deviation=mean(gaps), greatest_deviation=max(gaps), fallback=_planned_share(episodes),
+        )  # fmt: skip
     return found
 
 

@@ -44,12 +44,9 @@ class Composer:
     """Builds the graph of a policy file around a foreign network, for one observation at once."""
 
     def __init__(
-        self,
-        network: Network,
-        mapping: foreign_mapping.ForeignPolicy,
-        task: Navigation,
+        self, network: Network, mapping: foreign_mapping.ForeignPolicy, task: Navigation,
         source: str,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._network, self._mapping, self._task, self._source = network, mapping, task, source
         self._states = {**network.states, **mapping.states}
         self._build = Builder()

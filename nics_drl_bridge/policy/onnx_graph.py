@@ -47,12 +47,9 @@ INTEGERS = frozenset({TensorProto.INT64, TensorProto.INT32})
 NUMBERS = FLOATS | INTEGERS | {TensorProto.BOOL}  # types as large in memory as in the file
 DIVIDING = frozenset({"Div", "ReduceMean"})  # of integers by zero, or minimum by -1: a crash
 OTHER_FORMATS = (
-    (b"PK", "a zip archive, as Stable-Baselines3 and torch write them"),
-    (b"\x80", "a pickle"),
-    (b"\x93NUMPY", "a numpy array"),
-    (b"\x89HDF", "an HDF5 file"),
-    (b"\x1f\x8b", "a gzip file"),
-)
+    (b"PK", "a zip archive, as Stable-Baselines3 and torch write them"), (b"\x80", "a pickle"),
+    (b"\x93NUMPY", "a numpy array"), (b"\x89HDF", "an HDF5 file"), (b"\x1f\x8b", "a gzip file"),
+)  # fmt: skip
 """First bytes of files that trainers write and that are never opened here."""
 _VARINT, _BYTES = 0, 2  # types of a field on the wire
 _FIXED = {1: 8, 5: 4}  # other types, and their sizes [bytes]

@@ -50,12 +50,10 @@ class Shadow:
             signed = (np.abs(one) > band) & (np.abs(other) > band)
             opposite = (one[signed] * other[signed] < 0.0).mean() if signed.any() else 0.0
             found[name] = {
-                "mean": float(gap.mean()),
-                "mean_size": float(size.mean()),
+                "mean": float(gap.mean()), "mean_size": float(size.mean()),
                 **{f"p{q}": float(np.percentile(size, q)) for q in PERCENTILES},
-                "greatest": float(size.max()),
-                "opposite": float(opposite),
-            }
+                "greatest": float(size.max()), "opposite": float(opposite),
+            }  # fmt: skip
         return found
 
 

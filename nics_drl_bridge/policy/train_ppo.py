@@ -375,15 +375,12 @@ class LeanPpo:
     def state(self) -> dict[str, Any]:
         """All that changes, for a checkpoint."""
         return {
-            "weights": self.networks.state_dict(),
-            "optimiser": self.learner.optimiser.state_dict(),
-            "steps": self.steps,
-            "recent": list(self._successes),
-            "last": torch.from_numpy(self.collector.last),
-            "memory": self.collector.state,
+            "weights": self.networks.state_dict(), "optimiser": self.learner.optimiser.state_dict(),
+            "steps": self.steps, "recent": list(self._successes),
+            "last": torch.from_numpy(self.collector.last), "memory": self.collector.state,
             "rollout": self._rollout and self._rollout._asdict(),
             "random": [part.generator.get_state() for part in (self.collector, self.learner)],
-        }
+        }  # fmt: skip
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continues with the state of another, made with the same arguments."""

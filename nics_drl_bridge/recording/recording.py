@@ -127,12 +127,10 @@ def samples_on_one_clock(t: Array, pose: Array, state: Array, command: Array) ->
     twist = geometry.log(geometry.between(pose[first], pose[last])) / length
     rates = (state[last] - state[first]) / length
     return Samples(
-        t=t[first],
-        q=np.concatenate([pose, state], axis=1)[first],
+        t=t[first], q=np.concatenate([pose, state], axis=1)[first],
         x=np.concatenate([state, command], axis=1)[first],
-        dq=np.concatenate([twist, rates], axis=1),
-        dt=dt,
-    )
+        dq=np.concatenate([twist, rates], axis=1), dt=dt,
+    )  # fmt: skip
 
 
 def check(recording: Recording, spec: RobotSpec) -> Recording:
@@ -188,12 +186,10 @@ def save_recording(recording: Recording, path: str | Path) -> None:
         if stream.sigma is not None:
             arrays[f"{name}_sigma"] = stream.sigma
     meta = {
-        "format": FORMAT,
-        "source": recording.source,
+        "format": FORMAT, "source": recording.source,
         "clocks": {name: stream.clock for name, stream in streams.items()},
-        "variables": recording.variables,
-        "repairs": recording.repairs,
-    }
+        "variables": recording.variables, "repairs": recording.repairs,
+    }  # fmt: skip
     if recording.robot is not None:
         meta["robot"] = recording.robot
     if recording.latency.measured:

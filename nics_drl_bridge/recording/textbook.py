@@ -48,9 +48,7 @@ def record(
     pose = np.concatenate([position, geometry.wrap_angle(heading)[:, None]], axis=1)
     t = np.asarray(np.arange(holds * per_hold) * dt, dtype=np.float64)
     return Recording(
-        Stream(t, np.repeat(held, per_hold, axis=0)),
-        Stream(t, pose[::inner]),
-        Stream(t, state[::inner]) if spec.state else None,
-        source=f"textbook {spec.name}",
+        Stream(t, np.repeat(held, per_hold, axis=0)), Stream(t, pose[::inner]),
+        Stream(t, state[::inner]) if spec.state else None, source=f"textbook {spec.name}",
         variables=spec.variable_names,
-    )
+    )  # fmt: skip

@@ -26,11 +26,9 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 JOINTS, IMU = "sensor_msgs/msg/JointState", "sensor_msgs/msg/Imu"
 TYPES = {
     "cmd_vel": (TWIST, TWIST_STAMPED, ACKERMANN_STAMPED, ACKERMANN),
-    "pose": (POSE, POSE_COVARIANCE, TRANSFORM, TRANSFORMS, ODOMETRY),
-    "odom": (ODOMETRY,),
-    "joint_states": (JOINTS,),
-    "imu": (IMU,),
-}
+    "pose": (POSE, POSE_COVARIANCE, TRANSFORM, TRANSFORMS, ODOMETRY), "odom": (ODOMETRY,),
+    "joint_states": (JOINTS,), "imu": (IMU,),
+}  # fmt: skip
 """Allowed message types of each role."""
 NEVER_GUESSED = {"pose": (ODOMETRY, TRANSFORMS)}  # only if the user assigns the role
 USUAL = {

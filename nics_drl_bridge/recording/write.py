@@ -167,13 +167,9 @@ class BagSink:
         self.counts: dict[str, int] = {}  # number of messages by topic
 
     def add_topic(
-        self,
-        topic: str,
-        kind: str,
-        offers: Sequence[msgs.Offer] = (),
-        texts: Mapping[str, str] | None = None,
-        definition: str | None = None,
-    ) -> None:
+        self, topic: str, kind: str, offers: Sequence[msgs.Offer] = (),
+        texts: Mapping[str, str] | None = None, definition: str | None = None,
+    ) -> None:  # fmt: skip
         """Adds a topic of a type such as `nav_msgs/msg/Odometry`; unknown ones need definitions."""
         from rosbags.typesys import get_types_from_msg
 

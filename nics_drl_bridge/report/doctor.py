@@ -369,11 +369,10 @@ def ranges(facts: Facts, expected: Expected) -> Findings:
         fix = "set the driver's limit, or range_max of the lidar, and generate the model anew"
         yield warning("range convention", SCAN, what, fix)
     hits = {
-        "zero": values == 0.0,
-        "nan": np.isnan(values),
+        "zero": values == 0.0, "nan": np.isnan(values),
         "range_max": np.abs(values - spec.range_max) < 1e-4 * spec.range_max,
         "inf": values == np.inf,
-    }
+    }  # fmt: skip
     for word, hit in hits.items():
         if hit.mean() > ODD_SHARE and word != spec.no_return:
             share = f"{100 * hit.mean():.0f} % of the ranges are {word}"

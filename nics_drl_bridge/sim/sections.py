@@ -201,9 +201,6 @@ def _polygon(points: Array) -> Polygon:
 
 
 _CUTS: dict[type[Solid], Callable[..., _Cut]] = {
-    Box: _of_box,
-    Cylinder: _of_cylinder,
-    Capsule: _of_capsule,
-    Sphere: _of_sphere,
+    Box: _of_box, Cylinder: _of_cylinder, Capsule: _of_capsule, Sphere: _of_sphere,
     Prism: _of_prism,
-}
+}  # fmt: skip

@@ -83,10 +83,8 @@ def _read(
     """Times from the first on [s], shots, and the lidar of the bag."""
     messages = played(path, topics)
     playback, stamps, shots = (
-        Playback(model, POSE in messages, any_lidar=True),
-        [],
-        list[Snapshot](),
-    )
+        Playback(model, POSE in messages, any_lidar=True), [], list[Snapshot](),
+    )  # fmt: skip
     middleware, every = playback.middleware, SCAN if SCAN in messages else ODOM
     command: Array | None = None
     for role, message in in_order(messages):
