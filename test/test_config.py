@@ -18,6 +18,7 @@ from nics_drl_bridge.config import (
     validate,
 )
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.sim.world import World
 
 
 class Wheel(Schema):
@@ -99,6 +100,21 @@ def test_deep_nesting_is_refused_before_it_is_built(opening):
 def test_a_value_in_place_of_keys_is_told_without_the_words_of_a_library(key):
     sentence = refusal(f"name: a\n{key}: [1, 2]\n")
     assert sentence == f"cart.yaml: key '{key}': must hold `key: value` pairs, not [1, 2]."
+
+
+@pytest.mark.parametrize(
+    ("value", "told"),
+    [
+        ("6", "must be a list, as [a, b], not 6."),
+        ("[6]", "must have at least 2 entries, not 1."),
+        ("[6, 4, 2]", "must have at most 2 entries, not 3."),
+    ],
+)
+def test_a_list_is_asked_for_without_the_words_of_a_library(value, told):
+    text = f"name: mine\nsize: {value}\nclearance: 0.4\ngoal_distance: [1.0, 2.0]\n"
+    with pytest.raises(ConfigError) as caught:
+        validate(parse_yaml(text, "mine.yaml"), World, "mine.yaml")
+    assert str(caught.value) == f"mine.yaml: key 'size': {told}"
 
 
 def test_thirty_levels_are_allowed():

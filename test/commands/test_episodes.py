@@ -21,6 +21,7 @@ from nics_drl_bridge.commands.episodes import (
     contracts_of,
     limited,
     model_name,
+    short_name,
 )
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot import DEFAULT_ROBOT
@@ -28,6 +29,21 @@ from nics_drl_bridge.robot.spec import load_robot, robot_from
 from nics_drl_bridge.sim.world_set import load_worlds
 
 KART = SimpleNamespace(robot=robot_from({"kind": "ackermann_throttle", "footprint_radius": 0.2}))
+
+
+@pytest.mark.parametrize(
+    ("policy", "among", "name"),
+    [
+        ("runs/a/seed_0/policy.onnx", ["runs/b/seed_0/policy.onnx"], "a_seed_0_policy"),
+        ("runs/a/seed_1/policy.onnx", ["runs/a/seed_0/policy.onnx"], "seed_1_policy"),
+        ("runs/a/mine.onnx", ["straight", "differential"], "mine"),
+        ("straight", [], "straight"),
+    ],
+)
+def test_pictures_of_policies_with_the_same_name_are_told_apart_by_their_folders(
+    policy, among, name
+):
+    assert short_name(policy, [policy, *among]) == name
 
 
 def order(*places):

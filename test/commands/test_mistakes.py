@@ -38,6 +38,9 @@ FILES = {
     "settings.yaml": "tsak: navigation\n",
     "hurried.yaml": "robot: differential\nworlds: {corridor: 4}\nmax_episode_steps: 30\n",
     "stop.jsonl": "no black box\n",
+    "paced.yaml": "robot: differential\nworlds: {room: 4}\ntask_options: {top_speed: 0.5 m/s}\n",
+    "shapeless.yaml": "name: mine\nkind: differential\nfootprint: wide\n",
+    "units.yaml": "robot: differential\npose: {x: x, y: x, heading: x, unit: [m, m, rad]}\n",
     "taken/note.txt": "mine\n",
 }
 MISTAKES = {
@@ -83,6 +86,9 @@ MISTAKES = {
     "drive --robot nowhere.yaml --out m": "nowhere.yaml: no such file",
     "train --settings settings.yaml": "unknown key 'tsak'; did you mean 'task'",
     "train --settings hurried.yaml": "no goal can be reached in time: world 'corridor'",
+    "train --settings paced.yaml": "task option top_speed='0.5 m/s': must be a finite number",
+    "drive --robot shapeless.yaml --out m": "key 'footprint': must be a list, as .*'wide'",
+    "import table.csv --map units.yaml --out d.npz": "is no known unit .*not \\['m', 'm', 'rad'\\]",
     "generate drive.npz --out m --order five": "order is 'five'; it must be 1, 2, 3 or 4",
     "generate drive.npz --out m --alpha 2": "alpha",
     "generate drive.npz --out m --topic odom": "must be ROLE=TOPIC",
@@ -245,6 +251,14 @@ def test_ctrl_c_does_not_reach_the_processes_that_compile_ahead(tmp_path):
     assert "interrupted" in sentence_of(done, code=130)
     ignored = signal.signal, (signal.SIGINT, signal.SIG_IGN)
     assert pools.return_value.Pool.call_args.args[1:] == ignored
+
+
+def test_a_first_mapping_is_written_beside_json_too(folder):
+    told = json.loads(
+        nics("inspect", "table.csv", "--map", "first.yaml", "--json", cwd=folder).stdout
+    )
+    assert told["mapping"] == "first.yaml"
+    assert (folder / "first.yaml").read_text(encoding="utf-8").startswith("#")
 
 
 def test_columns_of_text_are_null_in_json(folder):

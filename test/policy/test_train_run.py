@@ -46,9 +46,12 @@ def test_a_run_leaves_policy_evaluation_and_logs_of_each_seed_and_can_be_resumed
         assert told["training_steps"] == 256
         assert figures["success"]["low"] <= figures["success"]["value"]
         assert any(folder.glob("events.out.tfevents.*"))
-    again = nics("--resume", "--seeds", 4, "--episodes", 10, "--out", out)
+    again = nics("--resume", "--episodes", 10, "--out", out)
     assert again.exit_code == 0, again.output
-    assert again.output.startswith("seed 4: 256 steps")
+    lines = [line for line in again.output.splitlines() if line.startswith("seed ")]
+    assert [line.partition(",")[0] for line in lines] == ["seed 3: 256 steps", "seed 4: 256 steps"]
+    refused = nics("--resume", "--seeds", 5, "--out", out)
+    assert "no checkpoint of these seeds; name one of [3, 4] with --seeds" in refused.output
     refused = nics("--settings", settings, "--seeds", 3, "--out", out)
     assert refused.exit_code == 2
     assert "holds checkpoints of these seeds; add --resume" in refused.output

@@ -53,6 +53,28 @@ def test_guesses_reach_over_files_split_stamps_and_quaternions(tmp_path):
     assert np.allclose(found.pose.values[:, 2], columns["yaw"])
 
 
+def test_streams_of_different_lengths_in_one_file_are_guessed_apart(tmp_path):
+    columns = drive()
+    quick = np.linspace(0.0, 20.0, 321)
+    streams = {"t": columns["t"], "x": columns["x"], "y": columns["y"], "yaw": columns["yaw"]}
+    np.savez(
+        tmp_path / "log.npz", **streams, wheel_t=quick, ticks_left=np.floor(50.0 * quick),
+        ticks_right=np.floor(50.0 * quick[:300]), v=columns["v"], w=columns["w"],
+    )  # fmt: skip
+    _, guess = surveyed(tmp_path / "log.npz")
+    assert guess["pose"]["heading"] == "yaw"
+
+
+@pytest.mark.parametrize(
+    "column", [np.array(["2024-01-01T00:00:01"], "datetime64[s]"), np.zeros((0, 3))]
+)
+def test_dates_and_empty_arrays_are_listed(tmp_path, column):
+    np.save(tmp_path / "log.npy", column)
+    with open_source(tmp_path / "log.npy") as source:
+        (table,) = survey(source)
+    assert table.rows == len(column)
+
+
 def test_units_that_can_only_be_others_are_guessed(tmp_path):
     columns = drive()
     wavy = {"pose.x": 3e3 * np.sin(columns["t"] * 3.0), "pose.y": columns["y"] * 1e3}

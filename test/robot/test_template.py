@@ -138,6 +138,13 @@ def test_a_file_may_say_it_in_a_few_words_too(tmp_path):
         ({**WIDE, "state": "none"}, None, "key 'state'"),
         ({**WIDE, "parameters": [1]}, None, "key 'parameters'"),
         ({**WIDE, "wheels": 4}, None, "unknown key 'wheels'"),
+        ({**WIDE, "command": [{"name": ["v"]}]}, None, "key 'command.0.name'"),
+        ({**WIDE, "state": [{"name": "vx", "twist": ["vx"]}]}, None, "key 'state.0.twist"),
+        (
+            {"kind": "ackermann", "name": "kart"},
+            {"forward_command": (0, 1), "turn_command": (0, 1)},
+            "'speed', 'steering', not 'forward_command', 'turn_command'; name them so",
+        ),
         (
             {"kind": "ackermann_throttle", "name": "kart"}, {"gas": (0, 1), "wheel": (0, 1)},
             "robot 'kart': commands of the kind 'ackermann_throttle' are 'throttle', 'steering', "
