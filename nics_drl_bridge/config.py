@@ -68,7 +68,8 @@ _SHORT.maxstring = _SHORT.maxother = 80
 
 def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
     details = error.errors(include_url=False)
-    first = next((d for d in details if d["type"] in _UNKNOWN), details[0])
+    wrong = [d for d in details if d["type"] != "missing"] or details
+    first = next((d for d in wrong if d["type"] in _UNKNOWN), wrong[0])
     key = ".".join(str(part) for part in first["loc"])
     if first["type"] in _UNKNOWN:
         known = _fields_at(schema, first["loc"][:-1])

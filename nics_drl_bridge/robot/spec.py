@@ -356,11 +356,10 @@ def _circumscribed(data: dict[str, Any]) -> dict[str, Any]:
     outline = data.get("footprint")
     if outline is None or "footprint_radius" in data:
         return data
-    radius = LARGEST
     with suppress(OverflowError, TypeError, ValueError):  # the field's own check reports it
         if len(outline) <= MOST_CORNERS:
-            radius = _reach(outline)
-    return data | {"footprint_radius": radius}
+            data = data | {"footprint_radius": _reach(outline)}
+    return data
 
 
 def _reach(outline: ArrayLike) -> float:

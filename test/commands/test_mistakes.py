@@ -258,7 +258,7 @@ def test_a_first_mapping_is_written_beside_json_too(folder):
         nics("inspect", "table.csv", "--map", "first.yaml", "--json", cwd=folder).stdout
     )
     assert told["mapping"] == "first.yaml"
-    assert (folder / "first.yaml").read_text(encoding="utf-8").startswith("#")
+    assert (folder / "first.yaml").read_text(encoding="utf-8").startswith("robot: ")
 
 
 def test_columns_of_text_are_null_in_json(folder):

@@ -49,7 +49,10 @@ def test_a_run_leaves_policy_evaluation_and_logs_of_each_seed_and_can_be_resumed
     again = nics("--resume", "--episodes", 10, "--out", out)
     assert again.exit_code == 0, again.output
     lines = [line for line in again.output.splitlines() if line.startswith("seed ")]
-    assert [line.partition(",")[0] for line in lines] == ["seed 3: 256 steps", "seed 4: 256 steps"]
+    assert [line.partition(" in ")[0] for line in lines] == [
+        "seed 3: 256 steps",
+        "seed 4: 256 steps",
+    ]
     refused = nics("--resume", "--seeds", 5, "--out", out)
     assert "no checkpoint of these seeds; name one of [3, 4] with --seeds" in refused.output
     refused = nics("--settings", settings, "--seeds", 3, "--out", out)
