@@ -53,6 +53,7 @@ class Machine:
     controls: Callable[[Array], Array]  # maps a wanted state (S,) to the actuators' inputs (U,)
     state: Callable[[Array, Array], Array]  # positions [rad] and speeds [rad/s] (J,) to state (S,)
     calibrated: tuple[float, float, float] = (1.0, 1.0, 1.0)  # driven twist, by that of the wheels
+    gyro: bool = False  # tells odometry how the robot turns, instead of the wheels
 
 
 def _motor(
@@ -282,7 +283,8 @@ def _skid_steer(p: Parameters, step: float, physics: Physics) -> Machine:
     motors = _motors(names, inertia, p["wheel_lag"], radius, step, physics, STIFF_SERVO_LAG_S)
     xml = _document("skid_steer", physics, radius, body, motors, SKIDDING)
     both = lambda _, speed: 0.5 * (speed[:2] + speed[2:])  # noqa: E731
-    return Machine(xml, names, lambda state: np.tile(state, 2), both)
+    # How far it skids differs with speed and curve; such robots' odometry turns by their gyro.
+    return Machine(xml, names, lambda state: np.tile(state, 2), both, gyro=True)
 
 
 def _motors(names: tuple[str, ...], *servo: Any) -> str:

@@ -92,9 +92,7 @@ class Rig:
     def read(self, data: Any) -> Reading:
         """Returns the current reading."""
         place, velocity = data.qpos[self._place :], data.qvel[self._drift :]
-        w, x, y, z = place[3:7]
-        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        heading = float(geometry.wrap_angle(yaw))
+        heading = self.heading(data)
         ahead, aside = geometry.rotate(velocity[:2], -heading)
         return Reading(
             time=float(data.time),
@@ -102,6 +100,12 @@ class Rig:
             twist=np.array([ahead, aside, velocity[5]]),
             state=self.machine.state(data.qpos[self._positions], data.qvel[self._speeds]),
         )
+
+    def heading(self, data: Any) -> float:
+        """Returns the heading [rad]."""
+        w, x, y, z = data.qpos[self._place + 3 : self._place + 7]
+        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        return float(geometry.wrap_angle(yaw))
 
     def encoders(self, data: Any) -> Array:
         """(J,) positions of the joints that have encoders [rad]."""
@@ -252,7 +256,7 @@ class MujocoSimulator(DrivenSimulator):
         rigs, data, part_s = self._rigs, self._data, self.model.control_period / self._subperiods
         wheels, counted = self.wheels.copy(), np.zeros((len(rigs), 3))
         touched = np.zeros(len(rigs), np.bool_)
-        turned = [rig.encoders(data) for rig in rigs]
+        turned, facing = [rig.encoders(data) for rig in rigs], [rig.heading(data) for rig in rigs]
         for part in range(self._subperiods):
             for rig, command in zip(rigs, self.in_force(part * part_s), strict=True):
                 rig.command(data, command)
@@ -261,9 +265,12 @@ class MujocoSimulator(DrivenSimulator):
             bumped = self._bumper_of[data.contact.geom.ravel()]
             touched[bumped[bumped >= 0]] = True
             before, turned = turned, [rig.encoders(data) for rig in rigs]
+            faced, facing = facing, [rig.heading(data) for rig in rigs]
             both, mean = zip(before, turned, strict=True), self._machine.state
             means = [mean(0.5 * (first + last), (last - first) / part_s) for first, last in both]
             counted = self._twist(np.array(means)) * self._machine.calibrated
+            if self._machine.gyro:
+                counted[:, 2] = geometry.wrap_angle(np.subtract(facing, faced)) / part_s
             wheels = geometry.compose(wheels, geometry.exp(counted * part_s))
         readings = [rig.read(data) for rig in rigs]
         pose, twist, state = (np.array([getattr(r, n) for r in readings]) for n in MOTION)

@@ -186,6 +186,17 @@ def test_odometry_of_mecanum_wheels_is_calibrated_for_what_their_rollers_lose():
     assert np.hypot(*(told - driven)[:2]) < 0.004 * np.hypot(*driven[:2])
 
 
+def test_odometry_of_a_robot_that_skids_turns_by_its_gyro():
+    model = builtin_model("jackal")
+    world = load_world("empty").model_copy(update={"size": (40.0, 40.0)})
+    simulator = MujocoSimulator(model, world)
+    simulator.reset([0], starts=np.zeros((1, 1, 3)))
+    start, believed = simulator.data.pose[0, 0].copy(), simulator.wheels[0].copy()
+    drive(simulator, np.array([[[1.8, 2.0]]]), 20)  # where it turns faster than its wheels tell
+    turned = geometry.between(start, simulator.data.pose[0, 0])[2]
+    assert geometry.between(believed, simulator.wheels[0])[2] == pytest.approx(turned, abs=0.01)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_robot_that_does_not_slip_moves_nearly_as_the_model_says(name):
     """The steady motion is the textbook's; motors are slower where wheels would slip."""
