@@ -34,17 +34,17 @@ BRACKET = re.compile(
     rf"\\.|\[(\^?)(\]?(?:\[:(?:{'|'.join(CLASSES)}):\]|\[(?![:.=])|[^][])*)\]|(\[)", re.DOTALL
 )
 HELD = re.compile(r"\[:(\w+):\]|[][\\&|~]")
-MOST_CHARACTERS, MOST_REPEATS = 1000, 6  # of a filter: it is matched while the simulator waits
+MOST_CHARACTERS, MOST_REPEATS = 1000, 5  # of a filter: it is matched while the simulator waits
 
 
 def pattern_of(expression: str) -> re.Pattern[str]:
     """Compiles a POSIX extended regular expression. Raises RefusalError for none."""
     try:
         if len(expression) > MOST_CHARACTERS or _runs_away(BRACKET.sub(".", expression)):
-            raise re.error("it may take too long: it is long, or repeats what repeats or branches")
+            raise re.error("it is long, or repeats what repeats or branches: it may take too long")
         return re.compile(BRACKET.sub(_bracket, expression))
     except (re.error, OverflowError, RecursionError) as error:
-        told = f"the filter {expression!r} is no regular expression ({error}); mend it."
+        told = f"the filter {expression!r} is no regular expression for names ({error}); mend it."
         raise RefusalError(FAILED, told) from None
 
 
