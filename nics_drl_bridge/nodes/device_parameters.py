@@ -152,6 +152,8 @@ def _check_episode(node: Node, parameters: list[Parameter]) -> SetParametersResu
             values = np.array(parameter.value, dtype=np.float64)
             if not values.size or values.size % 3 or not np.isfinite(values).all():
                 reason = "episode_start must be three finite numbers: x, y, heading; of each robot."
+            elif node.has_parameter(GIVEN) and values.size != (needed := 3 * len(namespaces(node))):
+                reason = f"episode_start has {values.size} numbers; give {needed}, 3 of each robot."
         elif parameter.name == "episode_seed" and parameter.value < 0:
             reason = "episode_seed must be 0 or more."
     names = {parameter.name for parameter in parameters}

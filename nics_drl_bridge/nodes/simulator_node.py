@@ -472,12 +472,12 @@ class DeviceNode(qos.QosWatch):
 
     def begin(self, rewind: bool = False) -> None:
         """Begins the episode of the parameters, with time at its start if it is to be rewound."""
-        if rewind:
-            self.now_ns = self._first_ns
         given = bool(self.get_parameter("episode_start_given").value)
         start = np.array(self.get_parameter("episode_start").value, dtype=np.float64)
         seed = int(device_parameters.number(self, "episode_seed"))
-        self.device.begin(seed, start if given else None)
+        self.device.begin(seed, start if given else None)  # may raise, so that all goes on
+        if rewind:
+            self.now_ns = self._first_ns
         self._outbox.clear()
         self._heard[:] = False
         self.now_ns += self._time.step_ns

@@ -28,7 +28,7 @@ class WorldTopics:
         self._frame = str(node.get_parameter("map_frame").value)
         self._cell = float(node.get_parameter("map_resolution").value or 0.0)
         self._map = node.create_publisher(OccupancyGrid, "map", qos.LATCHED)
-        self._shown: Any = None  # what stood in the world that was published
+        self._shown: Any = None  # the world that was published, and what stood in it
         runner.steadily(node, LOOK_S, self._look)
 
     def hear(self, namespace: str, robot: Callable[[], int]) -> Any:
@@ -39,10 +39,11 @@ class WorldTopics:
     def _look(self) -> None:
         if self._shown is None and not self._map.get_subscription_count():
             return
-        simulator = self._world().simulator
+        world = self._world()
+        simulator = world.simulator
         member = int(simulator.data.member[0])
         still = standing(simulator.sampler, member, simulator.obstacles[0])
-        shown = member, [(shape, tuple(np.asarray(pose))) for shape, pose in still]
+        shown = world, member, [(shape, tuple(np.asarray(pose))) for shape, pose in still]
         if shown != self._shown:
             self._shown = shown
             grid = occupancy(simulator.world.members[member], still, self._cell)

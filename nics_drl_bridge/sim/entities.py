@@ -15,14 +15,15 @@ from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
 from nics_drl_bridge.lidar.shapes import Shape, convex_hull, place
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.sim.device import DeviceWorld
-from nics_drl_bridge.sim.obstacles import Motion
+from nics_drl_bridge.sim.obstacles import FASTEST, Motion
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.sections import Placed
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 OBSTACLE = "obstacle_"  # and its number: the name of an obstacle of the world
-NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_./-]*")
+NAME = re.compile(r"(?=.{1,120}\Z)[A-Za-z0-9_][A-Za-z0-9_./-]*")
+REACH = 10.0  # twist that a robot may be given, as a multiple of its greatest command
 CORNERS = 32  # of the outline that stands for a circle
 
 # Makes the simulator of a world for a number of robots.
@@ -163,7 +164,8 @@ class Entities:
     def move(self, entity: Entity, pose: Array | None, twist: Array | None) -> None:
         """Puts an entity at a pose (3,), or gives it a twist (3,) along the axes of `map`.
 
-        Raises StillError for a twist of what stands still, OutsideError for a pose outside.
+        Raises StillError for a twist of what stands still, ConfigError for one beyond a robot's
+        reach, OutsideError for a pose outside.
         """
         if twist is not None and twist.any() and entity.robot < 0 and entity.motion is None:
             fix = "set its pose alone, or a twist of zeros"
@@ -178,7 +180,8 @@ class Entities:
             self._put(bodies, entity, pose)
             self._show(bodies)
         if twist is not None and entity.motion is not None:
-            self.simulator.data.velocity[0, entity.slots[0]] = twist
+            bounded = np.clip(twist, -FASTEST, FASTEST)
+            self.simulator.data.velocity[0, entity.slots[0]] = bounded
 
     def _move_robot(self, robot: int, pose: Array | None, twist: Array | None) -> None:
         simulator = self.simulator
@@ -187,7 +190,11 @@ class Entities:
         if twist is not None:
             ahead, aside = geometry.rotate(twist[:2], -at[2])
             spec = simulator.model.robot
-            state = textbook(spec).target(spec.from_cmd_vel([ahead, aside, twist[2]]))
+            command = spec.from_cmd_vel([ahead, aside, twist[2]])
+            if (np.abs(command) > REACH * np.maximum(-spec.command_low, spec.command_high)).any():
+                told = f"the twist is more than {REACH:g} times what {spec.name!r} can be commanded"
+                raise ConfigError(f"{told}; give a slower one.")
+            state = textbook(spec).target(command)
         simulator.put_robot(robot, np.array(at), np.array(state))
         self.device.put(robot)
 

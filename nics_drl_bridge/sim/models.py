@@ -12,9 +12,9 @@ from xml.etree import ElementTree
 from pydantic import Field, model_validator
 
 from nics_drl_bridge.config import Schema, parse_yaml, validate
-from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.lidar.shapes import Shape
-from nics_drl_bridge.sim.sdf import AssetsError, read_sdf, tags_in
+from nics_drl_bridge.sim.sdf import AssetsError, read_sdf, root_of
 from nics_drl_bridge.sim.sections import Placed
 from nics_drl_bridge.sim.world import Pose
 
@@ -62,11 +62,10 @@ def model_of_sdf(text: str, z: float, source: str = TEXT) -> Model:
     """Reads an entity of SDF, whose origin is spawned at a height z [m].
 
     Raises ConfigError for no SDF, more than one model, or what is no shape; `AssetsError` of it
-    where that is a mesh, or a file that is not there.
+    where that is a mesh, or a file that is not there; BridgeError for too many shapes.
     """
     with file_of(text, source) as file:
-        tags_in(file)  # refuses XML entities that grow, before anything else reads it
-    root = ElementTree.fromstring(text.encode())  # noqa: S314 (see above)
+        root = root_of(file)  # refuses XML entities that grow
     models = root.findall("model")
     if len(models) != 1 or root.find("world") is not None:
         raise ConfigError(f"{source}: holds {len(models)} models; give one <model>, no <world>.")
@@ -79,6 +78,8 @@ def model_of_sdf(text: str, z: float, source: str = TEXT) -> Model:
             raise
         except ConfigError:  # it is lower than that: at the height of its own origin
             standing = read_sdf(file, 0.0)
+    if len(standing.placed) > MOST_PARTS:
+        raise BridgeError(f"{source}: holds more than {MOST_PARTS} shapes; split it.")
     return Model(models[0].get("name", ""), "", (), standing.placed)
 
 

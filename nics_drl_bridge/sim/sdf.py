@@ -45,14 +45,10 @@ class AssetsError(ConfigError):
         return ABSENT in str(self)
 
 
-def tags_in(path: str | Path) -> set[str]:
-    """Returns the tags of all elements of an SDF file. Raises ConfigError, as `read_sdf`."""
-    return {element.tag for element in _root(Path(path)).iter()}
-
-
 def read_sdf(
-    path: str | Path, height: float, without: tuple[str, ...] = (), skip_unknown: bool = False
-) -> Standing:
+    path: str | Path, height: float, without: tuple[str, ...] = (), skip_unknown: bool = False,
+    may_be_empty: bool = False,
+) -> Standing:  # fmt: skip
     """Reads what stands in a Gazebo world at a height [m] above z = 0.
 
     Args:
@@ -60,6 +56,7 @@ def read_sdf(
         height: at which bodies count, that of the lidar [m].
         without: names of models to leave out, in which `*` stands for anything.
         skip_unknown: True to leave out what is no shape of a world: meshes, bodies that lean.
+        may_be_empty: True for a world in which nothing stands.
 
     Raises:
         ConfigError: the file is damaged or no SDF, holds what is no shape, or nothing stands there.
@@ -83,10 +80,10 @@ def read_sdf(
         fix = "leave it out by --skip-unknown or --without MODEL, or put a box in its place"
         raise AssetsError(f"{path}: {left_out[0]}{more}, which is no shape of a world; {fix}.")
     shapes = seen - sum(map(len, unknown.values()))
-    if left_out and not shapes:
+    if left_out and not shapes and not may_be_empty:
         reason = f"holds nothing but what is no shape of a world ({left_out[0]})"
         raise AssetsError(f"{path}: {reason}; put a box in its place.")
-    if not placed:
+    if not placed and not may_be_empty:
         reason = f"none of its {shapes} collision geometries stands at a height of {height:g} m"
         raise ConfigError(f"{path}: {reason}; choose another --height.")
     return Standing(tuple(placed), left_out)
@@ -104,7 +101,7 @@ class _Order:
 
     def root(self, file: Path) -> Element:
         if file not in self._roots:
-            self._roots[file] = _root(file)
+            self._roots[file] = root_of(file)
         return self._roots[file]
 
     def count(self, file: Path) -> None:
@@ -356,14 +353,15 @@ def _version(text: str) -> tuple[int, ...]:
 
 def _world(path: Path) -> Element:
     """The world of a file, or its root where that holds models alone."""
-    root = _root(path)
+    root = root_of(path)
     worlds = root.findall("world")
     if len(worlds) > 1 or not (worlds or root.findall("model")):
         raise ConfigError(f"{path}: holds {len(worlds)} worlds; give a file with one.")
     return worlds[0] if worlds else root
 
 
-def _root(path: Path) -> Element:
+def root_of(path: Path) -> Element:
+    """Returns the root of an SDF file, with tags as they stand there. Raises ConfigError."""
     root = _tree(path)
     if root.tag != "sdf":
         raise ConfigError(f"{path}: is no SDF but <{root.tag}>; give a .world or .sdf file.")

@@ -230,6 +230,7 @@ def test_the_same_seed_and_commands_give_the_same_data_again(lockstep):
         ({"episode_seed": -1}, "episode_seed must be 0 or more"),
         ({"episode_start": [1.0, 2.0]}, "three finite numbers"),
         ({"episode_start": [1.0, 2.0, math.nan]}, "three finite numbers"),
+        ({"episode_start": 6 * [1.0]}, "episode_start has 6 numbers; give 3"),
         ({"episode_start": [1.0, 2.0, math.inf]}, "three finite numbers"),
         ({"episode_seed": 1.5}, "type"),
         ({"mode": "realtime"}, "read-only"),

@@ -14,6 +14,7 @@ from nics_drl_bridge.sim.entities import (
     UnknownEntityError,
     overlap,
 )
+from nics_drl_bridge.sim.obstacles import FASTEST
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import load_worlds
 
@@ -173,6 +174,26 @@ def test_only_what_moves_takes_a_twist(staged):
         entities.move(still, None, np.array([0.1, 0.0, 0.0]))
     with pytest.raises(OutsideError, match="outside the world"):
         entities.move(still, np.array([99.0, 0.0, 0.0]), None)
+
+
+@pytest.mark.parametrize("value", [1e308, -1e308, 1e3])
+def test_a_robot_takes_no_twist_beyond_its_reach(staged, value):
+    entities = staged("empty")
+    car = entities.find("car")
+    at, twist = entities.pose(car), entities.twist(car)
+    with pytest.raises(ConfigError, match="more than 10 times what 'ackermann' can be commanded"):
+        entities.move(car, START, np.array([value, value, value]))
+    assert entities.pose(car) == pytest.approx(at)
+    assert entities.twist(car) == pytest.approx(twist)
+
+
+def test_an_obstacle_moves_no_faster_than_obstacles_can(staged):
+    entities = staged("crowd")
+    walker = next(entity for entity in entities if entity.motion is not None)
+    entities.move(walker, None, np.full(3, 1e308))
+    assert np.abs(entities.twist(walker)).max() == FASTEST
+    entities.device.advance()
+    assert np.isfinite(entities.pose(walker)).all()
 
 
 def test_polygons_overlap_if_no_edge_divides_them():

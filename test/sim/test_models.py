@@ -3,9 +3,9 @@ from __future__ import annotations
 import pytest
 
 from nics_drl_bridge.config import find_config, read_text, share_folder
-from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.lidar.shapes import Circle, Rectangle
-from nics_drl_bridge.sim.models import model_of_sdf, model_of_yaml
+from nics_drl_bridge.sim.models import MOST_PARTS, model_of_sdf, model_of_yaml
 from nics_drl_bridge.sim.sdf import AssetsError
 
 CRATE = (
@@ -64,3 +64,20 @@ def test_every_shipped_entity_is_read():
     assert files
     for file in files:
         assert model_of_yaml(read_text(find_config(file.stem, "entities")), str(file)).description
+
+
+def test_an_sdf_model_may_hold_prefixes_that_nothing_binds():
+    text = CRATE.replace("</model>", "<gz:x>1</gz:x></model>").format(BOX)
+    assert model_of_sdf(text, 0.15) == model_of_sdf(CRATE.format(BOX), 0.15)
+
+
+def test_an_sdf_model_of_too_many_shapes_is_refused():
+    collision = f"<collision name='{{}}'><geometry>{BOX}</geometry></collision>"
+    head, tail = CRATE.format(BOX).split("</link>")
+
+    def of(count):
+        return head + "".join(map(collision.format, range(count - 1))) + f"</link>{tail}"
+
+    assert len(model_of_sdf(of(MOST_PARTS), 0.15).parts) == MOST_PARTS
+    with pytest.raises(BridgeError, match=f"holds more than {MOST_PARTS} shapes; split it"):
+        model_of_sdf(of(MOST_PARTS + 1), 0.15)

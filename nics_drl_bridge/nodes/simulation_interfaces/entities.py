@@ -20,9 +20,8 @@ from nics_drl_bridge.sim.obstacles import Pedestrian
 FAILED = Result.RESULT_OPERATION_FAILED
 INVALID_POSE = SetEntityState.Response.INVALID_POSE
 CATEGORIES = {
-    getattr(EntityCategory, name)
+    getattr(EntityCategory, f"CATEGORY_{name}")
     for name in ("OBJECT", "ROBOT", "HUMAN", "DYNAMIC_OBJECT", "STATIC_OBJECT")
-    for name in (f"CATEGORY_{name}",)
 }
 # Classes of POSIX's bracket expressions, which Python writes otherwise.
 CLASSES = {
@@ -30,16 +29,41 @@ CLASSES = {
     "space": r"\s", "blank": r" \t", "punct": r"!-/:-@\[-`{-~", "xdigit": "0-9A-Fa-f",
     "word": r"\w", "print": " -~", "graph": "!-~", "cntrl": r"\x00-\x1f",
 }  # fmt: skip
+# What is escaped, a bracket expression (its `^`, and what it holds), or one that can't be had.
+BRACKET = re.compile(
+    rf"\\.|\[(\^?)(\]?(?:\[:(?:{'|'.join(CLASSES)}):\]|\[(?![:.=])|[^][])*)\]|(\[)", re.DOTALL
+)
+HELD = re.compile(r"\[:(\w+):\]|[][\\&|~]")
+MOST_CHARACTERS, MOST_REPEATS = 1000, 5  # of a filter: it is matched while the simulator waits
 
 
 def pattern_of(expression: str) -> re.Pattern[str]:
     """Compiles a POSIX extended regular expression. Raises RefusalError for none."""
-    text = re.sub(r"\[:(\w+):\]", lambda one: CLASSES.get(one[1], one[0]), expression)
     try:
-        return re.compile(text)
+        if len(expression) > MOST_CHARACTERS or _runs_away(BRACKET.sub(".", expression)):
+            raise re.error("it is long, or repeats what repeats or branches: it may take too long")
+        return re.compile(BRACKET.sub(_bracket, expression))
     except (re.error, OverflowError, RecursionError) as error:
-        told = f"the filter {expression!r} is no regular expression ({error}); mend it."
+        told = f"the filter {expression!r} is no regular expression for names ({error}); mend it."
         raise RefusalError(FAILED, told) from None
+
+
+def _bracket(found: re.Match[str]) -> str:
+    if found[3]:
+        raise re.error("a '[' has no end, or holds [. or [= or an unknown class")
+    held = HELD.sub(lambda one: CLASSES[one[1]] if one[1] else f"\\{one[0]}", found[2] or "")
+    return found[0] if found[2] is None else f"[{found[1]}{held}]"
+
+
+def _runs_away(plain: str) -> bool:
+    """True for many repeats, or groups that repeat with repeats or like branches in them."""
+    while group := re.search(r"\(([^()]*)\)([*+{]?)", plain):
+        heads = [branch[:1] for branch in group[1].split("|")]
+        alike = len(heads) > 1 and len({"", ".", *heads}) < len(heads) + 2
+        if group[2] and (alike or re.search(r"[*+?{]", group[1])):
+            return True
+        plain = plain.replace(group[0], group[1].replace("|", ".|.") + group[2], 1)
+    return sum(map(plain.count, "*+?{")) > MOST_REPEATS
 
 
 def tags_match(wanted: Any, tags: Any) -> bool:
@@ -132,9 +156,8 @@ class EntityServices:
         """Answers SetEntityInfo."""
         name, kind = self.find(request.entity).name, request.info.category.category
         if kind not in CATEGORIES:
-            raise RefusalError(
-                FAILED, f"category {kind} is none of the standard; give 0 to 5 but 3."
-            )
+            told = f"category {kind} is none of the standard; give 0 to 5 but 3."
+            raise RefusalError(FAILED, told)
         self._simulation.told[name] = request.info
 
     def get_state(self, request: Any, response: Any) -> None:
@@ -162,9 +185,8 @@ class EntityServices:
             told = f"{entity.name!r} stands still and takes no acceleration; leave it out."
             raise RefusalError(FAILED, told)
         if twist is not None and still and asked.twist != Twist():
-            raise RefusalError(
-                FAILED, f"{entity.name!r} stands still and takes no twist; leave it out."
-            )
+            told = f"{entity.name!r} stands still and takes no twist; leave it out."
+            raise RefusalError(FAILED, told)
         try:
             entities.move(entity, pose, twist)
         except OutsideError as error:

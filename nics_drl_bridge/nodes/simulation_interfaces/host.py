@@ -80,6 +80,8 @@ def outcome(act: Callable[[], object], host: Host) -> tuple[int, str]:
         return error.code, str(error)
     except UnknownEntityError as error:
         return Result.RESULT_NOT_FOUND, str(error)
+    except OSError as error:
+        return Result.RESULT_NOT_FOUND, str(BridgeError(f"{error}; check the path."))
     except BridgeError as error:
         return Result.RESULT_OPERATION_FAILED, str(error)
     except Exception as error:  # noqa: BLE001  (the other robots and clients go on)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import unquote, urlsplit
@@ -11,6 +12,7 @@ from simulation_interfaces.msg import Result
 from nics_drl_bridge.config import read_text
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes.simulation_interfaces.host import RefusalError
+from nics_drl_bridge.sim.world_set import SPECIAL
 
 SDF, YAML = "sdf", "yaml"
 SUFFIXES = {".sdf": SDF, ".world": SDF, ".yaml": YAML, ".yml": YAML}
@@ -51,8 +53,17 @@ def local(uri: str) -> Path | None:
     except ValueError:  # of a host that is none
         return None
     if parts.scheme == "file" and parts.netloc in ("", "localhost"):
-        return Path(unquote(parts.path))
-    return None if "://" in uri else Path(uri)
+        uri = unquote(parts.path)
+    return Path(uri) if uri and "://" not in uri else None
+
+
+def files_of(source: str) -> list[Path] | None:
+    """Returns the files of a folder, or a file with a known suffix; None for any other source."""
+    path = local(source)
+    with suppress(OSError):
+        if path and (path.is_dir() or (path.suffix.lower() in SUFFIXES and path.is_file())):
+            return sorted(path.iterdir()) if path.is_dir() else [path]
+    return None
 
 
 def find(resource: Any, codes: Codes) -> Found:
@@ -78,13 +89,12 @@ def _of_uri(uri: str, codes: Codes) -> Found:
         told = f"uri {uri!r}: is not on this machine; give file:// or a path."
         raise RefusalError(codes.unsupported_format, told)
     suffix = path.suffix.lower()
-    if suffix and suffix not in SUFFIXES and not path.is_dir():
-        known = ", ".join(SUFFIXES)
-        raise RefusalError(
-            codes.unsupported_format, f"uri {uri!r}: is none of {known}; convert it."
-        )
-    if not suffix or path.is_dir():
+    named = path.is_dir() or (any(sign in uri for sign in SPECIAL) and not path.is_file())
+    if named or not suffix:
         return Found("", "", str(path), path)
+    if suffix not in SUFFIXES:
+        told = f"uri {uri!r}: is none of {', '.join(SUFFIXES)}; convert it."
+        raise RefusalError(codes.unsupported_format, told)
     if not path.is_file():
         told = f"uri {uri!r}: no such file; check the path on the simulator's machine."
         raise RefusalError(Result.RESULT_NOT_FOUND, told)

@@ -76,11 +76,11 @@ class Spawning:
                 return None
             try:
                 path = find_config(found.source, FOLDER)
+                found = resources.Found(resources.YAML, read_text(path), path.stem, path)
             except ConfigError as error:
                 held = f"robots here are {self._host.model.robot.name!r}"
                 told = str(error).replace("entitie ", "entity ")
                 raise RefusalError(Result.RESULT_NOT_FOUND, f"{told} {held}.") from None
-            found = resources.Found(resources.YAML, read_text(path), path.stem, path)
         try:
             if found.form == resources.SDF:
                 z = request.initial_pose.pose.position.z
@@ -103,10 +103,8 @@ class Spawning:
             told = "the name is empty; give one, or set allow_renaming."
             raise RefusalError(SpawnResult.NAME_INVALID, told)
         if not NAME.fullmatch(wanted):
-            fix = "use letters, digits, and _ . / - between them"
-            raise RefusalError(
-                SpawnResult.NAME_INVALID, f"the name {wanted!r} is not valid; {fix}."
-            )
+            told = f"the name {wanted!r} is not valid; use up to 120 letters, digits, and _ . / -"
+            raise RefusalError(SpawnResult.NAME_INVALID, f"{told} between them.")
         free = entities.free_name(wanted)
         if free != wanted and not may_rename:
             fix = "give another, or set allow_renaming"
@@ -121,7 +119,9 @@ class Spawning:
             told = f"entity_namespace {given!r} is" if given else f"the name {name!r} makes"
             code = code if given else SpawnResult.NAME_INVALID
             raise RefusalError(code, f"{told} no namespace of ROS; write it as in 'robot_1'.")
-        if robot and device_parameters.frames(host, space.strip("/")) in host.frames:
+        scan = robot and host.resolve_topic_name(f"{space}/scan")
+        taken = scan in [each.topic_name for each in host.publishers]
+        if robot and (taken or device_parameters.frames(host, space.strip("/")) in host.frames):
             told = f"the namespace {space!r} is that of another robot; give one as entity_namespace"
             raise RefusalError(code, f"{told}.")
         return space
@@ -146,18 +146,16 @@ class Spawning:
         robot, unknown = self._host.model.robot, list[str]()
         hull = hull_of(self._simulation.entities.simulator.footprint)
         response.spawnables.append(_spawnable(robot.name, f"another robot {robot.name}", [hull]))
-        folders = [share_folder() / "config" / FOLDER]
+        shipped = share_folder() / "config" / FOLDER
+        found = [(file.stem, file) for file in sorted(shipped.iterdir())]
         for source in request.sources:
-            path = resources.local(source)
-            if path is None or not path.exists():
+            files = resources.files_of(source)
+            if files is None:
                 unknown.append(source)
-            else:
-                folders.append(path)
-        for folder in folders:
-            files = [folder] if folder.is_file() else sorted(folder.iterdir())
-            for file in files:
-                if file.suffix.lower() in resources.SUFFIXES:
-                    self._list(file, file.stem if folder == folders[0] else str(file), response)
+            found += [(str(file), file) for file in files or ()]
+        for uri, file in found:
+            if file.suffix.lower() in resources.SUFFIXES:
+                self._list(file, uri, response)
         if unknown:
             response.result.result = Result.RESULT_OK
             told = f"sources that are not known: {', '.join(map(repr, unknown))}"
@@ -168,7 +166,7 @@ class Spawning:
         try:
             text = read_text(file, resources.MOST_BYTES)
             model = model_of_yaml(text, str(file)) if read is None else read(text, 0.0, str(file))
-        except BridgeError:
+        except (BridgeError, OSError):
             return  # a world, or something else that is no entity
         hulls = [geometry.rotate(hull_of(shape), at[2]) + at[:2] for shape, at in model.parts]
         response.spawnables.append(_spawnable(uri, model.description or model.name, hulls))

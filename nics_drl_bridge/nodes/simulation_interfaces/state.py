@@ -12,7 +12,7 @@ from simulation_interfaces.srv import ResetSimulation, SetSimulationState
 
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.nodes import runner
-from nics_drl_bridge.nodes.simulation_interfaces.host import NO_WORLD, Host, RefusalError
+from nics_drl_bridge.nodes.simulation_interfaces.host import NO_WORLD, Host, RefusalError, outcome
 from nics_drl_bridge.sim.entities import Entities
 
 STOPPED, PLAYING, PAUSED = (
@@ -91,9 +91,8 @@ class Simulation:
                 self._reset_all()
             except BridgeError as error:
                 self.halt(PAUSED)
-                raise RefusalError(
-                    codes.STATE_TRANSITION_ERROR, f"it did not stop: {error}"
-                ) from None
+                told = f"it did not stop: {error}"
+                raise RefusalError(codes.STATE_TRANSITION_ERROR, told) from None
         self._stepping = False
         if wanted == PLAYING:
             self._host.pause(False)
@@ -137,8 +136,7 @@ class Simulation:
             return result
         self._stepping, done, why = True, 0, ""
         try:
-            while done < steps and not why:
-                self._host.step()
+            while done < steps and not (why := why or outcome(self._host.step, self._host)[1]):
                 done += 1
                 goal.publish_feedback(
                     SimulateSteps.Feedback(completed_steps=done, remaining_steps=steps - done)
@@ -186,7 +184,9 @@ class Simulation:
 
     def restore(self) -> None:
         """Removes what was spawned, and brings back what was deleted."""
-        changed = self.entities.robot_names != list(self._host.robot_names)
+        # A robot that was spawned may have the name of one that was deleted.
+        changed = any(each.robot >= 0 for each in self.entities.spawned.values())
+        changed |= self.entities.robot_names != list(self._host.robot_names)
         kept = self.told.keys() - self.entities.spawned.keys()
         self.told = {name: self.told[name] for name in kept}
         self.entities.restore()

@@ -13,16 +13,17 @@ from nics_drl_bridge.config import parse_yaml, share_folder, validate
 from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.nodes.simulation_interfaces import resources
 from nics_drl_bridge.nodes.simulation_interfaces.entities import tags_match
-from nics_drl_bridge.nodes.simulation_interfaces.host import Host, RefusalError
+from nics_drl_bridge.nodes.simulation_interfaces.host import RefusalError
 from nics_drl_bridge.nodes.simulation_interfaces.state import STOPPED, WITHOUT_WORLD, Simulation
 from nics_drl_bridge.sim.models import HEIGHT, file_of
-from nics_drl_bridge.sim.sdf import ABSENT, AssetsError, read_sdf, tags_in
+from nics_drl_bridge.sim.sdf import ABSENT, AssetsError, read_sdf, root_of
 from nics_drl_bridge.sim.sections import Standing
 from nics_drl_bridge.sim.world import World, check_places
 from nics_drl_bridge.sim.world_set import BARN, AnyWorld, load_worlds
 
 CODES = LoadWorld.Response
 CLEARANCE, NEAREST = 0.1, 2.0  # of worlds of SDF, as with `nics world import` [m]
+EMPTY = (-4.0, -4.0), (4.0, 4.0)  # places in the field of a world in which nothing stands [m]
 # Tags of SDF that are read, or say nothing of what stands in a plane.
 READ = {
     "sdf", "world", "model", "include", "uri", "name", "pose", "placement_frame", "frame", "link",
@@ -35,10 +36,9 @@ READ = {
 class Worlds:
     """Answers LoadWorld, UnloadWorld, GetCurrentWorld and GetAvailableWorlds."""
 
-    def __init__(self, host: Host, simulation: Simulation) -> None:
+    def __init__(self, host: Any, simulation: Simulation) -> None:
         self._host, self._simulation = host, simulation
-        name = host.world.source
-        self._resource = Resource(uri=name if Path(name).is_file() else host.world.name)
+        self._resource = Resource(uri=str(host.get_parameter("world").value))
         self._codes = resources.Codes.of(CODES)
 
     def current(self, _: Any, response: Any) -> None:
@@ -101,12 +101,12 @@ class Worlds:
 
     def _standing(self, file: Path, name: str, request: Any) -> World:
         skip = bool(request.ignore_missing_or_unsupported_assets)
-        strange = sorted(tag for tag in tags_in(file) - READ if ":" not in tag)
+        strange = sorted({each.tag for each in root_of(file).iter() if ":" not in each.tag} - READ)
         if request.fail_on_unsupported_element and strange:
             told = f"{name}: holds <{strange[0]}>, which is not simulated"
             fix = "remove it, or do not ask for fail_on_unsupported_element"
             raise RefusalError(CODES.UNSUPPORTED_ELEMENTS, f"{told}; {fix}.")
-        standing = read_sdf(file, HEIGHT, skip_unknown=True)
+        standing = read_sdf(file, HEIGHT, skip_unknown=True, may_be_empty=True)
         if standing.left_out and not skip:
             missing = any(ABSENT in each for each in standing.left_out)
             code = self._codes.missing_assets if missing else self._codes.unsupported_assets
@@ -121,9 +121,11 @@ class Worlds:
         names = [each.stem for each in sorted((folder / "worlds").glob("*.yaml"))]
         found = [(name, load_worlds(name)) for name in names]
         for source in request.additional_sources:
+            if source and request.offline_only and resources.local(source) is None:
+                continue
             try:
                 found += _in_source(source)
-            except BridgeError as error:
+            except (BridgeError, OSError) as error:
                 failed.append(f"{source!r}: {error}")
         if failed and not request.continue_on_error:
             raise RefusalError(Result.RESULT_NOT_FOUND, f"a source can't be read, {failed[0]}")
@@ -144,7 +146,7 @@ def _in_source(source: str) -> list[tuple[str, AnyWorld]]:
     files = sorted(path.iterdir()) if path.is_dir() else [path]
     forms = [(str(file), file, resources.SUFFIXES.get(file.suffix.lower())) for file in files]
     return [
-        (uri, world_of(read_sdf(file, HEIGHT, skip_unknown=True), file.stem)
+        (uri, world_of(read_sdf(file, HEIGHT, skip_unknown=True, may_be_empty=True), file.stem)
          if form == resources.SDF else load_worlds(file))
         for uri, file, form in forms if form or not path.is_dir()
     ]  # fmt: skip
@@ -179,11 +181,11 @@ def told_of(world: AnyWorld, resource: Resource) -> WorldResource:
 
 
 def world_of(standing: Standing, name: str) -> World:
-    """Returns the world of what stands in an SDF file, with a field around it."""
-    x1, y1, x2, y2 = bounds = standing.bounds()
+    """Returns the world of what stands in an SDF file, with a field around it. ConfigError."""
+    x1, y1, x2, y2 = bounds = standing.bounds(*() if standing.placed else EMPTY)
     far = round(math.hypot(x2 - x1, y2 - y1), 3)
     content = {
         "name": name, "bounds": bounds, "obstacles": standing.obstacles, "clearance": CLEARANCE,
         "goal_distance": (min(NEAREST, round(far / 4.0, 3)), far),
     }  # fmt: skip
-    return World.model_validate(content)
+    return validate(content, World, name)

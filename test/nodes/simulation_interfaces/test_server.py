@@ -9,17 +9,45 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 pytest.importorskip("simulation_interfaces", reason="needs what `make test-messages` builds")
 
+from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
-from nav_msgs.msg import Odometry
+from nav_msgs.msg import OccupancyGrid, Odometry
 from sensor_msgs.msg import LaserScan
 from simulation_interfaces import msg, srv
 from std_srvs.srv import Trigger
 
-from nics_drl_bridge.nodes import conversions
+from nics_drl_bridge.errors import BackendError, ConfigError
+from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.simulator_node import DeviceNode
+from nics_drl_bridge.sim.device import DeviceWorld
 
 pytestmark = pytest.mark.ros
 STATES, OK = msg.SimulationState, msg.Result.RESULT_OK
+
+
+MESH = "<collision name='c'><geometry><mesh><uri>a.dae</uri></mesh></geometry></collision>"
+FIELD = "name: {}\nsize: [{}, 4.0]\ngoal_distance: [1.0, 3.0]\n"
+
+
+def box(side):
+    size = f"<size>{side} {side} 1</size>"
+    return f"<collision name='c'><geometry><box>{size}</box></geometry></collision>"
+
+
+def model(collisions):
+    return f"<model name='m'><link name='l'>{collisions}</link></model>"
+
+
+def sdf(inside):
+    return f"<sdf version='1.9'>{inside}</sdf>"
+
+
+def in_sdf(inside):
+    return msg.Resource(resource_string=sdf(f"<world name='w'>{inside}</world>"))
+
+
+def spawned(**fields):
+    return {"name": "one", "entity_resource": msg.Resource(**fields)}
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +120,7 @@ def test_a_robot_that_was_deleted_comes_back_with_a_reset(client, meet, simulato
     ("name", "space", "code", "sentence"),
     [
         ("3rd", "", msg.SpawnResult.NAME_INVALID, "the name '3rd' makes no namespace"),
-        ("x" * 300, "", msg.SpawnResult.NAME_INVALID, "makes no namespace"),
+        ("x" * 121, "", msg.SpawnResult.NAME_INVALID, "use up to 120 letters"),
         ("third", "y" * 300, msg.SpawnResult.NAMESPACE_INVALID, "is no namespace of ROS"),
         ("third", "left", msg.SpawnResult.NAMESPACE_INVALID, "is that of another robot"),
         ("third", "/right", msg.SpawnResult.NAMESPACE_INVALID, "is that of another robot"),
@@ -211,6 +239,16 @@ def test_poses_may_be_given_in_the_frame_of_an_entity(client):
         ("ResetSimulation", {"scope": 8}, 0, "scope 8"),
         ("LoadWorld", {"world_resource": msg.Resource(uri="nowhere")}, 2, "unknown world"),
         ("LoadWorld", {"world_resource": msg.Resource(uri="/no/a.yaml")}, 2, "no such file"),
+        ("LoadWorld", {"world_resource": msg.Resource(uri="/no/[ab].yaml")}, 103, "no world file"),
+        ("LoadWorld", {"world_resource": msg.Resource(uri="x" * 253)}, 2, "name too long"),
+        ("LoadWorld", {"world_resource": msg.Resource(uri="x" * 300)}, 2, "name too long"),
+        ("SpawnEntity", spawned(uri="x" * 300), 2, "name too long"),
+        ("SpawnEntity", spawned(uri="/no/[ab].yaml"), 2, "no such file"),
+        ("SpawnEntity", spawned(resource_string=sdf("<model name='m'>")), 106, "is no XML"),
+        ("SpawnEntity", spawned(resource_string=sdf(model(101 * box(1)))), 4, "more than 100"),
+        ("LoadWorld", {"world_resource": in_sdf(model(box(9000)))}, 103, "goal_distance"),
+        ("LoadWorld", {"world_resource": in_sdf(model(box(0.003)))}, 103, "bounds must be"),
+        ("LoadWorld", {"world_resource": in_sdf(model(MESH))}, 105, "has a mesh"),
         ("LoadWorld", {"world_resource": msg.Resource(uri="http://a/b.sdf")}, 101, "this machine"),
         ("LoadWorld", {"world_resource": msg.Resource(uri="file://[")}, 101, "this machine"),
         ("SetSimulationState", {"state": STATES(state=77)}, 103, "state 77 can't be set"),
@@ -228,6 +266,30 @@ def test_names_are_matched_by_posix_expressions(client):
     client.spawn("disc_1", 1.0), client.spawn("disc_b", 1.5)
     assert client.names(filter="^disc_[[:digit:]]$") == ["disc_1"]
     assert client.names(filter="left|right") == ["left", "right"]
+    assert client.names(filter="^(lef|righ)+t$") == ["left", "right"]
+    for filter_ in (r"[a\]", "[]a]", "[^]a]", "[a[]", "[&&x]", r"\[a"):
+        assert client.code("GetEntities", filters=msg.EntityFilters(filter=filter_)) == OK
+    assert client.names(filter=r"_[\d]$") == []
+    assert client.names(filter=r"^[[:alpha:]\]+$") == ["left", "right"]
+
+
+@pytest.mark.parametrize(
+    ("expression", "why"),
+    [
+        ("[[.-.]]", "holds [. or [="),
+        ("[[=a=]]", "holds [. or [="),
+        ("[[:foo:]]", "unknown class"),
+        ("[a", "has no end"),
+        ("(a+)+$", "too long"),
+        ("((x?)|y){9}", "too long"),
+        ("(a|aa)*$", "too long"),
+        ("a?" * 30 + "a" * 30, "too long"),
+        ("a" * 1001, "too long"),
+    ],
+)
+def test_an_expression_that_is_none_of_posix_or_takes_forever_is_refused(client, expression, why):
+    result = client("GetEntities", filters=msg.EntityFilters(filter=expression)).result
+    assert (result.result, why in result.error_message) == (4, True), result
 
 
 def test_a_simulator_that_was_asked_to_quit_answers_and_ends(launch, domain_id, client_of):
@@ -243,3 +305,122 @@ def test_the_services_can_be_turned_off(launch, domain_id, meet):
     found = {name for name, _ in peer.node.get_service_names_and_types()}
     assert "/simulator_node/reset" in found
     assert "/get_simulator_features" not in found
+
+
+def test_the_map_is_that_of_the_world_that_is_loaded_also_where_nothing_stands(
+    client, meet, simulator
+):
+    peer = meet(simulator)
+    maps = peer.listen(OccupancyGrid, "map", qos.LATCHED)
+    for side in (5.0, 7.0):
+        world = msg.Resource(resource_string=FIELD.format("text", side))
+        assert client.code("LoadWorld", world_resource=world) == OK
+        peer.until(
+            lambda side=side: maps and maps[-1].info.width * maps[-1].info.resolution // 1 == side,
+            "the map of the world",
+        )
+
+
+def test_a_reset_that_fails_leaves_the_time_where_it_is(client, monkeypatch):
+    assert client.code("StepSimulation", steps=5) == OK
+
+    def fails(*_):
+        raise ConfigError("no room.")
+
+    before = client.time_ns()
+    with monkeypatch.context() as patch:
+        patch.setattr(DeviceWorld, "begin", fails)
+        failed = client("ResetSimulation", scope=0).result
+    assert (failed.result, failed.error_message) == (4, "no room.")
+    assert client.time_ns() == before
+
+
+def test_steps_that_fail_abort_the_action_with_the_reason(client, monkeypatch):
+    advance, made = DeviceNode.step, []
+
+    def step(node):
+        if len(made) == 2:
+            raise BackendError("the other physics is gone.")
+        made.append(advance(node))
+
+    monkeypatch.setattr(DeviceNode, "step", step)
+    assert client.simulate(5) == (GoalStatus.STATUS_ABORTED, 4, [1, 2])
+    monkeypatch.undo()
+    assert client.code("StepSimulation", steps=1) == OK  # it goes on
+
+
+def test_a_source_that_is_none_hinders_no_other(client, tmp_path):
+    (tmp_path / "notes.txt").write_text("kind: circle\nradius: 0.1\n", encoding="utf-8")
+    (tmp_path / "far.sdf").write_text(
+        sdf(f"<model name='m'><include><uri>{'x' * 300}</uri></include></model>"), encoding="utf-8"
+    )
+    (tmp_path / "free.sdf").write_text(sdf(f"<gz:x/>{model(box(1))}"), encoding="utf-8")
+    strange = ["", "x" * 300, "/dev/null", str(tmp_path / "notes.txt"), "https://a/b.sdf"]
+    told = client("GetSpawnables", sources=[*strange, str(tmp_path)])
+    assert told.result.result == OK
+    for source in strange:
+        assert repr(source) in told.result.error_message
+    uris = [each.entity_resource.uri for each in told.spawnables]
+    assert [uri for uri in uris if str(tmp_path) in uri] == [str(tmp_path / "free.sdf")]
+    assert not [uri for uri in uris if uri.endswith((".toml", ".world"))]  # of no folder here
+
+
+def test_a_source_of_worlds_that_can_not_be_read_is_left_out_if_that_is_asked(client):
+    strange = ["", "x" * 300, "/dev/null"]
+    refused = client("GetAvailableWorlds", additional_sources=strange)
+    assert refused.result.result == msg.Result.RESULT_NOT_FOUND
+    told = client("GetAvailableWorlds", additional_sources=strange, continue_on_error=True)
+    assert told.result.result == OK
+    assert all(repr(source) in told.result.error_message for source in strange)
+    remote = client("GetAvailableWorlds", additional_sources=["https://a/b.sdf"], offline_only=True)
+    assert (remote.result.result, remote.result.error_message) == (OK, "")
+    assert remote.worlds
+
+
+def test_a_world_of_gazebo_in_which_nothing_stands_is_an_empty_field(client):
+    sun = in_sdf("<include><uri>model://sun</uri></include>")
+    loaded = client("LoadWorld", world_resource=sun)
+    assert loaded.result.result == OK, loaded.result.error_message
+    assert loaded.world.description == "a field of 10 m x 10 m"
+    meshes = {"world_resource": in_sdf(model(MESH)), "ignore_missing_or_unsupported_assets": True}
+    assert client.code("LoadWorld", **meshes) == OK
+
+
+def test_a_launched_robot_comes_back_where_another_took_its_name(client, meet, simulator):
+    assert client.code("DeleteEntity", entity="left") == OK
+    robot = {"entity_resource": msg.Resource(uri="ackermann"), "entity_namespace": "other"}
+    assert client.spawn("left", 1.0, **robot).result.result == OK
+    assert client.code("DeleteEntity", entity="right") == OK
+    robot["entity_namespace"] = "third"
+    assert client.spawn("right", -1.0, **robot).result.result == OK
+    assert client.code("ResetSimulation", scope=0) == OK
+    peer = meet(simulator)
+    peer.until(
+        lambda: (
+            peer.node.count_publishers("/left/scan") == 1
+            and peer.node.count_publishers("/other/scan") == 0
+        ),
+        "its topics",
+    )
+
+
+def test_two_robots_never_share_their_topics(launch, domain_id, client_of):
+    launch("simulator_node", domain_id, world="empty", namespace="sim")
+    robot = {"entity_resource": msg.Resource(uri="ackermann"), "entity_namespace": "/sim"}
+    refused = client_of(domain_id, "sim").spawn("second", 1.0, **robot).result
+    assert refused.result == msg.SpawnResult.NAMESPACE_INVALID
+    assert "is that of another robot" in refused.error_message
+
+
+@pytest.mark.parametrize("world", ["{}", "{}/*.yaml", "barn/7"])
+def test_the_world_that_a_node_began_with_can_be_loaded_again(
+    launch, domain_id, client_of, tmp_path, world
+):
+    for name in ("one", "two"):
+        (tmp_path / f"{name}.yaml").write_text(FIELD.format(name, 5.0), encoding="utf-8")
+    launch("simulator_node", domain_id, world=world.format(tmp_path))
+    client = client_of(domain_id)
+    told = client("GetCurrentWorld").world
+    loaded = client("LoadWorld", world_resource=told.world_resource)
+    assert loaded.result.result == OK, loaded.result.error_message
+    assert loaded.world == told
