@@ -40,15 +40,11 @@ __all__ = [
 _NAMES = {
     "env.registry": ("make", "make_vec"),
     "generator": ("generate", "load_model", "open_model", "save_model"),
-    "policy.policy_file": ("load_policy",),
-    "recording.readers": ("read_recording",),
-    "recording.recording": ("load_recording", "save_recording"),
-    "robot.spec": ("load_robot",),
-    "sim.sdf": ("read_sdf",),
-    "sim.simulator": ("FastSimulator",),
-    "sim.world": ("load_world",),
+    "policy.policy_file": ("load_policy",), "recording.readers": ("read_recording",),
+    "recording.recording": ("load_recording", "save_recording"), "robot.spec": ("load_robot",),
+    "sim.sdf": ("read_sdf",), "sim.simulator": ("FastSimulator",), "sim.world": ("load_world",),
     "sim.world_set": ("load_worlds",),
-}
+}  # fmt: skip
 _HOMES = {name: home for home, names in _NAMES.items() for name in names}
 
 

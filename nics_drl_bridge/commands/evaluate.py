@@ -144,6 +144,5 @@ def _shadow(
         "policy", "command", "unit", "mean", "mean size", *(f"{q} %" for q in PERCENTILES),
         "greatest", "opposite sign",
     )  # fmt: skip
-    typer.echo(
-        "\n".join([console.table(heads, rows), *lines, f"pictures and shadow_*.json: {out}"])
-    )
+    lines = [console.table(heads, rows), *lines, f"pictures and shadow_*.json: {out}"]
+    typer.echo("\n".join(lines))

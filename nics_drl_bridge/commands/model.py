@@ -237,14 +237,13 @@ def generate(
             load_lidar(lidar)
         further = tuple(load_sensor(file) for file in sensor or ())
         shapes = load_world(world).shapes
-        reading = console.progress_bar(f"reading {recording}")
+        named, reading = str(recording), console.progress_bar(f"reading {recording}")
         with console.intact(recording, salvage) as whole, reading:
             spec, drive = robot_and_drive(whole, robot, topic_roles(topics, topic or ()), mapping)
-        drive = replace(drive, source=str(recording))
         with console.progress_bar("generating"):
             model, identified = generate_model(
-                drive, spec, lidar_of(spec, lidar), shapes, terms, threshold, assume_textbook,
-                strict, anyway, further,
+                replace(drive, source=named), spec, lidar_of(spec, lidar), shapes, terms,
+                threshold, assume_textbook, strict, anyway, further,
             )  # fmt: skip
             save_model(model, out)
         from nics_drl_bridge.identify.report import opening
@@ -252,16 +251,16 @@ def generate(
         from nics_drl_bridge.report.fit_pictures import write_pictures
 
         with console.progress_bar("drawing the report"):
-            write_fit_page(out / "report.html", str(recording), spec, identified, model.report)
+            write_fit_page(out / "report.html", named, spec, identified, model.report)
             if pictures:
                 write_pictures(spec, identified, out / "pictures")
-        if as_json:
-            typer.echo(json_of(fit_facts(out, spec.name, identified)))
-            return
-        named = "" if lidar or spec.lidar else ", as none is named: --lidar says which"
-        typer.echo(f"{opening(model.report)}\n\nits lidar: {model.lidar.name!r}{named}")
-        figures = f"{out / 'report.txt'}, with pictures: {out / 'report.html'}"
-        typer.echo(f"all figures: {figures}\nmodel written to {out}")
+        why = "" if lidar or spec.lidar else ", as none is named: --lidar says which"
+        lines = (
+            f"{opening(model.report)}\n", f"its lidar is {model.lidar.name!r}{why}",
+            f"all figures: {out / 'report.txt'}, with pictures: {out / 'report.html'}",
+            f"model written to {out}",
+        )  # fmt: skip
+        console.say(as_json, "\n".join(lines), **fit_facts(out, spec.name, identified))
 
 
 def fit_facts(out: Path, robot: str, identified: "Identified") -> dict[str, Any]:

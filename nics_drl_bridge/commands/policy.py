@@ -90,16 +90,13 @@ def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:
         )
     lines = {
         "file": f"{facts['file']}, {facts['bytes'] / 1024:.0f} kB, all checks passed",
-        "robot": f"{facts['robot']['name']}: {', '.join(commands)}",
-        "task": facts["task"]["name"],
-        "actions": facts["actions"],
-        "scan": observed,
+        "robot": f"{facts['robot']['name']}: {', '.join(commands)}", "task": facts["task"]["name"],
+        "actions": facts["actions"], "scan": observed,
         "lidar": f"{lidar['name']}: {lidar['beams']} beams, {lidar['range_max']:g} m",
         "observation": f"{seen['size']} parts, {seen['scan_parts']} of them the scan",
         "control period": f"{facts['control_period']:g} s",
         "time limit": "not told" if steps is None else f"{steps * facts['control_period']:g} s",
-        "model": facts["model_fingerprint"],
-        "graph": facts["graph_sha256"][:16],
-    }
+        "model": facts["model_fingerprint"], "graph": facts["graph_sha256"][:16],
+    }  # fmt: skip
     provenance = {name: str(value) for name, value in facts["provenance"].items()}
     return [*lines.items(), *provenance.items()]

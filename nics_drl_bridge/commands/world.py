@@ -100,9 +100,8 @@ def _places(files: list[Path], out: Path | None, name: str | None) -> dict[Path,
     one = out is not None and out.suffix in MAPS
     if len(files) > 1 and (one or name is not None):
         given = f"--out {out}" if one else f"--name {name}"
-        raise ConfigError(
-            f"{given}: is for one file, not for {len(files)}; give a folder as --out."
-        )
+        told = f"{given}: is for one file, not for {len(files)}"
+        raise ConfigError(f"{told}; give a folder as --out.")
     if out is not None and one:
         return {files[0]: out}
     ends = [".yaml" if file.suffix in SDF else "_world.yaml" for file in files]

@@ -222,9 +222,8 @@ class PathActions:
             way = self._way(frame, self._robot_in(NAVIGATE, frame), end[0])
         except ConfigError as error:
             raise Refusal(goal.code, f"{NAVIGATE}: {error}") from None
-        return self._begin(
-            goal, frame, way, (self._parameters.goals[0], self._parameters.progress[0])
-        )
+        checks = self._parameters.goals[0], self._parameters.progress[0]
+        return self._begin(goal, frame, way, checks)
 
     def _way(self, frame: str, robot: Array, end: Array) -> Array:
         """Returns the way (P, 3) on the map, if there is one; else straight."""
@@ -391,9 +390,8 @@ class PathActions:
         if end == held.ABORT:
             self._node.get_logger().warning(f"goal aborted: {sentence}")
         else:
-            self._node.get_logger().info(
-                "goal reached" if end == held.SUCCEED else "goal cancelled"
-            )
+            told = "goal reached" if end == held.SUCCEED else "goal cancelled"
+            self._node.get_logger().info(told)
         goal.server.finish(goal.handle, end, held.result_of(goal.kind, code, sentence))
 
 

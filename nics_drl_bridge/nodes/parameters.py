@@ -273,7 +273,7 @@ def drive() -> list[Row]:
         Row("topics", "", "YAML file that names joints; none if empty."),
         Row("odom_timeout", 0.5, "Stops after this silence of odom [s].", (0.05, 10.0)),
         stamped("cmd_vel")._replace(name="stamped"),
-    ]
+    ]  # fmt: skip
 
 
 class NodeFacts(NamedTuple):

@@ -51,7 +51,7 @@ MEANINGS: dict[str, tuple[set[str], ...]] = {
     "front_right": ({"fr"}, {"front", "right"}, {"rf"}),
     "rear_left": ({"rl"}, {"rear", "left"}, {"bl"}, {"back", "left"}),
     "rear_right": ({"rr"}, {"rear", "right"}, {"br"}, {"back", "right"}),
-}
+}  # fmt: skip
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 # Commands of a kind of robot, by meaning, and its names for them; other kinds have `words`.
 KINDS = (

@@ -162,10 +162,9 @@ def _heading(reader: MappedReader, pose: PoseSource, given: str | Sequence[Refer
 POSES = (
     ("pose.pose.position.{}", "pose.pose.orientation", "pose.covariance"),
     ("pose.position.{}", "pose.orientation", None),
-    ("transform.translation.{}", "transform.rotation", None),
-    ("position.{}", "orientation", None),
+    ("transform.translation.{}", "transform.rotation", None), ("position.{}", "orientation", None),
     ("{}", "theta", None),
-)
+)  # fmt: skip
 """Fields of messages that are poses: position, orientation, covariance."""
 
 

@@ -295,11 +295,9 @@ def _motors(names: tuple[str, ...], *servo: Any) -> str:
 
 
 _BUILDERS: dict[str, Callable[[Parameters, float, Physics], Machine]] = {
-    "ackermann": _ackermann,
-    "differential": _differential,
-    "mecanum": _mecanum,
+    "ackermann": _ackermann, "differential": _differential, "mecanum": _mecanum,
     "skid_steer": _skid_steer,
-}
+}  # fmt: skip
 
 
 def roller_size(radius: float, rollers: int) -> tuple[float, float]:

@@ -164,13 +164,11 @@ def told_of(world: AnyWorld, resource: Resource) -> WorldResource:
     members = world.members
     groups = [group for member in members for group in member.obstacles]
     about = {
-        "set": len(members) > 1,
-        "map": any(member.map is not None for member in members),
+        "set": len(members) > 1, "map": any(member.map is not None for member in members),
         "walled": any(member.size is not None or member.walls for member in members),
-        "obstacles": bool(groups),
-        "random": any(group.count is not None for group in groups),
+        "obstacles": bool(groups), "random": any(group.count is not None for group in groups),
         "moving": any(group.motion is not None for group in groups),
-    }
+    }  # fmt: skip
     x1, y1, x2, y2 = world.extent
     size = f"{x2 - x1:.3g} m x {y2 - y1:.3g} m"
     description = f"{len(members)} worlds in {size}" if len(members) > 1 else f"a field of {size}"
