@@ -57,12 +57,17 @@ def simulator(launch, module_domain_id):
     process.check()
 
 
+@pytest.fixture(scope="module")
+def connected(simulator, client_of):
+    """One for all tests: a process has no room for as many participants of DDS."""
+    return client_of(simulator)
+
+
 @pytest.fixture
-def client(simulator, client_of):
-    made = client_of(simulator)
-    made("LoadWorld", world_resource=msg.Resource(uri="empty"))
-    made.start()
-    return made
+def client(connected):
+    connected("LoadWorld", world_resource=msg.Resource(uri="empty"))
+    connected.start()
+    return connected
 
 
 def test_every_feature_does_what_the_standard_says_and_every_other_is_refused(client):
