@@ -107,9 +107,9 @@ def test_the_frames_of_a_fleet_begin_with_the_namespace_of_each_robot(fleet):
 
 
 def test_a_fleet_that_gets_starts_for_other_robots_says_how_many_it_needs(fleet):
-    answer = fleet.reset([0.0, 0.0, 0.0])
-    assert not answer.success
-    assert "2 robots need 6" in answer.message
+    answer = fleet.peer.set_parameters("simulator_node", episode_start=[0.0, 0.0, 0.0])
+    assert not answer.successful
+    assert "episode_start has 3 numbers; give 6" in answer.reason
     assert fleet.reset(FACING).success
 
 
