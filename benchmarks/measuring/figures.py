@@ -112,7 +112,7 @@ README = told(
     *(
         (
             f"transfer_{robot}",
-            f"{title}: one policy file in process, over DDS, in MuJoCo over DDS, in all shipped "
+            f"{title}: one policy file in process, over DDS, in MuJoCo over DDS, in shipped "
             "worlds: true success, with a real lidar, mild randomisation, gate and shield",
             "in process {min success.*.*.fast x100|.0f} to {max success.*.*.fast|.0%}; over DDS "
             "{min points_from_fast.*.*.dds|+.1f} to {max points_from_fast.*.*.dds|+.1f} points, in "
@@ -143,7 +143,7 @@ README = told(
     (
         "ros_lockstep",
         "env steps over DDS in lock-step, 720 beams, estimator included",
-        "{steps_per_s|,.0f} per second, {p50_ms|.2f} ms; a bare pair of rclpy nodes exchanges the "
+        "{steps_per_s|,.0f} per second, median {p50_ms|.2f} ms; a bare pair of rclpy nodes exchanges the "
         "same messages {bare_echo_per_s|,.0f} times",
     ),
     (
