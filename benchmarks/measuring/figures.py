@@ -143,8 +143,8 @@ README = told(
     (
         "ros_lockstep",
         "env steps over DDS in lock-step, 720 beams, estimator included",
-        "{steps_per_s|,.0f} per second, median {p50_ms|.2f} ms; a bare pair of rclpy nodes exchanges the "
-        "same messages {bare_echo_per_s|,.0f} times",
+        "{steps_per_s|,.0f} per second, median {p50_ms|.2f} ms; a bare pair of rclpy nodes "
+        "exchanges the same messages {bare_echo_per_s|,.0f} times",
     ),
     (
         "training_differential",
