@@ -25,7 +25,7 @@ from nics_drl_bridge.policy.foreign_mapping import ForeignPolicy
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 from nics_drl_bridge.recording.mapping import Mapping
 from nics_drl_bridge.recording.topic_roles import TopicRoles
-from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.spec import RobotSpec, kind_names
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.world_set import SetFile
@@ -37,16 +37,23 @@ BOUNDS = (("minimum", "≥"), ("exclusiveMinimum", ">"), ("maximum", "≤"), ("e
 
 
 class Kind(NamedTuple):
-    """A kind of file: its title, schema, an example below config/ or examples/, and its guide."""
+    """A kind of file: title, schema, an example below config/ or examples/, guide, and a note."""
 
     title: str
     schema: type[BaseModel]
     example: str
     guide: str
+    note: str = ""
 
 
+SHORT = (
+    "\n\nA file that begins with `kind:` needs a `footprint` or a `footprint_radius` and nothing "
+    "else: name, commands, state and parameters are those of its kind, unless it gives its own. "
+    "`free` needs its commands, too. "
+    f"Kinds are {', '.join(f'`{name}`' for name in kind_names())}."
+)
 KINDS = {
-    "robot": Kind("Robot file", RobotSpec, "config/robots/ackermann.yaml", "kinematics"),
+    "robot": Kind("Robot file", RobotSpec, "config/robots/ackermann.yaml", "kinematics", SHORT),
     "world": Kind("World file", World, "config/worlds/crowd.yaml", "worlds"),
     "world_set": Kind("World set file", SetFile, "config/world_sets/cellular.yaml", "worlds"),
     "map": Kind("Map file", MapFile, "config/maps/room.yaml", "worlds"),
@@ -185,7 +192,7 @@ def page(kind: Kind) -> str:
         f"Every key of the file; [the guide](../{kind.guide}.md) says what they are for. A key "
         "that is not known, stands twice or is out of range is refused by its name."
     )
-    parts = [section(kind.schema, whole, f"# {kind.title}\n\n{opening}")]
+    parts = [section(kind.schema, whole, f"# {kind.title}\n\n{opening}{kind.note}")]
     inner = whole.get("$defs", {})
     parts += [section(schemas[name], inner[name], f"## {name}") for name in inner]
     if kind.example:
@@ -212,8 +219,10 @@ def command_section(path: str, command: Any) -> str:
             continue
         names = [*one.opts, *one.secondary_opts] if one.param_type_name == "option" else [one.name]
         usual = "required" if one.required else ""
-        if isinstance(one.default, str | int | float) and not isinstance(one.default, bool):
-            usual = shown(one.default)
+        if isinstance(one.default, bool):
+            usual = f"`{names[not one.default]}`" if one.secondary_opts else ""
+        elif isinstance(one.default, str | int | float | Path):
+            usual = shown(one.default if not isinstance(one.default, Path) else str(one.default))
         told = " ".join((getattr(one, "help", "") or "").split()).replace("|", "&#124;")
         lines.append(f"| {', '.join(f'`{name}`' for name in names)} | {usual} | {told} |")
     return "\n".join([*lines, ""])
