@@ -80,6 +80,9 @@ def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
         return f"key {key!r}: unknown kind {tag!r}; {nearest(tag, known)}"
     if first["type"] == "union_tag_not_found":
         return f"the key '{key}.kind' is missing; add it."
+    if first["type"] == "missing" and isinstance(place := first["loc"][-1], int):
+        key = ".".join(map(str, first["loc"][:-1]))
+        return f"key {key!r}: number of entries must be more than {place}."
     if first["type"] == "missing":
         return f"the key {key!r} is missing; add it."
     if first["type"] in _NO_KEYS:
@@ -89,7 +92,7 @@ def _sentence(error: ValidationError, schema: type[BaseModel]) -> str:
     if first["type"] in _COUNT:
         least, most, found = map(first["ctx"].get, ("min_length", "max_length", "actual_length"))
         told = f"at most {most}" if least is None else f"at least {least}"
-        return f"key {key!r}: must have {told} entries, not {found}."
+        return f"key {key!r}: number of entries must be {told}, not {found}."
     message = first["msg"].removeprefix("Value error, ").rstrip(".")
     message = message[0].lower() + message[1:]
     if not key:  # an error of several keys, which the message names

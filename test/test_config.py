@@ -106,7 +106,8 @@ def test_a_value_in_place_of_keys_is_told_without_the_words_of_a_library(key):
     ("value", "told"),
     [
         ("6", "must be a list, as [a, b], not 6."),
-        ("[6, 4, 2]", "must have at most 2 entries, not 3."),
+        ("[6]", "number of entries must be more than 1."),
+        ("[6, 4, 2]", "number of entries must be at most 2, not 3."),
     ],
 )
 def test_a_list_is_asked_for_without_the_words_of_a_library(value, told):

@@ -1,5 +1,6 @@
 """The same episodes in process, over DDS, in MuJoCo, and on the vehicle, compared as in Fig. 7."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, replace
@@ -238,9 +239,15 @@ def judged(
     return Evaluated(policy, runs, evaluation.tallies(runs, model.control_period))
 
 
+ENDS = r"\.(onnx|ya?ml)$"  # of a policy, or a mapping of one
+
+
 def short_name(policy: str, among: Sequence[str]) -> str:
     """Returns the stem of a policy's path; where others have the same, folders before it, too."""
-    own, *others = (Path(one).with_suffix("").parts for one in (policy, *({*among} - {policy})))
+    own, *others = (
+        [part.strip("/") for part in Path(re.sub(ENDS, "", one)).absolute().parts]
+        for one in (policy, *({*among} - {policy}))
+    )
     alone = (k for k in range(1, len(own)) if all(one[-k:] != own[-k:] for one in others))
     return "_".join(own[-next(alone, 1) :])
 

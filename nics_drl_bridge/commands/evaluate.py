@@ -90,9 +90,9 @@ def evaluate(
 
 
 def _ask(yes: bool, question: str) -> None:
-    typer.echo(question)
+    typer.echo(question, err=True)
     if not yes:
-        typer.prompt("Enter when ready", default="", show_default=False)
+        typer.prompt("Enter when ready", default="", show_default=False, err=True)
 
 
 def _point(text: str | None) -> tuple[float, float] | None:

@@ -128,7 +128,7 @@ def inspect(
             raise ConfigError(f"--map {mapping}: is there already; give another name.")
         with open_source(source) as opened, console.progress_bar(f"reading {source}"):
             tables = survey(opened)
-        text = first_mapping(tables)
+        text = "" if as_json and mapping is None else first_mapping(tables)
         if mapping is not None:
             write_text(mapping, text)
         if as_json:

@@ -70,7 +70,8 @@ def train(
         chosen = resumed or _told(task, settings, named)
         folder = out or Path("runs") / chosen.title
         command = shlex.join(["nics", *sys.argv[1:]])
-        begun = train_run.seeds_of(folder) if resume else []
+        if begun := train_run.seeds_of(folder) if resume and not seeds else []:
+            typer.echo(f"seeds that were begun: {begun}; --seeds names others", err=True)
         every = [*(seeds or begun or [0]), *(more_seeds or [])]
         order = train_run.TrainOrder(chosen, every, folder, episodes, resume, command)
         with _learner(engine, address, env_runners, chosen.num_envs) as learn:

@@ -194,13 +194,12 @@ def _flow(value: Any) -> str:
 
 @world.command()
 def draw(
-    name: Shown,
-    out: Annotated[Path | None, Option(help="The .png to write; <world>.png.")] = None,
+    name: Shown, out: Annotated[Path | None, Option(help="The .png to write; <world>.png.")] = None,
     seed: Annotated[int, Option(min=0, help="Seed of the episode.")] = 0,
     robot: console.RobotOption = DEFAULT_ROBOT,
     footprint: Annotated[float | None, Option(help="Instead: radius of a round robot [m].")] = None,
     as_json: console.JsonOption = False,
-) -> None:
+) -> None:  # fmt: skip
     """Draws a world as an episode finds it, with start and goal.
 
     Of a set, such as barn or a folder of files, it is the world of the episode.
@@ -234,7 +233,7 @@ def map_(
     robot: console.RobotOption = DEFAULT_ROBOT,
     resolution: Annotated[float, Option(help="Greatest side of a cell [m].")] = 0.01,
     as_json: console.JsonOption = False,
-) -> None:
+) -> None:  # fmt: skip
     """Writes the map of an episode, as Nav2's map_server reads it.
 
     Obstacles that move are left out. `nics world map room`, then

@@ -20,7 +20,7 @@ from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCA
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.recording import topic_roles
 from nics_drl_bridge.recording.bag_file import BagFile, Message, opened
-from nics_drl_bridge.recording.messages import commanded, pose_row, stamp, twist_row
+from nics_drl_bridge.recording.messages import commanded, stamp, twist_row, whole_pose
 
 Array = NDArray[np.float64]
 SCAN_TYPE = "sensor_msgs/msg/LaserScan"
@@ -170,7 +170,7 @@ class Playback:
         return self.middleware.scan(stamp(message), arrival_ns, ranges)
 
     def _odometry(self, arrival_ns: int, message: Any) -> bool:
-        stamp_ns, pose = stamp(message), np.array(pose_row(message))
+        stamp_ns, pose = stamp(message), np.array(whole_pose(message))
         if not self._started and np.isfinite(pose).all():
             self.middleware.reset(stamp_ns, pose, ANYWHERE if self._posed else START_STD)
             self._started = True
@@ -187,7 +187,7 @@ class Playback:
         if hasattr(message.pose, "covariance"):
             six = np.reshape(message.pose.covariance, (6, 6))
             covariance = six[np.ix_([0, 1, 5], [0, 1, 5])]
-        return self.middleware.pose(stamp(message), arrival_ns, pose_row(message), covariance)
+        return self.middleware.pose(stamp(message), arrival_ns, whole_pose(message), covariance)
 
     def _imu(self, arrival_ns: int, message: Any) -> bool:
         covariance = message.angular_velocity_covariance

@@ -28,8 +28,9 @@ from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
 from nics_drl_bridge.nodes import device_parameters, parameters, qos, runner, wire
-from nics_drl_bridge.nodes.conversions import is_rotation, sensor_from_ros, sensor_type
+from nics_drl_bridge.nodes.conversions import sensor_from_ros, sensor_type
 from nics_drl_bridge.nodes.gate_log import GateLog
+from nics_drl_bridge.recording.messages import is_rotation
 
 TWIST, TWIST_STAMPED = "Twist", "TwistStamped"
 STALE_S = 0.05  # a motion that was decided on longer ago than this is decided on again [s]

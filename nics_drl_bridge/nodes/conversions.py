@@ -27,7 +27,6 @@ from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader, to_device
 from nics_drl_bridge.recording import messages
 from nics_drl_bridge.robot.spec import RobotSpec
 
-QUATERNION_TOLERANCE = 0.1  # tolerance of the squared length of a quaternion about 1
 PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # x, y and heading in the 6 x 6 covariance of a message
 UNUSED_VARIANCE = 1e6  # variance of z, roll and pitch, which a planar robot does not measure
 FIELD = re.compile(r"^\s*([A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z0-9_/]+)?)")  # type, in a `.msg` file
@@ -51,11 +50,6 @@ def heading_to_ros(heading: float) -> geometry.Quaternion:
 def heading_of(x: float, y: float, z: float, w: float) -> float:
     """Returns the heading [rad] of a quaternion given by its components."""
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-
-
-def is_rotation(x: float, y: float, z: float, w: float) -> bool:
-    """True if a quaternion has about unit length; one of zeros was never filled in."""
-    return abs(w * w + x * x + y * y + z * z - 1.0) < QUATERNION_TOLERANCE
 
 
 def twist_to_ros(twist: ArrayLike) -> geometry.Twist:
@@ -111,13 +105,7 @@ def odometry_to_ros(
 
 def odometry_from_ros(message: Odometry) -> tuple[Array, Array]:
     """Returns pose (3,) and body twist (3,) of an Odometry message."""
-    return _pose_of(message), np.array(messages.twist_row(message))
-
-
-def _pose_of(message: Any) -> Array:
-    """Returns the pose (3,) of a message; NaN where its orientation was never filled in."""
-    whole = is_rotation(*messages.quaternion(message))
-    return np.array(messages.pose_row(message)) if whole else np.full(3, np.nan)
+    return np.array(messages.whole_pose(message)), np.array(messages.twist_row(message))
 
 
 def covariance_to_ros(planar: Array) -> Array:
@@ -133,7 +121,7 @@ def pose_from_ros(
     """Returns the pose (3,) of a message and its covariance (3, 3); None if it carries none."""
     known = isinstance(message, geometry.PoseWithCovarianceStamped)
     covariance = np.reshape(message.pose.covariance, (6, 6))[PLANAR] if known else None
-    return _pose_of(message), covariance
+    return np.array(messages.whole_pose(message)), covariance
 
 
 def pose_to_ros(pose: ArrayLike, time_ns: int, frame: str) -> geometry.PoseStamped:

@@ -79,7 +79,8 @@ class RosSource:
         self._goal = np.array([[position.x, position.y]])
 
     def _take_truth(self, message: Odometry) -> None:
-        self._truth = conversions.odometry_from_ros(message)[0]
+        pose = conversions.odometry_from_ros(message)[0]
+        self._truth = pose if np.isfinite(pose).all() else None
 
     def _take_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:

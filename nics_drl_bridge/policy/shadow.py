@@ -155,10 +155,7 @@ def _answered(moments: list[_Moment], goals: Array, name: str, model: SimulatorM
         raise RecordingError(f"nothing to compare the policy by: {reasons}; choose another goal.")
     stamps, poses, aims, wanted, driven = (np.array(column) for column in zip(*rows, strict=True))
     return Shadow(
-        tuple(one.name for one in robot.command),
-        tuple(one.unit for one in robot.command),
-        (stamps - stamps[0]) * S_PER_NS,
-        poses, aims, wanted, driven,
-        np.maximum(np.abs(robot.command_low), np.abs(robot.command_high)),
-        skipped, resets,
+        tuple(one.name for one in robot.command), tuple(one.unit for one in robot.command),
+        (stamps - stamps[0]) * S_PER_NS, poses, aims, wanted, driven,
+        np.maximum(np.abs(robot.command_low), np.abs(robot.command_high)), skipped, resets,
     )  # fmt: skip

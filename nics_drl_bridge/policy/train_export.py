@@ -151,8 +151,7 @@ def _graph(deployed: Deployed, task: Task) -> Any:
         torch.onnx.export(
             deployed, tuple(examples), buffer,
             input_names=inputs, output_names=outputs, opset_version=OPSET,
-            dynamic_axes={name: {0: "n"} for name in (*inputs, *outputs)},
-            dynamo=False,
+            dynamic_axes={name: {0: "n"} for name in (*inputs, *outputs)}, dynamo=False,
         )  # fmt: skip
     return onnx.load_model_from_string(buffer.getvalue())
 

@@ -331,10 +331,13 @@ def _values(pose: Guess, lines: Sequence[str]) -> tuple[Array, Array] | None:
     """Returns stamps (T,) and poses (T, 3) of a guess in the units of its lines, if known."""
     table = pose.table
     columns = [table.data.get(pose.keys.get(key, "")) for key in ("x", "y", "heading")]
-    known = [np.zeros(table.rows) if c is None else c.astype(np.float64) for c in columns]
+    rows = 0 if table.t is None else len(table.t)
+    known = [np.zeros(rows) if c is None else c.astype(np.float64) for c in columns]
+    if any(len(each) != rows for each in known):  # of several streams
+        return None
     values = np.stack(known, axis=1)
     whole = np.isfinite(values).all(axis=1)
-    if table.t is None or len(table.t) != len(values) or whole.sum() < 3:
+    if table.t is None or whole.sum() < 3:
         return None
     for key, part in (("unit", np.s_[:, :2]), ("heading_unit", np.s_[:, 2])):
         if named := re.search(rf"^  {key}: (\S+)", "\n".join(lines), re.MULTILINE):

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 Row = tuple[float, float, float]
+QUATERNION_TOLERANCE = 0.1  # tolerance of the squared length of a quaternion about 1
 
 ACKERMANN_DEFINITION = (
     "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\n"
@@ -119,6 +120,16 @@ def quaternion(message: Any) -> tuple[float, float, float, float]:
     """Returns x, y, z, w of a message's orientation."""
     q = _place(message)[1]
     return q.x, q.y, q.z, q.w
+
+
+def is_rotation(x: float, y: float, z: float, w: float) -> bool:
+    """True if a quaternion has about unit length; one of zeros was never filled in."""
+    return abs(w * w + x * x + y * y + z * z - 1.0) < QUATERNION_TOLERANCE
+
+
+def whole_pose(message: Any) -> Row:
+    """Returns the pose of a message; NaN where its orientation was never filled in."""
+    return pose_row(message) if is_rotation(*quaternion(message)) else (math.nan,) * 3
 
 
 def pose_row(message: Any) -> Row:

@@ -138,9 +138,10 @@ def _surveyed(name: str, table: Table) -> TableSurvey:
 
 
 def _range(column: Column) -> tuple[float, float]:
-    if column.dtype.kind in "US" or not np.isfinite(column.astype(np.float64)).any():
+    values = np.zeros(0) if column.dtype.kind in "US" else column.astype(np.float64)
+    if not np.isfinite(values).any():
         return np.nan, np.nan
-    return float(np.nanmin(column)), float(np.nanmax(column))
+    return float(np.nanmin(values)), float(np.nanmax(values))
 
 
 def _time(data: dict[str, Column]) -> tuple[str | None, Array | None]:

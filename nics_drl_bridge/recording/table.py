@@ -110,7 +110,7 @@ def flattened(arrays: Mapping[str, Column]) -> Iterator[tuple[str, Column]]:
             inner = {f"{name}.{field}".lstrip("."): array[field] for field in array.dtype.names}
             yield from flattened(inner)
         elif array.ndim == 1:
-            yield name, array.astype(str) if array.dtype.kind in "mM" else array
+            yield name, array
         elif array.ndim > 1:
             flat = array.reshape(len(array), math.prod(array.shape[1:]))
             for k in range(flat.shape[1]):

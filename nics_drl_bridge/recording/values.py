@@ -249,7 +249,7 @@ def _table_name(wanted: str, names: Sequence[str]) -> str | None:
 def dates_of(column: Column) -> Array | None:
     """Returns seconds since 1970 of dates like 2024-05-01 12:00:00.5; None if they are none."""
     text = [ZONE.sub("", str(each)).replace("/", "-") for each in column]
-    if CLOCK.match(text[0]):
+    if text and CLOCK.match(text[0]):
         text = [f"1970-01-01T{each}" for each in text]
     try:
         ns = np.array(text, dtype="datetime64[ns]").astype(np.int64)

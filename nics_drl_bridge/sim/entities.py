@@ -180,7 +180,7 @@ class Entities:
             self._put(bodies, entity, pose)
             self._show(bodies)
         if twist is not None and entity.motion is not None:
-            bounded = np.clip(twist, -FASTEST, FASTEST)
+            bounded = twist / max(1.0, float(np.abs(twist).max()) / FASTEST)
             self.simulator.data.velocity[0, entity.slots[0]] = bounded
 
     def _move_robot(self, robot: int, pose: Array | None, twist: Array | None) -> None:

@@ -36,6 +36,8 @@ KART = SimpleNamespace(robot=robot_from({"kind": "ackermann_throttle", "footprin
     [
         ("runs/a/seed_0/policy.onnx", ["runs/b/seed_0/policy.onnx"], "a_seed_0_policy"),
         ("runs/a/seed_1/policy.onnx", ["runs/a/seed_0/policy.onnx"], "seed_1_policy"),
+        ("a/policy.onnx", ["b/policy.onnx"], "a_policy"),
+        ("m/v1.2", ["m/v1.3"], "v1.2"),
         ("runs/a/mine.onnx", ["straight", "differential"], "mine"),
         ("straight", [], "straight"),
     ],

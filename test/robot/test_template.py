@@ -140,7 +140,7 @@ def test_a_file_may_say_it_in_a_few_words_too(tmp_path):
         ({**WIDE, "wheels": 4}, None, "unknown key 'wheels'"),
         (
             {"kind": "mecanum", "footprint": [[0, 0], [1, 1]]}, None,
-            "key 'footprint': must have at least 3 entries, not 2.",
+            "key 'footprint': number of entries must be at least 3, not 2.",
         ),
         ({**WIDE, "command": [{"name": ["v"]}]}, None, "key 'command.0.name'"),
         ({**WIDE, "state": [{"name": "vx", "twist": ["vx"]}]}, None, "key 'state.0.twist"),

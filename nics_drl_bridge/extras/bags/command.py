@@ -140,6 +140,10 @@ def export(
             raise ConfigError("nothing to write; say --lerobot FOLDER or --mcap FOLDER.")
         known = None if model is None else open_model(model)
         lines, told = [], dict[str, Any]()
+        if lerobot is not None:
+            from nics_drl_bridge.extras.bags.lerobot import check_output, write_dataset
+
+            check_output(lerobot)
         if mcap is not None:
             from nics_drl_bridge.extras.bags.convert import convert
 
@@ -149,9 +153,7 @@ def export(
             lines.append(f"bag written to {mcap}{also}")
         if lerobot is not None:
             from nics_drl_bridge.extras.bags.frames import frames_of
-            from nics_drl_bridge.extras.bags.lerobot import check_output, write_dataset
 
-            check_output(lerobot)
             frames = frames_of(whole, console.roles_of(topic or []), known, fps, gap)
             episodes, total = len(frames.lengths), int(frames.lengths.sum())
             reached = _numbers(succeeded, episodes)

@@ -79,8 +79,7 @@ def _topic(topic: str, kind: str, since: Nanoseconds, delays: Nanoseconds | str)
     apart = np.diff(since) * S_PER_NS
     usual = float(np.median(apart)) if len(apart) else 0.0
     return BagTopic(
-        topic, kind, len(since),
-        rate_hz=1.0 / usual if usual > 0.0 else None,
+        topic, kind, len(since), rate_hz=1.0 / usual if usual > 0.0 else None,
         first_s=float(since[0] * S_PER_NS), last_s=float(since[-1] * S_PER_NS),
         gaps=int((apart > GAP * usual).sum()) if usual > 0.0 else 0,
         longest_gap_s=float(apart.max()) if len(apart) else None,

@@ -34,14 +34,15 @@ BRACKET = re.compile(
     rf"\\.|\[(\^?)(\]?(?:\[:(?:{'|'.join(CLASSES)}):\]|\[(?![:.=])|[^][])*)\]|(\[)", re.DOTALL
 )
 HELD = re.compile(r"\[:(\w+):\]|[][\\&|~]")
-MOST_CHARACTERS, MOST_REPEATS = 1000, 5  # of a filter: it is matched while the simulator waits
+MOST_CHARACTERS, MOST_REPEATS = 1000, 3  # of a filter: it is matched while the simulator waits
+TOO_LONG = "it repeats what repeats or branches, or more than 3 times, or has over 1000 characters"
 
 
 def pattern_of(expression: str) -> re.Pattern[str]:
     """Compiles a POSIX extended regular expression. Raises RefusalError for none."""
     try:
         if len(expression) > MOST_CHARACTERS or _runs_away(BRACKET.sub(".", expression)):
-            raise re.error("it is long, or repeats what repeats or branches: it may take too long")
+            raise re.error(TOO_LONG)
         return re.compile(BRACKET.sub(_bracket, expression))
     except (re.error, OverflowError, RecursionError) as error:
         told = f"the filter {expression!r} is no regular expression for names ({error}); mend it."
@@ -62,8 +63,9 @@ def _runs_away(plain: str) -> bool:
         alike = len(heads) > 1 and len({"", ".", *heads}) < len(heads) + 2
         if group[2] and (alike or re.search(r"[*+?{]", group[1])):
             return True
-        plain = plain.replace(group[0], group[1].replace("|", ".|.") + group[2], 1)
-    return sum(map(plain.count, "*+?{")) > MOST_REPEATS
+        inner = group[1].replace("|", "." if group[2] else ".|.")
+        plain = plain.replace(group[0], inner + group[2], 1)
+    return max(sum(map(one.count, "*+?{")) for one in plain.split("|")) > MOST_REPEATS
 
 
 def tags_match(wanted: Any, tags: Any) -> bool:

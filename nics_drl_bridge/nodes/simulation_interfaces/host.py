@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
@@ -70,6 +71,7 @@ class RefusalError(BridgeError):
 
 
 Handler = Callable[[Any, Any], None]
+ABSENT = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.ENAMETOOLONG, errno.ELOOP)
 
 
 def outcome(act: Callable[[], object], host: Host) -> tuple[int, str]:
@@ -80,11 +82,11 @@ def outcome(act: Callable[[], object], host: Host) -> tuple[int, str]:
         return error.code, str(error)
     except UnknownEntityError as error:
         return Result.RESULT_NOT_FOUND, str(error)
-    except OSError as error:
-        return Result.RESULT_NOT_FOUND, str(BridgeError(f"{error}; check the path."))
     except BridgeError as error:
         return Result.RESULT_OPERATION_FAILED, str(error)
     except Exception as error:  # noqa: BLE001  (the other robots and clients go on)
+        if isinstance(error, OSError) and error.errno in ABSENT:
+            return Result.RESULT_NOT_FOUND, str(BridgeError(f"{error}; check the path."))
         told = f"the simulator failed: {type(error).__name__}: {error}"
         host.get_logger().error(told)
         return Result.RESULT_OPERATION_FAILED, " ".join(told.split())

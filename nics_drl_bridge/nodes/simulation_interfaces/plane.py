@@ -15,6 +15,7 @@ from nics_drl_bridge.interface import Array
 from nics_drl_bridge.lidar.shapes import convex_hull
 from nics_drl_bridge.nodes import conversions
 from nics_drl_bridge.nodes.simulation_interfaces.host import RefusalError
+from nics_drl_bridge.recording.messages import is_rotation
 from nics_drl_bridge.sim.entities import Entities, overlap
 
 HEIGHT = 0.5  # of whatever stands in a plane world, as in MuJoCo [m]
@@ -32,7 +33,7 @@ def pose_from_ros(pose: Any, base: Array, code: int) -> Array:
     given = f"quaternion x {turn.x:g}, y {turn.y:g}, z {turn.z:g}, w {turn.w:g}"
     if not all(map(math.isfinite, (place.x, place.y, place.z, *quaternion))):
         raise RefusalError(code, "the pose holds NaN or inf; give finite numbers.")
-    if not conversions.is_rotation(*quaternion):
+    if not is_rotation(*quaternion):
         raise RefusalError(code, f"the {given} is no rotation; give one of unit length.")
     if 1.0 - 2.0 * (turn.x**2 + turn.y**2) < math.cos(LEAN):
         raise RefusalError(code, f"the {given} leans, but the world is flat; turn about z alone.")
