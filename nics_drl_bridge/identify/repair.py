@@ -13,16 +13,8 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.signals import held, interval_means, unwrapped
 from nics_drl_bridge.identify.statistics import unexplained
+from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording.mapping import UNITS
-from nics_drl_bridge.recording.recording import (
-    BETTER,
-    MIRRORED,
-    Recording,
-    Stream,
-    along_path,
-    clockwise_line,
-    shows_axes,
-)
 from nics_drl_bridge.recording.stamping import not_repeated
 from nics_drl_bridge.robot.kinds import has_textbook, textbook
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -62,12 +54,14 @@ def repaired(drive: Drive) -> tuple[Drive, tuple[str, ...]]:
     return drive, tuple(notes)
 
 
-def _with_rows(recording: Recording, name: str, keep: NDArray[np.bool_]) -> Recording:
+def _with_rows(
+    recording: recordings.Recording, name: str, keep: NDArray[np.bool_]
+) -> recordings.Recording:
     some: Any = {name: recording.streams[name].rows(keep)}
     return replace(recording, **some)
 
 
-def _without_repetitions(drive: Drive, notes: list[str]) -> Recording:
+def _without_repetitions(drive: Drive, notes: list[str]) -> recordings.Recording:
     recording = drive.recording
     for name, stream in recording.streams.items():
         keep, note = not_repeated(stream.t, stream.values, name)
@@ -77,7 +71,7 @@ def _without_repetitions(drive: Drive, notes: list[str]) -> Recording:
     return recording
 
 
-def _without_jumps(drive: Drive, notes: list[str]) -> Recording:
+def _without_jumps(drive: Drive, notes: list[str]) -> recordings.Recording:
     recording = drive.recording
     found = {"pose": _jumps_of_pose(drive)}
     if recording.state is not None and drive.spec.state:
@@ -107,7 +101,7 @@ def _jumps_of_pose(drive: Drive) -> NDArray[np.bool_]:
     return out[0] | out[1] | _stands_out(pose.values[:, 2], turns, turning=True)
 
 
-def _jumps_of_state(state: Stream) -> NDArray[np.bool_]:
+def _jumps_of_state(state: recordings.Stream) -> NDArray[np.bool_]:
     out = np.zeros(len(state.t), dtype=np.bool_)
     for column in state.values.T:
         low, high = np.percentile(column, (5.0, 95.0))
@@ -115,7 +109,7 @@ def _jumps_of_state(state: Stream) -> NDArray[np.bool_]:
     return out
 
 
-def _joined(drive: Drive, notes: list[str]) -> Recording:
+def _joined(drive: Drive, notes: list[str]) -> recordings.Recording:
     """Moves all poses after a jump of the localiser to where the motion before it leads."""
     recording, t, pose = drive.recording, drive.sample_t, drive.recording.pose.values
     span = np.diff(t)
@@ -173,7 +167,7 @@ def _stands_out(values: Array, least: Array, turning: bool = False) -> NDArray[n
     return np.asarray((before * after > 0.0) & (apart > np.maximum(STEPS * usual, least)))
 
 
-def _within_limits(drive: Drive, notes: list[str]) -> Recording:
+def _within_limits(drive: Drive, notes: list[str]) -> recordings.Recording:
     """Clips commands to the robot's limits, unless it followed them beyond."""
     recording, spec = drive.recording, drive.spec
     low, high, values = spec.command_low, spec.command_high, recording.command.values
@@ -197,7 +191,7 @@ def _within_limits(drive: Drive, notes: list[str]) -> Recording:
     return replace(recording, command=replace(recording.command, values=clipped))
 
 
-def _rates_left(recording: Recording, command: Array) -> float:
+def _rates_left(recording: recordings.Recording, command: Array) -> float:
     """Returns the share of the state's rates that commands leave unexplained; 0 without state."""
     state = recording.state
     if state is None or len(state.t) < 2:
@@ -235,7 +229,7 @@ def check_units(drive: Drive) -> None:
             raise RecordingError(f"{recording.source}: {fault}; {advice}.")
 
 
-def check_commands(drive: Drive, command: Stream | None = None) -> tuple[str, ...]:
+def check_commands(drive: Drive, command: recordings.Stream | None = None) -> tuple[str, ...]:
     """Refuses swapped commands, with a RecordingError; a sentence on each in another unit.
 
     By how the speed and the turn rate that they ask for, or those before they were clipped,
@@ -268,7 +262,9 @@ def _places(spec: RobotSpec) -> list[int]:
     return [PLACES[key] for key in keys] if {*keys} <= {*PLACES} else []
 
 
-def _asked_and_driven(drive: Drive, command: Stream) -> tuple[Array, Array, Array] | None:
+def _asked_and_driven(
+    drive: Drive, command: recordings.Stream
+) -> tuple[Array, Array, Array] | None:
     """Returns speed and turn rate (n, 2), as commanded and as driven, and how alike (2, 2).
 
     None if that does not show, as of robots that move sideways.
@@ -301,18 +297,20 @@ def check_axes(drive: Drive) -> None:
     # If only mirrored headings make the direction constant, then x, y or heading is reversed.
     recording, values = drive.recording, drive.dated.values
     apart = max(TRAVEL_SHARE * drive.spec.footprint_radius, 1e-3)
-    some = drive.dated.rows(along_path(values, apart))
-    line = "" if drive.spec.moves_sideways else clockwise_line(some.values)
+    some = drive.dated.rows(recordings.along_path(values, apart))
+    line = "" if drive.spec.moves_sideways else recordings.clockwise_line(some.values)
     state = recording.state
     if (
         drive.spec.moves_sideways
         and state is not None
         and state.clock == recording.pose.clock
-        and shows_axes(some.values)
+        and recordings.shows_axes(some.values)
     ):
         other = some.values * np.array([1.0, 1.0, -1.0])
         as_given, mirrored = (_explained(some.t, p, state) for p in (some.values, other))
-        line = "scale: -1" if mirrored > max(MIRRORED, BETTER + as_given) else ""
+        line = (
+            "scale: -1" if mirrored > max(recordings.MIRRORED, recordings.BETTER + as_given) else ""
+        )
     if line:
         fault = "heading and path turn opposite ways; one of x, y and heading is reversed"
         known = "as that of a compass" if "offset" in line else "counted clockwise"
@@ -321,7 +319,7 @@ def check_axes(drive: Drive) -> None:
         raise RecordingError(f"{recording.source}: pose: {fault}: {advice}; or {other} (REP-103).")
 
 
-def _explained(t: Array, pose: Array, state: Stream) -> float:
+def _explained(t: Array, pose: Array, state: recordings.Stream) -> float:
     """Returns the share (0 to 1) of the body velocity between poses that the state explains."""
     span = np.diff(t)
     keep = span > 0.0

@@ -14,14 +14,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import exact_kernels
-from nics_drl_bridge.lidar.exact_kernels import (
-    RADIUS,
-    SHAPE,
-    Beams,
-    OutlineArrays,
-    X,
-    Y,
-)  # fmt: skip
+from nics_drl_bridge.lidar import exact_kernels as exact
 
 ABOVE_ZERO = 2.0**24  # Added before truncation to an integer: numbers are rounded down
 PER_TURN = 0.5 / math.pi
@@ -59,12 +52,12 @@ class LidarArrays(NamedTuple):
     """A lidar with its table, for the kernels."""
 
     mount: NDArray[np.float64]  # (3,) pose on the robot
-    beams: Beams
+    beams: exact.Beams
     range_min: float  # [m]
     range_max: float
     sweep_time: float  # duration of a sweep [s]
     between: NDArray[np.float64]  # (H, 2) squares of the distances of a look-up [m^2]
-    outlines: OutlineArrays  # `outlines`, `table`: of the shapes
+    outlines: exact.OutlineArrays  # `outlines`, `table`: of the shapes
     table: TableArrays
     exact: bool  # True if maps are scanned exactly, from cell to cell
 
@@ -95,11 +88,11 @@ def compute(out, here, bodies, me, near, walls, lidar):  # type: ignore[no-untyp
 @kernel(contracts=True, inline=True)
 def way_of(body, x, y, lidar):  # type: ignore[no-untyped-def]
     """Way to scan a body: computed where the lidar is in its circle, or the table is too coarse."""
-    dx, dy, radius = body[X] - x, body[Y] - y, body[RADIUS]
+    dx, dy, radius = body[exact.X] - x, body[exact.Y] - y, body[exact.RADIUS]
     d2, reach = dx * dx + dy * dy, lidar.range_max + radius
     if not (radius > 0.0 and d2 <= reach * reach):
         return UNSEEN
-    h = np.uintp(np.int32(body[SHAPE]))
+    h = np.uintp(np.int32(body[exact.SHAPE]))
     kept = d2 >= radius * radius and lidar.between[h, 0] <= d2 <= lidar.between[h, 1]
     return LOOKED_UP if kept else COMPUTED
 

@@ -12,11 +12,7 @@ from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS, class_for
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.lidar.sectors import covers
-from nics_drl_bridge.policy.training_settings import (
-    TrainingSettings,
-    chosen_settings,
-    load_training,
-)
+from nics_drl_bridge.policy import training_settings as recordings
 from nics_drl_bridge.robot.kinds import has_textbook, reach
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.world import World
@@ -89,7 +85,7 @@ def kin(robot: RobotSpec) -> str:
 class Fitted(NamedTuple):
     """Settings of a training that fit robot and worlds, and a sentence for each thing adapted."""
 
-    settings: TrainingSettings
+    settings: recordings.TrainingSettings
     told: tuple[str, ...]
 
 
@@ -103,13 +99,13 @@ def settings_for(task: str, name: str | None, changes: dict[str, Any]) -> Fitted
     if name is None and robot is not None and not own and task == OWN_TASK:
         name = f"own_{kin(open_model(robot).robot)}"
         told.append(f"settings {name!r}, as the robot {robot!r} has none of its own")
-    settings = chosen_settings(task, name, changes)
-    inherited = name in shipped and load_training(str(name)).robot != settings.robot
+    settings = recordings.chosen_settings(task, name, changes)
+    inherited = name in shipped and recordings.load_training(str(name)).robot != settings.robot
     made = fitted(settings, open_model(settings.robot, settings.lidar), inherited)
     return Fitted(made.settings, (*told, *made.told))
 
 
-def fitted(settings: TrainingSettings, model: SimulatorModel, inherited: bool) -> Fitted:
+def fitted(settings: recordings.TrainingSettings, model: SimulatorModel, inherited: bool) -> Fitted:
     """Settings with a time limit for robot and worlds, unless they have one; ConfigError if short.
 
     Those inherited from another robot get its lidar's layout of a scan, and a time reward and a
@@ -135,7 +131,7 @@ def fitted(settings: TrainingSettings, model: SimulatorModel, inherited: bool) -
 
 
 def _stretched(
-    settings: TrainingSettings, options: dict[str, Any], factor: float, told: list[str]
+    settings: recordings.TrainingSettings, options: dict[str, Any], factor: float, told: list[str]
 ) -> dict[str, Any]:
     """Returns the changes for episodes longer by a factor; those of `options` are made in place."""
     if reward := options.get("time_reward"):

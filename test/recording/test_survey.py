@@ -65,8 +65,18 @@ def test_streams_of_different_lengths_in_one_file_are_guessed_apart(tmp_path):
     assert guess["pose"]["heading"] == "yaw"
 
 
+def test_a_pose_of_streams_of_different_lengths_is_listed_and_guessed_by_its_names(tmp_path):
+    columns = drive()
+    half = columns["yaw"][:150] / 2.0
+    turned = {"qx": 0.0 * half, "qy": 0.0 * half, "qz": np.sin(half), "qw": np.cos(half)}
+    place = {name: columns[name] for name in ("t", "x", "y")}
+    np.savez(tmp_path / "log.npz", **place, **turned, imu_t=np.arange(321.0), v=columns["v"])
+    _, guess = surveyed(tmp_path / "log.npz")
+    assert guess["pose"]["quaternion"] == ["qx", "qy", "qz", "qw"]
+
+
 @pytest.mark.parametrize(
-    "column", [np.array(["2024-01-01T00:00:01"], "datetime64[s]"), np.zeros((0, 3))]
+    "column", [np.array([["2024-01-01T00:00:01"]], "datetime64[s]"), np.zeros((0, 3))]
 )
 def test_dates_and_empty_arrays_are_listed(tmp_path, column):
     np.save(tmp_path / "log.npy", column)
