@@ -223,7 +223,7 @@ def test_a_missing_key_of_a_part_is_one_sentence(saved, part, key):
         ("calibration.burst_period_s", "0.1", "should be a number, not '0.1'"),
         ("calibration.rotation_rad", float("nan"), "should be a finite number"),
         ("calibration.lever_arm_m", [0.0], "lever_arm_m"),
-        ("calibration.notes", 3, "should be a valid tuple"),
+        ("calibration.notes", 3, "must be a list, as"),
         ("calibration.colour", 3, "unknown key 'calibration.colour'"),
         ("calibration.responses", [{"state": "speed"}], "the key 'calibration.responses.0."),
         ("calibration", 3, "key 'calibration'"),

@@ -90,7 +90,7 @@ MISTAKES = {
     "train --settings paced.yaml": "task option top_speed='0.5 m/s': must be a finite number",
     "drive --robot shapeless.yaml --out m": "key 'footprint': must be a list, as .*'wide'",
     "import table.csv --map units.yaml --out d.npz": "is no known unit .*not \\['m', 'm', 'rad'\\]",
-    "import table.csv --map number.yaml --out d.npz": "key 'pose.unit': must be one of m, dm, .*not 1",
+    "import table.csv --map number.yaml --out d.npz": "pose.unit.*must be one of m, dm, .*not 1",
     "generate drive.npz --out m --order five": "order is 'five'; it must be 1, 2, 3 or 4",
     "generate drive.npz --out m --alpha 2": "alpha",
     "generate drive.npz --out m --topic odom": "must be ROLE=TOPIC",

@@ -118,7 +118,7 @@ def test_a_node_is_told_which_command_is_no_field_of_cmd_vel():
         ({"angular_is": "sideways"}, "'turn_rate' or 'steering'"),
         ({"footprint_radius": 0.0}, "greater than or equal to 0.001"),
         ({"footprint_radius": 30.0}, "reaches 30 m from base_link, at most 10 m can be"),
-        ({"command": []}, "at least 1 item"),
+        ({"command": []}, "number of entries must be at least 1"),
         ({"state": data()["command"][:1]}, "unknown key 'state.0.cmd_vel'"),
         ({"state": [{"name": "push", "unit": "m", "min": 0, "max": 1}]}, "a name of its own"),
         (
@@ -135,7 +135,7 @@ def test_a_node_is_told_which_command_is_no_field_of_cmd_vel():
         ),
         ({"state": [{"name": "A b", "unit": "m", "min": 0, "max": 1}]}, "state.0.name"),
         ({"textbook": "tank"}, "key 'textbook'"),
-        ({"footprint": [[0.1, 0.0], [0.0, 0.1]]}, "at least 3 items"),
+        ({"footprint": [[0.1, 0.0], [0.0, 0.1]]}, "number of entries must be at least 3"),
         ({"footprint": [[0.1, 0.0], [0.0, "a"], [0.0, 0.0]]}, "footprint.1.1"),
         ({"footprint": [[0.1, 0.1], [-0.1, -0.1], [0.1, -0.1], [-0.1, 0.1]]}, "cross or touch"),
         ({"footprint": [[0.1, 0.0], [0.2, 0.0], [0.1, 0.0]]}, "cross or touch"),
