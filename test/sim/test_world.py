@@ -129,7 +129,7 @@ def test_an_unknown_key_is_named_with_the_file_and_the_nearest_key(tmp_path):
         ({"bounds": [0.0, 0.0, 1.0, 1.0]}, "either a `size` and walls, or `bounds` and none"),
         ({"size": None, "bounds": [1.0, 0.0, 0.0, 1.0]}, "bounds must be [least x, least y"),
         ({"size": None, "bounds": [0.0, 0.0, 1.0, 2e4]}, "bounds must be [least x, least y"),
-        ({"size": None, "bounds": [0.0, 0.0, 1.0]}, "'bounds': number of entries must be more than 3"),
+        ({"size": None, "bounds": [0.0, 0.0, 1.0]}, "'bounds': number of entries must be more"),
         ({"goal_distance": [3.0, 1.0]}, "goal_distance must be"),
         ({"obstacles": [circles(1, (0.0,))]}, "key 'obstacles.0.shapes.0.circle.radius'"),
         ({"obstacles": [circles(1, ())]}, "key 'obstacles.0.shapes'"),
