@@ -2,6 +2,7 @@
 
 import json
 import queue
+import socket
 import threading
 from contextlib import suppress
 from importlib.resources import files
@@ -177,7 +178,8 @@ class PageServer:
     def close(self) -> None:
         """Ends all pages and frees the port; what waits for a frame ends, too."""
         self.closed = True
-        self._server.shutdown()
         for page in tuple(self._pages):
-            page.close()
+            with suppress(OSError):  # a page that reads nothing would not answer a farewell
+                page.socket.shutdown(socket.SHUT_RDWR)
+        self._server.shutdown()
         self._thread.join()

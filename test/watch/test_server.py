@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import socket
 import sys
+import threading
 import urllib.error
 import urllib.request
 from contextlib import closing
@@ -103,6 +105,24 @@ def test_a_page_that_floods_the_server_does_not_fill_its_memory(server):
     while server.request(0.0):
         taken += 1
     assert taken == module.MOST_REQUESTS
+
+
+def test_a_page_that_reads_nothing_does_not_hold_up_the_end(server):
+    host = server.url.removeprefix("http://").strip("/")
+    address, port = host.split(":")
+    with socket.create_connection((address, int(port))) as page:
+        page.sendall(
+            f"GET /socket HTTP/1.1\r\nHost: {host}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+            "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+            "".encode()
+        )
+        until(lambda: server.watched, "the page")
+        server.tell("x" * 50_000_000)  # more than all buffers between the two hold
+        page.recv(100_000, socket.MSG_WAITALL)  # its beginning: the rest is stuck
+        end = threading.Thread(target=server.close, daemon=True)
+        end.start()
+        end.join(9.0)  # a farewell would be awaited for 10 s
+        assert not end.is_alive()
 
 
 def test_a_taken_port_and_a_missing_library_are_one_sentence(server, monkeypatch):
