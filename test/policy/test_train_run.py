@@ -53,6 +53,10 @@ def test_a_run_leaves_policy_evaluation_and_logs_of_each_seed_and_can_be_resumed
         "seed 3: 256 steps",
         "seed 4: 256 steps",
     ]
+    one = nics("--resume", "--seeds", 4, "--episodes", 10, "--out", out)
+    assert one.exit_code == 0, one.output
+    assert [line for line in one.output.splitlines() if line.startswith("seed 3")] == []
+    assert "seed 4: 256 steps" in one.output
     refused = nics("--resume", "--seeds", 5, "--out", out)
     assert "no checkpoint of these seeds; name one of [3, 4] with --seeds" in refused.output
     refused = nics("--settings", settings, "--seeds", 3, "--out", out)
