@@ -42,6 +42,7 @@ DELAYS_S, COMPARED_S, MIN_COMPARED = np.linspace(-1.0, 1.5, 26), 1.0, 20  # and 
 ALIKE, NEAR = 0.85, 1.2  # from this correlation on, another unit explains sizes by up to this ratio
 SWAPPED = 0.6  # least correlation of each of two commands with what the other should move
 PLACES = {"linear.x": 0, "angular.z": 1, "throttle": 0, "steering": 1}  # in speed and turn rate
+SIDEWAYS = ("linear.x", "linear.y", "angular.z")  # commands of a robot that moves sideways
 CONFUSED = {"m/s": ("km/h", "cm/s", "mm/s"), "rad/s": ("deg/s", "rpm")}
 TRAVEL_SHARE = 0.1  # of the footprint's radius: least distance to measure a direction of travel
 
@@ -235,16 +236,16 @@ def check_commands(drive: Drive, command: recordings.Stream | None = None) -> tu
     By how the speed and the turn rate that they ask for, or those before they were clipped,
     compare with those that were driven.
     """
-    spec, pair = drive.spec, _asked_and_driven(drive, command or drive.recording.command)
+    spec, sent = drive.spec, command or drive.recording.command
+    if spec.moves_sideways:
+        _check_sideways(drive, sent)
+    pair = _asked_and_driven(drive, sent)
     if pair is None:
         return ()
     asked, driven, alike = pair
     places, notes = _places(spec), []
-    if len(places) == 2 and min(alike[0, 1], alike[1, 0]) > max(SWAPPED, np.trace(alike)):
-        one, other = (c.name for c in spec.command)
-        fault = f"{one} and {other} are swapped: each moves the robot as the other should"
-        advice = f"write the column of `{other}:` behind `{one}:`, and the other way round"
-        raise RecordingError(f"{drive.recording.source}: {fault}; {advice}.")
+    if len(places) == 2:
+        _check_swapped(drive, [0, 1], min(alike[0, 1], alike[1, 0]), np.trace(alike))
     told = [(c.name, c.unit) for c in spec.command] if places else [("speed", "rad/s")]
     for place, (name, unit) in zip(places or [0], told, strict=True):
         times = float(asked[:, place].std() / max(driven[:, place].std(), 1e-9))
@@ -254,6 +255,45 @@ def check_commands(drive: Drive, command: recordings.Stream | None = None) -> tu
                 advice = f"write `unit: {other}` beside `from:`"
                 notes.append(f"{finding}: if they are in {other}, {advice}.")
     return tuple(notes)
+
+
+def _check_swapped(drive: Drive, pair: list[int], crosswise: float, straight: float) -> None:
+    """Refuses two commands that are more alike to what the other should move than to their own."""
+    if crosswise > max(SWAPPED, straight):
+        one, other = (drive.spec.command[place].name for place in pair)
+        fault = f"{one} and {other} are swapped: each moves the robot as the other should"
+        advice = f"write the column of `{other}:` behind `{one}:`, and the other way round"
+        raise RecordingError(f"{drive.recording.source}: {fault}; {advice}.")
+
+
+def _check_sideways(drive: Drive, command: recordings.Stream) -> None:
+    """Refuses swapped commands of a robot that moves sideways; its pose sensor may be turned."""
+    spec, (start, end, driven) = drive.spec, _driven(drive)
+    keys = [c.cmd_vel or c.name for c in spec.command]
+    if sorted(keys) != sorted(SIDEWAYS) or len(start) < MIN_COMPARED:
+        return
+    order, best = [keys.index(key) for key in SIDEWAYS], np.zeros((3, 3))
+    for delay in DELAYS_S:
+        asked = held(command, spec, start - delay, end - delay)[:, order]
+        with np.errstate(invalid="ignore"):  # of what never changed
+            alike = np.nan_to_num(np.corrcoef(asked.T, driven.T)[:3, 3:])
+        best = max(best, alike, key=lambda each: float(np.abs(each).sum()))
+    along, turn = np.hypot(best[:, 0], best[:, 1]), np.abs(best[:, 2])
+    for k in (0, 1):
+        _check_swapped(drive, [order[k], order[2]], min(along[2], turn[k]), along[k] + turn[2])
+    if best[0, 1] * best[1, 0] > 0.0:  # opposite signs are of poses that are turned by 90 degrees
+        ahead, left, straight = abs(best[0, 1]), abs(best[1, 0]), np.abs(np.diag(best)[:2]).sum()
+        _check_swapped(drive, order[:2], min(ahead, left), straight)
+
+
+def _driven(drive: Drive) -> tuple[Array, Array, Array]:
+    """Returns the ends (n,) of spans of time [s], and the twist (n, 3) that was driven in each."""
+    t = drive.dated.t
+    start = np.arange(t[0], t[-1] - COMPARED_S, COMPARED_S / 2.0)
+    first, last = np.searchsorted(t, start), np.searchsorted(t, start + COMPARED_S)
+    first, last = first[last > first], last[last > first]
+    moved = geometry.log(geometry.between(drive.dated.values[first], drive.dated.values[last]))
+    return t[first], t[last], moved / (t[last] - t[first])[:, None]
 
 
 def _places(spec: RobotSpec) -> list[int]:
@@ -269,22 +309,17 @@ def _asked_and_driven(
 
     None if that does not show, as of robots that move sideways.
     """
-    spec, t, places = drive.spec, drive.dated.t, _places(drive.spec)
+    spec, places, (start, end, moved) = drive.spec, _places(drive.spec), _driven(drive)
     wheels = all(c.unit == "rad/s" for c in spec.command) and "wheel_radius" in spec.parameters
     wheels = wheels and "wheel_radius" not in spec.assumed and has_textbook(spec)
-    start = np.arange(t[0], t[-1] - COMPARED_S, COMPARED_S / 2.0)
-    first, last = np.searchsorted(t, start), np.searchsorted(t, start + COMPARED_S)
-    first, last = first[last > first], last[last > first]
-    if spec.moves_sideways or not (places or wheels) or len(first) < MIN_COMPARED:
+    if spec.moves_sideways or not (places or wheels) or len(start) < MIN_COMPARED:
         return None
-    moved = geometry.log(geometry.between(drive.dated.values[first], drive.dated.values[last]))
-    moved = moved / (t[last] - t[first])[:, None]
     axis = np.sqrt(((moved[:, 0] + 1j * moved[:, 1]) ** 2).sum())  # of travel, ahead or back
     axis = axis / max(abs(axis), 1e-9)
     driven = np.stack([moved[:, :2] @ [axis.real, axis.imag], moved[:, 2]], axis=1)
     best = np.zeros((2, 2)), driven
     for delay in DELAYS_S:
-        sent, twist = held(command, spec, t[first] - delay, t[last] - delay), np.zeros_like(driven)
+        sent, twist = held(command, spec, start - delay, end - delay), np.zeros_like(driven)
         twist[:, places or [0, 1]] = sent if places else textbook(spec).steady(sent)[:, [0, 2]]
         with np.errstate(invalid="ignore"):  # of what never changed
             alike = np.corrcoef(twist.T, driven.T)[:2, 2:]

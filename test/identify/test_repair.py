@@ -109,6 +109,26 @@ def test_a_swapped_speed_and_turn_is_refused_by_what_they_move(name, ahead):
         check_commands(Drive(replace(plain, command=command), spec))
 
 
+@pytest.mark.parametrize("rotation", [0.0, 0.4])
+@pytest.mark.parametrize("pair", [(0, 1), (0, 2), (1, 2)])
+def test_swapped_commands_of_a_robot_that_moves_sideways_are_refused(pair, rotation):
+    spec = load_robot("mecanum")
+    plain = drive(spec, pose_clock_ahead=0.4, rotation=rotation)
+    assert check_commands(Drive(plain, spec)) == ()
+    order = np.arange(3)
+    order[list(pair)] = pair[::-1]
+    command = replace(plain.command, values=plain.command.values[:, order])
+    one, other = (spec.command[k].name for k in pair)
+    with pytest.raises(RecordingError, match=f"{one} and {other} are swapped: each moves"):
+        check_commands(Drive(replace(plain, command=command), spec))
+
+
+def test_poses_of_a_mount_that_is_turned_by_90_degrees_are_not_swapped_commands():
+    spec = load_robot("mecanum")
+    for rotation in (np.pi / 2, -np.pi / 2, np.pi):
+        assert check_commands(Drive(drive(spec, rotation=rotation), spec)) == ()
+
+
 def test_two_commands_a_quarter_of_a_period_apart_are_not_swapped(differential):
     """Late by as much, each goes as the other does."""
     t, turn = np.arange(0.0, 60.0, 0.02), 2.0 * np.pi / 3.8
