@@ -17,7 +17,7 @@ from nics_drl_bridge.env.snapshot import Snapshot, gate_of, goals_of
 from nics_drl_bridge.env.task import Episodes, Memory, Task, still, team_space
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.interface import Backend, RobotView, Start
+from nics_drl_bridge.interface import Array, Backend, RobotView, Start
 from nics_drl_bridge.lidar.sensor import unread
 from nics_drl_bridge.random_kernels import episode_seed
 from nics_drl_bridge.robot import DEFAULT_ROBOT
@@ -25,7 +25,6 @@ from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.scenes import Scene, sample_scene
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
-Array = NDArray[np.float64]
 RENDER_FPS = 10
 
 

@@ -7,10 +7,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.env.task import Mirror, Sight, Task
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.geometry import wrap_angle
+from nics_drl_bridge.geometry import Array, wrap_angle
 from nics_drl_bridge.robot.mirror import mirrored_commands
 
-Array = NDArray[np.float64]
 Places = NDArray[np.intp]
 NEAR_RAD, NEAR_M = 1e-4, 1e-6  # by which a scan may be off its mirror image: angles are float32
 

@@ -12,9 +12,7 @@ from nics_drl_bridge.env import kernels
 from nics_drl_bridge.env.kernels import LIMIT
 from nics_drl_bridge.env.mirror import mirror_of
 from nics_drl_bridge.env.task import Episodes, Flags, Memory, Mirror, Observation, Outcome, Task
-from nics_drl_bridge.interface import RobotView
-
-Array = NDArray[np.float64]
+from nics_drl_bridge.interface import Array, RobotView
 
 
 class GoalProgress(NamedTuple):

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.env.snapshot import Snapshot, hits_of
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.style import DARK, EDGE, GOAL, OTHER, SERIES, VERMILION
 
-Array = NDArray[np.float64]
 SIZE_IN, DPI, MARGIN = 5.0, 100, 0.05
 WALL, STANDING, SCAN = DARK, OTHER, VERMILION
 ROBOTS = tuple(colour for colour in SERIES if colour != SCAN)

@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 from nics_drl_bridge import extensions
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import NS_PER_S, Backend, BackendFacts, RobotView, Start, stacked
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import AnyWorld
-
-Array = NDArray[np.float64]
 
 
 def _sent(pose: Array) -> Array:

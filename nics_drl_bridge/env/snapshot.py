@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.spec import LidarSpec
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

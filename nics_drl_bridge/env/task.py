@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge.env import kernels
 from nics_drl_bridge.env.kernels import LIMIT, ScanScale
 from nics_drl_bridge.errors import ConfigError, nearest
-from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.interface import Array, RobotView
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan
 from nics_drl_bridge.lidar.sectors import NO_PLAN, ScanLayout, plan_of
 from nics_drl_bridge.lidar.sensor import Sensor
@@ -21,7 +21,6 @@ from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.robot.kinds import command_for, has_textbook, reach
 from nics_drl_bridge.robot.spec import RobotSpec
 
-Array = NDArray[np.float64]
 Observation = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 Actions = Literal["continuous", "discrete"]

@@ -10,12 +10,10 @@ from nics_drl_bridge.config import Schema
 from nics_drl_bridge.env.task import Outcome
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import footprint_shape
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.sim.guide import Guide
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.simulator import FastSimulator
-
-Array = NDArray[np.float64]
-
 
 FEWEST = 100  # episodes by which a level of a curriculum is judged, or as many as there are worlds
 Share = Annotated[float, Field(gt=0.0, le=1.0)]

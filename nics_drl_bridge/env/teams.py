@@ -12,9 +12,7 @@ from nics_drl_bridge.env import task
 from nics_drl_bridge.env.kernels import LIMIT
 from nics_drl_bridge.env.task import Episodes, Flags, Memory, Observation, Task
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.interface import RobotView
-
-Array = NDArray[np.float64]
+from nics_drl_bridge.interface import Array, RobotView
 
 
 def pairs(pose: Array, points: Array) -> tuple[Array, Array]:

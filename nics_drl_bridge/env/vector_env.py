@@ -20,14 +20,13 @@ from nics_drl_bridge.env.task import Episodes, Memory, Outcome, Task, still, tea
 from nics_drl_bridge.env.teaching import Teacher, Teaching
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.interface import NS_PER_S, RobotView
+from nics_drl_bridge.interface import NS_PER_S, Array, RobotView
 from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
-Array = NDArray[np.float64]
 Observation = NDArray[np.float32]
 Flags = NDArray[np.bool_]
 Facts = Mapping[str, Any]  # name -> array whose first dimension is the world, or such a mapping

@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.geometry import rotate
+from nics_drl_bridge.geometry import Array, rotate
 from nics_drl_bridge.lidar import bake_kernels
 from nics_drl_bridge.lidar.sensor_models import Function, SensorModel, returned
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape, describe
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.lidar.table import MOST_WIDE, Density, LidarTable, padding
 
-Array = NDArray[np.float64]
 TOUCHING = 1e-6  # excess of the nearest grid distance over the radius, as a share of the radius
 COARSE = np.radians(2.0)  # between grid rotations, steps are of at most half of this [rad]
 MOST_NUMBERS = 2**31 - 2**20

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.map_kernels import GridArrays
 
-Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 

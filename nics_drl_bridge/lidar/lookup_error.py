@@ -1,15 +1,14 @@
 """Distances at which a shape may be looked up, measured for the renderer `auto`."""
 
 import numpy as np
-from numpy.typing import NDArray
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.cell_kernels import body_cells
 from nics_drl_bridge.lidar.maps import stack_fixtures
 from nics_drl_bridge.lidar.shapes import place
 
-Array = NDArray[np.float64]
 # Rings around the lidar, placements in each, bands of range; rings and bands grow geometrically.
 RINGS, PLACES, BANDS, SEED = 13, 256, 8, 0
 TOUCHING = 1e-3  # of the nearest ring from the shape's circle, as a share of the lidar's range

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.errors import ConfigError, ModelError, nearest
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
@@ -23,7 +24,6 @@ from nics_drl_bridge.lidar.table import LidarTable
 
 Renderer = Literal["auto", "baked", "exact"]
 RENDERERS: tuple[Renderer, ...] = ("auto", "baked", "exact")
-Array = NDArray[np.float64]
 NO_WALLS = np.zeros((0, 4))
 GREATEST_ERROR = 0.01  # `auto` looks up at distances where the ranges' RMSE is at most this [m]
 _MEASURED: dict[tuple[Any, ...], tuple[float, float]] = {}  # cache of `lookup_distances`

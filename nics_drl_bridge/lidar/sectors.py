@@ -16,12 +16,11 @@ from pydantic import Field, model_validator
 
 from nics_drl_bridge.config import Schema, validate
 from nics_drl_bridge.errors import ConfigError, nearest
-from nics_drl_bridge.geometry import wrap_angle
+from nics_drl_bridge.geometry import Array, wrap_angle
 from nics_drl_bridge.lidar.sector_kernels import SectorPlan
 from nics_drl_bridge.lidar.shapes import LARGEST, Place
 from nics_drl_bridge.lidar.spec import FULL_CIRCLE_TOLERANCE, LidarSpec, ScanHeader, check_angles
 
-Array = NDArray[np.float64]
 Ranges = NDArray[np.float32]
 COARSEST_RAD = 0.21  # Beams farther apart are rejected: at 1 m they miss objects 0.2 m wide
 BORDER_RAD = 1e-4  # A beam this near to a border counts in both: headers have angles in float32

@@ -17,11 +17,11 @@ from pydantic import Field, PlainSerializer, PlainValidator
 from nics_drl_bridge import extensions
 from nics_drl_bridge.config import Schema, parse_yaml, read_text, validate
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.fixture_kernels import Fixtures
 from nics_drl_bridge.lidar.scanner import Renderer
 from nics_drl_bridge.lidar.shapes import Shape
 
-Array = NDArray[np.float64]
 Readings = NDArray[np.float32]
 # Topics of a robot that are no sensor's.
 TAKEN = ("scan", "odom", "pose", "imu", "joint_states", "ground_truth", "cmd_vel")

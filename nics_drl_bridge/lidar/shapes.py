@@ -13,9 +13,9 @@ from pydantic import Field, field_validator, model_validator
 
 from nics_drl_bridge.config import Schema, load_yaml
 from nics_drl_bridge.errors import ModelError
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SHAPE, SIN, OutlineArrays
 
-Array = NDArray[np.float64]
 MOST_CORNERS = 16_384
 MOST_SHAPES = 1_000  # in one file, or in one group of obstacles
 SMALLEST, LARGEST = 1e-6, 1e4  # Extent of a shape [m]: less is invisible, more fits in no world

@@ -4,13 +4,12 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.middleware.kernels import Anchor
 
-Array = NDArray[np.float64]
 JITTER_S = 0.2  # Uncertainty of the unobserved time: transmission takes longer now and then [s]
 MARGIN = 1.2  # Factor by which odometry, through noise or slip, may exceed the greatest speed
 LEVELS, MOST_CORNERS = 3, 4096  # values tried per variable for the greatest speed; combinations

@@ -4,17 +4,16 @@ from typing import Any
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.middleware import kernels
 from nics_drl_bridge.middleware.belief import Belief, Foreseen, Unseen, parted
 from nics_drl_bridge.middleware.kernels import Anchor, Log, MotionModel, log_of
 from nics_drl_bridge.middleware.measurement import Acceptance, Judgement, Kind, Measurement
 from nics_drl_bridge.robot.kernels import SERIES, term_arrays, wrap
 
-Array = NDArray[np.float64]
 LEAST_POSE_DRIFT, LEAST_STATE_DRIFT = 1e-2, 2e-2
 """Lower bounds on the model's error after a second, of the pose [m or rad / sqrt(s)], and of the
 state as a share of its range [1 / sqrt(s)]."""

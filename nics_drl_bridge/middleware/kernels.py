@@ -10,11 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.robot import kernels as robot
 
-Array = NDArray[np.float64]
 RUNAWAY = 1e9  # Bound on poses, states and their derivatives; beyond, the model has diverged
 SHORT_S = 0.25  # longest time in which the way is that of the twists at its ends
 LEAST_PIVOT = 1e-12  # Lower bound on a variance given the variables before, as a share of its own

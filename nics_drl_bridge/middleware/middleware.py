@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, RobotView
+from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, Array, RobotView
 from nics_drl_bridge.lidar.sensor import unread
 from nics_drl_bridge.middleware import measurement as measured
 from nics_drl_bridge.middleware import timeline
@@ -18,7 +18,6 @@ from nics_drl_bridge.middleware.ekf import LEAST_POSE_STD, LEAST_TWIST_STD, STAR
 from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, SCAN, Kind, Measurement
 from nics_drl_bridge.middleware.timeline import ReportedPose, Stamps
 
-Array = NDArray[np.float64]
 NOT_FINITE = "NaN or inf"
 LEAST_STD = {Kind.YAW_RATE: LEAST_TWIST_STD, Kind.POSE: LEAST_POSE_STD}
 RATE_OVER = 32  # Number of arrivals over which rates are computed

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge.errors import RecordingError, nearest
 from nics_drl_bridge.files import sha256, write_bytes, write_text
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.sectors import Reader, reader_beside
 from nics_drl_bridge.lidar.spec import ScanHeader, from_device
 from nics_drl_bridge.middleware.ekf import ANYWHERE, START_STD
@@ -22,7 +23,6 @@ from nics_drl_bridge.recording import topic_roles
 from nics_drl_bridge.recording.bag_file import BagFile, Message, opened
 from nics_drl_bridge.recording.messages import commanded, stamp, twist_row, whole_pose
 
-Array = NDArray[np.float64]
 SCAN_TYPE = "sensor_msgs/msg/LaserScan"
 TYPES: Mapping[str, tuple[str, ...]] = {
     SCAN: (SCAN_TYPE,), ODOM: (topic_roles.ODOMETRY,), CMD_VEL: topic_roles.TYPES["cmd_vel"],

@@ -11,12 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge import geometry
-from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.middleware.belief import JITTER_S, Belief
 from nics_drl_bridge.middleware.ekf import Estimator
 from nics_drl_bridge.middleware.measurement import Acceptance, Judgement, Kind, Measurement
 
-Array = NDArray[np.float64]
 HISTORY_NS = NS_PER_S  # Length of the past that may still change [ns]
 BEFORE_START = "not after the reset"
 TOO_OLD = f"older than {HISTORY_NS / NS_PER_S:g} s"

@@ -3,13 +3,9 @@
 import math
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.policy import local_map_kernels as kernels
-
-Array = NDArray[np.float64]
 
 
 class LookAhead(NamedTuple):

@@ -14,11 +14,11 @@ from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.guard import uninterrupted
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy.fallback import acted
 from nics_drl_bridge.policy.stateful import Policy, begin
 from nics_drl_bridge.seeds import checked_seeds
 
-Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Act = Callable[[NDArray[np.float32]], NDArray[Any]]  # actions (N, C) for observations (N, O)
 

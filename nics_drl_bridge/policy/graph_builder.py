@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 import onnx
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy.foreign_mapping import Limits, Scaled
 
-Array = NDArray[np.float64]
 STEP = 1e30  # times which nearly every float32 but 0 is beyond 1
 
 

@@ -3,13 +3,12 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy import local_map_kernels as kernels
 from nics_drl_bridge.robot.spec import RobotSpec
 
-Array = NDArray[np.float64]
 CELL_M, MOST_M = 0.05, 4.0  # side of the cells of distances; greatest reach of a map
 FINE_M, DEEP_M, BORDER_M = 0.02, 0.03, 0.08
 """Lattice of the discs, depth from which they cover all, and space of points on the border."""

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.sim.guide_kernels import sweep
 
-Array = NDArray[np.float64]
 Grid = NDArray[np.float32]
 ARRIVED_M = 0.15  # at which a robot is at its goal: nothing behind it matters
 APART_M = 0.02  # hits nearer to the one before are left out

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.task import still
 from nics_drl_bridge.generator import BUILTIN_SEED, CONTROL_PERIOD_S, SimulatorModel
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.policy import mppi_kernels as kernels
 from nics_drl_bridge.policy.local_map import outline_of, rays_of, scratch_of
@@ -23,7 +24,6 @@ from nics_drl_bridge.robot.kinds import steady_twist
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.threads import run_parts
 
-Array = NDArray[np.float64]
 Sense = tuple[ScanRays, FootprintDiscs, Clearance]
 SETTLED_S = 3.0  # after which a held command has led to its state
 LONGEST_STOP_S = 10.0  # for which a stop is looked at

@@ -10,12 +10,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.policy import local_map_kernels as maps
 from nics_drl_bridge.random_kernels import PLANNER_STREAM, normal, uniform
 from nics_drl_bridge.robot.kernels import Terms, advance, bend, rates, run
 
-Array = NDArray[np.float64]
 HIT = 1e3  # cost of a touch at once; later ones cost less
 BEYOND = 1.3  # offers are drawn over this much of the range and cut: many are at its ends
 STOPPED = 0.01  # speed of the outline at which a robot has stopped [m/s]

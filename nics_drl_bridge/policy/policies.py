@@ -14,6 +14,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError, PolicyError, nearest
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy import dynamic_window_kernels as kernels
 from nics_drl_bridge.policy.contract import MAPPINGS, SUFFIX, shipped
 from nics_drl_bridge.policy.fallback import Fallback, check_readable
@@ -27,7 +28,6 @@ from nics_drl_bridge.robot.spec import RobotSpec
 if TYPE_CHECKING:
     from nics_drl_bridge.policy.policy_file import PolicyFile
 
-Array = NDArray[np.float64]
 
 CLEARANCE = Clearance(margin=0.1, soft=0.4)  # of the dynamic window, whose twists are few
 FULL_TURN_RAD = 0.8  # bearing of the goal from which a robot turns as fast as it can

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import S_PER_NS, RobotView
+from nics_drl_bridge.interface import S_PER_NS, Array, RobotView
 from nics_drl_bridge.middleware.measurement import CMD_VEL, ODOM, POSE, SCAN
 from nics_drl_bridge.middleware.playback import Playback, in_order, played
 from nics_drl_bridge.policy.pacing import ActionPace
@@ -19,7 +19,6 @@ from nics_drl_bridge.policy.stateful import resume
 from nics_drl_bridge.recording.bag_file import Message
 from nics_drl_bridge.recording.messages import commanded
 
-Array = NDArray[np.float64]
 JITTER = 0.25  # permitted earliness of a scan, in control periods
 HELD_S = 1.0  # age from which a command no longer applies to the robot
 DEAD_BAND = 0.05  # commands below this share of their maximum have no sign

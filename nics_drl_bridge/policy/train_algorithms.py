@@ -22,6 +22,7 @@ from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy.evaluation import Act
 from nics_drl_bridge.policy.stateful import Stateful
 from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch, tensors
@@ -29,7 +30,6 @@ from nics_drl_bridge.policy.train_memory import Memory
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import TrainingSettings
 
-Array = NDArray[np.float64]
 LEAST_RATE = 0.02  # share of PPO's learning rate that is left at the end
 LEAST_STD, LIMIT = 0.05, 5.0
 NEAR = 0.1  # share of the range that counts as half of it, see `bend`

@@ -10,12 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from nics_drl_bridge.env.task import Mirror
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy.train_rollout import Transitions
-
-Array = NDArray[np.float64]
 
 
 class Reflection:

@@ -23,6 +23,7 @@ import torch
 from numpy.typing import NDArray
 from stable_baselines3.common.logger import Logger
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy import train_algorithms, train_imitation
 from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch
 from nics_drl_bridge.policy.train_memory import memory_of
@@ -33,7 +34,6 @@ from nics_drl_bridge.policy.training_settings import PpoSettings, TrainingSettin
 from nics_drl_bridge.threads import run_parts
 
 T = TypeVar("T")
-Array = NDArray[np.float64]
 Ended = list[tuple[bool, bool]]  # success and collision of episodes
 Seen = tuple[torch.Tensor, torch.Tensor]  # features and state
 VALUE_WEIGHT, GRADIENT_LIMIT = 0.5, 0.5  # of the loss, and of the norm of its gradient

@@ -8,10 +8,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
-from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.env.rendering import draw_world
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, X, Y
 from nics_drl_bridge.policy.evaluation import ConfidenceInterval, Episode
 from nics_drl_bridge.policy.shadow import Shadow
@@ -23,7 +23,6 @@ from nics_drl_bridge.sim.world import Places, World
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.style import DARK, GOAL, GREEN, MEASURED, MODEL, OTHER, panels, png, styled
 
-Array = NDArray[np.float64]
 LINES: tuple[dict[str, Any], ...] = (
     {"color": MEASURED, "linewidth": 3.5, "alpha": 0.55, "linestyle": "-"},
     {"color": MODEL, "linewidth": 1.4, "linestyle": "--"},

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import AllowInfNan, Field
 
 from nics_drl_bridge.config import Schema
+from nics_drl_bridge.geometry import Array
 
-Array = NDArray[np.float64]
 LONGEST_DELAY_S = 60.0  # simulators and estimators keep all commands of such a time
 End = Annotated[float, AllowInfNan(), Field(ge=-np.inf)]  # infinite maybe, but not NaN
 

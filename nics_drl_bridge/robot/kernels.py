@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ModelError
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.robot.taylor import TaylorModel
-
-Array = NDArray[np.float64]
 
 # Of sin(t) / t and (1 - cos(t)) / t: to 1e-14 for a turn below 0.1 rad, 1e-8 below WIDE_TURN.
 SERIES: Array = np.array([1 / 6, 1 / 120, 1 / 5040, 1 / 2, 1 / 24, 1 / 720])

@@ -14,9 +14,8 @@ from pydantic import AllowInfNan, ConfigDict, Field, NonNegativeFloat
 from nics_drl_bridge import geometry
 from nics_drl_bridge.config import Schema
 from nics_drl_bridge.errors import ModelError
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.robot.curve import InputCurve, bent, delays, ends
-
-Array = NDArray[np.float64]
 
 BEYOND = 0.25  # share of its range by which a bounded state may leave it, on both ends
 

@@ -9,11 +9,10 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.sim import contact_kernels, step_kernels
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.simulator import FastSimulator, Starts
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

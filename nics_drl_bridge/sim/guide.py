@@ -8,13 +8,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.shapes import Circle, Polygon
 from nics_drl_bridge.sim import guide_kernels as kernels
 from nics_drl_bridge.sim.guide_kernels import GuideGrid
 from nics_drl_bridge.sim.scenes import Scenes, SetSampler
 from nics_drl_bridge.sim.state import State
 
-Array = NDArray[np.float64]
 CELL, MOST_CELLS = 0.15, 10_000  # side of a cell [m]; in fields with more cells it is larger
 
 

@@ -8,15 +8,14 @@ from itertools import pairwise
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
 from nics_drl_bridge.config import Schema
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.shapes import Coordinate
 from nics_drl_bridge.sim import separation_kernels as at
 
 __all__ = ["Motion", "Patrol", "Pedestrian", "Wander", "plan_arrays"]
-Array = NDArray[np.float64]
 FASTEST = 10.0  # Greatest speed of an obstacle [m/s]; beyond, a control period is too coarse
 STRONGEST = 1e3  # Upper bound on the parameters of the social force model, each in its unit
 

@@ -11,14 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from nics_drl_bridge.geometry import compose, rotate
+from nics_drl_bridge.geometry import Array, compose, rotate
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, SHAPE
 from nics_drl_bridge.lidar.maps import FREE, OCCUPIED, GridMap
 from nics_drl_bridge.lidar.shapes import Circle, Shape
 from nics_drl_bridge.sim.scenes import SetSampler
 from nics_drl_bridge.sim.world import World
 
-Array = NDArray[np.float64]
 Placed = tuple[Shape, ArrayLike]  # a shape, and its pose (3,)
 CELL, MOST_CELLS = 0.01, 1_000_000  # side of a cell [m]; in fields with more cells it is larger
 SAMPLES = 8  # of an edge, in a cell

@@ -17,6 +17,7 @@ from nics_drl_bridge import random_kernels as random
 from nics_drl_bridge.config import Schema, find_config, load_yaml, validate
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar import fault_kernels
 from nics_drl_bridge.lidar.faults import SKEW, TOO_CLOSE, Skew, TooClose
 from nics_drl_bridge.lidar.spec import LidarSpec
@@ -26,7 +27,6 @@ from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.seeds import checked_seeds
 
 __all__ = ["Draws", "LidarRanges", "Randomisation", "Sampler", "load_randomisation"]
-Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Bounds = tuple[Array, Array]
 MOST_OBSTACLES = 10_000

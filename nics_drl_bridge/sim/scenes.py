@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from scipy import ndimage
 
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.cell_kernels import FEWEST, body_cells
 from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
 from nics_drl_bridge.lidar.shapes import BODY, LARGEST, SMALLEST, Circle, Outlines, Shape, describe
@@ -27,7 +28,6 @@ from nics_drl_bridge.sim.world import Goals, Starts, World, check_places
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 __all__ = ["Scene", "SceneSampler", "Scenes", "SetSampler", "sample_scene", "scaled"]
-Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 CELL = 0.1  # Side of cells without a map [m]; larger in large fields, smaller in small ones
 FEWEST_CELLS = 20

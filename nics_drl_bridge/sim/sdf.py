@@ -15,16 +15,15 @@ from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import ConfigError, nearest
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.shapes import FARTHEST, LARGEST, SMALLEST
 from nics_drl_bridge.sim import sections
 from nics_drl_bridge.sim.sections import Placed, ShapelessError, Solid, Standing
 
-Array = NDArray[np.float64]
 MOST_BYTES = 2**24  # of a file; the largest saved worlds have some megabytes
 MOST_MODELS = 20_000  # with all that are included
 OLDEST, NEWEST = (1, 4), (1, 12)  # versions of SDF

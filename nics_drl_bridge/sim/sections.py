@@ -8,13 +8,12 @@ from itertools import combinations, product
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.shapes import SMALLEST, Circle, Polygon, Rectangle, Shape, convex_hull
 from nics_drl_bridge.sim.world import Obstacles, Region
 
-Array = NDArray[np.float64]
 TILT = 1e-3  # up to this angle [rad] a body counts as upright: a millimetre in a metre
 DIGITS = 6  # shapes and poses are rounded to a micrometre
 AROUND = 1.0  # of the bounds, around starts and goals [m]

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, footprint_shape
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.bake import with_shapes
 from nics_drl_bridge.lidar.exact_kernels import SHAPE
 from nics_drl_bridge.lidar.scanner import Renderer, Scanner
@@ -26,7 +27,6 @@ from nics_drl_bridge.sim.state import Members
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.threads import run_parts
 
-Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 R = TypeVar("R")
 # Poses of robots (n, M, 3), or a function that tells them for scenes; None: as the scenes have them

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.geometry import Array as Array
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.cell_kernels import BodyCells
 from nics_drl_bridge.lidar.exact_kernels import OutlineArrays
@@ -16,7 +17,6 @@ from nics_drl_bridge.lidar.fixture_kernels import Fixtures
 from nics_drl_bridge.lidar.scan_kernels import ScanLanes
 from nics_drl_bridge.robot.kernels import Terms
 
-Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 

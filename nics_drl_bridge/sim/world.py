@@ -7,18 +7,17 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
 from nics_drl_bridge.config import Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import sha256
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.maps import GridMap, load_map
 from nics_drl_bridge.lidar.shapes import LARGEST, MOST_SHAPES, Coordinate, Heading, Shape
 from nics_drl_bridge.sim.collision_kernels import wall_distance
 from nics_drl_bridge.sim.obstacles import Motion, Patrol
 
-Array = NDArray[np.float64]
 MOST_OBSTACLES = 10_000
 MOST_WALLS = 10_000
 MOST_PLACES = 10_000

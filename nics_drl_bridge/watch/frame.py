@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from nics_drl_bridge.env.snapshot import Snapshot
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE, X, Y
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.lidar.shapes import Shape
@@ -19,7 +20,6 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 
 MM = 1000.0  # lengths and angles go over the wire in thousandths, as whole numbers
 NO_RETURN = -1
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
