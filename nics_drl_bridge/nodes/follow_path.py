@@ -198,6 +198,7 @@ class PathActions:
             ("controller", known.controllers),
             ("goal_checker", known.goals),
             ("progress_checker", known.progress),
+            ("path_handler", known.handlers),
         ):
             name, wrong = chosen(what.replace("_", " "), getattr(asked, f"{what}_id", ""), those)
             if wrong:  # the code of Nav2's own server
@@ -207,7 +208,7 @@ class PathActions:
         poses = np.array([_pose_of(each.pose) for each in asked.path.poses]).reshape(-1, 3)
         headers = [asked.path.header, *(each.header for each in asked.path.poses[:1])]
         frame = next((each.frame_id for each in headers if each.frame_id), "")
-        return self._begin(goal, frame, poses, names[1:])
+        return self._begin(goal, frame, poses, names[1:3])
 
     def _navigate(self, goal: Goal) -> Run:
         asked = goal.handle.request

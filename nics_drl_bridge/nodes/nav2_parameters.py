@@ -13,20 +13,20 @@ from nics_drl_bridge.policy.follow import GoalCheck, ProgressCheck
 # Those that are for its own plugins, or for a loop that a policy, which answers scans, has not.
 UNUSED = {
     "controller_frequency", "min_x_velocity_threshold", "min_y_velocity_threshold",
-    "min_theta_velocity_threshold", "use_realtime_priority", "path_handler_plugins", "odom_topic",
-    "odom_duration", "publish_zero_velocity", "introspection_mode", "bond_heartbeat_period",
+    "min_theta_velocity_threshold", "use_realtime_priority", "odom_topic", "odom_duration",
+    "publish_zero_velocity", "introspection_mode", "bond_heartbeat_period",
 }  # fmt: skip
 
 
 class ControllerParameters:
-    """Names of controllers and checkers, and the checks by their names."""
+    """Names of controllers, checkers and path handlers, and the checks by their names."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
         values = {row.name: declare_row(node, row) for row in nav2()}
-        self.controllers, self.goals, self.progress = (
+        self.controllers, self.goals, self.progress, self.handlers = (
             tuple(values[f"{kind}_plugins"])
-            for kind in ("controller", "goal_checker", "progress_checker")
+            for kind in ("controller", "goal_checker", "progress_checker", "path_handler")
         )
         if one := values["progress_checker_plugin"]:
             self.progress = (one,)
@@ -48,12 +48,8 @@ class ControllerParameters:
 
     def ignores(self, name: str) -> bool:
         """True for a parameter of Nav2's own controller, which means nothing to a policy."""
-        first = name.split(".")[0]
-        handlers = ("PathHandler", "path_handler")
-        return name in UNUSED or first in (*self._all(), *handlers)
-
-    def _all(self) -> Sequence[str]:
-        return (*self.controllers, *self.goals, *self.progress)
+        known = (*self.controllers, *self.goals, *self.progress, *self.handlers)
+        return name in UNUSED or name.split(".")[0] in known
 
 
 def chosen(what: str, asked: str, known: Sequence[str]) -> tuple[str, str]:

@@ -110,6 +110,7 @@ def nav2() -> list[Row]:
         Row("controller_plugins", ["FollowPath"], "Names that goals of follow_path may ask for."),
         Row("goal_checker_plugins", ["general_goal_checker"], "The same, of the goal's checks."),
         Row("progress_checker_plugins", ["progress_checker"], "The same, of the progress' checks."),
+        Row("path_handler_plugins", ["PathHandler"], "Names of path handlers; all do the same."),
         Row("progress_checker_plugin", "", "The only one, as Humble names it; empty for these."),
         Row("failure_tolerance", 0.3,
             "So long a robot that touches something waits [s]; -1 for ever.", (-1.0, 1e6), False),

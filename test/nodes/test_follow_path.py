@@ -135,6 +135,7 @@ REFUSED = [
     (path((0.0, 0.0), frame="kitchen"), CODES.TF_ERROR, "'kitchen' is refused, which is not known"),
     (by(controller_id="DWB"), CODES.INVALID_CONTROLLER, "'DWB'; name one of 'FollowPath'"),
     (by(goal_checker_id="exact"), CODES.UNKNOWN, "no goal checker 'exact'"),
+    (by(path_handler_id="exact"), CODES.UNKNOWN, "no path handler 'exact'"),
     (path((1e5, 0.0), frame="base_link"), CODES.INVALID_PATH, "pose 0 of the path"),
 ]
 
