@@ -9,6 +9,7 @@ nothing of the perturbation; success is by the truth, and told beside what the r
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 import time
@@ -266,6 +267,17 @@ def draw(
     write_bytes(file, style.png(figure, grid[0]))
 
 
+def measured_in(results: Path) -> dict[str, dict[str, list[float]]]:
+    """The success of all robots in the results of runs: robot -> perturbation -> by multiple."""
+    runs = json.loads(results.read_text(encoding="utf-8"))["runs"]
+    return {
+        robot: own
+        for name, run in sorted(runs.items())
+        if name.startswith("robustness_") and run["result"]
+        for robot, own in run["result"]["success"].items()
+    }
+
+
 def table_of(
     success: Mapping[str, Mapping[str, Sequence[float]]], multiples: Sequence[float], wall_s: float
 ) -> str:
@@ -290,7 +302,12 @@ def main() -> None:
     parser.add_argument("--multiples", nargs="+", type=float, default=MULTIPLES, metavar="M",
                         help="of the declared range, which is measured in any case")  # fmt: skip
     parser.add_argument("--picture", type=Path, help="draw the curves into this file")
+    parser.add_argument("--of", type=Path, metavar="RESULTS",
+                        help="draw the picture of these runs, and drive nothing")  # fmt: skip
     given = parser.parse_args()
+    if given.of:
+        draw(measured_in(given.of), given.picture or parser.error("--of needs --picture"))
+        return
     begin = time.perf_counter()
     multiples = tuple(sorted({DECLARED, *given.multiples}))
     job = partial(

@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from measuring import figures_lidar as lidar
+from measuring.plan import RUNS
 from measuring.table import Table
 
 
 def told(*rows: tuple[str, str, str]) -> Table:
     """Figures in words: run, what, figure."""
-    of = {"training_differential": "training", "training_ackermann": "training"}
-    of |= dict.fromkeys(("barn_five_fold", "barn_mujoco"), "barn")
-    of |= {f"transfer_{robot}": "transfer" for robot in POLICIES}
-    of |= {f"env_throughput_{what}": "env_throughput" for what in ("lidar", "obstacles")}
     return Table(
         ("what", "script", "figure"),
-        tuple((run, what, f"`{of.get(run, run)}.py`", text) for run, what, text in rows),
+        tuple(
+            (run, what, f"`{RUNS[run].script if run in RUNS else f'{run}.py'}`", text)
+            for run, what, text in rows
+        ),
     )
 
 
@@ -121,11 +121,15 @@ README = told(
         )
         for robot, title in POLICIES.items()
     ),
-    (
-        "robustness",
-        "success that a shipped policy loses to one perturbation at its declared range",
-        "{worst.points|.1f} points at worst: {worst.robot}, {worst.perturbation} "
-        "(`docs/randomisation.md`)",
+    *(
+        (
+            f"robustness_{robot}",
+            f"{title}: success that the shipped policy loses to one perturbation at its declared "
+            "range",
+            "{worst.points|.1f} points at worst, to {worst.perturbation} "
+            "(`docs/randomisation.md`)",
+        )
+        for robot, title in POLICIES.items()
     ),
     (
         "barn_five_fold",
@@ -250,8 +254,10 @@ TRANSFER = Table(
 ROBUSTNESS = Table(
     ("success [%] at 0, 1/2, 1, 2 times the range", "declared range", *POLICIES.values()),
     tuple(
-        ("robustness", each, f"{{declared.differential.{each}}}", *(
-            ", ".join(f"{{success.{robot}.{each}.{k} x100|.0f}}" for k in range(4))
+        ("robustness_differential", each, f"{{declared.differential.{each}}}", *(
+            ", ".join(
+                f"{{robustness_{robot}:success.{robot}.{each}.{k} x100|.0f}}" for k in range(4)
+            )
             for robot in POLICIES
         ))
         for each in PERTURBATIONS

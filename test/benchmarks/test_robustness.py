@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+import json
 import math
+import subprocess
+import sys
 from importlib import import_module
 
 import pytest
@@ -107,6 +110,22 @@ def test_the_picture_has_a_panel_for_each_perturbation(robustness, tmp_path):
     with Image.open(tmp_path / "new" / "curves.png") as picture:
         assert picture.width == 1100
         assert 550 < picture.height < 700  # two rows of three
+
+
+def test_the_picture_is_drawn_of_runs_robot_by_robot(robustness, tmp_path):
+    if not shipped_policies():
+        pytest.skip("no policy is shipped")
+    names = shipped_policies()[:2]
+    runs = {f"robustness_{name}": {"result": {"success": {name: curves()}}} for name in names}
+    runs |= {"robustness_broken": {"result": None}, "parity": {"result": {"steps": 1}}}
+    (tmp_path / "results.json").write_text(json.dumps({"runs": runs}))
+    assert robustness.measured_in(tmp_path / "results.json") == dict.fromkeys(names, curves())
+    words = ("--of", str(tmp_path / "results.json"), "--picture", str(tmp_path / "curves.png"))
+    done = subprocess.run(
+        [sys.executable, BENCHMARKS / "robustness.py", *words], capture_output=True, text=True
+    )
+    assert (done.returncode, done.stdout) == (0, ""), done.stderr
+    assert (tmp_path / "curves.png").read_bytes().startswith(b"\x89PNG")
 
 
 ONE = ("--episodes", "2", "--robots", "differential", "--worlds", "circles")
