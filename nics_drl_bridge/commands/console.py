@@ -92,7 +92,10 @@ APART: dict[str, dict[str, tuple[str, ...]]] = {  # options that leave others no
 
 
 def checked(command: Callable[..., Any]) -> Callable[..., Any]:
-    """A command that refuses numbers that are not finite, and options that would do nothing."""
+    """A command that refuses numbers that are not finite, and options that would do nothing.
+
+    All user errors in it end as `one_sentence`.
+    """
     usual, needed = signature(command).parameters, NEEDED.get(command.__name__, {})
 
     @wraps(command)
@@ -111,7 +114,7 @@ def checked(command: Callable[..., Any]) -> Callable[..., Any]:
                     if other in told:
                         fix = f"does not go with {_option(name)}; leave out {_option(other)}"
                         raise ConfigError(f"{_option(other)} {fix}, or {_option(name)}.")
-        return command(**given)
+            return command(**given)
 
     return run
 

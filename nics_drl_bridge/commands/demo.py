@@ -22,10 +22,9 @@ def demo(
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Runs the whole chain once, from a recording to a report."""
-    with console.one_sentence():
-        from nics_drl_bridge.commands.demo_run import DemoPlan, run
+    from nics_drl_bridge.commands.demo_run import DemoPlan, run
 
-        console.tell_replaced(out / "report.html")
-        plan = DemoPlan(out, robot, world, recording, episodes, policy, train_steps)
-        line = run(plan, partial(typer.echo, err=as_json))
-        console.say(as_json, line, told=line, report=str(out / "report.html"))
+    console.tell_replaced(out / "report.html")
+    plan = DemoPlan(out, robot, world, recording, episodes, policy, train_steps)
+    line = run(plan, partial(typer.echo, err=as_json))
+    console.say(as_json, line, told=line, report=str(out / "report.html"))

@@ -27,41 +27,40 @@ def doctor(
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Tells what of a robot or a bag does not fit; it sends nothing."""
-    with console.one_sentence():
-        if install:
-            _tell_installation(as_json)
-            return
-        from nics_drl_bridge.generator import open_model
-        from nics_drl_bridge.policy.foreign import load_any
-        from nics_drl_bridge.report.doctor import examine
-        from nics_drl_bridge.report.doctor_facts import expected_of, facts_of_bag
+    if install:
+        _tell_installation(as_json)
+        return
+    from nics_drl_bridge.generator import open_model
+    from nics_drl_bridge.policy.foreign import load_any
+    from nics_drl_bridge.report.doctor import examine
+    from nics_drl_bridge.report.doctor_facts import expected_of, facts_of_bag
 
-        if policy is None:
-            expected = expected_of(open_model(model or DEFAULT_ROBOT))
-        elif model is not None:
-            raise ConfigError("--model and --policy: give one of them, what the robot must fit.")
-        else:
-            contract = load_any(policy).contract
-            expected = expected_of(contract, contract.scan)
-        if bag is not None:
-            facts = facts_of_bag(bag, namespace)
-        else:
-            with console.needs_ros("nics doctor"):
-                from nics_drl_bridge.nodes.listen import listen
-            with console.progress_bar(f"listening for {duration:g} s"):
-                facts = listen(duration, namespace)
-        findings = examine(facts, expected)
-        if as_json:
-            plain = {"source": facts.source, "findings": [asdict(each) for each in findings]}
-            typer.echo(json_of(plain))
-        elif findings:
-            heads = ("", "check", "where", "what does not fit", "what to do")
-            rows = [(f.severity, f.check, f.where, f.what, f.fix) for f in findings]
-            typer.echo(console.table(heads, rows))
-        else:
-            typer.echo(f"{facts.source}: all fits {policy or model or DEFAULT_ROBOT}.")
-        if findings:
-            raise typer.Exit(EXIT_FINDINGS)
+    if policy is None:
+        expected = expected_of(open_model(model or DEFAULT_ROBOT))
+    elif model is not None:
+        raise ConfigError("--model and --policy: give one of them, what the robot must fit.")
+    else:
+        contract = load_any(policy).contract
+        expected = expected_of(contract, contract.scan)
+    if bag is not None:
+        facts = facts_of_bag(bag, namespace)
+    else:
+        with console.needs_ros("nics doctor"):
+            from nics_drl_bridge.nodes.listen import listen
+        with console.progress_bar(f"listening for {duration:g} s"):
+            facts = listen(duration, namespace)
+    findings = examine(facts, expected)
+    if as_json:
+        plain = {"source": facts.source, "findings": [asdict(each) for each in findings]}
+        typer.echo(json_of(plain))
+    elif findings:
+        heads = ("", "check", "where", "what does not fit", "what to do")
+        rows = [(f.severity, f.check, f.where, f.what, f.fix) for f in findings]
+        typer.echo(console.table(heads, rows))
+    else:
+        typer.echo(f"{facts.source}: all fits {policy or model or DEFAULT_ROBOT}.")
+    if findings:
+        raise typer.Exit(EXIT_FINDINGS)
 
 
 def _tell_installation(as_json: bool) -> None:
@@ -81,13 +80,12 @@ def explain(
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Tells why command_gate stopped a robot, from what it wrote down."""
-    with console.one_sentence():
-        from nics_drl_bridge.gate import black_box
+    from nics_drl_bridge.gate import black_box
 
-        again = black_box.replay(file)
-        if as_json:
-            typer.echo(json_of({"story": list(again.story), "differing": again.differing}))
-        else:
-            typer.echo("\n".join(again.story))
-        if again.differing:
-            raise typer.Exit(EXIT_FINDINGS)
+    again = black_box.replay(file)
+    if as_json:
+        typer.echo(json_of({"story": list(again.story), "differing": again.differing}))
+    else:
+        typer.echo("\n".join(again.story))
+    if again.differing:
+        raise typer.Exit(EXIT_FINDINGS)

@@ -50,43 +50,42 @@ def evaluate(
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Drives policies through the same episodes, and compares them."""
-    with console.one_sentence():
-        place = _point(goal)
-        if backend not in (None, "dds"):
-            raise ConfigError(f"--backend {backend!r}: must be dds; simulators are chosen by --in.")
-        if hardware != (backend == "dds"):
-            reason = "belong together; the fast simulator over DDS is --in dds."
-            raise ConfigError(f"--hardware and --backend dds {reason}")
-        check_above(out / "evaluation.json")
-        if hardware and len(policies) > 1:
-            raise ConfigError(f"--hardware drives one policy at a time, not {', '.join(policies)}.")
-        if shadow is not None:
-            _shadow(shadow, policies, model, topic or [], place, ahead, out, as_json)
-            return
-        from nics_drl_bridge.commands import episodes as driving
-        from nics_drl_bridge.commands.conditions import Conditions
+    place = _point(goal)
+    if backend not in (None, "dds"):
+        raise ConfigError(f"--backend {backend!r}: must be dds; simulators are chosen by --in.")
+    if hardware != (backend == "dds"):
+        reason = "belong together; the fast simulator over DDS is --in dds."
+        raise ConfigError(f"--hardware and --backend dds {reason}")
+    check_above(out / "evaluation.json")
+    if hardware and len(policies) > 1:
+        raise ConfigError(f"--hardware drives one policy at a time, not {', '.join(policies)}.")
+    if shadow is not None:
+        _shadow(shadow, policies, model, topic or [], place, ahead, out, as_json)
+        return
+    from nics_drl_bridge.commands import episodes as driving
+    from nics_drl_bridge.commands.conditions import Conditions
 
-        count, tell = episodes or (1 if hardware else 20), partial(typer.echo, err=True)
-        under = Conditions(lidar, randomisation, gate, fallback, kind=task)
-        order = driving.EvaluationOrder(
-            policies, out, model, world, count, seed, tuple(dict.fromkeys(places or ())), under
-        )
-        console.tell_replaced(out / driving.EVALUATION)
-        if hardware:
-            options = {"start": start, "namespace": namespace, "pose_type": pose_type}
-            driven = partial(driving.drive_vehicle, order, place, arm, tell, partial(_ask, yes))
-            with console.needs_ros("nics evaluate --hardware"):
-                evaluated = [driven(**options)]
-        else:
-            with console.progress_bar("opening robot and policies") as advance:
-                evaluated = driving.evaluate(order, tell, advance)
-        if as_json:
-            typer.echo((out / driving.EVALUATION).read_text().rstrip())
-            return
-        typer.echo(console.table(driving.HEADS, driving.rows_of(evaluated)))
-        for one in evaluated:
-            typer.echo(driving.line_of(one))
-        typer.echo(f"pictures and evaluation.json: {out}")
+    count, tell = episodes or (1 if hardware else 20), partial(typer.echo, err=True)
+    under = Conditions(lidar, randomisation, gate, fallback, kind=task)
+    order = driving.EvaluationOrder(
+        policies, out, model, world, count, seed, tuple(dict.fromkeys(places or ())), under
+    )
+    console.tell_replaced(out / driving.EVALUATION)
+    if hardware:
+        options = {"start": start, "namespace": namespace, "pose_type": pose_type}
+        driven = partial(driving.drive_vehicle, order, place, arm, tell, partial(_ask, yes))
+        with console.needs_ros("nics evaluate --hardware"):
+            evaluated = [driven(**options)]
+    else:
+        with console.progress_bar("opening robot and policies") as advance:
+            evaluated = driving.evaluate(order, tell, advance)
+    if as_json:
+        typer.echo((out / driving.EVALUATION).read_text().rstrip())
+        return
+    typer.echo(console.table(driving.HEADS, driving.rows_of(evaluated)))
+    for one in evaluated:
+        typer.echo(driving.line_of(one))
+    typer.echo(f"pictures and evaluation.json: {out}")
 
 
 def _ask(yes: bool, question: str) -> None:

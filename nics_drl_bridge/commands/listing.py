@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument
 
-from nics_drl_bridge.commands.console import JsonOption, one_sentence, table
+from nics_drl_bridge.commands.console import JsonOption, table
 from nics_drl_bridge.config import shipped_names
 from nics_drl_bridge.files import json_of
 
@@ -27,13 +27,12 @@ def list_(
     what: Annotated[Listed, Argument(help="What to list.")], as_json: JsonOption = False
 ) -> None:
     """Lists the robots, worlds, lidars or policies that are shipped."""
-    with one_sentence():
-        rows = ROWS[what]()
-        if as_json:
-            typer.echo(json_of({what.value: rows}))
-        else:
-            cells = [tuple(map(str, row.values())) for row in rows]
-            typer.echo(table(tuple(rows[0]), cells))
+    rows = ROWS[what]()
+    if as_json:
+        typer.echo(json_of({what.value: rows}))
+    else:
+        cells = [tuple(map(str, row.values())) for row in rows]
+        typer.echo(table(tuple(rows[0]), cells))
 
 
 def robots() -> list[Row]:

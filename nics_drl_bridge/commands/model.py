@@ -35,35 +35,34 @@ def record(
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Drives a robot so that it shows its whole motion; records it."""
-    with console.one_sentence():
-        arguments = node_arguments(namespace, remap or ())
-        given = {
-            "robot": robot, "out": str(out), "bound": bound, "duration": duration, "speed": speed,
-            "seed": seed, "topics": str(topics or ""), "use_sim_time": use_sim_time,
-        } | ({} if stamped is None else {"stamped": stamped})  # fmt: skip
-        if not preview:
-            # First: with ROS 2 from wheels it restarts Python.
-            with console.needs_ros("nics record"):
-                from nics_drl_bridge.nodes.record_node import record as drive
-        lines = preview_lines(given)
-        told: dict[str, Any] = {"out": str(out), "robot": robot}
-        if preview:
-            console.say(as_json, "\n".join(lines), **told, told=lines)
-            return
-        typer.echo("\n".join(lines), err=as_json)
-        if not yes and not typer.confirm("Drive the robot now?", err=as_json):
-            console.say(as_json, "nothing was driven or recorded.", **told, recorded=False)
-            return
-        driven = drive(given, arguments)
-        if driven.failure is not None:
-            raise BackendError(driven.line)
-        recording, lines = driven.recording, (driven.line,)
-        if recording is not None:
-            lines += drive_summary(recording, given)
-        told |= {"recorded": recording is not None, "complete": driven.complete}
+    arguments = node_arguments(namespace, remap or ())
+    given = {
+        "robot": robot, "out": str(out), "bound": bound, "duration": duration, "speed": speed,
+        "seed": seed, "topics": str(topics or ""), "use_sim_time": use_sim_time,
+    } | ({} if stamped is None else {"stamped": stamped})  # fmt: skip
+    if not preview:
+        # First: with ROS 2 from wheels it restarts Python.
+        with console.needs_ros("nics record"):
+            from nics_drl_bridge.nodes.record_node import record as drive
+    lines = preview_lines(given)
+    told: dict[str, Any] = {"out": str(out), "robot": robot}
+    if preview:
         console.say(as_json, "\n".join(lines), **told, told=lines)
-        if not driven.complete:
-            raise typer.Exit(console.EXIT_INTERRUPTED)
+        return
+    typer.echo("\n".join(lines), err=as_json)
+    if not yes and not typer.confirm("Drive the robot now?", err=as_json):
+        console.say(as_json, "nothing was driven or recorded.", **told, recorded=False)
+        return
+    driven = drive(given, arguments)
+    if driven.failure is not None:
+        raise BackendError(driven.line)
+    recording, lines = driven.recording, (driven.line,)
+    if recording is not None:
+        lines += drive_summary(recording, given)
+    told |= {"recorded": recording is not None, "complete": driven.complete}
+    console.say(as_json, "\n".join(lines), **told, told=lines)
+    if not driven.complete:
+        raise typer.Exit(console.EXIT_INTERRUPTED)
 
 
 def node_arguments(namespace: str, remap: Sequence[str]) -> list[str]:
@@ -118,36 +117,35 @@ def inspect(
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Lists what a recording of any form holds and begins its mapping."""
-    with console.one_sentence():
-        from nics_drl_bridge.files import write_text
-        from nics_drl_bridge.recording.guess import NOT_USED, first_mapping
-        from nics_drl_bridge.recording.readers import open_source
-        from nics_drl_bridge.recording.survey import survey
+    from nics_drl_bridge.files import write_text
+    from nics_drl_bridge.recording.guess import NOT_USED, first_mapping
+    from nics_drl_bridge.recording.readers import open_source
+    from nics_drl_bridge.recording.survey import survey
 
-        if mapping is not None and mapping.exists():
-            raise ConfigError(f"--map {mapping}: is there already; give another name.")
-        with open_source(source) as opened, console.progress_bar(f"reading {source}"):
-            tables = survey(opened)
-        text = "" if as_json and mapping is None else first_mapping(tables)
-        if mapping is not None:
-            write_text(mapping, text)
-        if as_json:
-            facts = {"tables": [asdict(table) for table in tables]}
-            typer.echo(json_of(facts | {"mapping": mapping and str(mapping)}))
-            return
-        for table in tables:
-            found = "".join(f"\n  {finding}" for finding in table.regularity + table.findings)
-            typer.echo(f"{table.name}: {table.rows} rows{found}")
-            rows = [(c.name, f"{c.low:.6g}", f"{c.high:.6g}") for c in table.columns]
-            if rows:
-                typer.echo(console.table(("column", "least", "greatest"), rows))
-        if mapping is None:
-            typer.echo(f"A first mapping, to edit; --map FILE writes it:\n\n{text}")
-            return
-        for line in text.splitlines():
-            if line.startswith(NOT_USED):
-                typer.echo(line.removeprefix("# "))
-        typer.echo(f"a first mapping is in {mapping}: edit it, then nics import or nics generate")
+    if mapping is not None and mapping.exists():
+        raise ConfigError(f"--map {mapping}: is there already; give another name.")
+    with open_source(source) as opened, console.progress_bar(f"reading {source}"):
+        tables = survey(opened)
+    text = "" if as_json and mapping is None else first_mapping(tables)
+    if mapping is not None:
+        write_text(mapping, text)
+    if as_json:
+        facts = {"tables": [asdict(table) for table in tables]}
+        typer.echo(json_of(facts | {"mapping": mapping and str(mapping)}))
+        return
+    for table in tables:
+        found = "".join(f"\n  {finding}" for finding in table.regularity + table.findings)
+        typer.echo(f"{table.name}: {table.rows} rows{found}")
+        rows = [(c.name, f"{c.low:.6g}", f"{c.high:.6g}") for c in table.columns]
+        if rows:
+            typer.echo(console.table(("column", "least", "greatest"), rows))
+    if mapping is None:
+        typer.echo(f"A first mapping, to edit; --map FILE writes it:\n\n{text}")
+        return
+    for line in text.splitlines():
+        if line.startswith(NOT_USED):
+            typer.echo(line.removeprefix("# "))
+    typer.echo(f"a first mapping is in {mapping}: edit it, then nics import or nics generate")
 
 
 def import_(
@@ -157,32 +155,31 @@ def import_(
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Keeps a recording of any form as an .npz, read by its mapping."""
-    with console.one_sentence():
-        from nics_drl_bridge.recording.readers import read_recording
-        from nics_drl_bridge.recording.recording import save_recording
-        from nics_drl_bridge.recording.write import check_out
+    from nics_drl_bridge.recording.readers import read_recording
+    from nics_drl_bridge.recording.recording import save_recording
+    from nics_drl_bridge.recording.write import check_out
 
-        if out.suffix != ".npz":
-            raise ConfigError(f"--out {out}: must end in .npz.")
-        check_out(out)
-        with console.progress_bar(f"reading {source}"):
-            drive = read_recording(source, mapping=mapping)
-            save_recording(drive, out)
-        streams = stream_facts(drive)
-        if as_json:
-            told = {"recording": str(out), "streams": streams, "repairs": drive.repairs}
-            typer.echo(json_of(told | {"robot": drive.robot}))
-            return
-        rows = [
-            (
-                s["stream"], f"{s['rows']}", f"{s['rate_hz']:.1f} Hz",
-                f"{s['from_s']:.2f} to {s['to_s']:.2f} s", s["clock"],
-            )
-            for s in streams
-        ]  # fmt: skip
-        typer.echo(console.table(("stream", "rows", "rate", "time", "clock"), rows))
-        for line in (*drive.repairs, f"recording written to {out}"):
-            typer.echo(line)
+    if out.suffix != ".npz":
+        raise ConfigError(f"--out {out}: must end in .npz.")
+    check_out(out)
+    with console.progress_bar(f"reading {source}"):
+        drive = read_recording(source, mapping=mapping)
+        save_recording(drive, out)
+    streams = stream_facts(drive)
+    if as_json:
+        told = {"recording": str(out), "streams": streams, "repairs": drive.repairs}
+        typer.echo(json_of(told | {"robot": drive.robot}))
+        return
+    rows = [
+        (
+            s["stream"], f"{s['rows']}", f"{s['rate_hz']:.1f} Hz",
+            f"{s['from_s']:.2f} to {s['to_s']:.2f} s", s["clock"],
+        )
+        for s in streams
+    ]  # fmt: skip
+    typer.echo(console.table(("stream", "rows", "rate", "time", "clock"), rows))
+    for line in (*drive.repairs, f"recording written to {out}"):
+        typer.echo(line)
 
 
 def stream_facts(drive: "Recording") -> list[dict[str, Any]]:
@@ -221,46 +218,45 @@ def generate(
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Generates a simulator from a recording, and writes its folder."""
-    with console.one_sentence():
-        from nics_drl_bridge.generator import check_place, lidar_of, save_model
-        from nics_drl_bridge.generator import generate as generate_model
-        from nics_drl_bridge.identify.fit import parse_alpha, parse_order
-        from nics_drl_bridge.lidar.sensor import load_sensor
-        from nics_drl_bridge.lidar.spec import load_lidar
-        from nics_drl_bridge.recording.readers import robot_and_drive
-        from nics_drl_bridge.recording.topic_roles import topic_roles
-        from nics_drl_bridge.sim.world import load_world
+    from nics_drl_bridge.generator import check_place, lidar_of, save_model
+    from nics_drl_bridge.generator import generate as generate_model
+    from nics_drl_bridge.identify.fit import parse_alpha, parse_order
+    from nics_drl_bridge.lidar.sensor import load_sensor
+    from nics_drl_bridge.lidar.spec import load_lidar
+    from nics_drl_bridge.recording.readers import robot_and_drive
+    from nics_drl_bridge.recording.topic_roles import topic_roles
+    from nics_drl_bridge.sim.world import load_world
 
-        check_place(out)
-        threshold, terms = parse_alpha(alpha), parse_order(order)
-        if lidar is not None:  # a wrong name is told before the drive is read
-            load_lidar(lidar)
-        further = tuple(load_sensor(file) for file in sensor or ())
-        shapes = load_world(world).shapes
-        named, reading = str(recording), console.progress_bar(f"reading {recording}")
-        with console.intact(recording, salvage) as whole, reading:
-            spec, drive = robot_and_drive(whole, robot, topic_roles(topics, topic or ()), mapping)
-        with console.progress_bar("generating"):
-            model, identified = generate_model(
-                replace(drive, source=named), spec, lidar_of(spec, lidar), shapes, terms,
-                threshold, assume_textbook, strict, anyway, further,
-            )  # fmt: skip
-            save_model(model, out)
-        from nics_drl_bridge.identify.report import opening
-        from nics_drl_bridge.report.fit_page import write_fit_page
-        from nics_drl_bridge.report.fit_pictures import write_pictures
-
-        with console.progress_bar("drawing the report"):
-            write_fit_page(out / "report.html", named, spec, identified, model.report)
-            if pictures:
-                write_pictures(spec, identified, out / "pictures")
-        why = "" if lidar or spec.lidar else ", as none is named: --lidar says which"
-        lines = (
-            f"{opening(model.report)}\n", f"its lidar is {model.lidar.name!r}{why}",
-            f"all figures: {out / 'report.txt'}, with pictures: {out / 'report.html'}",
-            f"model written to {out}",
+    check_place(out)
+    threshold, terms = parse_alpha(alpha), parse_order(order)
+    if lidar is not None:  # a wrong name is told before the drive is read
+        load_lidar(lidar)
+    further = tuple(load_sensor(file) for file in sensor or ())
+    shapes = load_world(world).shapes
+    named, reading = str(recording), console.progress_bar(f"reading {recording}")
+    with console.intact(recording, salvage) as whole, reading:
+        spec, drive = robot_and_drive(whole, robot, topic_roles(topics, topic or ()), mapping)
+    with console.progress_bar("generating"):
+        model, identified = generate_model(
+            replace(drive, source=named), spec, lidar_of(spec, lidar), shapes, terms,
+            threshold, assume_textbook, strict, anyway, further,
         )  # fmt: skip
-        console.say(as_json, "\n".join(lines), **fit_facts(out, spec.name, identified))
+        save_model(model, out)
+    from nics_drl_bridge.identify.report import opening
+    from nics_drl_bridge.report.fit_page import write_fit_page
+    from nics_drl_bridge.report.fit_pictures import write_pictures
+
+    with console.progress_bar("drawing the report"):
+        write_fit_page(out / "report.html", named, spec, identified, model.report)
+        if pictures:
+            write_pictures(spec, identified, out / "pictures")
+    why = "" if lidar or spec.lidar else ", as none is named: --lidar says which"
+    lines = (
+        f"{opening(model.report)}\n", f"its lidar is {model.lidar.name!r}{why}",
+        f"all figures: {out / 'report.txt'}, with pictures: {out / 'report.html'}",
+        f"model written to {out}",
+    )  # fmt: skip
+    console.say(as_json, "\n".join(lines), **fit_facts(out, spec.name, identified))
 
 
 def fit_facts(out: Path, robot: str, identified: "Identified") -> dict[str, Any]:
@@ -290,30 +286,29 @@ def drive(
 
     For training before there is a recording; with one, `nics generate` makes a truer simulator.
     """
-    with console.one_sentence():
-        import numpy as np
+    import numpy as np
 
-        from nics_drl_bridge.generator import check_place, generate, lidar_of, save_model
-        from nics_drl_bridge.recording.textbook import record as record_textbook
-        from nics_drl_bridge.recording.write import check_out, write_drive
-        from nics_drl_bridge.robot.spec import load_robot
+    from nics_drl_bridge.generator import check_place, generate, lidar_of, save_model
+    from nics_drl_bridge.recording.textbook import record as record_textbook
+    from nics_drl_bridge.recording.write import check_out, write_drive
+    from nics_drl_bridge.robot.spec import load_robot
 
-        spec = load_robot(robot)
-        check_place(out := out or Path(spec.name))
-        seen = lidar_of(spec, lidar)
-        if recording is not None and recording.suffix != ".npz":
-            raise ConfigError(f"--recording {recording}: must end in .npz.")
-        with console.progress_bar(f"driving and generating {spec.name!r}"):
-            driven = record_textbook(spec, np.random.default_rng(seed), duration)
-            if recording is not None:
-                write_drive(driven, check_out(recording), spec)
-            model, _ = generate(driven, spec, seen, ())
-        save_model(model, out)
-        kept = () if recording is None else (f"recording written to {recording}",)
-        made = f"model of the textbook {spec.name!r} with the lidar {seen.name!r}: {out}"
-        lines = model.report.rstrip(), *kept, made, f"next: nics train --robot {out}"
-        facts = {"model": str(out), "robot": spec.name, "lidar": seen.name}
-        console.say(as_json, "\n".join(lines), **facts, recording=recording and str(recording))
+    spec = load_robot(robot)
+    check_place(out := out or Path(spec.name))
+    seen = lidar_of(spec, lidar)
+    if recording is not None and recording.suffix != ".npz":
+        raise ConfigError(f"--recording {recording}: must end in .npz.")
+    with console.progress_bar(f"driving and generating {spec.name!r}"):
+        driven = record_textbook(spec, np.random.default_rng(seed), duration)
+        if recording is not None:
+            write_drive(driven, check_out(recording), spec)
+        model, _ = generate(driven, spec, seen, ())
+    save_model(model, out)
+    kept = () if recording is None else (f"recording written to {recording}",)
+    made = f"model of the textbook {spec.name!r} with the lidar {seen.name!r}: {out}"
+    lines = model.report.rstrip(), *kept, made, f"next: nics train --robot {out}"
+    facts = {"model": str(out), "robot": spec.name, "lidar": seen.name}
+    console.say(as_json, "\n".join(lines), **facts, recording=recording and str(recording))
 
 
 def urdf(
@@ -323,14 +318,13 @@ def urdf(
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Writes a robot's URDF, for RViz and robot_state_publisher."""
-    with console.one_sentence():
-        from nics_drl_bridge.files import write_text
-        from nics_drl_bridge.generator import open_model
-        from nics_drl_bridge.robot.urdf import urdf_of
+    from nics_drl_bridge.files import write_text
+    from nics_drl_bridge.generator import open_model
+    from nics_drl_bridge.robot.urdf import urdf_of
 
-        opened = open_model(model)
-        file = out or Path(f"{opened.robot.name}.urdf")
-        lidar, further = opened.lidar, {each.frame: each.mount for each in opened.sensors}
-        write_text(file, urdf_of(opened.robot, lidar.mount, lidar.frame, further=further))
-        name = opened.robot.name
-        console.say(as_json, f"{file}: the URDF of {name}", file=str(file), robot=name)
+    opened = open_model(model)
+    file = out or Path(f"{opened.robot.name}.urdf")
+    lidar, further = opened.lidar, {each.frame: each.mount for each in opened.sensors}
+    write_text(file, urdf_of(opened.robot, lidar.mount, lidar.frame, further=further))
+    name = opened.robot.name
+    console.say(as_json, f"{file}: the URDF of {name}", file=str(file), robot=name)

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 from typer import Argument, Option
 
-from nics_drl_bridge.commands.console import POLICIES, ROBOTS, JsonOption, one_sentence, say
+from nics_drl_bridge.commands.console import POLICIES, ROBOTS, JsonOption, say
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import write_bytes
 
@@ -26,13 +26,12 @@ def info(
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
     """Checks a policy file and tells what it was trained on and needs."""
-    with one_sentence():
-        from nics_drl_bridge.policy.foreign import load_any
-        from nics_drl_bridge.policy.policy_file import summary
+    from nics_drl_bridge.policy.foreign import load_any
+    from nics_drl_bridge.policy.policy_file import summary
 
-        facts = summary(load_any(file))
-        lines = (f"{name:<18} {value}" for name, value in _lines(facts))
-        say(as_json, "\n".join(lines), **facts)
+    facts = summary(load_any(file))
+    lines = (f"{name:<18} {value}" for name, value in _lines(facts))
+    say(as_json, "\n".join(lines), **facts)
 
 
 @policy.command()
@@ -43,12 +42,11 @@ def export(
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
     """Writes a policy file in a format of others: Isaac's LEAPP."""
-    with one_sentence():
-        from nics_drl_bridge.policy.foreign import load_any
-        from nics_drl_bridge.policy.leapp import export_bundle
+    from nics_drl_bridge.policy.foreign import load_any
+    from nics_drl_bridge.policy.leapp import export_bundle
 
-        written = str(export_bundle(load_any(file), leapp))
-        say(as_json, f"wrote {written}", file=written)
+    written = str(export_bundle(load_any(file), leapp))
+    say(as_json, f"wrote {written}", file=written)
 
 
 @policy.command(name="import")
@@ -61,20 +59,19 @@ def import_(
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
     """Makes a policy file of somebody else's policy."""
-    with one_sentence():
-        from nics_drl_bridge.generator import open_model
-        from nics_drl_bridge.policy.contract import SUFFIX
-        from nics_drl_bridge.policy.foreign import import_policy
-        from nics_drl_bridge.policy.policy_file import policy_of
+    from nics_drl_bridge.generator import open_model
+    from nics_drl_bridge.policy.contract import SUFFIX
+    from nics_drl_bridge.policy.foreign import import_policy
+    from nics_drl_bridge.policy.policy_file import policy_of
 
-        if out.suffix != SUFFIX:
-            raise ConfigError(f"--out {out}: a policy file ends with {SUFFIX!r}; change the name.")
-        data = import_policy(source, None if robot is None else open_model(robot))
-        contract = policy_of(data, out).contract  # what can't be loaded is not written
-        write_bytes(out, data)
-        name = contract.robot.name
-        line = f"wrote {out}, a policy of {name!r}; see nics policy info {out}"
-        say(as_json, line, file=str(out), robot=name)
+    if out.suffix != SUFFIX:
+        raise ConfigError(f"--out {out}: a policy file ends with {SUFFIX!r}; change the name.")
+    data = import_policy(source, None if robot is None else open_model(robot))
+    contract = policy_of(data, out).contract  # what can't be loaded is not written
+    write_bytes(out, data)
+    name = contract.robot.name
+    line = f"wrote {out}, a policy of {name!r}; see nics policy info {out}"
+    say(as_json, line, file=str(out), robot=name)
 
 
 def _lines(facts: dict[str, Any]) -> list[tuple[str, str]]:

@@ -50,32 +50,31 @@ def train(
         help="Show some of the worlds on a page, as nics watch does.")] = False,
 ) -> None:  # fmt: skip
     """Trains policies in the fast simulator, and evaluates them."""
-    with console.one_sentence():
-        given = {"robot": robot, "algorithm": algorithm, "steps": steps, "world": world}
-        given["engine"] = engine if engine in OWN else None
-        named = {name: value for name, value in given.items() if value}
-        if resume and (settings or named):
-            option = next(iter(named), "settings")
-            raise ConfigError(f"--{option}: a resumed run has its own settings; leave it out.")
-        if resume and out is None:
-            raise ConfigError("--resume needs --out, the folder of the run to go on with.")
-        if watch and engine is not None and engine not in OWN:
-            reason = "worlds of other processes are not shown; leave out --watch, or --engine"
-            raise ConfigError(f"--watch --engine {engine}: {reason}.")
-        extensions.require("training", *extensions.TRAINING)
-        with console.progress_bar("loading PyTorch"):
-            from nics_drl_bridge.policy import train as train_run
+    given = {"robot": robot, "algorithm": algorithm, "steps": steps, "world": world}
+    given["engine"] = engine if engine in OWN else None
+    named = {name: value for name, value in given.items() if value}
+    if resume and (settings or named):
+        option = next(iter(named), "settings")
+        raise ConfigError(f"--{option}: a resumed run has its own settings; leave it out.")
+    if resume and out is None:
+        raise ConfigError("--resume needs --out, the folder of the run to go on with.")
+    if watch and engine is not None and engine not in OWN:
+        reason = "worlds of other processes are not shown; leave out --watch, or --engine"
+        raise ConfigError(f"--watch --engine {engine}: {reason}.")
+    extensions.require("training", *extensions.TRAINING)
+    with console.progress_bar("loading PyTorch"):
+        from nics_drl_bridge.policy import train as train_run
 
-        resumed = train_run.settings_of(out) if resume and out is not None else None
-        chosen = resumed or _told(task, settings, named)
-        folder = out or Path("runs") / chosen.title
-        command = shlex.join(["nics", *sys.argv[1:]])
-        if begun := train_run.seeds_of(folder) if resume and not seeds else []:
-            typer.echo(f"seeds that were begun: {begun}; --seeds names others", err=True)
-        every = [*(seeds or begun or [0]), *(more_seeds or [])]
-        order = train_run.TrainOrder(chosen, every, folder, episodes, resume, command)
-        with _learner(engine, address, env_runners, chosen.num_envs) as learn:
-            (_run_watched if watch else _run)(train_run, order, learn, as_json)
+    resumed = train_run.settings_of(out) if resume and out is not None else None
+    chosen = resumed or _told(task, settings, named)
+    folder = out or Path("runs") / chosen.title
+    command = shlex.join(["nics", *sys.argv[1:]])
+    if begun := train_run.seeds_of(folder) if resume and not seeds else []:
+        typer.echo(f"seeds that were begun: {begun}; --seeds names others", err=True)
+    every = [*(seeds or begun or [0]), *(more_seeds or [])]
+    order = train_run.TrainOrder(chosen, every, folder, episodes, resume, command)
+    with _learner(engine, address, env_runners, chosen.num_envs) as learn:
+        (_run_watched if watch else _run)(train_run, order, learn, as_json)
 
 
 def _plain(result: Any) -> dict[str, Any]:

@@ -41,26 +41,25 @@ def watch(
     browser: Annotated[bool, Option(help="Open the page in a browser.")] = True,
 ) -> None:  # fmt: skip
     """Shows a policy, live topics or a bag on a page in the browser."""
-    with console.one_sentence():
-        given = {"lidar": lidar, "randomisation": randomisation, "gate": gate}
-        given["task"] = task
-        if record is None:  # before the source is opened, which may take a while
-            extensions.require("the page", "websockets")
-        else:
-            from nics_drl_bridge.watch.record import check_file
+    given = {"lidar": lidar, "randomisation": randomisation, "gate": gate}
+    given["task"] = task
+    if record is None:  # before the source is opened, which may take a while
+        extensions.require("the page", "websockets")
+    else:
+        from nics_drl_bridge.watch.record import check_file
 
-            check_file(record)
-        if bag is not None:
-            source: Any = _bag(bag, model, world, console.roles_of(topic or []))
-        elif ros:
-            source = _ros(model, world, namespace)
+        check_file(record)
+    if bag is not None:
+        source: Any = _bag(bag, model, world, console.roles_of(topic or []))
+    elif ros:
+        source = _ros(model, world, namespace)
+    else:
+        source = _episodes(policy or DEFAULT_ROBOT, model, world or ["circles"], seed, given)
+    with closing(source):
+        if record is not None:
+            _record(record, source, episodes)
         else:
-            source = _episodes(policy or DEFAULT_ROBOT, model, world or ["circles"], seed, given)
-        with closing(source):
-            if record is not None:
-                _record(record, source, episodes)
-            else:
-                _serve(source, port, browser)
+            _serve(source, port, browser)
 
 
 def _episodes(

@@ -67,32 +67,31 @@ def import_(
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Makes worlds of Gazebo's worlds, of Nav2's maps, or of pictures."""
-    with console.one_sentence():
-        from nics_drl_bridge.sim.sdf import read_sdf
+    from nics_drl_bridge.sim.sdf import read_sdf
 
-        keys = {
-            "name": name, "bounds": bounds, "clearance": clearance, "goal_distance": goal_distance,
-            "starts": start and {"at": [start]}, "goals": goal and {"at": [goal]},
-        }  # fmt: skip
-        keys = {key: value for key, value in keys.items() if value is not None}
-        made = list[Written]()
-        for file, place in _places(files, out, name).items():
-            if file.suffix in SDF:
-                standing = read_sdf(file, height, tuple(without or ()), skip_unknown)
-                made.append(_standing(file, place, standing, keys, height))
-            else:
-                made += _mapped(file, place, keys, resolution)
-        for each in made:
-            if each.path.exists():
-                fix = "remove it, or give another place as --out"
-                raise ConfigError(f"{each.path}: is there already; {fix}.")
-        for each in made:
-            write_text(each.path, each.text)
-            if not as_json:
-                typer.echo(f"{each.path}: {each.line}")
-        if as_json:
-            told = [{"file": str(each.path), "holds": each.line} for each in made]
-            typer.echo(json_of({"worlds": told}))
+    keys = {
+        "name": name, "bounds": bounds, "clearance": clearance, "goal_distance": goal_distance,
+        "starts": start and {"at": [start]}, "goals": goal and {"at": [goal]},
+    }  # fmt: skip
+    keys = {key: value for key, value in keys.items() if value is not None}
+    made = list[Written]()
+    for file, place in _places(files, out, name).items():
+        if file.suffix in SDF:
+            standing = read_sdf(file, height, tuple(without or ()), skip_unknown)
+            made.append(_standing(file, place, standing, keys, height))
+        else:
+            made += _mapped(file, place, keys, resolution)
+    for each in made:
+        if each.path.exists():
+            fix = "remove it, or give another place as --out"
+            raise ConfigError(f"{each.path}: is there already; {fix}.")
+    for each in made:
+        write_text(each.path, each.text)
+        if not as_json:
+            typer.echo(f"{each.path}: {each.line}")
+    if as_json:
+        told = [{"file": str(each.path), "holds": each.line} for each in made]
+        typer.echo(json_of({"worlds": told}))
 
 
 def _places(files: list[Path], out: Path | None, name: str | None) -> dict[Path, Path]:
@@ -204,25 +203,24 @@ def draw(
 
     Of a set, such as barn or a folder of files, it is the world of the episode.
     """
-    with console.one_sentence():
-        from nics_drl_bridge.files import write_bytes
-        from nics_drl_bridge.report.pictures import world_picture
-        from nics_drl_bridge.robot.spec import load_robot
-        from nics_drl_bridge.sim.scenes import member_of
-        from nics_drl_bridge.sim.world_set import load_worlds
+    from nics_drl_bridge.files import write_bytes
+    from nics_drl_bridge.report.pictures import world_picture
+    from nics_drl_bridge.robot.spec import load_robot
+    from nics_drl_bridge.sim.scenes import member_of
+    from nics_drl_bridge.sim.world_set import load_worlds
 
-        worlds = load_worlds(name)
-        opened = worlds.members[member_of(worlds, seed)]
-        outline = None if footprint is not None else load_robot(robot).footprint
-        radius = load_robot(robot).footprint_radius if footprint is None else footprint
-        if not 0.0 < radius < math.inf:
-            raise ConfigError(f"--footprint {radius:g}: must be above 0 m.")
-        file = out or Path(f"{opened.name}.png")
-        if file.suffix != ".png":
-            raise ConfigError(f"--out {file}: must end in .png.")
-        write_bytes(file, world_picture(opened, radius, seed, outline))
-        facts = {"file": str(file), "world": opened.name, "seed": seed}
-        console.say(as_json, f"{file}: the world {opened.name!r}, seed {seed}", **facts)
+    worlds = load_worlds(name)
+    opened = worlds.members[member_of(worlds, seed)]
+    outline = None if footprint is not None else load_robot(robot).footprint
+    radius = load_robot(robot).footprint_radius if footprint is None else footprint
+    if not 0.0 < radius < math.inf:
+        raise ConfigError(f"--footprint {radius:g}: must be above 0 m.")
+    file = out or Path(f"{opened.name}.png")
+    if file.suffix != ".png":
+        raise ConfigError(f"--out {file}: must end in .png.")
+    write_bytes(file, world_picture(opened, radius, seed, outline))
+    facts = {"file": str(file), "world": opened.name, "seed": seed}
+    console.say(as_json, f"{file}: the world {opened.name!r}, seed {seed}", **facts)
 
 
 @world.command("map")
@@ -239,27 +237,26 @@ def map_(
     Obstacles that move are left out. `nics world map room`, then
     `ros2 run nav2_map_server map_server --ros-args -p yaml_filename:=room_map.yaml`.
     """
-    with console.one_sentence():
-        from nics_drl_bridge.lidar.maps import map_files
-        from nics_drl_bridge.robot.spec import load_robot
-        from nics_drl_bridge.sim.occupancy import occupancy, standing
-        from nics_drl_bridge.sim.scenes import SetSampler
-        from nics_drl_bridge.sim.world_set import load_worlds
+    from nics_drl_bridge.lidar.maps import map_files
+    from nics_drl_bridge.robot.spec import load_robot
+    from nics_drl_bridge.sim.occupancy import occupancy, standing
+    from nics_drl_bridge.sim.scenes import SetSampler
+    from nics_drl_bridge.sim.world_set import load_worlds
 
-        if not 1e-3 <= resolution <= 100.0:
-            raise ConfigError(f"--resolution {resolution:g}: must be from 0.001 to 100 m.")
-        worlds = load_worlds(name)
-        sampler = SetSampler(worlds, load_robot(robot).footprint_radius)
-        scenes = sampler.draw([seed])
-        scene, member = scenes[0], int(scenes.member[0])
-        opened = worlds.members[member]
-        file = out or Path(f"{opened.name}_map.yaml")
-        if file.suffix not in MAPS:
-            raise ConfigError(f"--out {file}: must end in .yaml.")
-        grid = occupancy(opened, standing(sampler, member, scene.bodies), resolution)
-        map_files(grid, file)
-        rows, columns = grid.cells.shape
-        size = f"{columns} x {rows} cells of {grid.resolution:.4g} m"
-        facts = {"file": str(file), "world": opened.name, "seed": seed, "cells": [columns, rows]}
-        line = f"{file}: the map of {opened.name!r}, seed {seed}, {size}"
-        console.say(as_json, line, **facts, resolution_m=grid.resolution)
+    if not 1e-3 <= resolution <= 100.0:
+        raise ConfigError(f"--resolution {resolution:g}: must be from 0.001 to 100 m.")
+    worlds = load_worlds(name)
+    sampler = SetSampler(worlds, load_robot(robot).footprint_radius)
+    scenes = sampler.draw([seed])
+    scene, member = scenes[0], int(scenes.member[0])
+    opened = worlds.members[member]
+    file = out or Path(f"{opened.name}_map.yaml")
+    if file.suffix not in MAPS:
+        raise ConfigError(f"--out {file}: must end in .yaml.")
+    grid = occupancy(opened, standing(sampler, member, scene.bodies), resolution)
+    map_files(grid, file)
+    rows, columns = grid.cells.shape
+    size = f"{columns} x {rows} cells of {grid.resolution:.4g} m"
+    facts = {"file": str(file), "world": opened.name, "seed": seed, "cells": [columns, rows]}
+    line = f"{file}: the map of {opened.name!r}, seed {seed}, {size}"
+    console.say(as_json, line, **facts, resolution_m=grid.resolution)

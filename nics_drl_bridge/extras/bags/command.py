@@ -9,7 +9,7 @@ import typer
 from typer import Argument, Option
 
 from nics_drl_bridge.commands import console
-from nics_drl_bridge.commands.console import SalvageOption, intact, needs_ros, one_sentence
+from nics_drl_bridge.commands.console import SalvageOption, intact, needs_ros
 from nics_drl_bridge.files import json_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
@@ -35,16 +35,15 @@ def record(
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Records the topics of a robot as they are, without driving it."""
-    with one_sentence():
-        kind = _storage(storage)
-        with needs_ros("nics bag record"):
-            from nics_drl_bridge.extras.bags.live import BagOrder, record_bag
-        names, say = tuple(topics or ()), partial(typer.echo, err=True)
-        order = BagOrder(out, names, everything, namespace, duration, kind, use_sim_time)
-        counts = dict(sorted(record_bag(order, say).items()))
-        lines = [f"{topic}: {count} messages" for topic, count in counts.items()]
-        lines.append(f"bag written to {out}")
-        console.say(as_json, "\n".join(lines), path=str(out), messages=counts)
+    kind = _storage(storage)
+    with needs_ros("nics bag record"):
+        from nics_drl_bridge.extras.bags.live import BagOrder, record_bag
+    names, say = tuple(topics or ()), partial(typer.echo, err=True)
+    order = BagOrder(out, names, everything, namespace, duration, kind, use_sim_time)
+    counts = dict(sorted(record_bag(order, say).items()))
+    lines = [f"{topic}: {count} messages" for topic, count in counts.items()]
+    lines.append(f"bag written to {out}")
+    console.say(as_json, "\n".join(lines), path=str(out), messages=counts)
 
 
 @bag.command()
@@ -52,18 +51,17 @@ def info(
     path: BagArgument, as_json: console.JsonOption = False, salvage: SalvageOption = False
 ) -> None:  # fmt: skip
     """Tells a bag's topics, rates and gaps, and whose clock stamped it."""
-    with one_sentence():
-        from nics_drl_bridge.extras.bags.info import bag_info
+    from nics_drl_bridge.extras.bags.info import bag_info
 
-        with intact(path, salvage) as whole:
-            told = bag_info(whole)
-        if as_json:
-            typer.echo(json_of(asdict(told) | {"path": str(path)}))
-            return
-        span, size = f"{told.duration_s:.3f} s", f"{told.size_bytes / 1e6:.2f} MB"
-        typer.echo(f"{path}: {told.messages} messages in {span}, {size}")
-        heads = ("topic", "type", "count", "Hz", "from, to [s]", "gaps", "clock", "delay [ms]")
-        typer.echo(console.table(heads, [_row(each) for each in told.topics]))
+    with intact(path, salvage) as whole:
+        told = bag_info(whole)
+    if as_json:
+        typer.echo(json_of(asdict(told) | {"path": str(path)}))
+        return
+    span, size = f"{told.duration_s:.3f} s", f"{told.size_bytes / 1e6:.2f} MB"
+    typer.echo(f"{path}: {told.messages} messages in {span}, {size}")
+    heads = ("topic", "type", "count", "Hz", "from, to [s]", "gaps", "clock", "delay [ms]")
+    typer.echo(console.table(heads, [_row(each) for each in told.topics]))
 
 
 @bag.command()
@@ -87,7 +85,7 @@ def replay(
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Plays a bag over ROS 2, or gives the middleware's estimate of it."""
-    with one_sentence(), intact(path, salvage) as whole:
+    with intact(path, salvage) as whole:
         if estimate:
             from nics_drl_bridge.generator import open_model
             from nics_drl_bridge.middleware import playback
@@ -132,7 +130,7 @@ def export(
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Writes a bag for others: as a dataset, or as MCAP to look at."""
-    with one_sentence(), intact(path, salvage) as whole:
+    with intact(path, salvage) as whole:
         from nics_drl_bridge.errors import ConfigError
         from nics_drl_bridge.generator import open_model
 
@@ -174,15 +172,14 @@ def salvage(
     storage: StorageOption = "mcap", as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Writes what is intact of a damaged bag as a new one."""
-    with one_sentence():
-        from nics_drl_bridge.recording.messages import check_libraries
+    from nics_drl_bridge.recording.messages import check_libraries
 
-        check_libraries(path, "reading")
-        from nics_drl_bridge.extras.bags.salvage import salvage as salvage_bag
+    check_libraries(path, "reading")
+    from nics_drl_bridge.extras.bags.salvage import salvage as salvage_bag
 
-        lines = salvage_bag(path, out, _storage(storage)).lines()
-        line = "\n".join((*lines, f"bag written to {out}"))
-        console.say(as_json, line, path=str(out), told=lines)
+    lines = salvage_bag(path, out, _storage(storage)).lines()
+    line = "\n".join((*lines, f"bag written to {out}"))
+    console.say(as_json, line, path=str(out), told=lines)
 
 
 def _storage(name: str) -> Any:
