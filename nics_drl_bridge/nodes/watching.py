@@ -1,14 +1,12 @@
 """A live robot for the page of `nics watch`: its topics, listened to; a goal is all it sends."""
 
 import threading
-from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
 from nics_drl_bridge.env.snapshot import Snapshot
@@ -18,14 +16,14 @@ from nics_drl_bridge.lidar.shapes import BODY
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
-from nics_drl_bridge.nodes.runner import open_context
+from nics_drl_bridge.nodes.runner import open_context, spin
 from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame
 from nics_drl_bridge.watch.server import Request
 
 NAME, GATE = "nics_watch", ": gate"
-PERIOD_S, SPIN_S = 1.0 / 30.0, 0.1
+PERIOD_S = 1.0 / 30.0
 SIDE_M = 10.0  # of the field that is shown where no world is given
 
 
@@ -60,16 +58,10 @@ class RosSource:
             (DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.DIAGNOSTICS),
         ):
             self._node.create_subscription(kind, topic, take, quality)
-        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread = threading.Thread(
+            target=spin, args=(self._node, threading.Event()), daemon=True
+        )
         self._thread.start()
-
-    def _spin(self) -> None:
-        executor = SingleThreadedExecutor(context=self._context)
-        executor.add_node(self._node)
-        with suppress(ExternalShutdownException):
-            while self._context.ok():
-                executor.spin_once(timeout_sec=SPIN_S)
-        executor.shutdown(timeout_sec=1.0)
 
     def _take_lidar(self, lidar: LidarSpec) -> None:
         self._new_lidar = lidar
