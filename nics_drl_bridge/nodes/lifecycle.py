@@ -1,6 +1,6 @@
 """Base of the managed nodes: configure, activate, deactivate, cleanup, shutdown."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from typing import Any
 
@@ -12,7 +12,7 @@ from rclpy.publisher import Publisher
 
 from nics_drl_bridge.errors import BridgeError
 from nics_drl_bridge.nodes.ending import at_once
-from nics_drl_bridge.nodes.parameters import managed
+from nics_drl_bridge.nodes.parameters import Row, managed, sensors
 from nics_drl_bridge.nodes.qos import QosWatch
 from nics_drl_bridge.nodes.runner import ACTIVE, INACTIVE, UNCONFIGURED, declare_row
 
@@ -20,13 +20,17 @@ SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FA
 
 
 class ManagedNode(QosWatch, LifecycleNode):
-    """A lifecycle node; `configure` makes what it needs, with the clean-up on the stack `undo`."""
+    """A lifecycle node; `configure` makes what it needs, with the clean-up on the stack `undo`.
 
-    def __init__(self, name: str, context: Context) -> None:
+    It declares the parameters of the rows, beside those of any managed node and of the sensors.
+    """
+
+    def __init__(self, name: str, context: Context, rows: Sequence[Row]) -> None:
         super().__init__(name, context=context)
         self.fixed: set[str] = set()
         self.undo = ExitStack()
-        self._autostart = bool(declare_row(self, managed()[0]))
+        values = [declare_row(self, row) for row in (*managed(), *sensors(), *rows)]
+        self._autostart = bool(values[0])
         self.state, self._starting = UNCONFIGURED, False  # `state`: the last primary one
         self._failure: Exception | None = None
         self.add_on_set_parameters_callback(self._check_fixed)

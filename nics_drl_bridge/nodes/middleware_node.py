@@ -14,7 +14,7 @@ from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.lifecycle import ManagedNode
 from nics_drl_bridge.nodes.map_to_odom import MapToOdom, odom_in_map
 from nics_drl_bridge.nodes.parameters import middleware
-from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
+from nics_drl_bridge.nodes.robot_topics import RobotTopics
 from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED
 
 SILENCE_S = 5.0  # diagnostics warn of a topic that has been silent for this long [s]
@@ -24,11 +24,7 @@ class MiddlewareNode(ManagedNode):
     """Listens to a robot's topics; publishes `odometry/filtered` and `/diagnostics`."""
 
     def __init__(self, context: Context) -> None:
-        super().__init__("middleware_node", context)
-        runner.declare_model_name(self)
-        declare_sensors(self)
-        for row in middleware():
-            runner.declare_row(self, row)
+        super().__init__("middleware_node", context, middleware())
         runner.serve(self, "~/reset", self._reset)
         runner.diagnose(self, "topics", self._look)
 

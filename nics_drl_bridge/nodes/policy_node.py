@@ -21,7 +21,7 @@ from nics_drl_bridge.nodes.goal_frames import GoalFrames
 from nics_drl_bridge.nodes.lifecycle import ManagedNode
 from nics_drl_bridge.nodes.nav2_parameters import ControllerParameters
 from nics_drl_bridge.nodes.parameters import policy
-from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
+from nics_drl_bridge.nodes.robot_topics import RobotTopics
 from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED
 from nics_drl_bridge.policy.fallback import acted
 from nics_drl_bridge.policy.pacing import ActionPace, Answer, Deadline
@@ -36,11 +36,7 @@ class PolicyNode(ManagedNode):
     """Answers scans with `cmd_vel_raw`, with the stamp of the scan, until the goal is reached."""
 
     def __init__(self, context: Context) -> None:
-        super().__init__("policy_node", context)
-        runner.declare_model_name(self)
-        declare_sensors(self)
-        for row in policy():
-            runner.declare_row(self, row)
+        super().__init__("policy_node", context, policy())
         self._nav2 = ControllerParameters(self)
         self.ignores = self._nav2.ignores  # of Nav2's file for its controller server
         self._acted_ns = 0

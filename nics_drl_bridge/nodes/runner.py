@@ -208,14 +208,9 @@ def serve(node: Node, name: str, answer: Callable[[], tuple[bool, str]]) -> None
 
 def declare_model(node: Node) -> SimulatorModel:
     """Declares the parameter `model`, and opens it; ConfigError if `cmd_vel` can't drive it."""
-    model = open_model(declare_model_name(node))
+    model = open_model(str(declare_row(node, MODEL)))
     model.robot.require_cmd_vel()
     return model
-
-
-def declare_model_name(node: Node) -> str:
-    """Declares the parameter `model`; the model itself is opened later."""
-    return str(declare_row(node, MODEL))
 
 
 def declare_row(node: Node, row: Row) -> Any:
