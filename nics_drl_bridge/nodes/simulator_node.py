@@ -174,7 +174,7 @@ class CommandInlet:
         self._node, self._robot, self._take, self._too_old = node, robot, take, too_old
         stamped = bool(node.get_parameter("enable_stamped_cmd_vel").value)
         self._kind = TWIST_STAMPED if stamped else TWIST
-        kind, hear = (TwistStamped, self._on_stamped) if stamped else (Twist, self._on_bytes)
+        kind, hear = TwistStamped if stamped else Twist, partial(self._on_bytes, stamped)
         heard = node.create_subscription(kind, f"{namespace}cmd_vel", hear, quality, raw=True)
         self._topic, self.heard = heard.topic_name, [heard]
         self._warned: set[str] = set()
@@ -188,11 +188,15 @@ class CommandInlet:
         for each in self.heard:
             self._node.destroy_subscription(each)
 
-    def _on_bytes(self, content: bytes) -> None:
+    def _on_bytes(self, stamped: bool, content: bytes) -> None:
         try:
-            self._obey(wire.twist_of(content))
+            stamp_ns = wire.stamp_of(content) if stamped else 0
+            twist = wire.stamped_twist_of(content) if stamped else wire.twist_of(content)
         except wire.UNREADABLE as error:
             self._complain(f"a message that can't be read ({error}) is ignored")
+            return
+        if self._is_fresh(stamp_ns):
+            self._obey(twist)
 
     def _obey(
         self, twist: Sequence[float], read: Callable[[Sequence[float]], Array] | None = None
@@ -201,15 +205,6 @@ class CommandInlet:
             self._take((read or self._robot.from_cmd_vel)(twist))
         else:
             self._complain("NaN or inf ignored")
-
-    def _on_stamped(self, content: bytes) -> None:
-        try:
-            stamp_ns, twist = wire.stamp_of(content), wire.stamped_twist_of(content)
-        except wire.UNREADABLE as error:
-            self._complain(f"a message that can't be read ({error}) is ignored")
-            return
-        if self._is_fresh(stamp_ns):
-            self._obey(twist)
 
     def _on_ackermann(self, message: Any) -> None:
         if self._is_fresh(conversions.stamp_from_ros(message.header.stamp)):
