@@ -17,6 +17,7 @@ from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import cell_kernels, exact_kernels
 from nics_drl_bridge.lidar.cell_kernels import BodyCells
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, X, Y
+from nics_drl_bridge.random_kernels import uniform_of
 from nics_drl_bridge.sim import collision_kernels as collision
 from nics_drl_bridge.sim.state import Array, Integers, MapField
 
@@ -229,18 +230,13 @@ def _is_joined(x, y, gx, gy, plan, bodies, scratch):  # type: ignore[no-untyped-
 
 
 @kernel
-def _uniform(source, counter):  # type: ignore[no-untyped-def]
-    return random.uniform_of(source, counter)
-
-
-@kernel
 def _point(source, counter, chosen, cells):  # type: ignore[no-untyped-def]
     """Draws a point in one of the chosen cells, given by row-major indices; takes 3 counters."""
-    cell = int(_uniform(source, counter) * chosen.shape[0])
+    cell = int(uniform_of(source, counter) * chosen.shape[0])
     if chosen.shape[0] < cells.distances.size:  # of all cells, a look-up would only miss the cache
         cell = chosen[cell]
     i, j = cell // cells.distances.shape[1], cell % cells.distances.shape[1]
-    return place_in(i + _uniform(source, counter + 1), j + _uniform(source, counter + 2), cells)
+    return place_in(i + uniform_of(source, counter + 1), j + uniform_of(source, counter + 2), cells)
 
 
 @kernel
@@ -259,7 +255,7 @@ def _choose(source, wanted, size, plan, bodies, active):  # type: ignore[no-unty
             total += int(groups[g, GREATEST])
     for g in range(groups.shape[0]):
         least, greatest = int(groups[g, LEAST]), int(groups[g, GREATEST])
-        count = least + int(_uniform(source, counter) * (greatest - least + 1))
+        count = least + int(uniform_of(source, counter) * (greatest - least + 1))
         counter += 1
         if groups[g, FIXED] == 0.0:
             if wanted >= 0:  # each group gets its share
@@ -268,7 +264,7 @@ def _choose(source, wanted, size, plan, bodies, active):  # type: ignore[no-unty
             before += greatest
         first, shapes = int(groups[g, FIRST_SHAPE]), int(groups[g, SHAPES])
         for number in range(greatest):
-            taken = plan.choices[first + int(_uniform(source, counter) * shapes)]
+            taken = plan.choices[first + int(uniform_of(source, counter) * shapes)]
             counter += 1
             active[k] = number < count
             bodies[k, :] = 0.0
@@ -299,7 +295,7 @@ def _place_obstacles(source, counter, plan, bodies, scratch):  # type: ignore[no
             x, y = _point(source, counter, space.for_anything, space.cells)
             counter += 3
             if outlines.first[shape] < outlines.first[shape + 1]:
-                heading = (2.0 * _uniform(source, counter) - 1.0) * math.pi
+                heading = (2.0 * uniform_of(source, counter) - 1.0) * math.pi
                 counter += 1
             _put(trial, x, y, heading, shape, plan)
             placed = _is_apart(k, widest, plan, bodies, scratch) and _clear_of_walls(
@@ -329,16 +325,16 @@ def _is_apart(k, widest, plan, bodies, scratch):  # type: ignore[no-untyped-def]
 @kernel
 def _spot(source, counter, places, space):  # type: ignore[no-untyped-def]
     """Draws x, y, heading of a start or goal in one of the places; takes 4 counters."""
-    turn = _uniform(source, counter + 3)
+    turn = uniform_of(source, counter + 3)
     if places.shape[0] == 0:
         x, y = _point(source, counter, space.for_robots, space.cells)
         return x, y, (2.0 * turn - 1.0) * math.pi
-    share, p = _uniform(source, counter), 0
+    share, p = uniform_of(source, counter), 0
     while p < places.shape[0] - 1 and share >= places[p, SHARE]:
         p += 1
     place = places[p]
-    x = place[X1] + _uniform(source, counter + 1) * (place[X2] - place[X1])
-    y = place[Y1] + _uniform(source, counter + 2) * (place[Y2] - place[Y1])
+    x = place[X1] + uniform_of(source, counter + 1) * (place[X2] - place[X1])
+    y = place[Y1] + uniform_of(source, counter + 2) * (place[Y2] - place[Y1])
     spread = place[GREATEST_HEADING] - place[LEAST_HEADING]
     return x, y, place[LEAST_HEADING] + turn * spread
 
@@ -359,8 +355,8 @@ def _goal_of(source, counter, x, y, plan):  # type: ignore[no-untyped-def]
         gx, gy, _ = _spot(source, counter, plan.goals, plan.space)
         return gx, gy
     least, greatest = plan.least, plan.greatest
-    turn = 2.0 * math.pi * _uniform(source, counter)
-    share = _uniform(source, counter + 1)
+    turn = 2.0 * math.pi * uniform_of(source, counter)
+    share = uniform_of(source, counter + 1)
     far = math.sqrt(least * least + share * (greatest * greatest - least * least))
     return x + far * math.cos(turn), y + far * math.sin(turn)
 
