@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.config import share_folder
+from nics_drl_bridge.config import shipped_names
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError
@@ -180,7 +180,7 @@ class EpisodeSource:
         fitting = [name for name in shipped_policies() if name == robot]
         can = CAN | {"drive"} if self._drives else CAN
         policies = dict.fromkeys([self._policy, *fitting, *POLICIES])
-        worlds = dict.fromkeys([first, *shipped_worlds()])
+        worlds = dict.fromkeys([first, *shipped_names("worlds")])
         return Stage(
             f"{self._policy} in {', '.join(lane.world.name for lane in self.lanes)}", self.model,
             tuple(lane.env.world for lane in self.lanes), can,
@@ -253,9 +253,3 @@ class EpisodeSource:
         """Closes all envs."""
         for lane in self.lanes:
             lane.close()
-
-
-def shipped_worlds() -> list[str]:
-    """Names of the worlds that come with the package."""
-    folder = share_folder() / "config" / "worlds"
-    return sorted(file.stem for file in folder.glob("*.yaml"))
