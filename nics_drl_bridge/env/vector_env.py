@@ -309,7 +309,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
 
     def snapshot(self, n: int) -> Snapshot:
         """All that a picture of world n shows now; `step` does not change its arrays."""
-        data, bodies = self.simulator.data, self.simulator.obstacles_of(n)
+        data, bodies = self.simulator.data, self.simulator.obstacles_of(np.array([n]))[0]
         goals = goals_of({name: rows[n] for name, rows in self.memory.items() if name == "goal"})
         seen = data.pose[n].copy(), data.ranges[n].copy(), bodies, goals.copy()
         return Snapshot(*seen, int(data.member[n]), int(data.steps[n]), data.odom[n].copy())

@@ -52,11 +52,6 @@ class Candidate:
     gain: float  # share of the unexplained variance that it explains
     drives: bool  # True if of the speed
 
-    @property
-    def is_clear(self) -> bool:
-        """True if it is beyond doubt."""
-        return self.gain >= CLEAR
-
 
 def curve_of(samples: Samples, spec: RobotSpec, place: int) -> Candidate | None:
     """Returns the best curve of the command at a place; None if a straight line does as well."""

@@ -16,7 +16,7 @@ from nics_drl_bridge.identify import motion as motions
 from nics_drl_bridge.identify.assume import assume_textbook
 from nics_drl_bridge.identify.calibration import Calibration, Response, align
 from nics_drl_bridge.identify.drive import Drive, Settings
-from nics_drl_bridge.identify.forms import curve_of, likely_delay, reached
+from nics_drl_bridge.identify.forms import CLEAR, curve_of, likely_delay, reached
 from nics_drl_bridge.identify.judgement import bands_of, judged, shortfall
 from nics_drl_bridge.identify.mounting import Mounting, mounted, mounting_of
 from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
@@ -175,7 +175,7 @@ def inputs(drive: Drive, findings: Findings) -> Findings:
     samples, places = aligned(training, findings), range(len(drive.spec.command))
     curves = [c for place in places if (c := curve_of(samples, drive.spec, place)) is not None]
     calibration = replace(findings.calibration, inputs=tuple(c.curve for c in curves))
-    clear = tuple(c.curve for c in curves if c.is_clear)
+    clear = tuple(c.curve for c in curves if c.gain >= CLEAR)
     findings = replace(findings, calibration=calibration, clear=clear)
     return _with_delay(findings, aligned(training, findings))
 

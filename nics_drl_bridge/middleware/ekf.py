@@ -136,7 +136,8 @@ class Estimator:
         """
         needed_ns = self.time_ns if needed_ns is None else needed_ns
         self._foreseen = None
-        needed_ns -= self._motion.longest_delay_ns
+        # By the longest delay of a command after the common latency.
+        needed_ns -= int(self._motion.terms.late.max(initial=0)) * self._motion.step_ns
         given = np.asarray(command, np.float64), self._least, self._most, needed_ns
         log = Log(*kernels.logged(self._log, self.effective_ns(stamp_ns), *given))
         self._log = log if len(log.effective) else self._log

@@ -52,11 +52,6 @@ class MotionModel(NamedTuple):
     step_ns: int  # the model's step [ns]
     longest_ns: int  # longest gap that is predicted [ns]
 
-    @property
-    def longest_delay_ns(self) -> int:
-        """Longest delay of a command after the common latency [ns]."""
-        return int(self.terms.late.max(initial=0)) * self.step_ns
-
 
 class Log(NamedTuple):
     """Commands in the order in which they take effect; the first is in effect before, too."""

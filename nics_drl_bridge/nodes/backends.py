@@ -155,7 +155,7 @@ class DdsBackend:
             kind = LaserScan if topic == SCAN else Odometry
             if topic in self._sensors:
                 kind = sensor_type(self._sensors[topic])
-            put = partial(_put, self._mail, topic)
+            put = partial(self._mail.put, topic)
             self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
         self._episodes: EpisodeServices | StandardEpisodes
         if simulator == STANDARD.name:
@@ -262,10 +262,6 @@ def _read(topic: str, read: Callable[[bytes], T], message: bytes) -> T:
     except wire.UNREADABLE as error:
         reason = f"a message can't be read ({error}); look at who publishes it."
         raise BackendError(f"topic {topic!r}: {reason}") from None
-
-
-def _put(mail: _Mailbox, topic: str, message: bytes) -> object:
-    return mail.put(topic, message)
 
 
 class FleetBackend:

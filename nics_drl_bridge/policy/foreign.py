@@ -29,18 +29,14 @@ class Order:
     sha256: str  # of the network's files
 
 
-def load_foreign(path: str | Path, model: SimulatorModel | None = None) -> policy_file.PolicyFile:
-    """Opens a foreign policy by its mapping, for a robot; None: the one that the mapping names.
-
-    Raises ConfigError for a wrong mapping, PolicyError for what does not fit together.
-    """
-    return policy_file.policy_of(_content(_ordered(Path(path), model), model), Path(path))
-
-
 def load_any(path: str | Path, model: SimulatorModel | None = None) -> policy_file.PolicyFile:
-    """Loads a policy file, see `load_policy`, or makes one of the YAML file of a foreign policy."""
+    """Loads a policy file, see `load_policy`, or makes one of the YAML file of a foreign policy.
+
+    That is for a robot; None: the one that the mapping names. Raises ConfigError for a wrong
+    mapping, PolicyError for what does not fit together.
+    """
     if str(path).endswith(MAPPINGS):
-        return load_foreign(Path(path), model)
+        return policy_file.policy_of(_content(_ordered(Path(path), model), model), Path(path))
     return policy_file.load_policy(path)
 
 

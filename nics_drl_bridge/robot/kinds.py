@@ -136,7 +136,7 @@ def textbook(spec: RobotSpec) -> Textbook:
     book = actuated(spec)
     if spec.state and all(v.twist is not None for v in spec.state):
         return _through_lags(spec, book)
-    if not spec.state and not _made(spec, lambda kind: kind.template.has_state):
+    if not spec.state and not _made(spec, lambda kind: kind.template.moves or kind.template.state):
         return replace(book, lag=np.full(len(book.lag), AT_ONCE_S))
     if len(spec.state) != len(book.lag):
         have = ", ".join(v.name for v in spec.state) or "none"

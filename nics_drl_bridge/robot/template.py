@@ -65,11 +65,6 @@ class Template:
     # its commands by words that others have for them, from which `nics inspect` guesses the kind
     words: Mapping[str, str] = field(default_factory=dict)
 
-    @property
-    def has_state(self) -> bool:
-        """True if the motion does not follow the commands at once."""
-        return bool(self.moves or self.state)
-
     def filled(self, given: Given, ranges: Ranges) -> dict[str, Any]:
         """Returns a robot's whole file; ConfigError if the names of its commands do not fit."""
         kind = given["kind"]

@@ -140,7 +140,7 @@ class Entities:
         """Returns vx, vy [m/s], wz [rad/s] (3,) of an entity along the axes of `map`."""
         if entity.robot >= 0:
             sensed = self.device.sensed(entity.robot)
-            body = textbook_twist(self.simulator, sensed.state)
+            body = textbook(self.simulator.model.robot).twist(sensed.state)
             return np.array([*geometry.rotate(body[:2], sensed.pose[2]), body[2]])
         if entity.motion is None:
             return np.zeros(3)
@@ -293,12 +293,6 @@ class Entities:
         new.put_bodies(table)
         self._spare, self._table = list(spare), table
         self.device.exchange(new, np.array(robots, np.int64))
-
-
-def textbook_twist(simulator: FastSimulator, state: Array) -> Array:
-    """Returns the body twist (3,) of a robot whose state is (S,)."""
-    twist: Array = np.asarray(textbook(simulator.model.robot).twist(state))
-    return twist
 
 
 def hull_of(shape: Shape) -> Array:

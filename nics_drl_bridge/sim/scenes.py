@@ -104,7 +104,8 @@ class SceneSampler:
         self.motions: tuple[Motion | None, ...] = tuple(world.obstacles[g].motion for g in slots)
         self.plan = _plan(world, footprint_radius, slots, known)
         # Greatest number of cells, obstacles and corners; threads draw with a scratch memory each.
-        self.room = _room_for(self.plan)
+        corners = max(int(np.diff(self.plan.outlines.first).max()), 4)
+        self.room = self.plan.space.area.size, len(self.plan.group), corners
         self.scratches: list[SceneScratch] = []
 
     @cached_property
@@ -301,10 +302,6 @@ def _places(places: Starts | Goals | None) -> Array:
     shares = sizes if sizes.all() else np.ones(len(rows))
     rows[:, kernels.SHARE] = np.cumsum(shares) / shares.sum()
     return rows
-
-
-def _room_for(plan: ScenePlan) -> tuple[int, ...]:
-    return plan.space.area.size, len(plan.group), max(int(np.diff(plan.outlines.first).max()), 4)
 
 
 def _scratch(cells: int, count: int, corners: int) -> SceneScratch:

@@ -116,10 +116,6 @@ def _axis(pose: Array) -> int | None:
     return int(np.argmax(upright)) if upright.any() else None
 
 
-def _lies(pose: Array) -> bool:
-    return abs(float(pose[2, 2])) < math.sin(TILT)
-
-
 def _turn(pose: Array, axis: int) -> float:
     return math.atan2(pose[1, axis], pose[0, axis])
 
@@ -144,7 +140,7 @@ def _of_sphere(sphere: Sphere, pose: Array, up: float) -> _Cut:
 def _of_cylinder(body: Cylinder, pose: Array, up: float) -> _Cut:
     if _axis(pose) == 2:
         return _disc(pose, body.radius**2) if abs(up) < body.length / 2.0 else None
-    if not _lies(pose):
+    if abs(pose[2, 2]) >= math.sin(TILT):
         raise ShapelessError("a cylinder that leans")
     width2 = body.radius**2 - up**2
     if width2 <= 0.0:

@@ -298,7 +298,7 @@ class FastSimulator:
                 self.sense(of_part)
         if self.sampler.count < allocation.STANDING:
             return scenes
-        return Scenes(self._obstacles(chosen), scenes.starts, scenes.goals, scenes.member)
+        return Scenes(self.obstacles_of(chosen), scenes.starts, scenes.goals, scenes.member)
 
     def scenes(self, seeds: ArrayLike) -> Scenes:
         """Returns the scenes that `reset` would begin with for seeds (n,)."""
@@ -307,14 +307,10 @@ class FastSimulator:
     @property
     def obstacles(self) -> Array:
         """(N, K, 7) the obstacles at their present poses, in the format of `scenes`."""
-        return self._obstacles(np.arange(len(self.data.steps)))
+        return self.obstacles_of(np.arange(len(self.data.steps)))
 
-    def obstacles_of(self, n: int) -> Array:
-        """(K, 7) those of world n."""
-        of_one: Array = self._obstacles(np.array([n]))[0]
-        return of_one
-
-    def _obstacles(self, worlds: Indices) -> Array:
+    def obstacles_of(self, worlds: Indices) -> Array:
+        """(n, K, 7) those of some worlds (n,)."""
         bodies = self.data.bodies[worlds, : self.sampler.count]
         index = np.zeros(int(self._in_table.max()) + 1)
         index[self._in_table[:-1]] = np.arange(len(self.sampler.shapes))
