@@ -9,7 +9,6 @@ from typer import Argument, Option
 
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.files import json_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 EXIT_FINDINGS = 1
@@ -50,15 +49,12 @@ def doctor(
         with console.progress_bar(f"listening for {duration:g} s"):
             facts = listen(duration, namespace)
     findings = examine(facts, expected)
-    if as_json:
-        plain = {"source": facts.source, "findings": [asdict(each) for each in findings]}
-        typer.echo(json_of(plain))
-    elif findings:
+    told = f"{facts.source}: all fits {policy or model or DEFAULT_ROBOT}."
+    if findings:
         heads = ("", "check", "where", "what does not fit", "what to do")
         rows = [(f.severity, f.check, f.where, f.what, f.fix) for f in findings]
-        typer.echo(console.table(heads, rows))
-    else:
-        typer.echo(f"{facts.source}: all fits {policy or model or DEFAULT_ROBOT}.")
+        told = console.table(heads, rows)
+    console.say(as_json, told, source=facts.source, findings=list(map(asdict, findings)))
     if findings:
         raise typer.Exit(EXIT_FINDINGS)
 
@@ -67,12 +63,9 @@ def _tell_installation(as_json: bool) -> None:
     from nics_drl_bridge.commands.installation import checks
 
     found = checks()
-    if as_json:
-        typer.echo(json_of({"checks": [each._asdict() for each in found]}))
-        return
     heads = ("", "part", "what there is", "what to do")
     rows = [("+" if c.works else "-", c.part, c.found, "" if c.works else c.fix) for c in found]
-    typer.echo(console.table(heads, rows))
+    console.say(as_json, console.table(heads, rows), checks=[each._asdict() for each in found])
 
 
 def explain(
@@ -83,9 +76,7 @@ def explain(
     from nics_drl_bridge.gate import black_box
 
     again = black_box.replay(file)
-    if as_json:
-        typer.echo(json_of({"story": list(again.story), "differing": again.differing}))
-    else:
-        typer.echo("\n".join(again.story))
+    story = list(again.story)
+    console.say(as_json, "\n".join(story), story=story, differing=again.differing)
     if again.differing:
         raise typer.Exit(EXIT_FINDINGS)

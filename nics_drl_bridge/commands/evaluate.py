@@ -136,12 +136,9 @@ def _shadow(
         left_out = ", ".join(f"{count} {why}" for why, count in made.skipped.items() if count)
         anew = f"; its state began anew after {made.resets} gaps" if made.resets else ""
         lines.append(f"{compared}; left out: {left_out or 'none'}{anew}")
-    if as_json:
-        typer.echo(json_of({"policies": told}))
-        return
     heads = (
         "policy", "command", "unit", "mean", "mean size", *(f"{q} %" for q in PERCENTILES),
         "greatest", "opposite sign",
     )  # fmt: skip
     lines = [console.table(heads, rows), *lines, f"pictures and shadow_*.json: {out}"]
-    typer.echo("\n".join(lines))
+    console.say(as_json, "\n".join(lines), policies=told)

@@ -4,12 +4,10 @@ from collections.abc import Callable
 from enum import Enum
 from typing import Annotated, Any
 
-import typer
 from typer import Argument
 
-from nics_drl_bridge.commands.console import JsonOption, table
+from nics_drl_bridge.commands.console import JsonOption, say, table
 from nics_drl_bridge.config import shipped_names
-from nics_drl_bridge.files import json_of
 
 Row = dict[str, Any]
 
@@ -28,11 +26,8 @@ def list_(
 ) -> None:
     """Lists the robots, worlds, lidars or policies that are shipped."""
     rows = ROWS[what]()
-    if as_json:
-        typer.echo(json_of({what.value: rows}))
-    else:
-        cells = [tuple(map(str, row.values())) for row in rows]
-        typer.echo(table(tuple(rows[0]), cells))
+    cells = [tuple(map(str, row.values())) for row in rows]
+    say(as_json, table(tuple(rows[0]), cells), **{what.value: rows})
 
 
 def robots() -> list[Row]:

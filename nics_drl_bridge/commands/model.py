@@ -166,10 +166,6 @@ def import_(
         drive = read_recording(source, mapping=mapping)
         save_recording(drive, out)
     streams = stream_facts(drive)
-    if as_json:
-        told = {"recording": str(out), "streams": streams, "repairs": drive.repairs}
-        typer.echo(json_of(told | {"robot": drive.robot}))
-        return
     rows = [
         (
             s["stream"], f"{s['rows']}", f"{s['rate_hz']:.1f} Hz",
@@ -177,9 +173,10 @@ def import_(
         )
         for s in streams
     ]  # fmt: skip
-    typer.echo(console.table(("stream", "rows", "rate", "time", "clock"), rows))
-    for line in (*drive.repairs, f"recording written to {out}"):
-        typer.echo(line)
+    table = console.table(("stream", "rows", "rate", "time", "clock"), rows)
+    text = "\n".join((table, *drive.repairs, f"recording written to {out}"))
+    facts = {"streams": streams, "repairs": drive.repairs, "robot": drive.robot}
+    console.say(as_json, text, recording=str(out), **facts)
 
 
 def stream_facts(drive: "Recording") -> list[dict[str, Any]]:

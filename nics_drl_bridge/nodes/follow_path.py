@@ -24,6 +24,7 @@ from nics_drl_bridge.nodes.nav2_parameters import ControllerParameters, chosen
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
 from nics_drl_bridge.policy.follow import GoalChecker, Place, PlannedPath, ProgressChecker
 from nics_drl_bridge.policy.route import route
+from nics_drl_bridge.recording.messages import pose_row
 
 FOLLOW, NAVIGATE = "follow_path", "navigate_to_pose"
 KINDS = {FOLLOW: "nav2_msgs/action/FollowPath", NAVIGATE: "nav2_msgs/action/NavigateToPose"}
@@ -205,7 +206,7 @@ class PathActions:
                 code = "INVALID_CONTROLLER" if what == "controller" else "UNKNOWN"
                 raise Refusal(code, f"{FOLLOW}: {wrong}")
             names.append(name)
-        poses = np.array([_pose_of(each.pose) for each in asked.path.poses]).reshape(-1, 3)
+        poses = np.array([pose_row(each) for each in asked.path.poses]).reshape(-1, 3)
         headers = [asked.path.header, *(each.header for each in asked.path.poses[:1])]
         frame = next((each.frame_id for each in headers if each.frame_id), "")
         return self._begin(goal, frame, poses, names[1:3])
@@ -216,7 +217,7 @@ class PathActions:
             fix = "leave it empty, or let Nav2 serve the action"
             reason = f"there are no behaviour trees here, as {asked.behavior_tree!r}; {fix}."
             raise Refusal("FAILED_TO_LOAD_BEHAVIOR_TREE", f"{NAVIGATE}: {reason}")
-        end = _pose_of(asked.pose.pose)[None]
+        end = np.array([pose_row(asked.pose)])
         frame, end = self._placed(goal, asked.pose.header.frame_id, end)
         self._planned(goal, end)
         try:
@@ -394,9 +395,3 @@ class PathActions:
             told = "goal reached" if end == held.SUCCEED else "goal cancelled"
             self._node.get_logger().info(told)
         goal.server.finish(goal.handle, end, held.result_of(goal.kind, code, sentence))
-
-
-def _pose_of(pose: Any) -> Array:
-    turn = pose.orientation
-    heading = conversions.heading_of(turn.x, turn.y, turn.z, turn.w)
-    return np.array([pose.position.x, pose.position.y, heading])

@@ -13,6 +13,7 @@ from rclpy.node import Node
 from nics_drl_bridge import geometry
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.recording import messages
 
 QUIET_S = 2.0  # so long after another's transform, ours is published again
 KEPT = 100  # own transforms that are known again when they are heard
@@ -30,10 +31,7 @@ def transform_to_ros(parent: str, child: str, pose: ArrayLike, stamp: Any) -> Tr
 
 def transform_from_ros(message: TransformStamped) -> tuple[str, str, Array]:
     """Returns parent and child of a transform, without slashes, and the child's pose (3,) there."""
-    place, turn = message.transform.translation, message.transform.rotation
-    heading = conversions.heading_of(turn.x, turn.y, turn.z, turn.w)
-    parent, child = message.header.frame_id.strip("/"), message.child_frame_id.strip("/")
-    return parent, child, np.array([place.x, place.y, heading])
+    return *messages.frames(message), np.array(messages.pose_row(message))
 
 
 def odom_in_map(in_map: ArrayLike, in_odom: ArrayLike) -> Array:
@@ -78,8 +76,7 @@ class MapToOdom:
 
     def _take(self, message: Any) -> None:
         for each in message.transforms:
-            frames = each.header.frame_id.strip("/"), each.child_frame_id.strip("/")
-            if frames != self._frames or each in self._own:
+            if messages.frames(each) != self._frames or each in self._own:
                 continue
             if time.monotonic() - self._heard_s > QUIET_S:
                 told = f"another node publishes {' -> '.join(self._frames)}, so this one does not"

@@ -26,7 +26,9 @@ def start(node: str, args: list[str] | None = None) -> None:
     if sentence := usage.wrong_with(node, words):
         sys.stderr.write(f"{sentence}\n")
         ending.leave(EXIT_BAD_INPUT)
-    say_first(node)
+    # As the log of ROS 2 would say it, which is there seconds later.
+    sys.stderr.write(f"[INFO] [{time.time():.9f}] [{node}]: starting\n")
+    sys.stderr.flush()
     code: Any = 0
     try:
         ending.own_process()
@@ -39,12 +41,6 @@ def start(node: str, args: list[str] | None = None) -> None:
         traceback.print_exc()
         code = 1
     ending.leave(code if isinstance(code, int) else 0 if code is None else 1)
-
-
-def say_first(node: str) -> None:
-    """Says that a node starts, as the log of ROS 2 would, which is there seconds later."""
-    sys.stderr.write(f"[INFO] [{time.time():.9f}] [{node}]: starting\n")
-    sys.stderr.flush()
 
 
 def _main_of(node: str) -> Any:

@@ -10,7 +10,6 @@ from typer import Argument, Option
 
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands.console import SalvageOption, intact, needs_ros
-from nics_drl_bridge.files import json_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 bag = typer.Typer(help="Records, describes, replays, exports and saves bags.", no_args_is_help=True)
@@ -55,13 +54,11 @@ def info(
 
     with intact(path, salvage) as whole:
         told = bag_info(whole)
-    if as_json:
-        typer.echo(json_of(asdict(told) | {"path": str(path)}))
-        return
     span, size = f"{told.duration_s:.3f} s", f"{told.size_bytes / 1e6:.2f} MB"
-    typer.echo(f"{path}: {told.messages} messages in {span}, {size}")
+    line = f"{path}: {told.messages} messages in {span}, {size}"
     heads = ("topic", "type", "count", "Hz", "from, to [s]", "gaps", "clock", "delay [ms]")
-    typer.echo(console.table(heads, [_row(each) for each in told.topics]))
+    table = console.table(heads, [_row(each) for each in told.topics])
+    console.say(as_json, f"{line}\n{table}", **asdict(told) | {"path": str(path)})
 
 
 @bag.command()

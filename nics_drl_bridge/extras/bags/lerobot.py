@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.extras.bags.frames import BagFrames, Feature
-from nics_drl_bridge.files import check_folder, whole_folder
+from nics_drl_bridge.files import check_folder, whole_folder, write_text
 
 if TYPE_CHECKING:
     from pyarrow import Table
@@ -46,6 +46,8 @@ def write_dataset(
     which it did, or None where that is not known.
     """
     check_output(folder)
+    import pyarrow
+
     columns = _columns(frames, succeeded)
     ends = np.cumsum(frames.lengths)
     files = _files(frames)
@@ -59,10 +61,10 @@ def write_dataset(
             begin, end = ends[inside[0]] - frames.lengths[inside[0]], ends[inside[-1]]
             some = {name: column[begin:end] for name, column in columns.items()}
             _write(_table(some), root / _numbered(DATA, number))
-        _write_rows(rows, root / _numbered(EPISODES, 0))
+        _write(pyarrow.Table.from_pylist(rows), root / _numbered(EPISODES, 0))
         _write(_tasks(task), root / TASKS)
-        _write_json(_info(frames, columns, robot), root / INFO)
-        _write_json(_stats(columns), root / STATS)
+        for name, told in ((INFO, _info(frames, columns, robot)), (STATS, _stats(columns))):
+            write_text(root / name, json.dumps(told, indent=4) + "\n")
 
 
 def _columns(frames: BagFrames, succeeded: Collection[int] | None) -> Columns:
@@ -126,12 +128,9 @@ def _episode_row(
     }  # fmt: skip
     told |= {f"data/{key}": value for key, value in _place(file).items()}
     told |= {f"meta/episodes/{key}": value for key, value in _place(0).items()}
-    return told | dict(_flat(stats))
-
-
-def _flat(stats: Mapping[str, Mapping[str, Any]]) -> Iterator[tuple[str, Any]]:
-    for name, told in stats.items():
-        yield from ((f"stats/{name}/{key}", values) for key, values in told.items())
+    for name, each in stats.items():
+        told |= {f"stats/{name}/{key}": values for key, values in each.items()}
+    return told
 
 
 def _info(frames: BagFrames, columns: Columns, robot: str | None) -> dict[str, Any]:
@@ -181,19 +180,8 @@ def _tasks(task: str) -> Table:
     return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
 
 
-def _write_rows(rows: list[dict[str, Any]], path: Path) -> None:
-    import pyarrow
-
-    _write(pyarrow.Table.from_pylist(rows), path)
-
-
 def _write(table: Table, path: Path) -> None:
     from pyarrow import parquet
 
     path.parent.mkdir(parents=True, exist_ok=True)
     parquet.write_table(table, path)
-
-
-def _write_json(told: Mapping[str, Any], path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(told, indent=4) + "\n", encoding="utf-8")
