@@ -19,9 +19,8 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy import onnx_graph
 from nics_drl_bridge.policy.foreign_graph import Network
 from nics_drl_bridge.policy.foreign_mapping import ForeignState
-from nics_drl_bridge.policy.leapp import BEAMS, SECTORS, restored
+from nics_drl_bridge.policy.leapp import BEAMS, SECTORS, Data, restored
 
-Data = dict[str, Any]
 ZERO = "constant"  # of what a robot in the plane does not have
 LINEAR = {"x": "velocity.forward", "y": "velocity.left", "z": ZERO}
 ANGULAR = {"x": ZERO, "y": ZERO, "z": "velocity.turn"}

@@ -16,14 +16,13 @@ from nics_drl_bridge.lidar.sectors import plan_of
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.policy import contract as contracts
 from nics_drl_bridge.policy import onnx_graph
-from nics_drl_bridge.policy.contract import Contract, leaves
+from nics_drl_bridge.policy.contract import Contract, Rows, leaves
 from nics_drl_bridge.robot.spec import RobotSpec
 
 GOLDEN_TOLERANCE = 1e-5
 PERIOD_TOLERANCE = 1e-9
 ROBOT = {"command", "footprint", "footprint_radius"}
 LIDAR = {"beams", "angle_min", "angle_max", "range_max", "mount"}
-Rows = NDArray[np.float32]
 
 
 class PolicyFile:

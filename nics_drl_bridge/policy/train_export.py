@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.files import write_bytes
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.policy.contract import GOLDEN, SUFFIX, contract_of, golden_observations
+from nics_drl_bridge.policy.contract import GOLDEN, SUFFIX, Rows, contract_of, golden_observations
 
 with extensions.needed_by("the export of a policy"):
     import onnx
@@ -23,7 +23,6 @@ with extensions.needed_by("the export of a policy"):
     from nics_drl_bridge.policy import onnx_graph, policy_file
     from nics_drl_bridge.policy.train_memory import Memory
 
-Rows = NDArray[np.float32]
 Normaliser = tuple[ArrayLike, ArrayLike, float]
 OPSET = 17
 

@@ -23,12 +23,11 @@ from nics_drl_bridge.sim import scene_kernels as kernels
 from nics_drl_bridge.sim.obstacles import Motion
 from nics_drl_bridge.sim.packing_kernels import pack
 from nics_drl_bridge.sim.scene_kernels import FreeSpace, ScenePlan, SceneScratch
-from nics_drl_bridge.sim.state import NO_FIELD, MapField
+from nics_drl_bridge.sim.state import NO_FIELD, Integers, MapField
 from nics_drl_bridge.sim.world import Goals, Starts, World, check_places
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 __all__ = ["Scene", "SceneSampler", "Scenes", "SetSampler", "sample_scene", "scaled"]
-Integers = NDArray[np.int64]
 CELL = 0.1  # Side of cells without a map [m]; larger in large fields, smaller in small ones
 FEWEST_CELLS = 20
 MOST_CELLS = 4_000_000
