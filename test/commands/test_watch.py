@@ -15,6 +15,7 @@ from browser import until
 from command_line import nics
 from watch.rig import Client, source
 
+from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands import episodes as driving
 from nics_drl_bridge.commands import watch as module
 
@@ -47,7 +48,7 @@ def test_a_page_without_its_library_is_refused_before_a_robot_is_opened(monkeypa
     monkeypatch.setattr(module.extensions, "lacking", lambda names: next(iter(names)))
     monkeypatch.setattr(module, "_episodes", lambda *given: pytest.fail("a robot was opened"))
     with pytest.raises(typer.Exit):
-        module.watch("straight")
+        console.checked(module.watch)(policy="straight")
     assert "pip install 'nics_drl_bridge[view]'" in capsys.readouterr().err
 
 
