@@ -41,8 +41,7 @@ def watch(
     browser: Annotated[bool, Option(help="Open the page in a browser.")] = True,
 ) -> None:  # fmt: skip
     """Shows a policy, live topics or a bag on a page in the browser."""
-    given = {"lidar": lidar, "randomisation": randomisation, "gate": gate}
-    given["task"] = task
+    given = {"lidar": lidar, "randomisation": randomisation, "gate": gate, "task": task}
     if record is None:  # before the source is opened, which may take a while
         extensions.require("the page", "websockets")
     else:

@@ -149,11 +149,13 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         else:
             self._episode += 1
         episode = int(episode_seed(self._seed, self._episode))
-        self.scene = self._scene_of(episode)
+        radius, draw = self.model.robot.footprint_radius, self._backend.facts().get("scenes")
+        one = self.world, radius, episode, self.robots
+        self.scene = draw([episode])[0] if draw else sample_scene(*one)
         starts = np.array(self.scene.starts)
         if options and "start" in options:
             give(starts[None], "start", options["start"])
-            around = [self.scene], self.world, self.model.robot.footprint_radius
+            around = [self.scene], self.world, radius
             guard.check_places("start", starts[None], *around)
         episodes = Episodes(np.array([episode]), starts[None], self.scene.goals[None])
         if not self._rehearsed:
@@ -183,11 +185,6 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         memory = self.task.reset(episodes)
         self.task.step_into(np.empty(self._shape, np.float32), view, view, memory)
         self._rehearsed = True
-
-    def _scene_of(self, episode: int) -> Scene:
-        if draw := self._backend.facts().get("scenes"):
-            return draw([episode])[0]  # type: ignore[no-any-return]
-        return sample_scene(self.world, self.model.robot.footprint_radius, episode, self.robots)
 
     @halts_on_error
     def step(

@@ -35,17 +35,14 @@ def fields_of(message: Any, path: str = "") -> Iterator[str]:
         for k in range(len(message) if len(message) <= LONGEST_ARRAY else 0):
             yield from fields_of(message[k], f"{path}[{k}]")
     else:
-        labels = getattr(message, NAMES, None)
+        labels: Any = getattr(message, NAMES, None)
         for name in (each for each in vars(message) if not each.startswith("__")):
             inner, where = getattr(message, name), f"{path}.{name}".lstrip(".")
-            if isinstance(labels, list) and name != NAMES and _is_array(inner, len(labels)):
+            listed = isinstance(labels, list) and isinstance(inner, (list, np.ndarray))
+            if listed and name != NAMES and len(inner) == len(labels) > 0:
                 yield from (f"{where}[{label}]" for label in labels)
             else:
                 yield from fields_of(inner, where)
-
-
-def _is_array(value: Any, length: int) -> bool:
-    return isinstance(value, (list, np.ndarray)) and len(value) == length > 0
 
 
 def reader_of_field(path: str) -> Callable[[Any], Any]:

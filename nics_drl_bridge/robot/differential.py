@@ -13,13 +13,13 @@ from nics_drl_bridge.robot.template import LAGS, TWIST, WHEELS, Template, names_
 MOVES, LENGTHS = ("vx", "wz"), {"track": 1.4, "wheel_radius": 0.3}
 
 
-def kinematics(spec: RobotSpec) -> Textbook:
-    """The mean of the wheels drives, their difference over the track turns."""
+def kinematics(spec: RobotSpec, slip: float = 1.0) -> Textbook:
+    """The mean of the wheels drives, their difference over the track turns, by a factor `slip`."""
     p = spec.parameters
     inverse = np.array([[1, -p["track"] / 2], [1, p["track"] / 2]]) / p["wheel_radius"]
     forward = np.zeros((3, 2))
     forward[[0, 2]] = np.linalg.inv(inverse)
-    return wheeled(spec, inverse, forward, ("vx", "wz"), names_of(WHEELS))
+    return wheeled(spec, inverse, forward, ("vx", "wz"), names_of(WHEELS), slip)
 
 
 def drawing(spec: RobotSpec) -> Drawing:

@@ -6,11 +6,10 @@ which its drive makes wheel speeds of a turn rate (Mandow et al. 2007). Its four
 `half_length` and `half_width` [m] from `base_link`, half a track if they are not given.
 """
 
-import numpy as np
-
-from nics_drl_bridge.robot.kinds import Drawing, RobotKind, Textbook, Wheel, places_of_four, wheeled
+from nics_drl_bridge.robot import differential
+from nics_drl_bridge.robot.kinds import Drawing, RobotKind, Textbook, Wheel, places_of_four
 from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec
-from nics_drl_bridge.robot.template import LAGS, TWIST, WHEELS, Template, names_of
+from nics_drl_bridge.robot.template import LAGS, TWIST, WHEELS, Template
 
 TEMPLATE = Template(
     commands=(TWIST, WHEELS), moves=POSE_RATES, parameters=LAGS,
@@ -20,12 +19,8 @@ TEMPLATE = Template(
 
 def kinematics(spec: RobotSpec) -> Textbook:
     """A differential robot's kinematics, of which the effective track takes a share."""
-    p = spec.parameters
-    inverse = np.array([[1, -p["track"] / 2], [1, p["track"] / 2]]) / p["wheel_radius"]
-    forward = np.zeros((3, 2))
-    forward[[0, 2]] = np.linalg.inv(inverse)
-    slip = p["track"] / p["effective_track"]
-    return wheeled(spec, inverse, forward, ("vx", "wz"), names_of(WHEELS), slip)
+    slip = spec.parameters["track"] / spec.parameters["effective_track"]
+    return differential.kinematics(spec, slip)
 
 
 def drawing(spec: RobotSpec) -> Drawing:
