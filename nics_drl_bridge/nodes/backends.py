@@ -28,7 +28,11 @@ from nics_drl_bridge.nodes.link import EpisodeServices, Link
 from nics_drl_bridge.nodes.parameters import STANDARD
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.nodes.robot_topics import data_facts
-from nics_drl_bridge.nodes.simulation_interfaces.client import StandardEpisodes, StandardOptions
+from nics_drl_bridge.nodes.simulation_interfaces.client import (
+    TOLERANCE,
+    StandardEpisodes,
+    StandardOptions,
+)
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 from nics_drl_bridge.sim.simulator import EpisodeSampler
 from nics_drl_bridge.sim.world_set import AnyWorld
@@ -144,7 +148,9 @@ class DdsBackend:
         # No reference to the backend, which may be garbage.
         take = partial(_take_odometry, self._middleware)
         options = validate(dict(standard or {}), StandardOptions, "standard")
-        self._slack_ns = round(options.slack_s * NS_PER_S)
+        standards = simulator == STANDARD.name  # whose steps may be of a rounded length
+        self._grain_ns = round(TOLERANCE * self._period_ns) if standards else 0
+        self._slack_ns = max(round(options.slack_s * NS_PER_S), self._grain_ns)
         self._now_ns, self._mail = 0, _Mailbox(self._topics, take, self._slack_ns)
         self._known: BackendFacts = {}
         if randomisation is not None:
@@ -158,7 +164,7 @@ class DdsBackend:
             put = partial(self._mail.put, topic)
             self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
         self._episodes: EpisodeServices | StandardEpisodes
-        if simulator == STANDARD.name:
+        if standards:
             self._episodes = StandardEpisodes(self._link, model, world, options, self._mail)
         else:
             self._episodes = EpisodeServices(self._link, simulator, model, world, randomisation)
@@ -209,7 +215,7 @@ class DdsBackend:
     def _check_stamps(self) -> None:
         for topic in self._topics:
             off_ns = self._mail.stamp_ns(topic) - self._now_ns
-            if not -self._slack_ns <= off_ns <= 0:
+            if not -self._slack_ns <= off_ns <= self._grain_ns:
                 self._link.check_alone()
                 off = f"stamped {off_ns / NS_PER_S:+.3f} s off the step"
                 fix = "start the simulator with mode:=lockstep, and move it from here alone."
@@ -218,9 +224,10 @@ class DdsBackend:
     @halts_on_error
     def receive(self) -> tuple[RobotView, dict[str, Any]]:
         """The second half: waits for the data after the command; returns the view and `info`."""
-        now = self._now_ns
-        mail = self._await(now)
+        mail = self._await(self._now_ns)
         self._check_stamps()
+        off_ns = self._mail.stamp_ns(ODOM) - self._now_ns
+        now = self._now_ns = self._now_ns + (off_ns if abs(off_ns) <= self._grain_ns else 0)
         ranges = from_device(_read(SCAN, wire.ranges_of, mail[SCAN].content), self._lidar)
         self._middleware.scan(now, mail[SCAN].arrival_ns, ranges)
         for name, sensor in self._sensors.items():

@@ -52,6 +52,16 @@ def heading_of(x: float, y: float, z: float, w: float) -> float:
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
+def turned_to(stood: geometry.Quaternion, heading: float) -> geometry.Quaternion:
+    """Returns an orientation turned about the vertical to a heading [rad]; it stays tilted."""
+    x, y, z, w = stood.x, stood.y, stood.z, stood.w
+    if not (x or y):
+        return heading_to_ros(heading)
+    turn = heading_to_ros(heading - heading_of(x, y, z, w))
+    s, c = turn.z, turn.w
+    return geometry.Quaternion(x=c * x - s * y, y=c * y + s * x, z=c * z + s * w, w=c * w - s * z)
+
+
 def twist_to_ros(twist: ArrayLike) -> geometry.Twist:
     """Returns linear.x, linear.y, angular.z (3,) as a Twist."""
     message = geometry.Twist()

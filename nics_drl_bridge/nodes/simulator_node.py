@@ -260,8 +260,8 @@ class DeviceNode(qos.QosWatch):
         self.now_ns = self._first_ns
         self._open_topics()
         self._start_time()
+        self.standard = open_services(self)  # its entities are those of the first episode, too
         self.begin()
-        self.standard = open_services(self)
 
     def use_world(self, world: AnyWorld) -> None:
         """Simulates a world with the robots that it was started with; `begin` an episode next."""

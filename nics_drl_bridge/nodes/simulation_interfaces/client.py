@@ -6,7 +6,7 @@ import time
 from importlib import import_module
 from typing import Any
 
-from geometry_msgs.msg import Pose
+from geometry_msgs.msg import Point, Pose
 from pydantic import Field, PositiveFloat
 from rosgraph_msgs.msg import Clock
 
@@ -30,7 +30,7 @@ NEEDED = {
     "SIMULATION_RESET": "ResetSimulation", "STEP_SIMULATION_SINGLE": "StepSimulation",
     "ENTITY_STATE_SETTING": "SetEntityState", "ENTITY_STATE_GETTING": "GetEntityState",
 }  # fmt: skip
-TOLERANCE = 1e-3  # of a control period, as a share of a step
+TOLERANCE = 1e-3  # of a control period, as a share of a step; and of stamps, of a period
 
 
 class StandardOptions(Schema):
@@ -77,6 +77,7 @@ class StandardEpisodes:
         self._entities = self._client("GetEntities")
         self.clients = [self._features]  # the one that all simulators have
         self._known: frozenset[int] = frozenset()
+        self._stood: dict[str, Pose] = {}  # of entities after a reset: heights and tilts are kept
         self._steps, self._period_ns = 0, round(model.control_period * NS_PER_S)
         self._pending: list[Any] = []
         self._clock: list[Any] = []
@@ -182,10 +183,13 @@ class StandardEpisodes:
                 self._put(f"{OBSTACLE}{k}", body[:3], timeout_s)
 
     def _put(self, entity: str, pose: Array, timeout_s: float) -> None:
-        placed, state = Pose(), self._messages.EntityState()
-        placed.position.x, placed.position.y = float(pose[0]), float(pose[1])
-        placed.orientation = conversions.heading_to_ros(float(pose[2]))
-        state.pose = placed
+        if entity not in self._stood:
+            found = self._call("GetEntityState", timeout_s, entity=entity)
+            self._stood[entity] = found.state.pose
+        state, stood = self._messages.EntityState(), self._stood[entity]
+        x, y, heading = map(float, pose)
+        state.pose.position = Point(x=x, y=y, z=stood.position.z)
+        state.pose.orientation = conversions.turned_to(stood.orientation, heading)
         flags = {"set_pose": True, "set_twist": not entity.startswith(OBSTACLE)}
         self._call("SetEntityState", timeout_s, entity=entity, state=state, **flags)
 

@@ -176,7 +176,11 @@ class Simulation:
             self._reset_all()
             return
         if scope & SCOPES.SCOPE_SPAWNED:
-            self.remove(*self.entities.spawned)
+            spawned = self.entities.spawned
+            if all(each.name in spawned for each in self.entities if each.robot >= 0):
+                told = "a simulator needs a robot, and all were spawned; reset all, by scope 0."
+                raise RefusalError(Result.RESULT_OPERATION_FAILED, told)
+            self.remove(*spawned)
         if scope & SCOPES.SCOPE_STATE:
             self._host.begin(rewind=bool(scope & SCOPES.SCOPE_TIME))
         elif scope & SCOPES.SCOPE_TIME:
@@ -187,8 +191,7 @@ class Simulation:
         # A robot that was spawned may have the name of one that was deleted.
         changed = any(each.robot >= 0 for each in self.entities.spawned.values())
         changed |= self.entities.robot_names != list(self._host.robot_names)
-        kept = self.told.keys() - self.entities.spawned.keys()
-        self.told = {name: self.told[name] for name in kept}
+        self.told.clear()
         self.entities.restore()
         if changed:
             self._host.reopen_robots()

@@ -6,24 +6,29 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from scipy import ndimage
 from simulation_interfaces.msg import Resource, Result, WorldResource
 from simulation_interfaces.srv import GetCurrentWorld, LoadWorld, UnloadWorld
 
 from nics_drl_bridge.config import parse_yaml, share_folder, validate
 from nics_drl_bridge.errors import BridgeError, ConfigError
+from nics_drl_bridge.lidar.maps import FREE
 from nics_drl_bridge.nodes.simulation_interfaces import resources
 from nics_drl_bridge.nodes.simulation_interfaces.entities import tags_match
 from nics_drl_bridge.nodes.simulation_interfaces.host import RefusalError
 from nics_drl_bridge.nodes.simulation_interfaces.state import STOPPED, WITHOUT_WORLD, Simulation
 from nics_drl_bridge.sim.models import HEIGHT, file_of
+from nics_drl_bridge.sim.occupancy import occupancy
 from nics_drl_bridge.sim.sdf import ABSENT, AssetsError, read_sdf, root_of
 from nics_drl_bridge.sim.sections import Standing
-from nics_drl_bridge.sim.world import World, check_places
+from nics_drl_bridge.sim.world import Region, World, check_places
 from nics_drl_bridge.sim.world_set import BARN, AnyWorld, load_worlds
 
 CODES = LoadWorld.Response
 CLEARANCE, NEAREST = 0.1, 2.0  # of worlds of SDF, as with `nics world import` [m]
-EMPTY = (-4.0, -4.0), (4.0, 4.0)  # places in the field of a world in which nothing stands [m]
+EMPTY = (-4.0, -4.0), (4.0, 4.0)  # places in the field of a world without walls around it [m]
+CELL, MOST_OPEN = 0.05, 0.5  # [m]; share of what is free in a field that may be open to all around
 # Tags of SDF that are read, or say nothing of what stands in a plane.
 READ = {
     "sdf", "world", "model", "include", "uri", "name", "pose", "placement_frame", "frame", "link",
@@ -58,7 +63,6 @@ class Worlds:
     def _unload(self) -> None:
         self._simulation.restore()
         self._simulation.halt(WITHOUT_WORLD)
-        self._simulation.told.clear()
 
     def load(self, request: Any, response: Any) -> None:
         """Answers LoadWorld: the present world is unloaded, even if the other can't be read."""
@@ -117,14 +121,14 @@ class Worlds:
     def available(self, request: Any, response: Any) -> None:
         """Answers GetAvailableWorlds."""
         tags_match(request.filter, ())
-        folder, failed = share_folder() / "config", list[str]()
+        folder, failed, skipped = share_folder() / "config", list[str](), list[str]()
         names = [each.stem for each in sorted((folder / "worlds").glob("*.yaml"))]
         found = [(name, load_worlds(name)) for name in names]
         for source in request.additional_sources:
             if source and request.offline_only and resources.local(source) is None:
                 continue
             try:
-                found += _in_source(source)
+                found += _in_source(source, skipped)
             except (BridgeError, OSError) as error:
                 failed.append(f"{source!r}: {error}")
         if failed and not request.continue_on_error:
@@ -133,23 +137,35 @@ class Worlds:
         told = [told_of(world, Resource(uri=uri)) for uri, world in found]
         told += [_set_of(name) for name in sets]
         response.worlds = [each for each in told if tags_match(request.filter, each.tags)]
-        if failed:
+        if failed or skipped:
             response.result.result = Result.RESULT_OK
-            response.result.error_message = f"left out: {'; '.join(failed)}"
+            response.result.error_message = f"left out: {'; '.join([*failed, *skipped])}"
 
 
-def _in_source(source: str) -> list[tuple[str, AnyWorld]]:
-    """Worlds of a folder, a file, a glob or a name. Raises BridgeError."""
-    path = resources.local(source)
+def _in_source(source: str, skipped: list[str]) -> list[tuple[str, AnyWorld]]:
+    """Worlds of a file, or of those in a folder that can be read, the rest of which is told.
+
+    Raises BridgeError, OSError.
+    """
+    path, found = resources.local(source), list[tuple[str, AnyWorld]]()
     if path is None:
         raise ConfigError("is not on this machine; give a folder or file.")
-    files = sorted(path.iterdir()) if path.is_dir() else [path]
-    forms = [(str(file), file, resources.SUFFIXES.get(file.suffix.lower())) for file in files]
-    return [
-        (uri, world_of(read_sdf(file, HEIGHT, skip_unknown=True, may_be_empty=True), file.stem)
-         if form == resources.SDF else load_worlds(file))
-        for uri, file, form in forms if form or not path.is_dir()
-    ]  # fmt: skip
+    if not path.is_dir():
+        return [(str(path), _world_in(path))]
+    for file in sorted(path.iterdir()):
+        form = resources.SUFFIXES.get(file.suffix.lower())
+        try:
+            if form and (form != resources.SDF or root_of(file).find("world") is not None):
+                found.append((str(file), _world_in(file)))
+        except (BridgeError, OSError) as error:
+            skipped.append(str(error))
+    return found
+
+
+def _world_in(file: Path) -> AnyWorld:
+    if resources.SUFFIXES.get(file.suffix.lower()) != resources.SDF:
+        return load_worlds(file)
+    return world_of(read_sdf(file, HEIGHT, skip_unknown=True, may_be_empty=True), file.stem)
 
 
 def _set_of(name: str) -> WorldResource:
@@ -179,11 +195,31 @@ def told_of(world: AnyWorld, resource: Resource) -> WorldResource:
 
 
 def world_of(standing: Standing, name: str) -> World:
-    """Returns the world of what stands in an SDF file, with a field around it. ConfigError."""
-    x1, y1, x2, y2 = bounds = standing.bounds(*() if standing.placed else EMPTY)
+    """Returns the world of what stands in an SDF file. Raises ConfigError.
+
+    What encloses most of its field, as the walls of a room do, bounds it. Else there are 2 m around
+    all that stands, and 5 m around the origin.
+    """
+    tight = standing.bounds(*() if standing.placed else EMPTY)
+    wide = standing.bounds(*EMPTY, *np.add(np.reshape(tight, (2, 2)), [[-1.0], [1.0]]))
+    return _in_field(standing, name, tight if _encloses(standing, tight, wide) else wide)
+
+
+def _in_field(standing: Standing, name: str, bounds: Region) -> World:
+    x1, y1, x2, y2 = bounds
     far = round(math.hypot(x2 - x1, y2 - y1), 3)
     content = {
         "name": name, "bounds": bounds, "obstacles": standing.obstacles, "clearance": CLEARANCE,
         "goal_distance": (min(NEAREST, round(far / 4.0, 3)), far),
     }  # fmt: skip
     return validate(content, World, name)
+
+
+def _encloses(standing: Standing, tight: Region, wide: Region) -> bool:
+    """True if most of what is free within a field can't be reached from around it."""
+    made = occupancy(_in_field(standing, "field", wide), standing.placed, CELL)
+    free = ndimage.distance_transform_edt(made.cells == FREE) * made.resolution > CLEARANCE
+    area, _ = ndimage.label(free)
+    (first, last) = made.world_to_cell(np.reshape(tight, (2, 2)))
+    within = area[first[0] : last[0], first[1] : last[1]]
+    return bool((within > 0).any() and np.mean(within[within > 0] == area[2, 2]) < MOST_OPEN)

@@ -127,7 +127,7 @@ def test_steps_that_are_refused_are_told(launch, domain_id, make, client_of):
 def test_the_robot_has_another_name_in_another_simulator(launch, domain_id, make):
     launch("simulator_node", domain_id, world="circles", mode="lockstep")
     env = make(domain_id, standard={"entity": "waffle"})
-    with pytest.raises(BackendError, match="refused SetEntityState: there is no entity 'waffle'"):
+    with pytest.raises(BackendError, match="refused GetEntityState: there is no entity 'waffle'"):
         env.reset(seed=0)
 
 
