@@ -1,7 +1,5 @@
 """Mirror: what a robot sees and does with left and right exchanged, for a training."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 

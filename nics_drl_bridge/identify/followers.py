@@ -1,7 +1,5 @@
 """Followers: delay, lag, dead zone and limits of each state that follows a command, unmeasured."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product

@@ -3,8 +3,6 @@
 Input curves are those of Hammerstein models: a dead zone, saturation, a gain of its own backwards.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Hypotheses on a motion: a base by the textbook, and orders of terms that depart from it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

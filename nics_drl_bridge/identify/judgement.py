@@ -1,7 +1,5 @@
 """Judgement of a model: its predictions of unseen data, their band, and those of yardsticks."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

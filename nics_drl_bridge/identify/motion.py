@@ -1,7 +1,5 @@
 """Motion as state: the body twist, taken from the pose, of robots whose state is a part of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Terms that a model may have: by mirror symmetry, by its textbook, and through its state."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Yardsticks of a model: a robot that keeps its twist, and its fitted textbook kinematics."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Following a path by a policy that drives to goals: sub-goals on it, progress, and its end."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple

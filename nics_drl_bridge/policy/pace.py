@@ -1,7 +1,5 @@
 """Time limit of an episode, and what a reward or discount per step means to a slower robot."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Shortest ways on a map, for a robot that is taken for a disc: Dijkstra's search over cells."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

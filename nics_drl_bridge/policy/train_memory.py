@@ -1,7 +1,5 @@
 """Memories of an actor: a stack of past scans, and a gated recurrent unit; each keeps a state."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import torch

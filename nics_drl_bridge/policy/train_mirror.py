@@ -6,8 +6,6 @@ mirrored policy would have driven so. What the policy itself would have done in 
 is no measure: where it is not symmetric yet, ratios to that grow without bound.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

@@ -7,8 +7,6 @@ rollout, so that the bits do not depend on which of them is faster. As soon as a
 and critic are learnt on a core each.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 import threading

@@ -1,7 +1,5 @@
 """Topics of a bag as tables: any numeric field of any message type."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial

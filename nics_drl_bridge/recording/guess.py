@@ -1,7 +1,5 @@
 """Guesses the mapping of a recording by names and motion, as a first one to edit."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Reads the streams of a recording of any form as its mapping says."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping as Names
 from collections.abc import Sequence
 from dataclasses import replace

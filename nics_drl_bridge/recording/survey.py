@@ -1,7 +1,5 @@
 """Surveys a recording of any form: tables, their stamps and what is odd in them, columns."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field

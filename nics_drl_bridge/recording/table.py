@@ -1,7 +1,5 @@
 """Table: named columns of a file, a topic or an archive; Source: the tables of a recording."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence

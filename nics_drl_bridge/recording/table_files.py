@@ -1,7 +1,5 @@
 """Tables of files: text with any separator and what loggers leave in it, numpy's, Parquet."""
 
-from __future__ import annotations
-
 import csv
 import re
 from collections import Counter

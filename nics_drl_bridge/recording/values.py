@@ -1,7 +1,5 @@
 """Values of a recording in SI, with their stamps, as its mapping says."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """InputCurve: what a motor makes of a command, and when, before the kinematics."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Annotated
 

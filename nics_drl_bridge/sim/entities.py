@@ -1,7 +1,5 @@
 """Entities of one world by their names: what stands there, is put elsewhere, comes and goes."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field

@@ -3,8 +3,6 @@
 Only a simulator knows it: it is for the reward of a training.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

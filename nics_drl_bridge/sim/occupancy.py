@@ -1,7 +1,5 @@
 """A world as a grid of free and occupied cells, for planners: all that stands still in it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from itertools import pairwise, zip_longest

@@ -1,7 +1,5 @@
 """Solid bodies in space, and what a horizontal plane cuts out of them: shapes of a world."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from itertools import combinations, product

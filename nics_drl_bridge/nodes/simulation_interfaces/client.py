@@ -1,7 +1,5 @@
 """The client: episodes and steps of any simulator that serves simulation_interfaces."""
 
-from __future__ import annotations
-
 import time
 from importlib import import_module
 from typing import Any

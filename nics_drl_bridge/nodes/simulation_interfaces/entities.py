@@ -1,7 +1,5 @@
 """Entities: their names by filters, their states, what they are, and their bounds."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

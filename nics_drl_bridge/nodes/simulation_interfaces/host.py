@@ -1,7 +1,5 @@
 """Requirements of the services on the node that offers them, and how they refuse."""
 
-from __future__ import annotations
-
 import errno
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol

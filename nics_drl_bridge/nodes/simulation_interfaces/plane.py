@@ -1,7 +1,5 @@
 """Poses, twists and bounds of the standard's messages, in the plane of a world."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """The server: every service of the standard, and the features that stand behind them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NoReturn

@@ -1,7 +1,5 @@
 """Spawning: shapes of YAML and SDF, and robots of the simulator's kind."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

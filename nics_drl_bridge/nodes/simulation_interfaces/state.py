@@ -1,7 +1,5 @@
 """State of the simulation: playing, paused, stopped; steps, and resets."""
 
-from __future__ import annotations
-
 from collections.abc import Generator
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Worlds: the one that is loaded, those that may be, loading and unloading."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any
