@@ -1,11 +1,13 @@
 """Parameters of Nav2's controller server that a policy in its place goes by."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 from rclpy.node import Node
 
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes.parameters import checkers, nav2
 from nics_drl_bridge.nodes.runner import declare_row
 from nics_drl_bridge.policy.follow import GoalCheck, ProgressCheck
@@ -15,7 +17,12 @@ UNUSED = {
     "controller_frequency", "min_x_velocity_threshold", "min_y_velocity_threshold",
     "min_theta_velocity_threshold", "use_realtime_priority", "odom_topic", "odom_duration",
     "publish_zero_velocity", "introspection_mode", "bond_heartbeat_period",
+    "action_server_result_timeout", "allow_parameter_qos_overrides",
 }  # fmt: skip
+
+
+OF_PLACE = ("PositionGoalChecker", "AxisGoalChecker")  # which do not look at the heading
+KINDS = ("controller", "goal_checker", "progress_checker", "path_handler")
 
 
 class ControllerParameters:
@@ -24,9 +31,11 @@ class ControllerParameters:
     def __init__(self, node: Node) -> None:
         self._node = node
         values = {row.name: declare_row(node, row) for row in nav2()}
+        lists = [f"{kind}_plugins" for kind in KINDS]
+        if empty := [name for name in lists if not values[name]]:
+            raise ConfigError(f"parameter {empty[0]!r} is empty; give one name or more.")
         self.controllers, self.goals, self.progress, self.handlers = (
-            tuple(values[f"{kind}_plugins"])
-            for kind in ("controller", "goal_checker", "progress_checker", "path_handler")
+            tuple(values[name]) for name in lists
         )
         if one := values["progress_checker_plugin"]:
             self.progress = (one,)
@@ -38,8 +47,16 @@ class ControllerParameters:
         return float(self._node.get_parameter(name).value or 0.0)
 
     def checks(self, goal: str, progress: str) -> tuple[GoalCheck, ProgressCheck]:
-        """Returns the checks of two names."""
-        return self._filled(GoalCheck, goal), self._filled(ProgressCheck, progress)
+        """Returns the checks of two names, as Nav2's checkers of these plugins make them."""
+        arrives, gets_on = self._filled(GoalCheck, goal), self._filled(ProgressCheck, progress)
+        if self._plugin(goal).endswith(OF_PLACE):
+            arrives = replace(arrives, yaw_goal_tolerance=math.inf)
+        if not self._plugin(progress).endswith("PoseProgressChecker"):
+            gets_on = replace(gets_on, required_movement_angle=math.inf)
+        return arrives, gets_on
+
+    def _plugin(self, name: str) -> str:
+        return str(self._node.get_parameter(f"{name}.plugin").value)
 
     def _filled(self, kind: Any, name: str) -> Any:
         known = {each.name: self._node.get_parameter(f"{name}.{each.name}").value

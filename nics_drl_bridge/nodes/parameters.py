@@ -122,15 +122,18 @@ def nav2() -> list[Row]:
 
 
 def checkers(goals: Sequence[str], progress: Sequence[str]) -> list[Row]:
-    """Returns the parameters of the checks of these names, as of Nav2's simple checkers."""
-    span = (0.0, 1e6)
+    """Returns the parameters of the checks of these names, as of Nav2's own checkers."""
+    span, plugin = (0.0, 1e6), "Nav2's checker that it is to be as."
     rows: tuple[list[tuple[str, Any, str, tuple[float, float] | None]], ...] = [
         ("xy_goal_tolerance", 0.25, "Greatest distance from the goal [m].", span),
         ("yaw_goal_tolerance", 0.25, "Of the heading there [rad]; not of robots that steer.", span),
         ("stateful", True, "Whether a place that was reached stays so.", None),
         ("path_length_tolerance", 1.0, "Greatest way that may be left at the goal [m].", span),
+        ("plugin", "nav2_controller::SimpleGoalChecker", plugin, None),
     ], [
+        ("plugin", "nav2_controller::SimpleProgressChecker", plugin, None),
         ("required_movement_radius", 0.5, "That the robot has to leave [m].", span),
+        ("required_movement_angle", 0.5, "Or turn by [rad], for a PoseProgressChecker.", span),
         ("movement_time_allowance", 10.0, "Within this time [s].", span),
     ]  # fmt: skip
     return [

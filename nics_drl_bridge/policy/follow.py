@@ -18,7 +18,7 @@ LONGEST = 1e5  # greatest length of a path [m]
 
 @dataclass(frozen=True)
 class GoalCheck:
-    """When a path counts as followed, as of Nav2's SimpleGoalChecker."""
+    """When a path counts as followed, as of Nav2's SimpleGoalChecker or PositionGoalChecker."""
 
     xy_goal_tolerance: float = 0.25  # [m]
     yaw_goal_tolerance: float = 0.25  # [rad]; robots that steer are not turned
@@ -28,10 +28,11 @@ class GoalCheck:
 
 @dataclass(frozen=True)
 class ProgressCheck:
-    """When a robot counts as stuck, as of Nav2's SimpleProgressChecker."""
+    """When a robot counts as stuck, as of Nav2's SimpleProgressChecker or PoseProgressChecker."""
 
     required_movement_radius: float = 0.5  # that it has to leave [m]
     movement_time_allowance: float = 10.0  # within this time [s]
+    required_movement_angle: float = math.inf  # or has to turn by [rad]
 
 
 class Place(NamedTuple):
@@ -122,6 +123,8 @@ class ProgressChecker:
         """True if a robot, at a pose (3,) at a time, has not moved enough for too long."""
         check = self.check
         since, place = self._base or (math.inf, pose)  # later than now if the clock was set back
-        if time_s < since or math.dist(pose[:2], place[:2]) > check.required_movement_radius:
+        moved = math.dist(pose[:2], place[:2]) > check.required_movement_radius
+        turned = abs(wrap_angle(pose[2] - place[2])) > check.required_movement_angle
+        if time_s < since or moved or turned:
             self._base = since, _ = time_s, pose
         return time_s - since > check.movement_time_allowance

@@ -18,6 +18,7 @@ from rclpy.action import ActionClient, ActionServer
 from rclpy.node import NodeNameNonExistentError
 from test_packaging import ROOT
 
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, policy_node, qos
 from nics_drl_bridge.nodes.follow_path import FOLLOW, NAVIGATE, PathActions
@@ -289,6 +290,33 @@ def test_the_progress_checker_of_humble_is_taken_by_its_own_name(domain_id, tmp_
     assert node._nav2.progress == ("progress",)
     assert node._nav2.checks("general_goal_checker", "progress")[1].movement_time_allowance == 7.0
     node.destroy_node()
+    context.try_shutdown()
+
+
+def test_checkers_go_by_their_plugins_and_unknown_headings_do_not_count(domain_id):
+    words = [
+        "goal_checker_plugins:=[exact,near]", "near.plugin:=nav2_controller::PositionGoalChecker",
+        "progress_checker_plugins:=[slow,turning]", "slow.required_movement_angle:=0.1",
+        "turning.plugin:=nav2_controller::PoseProgressChecker",
+        "turning.required_movement_angle:=0.1", "action_server_result_timeout:=10.0",
+    ]  # fmt: skip
+    given = [part for word in words for part in ("-p", word)]
+    context = open_context(["node", "--ros-args", *given], domain_id)
+    node = PolicyNode(context)
+    assert unknown(node) == []
+    found = [node._nav2.checks(*names) for names in (("exact", "slow"), ("near", "turning"))]
+    assert [goal.yaw_goal_tolerance for goal, _ in found] == [0.25, math.inf]
+    assert [progress.required_movement_angle for _, progress in found] == [math.inf, 0.1]
+    node.destroy_node()
+    context.try_shutdown()
+
+
+@pytest.mark.parametrize("kind", ["controller", "goal_checker", "progress_checker", "path_handler"])
+def test_an_empty_list_of_plugins_is_one_sentence(domain_id, kind):
+    words = ["-p", f"{kind}_plugins:=[]"]
+    context = open_context(["node", "--ros-args", *words], domain_id)
+    with pytest.raises(ConfigError, match=f"parameter '{kind}_plugins' is empty; give one name"):
+        PolicyNode(context)
     context.try_shutdown()
 
 

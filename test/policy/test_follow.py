@@ -91,6 +91,14 @@ def test_a_loop_does_not_end_where_it_begins():
     assert checker.turn_left(path.locate(np.zeros(3), 1.0), np.zeros(3), path.end) is None
 
 
+def test_a_turn_is_progress_where_it_is_to_count():
+    turned = np.array([0.0, 0.0, 0.6])
+    for angle, stuck in ((math.inf, True), (0.5, False)):
+        checker = ProgressChecker(ProgressCheck(required_movement_angle=angle))
+        assert not checker.stuck(0.0, np.zeros(3))
+        assert checker.stuck(10.5, turned) is stuck
+
+
 def test_a_robot_that_does_not_get_on_is_stuck():
     checker = ProgressChecker(ProgressCheck())
     assert not checker.stuck(0.0, np.zeros(3))

@@ -198,7 +198,9 @@ def world_of(standing: Standing, name: str) -> World:
     What encloses most of its field, as the walls of a room do, bounds it. Else there are 2 m around
     all that stands, and 5 m around the origin.
     """
-    tight = standing.bounds(*() if standing.placed else EMPTY)
+    if not standing.placed:
+        return _in_field(standing, name, standing.bounds(*EMPTY))
+    tight = standing.bounds()
     wide = standing.bounds(*EMPTY, *np.add(np.reshape(tight, (2, 2)), [[-1.0], [1.0]]))
     return _in_field(standing, name, tight if _encloses(standing, tight, wide) else wide)
 

@@ -14,6 +14,8 @@ from simulation_interfaces import msg
 
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.errors import BackendError, ConfigError
+from nics_drl_bridge.nodes import device_parameters
+from nics_drl_bridge.nodes.conversions import heading_of, heading_to_ros
 from nics_drl_bridge.nodes.simulation_interfaces import server
 from nics_drl_bridge.nodes.simulation_interfaces.entities import EntityServices
 from nics_drl_bridge.nodes.simulator_node import DeviceNode
@@ -98,6 +100,46 @@ def test_a_simulator_that_puts_time_back_and_tells_of_it_by_steps_alone_is_drive
         assert math.dist(info["pose"][:2], start[:2]) > 0.1
         stamps.add(info["stamp_ns"])
     assert len(stamps) == 1  # of a time that was put back
+
+
+def test_steps_of_a_rounded_length_are_followed(launch, domain_id, make, monkeypatch):
+    timing = device_parameters.timing
+    rounded = {"step_ns": 100_000_002, "odom_ns": 100_000_002, "scan_ns": 100_000_002}
+    monkeypatch.setattr(
+        device_parameters, "timing", lambda node, model: timing(node, model)._replace(**rounded)
+    )
+    launch("simulator_node", domain_id, world="circles", mode="lockstep")
+    env = make(domain_id)
+    env.reset(seed=3)
+    stamps = [env.step(np.array([0.6, 0.0], np.float32))[4]["stamp_ns"] for _ in range(STEPS)]
+    assert set(np.diff(stamps)) == {100_000_002}
+
+
+def test_what_stands_above_the_floor_or_tilted_stays_so(launch, domain_id, make, monkeypatch):
+    state, put = EntityServices.state, EntityServices.set_state
+    placed = {}
+
+    def raised(self, entity):
+        told = state(self, entity)
+        told.pose.position.z, told.pose.orientation.x = 0.17, 0.1
+        return told
+
+    def flat(self, request, response):
+        pose = request.state.pose
+        placed[request.entity] = (pose.position.z, pose.orientation.x != 0.0)
+        pose.position.z = 0.0
+        turn = pose.orientation
+        pose.orientation = heading_to_ros(heading_of(turn.x, turn.y, turn.z, turn.w))
+        put(self, request, response)
+
+    monkeypatch.setattr(EntityServices, "state", raised)
+    monkeypatch.setattr(EntityServices, "set_state", flat)
+    launch("simulator_node", domain_id, world="circles", mode="lockstep")
+    env = make(domain_id)
+    _, info = env.reset(seed=3)
+    assert info["pose"] == pytest.approx(info["start"], abs=1e-6)
+    assert {"obstacle_0", env.unwrapped.model.robot.name} <= placed.keys()
+    assert set(placed.values()) == {(0.17, True)}
 
 
 def test_a_feature_that_is_missing_is_named_when_the_env_is_made(

@@ -4,6 +4,7 @@ import math
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
@@ -168,6 +169,50 @@ def test_what_was_told_of_an_entity_goes_with_it(client):
         client.spawn("disc", 1.0)
         assert client("GetEntityInfo", entity="disc").info.description != "mine"
         assert client.code("DeleteEntity", entity="disc") == OK
+
+
+def test_what_was_told_of_the_worlds_own_goes_with_a_full_reset(client):
+    told = msg.EntityInfo(description="mine", tags=["mine"])
+    for reset in ("ResetSimulation", "SetSimulationState"):  # stopped, which is the default
+        assert client.code("SetEntityInfo", entity="left", info=told) == OK
+        assert client.code(reset) == OK
+        assert client("GetEntityInfo", entity="left").info.description != "mine"
+
+
+def test_the_last_robot_is_not_removed_as_spawned_and_nothing_else_is(client):
+    client.spawn("disc", 2.0)
+    assert (
+        client.spawn("r2", 1.0, entity_resource=msg.Resource(uri="ackermann")).result.result == OK
+    )
+    for own in ("left", "right"):
+        assert client.code("DeleteEntity", entity=own) == OK
+    refused = client("ResetSimulation", scope=srv.ResetSimulation.Request.SCOPE_SPAWNED).result
+    assert refused.result == msg.Result.RESULT_OPERATION_FAILED
+    assert "a simulator needs a robot, and all were spawned" in refused.error_message
+    assert client.names() == ["r2", "disc"] or client.names() == ["disc", "r2"]
+    assert client.code("ResetSimulation") == OK
+    assert client.names() == ["left", "right"]
+
+
+def test_obstacles_of_the_first_episode_are_entities_and_stay_where_another_is_spawned(
+    launch, domain_id, client_of, meet
+):
+    launch("simulator_node", domain_id, world="circles")
+    client, peer = client_of(domain_id), meet(domain_id)
+    client.set_state(STATES.STATE_PAUSED)
+    names = client.names()
+    assert len([name for name in names if name.startswith("obstacle_")]) == 10
+    scans = peer.listen(LaserScan, "scan")
+    looks = []
+    for name in ("", "disc"):
+        if name:
+            assert client.spawn(name, 2.9).result.result == OK
+        scans.clear()
+        assert client.code("StepSimulation", steps=10) == OK
+        peer.until(lambda: scans, "a scan")
+        looks.append(np.nan_to_num(np.array(scans[-1].ranges), posinf=9.0))
+    assert np.mean(np.abs(looks[1] - looks[0]) > 0.3) < 0.05
+    assert client.code("DeleteEntity", entity="obstacle_0") == OK
 
 
 def test_after_one_robot_is_deleted_the_others_keep_their_topics_and_starts(
@@ -381,6 +426,35 @@ def test_a_source_of_worlds_that_can_not_be_read_is_left_out_if_that_is_asked(cl
     remote = client("GetAvailableWorlds", additional_sources=["https://a/b.sdf"], offline_only=True)
     assert (remote.result.result, remote.result.error_message) == (OK, "")
     assert remote.worlds
+
+
+def test_what_is_no_world_in_a_folder_is_told_and_hinders_no_other(client, tmp_path):
+    (tmp_path / "disc.yaml").write_text("kind: circle\nradius: 0.1\n", encoding="utf-8")
+    (tmp_path / "field.yaml").write_text(FIELD.format("field", 4.0), encoding="utf-8")
+    (tmp_path / "free.sdf").write_text(sdf(model(box(1))), encoding="utf-8")
+    told = client("GetAvailableWorlds", additional_sources=[str(tmp_path)])
+    assert told.result.result == OK, told.result.error_message
+    uris = [each.world_resource.uri for each in told.worlds]
+    assert [uri for uri in uris if str(tmp_path) in uri] == [str(tmp_path / "field.yaml")]
+    assert "disc.yaml" in told.result.error_message
+
+
+WALLS = "".join(
+    f"<collision name='{k}'><pose>{x} {y} 0.5 0 0 0</pose><geometry><box><size>{a} {b} 1</size>"
+    "</box></geometry></collision>"
+    for k, (x, y, a, b) in enumerate(
+        [(0, 2, 4, 0.1), (0, -2, 4, 0.1), (2, 0, 0.1, 4), (-2, 0, 0.1, 4)]
+    )
+)
+
+
+@pytest.mark.parametrize(("stands", "field"), [(box(1), "10 m x 10 m"), (WALLS, "4.1 m x 4.1 m")])
+def test_a_world_of_gazebo_has_room_around_what_stands_unless_that_encloses_it(
+    client, stands, field
+):
+    loaded = client("LoadWorld", world_resource=in_sdf(model(stands)))
+    assert loaded.result.result == OK, loaded.result.error_message
+    assert loaded.world.description == f"a field of {field}"
 
 
 def test_a_world_of_gazebo_in_which_nothing_stands_is_an_empty_field(client):
