@@ -13,14 +13,15 @@ from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, qos_check_
 
 # What nodes of Nav2 say to each other, and the frame of a lidar that its own simulator plays.
 OWN = {
-    "cmd_vel_smoothed", "collision_monitor_state", "base_scan", "speed_filter_mask",
-    "keepout_filter_mask",
+    "cmd_vel_smoothed", "cmd_vel_raw", "cmd_vel_nav", "cmd_vel_teleop", "collision_monitor_state",
+    "base_scan", "speed_filter_mask", "keepout_filter_mask",
 }  # fmt: skip
 OWN_ENDS = ("costmap_raw", "published_footprint", "filter_info", "/voxel_grid", "costmap_updates")
 FRAME_KEYS = ("frame", "frame_id")
 TYPES = {
     "scan": "sensor_msgs/msg/LaserScan",
     "odom": "nav_msgs/msg/Odometry",
+    "odometry/filtered": "nav_msgs/msg/Odometry",
     "map": "nav_msgs/msg/OccupancyGrid",
     "cmd_vel": "geometry_msgs/msg/Twist",
     "clock": "rosgraph_msgs/msg/Clock",
@@ -50,7 +51,7 @@ def wanted(file: Path) -> tuple[set[str], set[str]]:
     topics, frames = set(ALWAYS), set[str]()
     for key, value in named:
         name = value.strip("/")
-        if not name or name in OWN or name.endswith(OWN_ENDS):
+        if not name or name in OWN or name.endswith(OWN_ENDS) or key == "polygon_pub_topic":
             continue
         if key.endswith(FRAME_KEYS):
             frames.add(name)

@@ -34,6 +34,21 @@ def test_paths_are_followed_and_every_name_of_nav2_is_served():
     assert (code, result["missing"], result["not_followed"]) == (0, [], [])
 
 
+def test_what_nodes_of_nav2_say_to_each_other_is_not_asked_of_the_robot(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(BENCHMARKS)
+    pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+    from measuring import nav2_names
+
+    file = tmp_path / "nav2.yaml"
+    file.write_text(
+        "collision_monitor:\n  ros__parameters:\n    cmd_vel_in_topic: cmd_vel_raw\n"
+        "    odom_topic: /odometry/filtered\n    polygon: {polygon_pub_topic: polygon_stop}\n"
+    )
+    topics, _ = nav2_names.wanted(file)
+    assert topics - nav2_names.ALWAYS == {"odometry/filtered"}
+    assert topics <= nav2_names.TYPES.keys()
+
+
 @pytest.mark.ros
 @pytest.mark.parametrize(
     ("topic", "hears", "durable", "reliable", "fault"),
