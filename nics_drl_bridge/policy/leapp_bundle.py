@@ -258,7 +258,8 @@ def _merged(bundle: Bundle) -> Any:
             elif (source := source_of.get(one.name, "")) not in ready:
                 reason = f"nothing before the node gives {one.name!r}; connect it."
                 raise bundle.fault("pipeline.data_flow", reason)
-            graph.node.append(onnx.helper.make_node("Identity", [source], [one.name]))
+            if source != one.name:
+                graph.node.append(onnx.helper.make_node("Identity", [source], [one.name]))
         graph.node.extend(model.graph.node)
         graph.initializer.extend(model.graph.initializer)
         infos |= {one.name: one for one in model.graph.output}
@@ -274,7 +275,8 @@ def _merged(bundle: Bundle) -> Any:
             raise bundle.fault("pipeline.outputs", f"no network gives {end!r}.")
         infos[end].name = bundle.name_of(end)
         graph.output.append(infos[end])
-        graph.node.append(onnx.helper.make_node("Identity", [end], [infos[end].name]))
+        if infos[end].name != end:
+            graph.node.append(onnx.helper.make_node("Identity", [end], [infos[end].name]))
     return onnx.helper.make_model(graph, opset_imports=list(opsets.values()), ir_version=newest)
 
 

@@ -186,8 +186,37 @@ def parts():
     }, {"scaling": first, "policy": second}
 
 
-def write_foreign(folder, spoil=lambda data, models: None):
-    data, models = parts()
+def alike():
+    """Two networks whose input and output have the same names."""
+    rng = np.random.default_rng(1)
+    models = {
+        name: foreign_nets.model_of(
+            [helper.make_node("MatMul", ["scan", "weights"], ["out"])],
+            {"scan": [1, SECTORS]},
+            {"out": [1, 3]},
+            {"weights": rng.normal(0.0, 0.1, (SECTORS, 3)).astype(np.float32)},
+        )
+        for name in ("linear", "angular")
+    }
+    layout = {"sectors": SECTORS, "range_max": 3.0}
+    scan = tensor("scan", [1, SECTORS], "state/lidar/sectors") | {"scan": layout}
+    return {
+        "models": {
+            name: {
+                "inputs": [scan],
+                "outputs": [tensor("out", [1, 3], f"target/body/{name}_velocity")],
+            }
+            for name in models
+        },
+        "pipeline": {
+            "inputs": {name: ["scan"] for name in models},
+            "outputs": {name: ["out"] for name in models},
+        },
+    }, models
+
+
+def write_foreign(folder, spoil=lambda data, models: None, made=parts):
+    data, models = made()
     for name, model in models.items():
         content = model.SerializeToString()
         write_bytes(folder / f"{name}.onnx", content)
@@ -268,6 +297,17 @@ def test_what_leapp_itself_traces_becomes_a_policy_file(tmp_path):
         out = manager({key: torch.as_tensor(value) for key, value in given.items()})
         _, command, state = policy.run(row, state)
         assert command == pytest.approx(out["walk/action"].detach().numpy(), abs=1e-6)
+
+
+def test_nodes_may_share_the_names_of_inputs_and_outputs(tmp_path):
+    bundle, model = write_foreign(tmp_path, made=alike), direct_model()
+    policy = policy_of(import_policy(bundle, model), tmp_path / "ours.onnx")
+    (row,) = sequence(policy.make_task(model), 1)
+    linear, angular = (
+        3.0 * row[:SECTORS] @ onnx.numpy_helper.to_array(one.graph.initializer[0])
+        for one in alike()[1].values()
+    )
+    assert policy.run(row)[1] == pytest.approx([*linear[:2], angular[2]], abs=1e-6)
 
 
 def test_a_bundle_of_others_is_driven_by_a_mapping_too(tmp_path):
