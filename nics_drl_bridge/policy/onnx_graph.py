@@ -200,14 +200,12 @@ def _graph_faults(model: Any) -> Iterator[Fault]:
             yield name, reason
         location = next((entry.value for entry in tensor.external_data if entry.key), "")
         if tensor.data_location == TensorProto.EXTERNAL or tensor.external_data:
-            yield name, f"refers to another file ({location!r}); a policy holds its own weights."
+            fix = "export with `external_data=False`, or `onnx.save(onnx.load(FILE), FILE)`"
+            yield name, f"refers to another file ({location!r}); a policy holds its weights: {fix}."
     if len(model.functions) or len(model.training_info) or len(graph.sparse_initializer):
         yield "graph", "holds functions, training or sparse weights; remove."
-    standard = ("", "ai.onnx")
-    for domain in (opset.domain for opset in model.opset_import if opset.domain not in standard):
-        yield "opset_import", f"holds the domain {domain!r}; only standard operators are run."
     for node in graph.node:
-        if node.domain not in standard or node.op_type not in OPERATORS:
+        if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS:
             name = f"{node.domain}.{node.op_type}" if node.domain else node.op_type
             reason = f"the operator {name} is not one of a feed-forward network; not run."
             yield "graph.node", reason
@@ -216,6 +214,7 @@ def _graph_faults(model: Any) -> Iterator[Fault]:
                 yield "graph.node", f"{node.op_type} holds a graph of its own."
             if a.HasField("sparse_tensor") or len(a.sparse_tensors):
                 yield "graph.node", f"{node.op_type} holds sparse weights."
+    yield from _setting_faults(graph)
 
 
 def _weight_faults(graph: Any) -> Iterator[Fault]:

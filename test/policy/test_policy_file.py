@@ -246,7 +246,7 @@ REFUSED = {
     "external data": (elsewhere("weights.bin"), "weights."),
     "absolute path": (elsewhere("/etc/passwd"), "weights."),
     "path outside": (elsewhere("../../weights.bin"), "weights."),
-    "own operator": (node("Evil", "com.example"), "opset_import"),
+    "own operator": (node("Evil", "com.example"), "graph.node"),
     "loop": (node("Loop"), "graph.node"),
     "random": (node("RandomNormalLike"), "graph.node"),
     "graph in a node": (branch, "graph.node"),
