@@ -11,7 +11,7 @@ from onnx import TensorProto
 
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import PolicyError, nearest
-from nics_drl_bridge.policy import foreign_mapping, onnx_graph
+from nics_drl_bridge.policy import foreign_mapping, graph_folding, onnx_graph
 from nics_drl_bridge.policy.graph_builder import Builder
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -119,24 +119,17 @@ class Composer:
         if not versions or max(versions) < OLDEST_OPSET:
             reason = f"is {max(versions, default=0)}, needed is {OLDEST_OPSET} or newer."
             raise self._fault("network.opset", reason)
-        del model.graph.value_info[:]  # their shapes may be open
         for one in model.graph.input:
             if one.name in self._network.inputs:
                 shape = one.type.tensor_type.shape
                 for place, size in zip(shape.dim, self._shape(one.name), strict=True):
                     place.dim_value = size
-        for one in model.graph.output:
-            one.type.tensor_type.ClearField("shape")  # follow from those of the inputs
         try:
             model = onnx.compose.add_prefix(model, THEIRS)
-            found = onnx.shape_inference.infer_shapes(model, strict_mode=True)
+            self._made = graph_folding.fold_shapes(model.graph, max(versions))
         except Exception as error:  # noqa: BLE001 - a damaged graph raises anything
             words = " ".join(str(error).split())[:120]
             raise self._fault("network", f"its shapes do not fit ({words}).") from None
-        self._made = {
-            one.name: tuple(d.dim_value for d in one.type.tensor_type.shape.dim)
-            for one in found.graph.output
-        }
         return model
 
     def _shape(self, name: str) -> tuple[int, ...]:

@@ -134,6 +134,49 @@ def test_turn_rates_become_the_steering_angles_of_a_car(tmp_path, name):
     assert policy.command(rows) == pytest.approx(wanted, abs=1e-5)
 
 
+def of_goal(folder, nodes, outputs, weights, turn):
+    """Writes a network of the goal (x, y) and its mapping; `turn` says what turns."""
+    ends = {name: ["n", size] for name, size in outputs.items()}
+    made = foreign_nets.model_of(nodes, {"goal": ["n", 2]}, ends, weights)
+    write_bytes(folder / "net.onnx", made.SerializeToString())
+    data = foreign_nets.three_mapping()
+    data["inputs"] = {"goal": {"parts": [{"of": "goal.x"}, {"of": "goal.y"}]}}
+    data["outputs"] = {"forward": {"of": "action", "clip": [0.0, 0.4]}, "turn": turn}
+    return write_mapping(folder, data)
+
+
+def test_sizes_that_follow_from_shapes_are_known(tmp_path, robot):
+    """The first half of four numbers, cut as PyTorch's exporter writes `chunk`."""
+    node = onnx.helper.make_node
+    nodes = [
+        node("MatMul", ["goal", "weights"], ["four"]),
+        node("Shape", ["four"], ["shape"]),
+        node("Gather", ["shape", "last"], ["size"], axis=0),
+        node("Add", ["size", "one"], ["more"]),
+        node("Div", ["more", "two"], ["half"]),
+        node("Slice", ["four", "zero", "half", "last"], ["action"]),
+    ]
+    numbers = {"zero": [0], "one": [1], "two": [2], "last": [-1]}
+    weights = {name: np.int64(values) for name, values in numbers.items()}
+    weights["weights"] = np.float32([[0.1, -0.1, 9.0, 9.0], [0.3, 0.1, 9.0, 9.0]])
+    turn = {"of": "action", "index": 1, "clip": [-0.5, 0.5]}
+    path, (rows, bearing) = of_goal(tmp_path, nodes, {"action": "half"}, weights, turn), seen()
+    x, y = rows[:, SECTORS] * np.cos(bearing), rows[:, SECTORS] * np.sin(bearing)
+    wanted = [np.clip(0.1 * x + 0.3 * y, 0.0, 0.4), np.clip(0.1 * y - 0.1 * x, -0.5, 0.5)]
+    found = commands_of(path, robot, rows)
+    assert found == pytest.approx(np.stack(wanted, axis=-1), abs=1e-5)
+
+
+def test_an_output_may_be_an_input_as_it_is(tmp_path, robot):
+    nodes = [onnx.helper.make_node("Neg", ["goal"], ["action"])]
+    turn = {"of": "goal", "index": 1, "clip": [-0.5, 0.5]}
+    path, (rows, bearing) = of_goal(tmp_path, nodes, {"action": 2, "goal": 2}, {}, turn), seen()
+    x, y = rows[:, SECTORS] * np.cos(bearing), rows[:, SECTORS] * np.sin(bearing)
+    wanted = [np.clip(-x, 0.0, 0.4), np.clip(y, -0.5, 0.5)]
+    found = commands_of(path, robot, rows)
+    assert found == pytest.approx(np.stack(wanted, axis=-1), abs=1e-5)
+
+
 # It is a policy like any other.
 
 
@@ -249,6 +292,28 @@ def test_a_network_that_gives_no_numbers_or_hides_others_operators_is_refused(tm
         write_bytes(tmp_path / "net.onnx", spoilt.SerializeToString())
         with pytest.raises(PolicyError, match=words):
             open_policy(str(path), robot)
+
+
+def test_a_domain_that_no_operator_is_of_is_no_hindrance(tmp_path, robot):
+    path, network = write(tmp_path, "three"), foreign_nets.three()
+    network.opset_import.append(onnx.helper.make_opsetid("ai.onnx.ml", 2))
+    write_bytes(tmp_path / "net.onnx", network.SerializeToString())
+    policy = load_any(path, robot)
+    network.graph.node[3].domain = "ai.onnx.ml"
+    write_bytes(tmp_path / "net.onnx", network.SerializeToString())
+    with pytest.raises(PolicyError, match=r"the operator ai\.onnx\.ml\.Tanh is not one"):
+        load_any(path, robot)
+    assert policy.contract.robot == robot.robot
+
+
+def test_weights_in_another_file_are_refused_with_the_fix(tmp_path, robot):
+    path, file = write(tmp_path, "three"), tmp_path / "net.onnx"
+    given = {"location": "net.onnx.data", "size_threshold": 0, "save_as_external_data": True}
+    onnx.save(onnx.load(file), file, **given)
+    with pytest.raises(PolicyError, match=r"'net.onnx.data'.* export with `external_data=False`"):
+        load_any(path, robot)
+    onnx.save(onnx.load(file), file)
+    assert load_any(path, robot).contract.robot == robot.robot
 
 
 def test_without_a_robot_it_says_how_to_name_one(tmp_path):

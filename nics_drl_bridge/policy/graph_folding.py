@@ -1,0 +1,66 @@
+"""Puts weights in place of what a foreign network computes of the shapes of its own arrays."""
+
+import math
+from typing import Any
+
+import numpy as np
+from onnx import ValueInfoProto, defs, helper, numpy_helper
+from onnx.reference import ReferenceEvaluator
+from onnx.shape_inference import infer_node_outputs
+
+from nics_drl_bridge.policy.onnx_graph import INTEGERS, MOST_AXES, SMALL, Shape
+
+FOLDED = ("Add", "Cast", "Concat", "Constant", "Div", "Gather", "Identity", "Mul", "Reshape",
+          "Slice", "Squeeze", "Sub", "Unsqueeze")  # fmt: skip
+"""Operators of sizes; none costs more than its inputs and its output, which are small here."""
+
+
+def fold_shapes(graph: Any, opset: int) -> dict[str, Shape]:
+    """Folds small whole numbers that are known; returns shapes of outputs, 0 where unknown."""
+    weights, nodes = {one.name: one for one in graph.initializer}, list(graph.node)
+    imports = [helper.make_opsetid("", opset)]
+    types = {one.name: one.type for one in graph.input}
+    for one in graph.initializer:
+        types[one.name] = helper.make_tensor_type_proto(one.data_type, one.dims)
+    known = {name: one for name, one in weights.items() if _is_small(types[name])}
+    del graph.node[:], graph.initializer[:]
+    for node in nodes:
+        node.ClearField("domain")  # "ai.onnx" is the same
+        schema = defs.get_schema(node.op_type, opset)
+        given = {name: types[name] for name in node.input if name}
+        made = infer_node_outputs(schema, node, given, known, opset_imports=imports)
+        if any(len(_shape(one)) > MOST_AXES for one in made.values()):
+            raise ValueError(f"{node.op_type} gives more than {MOST_AXES} dimensions")
+        types |= made
+        if (value := _value(node, types, known, opset)) is None:
+            graph.node.append(node)
+        else:
+            known[value.name] = value
+    used = {one.name for one in graph.output}.union(*(node.input for node in graph.node))
+    graph.initializer.extend(one for name, one in (weights | known).items() if name in used)
+    return {one.name: _shape(types[one.name]) for one in graph.output}
+
+
+def _shape(kind: Any) -> Shape:
+    tensor = kind.tensor_type
+    return tuple(d.dim_value for d in tensor.shape.dim) if tensor.HasField("shape") else (0,)
+
+
+def _is_small(kind: Any) -> bool:
+    return kind.tensor_type.elem_type in INTEGERS and 0 < math.prod(_shape(kind)) <= SMALL
+
+
+def _value(node: Any, types: dict[str, Any], known: dict[str, Any], opset: int) -> Any:
+    """Returns None for what is not small, or is not known before the network runs."""
+    name, given = node.output[0], [known.get(one) for one in node.input if one]
+    if node.op_type == "Shape" and all(shape := _shape(types[node.input[0]])):
+        ends = {setting.name: setting.i for setting in node.attribute}
+        sizes = np.array(shape[ends.get("start", 0) : ends.get("end")], np.int64)
+        return numpy_helper.from_array(sizes, name)
+    if node.op_type not in FOLDED or None in given or not _is_small(types[name]):
+        return None
+    if node.op_type == "Div" and any(numpy_helper.to_array(one).min() <= 0 for one in given):
+        return None  # by zero, or rounded to another side
+    graph = helper.make_graph([node], "", [], [ValueInfoProto(name=name)], given)
+    (value,) = ReferenceEvaluator(graph, opsets={"": opset}).run(None, {})
+    return numpy_helper.from_array(np.asarray(value), name)
