@@ -6,7 +6,7 @@ from typing import NamedTuple
 from nics_drl_bridge.identify.excitation import narrow
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.judgement import shortfall, usual
-from nics_drl_bridge.identify.verdict import doubts
+from nics_drl_bridge.identify.verdict import doubts, missed
 from nics_drl_bridge.robot.kinds import overdriven
 from nics_drl_bridge.robot.taylor import EndErrors
 
@@ -21,7 +21,7 @@ class Conclusion(NamedTuple):
     doubts: tuple[str, ...]  # reasons not to trust it
     gaps: tuple[str, ...]  # what the drive could not teach
     advice: str  # the next step
-    ready: bool  # false if a policy had better wait for another drive
+    ready: bool  # false if a policy had better wait for another drive or mapping
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -31,13 +31,15 @@ class Conclusion(NamedTuple):
 
 def conclude(identified: Identified) -> Conclusion:
     """Draws the conclusion of a fit."""
-    about = *shortfall(identified.judgement), *doubts(identified.held_out)
-    spec, ready = identified.drive.spec, False
+    wrong, spec, ready = identified.mistakes, identified.drive.spec, False
+    about = *wrong, *shortfall(identified.judgement), *doubts(identified.held_out)
     beyond = *narrow(identified.recording, spec), overdriven(spec)
     gaps = *identified.gaps, *(one for one in beyond if one)
-    if about or not identified.judgement:
+    if wrong:
+        advice = "mend the mapping as said above, and generate anew before a policy is trained"
+    elif about or not identified.judgement:
         advice = "drive once more, for 60 s or longer, and generate anew before a policy is trained"
-    elif identified.fit.unmoved or identified.model.assumed:
+    elif missed(identified.fit, spec) or identified.model.assumed:
         advice = "drive once more as said above: a policy would act by what was not learnt"
     else:
         first = ", or first see to what is said above" if gaps else ""

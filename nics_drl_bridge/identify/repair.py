@@ -13,6 +13,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.signals import held, interval_means, unwrapped
 from nics_drl_bridge.identify.statistics import unexplained
+from nics_drl_bridge.identify.verdict import Mistake
 from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording.mapping import UNITS
 from nics_drl_bridge.recording.stamping import not_repeated
@@ -44,7 +45,8 @@ SWAPPED = 0.6  # least correlation of each of two commands with what the other s
 PLACES = {"linear.x": 0, "angular.z": 1, "throttle": 0, "steering": 1}  # in speed and turn rate
 SIDEWAYS = ("linear.x", "linear.y", "angular.z")  # commands of a robot that moves sideways
 CONFUSED = {"m/s": ("km/h", "cm/s", "mm/s"), "rad/s": ("deg/s", "rpm")}
-TRAVEL_SHARE = 0.1  # of the footprint's radius: least distance to measure a direction of travel
+# Least distance to measure a direction of travel, of the footprint's radius, of the pose's noise
+TRAVEL_SHARE, TRAVEL_NOISE = 0.1, 25.0
 
 
 def repaired(drive: Drive) -> tuple[Drive, tuple[str, ...]]:
@@ -231,14 +233,14 @@ def check_units(drive: Drive) -> None:
 
 
 def check_commands(drive: Drive, command: recordings.Stream | None = None) -> tuple[str, ...]:
-    """Refuses swapped commands, with a RecordingError; a sentence on each in another unit.
+    """Refuses swapped commands, with a RecordingError; tells other units and a mirrored motion.
 
     By how the speed and the turn rate that they ask for, or those before they were clipped,
     compare with those that were driven.
     """
     spec, sent = drive.spec, command or drive.recording.command
     if spec.moves_sideways:
-        _check_sideways(drive, sent)
+        return _check_sideways(drive, sent)
     pair = _asked_and_driven(drive, sent)
     if pair is None:
         return ()
@@ -253,7 +255,7 @@ def check_commands(drive: Drive, command: recordings.Stream | None = None) -> tu
             if 1.0 / NEAR < times * UNITS[other].factor < NEAR:
                 finding = f"The commands ask for {times:.3g} times the {name} that was driven"
                 advice = f"write `unit: {other}` beside `from:`"
-                notes.append(f"{finding}: if they are in {other}, {advice}.")
+                notes.append(Mistake(f"{finding}: if they are in {other}, {advice}."))
     return tuple(notes)
 
 
@@ -266,12 +268,12 @@ def _check_swapped(drive: Drive, pair: list[int], crosswise: float, straight: fl
         raise RecordingError(f"{drive.recording.source}: {fault}; {advice}.")
 
 
-def _check_sideways(drive: Drive, command: recordings.Stream) -> None:
-    """Refuses swapped commands of a robot that moves sideways; its pose sensor may be turned."""
+def _check_sideways(drive: Drive, command: recordings.Stream) -> tuple[str, ...]:
+    """Checks commands of a robot that moves sideways, whose pose sensor may be turned."""
     spec, (start, end, driven) = drive.spec, _driven(drive)
     keys = [c.cmd_vel or c.name for c in spec.command]
     if sorted(keys) != sorted(SIDEWAYS) or len(start) < MIN_COMPARED:
-        return
+        return ()
     order, best = [keys.index(key) for key in SIDEWAYS], np.zeros((3, 3))
     for delay in DELAYS_S:
         asked = held(command, spec, start - delay, end - delay)[:, order]
@@ -284,6 +286,12 @@ def _check_sideways(drive: Drive, command: recordings.Stream) -> None:
     if best[0, 1] * best[1, 0] > 0.0:  # opposite signs are of poses that are turned by 90 degrees
         ahead, left, straight = abs(best[0, 1]), abs(best[1, 0]), np.abs(np.diag(best)[:2]).sum()
         _check_swapped(drive, order[:2], min(ahead, left), straight)
+    if np.linalg.det(best[:2, :2]) > -(SWAPPED**2):
+        return ()
+    one, other = (spec.command[k].name for k in order[:2])
+    finding = f"The robot moves right where {other} is positive, or back where {one} is"
+    cause = "one of them has the wrong sign, or the recording is a mirror image"
+    return (Mistake(f"{finding}: {cause} (y and heading reversed); the model moves as recorded."),)
 
 
 def _driven(drive: Drive) -> tuple[Array, Array, Array]:
@@ -307,12 +315,12 @@ def _asked_and_driven(
 ) -> tuple[Array, Array, Array] | None:
     """Returns speed and turn rate (n, 2), as commanded and as driven, and how alike (2, 2).
 
-    None if that does not show, as of robots that move sideways.
+    None if that does not show.
     """
     spec, places, (start, end, moved) = drive.spec, _places(drive.spec), _driven(drive)
     wheels = all(c.unit == "rad/s" for c in spec.command) and "wheel_radius" in spec.parameters
     wheels = wheels and "wheel_radius" not in spec.assumed and has_textbook(spec)
-    if spec.moves_sideways or not (places or wheels) or len(start) < MIN_COMPARED:
+    if not (places or wheels) or len(start) < MIN_COMPARED:
         return None
     axis = np.sqrt(((moved[:, 0] + 1j * moved[:, 1]) ** 2).sum())  # of travel, ahead or back
     axis = axis / max(abs(axis), 1e-9)
@@ -331,7 +339,8 @@ def check_axes(drive: Drive) -> None:
     """Refuses poses whose heading turns against the direction of travel (RecordingError)."""
     # If only mirrored headings make the direction constant, then x, y or heading is reversed.
     recording, values = drive.recording, drive.dated.values
-    apart = max(TRAVEL_SHARE * drive.spec.footprint_radius, 1e-3)
+    noise = TRAVEL_NOISE * (drive.pose_noise or (0.0, 0.0))[0]
+    apart = max(TRAVEL_SHARE * drive.spec.footprint_radius, noise, 1e-3)
     some = drive.dated.rows(recordings.along_path(values, apart))
     line = "" if drive.spec.moves_sideways else recordings.clockwise_line(some.values)
     state = recording.state

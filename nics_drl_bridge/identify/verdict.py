@@ -38,6 +38,12 @@ class Gap(str):
     __slots__ = ()
 
 
+class Mistake(str):
+    """A sentence on something that was mapped wrongly: the model holds for the mapping alone."""
+
+    __slots__ = ()
+
+
 def about_stamps(drive: Drive) -> Iterator[str]:
     """Tells of the stamps and the noise of the poses."""
     if (bursts := drive.bursts) is not None:
@@ -139,6 +145,12 @@ def refuse_unexcited(excitation: Excitation, spec: RobotSpec) -> None:
             raise FitError(f"{told} {fault}; drive with {told} {way}, or allow a model without.")
 
 
+def missed(linear: Fit, spec: RobotSpec) -> tuple[str, ...]:
+    """Returns the variables that never moved, but for a slip aside where none can be driven."""
+    slips = [v.name for v in spec.state if v.twist == "vy" and not spec.moves_sideways]
+    return tuple(name for name in linear.unmoved if name not in slips)
+
+
 def _commands(names: Sequence[str], spec: RobotSpec) -> list[str]:
     """Returns those names that are commands: what a driver can move."""
     return [c.name for c in spec.command if c.name in names]
@@ -148,7 +160,7 @@ def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> Iterator
     """Tells of inputs that were not moved, alone or at many levels, and of dependent states."""
     already = {name for r in calibration.responses for name in (r.command, r.state)}
     excitation = linear.regression.excitation
-    if unmoved := ", ".join(excitation.unmoved):
+    if unmoved := ", ".join(missed(linear, spec)):
         finding = f"The model has no terms of {unmoved}, which never moved"
         yield Gap(f"{finding}: it holds for this drive's constant value only.")
     still = _commands(excitation.unmoved, spec)
@@ -215,7 +227,7 @@ def mirror_note(samples: Samples, spec: RobotSpec) -> Iterator[str]:
         if min(turn.std(), wanted.std()) > 1e-3 and np.corrcoef(turn, wanted)[0, 1] < MIRRORED:
             finding = f"The robot turns right where {command.name} is positive"
             cause = "the recording is a mirror image (y and heading reversed), or the sign of"
-            yield f"{finding}: {cause} the command is; the model moves as recorded."
+            yield Mistake(f"{finding}: {cause} the command is; the model moves as recorded.")
             return
 
 

@@ -6,9 +6,8 @@ from pathlib import Path
 from nics_drl_bridge.files import write_text
 from nics_drl_bridge.identify.conclusion import OF_PATH, Conclusion, conclude, end_of
 from nics_drl_bridge.identify.identify import Identified
-from nics_drl_bridge.identify.judgement import shortfall, usual
+from nics_drl_bridge.identify.judgement import usual
 from nics_drl_bridge.identify.report import COMPARED, HEADS, equations_with_errors, judgement_rows
-from nics_drl_bridge.identify.verdict import doubts
 from nics_drl_bridge.report import fit_pictures, html
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -19,14 +18,13 @@ Tile = tuple[str, str, bool]
 
 def fit_tile(identified: Identified) -> Tile:
     """Returns the accuracy of a fit as a figure, its meaning, and false if it is doubtful."""
-    doubtful = [*shortfall(identified.judgement), *doubts(identified.held_out)]
     for at in usual(identified.judgement):
         beside = {"": at.model, "fitted textbook ": at.textbook, "twist kept ": at.kept_twist}
         told = [name + end_of(each, at.path_m) for name, each in beside.items() if each]
         figure, *others = (text.removesuffix(OF_PATH) for text in told)
         off = f"{OF_PATH} off".lstrip() if told[0] != figure else "off"
         meaning = f"{off} after {at.horizon_s:g} s, on unseen data; {', '.join(others)}"
-        return figure, meaning, not doubtful
+        return figure, meaning, not conclude(identified).doubts
     return "untried", "on data that it had not seen, as the drive is too short", False
 
 

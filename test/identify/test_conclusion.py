@@ -9,9 +9,9 @@ import pytest
 from nics_drl_bridge.identify.conclusion import UNTRIED, accuracy, conclude, end_of
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.report import fit_report, opening
-from nics_drl_bridge.identify.verdict import Gap
+from nics_drl_bridge.identify.verdict import Gap, Mistake
 from nics_drl_bridge.recording.textbook import record
-from nics_drl_bridge.robot.spec import load_robot
+from nics_drl_bridge.robot.spec import load_robot, robot_from
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors
 
 CAR = load_robot("ackermann")
@@ -77,3 +77,23 @@ def test_gaps_are_those_notes_that_tell_what_the_drive_could_not_teach(found):
     assert told.gaps == (gap,)
     assert "first see to what is said above" in told.advice
     assert type(told.gaps[0]) is str  # a file takes no other
+
+
+def test_a_mistake_of_the_mapping_is_told_first_and_to_be_mended_before_a_training(found):
+    assert conclude(found).ready
+    mistake = "The commands ask for 57.3 times the turn_command that was driven."
+    told = conclude(replace(judged(found, 2.0), notes=(Mistake(mistake),)))
+    assert told.doubts[0] == mistake
+    assert type(told.doubts[0]) is str  # a file takes no other
+    assert told.advice.startswith("Next: mend the mapping as said above")
+    assert not told.ready
+
+
+@pytest.mark.parametrize("kind", ["ackermann", "skid_steer"])
+def test_a_robot_that_moves_ahead_alone_is_not_to_be_driven_aside(kind):
+    spec = robot_from({"kind": kind, "footprint_radius": 0.25})
+    found = identify(record(spec, np.random.default_rng(0), 30.0), spec)
+    assert "vy" in found.fit.unmoved
+    told = conclude(found)
+    assert not any("vy" in gap for gap in told.gaps)
+    assert told.ready

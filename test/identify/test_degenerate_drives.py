@@ -236,6 +236,7 @@ def test_a_whole_mirror_image_is_told(car):
     values = recording.pose.values * [1.0, -1.0, -1.0]
     found = identify(replace(recording, pose=replace(recording.pose, values=values)), car)
     assert said(found, "turns right where steering_command is positive")
+    assert not conclude(found).ready
     upright = identify(recording, car)
     assert not said(upright, "turns right")
 

@@ -15,7 +15,8 @@ from nics_drl_bridge.identify.calibration import Calibration, align
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.fit import fit
 from nics_drl_bridge.identify.identify import identify
-from nics_drl_bridge.identify.repair import check_commands, check_units, repaired
+from nics_drl_bridge.identify.repair import check_axes, check_commands, check_units, repaired
+from nics_drl_bridge.identify.verdict import Mistake
 from nics_drl_bridge.recording.mapping import load_mapping
 from nics_drl_bridge.recording.readers import robot_and_drive
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream, samples_on_one_clock
@@ -123,10 +124,39 @@ def test_swapped_commands_of_a_robot_that_moves_sideways_are_refused(pair, rotat
         check_commands(Drive(replace(plain, command=command), spec))
 
 
+@pytest.mark.parametrize("rotation", [0.0, 0.8, np.pi])
+@pytest.mark.parametrize("place", [0, 1])
+def test_a_reversed_command_of_a_robot_that_moves_sideways_is_told(place, rotation):
+    spec = load_robot("mecanum")
+    plain = drive(spec, pose_clock_ahead=0.4, rotation=rotation, noise=(2e-3, 3e-3))
+    values = plain.command.values * np.where(np.arange(3) == place, -1.0, 1.0)
+    turned = Drive(replace(plain, command=replace(plain.command, values=values)), spec)
+    (note,) = check_commands(turned)
+    assert isinstance(note, Mistake)
+    assert note.startswith("The robot moves right where left_command is positive, or back where")
+    assert check_commands(Drive(plain, spec)) == ()
+
+
 def test_poses_of_a_mount_that_is_turned_by_90_degrees_are_not_swapped_commands():
     spec = load_robot("mecanum")
     for rotation in (np.pi / 2, -np.pi / 2, np.pi):
         assert check_commands(Drive(drive(spec, rotation=rotation), spec)) == ()
+
+
+def test_a_reversed_heading_is_refused_though_noise_hides_short_ways(differential):
+    """At rest and between rows 6 mm apart, 2 mm of noise lead anywhere."""
+    t, rng = np.arange(0.0, 90.0, 0.02), np.random.default_rng(1)
+    speed, turn = (np.repeat(rng.uniform(-a, a, 60), 75) for a in (0.3, 1.5))
+    moved = np.stack([speed, 0.0 * t, turn], axis=1) * 0.02
+    pose = [np.zeros(3)]
+    for each in geometry.exp(moved[:-1]):
+        pose.append(geometry.compose(pose[-1], each))
+    values = np.stack(pose) + rng.normal(size=(len(t), 3)) * [2e-3, 2e-3, 3e-3]
+    made = Recording(Stream(t, np.stack([speed, turn], axis=1)), Stream(t, values))
+    check_axes(Drive(made, differential))
+    other = replace(made, pose=Stream(t, values * [1.0, 1.0, -1.0]))
+    with pytest.raises(RecordingError, match=r"write `heading: {from: ..., scale: -1}`"):
+        check_axes(Drive(other, differential))
 
 
 def test_two_commands_a_quarter_of_a_period_apart_are_not_swapped(differential):
@@ -174,6 +204,7 @@ def test_a_speed_that_another_unit_explains_is_told(differential, column, unit, 
     other = replace(plain, command=replace(plain.command, values=values))
     (note,) = check_commands(Drive(other, differential))
     assert f"if they are in {unit}, write `unit: {unit}`" in note
+    assert isinstance(note, Mistake)
 
 
 def test_commands_in_volts_and_poses_with_gaps_are_compared_without_harm(differential):
