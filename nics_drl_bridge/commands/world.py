@@ -15,6 +15,7 @@ from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 if TYPE_CHECKING:
     from nics_drl_bridge.sim.sections import Standing
+    from nics_drl_bridge.sim.world_set import AnyWorld
 
 world = typer.Typer(
     help="Imports worlds of others, draws worlds, and writes their maps.", no_args_is_help=True
@@ -193,7 +194,8 @@ def _flow(value: Any) -> str:
 
 @world.command()
 def draw(
-    name: Shown, out: Annotated[Path | None, Option(help="The .png to write; <world>.png.")] = None,
+    name: Shown,
+    out: Annotated[Path | None, Option(help="The .png to write; <world>_drawn.png.")] = None,
     seed: Annotated[int, Option(min=0, help="Seed of the episode.")] = 0,
     robot: console.RobotOption = DEFAULT_ROBOT,
     footprint: Annotated[float | None, Option(help="Instead: radius of a round robot [m].")] = None,
@@ -215,12 +217,21 @@ def draw(
     radius = load_robot(robot).footprint_radius if footprint is None else footprint
     if not 0.0 < radius < math.inf:
         raise ConfigError(f"--footprint {radius:g}: must be above 0 m.")
-    file = out or Path(f"{opened.name}.png")
+    file = out or Path(f"{opened.stem}_drawn.png")
     if file.suffix != ".png":
         raise ConfigError(f"--out {file}: must end in .png.")
+    _spare(worlds, file)
     write_bytes(file, world_picture(opened, radius, seed, outline))
     facts = {"file": str(file), "world": opened.name, "seed": seed}
     console.say(as_json, f"{file}: the world {opened.name!r}, seed {seed}", **facts)
+
+
+def _spare(worlds: "AnyWorld", *written: Path) -> None:
+    """Raises ConfigError for a file that would replace one of which a world is made."""
+    for own in (own for member in worlds.members for own in member.files):
+        for file in written:
+            if file.exists() and file.samefile(own):
+                raise ConfigError(f"{file}: the world itself is made of it; name another as --out.")
 
 
 @world.command("map")
@@ -250,9 +261,10 @@ def map_(
     scenes = sampler.draw([seed])
     scene, member = scenes[0], int(scenes.member[0])
     opened = worlds.members[member]
-    file = out or Path(f"{opened.name}_map.yaml")
+    file = out or Path(f"{opened.stem}_map.yaml")
     if file.suffix not in MAPS:
         raise ConfigError(f"--out {file}: must end in .yaml.")
+    _spare(worlds, file, file.with_suffix(".pgm"))
     grid = occupancy(opened, standing(sampler, member, scene.bodies), resolution)
     map_files(grid, file)
     rows, columns = grid.cells.shape

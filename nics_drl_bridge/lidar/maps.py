@@ -139,6 +139,12 @@ def load_map(
     return GridMap(cells, file.resolution, file.origin, unknown_stops, occupied_from)
 
 
+def files_of(name: str | Path) -> tuple[Path, Path]:
+    """The YAML file and the image of a map, see `load_map`."""
+    path = find_config(name, "maps")
+    return path, path.parent / load_yaml(path, MapFile).image
+
+
 def map_files(grid: GridMap, path: Path) -> None:
     """Writes a map as files of Nav2's map_server: YAML, and a PGM of the same name beside it.
 

@@ -164,8 +164,8 @@ def test_a_file_of_another_kind_is_refused(tmp_path):
 def test_a_saved_world_of_gazebo_classic_can_be_drawn(tmp_path):
     done("import", HERE / "classic.world", cwd=tmp_path)
     told = done("draw", "classic.yaml", "--footprint", 0.1, "--seed", 7, cwd=tmp_path)
-    assert told == "classic.png: the world 'classic', seed 7\n"
-    with Image.open(tmp_path / "classic.png") as picture:
+    assert told == "classic_drawn.png: the world 'classic', seed 7\n"
+    with Image.open(tmp_path / "classic_drawn.png") as picture:
         assert picture.format == "PNG"
     done("draw", "corridor", "--robot", "ackermann", "--out", "sub/c.png", cwd=tmp_path)
     assert (tmp_path / "sub" / "c.png").is_file()
@@ -210,6 +210,23 @@ def test_the_map_of_a_world_is_a_world_again_with_the_same_walls(tmp_path):
     assert 0.9 < np.mean(grid.free) < 0.97
 
 
+def test_neither_picture_nor_map_replaces_a_file_that_the_world_is_made_of(tmp_path):
+    Image.fromarray(np.full((80, 90), 255, np.uint8)).save(tmp_path / "plan.png")
+    words = "--resolution", 0.1, "--name", "../plan", "--out", "plan.yaml"
+    done("import", "plan.png", *words, cwd=tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    for words, file in (
+        (("draw", "plan.yaml", "--out", "plan.png"), "plan.png"),
+        (("map", "plan.yaml"), "plan_map.yaml"),
+        (("map", "pl*n.yaml", "--out", "plan.yaml"), "plan.yaml"),  # a set of one
+    ):
+        sentence = refused(*words, cwd=tmp_path)
+        assert sentence == f"{file}: the world itself is made of it; name another as --out."
+        assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+    done("draw", "plan.yaml", cwd=tmp_path)
+    assert set(tmp_path.iterdir()) - set(before) == {tmp_path / "plan_drawn.png"}
+
+
 def test_a_map_that_can_not_be_written_is_one_sentence(tmp_path):
     for words, sentence in (
         (("--out", "map.png"), "must end in .yaml"),
@@ -223,7 +240,7 @@ def test_a_map_that_can_not_be_written_is_one_sentence(tmp_path):
 
 def test_what_is_written_is_told_as_json_too(tmp_path):
     drawn = json.loads(done("draw", "arena", "--seed", 1, "--json", cwd=tmp_path))
-    assert drawn == {"file": "arena.png", "world": "arena", "seed": 1}
+    assert drawn == {"file": "arena_drawn.png", "world": "arena", "seed": 1}
     words = "map", "arena", "--seed", 1, "--resolution", 0.05, "--json"
     mapped = json.loads(done(*words, cwd=tmp_path))
     assert (mapped["file"], mapped["cells"]) == ("arena_map.yaml", [122, 122])
