@@ -1,5 +1,6 @@
 """The generator: from a recording to a SimulatorModel, one readable folder on disk."""
 
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, lru_cache
@@ -9,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from nics_drl_bridge import files
-from nics_drl_bridge.config import Schema, dump_yaml, parse_yaml, read_text, validate
+from nics_drl_bridge.config import Schema, dump_yaml, parse_yaml, read_text, shipped_names, validate
 from nics_drl_bridge.errors import ConfigError, FitError, ModelError
 from nics_drl_bridge.identify import fit
 from nics_drl_bridge.identify.calibration import Calibration
@@ -166,8 +167,9 @@ def builtin_model(robot: str) -> SimulatorModel:
 
 
 def open_model(name: str | Path, lidar: str | None = None) -> SimulatorModel:
-    """Opens a model by its folder, by a shipped robot (`ackermann`), or by a robot's YAML file.
+    """Opens a model by a shipped robot (`ackermann`), by its folder, or by a robot's YAML file.
 
+    A folder that is called like a shipped robot is opened by `./ackermann`.
     A `lidar`, shipped or a YAML file, takes the place of the model's own.
     """
     if lidar is not None:
@@ -175,7 +177,9 @@ def open_model(name: str | Path, lidar: str | None = None) -> SimulatorModel:
         spec = lidar_of(model.robot, lidar)
         return replace(model, lidar=spec, table=bake(spec, model.table.shapes))
     name = str(name)
-    if Path(name).is_dir():
+    if name in shipped_names("robots"):
+        _tell_folder(Path(name).resolve())
+    elif Path(name).is_dir():
         return load_model(name)
     if "/" in name and not name.endswith((".yaml", ".yml")):
         raise ModelError(f"{name}: no such folder; make one with `nics generate`.")
@@ -184,6 +188,15 @@ def open_model(name: str | Path, lidar: str | None = None) -> SimulatorModel:
     except ConfigError as error:
         reason = str(error).removesuffix(".")
         raise ModelError(f"{reason}; there is no folder of this name either.") from None
+
+
+@lru_cache
+def _tell_folder(folder: Path) -> None:
+    """Says once that a model lies here whose folder has the name of a shipped robot."""
+    if (folder / MODEL_FILE).is_file():
+        name = folder.name
+        told = f"{name!r} is the shipped robot; the model in the folder of this name is ./{name}"
+        sys.stderr.write(f"nics_drl_bridge: {told}\n")
 
 
 def check_place(folder: str | Path) -> None:

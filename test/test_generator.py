@@ -321,6 +321,19 @@ def test_a_model_is_opened_by_folder_or_by_the_name_of_a_robot(saved):
     assert open_model(str(saved)).fingerprint == open_model("ackermann").fingerprint
 
 
+def test_a_shipped_robot_goes_before_a_folder_of_its_name_which_is_told(
+    tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    save_model(builtin_model("ackermann"), "differential")
+    assert open_model("differential").robot.name == "differential"
+    assert open_model("differential", "rplidar_a2").robot.name == "differential"
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith("the model in the folder of this name is ./differential")
+    assert open_model("./differential").robot.name == "ackermann"
+    assert capsys.readouterr().err == ""
+
+
 def test_a_robot_has_the_lidar_that_its_file_names_and_else_that_of_the_paper(tmp_path):
     assert builtin_model("ackermann").lidar == load_lidar("paper")
     jackal = builtin_model("jackal")

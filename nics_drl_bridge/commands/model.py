@@ -270,7 +270,7 @@ def fit_facts(out: Path, robot: str, identified: "Identified") -> dict[str, Any]
 
 
 def drive(
-    out: Annotated[Path | None, Option(help="The model's folder; the robot's name.")] = None,
+    out: Annotated[Path | None, Option(help="The model's folder; <robot>_model.")] = None,
     robot: console.RobotOption = DEFAULT_ROBOT,
     recording: Annotated[Path | None,
         Option(help="An .npz to keep the drive in, as one of a real robot.")] = None,
@@ -285,13 +285,14 @@ def drive(
     """
     import numpy as np
 
+    from nics_drl_bridge.config import shipped_names
     from nics_drl_bridge.generator import check_place, generate, lidar_of, save_model
     from nics_drl_bridge.recording.textbook import record as record_textbook
     from nics_drl_bridge.recording.write import check_out, write_drive
     from nics_drl_bridge.robot.spec import load_robot
 
     spec = load_robot(robot)
-    check_place(out := out or Path(spec.name))
+    check_place(out := out or Path(f"{Path(robot).stem}_model"))
     seen = lidar_of(spec, lidar)
     if recording is not None and recording.suffix != ".npz":
         raise ConfigError(f"--recording {recording}: must end in .npz.")
@@ -303,7 +304,8 @@ def drive(
     save_model(model, out)
     kept = () if recording is None else (f"recording written to {recording}",)
     made = f"model of the textbook {spec.name!r} with the lidar {seen.name!r}: {out}"
-    lines = model.report.rstrip(), *kept, made, f"next: nics train --robot {out}"
+    place = f"./{out}" if str(out) in shipped_names("robots") else out
+    lines = model.report.rstrip(), *kept, made, f"next: nics train --robot {place}"
     facts = {"model": str(out), "robot": spec.name, "lidar": seen.name}
     console.say(as_json, "\n".join(lines), **facts, recording=recording and str(recording))
 

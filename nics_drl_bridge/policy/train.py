@@ -12,7 +12,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import configure
 
-from nics_drl_bridge.config import dump_yaml, load_yaml
+from nics_drl_bridge.config import dump_yaml, load_yaml, shipped_names
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError, shortened
@@ -218,7 +218,7 @@ def export(settings: TrainingSettings, result: SeedResult, command: str, path: P
     task = make_task(settings.task, model, settings.task_options)
     rates = {f"success in {world}": one.success.value for world, one in result.summaries.items()}
     provenance = {"command": command, "seed": result.seed, "steps": result.trained.steps, **rates}
-    if Path(settings.robot).exists():  # where an evaluation finds the robot, if it is not shipped
+    if settings.robot not in shipped_names("robots"):  # where an evaluation finds the robot
         provenance["model"] = str(Path(settings.robot).resolve())
     limit = settings.max_episode_steps
     export_policy(result.trained.algorithm, task, model, path, None, provenance, limit)

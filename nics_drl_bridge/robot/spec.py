@@ -146,6 +146,13 @@ class RobotSpec(Schema):
     state: tuple[StateVariable, ...] = Field(default=(), max_length=MOST_VARIABLES)
     command: tuple[CommandVariable, ...] = Field(min_length=1, max_length=MOST_VARIABLES)
 
+    @field_validator("name")
+    @classmethod
+    def _no_path(cls, name: str) -> str:
+        if any(part in name for part in ("/", "\\", "..")):
+            raise ValueError("must be without /, \\ and .., as files are named after it")
+        return name
+
     @field_validator("textbook")
     @classmethod
     def _known(cls, textbook: str | None) -> str | None:

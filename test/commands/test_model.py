@@ -45,10 +45,11 @@ def test_a_robots_file_becomes_a_model_and_a_recording_by_a_textbook_drive(tmp_p
     words = ("drive", "--robot", "mine.yaml", "--out", "again", "--duration", "10", "--json")
     told = json.loads(nics(*words, cwd=tmp_path).stdout)
     assert told == {"model": "again", "robot": "mine", "lidar": model.lidar.name, "recording": None}
-    (tmp_path / "mine").rename(tmp_path / "elsewhere")
     done = nics("drive", "--robot", "mine.yaml", "--duration", "10", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / "mine").is_dir()
+    assert load_model(tmp_path / "mine_model").robot == spec
+    words = ("drive", "--robot", "mine.yaml", "--out", "jackal", "--duration", "10")
+    assert nics(*words, cwd=tmp_path).stdout.endswith("next: nics train --robot ./jackal\n")
 
 
 @pytest.mark.slow

@@ -34,6 +34,17 @@ def _small_world(monkeypatch):
     )  # fmt: skip
 
 
+def test_a_policy_of_a_shipped_robot_does_not_name_a_folder_of_that_name(tmp_path, monkeypatch):
+    told = []
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(training, "export_policy", lambda *given: told.append(given[5]))
+    for robot in ("differential", "./differential"):
+        (tmp_path / "differential").mkdir(exist_ok=True)
+        result = training.SeedResult(0, training.Trained(None, 0, 0.0, 0.0), {})
+        training.export(settings(robot=robot), result, "", tmp_path / "p.onnx")
+    assert [one.get("model") for one in told] == [None, str(tmp_path / "differential")]
+
+
 ENGINES = {
     "lean": {"algorithm": "ppo"},
     "gru": {"algorithm": "ppo", "memory": {"kind": "gru", "units": 5}},
