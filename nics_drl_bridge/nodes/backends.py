@@ -161,7 +161,7 @@ class DdsBackend:
             kind = LaserScan if topic == SCAN else Odometry
             if topic in self._sensors:
                 kind = sensor_type(self._sensors[topic])
-            put = partial(self._mail.put, topic)
+            put = partial(_put, self._mail, topic)
             self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
         self._episodes: EpisodeServices | StandardEpisodes
         if standards:
@@ -269,6 +269,10 @@ def _read(topic: str, read: Callable[[bytes], T], message: bytes) -> T:
     except wire.UNREADABLE as error:
         reason = f"a message can't be read ({error}); look at who publishes it."
         raise BackendError(f"topic {topic!r}: {reason}") from None
+
+
+def _put(mail: _Mailbox, topic: str, message: bytes) -> object:
+    return mail.put(topic, message)
 
 
 class FleetBackend:
