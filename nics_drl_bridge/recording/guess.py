@@ -14,6 +14,7 @@ from nics_drl_bridge.recording.recording import (
     clockwise_line,
     implausible_pose,
     led_along,
+    w_first,
 )
 from nics_drl_bridge.recording.survey import Survey, TableSurvey, unit_in, words_of
 from nics_drl_bridge.robot.spec import find_kind, kind_names
@@ -122,16 +123,19 @@ def _turned(
 
 def _unnamed(table: TableSurvey) -> Iterator[Guess]:
     """Yields a quaternion after x, y, z, or x, y, heading that lead along, side by side."""
-    names = [column.name for column in table.numbers]
+    names = [c.name for c in table.numbers if c.name not in table.stamp_columns]
     columns = [table.data[name].astype(np.float64) for name in names]
-    for k in range(3, len(names) - 3):
+    place = [name for word in ("x", "y") for name in names if unit_in(name)[0] == [word]]
+    for k in range(2, len(names) - 3):
         four = columns[k : k + 4]
         if len({len(each) for each in four}) > 1:
             continue  # of several streams
         turns = any(np.ptp(each) > 0.0 for each in four)
         if turns and np.nanmax(np.abs(np.linalg.norm(four, axis=0) - 1.0)) < UNIT_LENGTH:
-            quaternion = f"[{', '.join(names[k : k + 4])}]"
-            yield Guess(table, {"x": names[k - 3], "y": names[k - 2], "quaternion": quaternion})
+            turn = names[k : k + 4]
+            turn = [*turn[1:], turn[0]] if w_first(np.stack(four, axis=1)) else turn
+            x, y = place if len(place) == 2 else names[max(k - 3, 0) :][:2]
+            yield Guess(table, {"x": x, "y": y, "quaternion": f"[{', '.join(turn)}]"})
     for k in range(len(names) - 2):
         if len({len(each) for each in columns[k : k + 3]}) > 1:
             continue

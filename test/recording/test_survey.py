@@ -53,6 +53,25 @@ def test_guesses_reach_over_files_split_stamps_and_quaternions(tmp_path):
     assert np.allclose(found.pose.values[:, 2], columns["yaw"])
 
 
+@pytest.mark.parametrize("first", ["w", "x"])
+@pytest.mark.parametrize("place", [("x", "y"), ("a", "b"), ("a", "b", "c")])
+def test_a_quaternion_without_names_stands_after_the_place_whatever_is_first(
+    tmp_path, place, first
+):
+    columns = drive()
+    half = columns["yaw"] / 2.0
+    turned = [0.0 * half, 0.0 * half, np.sin(half), np.cos(half)]
+    turned = turned[-1:] + turned[:-1] if first == "w" else turned
+    where = dict(zip(place, (columns["x"], columns["y"], 0.0 * half), strict=False))
+    names = {f"q{k}": each for k, each in enumerate(turned)}
+    rest = {"v_cmd": columns["v"], "w_cmd": columns["w"]}
+    path = write(tmp_path / "log.csv", {"t": columns["t"]} | where | names | rest)
+    _, guess = surveyed(path)
+    assert (guess["pose"]["x"], guess["pose"]["y"]) == place[:2]
+    found = read_recording(path, mapping=Mapping.model_validate(guess))
+    assert np.allclose(found.pose.values[:, 2], columns["yaw"])
+
+
 def test_streams_of_different_lengths_in_one_file_are_guessed_apart(tmp_path):
     columns = drive()
     quick = np.linspace(0.0, 20.0, 321)
