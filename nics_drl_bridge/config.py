@@ -10,10 +10,10 @@ import reprlib
 from collections.abc import Iterator
 from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Any, TypeVar, get_type_hints
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, ValidationError
 from yaml.composer import Composer
 
 from nics_drl_bridge.errors import ConfigError, nearest, shortened
@@ -23,6 +23,21 @@ MAX_DEPTH = 32
 MAX_BYTES = 2**20  # maximum size of a YAML file
 MAX_VALUES = 50_000  # keys, values and lists; an alias counts as everything it stands for
 _LONGEST_PROBLEM = 200
+
+
+def _within(most: float, needed: str) -> AfterValidator:
+    def check(value: float) -> float:
+        if abs(value) > most:
+            raise ValueError(f"must be {needed}")
+        return value
+
+    return AfterValidator(check)
+
+
+Heading = Annotated[float, _within(6.3, "in radians, within 2 pi (degrees look like this)")]
+_Near = Annotated[float, _within(10.0, "in metres, within 10 (millimetres look like this)")]
+Mount = tuple[_Near, _Near, Heading]
+"""x, y [m] and heading [rad] of a sensor in `base_link`."""
 
 
 class Schema(BaseModel):

@@ -6,7 +6,7 @@ from typing import NamedTuple
 from nics_drl_bridge.identify.excitation import narrow
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.judgement import shortfall, usual
-from nics_drl_bridge.identify.verdict import doubts, missed
+from nics_drl_bridge.identify.verdict import Mistake, doubts, missed
 from nics_drl_bridge.robot.kinds import overdriven
 from nics_drl_bridge.robot.taylor import EndErrors
 
@@ -31,7 +31,8 @@ class Conclusion(NamedTuple):
 
 def conclude(identified: Identified) -> Conclusion:
     """Draws the conclusion of a fit."""
-    wrong, spec, ready = identified.mistakes, identified.drive.spec, False
+    spec, ready = identified.drive.spec, False
+    wrong = tuple(str(note) for note in identified.notes if isinstance(note, Mistake))
     about = *wrong, *shortfall(identified.judgement), *doubts(identified.held_out)
     beyond = *narrow(identified.recording, spec), overdriven(spec)
     gaps = *identified.gaps, *(one for one in beyond if one)

@@ -499,11 +499,6 @@ class Identified:
         return tuple(str(note) for note in self.notes if isinstance(note, verdict.Gap))
 
     @property
-    def mistakes(self) -> tuple[str, ...]:
-        """The notes on what was mapped wrongly."""
-        return tuple(str(note) for note in self.notes if isinstance(note, verdict.Mistake))
-
-    @property
     def train_until_s(self) -> float:
         """End of the training part, from the drive's first pose [s]."""
         return self.drive.settings.train_until_s

@@ -18,7 +18,7 @@ from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording.mapping import UNITS
 from nics_drl_bridge.recording.stamping import not_repeated
 from nics_drl_bridge.robot.kinds import has_textbook, textbook
-from nics_drl_bridge.robot.spec import RobotSpec
+from nics_drl_bridge.robot.spec import FARTHEST_STEERED, RobotSpec
 
 NEIGHBOURS = 3  # a jump is measured by the median difference from this many samples on either side
 STEPS = 6.0  # it is larger than this many usual changes from sample to sample,
@@ -36,8 +36,7 @@ MOST_JUMPS = 0.02  # of the steps: more of them are noise
 MOST = 0.15  # jumps in more than this share of the rows are not faults of single samples
 EXCESS = 0.01  # commands may exceed their limits by this share of their range
 WRONG_UNIT = 5.0  # times the limit is another unit: degrees are 57, rpm 9.5 times larger
-UNIT_PERCENTILE = 75.0
-FARTHEST_STEERED, STEERED_PERCENTILE = 3.2, 95.0  # angle of a wheel [rad]
+UNIT_PERCENTILE, STEERED_PERCENTILE = 75.0, 95.0
 # Commands are compared with the motion over this time [s], that many times or more, at any delay
 DELAYS_S, COMPARED_S, MIN_COMPARED = np.linspace(-1.0, 1.5, 26), 1.0, 20  # and offset of clocks;
 ALIKE, NEAR = 0.85, 1.2  # from this correlation on, another unit explains sizes by up to this ratio

@@ -17,13 +17,13 @@ from PIL import Image
 from pydantic import Field, model_validator
 from scipy import ndimage
 
-from nics_drl_bridge.config import Schema, dump_yaml, find_config, load_yaml
+from nics_drl_bridge.config import Heading, Schema, dump_yaml, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.files import write_bytes, write_text
 from nics_drl_bridge.geometry import rotate
 from nics_drl_bridge.lidar import map_kernels
 from nics_drl_bridge.lidar.fixture_kernels import Fixtures
-from nics_drl_bridge.lidar.shapes import Coordinate, Heading
+from nics_drl_bridge.lidar.shapes import Coordinate
 
 FREE, OCCUPIED, UNKNOWN = 0, 100, -1
 NO_MAP = map_kernels.GridArrays(np.zeros((0, 0), np.uint32), np.zeros(0))  # for the kernels

@@ -22,7 +22,6 @@ SMALLEST, LARGEST = 1e-6, 1e4  # Extent of a shape [m]: less is invisible, more 
 SAME_PLACE = 1e-9  # corners within this distance, as a share of the shape's radius, coincide
 FARTHEST = 1e8  # greatest coordinate in a map [m], enough for UTM
 Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST)]
-Heading = Annotated[float, Field(ge=-1000.0, le=1000.0)]
 Place = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Size = Annotated[float, Field(ge=SMALLEST, le=LARGEST)]
 

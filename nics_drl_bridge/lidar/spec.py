@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
-from nics_drl_bridge.config import Schema, find_config, load_yaml
+from nics_drl_bridge.config import Mount, Schema, find_config, load_yaml
 from nics_drl_bridge.lidar.faults import SKEW, LidarFaults
 from nics_drl_bridge.lidar.sensor_models import SensorModels
-from nics_drl_bridge.lidar.shapes import LARGEST, Heading, Place
+from nics_drl_bridge.lidar.shapes import LARGEST
 
 FULL_CIRCLE_TOLERANCE = 1e-6
 NoReturn = Literal["inf", "zero", "nan", "range_max"]
@@ -58,7 +58,7 @@ class LidarSpec(Schema):
     range_min: float = Field(ge=0.0)  # nearer returns are reported as `-inf` [m]
     range_max: float = Field(ge=1e-3, le=LARGEST)  # farther returns are reported as `inf` [m]
     rate: float = Field(ge=1e-3, le=1e5)  # scans per second [Hz]
-    mount: tuple[Place, Place, Heading] = (0.0, 0.0, 0.0)  # of `laser` in `base_link`
+    mount: Mount = (0.0, 0.0, 0.0)  # of `laser` in `base_link`
     noise_std: float = Field(default=0.0, ge=0.0, le=LARGEST)  # of a range [m]
     frame: str = Field(default="laser", min_length=1)  # id of the lidar's own frame
     no_return: NoReturn = "inf"  # the device's value for it; in the package it is `inf`

@@ -28,7 +28,7 @@ from pydantic import (
 )
 
 from nics_drl_bridge import extensions, geometry
-from nics_drl_bridge.config import Schema, find_config, parse_yaml, read_text, validate
+from nics_drl_bridge.config import Mount, Schema, find_config, parse_yaml, read_text, validate
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.geometry import Bicycle
 from nics_drl_bridge.robot.template import Ranges
@@ -44,6 +44,9 @@ TWIST_UNITS = dict(zip(CMD_VEL_FIELDS, POSE_UNITS, strict=True))
 Unit = Literal["m", "rad", "m/s", "rad/s", "m/s^2", "rad/s^2", "N", "N*m", "V", "A", "1"]
 MOST_CORNERS, MOST_VARIABLES = 512, 32  # of a footprint; of a state or a command
 LARGEST = 10.0  # reach of a footprint [m]: none of a robot or a car, but many in centimetres
+LENGTHS = {"wheelbase", "track", "effective_track", "wheel_radius", "half_length", "half_width"}
+LONGEST = 20.0  # of these parameters, in reaches of the footprint
+FARTHEST_STEERED = 3.2  # angle of a wheel [rad]
 SHARPEST = 0.2  # Corner up to which a grown outline keeps its edges parallel, 1 + its cosine
 FASTEST = 1e6  # Greatest absolute value of a variable, in its unit
 
@@ -141,7 +144,7 @@ class RobotSpec(Schema):
     # its usual lidar, a shipped one or a YAML file, where none is given; None: that of the paper
     lidar: str | None = Field(default=None, min_length=1)
     # where that is, x, y [m] and heading [rad] in `base_link`; None: as the lidar's own file says
-    lidar_mount: tuple[float, float, float] | None = None
+    lidar_mount: Mount | None = None
     # S and C components, in the order of every state and command vector
     state: tuple[StateVariable, ...] = Field(default=(), max_length=MOST_VARIABLES)
     command: tuple[CommandVariable, ...] = Field(min_length=1, max_length=MOST_VARIABLES)
@@ -186,6 +189,10 @@ class RobotSpec(Schema):
                     f"footprint reaches {reach:.6g} m from base_link, footprint_radius is "
                     f"{radius:.6g} m; leave footprint_radius out"
                 )
+        for name, size in self.parameters.items():
+            if name in LENGTHS and abs(size) > LONGEST * self.footprint_radius:
+                told = f"{name} {size:g} m is too long for a robot of {self.footprint_radius:.3g} m"
+                raise ValueError(f"{told} around base_link; lengths are in metres")
         names = self.variable_names
         if len(set(names)) != len(names):
             raise ValueError("every state and command variable needs a name of its own")
@@ -389,7 +396,13 @@ def robot_from(given: str | Path | Mapping[str, Any], ranges: Ranges | None = No
     source = "robot" if isinstance(given, Mapping) else str(find_config(given, "robots"))
     if "kind" in data:
         data = _of_kind(data, ranges or {}, source)
-    return validate(data, RobotSpec, source)
+    spec = validate(data, RobotSpec, source)
+    for c in spec.command:
+        end = max(c.min, c.max, key=abs)  # one that was recorded is judged with its mapping
+        if c.steers and abs(end) > FARTHEST_STEERED and end not in (ranges or {}).get(c.name, ()):
+            fault = f"key 'command': {c.name} reaches {end:g} rad, and no wheel steers so far"
+            raise ConfigError(f"{source}: {fault}; angles are in radians.")
+    return spec
 
 
 def definition(given: str | Path | Mapping[str, Any]) -> dict[str, Any]:

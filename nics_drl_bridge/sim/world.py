@@ -9,12 +9,12 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
-from nics_drl_bridge.config import Schema, find_config, load_yaml
+from nics_drl_bridge.config import Heading, Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import sha256
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.maps import GridMap, files_of, load_map
-from nics_drl_bridge.lidar.shapes import LARGEST, MOST_SHAPES, Coordinate, Heading, Shape
+from nics_drl_bridge.lidar.shapes import LARGEST, MOST_SHAPES, Coordinate, Shape
 from nics_drl_bridge.sim.collision_kernels import wall_distance
 from nics_drl_bridge.sim.obstacles import Motion, Patrol
 

@@ -12,6 +12,7 @@ from nics_drl_bridge.config import shipped_names
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.geometry import wrap_angle
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE, X, Y
 from nics_drl_bridge.lidar.shapes import Circle, Rectangle, Shape
 from nics_drl_bridge.policy.policies import POLICIES, actions_of, shipped_policies
@@ -157,7 +158,7 @@ def standing(env: BridgeEnv, *more: Obstacles, emptied: bool = False) -> World:
         if body[RADIUS] > 0.0 and not emptied:
             shape = shapes[int(body[SHAPE]) % len(shapes)]
             shape = scaled(shape, round(float(body[RADIUS]) / shape.radius, 6))
-            pose = float(body[X]), float(body[Y]), float(body[HEADING])
+            pose = float(body[X]), float(body[Y]), float(wrap_angle(body[HEADING]))
             groups.append(Obstacles(shapes=(shape,), at=(pose,), motion=motion))
     return world.model_copy(update={"obstacles": tuple(groups)})
 

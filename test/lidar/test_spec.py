@@ -133,6 +133,8 @@ def test_the_time_increment_has_the_sign_of_the_turn(skew, sign):
         ({"angle_min": -12.0, "angle_max": -10.0}, "within -2 pi and 2 pi"),
         ({"rate": 0.0}, "key 'rate'"),
         ({"mount": [0.0, 0.0]}, "key 'mount"),
+        ({"mount": [0.0, 0.0, 180.0]}, "'mount.2': must be in radians, within 2 pi (degrees look"),
+        ({"mount": [120.0, 0.0, 0.0]}, "'mount.0': must be in metres, within 10 (millimetres"),
         ({"noise_std": -1.0}, "key 'noise_std'"),
         ({"range_max": float("inf")}, "key 'range_max'"),
         ({"beem": 3}, "did you mean 'beams'"),

@@ -6,7 +6,7 @@ import pytest
 from nics_drl_bridge.config import validate
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot.kinds import require_textbook
-from nics_drl_bridge.robot.spec import RobotSpec, load_robot
+from nics_drl_bridge.robot.spec import RobotSpec, load_robot, robot_from
 
 ROBOTS = ("ackermann", "differential", "mecanum")
 
@@ -120,6 +120,9 @@ def test_a_node_is_told_which_command_is_no_field_of_cmd_vel():
         ({"angular_is": "sideways"}, "'turn_rate' or 'steering'"),
         ({"footprint_radius": 0.0}, "greater than or equal to 0.001"),
         ({"footprint_radius": 30.0}, "reaches 30 m from base_link, at most 10 m can be"),
+        ({"parameters": {"track": 330.0}}, "track 330 m is too long for a robot of 0.2 m"),
+        ({"lidar_mount": [0.0, 0.0, 180]}, "'lidar_mount.2': must be in radians, within 2 pi"),
+        ({"lidar_mount": [-40, 0.0, 3.14]}, "'lidar_mount.0': must be in metres, within 10"),
         ({"command": []}, "number of entries must be at least 1"),
         ({"state": data()["command"][:1]}, "unknown key 'state.0.cmd_vel'"),
         ({"state": [{"name": "push", "unit": "m", "min": 0, "max": 1}]}, "a name of its own"),
@@ -150,6 +153,15 @@ def test_a_robot_that_cant_be_is_refused_in_one_sentence(changes, sentence):
         validate(data(**changes), RobotSpec, "cart.yaml")
     assert sentence in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_steering_in_degrees_is_refused_where_the_robot_is_read_but_not_one_that_was_recorded():
+    kind = {"kind": "ackermann", "footprint_radius": 0.2}
+    speed, angle = {"name": "speed_command"}, {"name": "steering_command", "min": -24, "max": 22}
+    with pytest.raises(ConfigError, match=r"steering_command reaches -24 rad, .* are in radians"):
+        robot_from(kind | {"command": [speed, angle]})
+    ranges = {"speed_command": (-1.0, 1.0), "steering_command": (-24.0, 22.0)}
+    assert robot_from(kind, ranges).command[1].min == -24.0  # its mapping can turn it into radians
 
 
 def test_a_robot_without_textbook_is_told_so():

@@ -226,6 +226,8 @@ def copies(**keys):
         ({"clearance": 1e300}, "clearance"),
         ({"goal_distance": [1.0, 1e308]}, "goal_distance.1"),
         ({"starts": {"regions": [[1e300] * 4]}}, "starts.regions.0.0"),
+        ({"starts": {"at": [[1.0, 1.0, 90]]}}, "starts.at.0.2': must be in radians, within 2 pi"),
+        ({"obstacles": copies(at=[[1, 1, -90]])}, "obstacles.0.at.0.2': must be in radians"),
         ({"goals": {"at": [[0.0, 0.0]] * 20_000}}, "goals.at"),
         ({"obstacles": [{"count": 1, "shapes": [CIRCLE | {"radius": 1e308}]}]}, "radius"),
         ({"obstacles": [{"count": 1, "shapes": [CIRCLE | {"radius": 1e-320}]}]}, "radius"),

@@ -1,13 +1,17 @@
 from __future__ import annotations
 
 from contextlib import closing
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from robots import direct_model
 
 from nics_drl_bridge.errors import BridgeError, ConfigError
-from nics_drl_bridge.lidar.exact_kernels import RADIUS, X, Y
+from nics_drl_bridge.geometry import wrap_angle
+from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, X, Y
+from nics_drl_bridge.sim.world import load_world
+from nics_drl_bridge.watch.episode import standing
 from nics_drl_bridge.watch.server import Request
 from watch.rig import shown, source
 
@@ -173,3 +177,13 @@ def test_720_beams_are_sent_30_times_a_second_with_much_to_spare():
             text = json.dumps(made.frame().plain())
         assert time.thread_time() - begin < 0.5
         assert len(text) < 20_000
+
+
+def test_an_obstacle_that_has_turned_round_and_round_stands_in_a_world():
+    world = load_world("crowd")
+    count = sum(group.counts[1] for group in world.obstacles)
+    bodies = np.zeros((count, 7))
+    bodies[:, [HEADING, RADIUS]] = 40.0, 0.2
+    env = SimpleNamespace(snapshot=lambda: SimpleNamespace(member=0, bodies=bodies), world=world)
+    (_, _, heading), *_ = standing(env).obstacles[0].at
+    assert heading == pytest.approx(wrap_angle(40.0))
