@@ -148,7 +148,7 @@ def refuse_unexcited(excitation: Excitation, spec: RobotSpec) -> None:
 def missed(linear: Fit, spec: RobotSpec) -> tuple[str, ...]:
     """Returns the variables that never moved, but for a slip aside where none can be driven."""
     slips = [v.name for v in spec.state if v.twist == "vy" and not spec.moves_sideways]
-    return tuple(name for name in linear.unmoved if name not in slips)
+    return tuple(name for name in linear.regression.excitation.unmoved if name not in slips)
 
 
 def _commands(names: Sequence[str], spec: RobotSpec) -> list[str]:

@@ -36,9 +36,15 @@ def told(spec, *unmoved: str) -> str:
 
 def test_a_driver_is_asked_to_move_commands_and_no_states(throttled):
     sentences = told(throttled, "vy", "wz", "steering")
-    assert "no terms of vy, wz, steering, which never moved" in sentences
+    assert "no terms of wz, steering, which never moved" in sentences
     assert "Drive with steering changing over the whole range" in sentences
-    assert "Drive with" not in told(throttled, "vy")
+    assert "Drive with" not in told(throttled, "wz")
+
+
+def test_only_a_robot_that_moves_sideways_is_told_that_it_never_did(throttled):
+    assert told(throttled, "vy") == ""
+    aside = robot_from({"kind": "omnidirectional", "footprint_radius": 0.2})
+    assert "no terms of body_vy, which" in told(aside, "body_vy")
 
 
 def test_a_car_that_never_moves_sideways_is_not_refused(throttled, car):
