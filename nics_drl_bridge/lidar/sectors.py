@@ -83,6 +83,11 @@ def layout_of(given: Any, lidar: LidarSpec) -> ScanLayout | None:
     return validate(dict(given), ScanLayout, "task option scan")
 
 
+def sectors_over(lidar: LidarSpec) -> int:
+    """Number of sectors over a lidar's view, as wide as those of `LAYOUTS`."""
+    return max(4, round((lidar.angle_max - lidar.angle_min) / LAYOUTS["around"].width))
+
+
 def covers(lidar: LidarSpec, layout: str) -> bool:
     """True if a lidar can fill a layout of `LAYOUTS`."""
     try:
@@ -134,7 +139,7 @@ def _check(lidar: LidarSpec, layout: ScanLayout, angles: Array) -> None:
         reason = f"are {found:.3g} deg apart, a scan layout needs at most {most:.3g}"
         raise ConfigError(f"the beams of the lidar {lidar.name!r} {reason}; use a finer lidar.")
     if lidar.range_max < layout.range_max * (1.0 - RANGE_TOLERANCE):
-        needed = f"{layout.range_max:g} m; use a lidar that sees farther, or another layout."
+        needed = f"{layout.range_max:g} m; {_narrower(lidar, layout)}."
         seen = f"range_max of the lidar {lidar.name!r} is {lidar.range_max:g} m"
         raise ConfigError(f"{seen}, the scan layout needs {needed}")
     steps = max(layout.sectors, int(np.ceil((layout.angle_max - layout.angle_min) / apart)))
@@ -154,7 +159,8 @@ def _check(lidar: LidarSpec, layout: ScanLayout, angles: Array) -> None:
 def _narrower(lidar: LidarSpec, layout: ScanLayout) -> str:
     if layout.model_dump() == LAYOUTS["around"].model_dump() and covers(lidar, "front"):
         return "say `scan: front`, its 270 deg"
-    return "use a wider lidar, or another layout"
+    own = f"train with `scan: {sectors_over(lidar)}`, sectors over its own view"
+    return f"use a lidar that sees more, or {own}"
 
 
 @dataclass(frozen=True)

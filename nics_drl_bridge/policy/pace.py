@@ -9,7 +9,7 @@ from nics_drl_bridge.config import shipped_names
 from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS, class_for
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel, open_model
-from nics_drl_bridge.lidar.sectors import covers
+from nics_drl_bridge.lidar.sectors import LAYOUTS, covers, sectors_over
 from nics_drl_bridge.policy import training_settings as recordings
 from nics_drl_bridge.robot.kinds import has_textbook, reach
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -109,14 +109,15 @@ def fitted(settings: recordings.TrainingSettings, model: SimulatorModel, inherit
     Those inherited from another robot get its lidar's layout of a scan, and a time reward and a
     discount that come to the same over an episode.
     """
-    options, told = dict(settings.task_options), list[str]()
+    options, told, lidar = dict(settings.task_options), list[str](), model.lidar
     worlds = [load_worlds(world) for world in settings.worlds]
     class_for(settings.task, options)
     pace = pace_of(model, worlds, options.get("top_speed"))
     changed: dict[str, Any] = {}
-    if inherited and options.get("scan") == "around" and not covers(model.lidar, "around"):
-        options["scan"] = "front"
-        told.append(f"the lidar {model.lidar.name!r} does not see all around: scan: front")
+    if inherited and options.get("scan") == "around" and not covers(lidar, "around"):
+        scan = options["scan"] = "front" if covers(lidar, "front") else sectors_over(lidar)
+        far = LAYOUTS["around"].range_max
+        told.append(f"the lidar {lidar.name!r} does not see {far:g} m all around: scan: {scan}")
     if "max_episode_steps" not in settings.model_fields_set and pace.steps != MAX_EPISODE_STEPS:
         changed["max_episode_steps"] = pace.steps
         limit = f"{pace.steps * pace.period:g} s ({pace.steps} steps)"

@@ -4,13 +4,14 @@ import math
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from nics_drl_bridge.config import shipped_names
-from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS
+from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS, make_task
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import open_model
-from nics_drl_bridge.lidar.spec import load_lidar
+from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
 from nics_drl_bridge.policy.pace import fitted, kin, pace_of, settings_for, top_speed
 from nics_drl_bridge.policy.training_settings import TrainingSettings, load_training
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
@@ -100,7 +101,28 @@ def test_a_lidar_that_sees_no_full_circle_gets_the_layout_of_the_front(model):
     hokuyo = replace(model, lidar=load_lidar("hokuyo_ust_10lx"))
     settings, told = fitted(load_training("own_differential"), hokuyo, inherited=True)
     assert settings.task_options["scan"] == "front"
-    assert told == ("the lidar 'hokuyo_ust_10lx' does not see all around: scan: front",)
+    assert told == ("the lidar 'hokuyo_ust_10lx' does not see 3 m all around: scan: front",)
+
+
+@pytest.mark.parametrize(
+    ("changes", "scan"),
+    [
+        ({"angle_min": -np.pi / 2, "angle_max": np.pi / 2, "beams": 361}, 36),
+        ({"angle_min": 0.0, "angle_max": 0.1, "beams": 11}, 4),
+        ({"range_max": 2.0}, 72),  # which sees all around, but not far enough
+    ],
+)
+def test_a_lidar_that_fills_no_layout_gets_sectors_over_its_own_view(model, changes, scan):
+    changed = LidarSpec.model_validate(model.lidar.model_dump() | changes)
+    settings, told = fitted(
+        load_training("own_differential"), replace(model, lidar=changed), inherited=True
+    )
+    assert settings.task_options["scan"] == scan
+    assert told == (f"the lidar {changed.name!r} does not see 3 m all around: scan: {scan}",)
+    task = make_task("navigation", replace(model, lidar=changed), settings.task_options)
+    assert task.scan.sectors == scan
+    with pytest.raises(ConfigError, match=f"or train with `scan: {scan}`, sectors over its own"):
+        make_task("navigation", replace(model, lidar=changed), {"scan": "around"})
 
 
 @pytest.mark.slow
