@@ -162,6 +162,9 @@ def lidar_of(robot: RobotSpec, name: str | None = None) -> LidarSpec:
 def builtin_model(robot: str) -> SimulatorModel:
     """The model of a shipped robot, generated from a drive of its textbook kinematics."""
     spec = load_robot(robot)
+    if Path(robot, MODEL_FILE).is_file():
+        told = f"{robot!r} is the shipped robot; the folder of this name is ./{robot}"
+        sys.stderr.write(f"nics_drl_bridge: {told}\n")
     drive = textbook.record(spec, np.random.default_rng(BUILTIN_SEED))
     return generate(drive, spec, lidar_of(spec), ())[0]
 
@@ -177,9 +180,7 @@ def open_model(name: str | Path, lidar: str | None = None) -> SimulatorModel:
         spec = lidar_of(model.robot, lidar)
         return replace(model, lidar=spec, table=bake(spec, model.table.shapes))
     name = str(name)
-    if name in shipped_names("robots"):
-        _tell_folder(Path(name).resolve())
-    elif Path(name).is_dir():
+    if Path(name).is_dir() and name not in shipped_names("robots"):
         return load_model(name)
     if "/" in name and not name.endswith((".yaml", ".yml")):
         raise ModelError(f"{name}: no such folder; make one with `nics generate`.")
@@ -188,15 +189,6 @@ def open_model(name: str | Path, lidar: str | None = None) -> SimulatorModel:
     except ConfigError as error:
         reason = str(error).removesuffix(".")
         raise ModelError(f"{reason}; there is no folder of this name either.") from None
-
-
-@lru_cache
-def _tell_folder(folder: Path) -> None:
-    """Says once that a model lies here whose folder has the name of a shipped robot."""
-    if (folder / MODEL_FILE).is_file():
-        name = folder.name
-        told = f"{name!r} is the shipped robot; the model in the folder of this name is ./{name}"
-        sys.stderr.write(f"nics_drl_bridge: {told}\n")
 
 
 def check_place(folder: str | Path) -> None:

@@ -285,7 +285,6 @@ def drive(
     """
     import numpy as np
 
-    from nics_drl_bridge.config import shipped_names
     from nics_drl_bridge.generator import check_place, generate, lidar_of, save_model
     from nics_drl_bridge.recording.textbook import record as record_textbook
     from nics_drl_bridge.recording.write import check_out, write_drive
@@ -304,8 +303,7 @@ def drive(
     save_model(model, out)
     kept = () if recording is None else (f"recording written to {recording}",)
     made = f"model of the textbook {spec.name!r} with the lidar {seen.name!r}: {out}"
-    place = f"./{out}" if str(out) in shipped_names("robots") else out
-    lines = model.report.rstrip(), *kept, made, f"next: nics train --robot {place}"
+    lines = model.report.rstrip(), *kept, made, f"next: nics train --robot {out}"
     facts = {"model": str(out), "robot": spec.name, "lidar": seen.name}
     console.say(as_json, "\n".join(lines), **facts, recording=recording and str(recording))
 

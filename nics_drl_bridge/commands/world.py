@@ -217,7 +217,7 @@ def draw(
     radius = load_robot(robot).footprint_radius if footprint is None else footprint
     if not 0.0 < radius < math.inf:
         raise ConfigError(f"--footprint {radius:g}: must be above 0 m.")
-    file = out or Path(f"{opened.stem}_drawn.png")
+    file = out or Path(Path(f"{opened.name}_drawn.png").name)
     if file.suffix != ".png":
         raise ConfigError(f"--out {file}: must end in .png.")
     _spare(worlds, file)
@@ -228,10 +228,12 @@ def draw(
 
 def _spare(worlds: "AnyWorld", *written: Path) -> None:
     """Raises ConfigError for a file that would replace one of which a world is made."""
-    for own in (own for member in worlds.members for own in member.files):
-        for file in written:
-            if file.exists() and file.samefile(own):
-                raise ConfigError(f"{file}: the world itself is made of it; name another as --out.")
+    from nics_drl_bridge.lidar.maps import files_of
+
+    for one in worlds.members:
+        own = Path(one.source), *(files_of(one.map) if one.map else ())
+        for file in {each.resolve() for each in written} & {each.resolve() for each in own}:
+            raise ConfigError(f"{file}: the world itself is made of it; name another as --out.")
 
 
 @world.command("map")
@@ -261,7 +263,7 @@ def map_(
     scenes = sampler.draw([seed])
     scene, member = scenes[0], int(scenes.member[0])
     opened = worlds.members[member]
-    file = out or Path(f"{opened.stem}_map.yaml")
+    file = out or Path(Path(f"{opened.name}_map.yaml").name)
     if file.suffix not in MAPS:
         raise ConfigError(f"--out {file}: must end in .yaml.")
     _spare(worlds, file, file.with_suffix(".pgm"))

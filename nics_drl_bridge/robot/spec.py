@@ -149,13 +149,6 @@ class RobotSpec(Schema):
     state: tuple[StateVariable, ...] = Field(default=(), max_length=MOST_VARIABLES)
     command: tuple[CommandVariable, ...] = Field(min_length=1, max_length=MOST_VARIABLES)
 
-    @field_validator("name")
-    @classmethod
-    def _no_path(cls, name: str) -> str:
-        if any(part in name for part in ("/", "\\", "..")):
-            raise ValueError("must be without /, \\ and .., as files are named after it")
-        return name
-
     @field_validator("textbook")
     @classmethod
     def _known(cls, textbook: str | None) -> str | None:
@@ -177,6 +170,8 @@ class RobotSpec(Schema):
 
     @model_validator(mode="after")
     def _consistent(self) -> RobotSpec:
+        if any(part in self.name for part in ("/", "\\", "..")):
+            raise ValueError(f"name {self.name!r}: files are named after it; leave out .., / and \\")
         if not self.footprint_radius <= LARGEST:
             told = f"its footprint reaches {self.footprint_radius:.6g} m from base_link"
             raise ValueError(f"{told}, at most {LARGEST:g} m can be; lengths are in metres")

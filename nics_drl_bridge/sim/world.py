@@ -13,7 +13,7 @@ from nics_drl_bridge.config import Heading, Schema, find_config, load_yaml
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import sha256
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.lidar.maps import GridMap, files_of, load_map
+from nics_drl_bridge.lidar.maps import GridMap, load_map
 from nics_drl_bridge.lidar.shapes import LARGEST, MOST_SHAPES, Coordinate, Shape
 from nics_drl_bridge.sim.collision_kernels import wall_distance
 from nics_drl_bridge.sim.obstacles import Motion, Patrol
@@ -140,16 +140,6 @@ class World(Schema):
     def source(self) -> str:
         """Name of the world in error messages: its file, or its name."""
         return self._file or f"world {self.name!r}"
-
-    @property
-    def stem(self) -> str:
-        """Name for files about the world: its own file's without the ending, or its name."""
-        return Path(self._file or self.name).stem
-
-    @property
-    def files(self) -> tuple[Path, ...]:
-        """The files that it is read from: its own, and those of its map."""
-        return (*map(Path, filter(None, [self._file])), *(files_of(self.map) if self.map else ()))
 
     @cached_property
     def grid(self) -> GridMap | None:

@@ -221,7 +221,9 @@ def test_neither_picture_nor_map_replaces_a_file_that_the_world_is_made_of(tmp_p
         (("map", "pl*n.yaml", "--out", "plan.yaml"), "plan.yaml"),  # a set of one
     ):
         sentence = refused(*words, cwd=tmp_path)
-        assert sentence == f"{file}: the world itself is made of it; name another as --out."
+        assert (
+            sentence == f"{tmp_path / file}: the world itself is made of it; name another as --out."
+        )
         assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
     done("draw", "plan.yaml", cwd=tmp_path)
     assert set(tmp_path.iterdir()) - set(before) == {tmp_path / "plan_drawn.png"}
