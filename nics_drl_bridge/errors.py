@@ -15,7 +15,7 @@ def shortened(text: str, most: int) -> str:
     """One printable line of about `most` characters: messages quote whatever users gave."""
     if len(text) > most:
         text = f"{text[: most // 2]} ... {text[-(most // 2) :]}"
-    text = " ".join(text.splitlines())
+    text = " ".join(text.split())
     return text if text.isprintable() else "".join(c if c.isprintable() else "?" for c in text)
 
 

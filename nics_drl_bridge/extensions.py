@@ -10,7 +10,7 @@ from importlib import import_module
 from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, requires, version
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
-from traceback import extract_tb
+from traceback import extract_tb, walk_tb
 from typing import Any
 
 from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
@@ -111,6 +111,16 @@ def _wrong() -> Iterator[tuple[str, str]]:
 
 def _numbers(release: str) -> tuple[int, ...]:
     return tuple(int(part) for part in re.findall(r"\d+", release.partition("+")[0])[:3])
+
+
+def own_fault(error: Exception) -> str | None:
+    """A clause about an error that a user's own task raised, with its place; else None."""
+    for frame, line in reversed(list(walk_tb(error.__traceback__))):
+        task, module = type(frame.f_locals.get("self")), str(frame.f_globals.get("__name__"))
+        if hasattr(task, "step_into") and not module.startswith(f"{PACKAGE}."):
+            place = f"{frame.f_code.co_filename}:{line}, in {frame.f_code.co_name}"
+            return str(ConfigError(f"task {task.__name__}: {place}: {error!r}; mend it."))
+    return None
 
 
 def module_at(place: str, what: str) -> Any:

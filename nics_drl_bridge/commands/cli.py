@@ -71,7 +71,7 @@ def main() -> None:
         if not hasattr(error, "format_message"):  # no option error of click or typer
             raise
         if message := error.format_message().strip():  # otherwise its help has been shown
-            message = shortened(message.rstrip(".?"), LONGEST)
+            message = shortened(message.rstrip(".?").replace("Value error, ", ""), LONGEST)
             typer.echo(f"nics: {message}; see `nics --help`.", err=True)
         raise SystemExit(EXIT_BAD_INPUT) from None
     raise SystemExit(code if isinstance(code, int) else 0)

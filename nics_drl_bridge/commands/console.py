@@ -1,5 +1,6 @@
 """Shared parts of the commands: options, one-sentence errors, a table, a progress bar."""
 
+import errno
 import math
 import threading
 import time
@@ -141,26 +142,23 @@ def one_sentence() -> Iterator[None]:
     """Turns user errors into one sentence and exit code 2, never a traceback."""
     try:
         yield
-    except BridgeError as error:
-        typer.echo(f"nics: {error}", err=True)
-        raise typer.Exit(EXIT_BAD_INPUT) from None
-    except ImportError as error:
-        if (clause := extensions.unmet(error)) is None:
-            raise
-        typer.echo(f"nics: {clause}", err=True)
-        raise typer.Exit(EXIT_BAD_INPUT) from None
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        place = f"{error.filename}: " if error.filename else ""
-        typer.echo(f"nics: {place}{error.strerror or error}; choose another place.", err=True)
-        raise typer.Exit(EXIT_BAD_INPUT) from None
     except (KeyboardInterrupt, SystemError) as error:
         # Ctrl-C in a compiled function leaves it as a SystemError.
         if not isinstance(error.__cause__ or error, KeyboardInterrupt):
             raise
         typer.echo("nics: interrupted; everything that was started has ended.", err=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None
+    except Exception as error:
+        clause = str(error) if isinstance(error, BridgeError) else extensions.own_fault(error)
+        if clause is None and isinstance(error, ImportError):
+            clause = extensions.unmet(error)
+        elif clause is None and isinstance(error, OSError) and error.errno != errno.EPIPE:
+            place = f"{error.filename}: " if error.filename else ""
+            clause = f"{place}{error.strerror or error}; choose another place."
+        if clause is None:
+            raise
+        typer.echo(f"nics: {clause}", err=True)
+        raise typer.Exit(EXIT_BAD_INPUT) from None
 
 
 def tell_replaced(file: Path) -> None:

@@ -167,9 +167,21 @@ class Task(ABC):
     ) -> Outcome:
         """Returns the outcome of a step and writes the observation, maybe in one pass."""
         self.update(before, after, memory)
-        out[...] = self.observation(after, memory)
-        terms = self.reward(before, after, memory)
-        return Outcome(terms, self.end(after, memory), self.info(after, memory))
+        out[...] = self.valid("observation", self.observation(after, memory), out.shape)
+        terms, each = self.reward(before, after, memory), out.shape[:-1]
+        if not isinstance(terms, dict):
+            raise ConfigError(f"task {type(self).__name__}: reward must be a dictionary of terms.")
+        for name, term in terms.items():
+            self.valid(f"reward term {name!r}", term, each)
+        ended = self.valid("end", self.end(after, memory), each)
+        return Outcome(terms, ended, self.info(after, memory))
+
+    def valid(self, what: str, given: Any, shape: tuple[int, ...]) -> Any:
+        """Returns what a method gave. Raises ConfigError if it is not finite, or of this shape."""
+        if np.shape(given) != shape or not np.isfinite(given).all():
+            fault = f"must be finite, of shape {shape}, and is {given!r:.80} of {np.shape(given)}"
+            raise ConfigError(f"task {type(self).__name__}: its {what} {fault}.")
+        return given
 
     @cached_property
     def command_limits(self) -> tuple[Array, Array]:

@@ -188,7 +188,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
                 self.memory[name] = np.zeros((self.num_envs, *rows.shape[1:]), rows.dtype)
             self.memory[name][worlds] = rows
         self.ended[worlds], self._over[worlds] = False, False
-        out[worlds] = self.task.observation(self._view(worlds), fresh)
+        seen = self.task.observation(self._view(worlds), fresh)
+        out[worlds] = self.task.valid("observation", seen, (len(worlds), *out.shape[1:]))
 
     def _view(self, rows: Rows) -> RobotView:
         data, readings = self.simulator.data, self.simulator.readings

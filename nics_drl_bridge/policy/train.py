@@ -32,6 +32,7 @@ from nics_drl_bridge.sim.world_set import AnyWorld
 CHECKPOINT, SETTINGS = "checkpoint.pt", "settings.yaml"
 EVALUATION, POLICY = "evaluation.json", "policy.onnx"
 SEEDS = 2**40
+TRIED = 8  # worlds, and steps in each
 GREATEST_SEED = 2**32 - 1  # of numpy's global generator, from which Stable-Baselines3 draws
 Tell = checkpoints.Tell
 
@@ -190,7 +191,10 @@ def run(
     """Trains and evaluates seed after seed; ConfigError for a run in the folder, or none there."""
     _check(order.settings, order.seeds, order.out, order.resumed)
     settings, model = order.settings, open_model(order.settings.robot, order.settings.lidar)
-    make_task(settings.task, model, settings.task_options)  # refused before a folder is begun
+    trial = _env_of(settings, next(iter(settings.worlds)), TRIED, model)
+    trial.reset(seed=FIRST_SEED)
+    for _ in range(TRIED):  # a task that gives no numbers is refused before a folder is begun
+        trial.step(trial.action_space.sample())
     write_text(order.out / SETTINGS, dump_yaml(settings.model_dump(mode="json")))
     results = []
     for seed in order.seeds:

@@ -9,6 +9,26 @@ from typer.testing import CliRunner
 from nics_drl_bridge.commands.cli import app
 from nics_drl_bridge.policy.policy_file import load_policy
 
+REACH = """
+from dataclasses import dataclass
+import numpy as np
+from nics_drl_bridge.env.task import Task, bearing, distance
+
+@dataclass(frozen=True)
+class Reach(Task):
+    @property
+    def observation_space(self):
+        return self.box([0, -1, -1], [1000, 1, 1])
+    def reset(self, episodes):
+        return {"goal": episodes.goals.copy()}
+    def observation(self, view, memory):
+        seen = bearing(view.pose, memory["goal"])
+        return np.concatenate([self.free_share(view.ranges), seen], axis=-1)
+    def reward(self, before, after, memory):
+        return {"near": -distance(after.pose, memory["goal"])}
+    def end(self, view, memory):
+        return self.touches(view.ranges)
+"""
 SETTINGS = """
 worlds: {arena: 8}
 task_options: {scan: around}
@@ -96,6 +116,29 @@ def test_a_misspelt_task_leaves_no_folder_that_refuses_the_right_one(tmp_path, m
     (tmp_path / "mine.py").write_text("")
     done = nics("--task", "mine.py:Patrol", "--out", "run")
     assert "mine.py has no such Task" in " ".join(done.output.split())
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "sentence"),
+    [
+        ('{"near": -', '{"near": np.nan * ', "task Reach: its reward term 'near' must be finite"),
+        ('["goal"])}', '["goal"])[0]}', "'near' must be finite, of shape (8, 1), and is array("),
+        ('{"near": -distance(after.pose, memory["goal"])}', "-1.0", "must be a dictionary of"),
+        ("[self.free_share(view.ranges), seen]", "[seen]", "task Reach: its observation must be"),
+        ("self.touches(view.ranges)", "False", "task Reach: its end must be finite, of shape"),
+        ('memory["goal"])}', 'memory["gaol"])}', "mine.py:17, in reward: KeyError('gaol'); mend"),
+    ],
+)
+def test_a_task_that_gives_no_numbers_is_refused_before_a_folder_is_begun(
+    tmp_path, monkeypatch, right, wrong, sentence
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text(REACH.replace(right, wrong))
+    done = nics("--task", "mine.py:Reach", "--world", "empty", "--steps", 64, "--out", "run")
+    assert done.exit_code == 2
+    assert sentence in " ".join(done.output.split())
+    assert "Traceback" not in done.output
     assert not (tmp_path / "run").exists()
 
 
