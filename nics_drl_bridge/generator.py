@@ -163,16 +163,14 @@ def builtin_model(robot: str) -> SimulatorModel:
     """The model of a shipped robot, generated from a drive of its textbook kinematics."""
     spec = load_robot(robot)
     if Path(robot, MODEL_FILE).is_file():
-        told = f"{robot!r} is the shipped robot; the folder of this name is ./{robot}"
-        sys.stderr.write(f"nics_drl_bridge: {told}\n")
+        sys.stderr.write(f"nics_drl_bridge: {robot!r} is shipped; the folder is ./{robot}\n")
     drive = textbook.record(spec, np.random.default_rng(BUILTIN_SEED))
     return generate(drive, spec, lidar_of(spec), ())[0]
 
 
 def open_model(name: str | Path, lidar: str | None = None) -> SimulatorModel:
-    """Opens a model by a shipped robot (`ackermann`), by its folder, or by a robot's YAML file.
+    """Opens a model by a shipped robot (`ackermann`), by folder (`./mine`), or by a robot's YAML.
 
-    A folder that is called like a shipped robot is opened by `./ackermann`.
     A `lidar`, shipped or a YAML file, takes the place of the model's own.
     """
     if lidar is not None:

@@ -330,7 +330,7 @@ def test_a_shipped_robot_goes_before_a_folder_of_its_name_which_is_told(
     assert open_model("differential").robot.name == "differential"
     assert open_model("differential", "rplidar_a2").robot.name == "differential"
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.endswith("the folder of this name is ./differential")
+    assert line.endswith("'differential' is shipped; the folder is ./differential")
     assert open_model("./differential").robot.name == "ackermann"
     assert capsys.readouterr().err == ""
 

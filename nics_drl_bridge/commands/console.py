@@ -1,6 +1,5 @@
 """Shared parts of the commands: options, one-sentence errors, a table, a progress bar."""
 
-import errno
 import math
 import threading
 import time
@@ -152,7 +151,7 @@ def one_sentence() -> Iterator[None]:
         clause = str(error) if isinstance(error, BridgeError) else extensions.own_fault(error)
         if clause is None and isinstance(error, ImportError):
             clause = extensions.unmet(error)
-        elif clause is None and isinstance(error, OSError) and error.errno != errno.EPIPE:
+        elif not clause and isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
             place = f"{error.filename}: " if error.filename else ""
             clause = f"{place}{error.strerror or error}; choose another place."
         if clause is None:

@@ -171,7 +171,7 @@ class RobotSpec(Schema):
     @model_validator(mode="after")
     def _consistent(self) -> RobotSpec:
         if any(part in self.name for part in ("/", "\\", "..")):
-            raise ValueError(f"name {self.name!r}: files are named after it; leave out .., / and \\")
+            raise ValueError(f"name {self.name!r}: files are named so; leave out .., / and \\")
         if not self.footprint_radius <= LARGEST:
             told = f"its footprint reaches {self.footprint_radius:.6g} m from base_link"
             raise ValueError(f"{told}, at most {LARGEST:g} m can be; lengths are in metres")

@@ -115,7 +115,7 @@ def test_a_node_is_told_which_command_is_no_field_of_cmd_vel():
     [
         ({"state": [TWIST, TWIST | {"name": "b"}]}, "two states are the same component of the"),
         ({"state": [TWIST | {"unit": "rad"}]}, "state 'a' is vx of the twist, so its unit is m/s"),
-        ({"name": "../../evil"}, "name '../../evil': files are named after it"),
+        ({"name": "../../evil"}, "name '../../evil': files are named so"),
         ({"name": "a\\b"}, "leave out .., / and \\"),
         ({"angular_is": "sideways"}, "'turn_rate' or 'steering'"),
         ({"footprint_radius": 0.0}, "greater than or equal to 0.001"),
