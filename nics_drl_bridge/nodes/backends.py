@@ -28,11 +28,7 @@ from nics_drl_bridge.nodes.link import EpisodeServices, Link
 from nics_drl_bridge.nodes.parameters import STANDARD
 from nics_drl_bridge.nodes.realtime_backend import RealtimeBackend
 from nics_drl_bridge.nodes.robot_topics import data_facts
-from nics_drl_bridge.nodes.simulation_interfaces.client import (
-    TOLERANCE,
-    StandardEpisodes,
-    StandardOptions,
-)
+from nics_drl_bridge.nodes.simulation_interfaces import client
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 from nics_drl_bridge.sim.simulator import EpisodeSampler
 from nics_drl_bridge.sim.world_set import AnyWorld
@@ -147,9 +143,9 @@ class DdsBackend:
         self.timeout_s, self._topics = timeout_s, (ODOM, SCAN, *further)
         # No reference to the backend, which may be garbage.
         take = partial(_take_odometry, self._middleware)
-        options = validate(dict(standard or {}), StandardOptions, "standard")
-        standards = simulator == STANDARD.name  # whose steps may be of a rounded length
-        self._grain_ns = round(TOLERANCE * self._period_ns) if standards else 0
+        options = validate(dict(standard or {}), client.StandardOptions, "standard")
+        by_standard = simulator == STANDARD.name  # whose steps may be of a rounded length
+        self._grain_ns = round(client.TOLERANCE * self._period_ns) if by_standard else 0
         self._slack_ns = max(round(options.slack_s * NS_PER_S), self._grain_ns)
         self._now_ns, self._mail = 0, _Mailbox(self._topics, take, self._slack_ns)
         self._known: BackendFacts = {}
@@ -163,9 +159,9 @@ class DdsBackend:
                 kind = sensor_type(self._sensors[topic])
             put = partial(_put, self._mail, topic)
             self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
-        self._episodes: EpisodeServices | StandardEpisodes
-        if standards:
-            self._episodes = StandardEpisodes(self._link, model, world, options, self._mail)
+        self._episodes: EpisodeServices | client.StandardEpisodes
+        if by_standard:
+            self._episodes = client.StandardEpisodes(self._link, model, world, options, self._mail)
         else:
             self._episodes = EpisodeServices(self._link, simulator, model, world, randomisation)
         self._link.begin()

@@ -194,13 +194,8 @@ class PathActions:
             self._end(before.goal, held.ABORT, "UNKNOWN", "a newer goal has taken its place.")
 
     def _follow(self, goal: Goal) -> Run:
-        asked, known, names = goal.handle.request, self._parameters, []
-        for what, those in (
-            ("controller", known.controllers),
-            ("goal_checker", known.goals),
-            ("progress_checker", known.progress),
-            ("path_handler", known.handlers),
-        ):
+        asked, names = goal.handle.request, []
+        for what, those in self._parameters.names.items():
             name, wrong = chosen(what.replace("_", " "), getattr(asked, f"{what}_id", ""), those)
             if wrong:  # the code of Nav2's own server
                 code = "INVALID_CONTROLLER" if what == "controller" else "UNKNOWN"
@@ -224,7 +219,7 @@ class PathActions:
             way = self._way(frame, self._robot_in(NAVIGATE, frame), end[0])
         except ConfigError as error:
             raise Refusal(goal.code, f"{NAVIGATE}: {error}") from None
-        checks = self._parameters.goals[0], self._parameters.progress[0]
+        checks = [self._parameters.names[f"{what}_checker"][0] for what in ("goal", "progress")]
         return self._begin(goal, frame, way, checks)
 
     def _way(self, frame: str, robot: Array, end: Array) -> Array:

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import fields, replace
+from itertools import chain
 from typing import Any
 
 from rclpy.node import Node
@@ -31,15 +32,12 @@ class ControllerParameters:
     def __init__(self, node: Node) -> None:
         self._node = node
         values = {row.name: declare_row(node, row) for row in nav2()}
-        lists = [f"{kind}_plugins" for kind in KINDS]
-        if empty := [name for name in lists if not values[name]]:
-            raise ConfigError(f"parameter {empty[0]!r} is empty; give one name or more.")
-        self.controllers, self.goals, self.progress, self.handlers = (
-            tuple(values[name]) for name in lists
-        )
+        self.names = {kind: tuple(values[f"{kind}_plugins"] or ()) for kind in KINDS}
+        if empty := [kind for kind, names in self.names.items() if not names]:
+            raise ConfigError(f"parameter '{empty[0]}_plugins' is empty; give one name or more.")
         if one := values["progress_checker_plugin"]:
-            self.progress = (one,)
-        for row in checkers(self.goals, self.progress):
+            self.names["progress_checker"] = (one,)
+        for row in checkers(self.names["goal_checker"], self.names["progress_checker"]):
             declare_row(node, row)
 
     def number(self, name: str) -> float:
@@ -65,8 +63,7 @@ class ControllerParameters:
 
     def ignores(self, name: str) -> bool:
         """True for a parameter of Nav2's own controller, which means nothing to a policy."""
-        known = (*self.controllers, *self.goals, *self.progress, *self.handlers)
-        return name in UNUSED or name.split(".")[0] in known
+        return name in UNUSED or name.split(".")[0] in chain(*self.names.values())
 
 
 def chosen(what: str, asked: str, known: Sequence[str]) -> tuple[str, str]:

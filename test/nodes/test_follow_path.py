@@ -287,7 +287,7 @@ def test_the_progress_checker_of_humble_is_taken_by_its_own_name(domain_id, tmp_
     context = open_context(["node", "--ros-args", *words], domain_id)
     node = PolicyNode(context)
     assert unknown(node) == []
-    assert node._nav2.progress == ("progress",)
+    assert node._nav2.names["progress_checker"] == ("progress",)
     assert node._nav2.checks("general_goal_checker", "progress")[1].movement_time_allowance == 7.0
     node.destroy_node()
     context.try_shutdown()
