@@ -178,9 +178,7 @@ def to_plain(value: Any) -> Any:
         return {KIND: "array", "type": value.dtype.str, "shape": list(value.shape), "data": data}
     if isinstance(value, tuple):
         return [to_plain(each) for each in value]
-    if isinstance(value, np.generic):
-        return value.item()
-    return value
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def from_plain(value: Any) -> Any:

@@ -57,8 +57,8 @@ def turned_to(stood: geometry.Quaternion, heading: float) -> geometry.Quaternion
     x, y, z, w = stood.x, stood.y, stood.z, stood.w
     if not (x or y):
         return heading_to_ros(heading)
-    turn = heading_to_ros(heading - heading_of(x, y, z, w))
-    s, c = turn.z, turn.w
+    half = (heading - heading_of(x, y, z, w)) / 2.0
+    s, c = math.sin(half), math.cos(half)
     return geometry.Quaternion(x=c * x - s * y, y=c * y + s * x, z=c * z + s * w, w=c * w - s * z)
 
 

@@ -22,7 +22,6 @@ UNUSED = {
 }  # fmt: skip
 
 
-OF_PLACE = ("PositionGoalChecker", "AxisGoalChecker")  # which do not look at the heading
 KINDS = ("controller", "goal_checker", "progress_checker", "path_handler")
 
 
@@ -47,14 +46,12 @@ class ControllerParameters:
     def checks(self, goal: str, progress: str) -> tuple[GoalCheck, ProgressCheck]:
         """Returns the checks of two names, as Nav2's checkers of these plugins make them."""
         arrives, gets_on = self._filled(GoalCheck, goal), self._filled(ProgressCheck, progress)
-        if self._plugin(goal).endswith(OF_PLACE):
+        kinds = [str(self._node.get_parameter(f"{name}.plugin").value) for name in (goal, progress)]
+        if kinds[0].endswith(("PositionGoalChecker", "AxisGoalChecker")):
             arrives = replace(arrives, yaw_goal_tolerance=math.inf)
-        if not self._plugin(progress).endswith("PoseProgressChecker"):
+        if not kinds[1].endswith("PoseProgressChecker"):
             gets_on = replace(gets_on, required_movement_angle=math.inf)
         return arrives, gets_on
-
-    def _plugin(self, name: str) -> str:
-        return str(self._node.get_parameter(f"{name}.plugin").value)
 
     def _filled(self, kind: Any, name: str) -> Any:
         known = {each.name: self._node.get_parameter(f"{name}.{each.name}").value

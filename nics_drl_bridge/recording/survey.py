@@ -161,9 +161,7 @@ def _time(data: dict[str, Column]) -> tuple[str | None, Array | None]:
     texts = {name: dates_of(c) for name, c in data.items() if c.dtype.kind in "US"}
     values = numbers | {name: dates for name, dates in texts.items() if dates is not None}
     best = max(values, key=merit, default=None)
-    if best is None or merit(best) < 0.25:
-        return None, None
-    return best, values[best]
+    return (None, None) if best is None or merit(best) < 0.25 else (best, values[best])
 
 
 def _regularity(t: Array, data: dict[str, Column]) -> Iterator[str]:

@@ -182,8 +182,7 @@ class StandardEpisodes:
 
     def _put(self, entity: str, pose: Array, timeout_s: float) -> None:
         if entity not in self._stood:
-            found = self._call("GetEntityState", timeout_s, entity=entity)
-            self._stood[entity] = found.state.pose
+            self._stood[entity] = self._call("GetEntityState", timeout_s, entity=entity).state.pose
         state, stood = self._messages.EntityState(), self._stood[entity]
         x, y, heading = map(float, pose)
         state.pose.position = Point(x=x, y=y, z=stood.position.z)

@@ -174,11 +174,10 @@ class Simulation:
             self._reset_all()
             return
         if scope & SCOPES.SCOPE_SPAWNED:
-            spawned = self.entities.spawned
-            if all(each.name in spawned for each in self.entities if each.robot >= 0):
+            if set(self.entities.robot_names) <= self.entities.spawned.keys():
                 told = "a simulator needs a robot, and all were spawned; reset all, by scope 0."
                 raise RefusalError(Result.RESULT_OPERATION_FAILED, told)
-            self.remove(*spawned)
+            self.remove(*self.entities.spawned)
         if scope & SCOPES.SCOPE_STATE:
             self._host.begin(rewind=bool(scope & SCOPES.SCOPE_TIME))
         elif scope & SCOPES.SCOPE_TIME:

@@ -141,29 +141,23 @@ class Worlds:
 
 
 def _in_source(source: str, skipped: list[str]) -> list[tuple[str, AnyWorld]]:
-    """Worlds of a file, or of those in a folder that can be read, the rest of which is told.
-
-    Raises BridgeError, OSError.
-    """
+    """Worlds of a file, or of those in a folder that can be read. Raises BridgeError, OSError."""
     path, found = resources.local(source), list[tuple[str, AnyWorld]]()
     if path is None:
         raise ConfigError("is not on this machine; give a folder or file.")
-    if not path.is_dir():
-        return [(str(path), _world_in(path))]
-    for file in sorted(path.iterdir()):
+    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
         form = resources.SUFFIXES.get(file.suffix.lower())
         try:
-            if form and (form != resources.SDF or root_of(file).find("world") is not None):
-                found.append((str(file), _world_in(file)))
+            if form == resources.SDF and (root_of(file).find("world") is not None or file == path):
+                standing = read_sdf(file, HEIGHT, skip_unknown=True, may_be_empty=True)
+                found.append((str(file), world_of(standing, file.stem)))
+            elif form == resources.YAML or file == path:
+                found.append((str(file), load_worlds(file)))
         except (BridgeError, OSError) as error:
+            if file == path:
+                raise
             skipped.append(str(error))
     return found
-
-
-def _world_in(file: Path) -> AnyWorld:
-    if resources.SUFFIXES.get(file.suffix.lower()) != resources.SDF:
-        return load_worlds(file)
-    return world_of(read_sdf(file, HEIGHT, skip_unknown=True, may_be_empty=True), file.stem)
 
 
 def _set_of(name: str) -> WorldResource:
@@ -195,8 +189,7 @@ def told_of(world: AnyWorld, resource: Resource) -> WorldResource:
 def world_of(standing: Standing, name: str) -> World:
     """Returns the world of what stands in an SDF file. Raises ConfigError.
 
-    What encloses most of its field, as the walls of a room do, bounds it. Else there are 2 m around
-    all that stands, and 5 m around the origin.
+    What encloses most of its field bounds it; else 2 m around it do, and 5 m around the origin.
     """
     if not standing.placed:
         return _in_field(standing, name, standing.bounds(*EMPTY))
@@ -220,6 +213,6 @@ def _encloses(standing: Standing, tight: Region, wide: Region) -> bool:
     made = occupancy(_in_field(standing, "field", wide), standing.placed, CELL)
     free = ndimage.distance_transform_edt(made.cells == FREE) * made.resolution > CLEARANCE
     area, _ = ndimage.label(free)
-    (first, last) = made.world_to_cell(np.reshape(tight, (2, 2)))
+    first, last = made.world_to_cell(np.reshape(tight, (2, 2)))
     within = area[first[0] : last[0], first[1] : last[1]]
     return bool((within > 0).any() and np.mean(within[within > 0] == area[2, 2]) < MOST_OPEN)
