@@ -36,8 +36,7 @@ def _within(most: float, needed: str) -> AfterValidator:
 
 Heading = Annotated[float, _within(6.3, "in radians, within 2 pi (degrees look like this)")]
 _Near = Annotated[float, _within(10.0, "in metres, within 10 (millimetres look like this)")]
-Mount = tuple[_Near, _Near, Heading]
-"""x, y [m] and heading [rad] of a sensor in `base_link`."""
+Mount = tuple[_Near, _Near, Heading]  # x, y [m] and heading [rad] of a sensor in `base_link`
 
 
 class Schema(BaseModel):

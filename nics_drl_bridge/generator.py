@@ -177,10 +177,9 @@ def open_model(name: str | Path, lidar: str | None = None) -> SimulatorModel:
         model = open_model(name)
         spec = lidar_of(model.robot, lidar)
         return replace(model, lidar=spec, table=bake(spec, model.table.shapes))
-    name = str(name)
-    if Path(name).is_dir() and name not in shipped_names("robots"):
+    if Path(name).is_dir() and name not in shipped_names("robots"):  # never so for a Path
         return load_model(name)
-    if "/" in name and not name.endswith((".yaml", ".yml")):
+    if "/" in (name := str(name)) and not name.endswith((".yaml", ".yml")):
         raise ModelError(f"{name}: no such folder; make one with `nics generate`.")
     try:
         return builtin_model(name)
@@ -191,6 +190,8 @@ def open_model(name: str | Path, lidar: str | None = None) -> SimulatorModel:
 
 def check_place(folder: str | Path) -> None:
     """Raises ConfigError, before the work of a fit, if `save_model` can't write to a folder."""
+    if str(folder) in shipped_names("robots"):
+        raise ConfigError(f"{folder}: a shipped robot has this name; name another folder.")
     files.check_folder(folder, MODEL_FILE)
 
 

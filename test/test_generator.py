@@ -332,7 +332,16 @@ def test_a_shipped_robot_goes_before_a_folder_of_its_name_which_is_told(
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith("'differential' is shipped; the folder is ./differential")
     assert open_model("./differential").robot.name == "ackermann"
+    assert open_model(Path("./differential")).robot.name == "ackermann"  # which drops the "./"
     assert capsys.readouterr().err == ""
+
+
+def test_no_folder_is_made_that_has_the_name_of_a_shipped_robot():
+    for folder in ("jackal", Path("./jackal")):
+        with pytest.raises(
+            ConfigError, match="jackal: a shipped robot has this name; name another"
+        ):
+            generator.check_place(folder)
 
 
 def test_a_robot_has_the_lidar_that_its_file_names_and_else_that_of_the_paper(tmp_path):

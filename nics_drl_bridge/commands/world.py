@@ -15,7 +15,6 @@ from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 if TYPE_CHECKING:
     from nics_drl_bridge.sim.sections import Standing
-    from nics_drl_bridge.sim.world_set import AnyWorld
 
 world = typer.Typer(
     help="Imports worlds of others, draws worlds, and writes their maps.", no_args_is_help=True
@@ -220,18 +219,18 @@ def draw(
     file = out or Path(Path(f"{opened.name}_drawn.png").name)
     if file.suffix != ".png":
         raise ConfigError(f"--out {file}: must end in .png.")
-    _spare(worlds, file)
+    _spare(worlds, Path(name), file)
     write_bytes(file, world_picture(opened, radius, seed, outline))
     facts = {"file": str(file), "world": opened.name, "seed": seed}
     console.say(as_json, f"{file}: the world {opened.name!r}, seed {seed}", **facts)
 
 
-def _spare(worlds: "AnyWorld", *written: Path) -> None:
+def _spare(worlds: Any, given: Path, *written: Path) -> None:
     """Raises ConfigError for a file that would replace one of which a world is made."""
     from nics_drl_bridge.lidar.maps import files_of
 
     for one in worlds.members:
-        own = Path(one.source), *(files_of(one.map) if one.map else ())
+        own = given, Path(one.source), *(files_of(one.map) if one.map else ())
         for file in {each.resolve() for each in written} & {each.resolve() for each in own}:
             raise ConfigError(f"{file}: the world itself is made of it; name another as --out.")
 
@@ -266,7 +265,7 @@ def map_(
     file = out or Path(Path(f"{opened.name}_map.yaml").name)
     if file.suffix not in MAPS:
         raise ConfigError(f"--out {file}: must end in .yaml.")
-    _spare(worlds, file, file.with_suffix(".pgm"))
+    _spare(worlds, Path(name), file, file.with_suffix(".pgm"))
     grid = occupancy(opened, standing(sampler, member, scene.bodies), resolution)
     map_files(grid, file)
     rows, columns = grid.cells.shape

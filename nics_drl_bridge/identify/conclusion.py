@@ -37,7 +37,7 @@ def conclude(identified: Identified) -> Conclusion:
     beyond = *narrow(identified.recording, spec), overdriven(spec)
     gaps = *identified.gaps, *(one for one in beyond if one)
     if wrong:
-        advice = "mend the mapping as said above, and generate anew before a policy is trained"
+        advice = "mend the mapping as said above, or the robot's own driver, and generate anew"
     elif about or not identified.judgement:
         advice = "drive once more, for 60 s or longer, and generate anew before a policy is trained"
     elif missed(identified.fit, spec) or identified.model.assumed:

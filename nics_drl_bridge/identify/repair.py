@@ -278,14 +278,15 @@ def _check_sideways(drive: Drive, command: recordings.Stream) -> tuple[str, ...]
         asked = held(command, spec, start - delay, end - delay)[:, order]
         with np.errstate(invalid="ignore"):  # of what never changed
             alike = np.nan_to_num(np.corrcoef(asked.T, driven.T)[:3, 3:])
-        best = max(best, alike, key=lambda each: float(np.abs(each).sum()))
-    along, turn = np.hypot(best[:, 0], best[:, 1]), np.abs(best[:, 2])
-    for k in (0, 1):
-        _check_swapped(drive, [order[k], order[2]], min(along[2], turn[k]), along[k] + turn[2])
+        if np.abs(alike).sum() > np.abs(best).sum():  # a turn moves a sensor aside
+            best, chi = alike, np.column_stack([asked, driven[:, 2]])
+            way = np.linalg.lstsq(chi, driven[:, :2], rcond=None)[0]
+    along, size = np.hypot(best[:, 0], best[:, 1]), np.abs(best)
+    for k, straight in enumerate(along[:2] + size[2, 2]):
+        _check_swapped(drive, [order[k], order[2]], min(along[2], size[k, 2]), straight)
     if best[0, 1] * best[1, 0] > 0.0:  # opposite signs are of poses that are turned by 90 degrees
-        ahead, left, straight = abs(best[0, 1]), abs(best[1, 0]), np.abs(np.diag(best)[:2]).sum()
-        _check_swapped(drive, order[:2], min(ahead, left), straight)
-    if np.linalg.det(best[:2, :2]) > -(SWAPPED**2):
+        _check_swapped(drive, order[:2], min(size[0, 1], size[1, 0]), size[0, 0] + size[1, 1])
+    if np.linalg.det(best[:2, :2]) > -(SWAPPED**2) or np.linalg.det(way[:2]) > 0.0:
         return ()
     one, other = (spec.command[k].name for k in order[:2])
     finding = f"The robot moves right where {other} is positive, or back where {one} is"

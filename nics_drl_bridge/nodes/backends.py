@@ -157,7 +157,7 @@ class DdsBackend:
             kind = LaserScan if topic == SCAN else Odometry
             if topic in self._sensors:
                 kind = sensor_type(self._sensors[topic])
-            put = partial(_put, self._mail, topic)
+            put = lambda message, mail=self._mail, topic=topic: mail.put(topic, message)  # noqa: E731
             self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
         self._episodes: EpisodeServices | client.StandardEpisodes
         if by_standard:
@@ -265,10 +265,6 @@ def _read(topic: str, read: Callable[[bytes], T], message: bytes) -> T:
     except wire.UNREADABLE as error:
         reason = f"a message can't be read ({error}); look at who publishes it."
         raise BackendError(f"topic {topic!r}: {reason}") from None
-
-
-def _put(mail: _Mailbox, topic: str, message: bytes) -> object:
-    return mail.put(topic, message)
 
 
 class FleetBackend:

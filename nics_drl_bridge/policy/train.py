@@ -195,6 +195,7 @@ def run(
     trial.reset(seed=FIRST_SEED)
     for _ in range(TRIED):  # a task that gives no numbers is refused before a folder is begun
         trial.step(trial.action_space.sample())
+    del trial
     write_text(order.out / SETTINGS, dump_yaml(settings.model_dump(mode="json")))
     results = []
     for seed in order.seeds:

@@ -134,7 +134,8 @@ def _unnamed(table: TableSurvey) -> Iterator[Guess]:
         if turns and np.nanmax(np.abs(np.linalg.norm(four, axis=0) - 1.0)) < UNIT_LENGTH:
             turn = names[k : k + 4]
             turn = [*turn[1:], turn[0]] if w_first(np.stack(four, axis=1)) else turn
-            x, y = place if len(place) == 2 else names[max(k - 3, 0) :][:2]
+            own = [name for name in place if name not in turn]
+            x, y = own if len(own) == 2 else names[max(k - 3, 0) :][:2]
             yield Guess(table, {"x": x, "y": y, "quaternion": f"[{', '.join(turn)}]"})
     for k in range(len(names) - 2):
         if len({len(each) for each in columns[k : k + 3]}) > 1:

@@ -214,11 +214,13 @@ def test_neither_picture_nor_map_replaces_a_file_that_the_world_is_made_of(tmp_p
     Image.fromarray(np.full((80, 90), 255, np.uint8)).save(tmp_path / "plan.png")
     words = "--resolution", 0.1, "--name", "../plan", "--out", "plan.yaml"
     done("import", "plan.png", *words, cwd=tmp_path)
+    (tmp_path / "set.yaml").write_text("name: set\nworlds: [plan.yaml]\n")
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     for words, file in (
         (("draw", "plan.yaml", "--out", "plan.png"), "plan.png"),
         (("map", "plan.yaml"), "plan_map.yaml"),
         (("map", "pl*n.yaml", "--out", "plan.yaml"), "plan.yaml"),  # a set of one
+        (("map", "set.yaml", "--out", "set.yaml"), "set.yaml"),
     ):
         sentence = refused(*words, cwd=tmp_path)
         assert (

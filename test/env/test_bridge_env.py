@@ -15,6 +15,7 @@ from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS, NAVIGATION, register_envs
 from nics_drl_bridge.env.sim_backend import SimBackend
+from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError, ModelError
 from nics_drl_bridge.interface import Backend
@@ -397,3 +398,17 @@ def test_many_worlds_begin_at_a_start_where_an_obstacle_stands_in_some_of_them()
     assert 0 < len(taken) < 16
     _, info = BridgeVectorEnv(16, model, world).reset(seed=0, options={"start": (0.0, 0.0, 0.0)})
     assert not info["start"].any()
+
+
+def test_a_reward_of_the_scan_is_not_judged_by_a_view_that_no_step_gives():
+    class Clear(Navigation):
+        step_into = Task.step_into
+
+        def reward(self, before, after, memory):
+            return {"clearance": after.ranges.min(axis=-1)}
+
+    model = direct_model()
+    task = Clear(model.robot, model.lidar)
+    with contextlib.closing(BridgeEnv(task=task, model=model, world=field(count=3))) as env:
+        env.reset(seed=0)
+        assert np.isfinite(env.step(env.action_space.sample())[1])

@@ -85,7 +85,7 @@ def test_a_mistake_of_the_mapping_is_told_first_and_to_be_mended_before_a_traini
     told = conclude(replace(judged(found, 2.0), notes=(Mistake(mistake),)))
     assert told.doubts[0] == mistake
     assert type(told.doubts[0]) is str  # a file takes no other
-    assert told.advice.startswith("Next: mend the mapping as said above")
+    assert told.advice.startswith("Next: mend the mapping as said above, or the robot")
     assert not told.ready
 
 

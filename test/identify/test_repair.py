@@ -143,6 +143,18 @@ def test_poses_of_a_mount_that_is_turned_by_90_degrees_are_not_swapped_commands(
         assert check_commands(Drive(drive(spec, rotation=rotation), spec)) == ()
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_turn_that_moves_the_pose_sensor_aside_is_no_reversed_command(seed):
+    random, t = np.random.default_rng(seed), np.arange(0.0, 60.0, 0.02)
+    asked = np.repeat(random.uniform(-1.0, 1.0, (len(t) // 50, 3)), 50, axis=0) * [0.5, 0.05, 1.0]
+    asked[:, 1] += 0.15 * asked[:, 2]
+    heading = np.cumsum(asked[:, 2]) * 0.02
+    place = np.cumsum(geometry.rotate(asked[:, :2] * 0.02, heading), axis=0)
+    pose = geometry.compose(np.column_stack([place, heading]), np.array([-0.4, 0.0, 0.0]))
+    made = Recording(Stream(t, asked, "robot"), Stream(t, pose, "robot"), source="drive")
+    assert check_commands(Drive(made, load_robot("mecanum"))) == ()
+
+
 def test_a_reversed_heading_is_refused_though_noise_hides_short_ways(differential):
     """At rest and between rows 6 mm apart, 2 mm of noise lead anywhere."""
     t, rng = np.arange(0.0, 90.0, 0.02), np.random.default_rng(1)
