@@ -159,7 +159,7 @@ def _check(lidar: LidarSpec, layout: ScanLayout, angles: Array) -> None:
 def _narrower(lidar: LidarSpec, layout: ScanLayout) -> str:
     if layout.model_dump() == LAYOUTS["around"].model_dump() and covers(lidar, "front"):
         return "say `scan: front`, its 270 deg"
-    return f"use a lidar that sees more, or train with `scan: {sectors_over(lidar)}`, its own view"
+    return f"use a lidar that sees farther or wider, or train with `scan: {sectors_over(lidar)}`"
 
 
 @dataclass(frozen=True)

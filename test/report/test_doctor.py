@@ -177,7 +177,7 @@ def test_any_lidar_fits_a_policy_whose_sectors_it_fills():
 @pytest.mark.parametrize(
     ("scans", "said"),
     [
-        (other_lidar(360, -1.5, 1.5, 8.0), "use a lidar that sees more"),
+        (other_lidar(360, -1.5, 1.5, 8.0), "use a lidar that sees farther or wider"),
         (other_lidar(360, -3.13, 3.13, 2.0), "needs 3 m"),
         (other_lidar(20, -3.0, 3.0, 8.0), "deg apart"),
     ],
