@@ -72,9 +72,11 @@ class GoalFrames:
             frame, place = self.fixed(goal.header.frame_id, place)
         except ConfigError as error:
             raise ConfigError(f"goal_pose: {error}") from None
-        if frame == self._map:
-            return self._of_localiser(place)[:2]
-        if (robot := self._topics.in_odom()) is None:
+        if frame == self._map:  # of a localiser, if there is one; else that of the estimate
+            robot = None if self._odom is None else self.robot_in(self._map)
+            if robot is None:
+                return place[:2]
+        elif (robot := self._topics.in_odom()) is None:
             raise ConfigError("goal_pose: its place is unknown before odometry comes; wait for it.")
         there: Array = geometry.compose(self._topics.view().pose, geometry.between(robot, place))
         return there[:2]
@@ -108,10 +110,3 @@ class GoalFrames:
             heard = "install tf2_msgs for those that /tf_static joins to them"
         why = f"a goal in the frame {asked!r} is refused, which is not known here"
         raise ConfigError(f"{why}; give it in {names}, or {heard}.")
-
-    def _of_localiser(self, place: Array) -> Array:
-        """Returns a pose (3,) in the map of a localiser, if there is one, in the estimate's."""
-        robot = None if self._odom is None else self.robot_in(self._map)
-        if robot is None:
-            return place
-        return geometry.compose(self._topics.view().pose, geometry.between(robot, place))

@@ -222,20 +222,16 @@ class RecordNode(qos.QosWatch):
                 self._end(None, complete=True)
 
     def _ready(self) -> bool:
-        if self._topic is None and self.count_subscribers(self.resolve_topic_name("cmd_vel")):
+        topic = self.resolve_topic_name("cmd_vel")
+        if self._topic is None and self.count_subscribers(topic):
             heard = heard_stamped(self, "cmd_vel")
             self._speak(self._order.stamped if heard is None else heard)
-        listeners = 0 if self._topic is None else self._topic.get_subscription_count()
-        if (
-            self._topic is not None
-            and self._pose is not None
-            and listeners > 0
-            and self._now_ns() > 0
-        ):
-            others = self.count_publishers(self._topic.topic_name) - 1
+        listened = self._topic is not None and self._topic.get_subscription_count() > 0
+        if listened and self._pose is not None and self._now_ns() > 0:
+            others = self.count_publishers(topic) - 1
             if others > 0:
                 reason = f"{others} other publisher(s) would drive the robot too; end them, or"
-                raise BackendError(f"topic {self._topic.topic_name!r}: {reason} remap the topic.")
+                raise BackendError(f"topic {topic!r}: {reason} remap the topic.")
             self._start, self._origin_ns = self._pose, self._now_ns()
             return True
         if time.monotonic() - self._began > PATIENCE_S:

@@ -94,7 +94,10 @@ def run_node(
                 node.start()
         gc.collect()  # now, as the next one may take a tenth of a second while the robot moves
         started.set()
-        _introduce(node)
+        for sentence in unknown(node):  # rclpy ignores them silently
+            node.get_logger().warning(sentence)
+        if getattr(node, "state", ACTIVE) == ACTIVE:
+            node.get_logger().info("running")
         spin(node, stopping)
     except (BridgeError, ParameterException, OSError) as error:
         sys.stderr.write(f"{_sentence(error)}\n")
@@ -109,13 +112,6 @@ def run_node(
             context.try_shutdown()
         alone.close()
     return node
-
-
-def _introduce(node: Any) -> None:
-    for sentence in unknown(node):  # rclpy ignores them silently
-        node.get_logger().warning(sentence)
-    if getattr(node, "state", ACTIVE) == ACTIVE:
-        node.get_logger().info("running")
 
 
 def _sentence(error: Exception) -> str:

@@ -453,8 +453,7 @@ class DeviceNode(qos.QosWatch):
 
     def _on_free_time(self) -> None:
         if not self.paused:
-            self.advance()
-            self._outbox.flush(self.now_ns)
+            self.step()
 
     def advance(self) -> None:
         """Moves the world by one step, and publishes what is due."""
@@ -492,7 +491,7 @@ class DeviceNode(qos.QosWatch):
         self._publish()
 
     def step(self) -> None:
-        """Moves the world by one step while it is paused."""
+        """Moves the world by one step, and publishes all that is due; also while it is paused."""
         self.advance()
         self._outbox.flush(self.now_ns)
 
@@ -518,11 +517,10 @@ class DeviceNode(qos.QosWatch):
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         try:
             self._require_world()
+            self.pause(bool(request.data))
+            response.success, response.message = True, "paused" if self.paused else "running"
         except BridgeError as error:
             response.success, response.message = False, str(error)
-            return response
-        self.pause(bool(request.data))
-        response.success, response.message = True, "paused" if self.paused else "running"
         return response
 
     def _require_world(self) -> None:

@@ -1,6 +1,7 @@
 """A simulator's `map`, and `initialpose`, which puts a robot elsewhere."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ class WorldTopics:
     def hear(self, namespace: str, robot: Callable[[], int]) -> Any:
         """Listens for a robot, whose number is looked up at each message."""
         kind, topic = PoseWithCovarianceStamped, f"{namespace}{INITIAL_POSE}"
-        return self._node.create_subscription(kind, topic, self._taker(robot), qos.COMMAND)
+        return self._node.create_subscription(kind, topic, partial(self._take, robot), qos.COMMAND)
 
     def _look(self) -> None:
         if self._shown is None and not self._map.get_subscription_count():
@@ -49,22 +50,18 @@ class WorldTopics:
             grid = occupancy(simulator.world.members[member], still, self._cell)
             self._map.publish(conversions.map_to_ros(grid, self._node.now_ns, self._frame))
 
-    def _taker(self, robot: Callable[[], int]) -> Any:
-        def take(message: PoseWithCovarianceStamped) -> None:
-            logger, simulator = self._node.get_logger(), self._world().simulator
-            try:
-                pose = initial_pose(message, self._frame)
-                world = simulator.world.members[int(simulator.data.member[0])]
-                x1, y1, x2, y2 = world.extent
-                if not (x1 <= pose[0] <= x2 and y1 <= pose[1] <= y2):
-                    where = f"x {x1:g} to {x2:g} m, y {y1:g} to {y2:g} m"
-                    place = f"x {pose[0]:.2f} m, y {pose[1]:.2f} m"
-                    raise ConfigError(f"{INITIAL_POSE}: {place} is outside the world ({where}).")
-            except ConfigError as error:
-                logger.error(f"{error} The robot stays where it is.")
-                return
-            simulator.put_robot(robot(), pose, np.zeros(simulator.data.state.shape[-1]))
-            self._world().put(robot())
-            logger.info(f"a robot is put at ({pose[0]:.2f}, {pose[1]:.2f}) m, {pose[2]:.2f} rad")
-
-        return take
+    def _take(self, robot: Callable[[], int], message: PoseWithCovarianceStamped) -> None:
+        logger, simulator = self._node.get_logger(), self._world().simulator
+        try:
+            pose = initial_pose(message, self._frame)
+            x1, y1, x2, y2 = simulator.world.members[int(simulator.data.member[0])].extent
+            if not (x1 <= pose[0] <= x2 and y1 <= pose[1] <= y2):
+                where = f"x {x1:g} to {x2:g} m, y {y1:g} to {y2:g} m"
+                place = f"x {pose[0]:.2f} m, y {pose[1]:.2f} m"
+                raise ConfigError(f"{INITIAL_POSE}: {place} is outside the world ({where}).")
+        except ConfigError as error:
+            logger.error(f"{error} The robot stays where it is.")
+            return
+        simulator.put_robot(robot(), pose, np.zeros(simulator.data.state.shape[-1]))
+        self._world().put(robot())
+        logger.info(f"a robot is put at ({pose[0]:.2f}, {pose[1]:.2f}) m, {pose[2]:.2f} rad")
