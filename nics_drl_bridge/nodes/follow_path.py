@@ -19,6 +19,7 @@ from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes import held_action as held
+from nics_drl_bridge.nodes.device_parameters import number
 from nics_drl_bridge.nodes.goal_frames import GoalFrames
 from nics_drl_bridge.nodes.nav2_parameters import ControllerParameters, chosen
 from nics_drl_bridge.nodes.robot_topics import RobotTopics
@@ -287,7 +288,7 @@ class PathActions:
             self._run = None
             self._end(run.goal, held.CANCELED, "NONE")
             return True
-        longest = self._parameters.number("costmap_update_timeout")
+        longest = number(self._node, "costmap_update_timeout")
         longest = max(longest, PATIENT_PERIODS * self._period_s)
         newest, now_ns = self._topics.middleware.cache.newest, self._topics.now_ns()
         silent = [
@@ -314,7 +315,7 @@ class PathActions:
 
     def _steer(self, run: Run) -> Array:
         robot = self._robot_in("the path", run.frame)
-        place = run.path.locate(robot, float(self._parameters.number("lookahead")))
+        place = run.path.locate(robot, number(self._node, "lookahead"))
         turn = run.arrival.turn_left(place, robot, run.path.end)
         if turn == 0.0:
             self._run = None
@@ -330,32 +331,24 @@ class PathActions:
             self._wait(run)
         else:
             run.valid_s = time.monotonic()
-        twist = np.zeros(3) if drive.touched else drive.twist
-        if turn is not None:
-            twist = self._turning(turn)
-        twist = self._within_limit(twist)
+        twist: Array = np.zeros(3) if drive.touched else drive.twist
+        if turn is not None:  # on the spot
+            most = float(self._robot.in_fields(self._robot.command_high)[2])
+            rate = min(max(TURNING * abs(turn), LEAST_TURN), most)
+            twist = np.array([0.0, 0.0, math.copysign(rate, turn)])
+        # Slower, down to the speed limit; the robot's way stays the same.
+        share = min(1.0, self._limit / max(float(np.hypot(*twist[:2])), 1e-9))
+        steers = self._robot.steers and not self._robot.takes_turn_rate
+        twist = twist * np.array([share, share, 1.0 if steers else share])
         self._report(run, robot, place, estimate.twist)
         return twist
 
     def _wait(self, run: Run) -> None:
         """Raises Refusal when a robot that touches something has waited for long enough."""
-        patience = self._parameters.number("failure_tolerance")
+        patience = number(self._node, "failure_tolerance")
         if 0.0 <= patience < time.monotonic() - run.valid_s:
             code = "PATIENCE_EXCEEDED" if patience else "NO_VALID_CONTROL"
             raise Refusal(code, "the robot touches something, so that no command is valid.")
-
-    def _turning(self, turn: float) -> Array:
-        """Returns a turn on the spot."""
-        most = float(self._robot.in_fields(self._robot.command_high)[2])
-        rate = min(max(TURNING * abs(turn), LEAST_TURN), most)
-        return np.array([0.0, 0.0, math.copysign(rate, turn)])
-
-    def _within_limit(self, twist: Array) -> Array:
-        """Slows a twist down to the speed limit; the robot's way stays the same."""
-        share = min(1.0, self._limit / max(float(np.hypot(*twist[:2])), 1e-9))
-        steers = self._robot.steers and not self._robot.takes_turn_rate
-        slower: Array = twist * np.array([share, share, 1.0 if steers else share])
-        return slower
 
     def _report(self, run: Run, robot: Array, place: Place, twist: Array) -> None:
         speed = float(np.hypot(*twist[:2]))

@@ -39,10 +39,6 @@ class ControllerParameters:
         for row in checkers(self.names["goal_checker"], self.names["progress_checker"]):
             declare_row(node, row)
 
-    def number(self, name: str) -> float:
-        """Returns the value of a numeric parameter."""
-        return float(self._node.get_parameter(name).value or 0.0)
-
     def checks(self, goal: str, progress: str) -> tuple[GoalCheck, ProgressCheck]:
         """Returns the checks of two names, as Nav2's checkers of these plugins make them."""
         arrives, gets_on = self._filled(GoalCheck, goal), self._filled(ProgressCheck, progress)
