@@ -149,7 +149,8 @@ class StandardEpisodes:
         """Begins an episode; returns the stamp of its first data [ns]. Raises BackendError."""
         if not self._steps:
             self.open(timeout_s)
-        self._await_steps(timeout_s)
+        holds(lambda: all(each.done() for each in self._pending), timeout_s, POLL_S)
+        self._pending.clear()
         self._pause(timeout_s)
         scopes, known = self._types.ResetSimulation.Request, self._messages.SimulatorFeatures
         of_state = known.SIMULATION_RESET_STATE in self._known
@@ -208,7 +209,3 @@ class StandardEpisodes:
                 self._pending.clear()
                 told = result.error_message or f"result {result.result}"
                 raise BackendError(f"the simulator refused StepSimulation: {told}")
-
-    def _await_steps(self, timeout_s: float) -> None:
-        holds(lambda: all(each.done() for each in self._pending), timeout_s, POLL_S)
-        self._pending.clear()

@@ -180,12 +180,10 @@ class EntityServices:
         if request.set_twist:
             twist = plane.twist_from_ros(asked.twist, base[2], FAILED)
         still = entity.robot < 0 and entity.motion is None
-        pushed = asked.acceleration
-        if request.set_acceleration and still and pushed != type(pushed)():
-            told = f"{entity.name!r} stands still and takes no acceleration; leave it out."
-            raise RefusalError(FAILED, told)
-        if twist is not None and still and asked.twist != Twist():
-            told = f"{entity.name!r} stands still and takes no twist; leave it out."
+        pushed = request.set_acceleration and asked.acceleration != type(asked.acceleration)()
+        if still and (pushed or (request.set_twist and asked.twist != Twist())):
+            what = "acceleration" if pushed else "twist"
+            told = f"{entity.name!r} stands still and takes no {what}; leave it out."
             raise RefusalError(FAILED, told)
         try:
             entities.move(entity, pose, twist)

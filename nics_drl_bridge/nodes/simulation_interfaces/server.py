@@ -1,10 +1,9 @@
 """The server: every service of the standard, and the features that stand behind them."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NoReturn
 
-from rclpy.action import ActionServer
+from rclpy.action import ActionServer, CancelResponse
 from simulation_interfaces.msg import Result, SimulatorFeatures
 
 from nics_drl_bridge.nodes import conversions
@@ -55,7 +54,7 @@ class Server:
         if kind := conversions.message_type(f"{PACKAGE}/action/SimulateSteps"):
             self._action = ActionServer(
                 host, kind, "simulate_steps", simulation.simulate,
-                cancel_callback=simulation.cancel,
+                cancel_callback=lambda _: CancelResponse.ACCEPT,
             )  # fmt: skip
 
     @property
@@ -76,8 +75,6 @@ class Server:
         return response
 
 
-def _refuse(what: str, *_: Any) -> NoReturn:
-    raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, f"{what}; see get_simulator_features.")
-
-
-_no_named_poses = partial(_refuse, "worlds have no named poses here")
+def _no_named_poses(*_: Any) -> NoReturn:
+    told = "worlds have no named poses here; see get_simulator_features."
+    raise RefusalError(Result.RESULT_FEATURE_UNSUPPORTED, told)

@@ -3,7 +3,6 @@
 from collections.abc import Generator
 from typing import Any
 
-from rclpy.action import CancelResponse
 from simulation_interfaces.action import SimulateSteps
 from simulation_interfaces.msg import EntityInfo, Result, SimulationState
 from simulation_interfaces.srv import ResetSimulation, SetSimulationState
@@ -117,10 +116,6 @@ class Simulation:
             raise RefusalError(Result.RESULT_OPERATION_FAILED, f"{told}; use simulate_steps.")
         for _ in range(request.steps):
             self._host.step()
-
-    def cancel(self, _: Any) -> CancelResponse:
-        """Accepts to cancel SimulateSteps."""
-        return CancelResponse.ACCEPT
 
     async def simulate(self, goal: Any) -> Any:
         """Executes SimulateSteps: one step at a turn, so that all else is answered meanwhile."""

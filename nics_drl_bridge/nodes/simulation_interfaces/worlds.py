@@ -133,7 +133,10 @@ class Worlds:
             raise RefusalError(Result.RESULT_NOT_FOUND, f"a source can't be read, {failed[0]}")
         sets = [BARN, *(each.stem for each in sorted((folder / "world_sets").glob("*.yaml")))]
         told = [told_of(world, Resource(uri=uri)) for uri, world in found]
-        told += [_set_of(name) for name in sets]
+        for name in sets:  # whose many worlds would take long to read
+            about = f"the worlds of {name}, of which every episode draws one"
+            told.append(WorldResource(name=name, description=about, tags=["set"]))
+            told[-1].world_resource = Resource(uri=name)
         response.worlds = [each for each in told if tags_match(request.filter, each.tags)]
         if failed or skipped:
             response.result.result = Result.RESULT_OK
@@ -158,13 +161,6 @@ def _in_source(source: str, skipped: list[str]) -> list[tuple[str, AnyWorld]]:
                 raise
             skipped.append(str(error))
     return found
-
-
-def _set_of(name: str) -> WorldResource:
-    """A shipped set, whose many worlds would take long to read."""
-    about = f"the worlds of {name}, of which every episode draws one"
-    uri = Resource(uri=name)
-    return WorldResource(name=name, world_resource=uri, description=about, tags=["set"])
 
 
 def told_of(world: AnyWorld, resource: Resource) -> WorldResource:
