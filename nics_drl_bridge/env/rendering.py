@@ -56,18 +56,24 @@ class WorldPicture:
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
     def _robot(self, axes: Axes, pose: Array, ranges: NDArray[np.float32], colour: str) -> None:
-        lidar, robot = self._model.lidar, self._model.robot
-        hits = hits_of(lidar, pose, ranges)
+        hits, robot = hits_of(self._model.lidar, pose, ranges), self._model.robot
         axes.plot(hits[:, 0], hits[:, 1], ".", color=SCAN, markersize=2.0)
-        reach = robot.footprint_radius
-        if robot.footprint is None:
-            axes.add_patch(Disc((pose[0], pose[1]), reach, color=colour))
-        else:
-            corners = np.array(robot.footprint)
-            reach, outline = corners[:, 0].max(), geometry.rotate(corners, pose[2]) + pose[:2]
-            axes.add_patch(Outline(outline, closed=True, color=colour))
-        front = pose[:2] + reach * np.array([np.cos(pose[2]), np.sin(pose[2])])
-        axes.plot([pose[0], front[0]], [pose[1], front[1]], color="white", linewidth=2.0)
+        draw_robot(axes, pose, robot.footprint_radius, robot.footprint, color=colour, zorder=1.0)
+
+
+def draw_robot(
+    axes: Axes, pose: Array, radius: float, outline: Sequence[tuple[float, float]] | None,
+    zorder: float, **look: Any,
+) -> None:  # fmt: skip
+    """Draws a robot that is round, or has an outline (V, 2) [m], and a line to its front."""
+    if outline is None:
+        axes.add_patch(Disc((pose[0], pose[1]), radius, zorder=zorder, **look))
+    else:
+        radius = np.max(outline, axis=0)[0]
+        corners = geometry.rotate(outline, pose[2]) + pose[:2]
+        axes.add_patch(Outline(corners, closed=True, zorder=zorder, **look))
+    ends = np.stack([pose[:2], pose[:2] + radius * np.array([np.cos(pose[2]), np.sin(pose[2])])])
+    axes.plot(*ends.T, color="white", linewidth=2.0, zorder=zorder + 1.0)
 
 
 def draw_world(axes: Axes, world: AnyWorld, bodies: NDArray[np.float64], member: int = 0) -> None:

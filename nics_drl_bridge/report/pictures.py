@@ -7,11 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Polygon, Rectangle
+from matplotlib.patches import Circle, Rectangle
 
-from nics_drl_bridge import geometry
-from nics_drl_bridge.env.rendering import draw_world
-from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.env.rendering import draw_robot, draw_world
 from nics_drl_bridge.lidar.exact_kernels import RADIUS, X, Y
 from nics_drl_bridge.policy.evaluation import ConfidenceInterval, Episode
 from nics_drl_bridge.policy.shadow import Shadow
@@ -152,7 +150,8 @@ def world_picture(
     for kind, places, colour in (("starts", world.starts, GREEN), ("goals", world.goals, GOAL)):
         _regions(axes, places, colour, kind)
     _movers(axes, sampler.motions, scene)
-    _start(axes, scene.starts[0], footprint, outline)
+    look: dict[str, Any] = {"facecolor": MEASURED, "edgecolor": DARK, "label": "robot at its start"}
+    draw_robot(axes, scene.starts[0], footprint, outline, zorder=4.0, **look)
     goal: dict[str, Any] = {"marker": "*", "markersize": 18, "color": GOAL, "markeredgecolor": DARK}
     axes.plot(*scene.goals[0], linestyle="none", zorder=5, label="goal", **goal)
     margin = 0.03 * size.max()
@@ -183,17 +182,3 @@ def _movers(axes: Axes, motions: Sequence[Motion | None], scene: Scene) -> None:
         way = np.array([*patrol.waypoints, *patrol.waypoints[: int(patrol.loop)]])
         label = None if number else "its way"
         axes.plot(*way.T, color=MODEL, linewidth=1.2, linestyle=":", label=label)
-
-
-def _start(
-    axes: Axes, pose: Array, footprint: float, outline: Sequence[tuple[float, float]] | None
-) -> None:
-    look: dict[str, Any] = {"facecolor": MEASURED, "edgecolor": DARK, "zorder": 4}
-    look["label"] = "robot at its start"
-    front = footprint if outline is None else np.max(outline, axis=0)[0]
-    if outline is None:
-        axes.add_patch(Circle((pose[0], pose[1]), footprint, **look))
-    else:
-        axes.add_patch(Polygon(geometry.rotate(outline, pose[2]) + pose[:2], **look))
-    nose = pose[:2] + front * np.array([np.cos(pose[2]), np.sin(pose[2])])
-    axes.plot([pose[0], nose[0]], [pose[1], nose[1]], color="white", linewidth=2.0, zorder=4.5)
