@@ -126,19 +126,15 @@ def generate(
     identified = identify(recording, robot, order=order, alpha=alpha, assume=assume, strict=strict)
     if (reason := why_useless(identified, robot)) and not anyway:
         raise FitError(reason)
+    # The usual period [s], or that of a slower lidar: nothing new is seen before its next scan.
+    steps, dt = max(CONTROL_PERIOD_S, 1.0 / lidar.rate) / identified.model.dt, identified.model.dt
     model = SimulatorModel(
         robot, identified.model, replace(identified.calibration, inputs=(), limits={}), lidar,
         bake(lidar, (*shapes, footprint_shape(robot))), identified.noise,
-        _control_period(lidar, identified.model), fit_report(recording.source, robot, identified),
+        round(round(steps) * dt, 9), fit_report(recording.source, robot, identified),
         recording.latency, tuple(sensors),
     )  # fmt: skip
     return model, identified
-
-
-def _control_period(lidar: LidarSpec, kinematics: TaylorModel) -> float:
-    """The usual period [s], or that of a slower lidar: nothing new is seen before its next scan."""
-    steps = max(CONTROL_PERIOD_S, 1.0 / lidar.rate) / kinematics.dt
-    return round(round(steps) * kinematics.dt, 9)
 
 
 def footprint_shape(robot: RobotSpec) -> Circle | Polygon:

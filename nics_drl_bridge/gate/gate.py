@@ -354,21 +354,17 @@ def _standing(config: GateConfig, state: GateState, request: inputs.Arm, now: fl
     return "" if still else f"the robot has not stood still for {config.settle_s} s"
 
 
-def _limits(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
-    return "" if config.limits is not None else "no limits are set, name their file in `limits`"
-
-
-def _latched(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
-    return "" if state.latched is None else f"call ~/reset first: {state.latched.line}"
-
-
 def _e_stop(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
     cause = stops.e_stop_pressed(config, state, now) or stops.e_stop_silent(config, state, now)
     return "" if cause is None else cause.line
 
 
+UNLIMITED = "no limits are set, name their file in `limits`"
 CHECKS: tuple[tuple[str, Check], ...] = (
-    ("limits_set", _limits), ("nothing_latched", _latched), ("e_stop_released", _e_stop),
+    ("limits_set", lambda c, *_: UNLIMITED if c.limits is None else ""),
+    ("nothing_latched",
+     lambda _, s, *__: "" if s.latched is None else f"call ~/reset first: {s.latched.line}"),
+    ("e_stop_released", _e_stop),
     ("scan_fresh", lambda c, s, _, now: _fresh(SCAN, s.scans, c.scan_age_s, c, now)),
     ("scan_rate", lambda c, s, _, now: _rate(SCAN, s.scans, c.scan_rate, c, now)),
     ("sensors_fresh", _sensors),

@@ -153,16 +153,13 @@ def _found(drive: Drive, timing: clocks.TimingEstimate, moved: NDArray[np.intp])
     for tries in (_with_limits, _with_dead_zones, _with_limits):  # what one does hides another
         for i in moved:
             reach = command.values[:, signals.followed(spec)[i]]
-            options = [(_cost(left, each), each) for each in tries(best.best, i, reach, shift)]
+            tried = tries(best.best, i, reach, shift)
+            options = [(float((left(*vars(each).values()) ** 2).sum()), each) for each in tried]
             cost, option = min(options, key=lambda each: each[0])
             if cost < HELPS * best.cost:
                 other = _adjusted(left, option, moved, shift, cluster)
                 best = other if other.cost < WORTH * best.cost else best
     return best
-
-
-def _cost(left: clocks.Left, each: _Following) -> float:
-    return float((left(each.lags, each.delays, each.motors) ** 2).sum())
 
 
 def _with_limits(now: _Following, i: int, reach: Array, shift: float) -> Iterator[_Following]:
@@ -181,9 +178,7 @@ def _with_dead_zones(now: _Following, i: int, reach: Array, _: float) -> Iterato
 
 
 def _put(values: Array, i: int, value: float) -> Array:
-    changed = values.copy()
-    changed[i] = value
-    return changed
+    return np.where(np.arange(len(values)) == i, value, values)
 
 
 def _adjusted(
@@ -203,8 +198,7 @@ def _adjusted(
         return _Following(lags, delays, Motors(*motors.T))
 
     def residual(theta: Array) -> Array:
-        each = at(theta)
-        return left(each.lags, each.delays, each.motors)
+        return left(*vars(at(theta)).values())
 
     reach = np.full(len(size), np.log(WIDER))
     low, high = (np.repeat([shift + delay, log_lag], count) for delay, log_lag in clocks.BOUNDS)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from textwrap import fill
 
 import numpy as np
@@ -29,12 +30,11 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
     ranges = zip(model.variables, model.low, model.high, strict=True)
     around = list(stages(spec, identified))
     notes = identified.notes or ("Nothing had to be corrected.",)
+    of = "" if identified.findings.width else f" of {identified.fit.regression.terms_total}"
+    listed = partial(fill, width=WIDTH - 2, initial_indent="- ", subsequent_indent="    ")
     sections: dict[str, Iterable[str]] = {
-        f"Fit report: robot {spec.name!r} from {source}": (
-            fill(line, WIDTH - 2, initial_indent="- ", subsequent_indent="    ")
-            for line in conclude(identified).lines
-        ),
-        f"Kept {_count(identified)}, step {model.dt:g} s "
+        f"Fit report: robot {spec.name!r} from {source}": map(listed, conclude(identified).lines),
+        f"Kept {model.terms_kept}{of} terms, step {model.dt:g} s "
         f"(X = {', '.join(model.variables)}), with standard errors:": equations_with_errors(model),
         **({"What motors do around the terms (standard uncertainties):": around} if around else {}),
         **_linear_fit(identified),
@@ -50,9 +50,7 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
             identified.noise.sentences()
         ),
         **({"Latency of the device, which simulator_node has too:": latency} if latency else {}),
-        "Found, and not learnt:": (
-            fill(note, WIDTH - 2, initial_indent="- ", subsequent_indent="    ") for note in notes
-        ),
+        "Found, and not learnt:": map(listed, notes),
     }
     paragraphs = ([head, *(f"  {line}" for line in lines)] for head, lines in sections.items())
     return "\n\n".join("\n".join(lines) for lines in paragraphs) + "\n"
@@ -137,23 +135,20 @@ def with_error(value: float, error: float | None) -> str:
     return f"({value:.{digits}f} +- {error:.{digits}f})"
 
 
-def _count(identified: Identified) -> str:
-    """Tells the number of terms, and of how many where pruning chose them."""
-    by_motion, total = identified.findings.width is not None, identified.fit.regression.terms_total
-    return f"{identified.model.terms_kept}" + f" of {total}" * (not by_motion) + " terms"
-
-
 def _linear_fit(identified: Identified) -> dict[str, Iterable[str]]:
     """Tells of the pruned linear fit, where it gave the terms: not those of a motion."""
     if identified.findings.width is not None:
         return {}
+    fit, model = identified.fit, identified.model
+    rows = zip(model.dofs, model.dof_units, fit.rmse, fit.r2, fit.condition, strict=True)
     return {
         fill(_pruning(identified.alpha), WIDTH): (),
         "Cross-validated error against the number of terms, largest first, * for those kept:": (
-            line for curve in identified.fit.curves for line in _curve(curve)
+            line for curve in fit.curves for line in _curve(curve)
         ),
-        "Error of the linear fit per degree of freedom, on the part it was fitted to:": _errors(
-            identified
+        "Error of the linear fit per degree of freedom, on the part it was fitted to:": (
+            f"{dof:<24} RMSE {rmse:.3g} {unit}, R2 {r2:.6f}, condition number {number:.3g}"
+            for dof, unit, rmse, r2, number in rows
         ),
     }
 
@@ -175,13 +170,6 @@ def _curve(curve: Curve) -> list[str]:
     more = f" ({len(curve.error) - 1} in all)" if shown < len(curve.error) else ""
     text = f"{curve.dof:<14} " + ", ".join(points) + more
     return fill(text, WIDTH, subsequent_indent=" " * 15).splitlines()
-
-
-def _errors(identified: Identified) -> Iterator[str]:
-    fit, model = identified.fit, identified.model
-    rows = zip(model.dofs, model.dof_units, fit.rmse, fit.r2, fit.condition, strict=True)
-    for dof, unit, rmse, r2, number in rows:
-        yield f"{dof:<24} RMSE {rmse:.3g} {unit}, R2 {r2:.6f}, condition number {number:.3g}"
 
 
 def _held_out(identified: Identified) -> Iterator[str]:
