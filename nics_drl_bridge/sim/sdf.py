@@ -9,6 +9,7 @@ import math
 import os
 from collections.abc import Iterator
 from fnmatch import fnmatch
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element, TreeBuilder
@@ -93,15 +94,10 @@ class _Order:
 
     def __init__(self, without: tuple[str, ...]) -> None:
         self._without, self._models = without, 0
-        self._roots: dict[Path, Element] = {}
+        self.root = cache(root_of)  # of a file
 
     def takes(self, name: str) -> bool:
         return not any(fnmatch(name, pattern) for pattern in self._without)
-
-    def root(self, file: Path) -> Element:
-        if file not in self._roots:
-            self._roots[file] = root_of(file)
-        return self._roots[file]
 
     def count(self, file: Path) -> None:
         self._models += 1

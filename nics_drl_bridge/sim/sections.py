@@ -131,19 +131,13 @@ def _rectangle(
     return Rectangle(size=(x, y)), pose[0, 3], pose[1, 3], _turn(pose, along)
 
 
-def _of_sphere(sphere: Sphere, pose: Array, up: float) -> _Cut:
-    return _disc(pose, sphere.radius**2 - up**2)
-
-
 def _of_cylinder(body: Cylinder, pose: Array, up: float) -> _Cut:
     if _axis(pose) == 2:
         return _disc(pose, body.radius**2) if abs(up) < body.length / 2.0 else None
     if abs(pose[2, 2]) >= math.sin(TILT):
         raise ShapelessError("a cylinder that leans")
     width2 = body.radius**2 - up**2
-    if width2 <= 0.0:
-        return None
-    return _rectangle(pose, 2, (body.length, 2.0 * math.sqrt(width2)))
+    return None if width2 <= 0.0 else _rectangle(pose, 2, (body.length, 2.0 * math.sqrt(width2)))
 
 
 def _of_capsule(body: Capsule, pose: Array, up: float) -> _Cut:
@@ -194,6 +188,6 @@ def _polygon(points: Array) -> Polygon:
 
 
 _CUTS: dict[type[Solid], Callable[..., _Cut]] = {
-    Box: _of_box, Cylinder: _of_cylinder, Capsule: _of_capsule, Sphere: _of_sphere,
-    Prism: _of_prism,
+    Box: _of_box, Cylinder: _of_cylinder, Capsule: _of_capsule, Prism: _of_prism,
+    Sphere: lambda sphere, pose, up: _disc(pose, sphere.radius**2 - up**2),
 }  # fmt: skip
