@@ -47,8 +47,7 @@ def import_policy(source: str | Path, model: SimulatorModel | None = None) -> by
     """
     path = leapp_bundle.description_of(Path(source))
     if path is None:
-        order = _ordered(Path(source), model)
-        return _content(order, model)
+        return _content(_ordered(Path(source), model), model)
     bundle = leapp_bundle.read_bundle(path)
     if (ours := bundle.ours) is not None:
         return ours
@@ -125,13 +124,9 @@ def _golden(graph: Any, seen: Rows, size: int, source: str) -> dict[str, Rows]:
             words = " ".join(str(error).split())[:120]
             raise PolicyError(source, "network", f"onnxruntime can't run it ({words}).") from None
 
-    rows = policy_file.in_turn(run, seen, start) if size else _one_by_one(run, seen)
+    turn = run if size else lambda one, state: [*run(one), state]
+    rows = policy_file.in_turn(turn, seen, start)
     if not all(np.isfinite(part).all() for part in rows):
         reason = "gives NaN or inf for ordinary observations; check scaling and weights."
         raise PolicyError(source, "network", reason)
     return {"observations": seen, "actions": rows[0], "commands": rows[1]}
-
-
-def _one_by_one(run: Any, seen: Rows) -> list[Rows]:
-    rows = [run(seen[k : k + 1]) for k in range(len(seen))]
-    return [np.concatenate(parts) for parts in zip(*rows, strict=True)]

@@ -13,7 +13,6 @@ from nics_drl_bridge.lidar.sectors import LAYOUTS, covers, sectors_over
 from nics_drl_bridge.policy import training_settings as recordings
 from nics_drl_bridge.robot.kinds import has_textbook, reach
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 OWN_TASK = "navigation"  # for which there are settings for robots of one's own
@@ -54,7 +53,10 @@ class Pace:
 def pace_of(model: SimulatorModel, worlds: Iterable[AnyWorld], top: float | None = None) -> Pace:
     """The pace of a robot, at most of a top speed [m/s], in worlds."""
     members = [member for world in worlds for member in world.members]
-    far, name = max((_farthest(member), member.name) for member in members)
+    far, name = max(
+        (min(one.goal_distance[1], math.dist(one.extent[:2], one.extent[2:])), one.name)
+        for one in members
+    )
     near = min(member.goal_distance[0] for member in members)
     speed = min(top or math.inf, top_speed(model.robot))
     return Pace(name, near, far, speed, model.control_period)
@@ -66,11 +68,6 @@ def top_speed(robot: RobotSpec) -> float:
         return float(reach(robot)[:2].max())
     told = [max(abs(one.min), abs(one.max)) for one in robot.command if one.unit == "m/s"]
     return max(told, default=math.inf)
-
-
-def _farthest(world: World) -> float:
-    x1, y1, x2, y2 = world.extent
-    return min(world.goal_distance[1], math.hypot(x2 - x1, y2 - y1))
 
 
 def kin(robot: RobotSpec) -> str:
