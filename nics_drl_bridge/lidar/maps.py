@@ -192,7 +192,10 @@ def read_image(path: Path, source: str) -> tuple[NDArray[np.uint8], NDArray[np.b
     Raises ConfigError, with the `source` that names it, if it is missing, damaged or too large.
     """
     if not path.is_file():
-        raise ConfigError(f"{source}: key 'image': there is no file {str(path)!r}; {_near(path)}")
+        endings, folder = sum(FORMATS.values(), ()), path.parent
+        known = [file.name for file in folder.glob("*") if file.name.lower().endswith(endings)]
+        hint = nearest(path.name, known) if known else f"there are no images in {str(folder)!r}."
+        raise ConfigError(f"{source}: key 'image': there is no file {str(path)!r}; {hint}")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # MAX_CELLS is less
@@ -208,12 +211,6 @@ def read_image(path: Path, source: str) -> tuple[NDArray[np.uint8], NDArray[np.b
     except (EOFError, IndexError, OSError, OverflowError, SyntaxError, ValueError, struct.error):
         reason = "is no whole PGM, PNG or BMP image; save the map anew in one of them."
         raise ConfigError(f"{path}: {reason}") from None
-
-
-def _near(path: Path) -> str:
-    endings, folder = sum(FORMATS.values(), ()), path.parent
-    known = [file.name for file in folder.glob("*") if file.name.lower().endswith(endings)]
-    return nearest(path.name, known) if known else f"there are no images in {str(folder)!r}."
 
 
 def _pixels(image: Image.Image) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:

@@ -139,18 +139,14 @@ def robot_and_drive(
         _check_units(given, spec)
         return spec, arranged(drive, spec)
     if not is_recording(path):
-        spec = robot_from(robot or _robot_of_folder(path) or DEFAULT_ROBOT)
+        own: str | dict[str, Any] | None = robot
+        if not robot and _holds(path, FILES) and not is_bag(path):  # read by its shipped mapping
+            own = load_mapping(find_config(FOLDER, "recordings")).robot
+        spec = robot_from(own or DEFAULT_ROBOT)
         return spec, read_recording(path, spec, topics)
     drive = read_recording(path, None, topics)
     spec = _ranged(robot or drive.robot or DEFAULT_ROBOT, drive, drive.variables)
     return spec, drive if drive.robot is None else arranged(drive, spec)
-
-
-def _robot_of_folder(path: Path) -> str | dict[str, Any] | None:
-    """Returns the robot of a folder that is read by its shipped mapping; None of another form."""
-    if not _holds(path, FILES) or is_bag(path):
-        return None
-    return load_mapping(find_config(FOLDER, "recordings")).robot
 
 
 def robot_of(mapping: Mapping | str | Path, recording: Recording) -> RobotSpec:

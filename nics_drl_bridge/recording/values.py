@@ -124,7 +124,12 @@ class MappedReader:
         known = np.flatnonzero(np.isfinite(raw))
         alone = len(time.columns) == 1 and time.unit in (None, "s")
         if alone and (each := stamping.rows_a_second(raw[known])):
-            raise RecordingError(_without_rest(table, time.columns[0], each))
+            column = time.columns[0]  # lacks the part below a second
+            rest = (b for a, b in stamping.SPLIT if a == column and b in table.names)
+            line = next((f"time: [{column}, {b}]" for b in rest), f"time: {{rate: {each}}}")
+            fault = f"{table.place}: the stamps {column!r} are whole seconds, of {each} rows each"
+            fix = f"write `{line}` into the mapping, or choose another column"
+            raise RecordingError(f"{fault}; {fix}.")
         if len(known) < len(raw):
             self.say(f"{name}: {len(raw) - len(known)} rows without a stamp were left out.")
         t, note = stamping.without_overflow(raw[known], name)
@@ -254,14 +259,6 @@ def dates_of(column: Column) -> Array | None:
     except ValueError:
         return None
     return stamping.joined(ns // NS_PER_S, ns % NS_PER_S)  # exact to a quarter of a microsecond
-
-
-def _without_rest(table: Table, column: Reference, rows: int) -> str:
-    """Returns a sentence on stamps that lack the part below a second, with the line to write."""
-    rest = (b for a, b in stamping.SPLIT if a == column and b in table.names)
-    line = next((f"time: [{column}, {b}]" for b in rest), f"time: {{rate: {rows}}}")
-    fault = f"{table.place}: the stamps {column!r} are whole seconds, of {rows} rows each"
-    return f"{fault}; write `{line}` into the mapping, or choose another column."
 
 
 def _rate(raw: Series, held: bool) -> Series:

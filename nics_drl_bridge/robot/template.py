@@ -92,7 +92,8 @@ class Template:
         way = max(self.commands, key=lambda way: _alike(way, names, own or ()), default=())
         known = {one["name"]: one for one in way}
         known |= {name.removesuffix("_command"): one for name, one in known.items()}
-        if own is None and way and ranges and not _are(way, [known.get(name) for name in names]):
+        these = len(way) == len(names) and all(known.get(name) in way for name in names)
+        if own is None and way and ranges and not these:
             usual = _list(name for name in known if not name.endswith("_command"))
             fault = f"commands of the kind {kind!r} are {usual}, not {_list(names)}"
             fix = "name them so, or list them in that order under `command:` of the robot"
@@ -136,10 +137,6 @@ def _alike(way: Sequence[Given], names: Sequence[Any], own: Any) -> int:
     """Counts the commands of a way that are given by name or unit."""
     units = [one.get("unit") for one in own]
     return sum(one["name"] in names or one["unit"] in units for one in way)
-
-
-def _are(way: Sequence[Given], found: Sequence[Given | None]) -> bool:
-    return len(way) == len(found) and all(one in found for one in way)
 
 
 def _list(names: Any) -> str:
