@@ -46,15 +46,11 @@ def _python() -> Check:
     needed = ">=3.10,<3.15"
     with suppress(PackageNotFoundError):  # a source tree that was never installed
         needed = metadata(PACKAGE)["Requires-Python"] or needed
-    low, high = (tuple(map(int, part.split(".")[:2])) for part in _bounds(needed))
+    parts = sorted(needed.replace(" ", "").split(","), key=lambda part: not part.startswith(">="))
+    low, high = (tuple(map(int, part.lstrip("<>=").split(".")[:2])) for part in parts[:2])
     found = sys.version_info[:2]
     fix = f"use a Python {needed}"
     return Check("Python", low <= found < high, ".".join(map(str, sys.version_info[:3])), fix)
-
-
-def _bounds(needed: str) -> tuple[str, str]:
-    parts = sorted(needed.replace(" ", "").split(","), key=lambda part: not part.startswith(">="))
-    return parts[0].lstrip(">="), parts[1].lstrip("<")
 
 
 def _extras() -> list[Check]:

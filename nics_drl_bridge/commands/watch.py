@@ -86,8 +86,7 @@ def _bag(bag: Path, name: str | None, worlds: list[str] | None, topics: dict[str
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.watch.bag import BagSource
 
-    model = open_model(name or DEFAULT_ROBOT)
-    return BagSource(bag, model, topics, _only(worlds))
+    return BagSource(bag, open_model(name or DEFAULT_ROBOT), topics, _only(worlds))
 
 
 def _ros(name: str | None, worlds: list[str] | None, namespace: str) -> Any:

@@ -78,8 +78,7 @@ def _too_old(rule: str, topic: str, detail: str, old: float, limit: float) -> Ca
 
 def scan_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The newest scan is too old: the lidar has stopped."""
-    old = age(state.scans, now)
-    return _too_old("scan_silent", SCAN, "no fresh data", old, config.scan_age_s)
+    return _too_old("scan_silent", SCAN, "no fresh data", age(state.scans, now), config.scan_age_s)
 
 
 def sensor_silent(config: GateConfig, state: GateState, now: float) -> Cause | None:

@@ -83,8 +83,7 @@ class Calibration:
         limits = [self.limits.get(r.state, (-np.inf, np.inf)) for r in self.responses]
         fall, rise = np.array(limits).reshape(-1, 2).T
         dead = {curve.command: curve.dead for curve in self.inputs}
-        zones = [dead.get(r.command, 0.0) for r in self.responses]
-        return Motors(fall, rise, np.array(zones))
+        return Motors(fall, rise, np.array([dead.get(r.command, 0.0) for r in self.responses]))
 
     @property
     def mounting(self) -> Array:

@@ -17,7 +17,7 @@ from nics_drl_bridge.recording.excite import Pattern
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.obstacles import Motion, Patrol
 from nics_drl_bridge.sim.scenes import Scene, SceneSampler, member_of
-from nics_drl_bridge.sim.world import Places, World
+from nics_drl_bridge.sim.world import World
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.style import DARK, GOAL, GREEN, MEASURED, MODEL, OTHER, panels, png, styled
 
@@ -148,7 +148,10 @@ def world_picture(
     figure, (axes,) = panels(1, 1, (max(width, LEAST_WIDTH) + 0.8, max(depth, 1.6) + 1.3))
     draw_world(axes, world, scene.bodies)
     for kind, places, colour in (("starts", world.starts, GREEN), ("goals", world.goals, GOAL)):
-        _regions(axes, places, colour, kind)
+        for number, (x1, y1, x2, y2) in enumerate(places.regions if places else ()):
+            area: dict[str, Any] = {"facecolor": (colour, 0.12), "edgecolor": colour, "ls": "--"}
+            area["label"] = None if number else f"region of {kind}"
+            axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, zorder=0.5, **area))
     _movers(axes, sampler.motions, scene)
     look: dict[str, Any] = {"facecolor": MEASURED, "edgecolor": DARK, "label": "robot at its start"}
     draw_robot(axes, scene.starts[0], footprint, outline, zorder=4.0, **look)
@@ -161,13 +164,6 @@ def world_picture(
     about = f"{size[0]:.3g} m x {size[1]:.3g} m, {count} obstacles, seed {seed}"
     axes.set_title(f"{world.name}: {about}")
     return png(figure, axes)
-
-
-def _regions(axes: Axes, places: Places | None, colour: str, kind: str) -> None:
-    for number, (x1, y1, x2, y2) in enumerate(places.regions if places else ()):
-        look: dict[str, Any] = {"facecolor": (colour, 0.12), "edgecolor": colour, "linestyle": "--"}
-        look["label"] = None if number else f"region of {kind}"
-        axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, zorder=0.5, **look))
 
 
 def _movers(axes: Axes, motions: Sequence[Motion | None], scene: Scene) -> None:
