@@ -28,6 +28,7 @@ from nics_drl_bridge.recording import messages
 from nics_drl_bridge.robot.spec import RobotSpec
 
 PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # x, y and heading in the 6 x 6 covariance of a message
+INITIAL_POSE = "initialpose"  # topic, as RViz sends it
 UNUSED_VARIANCE = 1e6  # variance of z, roll and pitch, which a planar robot does not measure
 FIELD = re.compile(r"^\s*([A-Za-z][A-Za-z0-9_]*(?:/[A-Za-z0-9_/]+)?)")  # type, in a `.msg` file
 
@@ -132,6 +133,18 @@ def pose_from_ros(
     known = isinstance(message, geometry.PoseWithCovarianceStamped)
     covariance = np.reshape(message.pose.covariance, (6, 6))[PLANAR] if known else None
     return np.array(messages.whole_pose(message)), covariance
+
+
+def initial_pose(message: geometry.PoseWithCovarianceStamped, map_frame: str) -> Array:
+    """Returns the pose (3,) in the map of `initialpose`. Raises ConfigError if it can't be used."""
+    frame, pose = message.header.frame_id.strip("/"), pose_from_ros(message)[0]
+    if frame not in ("", map_frame):
+        fix = f"give it in {map_frame!r}, as RViz does if that is its fixed frame."
+        raise ConfigError(f"{INITIAL_POSE}: a pose in the frame {frame!r} is refused; {fix}")
+    if not np.isfinite(pose).all():
+        fix = "give finite numbers and a quaternion of unit length."
+        raise ConfigError(f"{INITIAL_POSE}: a pose that is none is refused; {fix}")
+    return pose
 
 
 def pose_to_ros(pose: ArrayLike, time_ns: int, frame: str) -> geometry.PoseStamped:

@@ -10,7 +10,7 @@ from nav_msgs.msg import OccupancyGrid
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import conversions, qos, runner
-from nics_drl_bridge.nodes.initial_pose import INITIAL_POSE, initial_pose
+from nics_drl_bridge.nodes.conversions import INITIAL_POSE, initial_pose
 from nics_drl_bridge.sim.device import DeviceWorld
 from nics_drl_bridge.sim.occupancy import occupancy, standing
 

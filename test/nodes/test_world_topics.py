@@ -15,7 +15,7 @@ from std_srvs.srv import Trigger
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.initial_pose import initial_pose
+from nics_drl_bridge.nodes.conversions import initial_pose
 from nics_drl_bridge.sim.occupancy import occupancy, standing
 from nics_drl_bridge.sim.scenes import SetSampler
 from nics_drl_bridge.sim.world_set import load_worlds
