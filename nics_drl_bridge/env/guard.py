@@ -77,11 +77,10 @@ def override(
     for name, value in (options or {}).items():
         if name in of_env:
             continue
-        if name in memory:
-            give(memory[name], name, value)
-        else:
+        if name not in memory:
             valid = {*memory, *of_env}
             raise ConfigError(f"unknown reset option {name!r}; {nearest(str(name), valid)}")
+        give(memory[name], name, value)
 
 
 def give(rows: NDArray[Any], name: str, value: Any) -> None:

@@ -321,8 +321,7 @@ def likely_delays(
         left = [_left(drive.spec, samples, each) for each in mixed]
         if np.ptp(left) > 0.0 and np.isfinite(left).all():
             found.append((command.name, float(tries[int(np.argmin(left))])))
-    delays = [delay for _, delay in found]
-    return tuple(found) if np.ptp(delays or [0.0]) > ALIKE_S else ()
+    return tuple(found) if np.ptp([delay for _, delay in found] or [0.0]) > ALIKE_S else ()
 
 
 def _delayed(drive: Drive, calibration: Calibration, samples: Samples) -> tuple[Array, Array]:

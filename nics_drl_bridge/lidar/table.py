@@ -142,8 +142,7 @@ class LidarTable:
     @property
     def _about(self) -> str:
         kept = {name: getattr(self, name) for name in TableAbout.model_fields if name != "format"}
-        about = TableAbout(format=FORMAT, **kept)
-        return about.model_dump_json(indent=1, exclude_none=True) + "\n"
+        return TableAbout(format=FORMAT, **kept).model_dump_json(indent=1, exclude_none=True) + "\n"
 
     @cached_property
     def fingerprint(self) -> str:

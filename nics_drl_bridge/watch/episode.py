@@ -84,8 +84,7 @@ class Lane:
 
     def _action(self, command: NDArray[np.float64]) -> Any:
         if self.task.actions == "discrete":
-            apart = np.abs(self.task.discrete_commands - command).sum(axis=-1)
-            return int(apart.argmin())
+            return int(np.abs(self.task.discrete_commands - command).sum(axis=-1).argmin())
         return actions_of(self.task, command)
 
     def anew(self, seed: int) -> bool:
