@@ -8,14 +8,12 @@ and critic are learnt on a core each.
 """
 
 import copy
-import math
 import threading
 from collections import deque
 from collections.abc import Callable
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, cast
 
-import gymnasium
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -24,58 +22,24 @@ from stable_baselines3.common.logger import Logger
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy import train_algorithms, train_imitation
 from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch
+from nics_drl_bridge.policy.train_kernels import (
+    LOG_NORM,
+    Batch,
+    Net,
+    actor_gradients,
+    critic_gradients,
+)
 from nics_drl_bridge.policy.train_memory import memory_of
 from nics_drl_bridge.policy.train_mirror import Reflection
-from nics_drl_bridge.policy.train_rollout import Transitions
+from nics_drl_bridge.policy.train_rollout import Driven, Transitions
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
 from nics_drl_bridge.policy.training_settings import PpoSettings, TrainingSettings
-from nics_drl_bridge.threads import run_parts
+from nics_drl_bridge.threads import one_blas_thread, run_parts
 
-T = TypeVar("T")
 Ended = list[tuple[bool, bool]]  # success and collision of episodes
 Seen = tuple[torch.Tensor, torch.Tensor]  # features and state
 VALUE_WEIGHT, GRADIENT_LIMIT = 0.5, 0.5  # of the loss, and of the norm of its gradient
 ADAM_EPSILON = 1e-5
-LOG_NORM = 0.5 * math.log(2.0 * math.pi)  # of the normal distribution
-
-
-class Layers:
-    """Linear layers with ReLU in between, and their gradients without autograd.
-
-    With arrays that are used again it takes half of autograd's time, for layers of 128 as of 64.
-    """
-
-    def __init__(self, layers: torch.nn.Sequential) -> None:
-        self._linear: list[Any] = [one for one in layers if isinstance(one, torch.nn.Linear)]
-        self._kept: list[torch.Tensor] = []
-        self._rows: list[torch.Tensor] = []
-
-    def forward(self, rows: torch.Tensor) -> torch.Tensor:
-        """Outputs (n, C) for inputs (n, O), which hold until the next call."""
-        if not self._kept or len(self._kept[0]) < len(rows):
-            self._kept = [rows.new_empty(len(rows), one.out_features) for one in self._linear]
-            self._back = [torch.empty_like(each) for each in self._kept[:-1]]
-        self._rows = [rows]
-        for layer, kept in zip(self._linear, self._kept, strict=True):
-            out = kept[: len(rows)]
-            torch.addmm(layer.bias, self._rows[-1], layer.weight.t(), out=out)
-            if layer is not self._linear[-1]:
-                out.relu_()
-            self._rows.append(out)
-        return self._rows[-1]
-
-    def backward(self, gradient: torch.Tensor) -> None:
-        """Writes the gradients of weights and biases, by that of the outputs (n, C)."""
-        for k in range(len(self._linear) - 1, -1, -1):
-            layer, rows = self._linear[k], self._rows[k]
-            torch.mm(gradient.t(), rows, out=layer.weight.grad)
-            torch.sum(gradient, 0, out=layer.bias.grad)
-            if k:
-                ahead = self._back[k - 1][: len(rows)]
-                torch.mm(gradient, layer.weight, out=ahead)
-                gradient = torch.ops.aten.threshold_backward.grad_input(
-                    ahead, rows, 0.0, grad_input=ahead
-                )
 
 
 class Networks(torch.nn.Module):
@@ -103,13 +67,13 @@ class Networks(torch.nn.Module):
         if self.actor.discrete:
             return raw.log_softmax(1).gather(1, actions[:, None]).squeeze(1)
         apart = (actions - raw) * torch.exp(-self.log_std)
-        return -0.5 * apart.square().sum(1) - (self.log_std + LOG_NORM).sum()
+        return -0.5 * apart.square().sum(1) - (self.log_std + float(LOG_NORM)).sum()
 
     def entropy(self, raw: torch.Tensor) -> torch.Tensor:
         """Entropy of the actions, averaged over outputs of the actor (n, C)."""
         if self.actor.discrete:
             return -(raw.softmax(1) * raw.log_softmax(1)).sum(1).mean()
-        return (self.log_std + 0.5 + LOG_NORM).sum()
+        return (self.log_std + 0.5 + float(LOG_NORM)).sum()
 
 
 def flattened(networks: Networks) -> torch.nn.Parameter:
@@ -125,6 +89,19 @@ def flattened(networks: Networks) -> torch.nn.Parameter:
     for parameter, values, gradient in parts:
         parameter.data, parameter.grad = values.view_as(parameter), gradient.view_as(parameter)
     return flat
+
+
+def net_of(layers: torch.nn.Sequential, rows: int) -> Net:
+    """The layers of one of `flattened` networks for the kernels, with memory for so many rows."""
+    every = list(layers.parameters())
+    whole = (sum(one.numel() for one in every),)
+    weights, gradients = (
+        first.view(-1).as_strided(whole, (1,)).numpy()
+        for first in (every[0].detach(), every[0].grad)
+    )
+    widths = np.array([every[0].shape[1], *(len(bias) for bias in every[1::2])])
+    kept, spare = (np.empty((k, rows * widths.max()), np.float32) for k in (len(widths) - 1, 2))
+    return Net(weights, gradients, widths, kept, spare)
 
 
 def advantages_of(
@@ -163,13 +140,30 @@ def loss_of(
 class Learner:
     """Moves the weights by gradients of the loss."""
 
-    def __init__(self, networks: Networks, ppo: PpoSettings, seed: int) -> None:
-        self.networks, self.ppo = networks, ppo
+    def __init__(
+        self, networks: Networks, ppo: PpoSettings, seed: int, reflection: Reflection | None = None
+    ) -> None:
+        self.networks, self.ppo, self._reflection = networks, ppo, reflection
         self.generator = torch.Generator().manual_seed(seed)
         self._all = flattened(networks)
         self.optimiser = torch.optim.Adam([self._all], eps=ADAM_EPSILON, fused=True)
-        self._parts = [Layers(layers) for layers in (networks.actor.layers, networks.critic)]
+        self._nets = [net_of(p, ppo.batch) for p in (networks.actor.layers, networks.critic)]
         self.core_is_free = threading.Event()  # no thread collects meanwhile
+
+    def judge(self, driven: Driven) -> Transitions:
+        """Advantages and returns of a rollout, by the present critic, and mirror images."""
+        networks, ppo = self.networks, self.ppo
+        with torch.no_grad():
+            values, rewards = networks.critic(driven.seen).squeeze(-1), driven.rewards.clone()
+            # What would have come after the time limits:
+            after = networks.critic(driven.final).squeeze(-1)
+            rewards.view(-1)[driven.cut] += ppo.discount * after
+        gains = advantages_of(rewards, values, driven.done, ppo.discount, ppo.gae_lambda)
+        rows = driven.seen[:-1], driven.actions, driven.log_probs, gains, gains + values[:-1]
+        rollout = Transitions(*(each.flatten(0, 1) for each in rows))
+        if networks.actor.memory.learnt:
+            rollout = rollout._replace(state=driven.state, done=driven.done)
+        return rollout if self._reflection is None else self._reflection.doubled(rollout)
 
     def learn(self, rollout: Transitions, rate: float) -> float:
         """Learns from a rollout with a learning rate; returns the loss of the last batch."""
@@ -186,25 +180,19 @@ class Learner:
         """Sets the gradients of all weights for a batch; returns the loss."""
         if batch.state is not None and batch.done is not None:
             return self._through_time(batch, batch.state, batch.done)
-        outputs = self._each(lambda part, _: part.forward(batch.seen))
-        raw, values = (each.detach().requires_grad_() for each in outputs)
-        loss = loss_of(self.networks, raw, values, batch, self.ppo)
-        wanted = raw, values, self.networks.log_std
-        *gradients, spread = torch.autograd.grad(loss, wanted, materialize_grads=True)
-        with torch.no_grad():
-            self.networks.log_std.grad.copy_(spread)
-        self._each(lambda part, k: part.backward(gradients[k]))
-        return loss.detach()
-
-    def _each(self, act: Callable[[Layers, int], T]) -> list[T]:
-        """Applies a function to actor and critic, at once while a core is free: the same bits."""
-
-        def apply(k: int) -> T:
-            with torch.no_grad():  # which is of each thread
-                return act(self._parts[k], k)
-
-        both = range(len(self._parts))
-        return run_parts(apply, both) if self.core_is_free.is_set() else [apply(k) for k in both]
+        columns = batch.actions.float().view(len(batch.seen), -1)
+        given = Batch(*(each.numpy() for each in batch[:5]))._replace(actions=columns.numpy())
+        (actor, critic), spread = self._nets, self.networks.log_std
+        own = spread.detach().numpy(), spread.grad.numpy()
+        bounds = np.float32(self.ppo.clip), np.float32(self.ppo.entropy)
+        jobs: list[Callable[[], Any]] = [
+            partial(actor_gradients, actor, given, *own, *bounds),
+            partial(critic_gradients, critic, given, np.float32(VALUE_WEIGHT)),
+        ]
+        free = self.core_is_free.is_set()
+        return torch.tensor(
+            sum(run_parts(lambda job: job(), jobs) if free else (j() for j in jobs))
+        )
 
     def _through_time(
         self, batch: Transitions, state: torch.Tensor, done: torch.Tensor
@@ -223,67 +211,48 @@ class Learner:
 class Collector:
     """Drives the worlds with a copy of the networks."""
 
-    def __init__(
-        self, env: TrainVecEnv, networks: Networks, ppo: PpoSettings, seed: int,
-        reflection: Reflection | None = None,
-    ) -> None:  # fmt: skip
-        self._reflection = reflection
+    def __init__(self, env: TrainVecEnv, networks: Networks, ppo: PpoSettings, seed: int) -> None:
         self.env, self.networks, self.ppo = env, copy.deepcopy(networks), ppo
         self.generator = torch.Generator().manual_seed(seed)
         self.last = np.zeros((env.num_envs, *env.observation_space.shape), np.float32)
         self.state = networks.actor.memory.begin(env.num_envs)  # (N, S) of the actor
 
-    def collect(self) -> tuple[Transitions, Ended]:
+    def collect(self) -> tuple[Driven, Ended]:
         """Drives all worlds for the steps of a rollout."""
-        with torch.no_grad():
-            return self._collect()
-
-    def _collect(self) -> tuple[Transitions, Ended]:
-        steps, worlds, ppo = self.ppo.rollout, self.env.num_envs, self.ppo
-        networks, first = self.networks, self.state
+        steps, worlds = self.ppo.rollout, self.env.num_envs
+        networks, first, space = self.networks, self.state, cast("Any", self.env.action_space)
         seen = torch.empty(steps + 1, worlds, networks.critic[0].in_features)
         rewards, done = torch.zeros(2, steps, worlds)
-        raw, actions, ended, cut, final = [], [], [], [], []
-        for t in range(steps):
-            seen[t], state = self._see(self.last, self.state)
-            raw.append(networks.actor.layers(seen[t]))
-            actions.append(networks.draw(raw[t], self.generator))
-            self.last, reward, over, infos = self.env.step(self._bounded(actions[t].numpy()))
-            rewards[t], done[t] = torch.from_numpy(reward), torch.from_numpy(over)
-            for n in np.flatnonzero(over):
-                one = infos[n]
-                ended.append((one.get("is_success", False), one.get("collision", False)))
-                if one["TimeLimit.truncated"]:
-                    cut.append(t * worlds + int(n))
-                    final.append(self._see(one["terminal_observation"][None], state[n : n + 1])[0])
-            self.state = networks.actor.memory.begun(state, done[t])
-        seen[steps], _ = self._see(self.last, self.state)
-        values = networks.critic(seen).squeeze(-1)
-        if cut:  # what would have come after the time limit
-            after = networks.critic(torch.cat(final)).squeeze(-1)
-            rewards.view(-1)[cut] += ppo.discount * after
-        gains = advantages_of(rewards, values, done, ppo.discount, ppo.gae_lambda)
-        drawn, returns = torch.cat(actions), gains + values[:-1]
-        log_probs = networks.log_probs(torch.cat(raw), drawn)
-        rows = seen[:-1].flatten(0, 1), drawn, log_probs, gains.flatten(), returns.flatten()
-        rollout = Transitions(*rows)
-        if networks.actor.memory.learnt:
-            rollout = rollout._replace(state=first, done=done)
-        if self._reflection is not None:
-            rollout = self._reflection.doubled(rollout)
-        return rollout, ended
+        raw, actions, ended, cut, final = [], [], [], [], [seen[0, :0]]
+        with torch.no_grad():
+            for t in range(steps):
+                seen[t], state = self._see(self.last, self.state)
+                raw.append(networks.actor.layers(seen[t]))
+                actions.append(networks.draw(raw[t], self.generator))
+                acted = actions[t].numpy()
+                if not networks.actor.discrete:
+                    acted = np.clip(acted, space.low, space.high)
+                self.last, reward, over, infos = self.env.step(acted)
+                rewards[t], done[t] = torch.from_numpy(reward), torch.from_numpy(over)
+                for n in np.flatnonzero(over):
+                    one = infos[n]
+                    ended.append((one.get("is_success", False), one.get("collision", False)))
+                    if one["TimeLimit.truncated"]:
+                        cut.append(t * worlds + int(n))
+                        last = one["terminal_observation"][None]
+                        final.append(self._see(last, state[n : n + 1])[0])
+                self.state = networks.actor.memory.begun(state, done[t])
+            seen[steps], _ = self._see(self.last, self.state)
+            beyond = torch.tensor(cut, dtype=torch.int64), torch.cat(final)
+            drawn = torch.stack(actions)
+            log_probs = networks.log_probs(torch.cat(raw), drawn.flatten(0, 1)).view_as(rewards)
+            return Driven(seen, drawn, log_probs, rewards, done, *beyond, first), ended
 
     def _see(self, observations: NDArray[np.float32], state: torch.Tensor) -> Seen:
         """Features of observations (n, O) for the networks, and the next state (n, S)."""
         actor = self.networks.actor
         seen: Seen = actor.memory(actor.normaliser(torch.from_numpy(observations)), state)
         return seen
-
-    def _bounded(self, actions: NDArray[Any]) -> NDArray[Any]:
-        space = self.env.action_space
-        if isinstance(space, gymnasium.spaces.Box):
-            return np.asarray(np.clip(actions, space.low, space.high))
-        return actions
 
 
 class LeanPpo:
@@ -306,13 +275,14 @@ class LeanPpo:
         actor = train_algorithms.Actor(*spaces, hidden, normaliser, torch.nn.ReLU, memory)
         self.networks = Networks(actor, hidden, self._ppo.log_std)
         seeds = np.random.SeedSequence(seed).generate_state(3)
-        self.collector = Collector(env, self.networks, self._ppo, int(seeds[0]), reflection)
-        self.learner = Learner(self.networks, self._ppo, int(seeds[1]))
+        self.collector = Collector(env, self.networks, self._ppo, int(seeds[0]))
+        self.learner = Learner(self.networks, self._ppo, int(seeds[1]), reflection)
         self.policy, self._settings, self._imitation_seed = actor, settings, int(seeds[2])
         self.steps = 0  # of all worlds together, learnt from so far
-        self._rollout: Transitions | None = None  # the next one to learn from
+        self._rollout: Driven | None = None  # the next one to learn from
         self._successes: deque[bool] = deque(maxlen=RECENT)
 
+    @one_blas_thread
     def learn(self, watch: Watch, logger: Logger) -> None:
         """Learns until all steps are done, or the watch ends it."""
         watch.begin(self.steps)
@@ -343,7 +313,7 @@ class LeanPpo:
         part.networks.load_state_dict(self.networks.state_dict())
         self.steps = len(shown.seen)
 
-    def _advance(self, rollout: Transitions, watch: Watch) -> float:
+    def _advance(self, rollout: Driven, watch: Watch) -> float:
         """Learns from a rollout, with the next one collected meanwhile."""
         rate = self._ppo.learning_rate * max(
             1.0 - self.steps / self._total, train_algorithms.LEAST_RATE
@@ -351,21 +321,25 @@ class LeanPpo:
         self.steps += self._ppo.rollout * self.collector.env.num_envs
         self.collector.networks.load_state_dict(self.networks.state_dict())
         self.learner.core_is_free.clear()
-        learn = partial(self.learner.learn, rollout, rate)
-        jobs: list[Callable[[], Any]] = [learn, self._collect]
+        learner = self.learner
+        jobs: list[Callable[[], Any]] = [
+            lambda: learner.learn(learner.judge(rollout), rate),
+            self._collect,
+        ]
         loss, *collected = run_parts(lambda job: job(), jobs[: 1 + (self.steps < self._total)])
         self._rollout = None
         for one in collected:
             self._take(watch, *one)
         return float(loss)
 
-    def _collect(self) -> tuple[Transitions, Ended]:
+    def _collect(self) -> tuple[Driven, Ended]:
+        torch.set_num_threads(self._settings.threads)  # which is of each thread
         try:
             return self.collector.collect()
         finally:
             self.learner.core_is_free.set()
 
-    def _take(self, watch: Watch, rollout: Transitions, ended: Ended) -> None:
+    def _take(self, watch: Watch, rollout: Driven, ended: Ended) -> None:
         self._rollout = rollout
         self._successes.extend(success for success, _ in ended)
         watch.collisions.extend(collision for _, collision in ended)
@@ -385,7 +359,7 @@ class LeanPpo:
         self.networks.load_state_dict(state["weights"])
         self.learner.optimiser.load_state_dict(state["optimiser"])
         self.steps, rollout = state["steps"], state["rollout"]
-        self._rollout = rollout and Transitions(**rollout)
+        self._rollout = rollout and Driven(**rollout)
         self._successes.extend(state["recent"])
         self.collector.last = state["last"].numpy()
         self.collector.state = state.get("memory", self.collector.state)

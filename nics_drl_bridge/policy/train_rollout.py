@@ -8,6 +8,19 @@ from typing import NamedTuple
 import torch
 
 
+class Driven(NamedTuple):
+    """A rollout as it was driven: T steps of N worlds."""
+
+    seen: torch.Tensor  # (T + 1, N, O) normalised observations, with what a memory adds
+    actions: torch.Tensor  # (T, N, C), or (T, N) discrete
+    log_probs: torch.Tensor  # (T, N) of the actions when they were drawn
+    rewards: torch.Tensor  # (T, N)
+    done: torch.Tensor  # (T, N) ends of episodes, which are 1
+    cut: torch.Tensor  # (K,) t N + n of those that a time limit ended
+    final: torch.Tensor  # (K, O) what was seen there at last
+    state: torch.Tensor  # (N, S) of the memory at the first step
+
+
 class Transitions(NamedTuple):
     """R transitions, T steps of N worlds, step after step; the last two for a learnt memory."""
 

@@ -47,7 +47,7 @@ def test_each_transition_is_followed_by_its_mirror_image(actions, memory):
     lean, mirror = engine(True, actions, memory)
     plain, _ = engine(False, actions, memory)
     plain.collector.networks.load_state_dict(lean.networks.state_dict())
-    both, driven = (one.collector.collect()[0] for one in (lean, plain))
+    both, driven = (one.learner.judge(one.collector.collect()[0]) for one in (lean, plain))
     reflection, count = Reflection(mirror, lean.networks.actor.memory.extra, 72), STEPS * WORLDS
     for one, other in zip(both[:5], driven[:5], strict=True):
         assert len(one) == 2 * count

@@ -1,0 +1,147 @@
+"""Compiled inner loops of the lean engine: the gradients of PPO's loss.
+
+The loss is that of `train_ppo.loss_of`. These free the interpreter's lock, for which autograd's
+many small steps would contend with the thread that collects. Shapes: n transitions, O
+observations, C outputs of the actor, W weights of a network.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.kernels import kernel
+
+ONE, NONE = np.float32(1.0), np.float32(0.0)
+LOG_NORM = np.float32(0.5 * np.log(2.0 * np.pi))  # of the normal distribution
+
+
+class Net(NamedTuple):
+    """Linear layers with ReLU in between, and memory for the rows of a batch."""
+
+    weights: NDArray[np.float32]  # (W,) layer after layer: (outs, ins), and biases (outs,)
+    gradients: NDArray[np.float32]  # (W,)
+    widths: NDArray[np.int64]  # (L + 1,) inputs, and outputs of each layer
+    kept: NDArray[np.float32]  # (L, at least n times the widest) outputs of each layer
+    spare: NDArray[np.float32]  # (2, as many) gradients of outputs
+
+
+class Batch(NamedTuple):
+    """Transitions to learn from, see `train_rollout.Transitions`."""
+
+    seen: NDArray[np.float32]  # (n, O)
+    actions: NDArray[np.float32]  # (n, C), or (n, 1) numbers of discrete ones
+    log_probs: NDArray[np.float32]  # (n,)
+    advantages: NDArray[np.float32]  # (n,)
+    returns: NDArray[np.float32]  # (n,)
+
+
+@kernel(allocates=True)
+def forward(net, seen):  # type: ignore[no-untyped-def]
+    """Outputs (n, C) of a network for inputs (n, O); those of all layers are kept."""
+    n, at, rows = seen.shape[0], 0, seen
+    for k in range(net.widths.shape[0] - 1):
+        ins, outs = net.widths[k], net.widths[k + 1]
+        middle, out = at + ins * outs, net.kept[k, : n * outs].reshape(n, outs)
+        np.dot(rows, net.weights[at:middle].reshape(outs, ins).T, out)
+        at, rows = middle + outs, out
+        bias, least = net.weights[middle:at], NONE if k + 2 < net.widths.shape[0] else -np.inf
+        for i in range(n):
+            for j in range(outs):
+                out[i, j] = max(out[i, j] + bias[j], np.float32(least))
+    return rows
+
+
+@kernel(allocates=True)
+def backward(net, seen, gradient):  # type: ignore[no-untyped-def]
+    """Writes the gradients of weights, by those (n, C) of the outputs, after `forward`.
+
+    `gradient` is the first of the spare arrays.
+    """
+    n, at, side = seen.shape[0], net.weights.shape[0], 0
+    for k in range(net.widths.shape[0] - 2, -1, -1):
+        ins, outs = net.widths[k], net.widths[k + 1]
+        middle = at - outs
+        at = middle - ins * outs
+        rows = net.kept[k - 1, : n * ins].reshape(n, ins) if k > 0 else seen
+        np.dot(gradient.T, rows, net.gradients[at:middle].reshape(outs, ins))
+        net.gradients[middle : middle + outs] = gradient.sum(axis=0)
+        if k > 0:
+            side = 1 - side
+            ahead = net.spare[side, : n * ins].reshape(n, ins)
+            np.dot(gradient, net.weights[at:middle].reshape(outs, ins), ahead)
+            for i in range(n):
+                for j in range(ins):
+                    ahead[i, j] = ahead[i, j] if rows[i, j] > NONE else NONE
+            gradient = ahead
+
+
+@kernel(allocates=True)
+def critic_gradients(net, batch, weight):  # type: ignore[no-untyped-def]
+    """Writes the gradients of the critic; returns its part of the loss, with a weight."""
+    values = forward(net, batch.seen)
+    n = values.shape[0]
+    out, loss, share = net.spare[0, :n].reshape(n, 1), NONE, weight / np.float32(n)
+    for i in range(n):
+        off = values[i, 0] - batch.returns[i]
+        loss += share * off * off
+        out[i, 0] = np.float32(2.0) * share * off
+    backward(net, batch.seen, out)
+    return loss
+
+
+@kernel(allocates=True)
+def actor_gradients(net, batch, log_std, spread, clip, entropy):  # type: ignore[no-untyped-def]
+    """Writes the gradients of the actor, and those (C,) of `log_std`; returns its part of the loss.
+
+    Of discrete actions, `log_std` has none.
+    """
+    raw, gains = forward(net, batch.seen), batch.advantages
+    n, actions = raw.shape[0], batch.actions
+    out = net.spare[0, : raw.size].reshape(raw.shape)
+    mean, share = gains.mean(), ONE / np.float32(n)
+    scale = ONE / (np.sqrt(np.square(gains - mean).sum() / np.float32(n - 1)) + np.float32(1e-8))
+    spread[:] = -entropy
+    loss, parts = NONE, np.empty(raw.shape[1], np.float32)
+    for i in range(n):
+        if log_std.size > 0:
+            log_prob, mixed = _density(parts, raw[i], actions[i], log_std)
+        else:
+            log_prob, mixed = _probability(parts, raw[i], int(actions[i, 0]))
+        ratio, gain = np.exp(log_prob - batch.log_probs[i]), (gains[i] - mean) * scale
+        bounded = gain * min(max(ratio, ONE - clip), ONE + clip)
+        loss -= share * (min(gain * ratio, bounded) + entropy * mixed)
+        pull = share * gain * ratio if gain * ratio <= bounded else NONE
+        for j in range(parts.shape[0]):
+            if log_std.size > 0:
+                out[i, j] = -pull * parts[j] * np.exp(-log_std[j])
+                spread[j] -= pull * (parts[j] * parts[j] - ONE)
+            else:
+                out[i, j] = np.exp(parts[j]) * (pull + share * entropy * (parts[j] + mixed))
+        if log_std.size == 0:
+            out[i, int(actions[i, 0])] -= pull
+    backward(net, batch.seen, out)
+    return loss
+
+
+@kernel(allocates=True)
+def _density(parts, raw, action, log_std):  # type: ignore[no-untyped-def]
+    """Logarithm of the density of an action (C,), and entropy; `parts` are its deviations (C,)."""
+    log_prob = mixed = NONE
+    for j in range(raw.shape[0]):
+        parts[j] = (action[j] - raw[j]) * np.exp(-log_std[j])
+        log_prob -= np.float32(0.5) * parts[j] * parts[j] + log_std[j] + LOG_NORM
+        mixed += log_std[j] + np.float32(0.5) + LOG_NORM
+    return log_prob, mixed
+
+
+@kernel(allocates=True)
+def _probability(parts, raw, action):  # type: ignore[no-untyped-def]
+    """Logarithm of the probability of an action, and entropy; `parts` are those of all (C,)."""
+    greatest, total, mixed = raw.max(), NONE, NONE
+    for j in range(raw.shape[0]):
+        total += np.exp(raw[j] - greatest)
+    for j in range(raw.shape[0]):
+        parts[j] = raw[j] - greatest - np.log(total)
+        mixed -= np.exp(parts[j]) * parts[j]
+    return parts[action], mixed
