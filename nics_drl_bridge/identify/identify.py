@@ -268,6 +268,11 @@ def refine(drive: Drive, findings: Findings) -> Findings:
         return _refined_motion(drive, findings)
     if findings.calibration.is_exact:
         return findings
+    tried = verdict.tried(model, findings.calibration, findings.training, 0.0)
+    if drive.settings.order == "auto" and not findings.trials and verdict.ran_away(tried):
+        linear = replace(drive, settings=replace(drive.settings, order=1))
+        found = run((fit, prune, refine), linear, findings)
+        return replace(found, refinement=(*found.refinement, verdict.LINEAR))
     model, calibration, note = refined(model, findings.calibration, findings.training)
     sentences = (note, *hypotheses.about_orders(findings.trials))
     return replace(findings, model=model, calibration=calibration, refinement=sentences)
@@ -327,7 +332,7 @@ def judge(drive: Drive, findings: Findings) -> Findings:
     begin = whole.recording.pose.t[0] + calibration.clock_offset_s + drive.settings.train_until_s
     rest = samples.rows(samples.t > begin)
     unseen = rest if len(rest.t) >= verdict.MIN_ROWS else None
-    held_out = verdict.tried(model, calibration, whole)
+    held_out = verdict.tried(model, calibration, whole, drive.settings.train_until_s)
     bands: dict[float, float] = {}
     if not calibration.is_exact and drive.duration_s > drive.settings.train_until_s:
         derived = None
@@ -372,10 +377,7 @@ def structure(findings: Findings) -> tuple[str, ...]:
 
 
 def _left_out(drive: Drive, findings: Findings, order: int | None = None) -> dict[float, Array]:
-    """Returns errors (W,) by horizon [s] on parts of the training part, by models of the rest.
-
-    With an order, these are made of what was found before.
-    """
+    """Returns errors (W,) by horizon [s] on left-out parts; with an order, by what was found."""
     training, stages = findings.training, STAGES[: STAGES.index(complete)]
     pose, settings = training.recording.pose, replace(drive.settings, train_until_s=np.inf)
     if order is not None:
@@ -384,9 +386,8 @@ def _left_out(drive: Drive, findings: Findings, order: int | None = None) -> dic
     for block in np.array_split(np.arange(len(pose.t)), hypotheses.FOLDS):
         others = np.ones(len(pose.t), dtype=np.bool_)
         others[block] = False
-        rest = training.part(replace(training.recording, pose=pose.rows(others)))
+        rest = training.part(replace(training.recording, pose=pose.rows(others))).under(settings)
         try:
-            rest = replace(rest, settings=settings)
             found = run(stages, rest, replace(findings, training=rest) if order else None)
         except (FitError, RecordingError):
             return {}

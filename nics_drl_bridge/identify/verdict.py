@@ -29,19 +29,16 @@ FAR_OFF = 0.25  # predictions whose mean error exceeds this share of the path ar
 UNEXPLAINED = 0.5
 WORSE = 1.25  # times the trial's error on the part that both know; a refit beyond is not believed
 MANY_OUTLIERS = 0.001
+LINEAR = "Predictions by terms of a higher order ran away, so the model has those of order 1 alone."
 MIRRORED = -0.5  # correlation of yaw rate and steering below which the robot turns the wrong way
 
 
 class Gap(str):
     """A sentence on something that a drive could not teach."""
 
-    __slots__ = ()
-
 
 class Mistake(str):
     """A sentence on something that was mapped wrongly: the model holds for the mapping alone."""
-
-    __slots__ = ()
 
 
 def about_stamps(drive: Drive) -> Iterator[str]:
@@ -231,13 +228,17 @@ def mirror_note(samples: Samples, spec: RobotSpec) -> Iterator[str]:
             return
 
 
-def tried(model: TaylorModel, calibration: Calibration, drive: Drive) -> OpenLoop | None:
-    """Tries a model on the unseen part of a drive; None if that is too short."""
-    until = drive.settings.train_until_s
+def tried(model: TaylorModel, calibration: Calibration, drive: Drive, t: float) -> OpenLoop | None:
+    """Tries a model on a drive from t [s] on; None if that is too short."""
     try:
-        return open_loop_error(model, calibration, drive, until, drive.duration_s)
+        return open_loop_error(model, calibration, drive, t, drive.duration_s)
     except RecordingError:
         return None
+
+
+def ran_away(tried: OpenLoop | None) -> bool:
+    """True if predictions end farther away than the robot drove."""
+    return tried is not None and not tried.mean_position_error_m <= tried.mean_path_m
 
 
 def untried(drive: Drive, held_out: OpenLoop | None) -> Iterator[str]:

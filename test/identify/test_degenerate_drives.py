@@ -11,11 +11,13 @@ import pytest
 from identify.drives import drive
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import FitError, RecordingError
+from nics_drl_bridge.identify import verdict
 from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.drive import Drive
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.repair import check_axes
 from nics_drl_bridge.recording.recording import Recording, Stream
+from nics_drl_bridge.recording.textbook import record
 from nics_drl_bridge.robot.kernels import SERIES, rollout, term_arrays
 from nics_drl_bridge.robot.kinds import textbook
 from nics_drl_bridge.robot.spec import load_robot
@@ -299,3 +301,18 @@ def test_a_model_of_every_partial_drive_stays_finite(car):
                 model.dt,
             )  # fmt: skip
         assert np.abs(poses[0, :, :2]).max() < 20.0
+
+
+def test_where_predictions_run_away_the_model_is_linear():
+    """Each half second of commands comes late by another time, as over a bad link."""
+    spec, rng = load_robot("differential"), np.random.default_rng(9)
+    whole = record(spec, rng, 40.0, dt=0.02)
+    poses = whole.pose.values + rng.normal(0.0, 1e-3, whole.pose.values.shape)
+    late = np.repeat(rng.uniform(0.0, 0.4, len(whole.command.t) // 25 + 1), 25)
+    t = np.maximum.accumulate(whole.command.t - late[: len(whole.command.t)])
+    late_commands = replace(whole.command, t=t + 1e-6 * np.arange(len(t)))
+    jittered = replace(whole, pose=replace(whole.pose, values=poses), command=late_commands)
+    found = identify(jittered, spec)
+    assert verdict.LINEAR in found.notes
+    assert (found.model.powers.sum(axis=1) <= 1).all()
+    assert found.held_out.mean_position_error_m < 0.25 * found.held_out.mean_path_m
