@@ -58,8 +58,8 @@ def test_a_block_that_installs_something_runs_in_a_fresh_clone(lines, tmp_path):
         ["bash", "-e", "-c", "\n".join(lines)], cwd=clone, env=environment(), text=True,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
     )  # fmt: skip
-    ran = done.returncode == 0 or "met their bars: " in done.stdout  # speeds are no test's
-    assert ran, done.stdout
+    measured = "met their bars: " in done.stdout and " broken " not in done.stdout
+    assert done.returncode == 0 or measured, done.stdout  # a speed may be missed here
 
 
 def test_the_blocks_of_the_first_pages_are_among_them():

@@ -274,7 +274,7 @@ def test_a_recorded_drive_of_a_simulator_generates_it_again(
         if held_out.mean_position_error_m < SHARE_OF_PATH * held_out.mean_path_m:
             break
     else:
-        pytest.fail("no drive generates the robot again")
+        pytest.fail(f"no drive generates the robot again: {command.said}")
     assert command.said.startswith("preview of ")
     after = f"next: nics generate {out}.npz --robot {name} --out {out}_model\n"
     assert command.said.endswith(after)
