@@ -19,6 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from llvmlite import binding as llvm
+from llvmlite import ir
+from numba import types
 from numba.core import event
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 from numba.core.codegen import JITCodeLibrary
@@ -26,6 +28,8 @@ from numba.core.compiler import Compiler, Flags, compile_result
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 from numba.core.sigutils import normalize_signature
+from numba.extending import intrinsic
+from numba.np.arrayobj import make_array
 
 PACKAGE = Path(__file__).parent
 PATIENCE_S = 2.0  # Compiling that takes longer is announced, on standard error
@@ -64,6 +68,22 @@ def kernel(
     compiled: Callable[..., Any] = _Kernel(function, targetoptions=options)
     KERNELS.append(compiled)
     return compiled
+
+
+@intrinsic
+def prefetch(_typing: Any, array: Any, index: Any) -> Any:
+    """Asks for array[index] (n,) to be in the cache soon, before a kernel waits for it."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        data = make_array(signature.args[0])(context, builder, args[0]).data
+        whole, byte = ir.IntType(32), ir.IntType(8).as_pointer()
+        place = builder.bitcast(builder.gep(data, [args[1]]), byte)
+        kind = ir.FunctionType(ir.VoidType(), [byte, whole, whole, whole])
+        ask = builder.module.declare_intrinsic("llvm.prefetch", [byte], kind)
+        builder.call(ask, [place, whole(0), whole(3), whole(1)])  # to read; to keep; of the data
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp), generate
 
 
 class _InnerLibrary(JITCodeLibrary):  # type: ignore[misc]

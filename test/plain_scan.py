@@ -11,7 +11,6 @@ from nics_drl_bridge.lidar.baked_kernels import (
     blended,
     compute,
     in_beams,
-    limited,
     nearest_cell,
     points_of,
     polar,
@@ -64,5 +63,6 @@ def fuse(out, middle, low, high, near, far, blend, lidar):  # type: ignore[no-un
     other, other2 = points_of(far[0], far[1], point, shift, hits)
     range_min, range_max = np.float32(lidar.range_min), np.float32(lidar.range_max)
     for j in range(hits):
-        value = blended(rows, one + j, two + j, other + j, other2 + j, share, blend)
-        out[begin + j] = min(out[begin + j], limited(value, range_min, range_max))
+        points = one + j, two + j, other + j, other2 + j
+        value = blended(rows, points, share, blend, range_min, range_max)
+        out[begin + j] = min(out[begin + j], value)

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from nics_drl_bridge import kernels
@@ -197,3 +198,16 @@ def test_a_kernel_of_ones_own_is_made_of_the_files_beside_it(tmp_path):
     names = {each.name for each in found if tmp_path in each.parents}
     assert names - {"__init__.py"} == {"helpers.py", "more.py", "consts.py", "deep.py"}
     assert kernels.PACKAGE / "geometry.py" in found
+
+
+@kernels.kernel
+def _asked(values, index):
+    kernels.prefetch(values, index)
+    return values[0] + values[values.shape[0] - 1]
+
+
+@pytest.mark.parametrize("index", [0, 2, -1, 10**12])
+def test_asking_for_any_place_of_an_array_changes_nothing(index):
+    values = np.array([1.0, 2.0, 4.0])
+    assert _asked(values, index) == 5.0
+    assert values.tolist() == [1.0, 2.0, 4.0]

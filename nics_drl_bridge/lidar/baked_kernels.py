@@ -199,17 +199,16 @@ def points_of(start, place, point, shift, hits):  # type: ignore[no-untyped-def]
 
 
 @kernel(contracts=True, inline=True)
-def blended(rows, one, two, other, other2, share, blend):  # type: ignore[no-untyped-def]
-    """Range between two points of a row and two of the farther one [m]."""
+def blended(rows, points, share, blend, range_min, range_max):  # type: ignore[no-untyped-def]
+    """Range between two points of a row and two of the farther one [m].
+
+    Too far becomes `inf`, too close `-inf` (REP-117).
+    """
+    one, two, other, other2 = points
     value, farther = rows[np.uintp(one)], rows[np.uintp(other)]
     value += share * (rows[np.uintp(two)] - value)
     farther += share * (rows[np.uintp(other2)] - farther)
-    return value + blend * (farther - value)
-
-
-@kernel(inline=True)
-def limited(value, range_min, range_max):  # type: ignore[no-untyped-def]
-    """A range within the limits: too far becomes `inf`, too close `-inf` (REP-117)."""
+    value += blend * (farther - value)
     value = value if value <= range_max else np.float32(np.inf)
     return value if value >= range_min else np.float32(-np.inf)
 
@@ -246,13 +245,9 @@ def arctan2_single(y, x):  # type: ignore[no-untyped-def]
     ratio = min(ax, ay) / max(ax, ay)
     s = ratio * ratio
     r = ATAN[7]
-    r = r * s + ATAN[6]
-    r = r * s + ATAN[5]
-    r = r * s + ATAN[4]
-    r = r * s + ATAN[3]
-    r = r * s + ATAN[2]
-    r = r * s + ATAN[1]
-    r = (r * s + ATAN[0]) * ratio
+    for k in range(6, -1, -1):
+        r = r * s + ATAN[k]
+    r *= ratio
     r = np.float32(0.5 * math.pi) - r if ay > ax else r
     r = np.float32(math.pi) - r if x < np.float32(0.0) else r
     return math.copysign(r, y)

@@ -57,16 +57,9 @@ def arctan2(y, x):  # type: ignore[no-untyped-def]
     ratio = min(ax, ay) / (max(ax, ay) + TINY)
     s = ratio * ratio
     r = ATAN[10]
-    r = r * s + ATAN[9]
-    r = r * s + ATAN[8]
-    r = r * s + ATAN[7]
-    r = r * s + ATAN[6]
-    r = r * s + ATAN[5]
-    r = r * s + ATAN[4]
-    r = r * s + ATAN[3]
-    r = r * s + ATAN[2]
-    r = r * s + ATAN[1]
-    r = (r * s + ATAN[0]) * ratio
+    for k in range(9, -1, -1):
+        r = r * s + ATAN[k]
+    r *= ratio
     r = HALF_PI - r if ay > ax else r
     r = math.pi - r if x < 0.0 else r
     return math.copysign(r, y)

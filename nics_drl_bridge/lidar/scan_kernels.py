@@ -12,13 +12,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.kernels import kernel, prefetch
 from nics_drl_bridge.lidar import baked_kernels as baked
 from nics_drl_bridge.lidar import cell_kernels, exact_kernels, map_kernels
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, LidarPose, X, Y
 from nics_drl_bridge.lidar.fixture_kernels import grid_of, walls_of
 
 BLOCK = 16  # Beams that are fused at once
+SOON = 8  # Bodies between asking for points and fusing them
 LANES = 9 * BLOCK  # Bodies looked up together: so few that their scans stay in the L1 cache
 DX, DY, TURNED, COSINE, SINE, SIZE, BEARING_0, SCAN, MIDDLE, LOW, HIGH, AT = (
     np.uintp(k * LANES) for k in range(12)
@@ -134,6 +135,10 @@ def look_up(found, ranges, lidar, lanes):  # type: ignore[no-untyped-def]
             climb(np.uintp(j), lidar, lanes)
     aims(padded, count, np.int32(table.shift), lanes)
     for j in range(found):
+        soon = np.uintp(min(j + SOON, found - 1))
+        for row in (ONE, OTHER):
+            prefetch(table.rows, np.intp(lanes.whole[soon + row]))
+            prefetch(table.rows, np.intp(lanes.whole[soon + row] + BLOCK))
         fuse(flat, np.uintp(j), lidar, lanes)
     for j in range(found):
         if wide[np.uintp(j) + HIGH] >= turn:  # across the seam of the circle
@@ -258,8 +263,8 @@ def fuse(flat, k, lidar, lanes):  # type: ignore[no-untyped-def]
         place = np.int32(-back)
         for j in range(blocks * BLOCK):
             i = np.uintp(j)
-            value = baked.blended(rows, one + i, two + i, other + i, other2 + i, share, blend)
-            value = baked.limited(value, least, most)
+            points = one + i, two + i, other + i, other2 + i
+            value = baked.blended(rows, points, share, blend, least, most)
             value = value if np.uint32(place) < np.uint32(hits) else np.float32(np.inf)
             place = np.int32(place + np.int32(1))  # of 32 bits, as the ranges
             flat[at + i] = min(flat[at + i], np.float32(value).view(np.int32))
@@ -267,8 +272,8 @@ def fuse(flat, k, lidar, lanes):  # type: ignore[no-untyped-def]
         at = np.uintp(lanes.wide[k + AT] + back)
         for j in range(hits):
             i = np.uintp(j)
-            value = baked.blended(rows, one + i, two + i, other + i, other2 + i, share, blend)
-            value = baked.limited(value, least, most)
+            points = one + i, two + i, other + i, other2 + i
+            value = baked.blended(rows, points, share, blend, least, most)
             flat[at + i] = min(flat[at + i], np.float32(value).view(np.int32))
 
 

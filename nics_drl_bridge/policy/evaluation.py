@@ -310,14 +310,11 @@ def tallies(runs: Mapping[str, Sequence[Episode]], control_period: float) -> dic
         outcomes = Outcomes(seeds, results == "success", results == "collision", *figures)
         pairs = list(zip(episodes, first, strict=True))
         gaps = [deviation(one, other) for one, other in pairs]
+        planned = [one.planned for one in episodes if one.planned is not None]
         found[place] = Tally(
             **vars(summarise(outcomes, control_period)),
             same=sum(one.result == other.result for one, other in pairs) / len(pairs),
-            deviation=mean(gaps), greatest_deviation=max(gaps), fallback=_planned_share(episodes),
+            deviation=mean(gaps), greatest_deviation=max(gaps),
+            fallback=sum(planned) / max(int(sum(figures[0])), 1) if planned else math.nan,
         )  # fmt: skip
     return found
-
-
-def _planned_share(episodes: Sequence[Episode]) -> float:
-    counts = [one.planned for one in episodes if one.planned is not None]
-    return sum(counts) / max(sum(one.steps for one in episodes), 1) if counts else math.nan

@@ -241,15 +241,12 @@ def _delay(bag: BagFile, topic: str | None) -> Delay | None:
     receive, stamps = times_of(messages)
     if len(messages) < LEAST_MESSAGES or stamps is None or not stamps.all():
         return None
-    late = (receive - stamps) * S_PER_NS - np.array([_sweep(m.content) for m in messages])
+    late = (receive - stamps) * S_PER_NS
+    if hasattr(messages[0].content, "ranges"):  # a scan's stamp is that of beam 0, not of its last
+        scans = [(max(0.0, float(m.content.time_increment)), m.content.ranges) for m in messages]
+        late -= [increment * max(len(ranges) - 1, 0) for increment, ranges in scans]
     low, middle, high = np.percentile(late, PERCENTILES)
     if not SAME_CLOCK_S[0] <= middle <= SAME_CLOCK_S[1]:
         return None
     jitter = float(high - low) / SPANNED
     return Delay(least=max(0.0, float(middle) - jitter / 2.0), jitter=jitter)
-
-
-def _sweep(scan: Any) -> float:
-    """Returns the time from a scan's stamp, that of beam 0, to its last beam [s]; else 0."""
-    beams = len(getattr(scan, "ranges", ()))
-    return max(0.0, float(scan.time_increment)) * (beams - 1) if beams else 0.0

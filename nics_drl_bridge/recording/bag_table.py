@@ -162,17 +162,10 @@ def topics_used(mapping: mapped.Mapping, topics: Sequence[str]) -> dict[str, boo
             for each in part:
                 walk(each, own)
         elif isinstance(part, str):
-            for topic in (each for each in (part, *_heads(part)) if each in topics):
+            heads = [part[:k] for k, sign in enumerate(part) if sign == ":"]
+            named = {part, f"/{part}", *heads, *(f"/{head}" for head in heads)}
+            for topic in (each for each in topics if each in named):
                 found[topic] = found.get(topic, False) or own
 
     walk(mapping.model_dump(by_alias=True, exclude={"robot"}, exclude_none=True), False)
     return found
-
-
-def _heads(reference: str) -> Iterator[str]:
-    """Yields what may be the topic of a reference."""
-    for k, sign in enumerate(reference):
-        if sign == ":":
-            yield reference[:k]
-            yield f"/{reference[:k]}"
-    yield f"/{reference}"
