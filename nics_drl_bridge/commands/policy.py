@@ -14,11 +14,6 @@ from nics_drl_bridge.files import write_bytes
 policy = typer.Typer(help="Policy files.", no_args_is_help=True)
 
 
-@policy.callback()
-def _group() -> None:
-    """Policy files."""
-
-
 @policy.command()
 def info(
     file: Annotated[str, Argument(autocompletion=POLICIES,

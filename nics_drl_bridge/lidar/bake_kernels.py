@@ -101,8 +101,7 @@ def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # 
         start, begin, width = layout[0, d], layout[1, d], layout[2, d]
         points = width * phases
         angles = (begin * phases + np.arange(points)) * (step / phases)
-        directions = np.empty((2, points))
-        directions[0], directions[1] = np.cos(angles), np.sin(angles)
+        directions = np.stack((np.cos(angles), np.sin(angles)))
         fine = np.empty(points, np.float32)
         beams = Beams(directions, angles[0], step / phases, False)
         row(fine, beams, corners, radius, distances[d], c, s, edges[d])

@@ -16,6 +16,7 @@ from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.cell_kernels import body_cells
 from nics_drl_bridge.lidar.exact_kernels import SHAPE, Beams
+from nics_drl_bridge.lidar.fixture_kernels import Fixtures
 from nics_drl_bridge.lidar.lookup_error import lookup_distances
 from nics_drl_bridge.lidar.maps import GridMap, stack_fixtures
 from nics_drl_bridge.lidar.shapes import BODY, Shape, place
@@ -78,6 +79,10 @@ class Scanner:
             table.outlines.arguments, table.arrays, self.renderer == "exact",
         )  # fmt: skip
 
+    @cached_property
+    def _without_walls(self) -> Fixtures:
+        return stack_fixtures([NO_WALLS], [self.grid], np.zeros(1, np.int64))
+
     def _looked_up(self) -> Array:
         spec, table, radii = self.spec, self.table, self.table.outlines.radii
         between = np.full((len(radii), 2), np.inf)
@@ -119,7 +124,8 @@ class Scanner:
             out[:] = self.scan(poses, bodies, walls)
             return out
         worlds, lanes = np.arange(len(poses)), scan_kernels.scan_lanes()
-        around = stack_fixtures([walls], [self.grid], np.zeros(len(poses), np.int64))
+        member, first = np.zeros(len(poses), np.int64), np.array([0, len(walls)])
+        around = self._without_walls._replace(member=member, walls=walls, first=first)
         cells = body_cells(0, bodies.shape[1])
         scan_kernels.scan_worlds(
             out[:, None], poses[:, None], worlds, bodies, -1, around, self.arguments, cells, lanes
@@ -133,7 +139,7 @@ class Scanner:
             bodies = np.zeros((len(poses), 0, BODY))
         elif bodies.ndim == 2:
             bodies = bodies[None]
-        walls = np.atleast_2d(np.asarray(walls if np.size(walls) else NO_WALLS, dtype=np.float64))
+        walls = np.array(walls if np.size(walls) else NO_WALLS, np.float64, order="C", ndmin=2)
         if poses.shape[1:] != (3,) or bodies.shape != (len(poses), bodies.shape[1], BODY):
             given = f"poses {poses.shape} and bodies {bodies.shape}"
             raise ConfigError(f"{given} must be (N, 3) and (N, K, {BODY}).")
