@@ -41,6 +41,7 @@ from nics_drl_bridge.policy.policies import open_policy, shipped_policies
 from nics_drl_bridge.policy.training_settings import load_training
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
+from nics_drl_bridge.sim.simulator import EpisodeSampler
 from nics_drl_bridge.sim.world import load_world
 
 CONTROLS = {
@@ -164,6 +165,8 @@ def reached(job: Job, perturbation: str | None, times: float) -> tuple[int, int]
     elif perturbation is not None:
         drawn = ranges(of_training(job.robot), perturbation, times, model.lidar.noise_std)
     backend = SimBackend(simulated, world, estimator=True, randomisation=drawn)
+    if perturbation == "footprint":  # in the scenes of the robot that it is believed to be
+        backend.simulator.episodes = EpisodeSampler(model, world)
     gated = GatedBackend(backend, model, job.robot)
     env = gymnasium.make(NAVIGATION, backend=gated, model=model, world=world, task=task)
     with closing(env):

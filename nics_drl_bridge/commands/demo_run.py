@@ -79,7 +79,7 @@ class Learned:
 
 @dataclass(frozen=True)
 class DemoEpisodes:
-    """DemoEpisodes of the demo: of the evaluation, and the same ones in process and over DDS."""
+    """Episodes of the demo: of the evaluation, and the same ones in process and over DDS."""
 
     summaries: Mapping[str, Summary]  # of the world as it is, and perturbed
     here: Sequence[Episode]  # in process

@@ -171,15 +171,15 @@ class FastSimulator:
             randomisation = load_randomisation(randomisation)
         _check_speed(model.kinematics, model.robot, world)
         self.model, self.world, self.randomisation = model, world, randomisation
-        self._episodes = EpisodeSampler(model, world, robots, randomisation)
-        if (draws := self._episodes.draws) is not None:
+        self.episodes = EpisodeSampler(model, world, robots, randomisation)
+        if (draws := self.episodes.draws) is not None:
             delay = max(delay, draws.longest_delay)
             longest_age = max(longest_age, draws.longest_age)
         self.goals: Array = np.zeros((worlds, robots, 2))  # of the episodes [m]
         # Draws of the randomisation for the running episodes, (N, M) per robot or (N,) per scene.
         self.drawn: dict[str, NDArray[Any]] = {}
         self.footprint = footprint_shape(model.robot)
-        self.sampler = self._episodes.scenes
+        self.sampler = self.episodes.scenes
         shapes = (*self.sampler.shapes, self.footprint)
         table = with_shapes(model.lidar, model.table, shapes)
         self._in_table = np.array([table.outlines.index_of(shape) for shape in shapes])
@@ -281,7 +281,7 @@ class FastSimulator:
         not fit.
         """
         chosen = np.arange(len(self.data.steps)) if worlds is None else np.asarray(worlds, np.int64)
-        scenes, draws = self._episodes.draw(seeds)
+        scenes, draws = self.episodes.draw(seeds)
         given = starts(scenes) if callable(starts) else starts
         begin = scenes.starts if given is None else np.asarray(given, dtype=np.float64)
         if len(scenes) != len(chosen) or begin.shape != scenes.starts.shape:
@@ -302,7 +302,7 @@ class FastSimulator:
 
     def scenes(self, seeds: ArrayLike) -> Scenes:
         """Returns the scenes that `reset` would begin with for seeds (n,)."""
-        return self._episodes.draw(seeds)[0]
+        return self.episodes.draw(seeds)[0]
 
     @property
     def obstacles(self) -> Array:

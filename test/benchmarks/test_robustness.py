@@ -151,3 +151,10 @@ def test_it_draws_its_curves_and_prints_one_json_object(tmp_path):
 )
 def test_a_perturbation_tenfold_or_a_policy_that_stands_misses_a_bar(control, bar):
     assert any(bar in line for line in fails("robustness.py", control, *ONE, "--only", "drift"))
+
+
+@pytest.mark.skipif("jackal" not in shipped_policies(), reason="needs the shipped policy")
+def test_a_larger_footprint_is_driven_in_the_scenes_of_the_robot_it_is_believed_to_be(robustness):
+    # Of so large a robot there would be no scene: the door's cells are narrower.
+    job = robustness.Job("jackal", "doorway", 1, ("footprint",), (2.0,), None)
+    assert robustness.reached(job, "footprint", 2.0) == (1, 1)
