@@ -113,8 +113,7 @@ def run(plan: DemoPlan, say: Say) -> str:
     write_bytes(plan.out / paths, pictures.trajectories({LABELS[FAST]: here}, world, radius))
     say(f"  the paths are drawn in {plan.out / paths}")  # while the report takes a while
     there = timed("driving over DDS", _drive, DDS, learned.policy) if topics else []
-    arrived = (episode.seed for episode in there if episode.result == "success")
-    given = model, learned.policy, next(arrived, 0)
+    given = model, learned.policy, next((e.seed for e in there if e.result == "success"), 0)
     live = timed("deploying", _deploy, *given) if topics else None
     times = [(part, f"{s:.0f}") for part, s in {**took, "all": sum(took.values())}.items()]
     episodes = DemoEpisodes(summaries, here, there, live)

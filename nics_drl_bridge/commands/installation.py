@@ -39,7 +39,9 @@ class Check(NamedTuple):
 
 def checks() -> list[Check]:
     """Checks all parts; compiles nothing and starts nothing."""
-    return [_python(), *_extras(), *_ros(), _cores(), _kernels()]
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    cores = Check("cores", (usable or 1) > 1, f"{usable} of {os.cpu_count()} may be used", "")
+    return [_python(), *_extras(), *_ros(), cores, _kernels()]
 
 
 def _python() -> Check:
@@ -79,11 +81,6 @@ def _ros() -> list[Check]:
         Check("ROS 2", True, told),
         *(Check(name, find_spec(name) is not None, what, fix) for name, what in MESSAGES.items()),
     ]
-
-
-def _cores() -> Check:
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return Check("cores", (usable or 1) > 1, f"{usable} of {os.cpu_count()} may be used", "")
 
 
 def _kernels() -> Check:

@@ -23,11 +23,10 @@ from std_srvs.srv import Trigger
 from nics_drl_bridge.config import dump_yaml
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.nodes import conversions, qos
-from nics_drl_bridge.nodes.runner import holds, open_context, spin
+from nics_drl_bridge.nodes.runner import GREATEST_DOMAIN_ID, holds, open_context, spin
 from nics_drl_bridge.nodes.transport import domains_in_use
 
 LAST_DOMAIN_ID = 101  # above it DDS ports may collide with Linux's ephemeral ports
-GREATEST_DOMAIN_ID = 232  # above it there are no ports
 PR_SET_PDEATHSIG, LOG_LINES = 1, 5
 PATIENCE_S, ASK_AGAIN_S, ANSWER_S, POLL_S = 5.0, 0.2, 2.0, 0.005
 

@@ -3,6 +3,7 @@
 import contextlib
 import gc
 import hashlib
+import os
 import signal
 import socket
 import sys
@@ -37,6 +38,7 @@ SPIN_S = 0.1
 UNKNOWN = "UnknownROSArgsError"  # of rclpy, which exports it nowhere
 UNCONFIGURED, INACTIVE, ACTIVE = "unconfigured", "inactive", "active"
 DELIVERY_S = 0.5
+GREATEST_DOMAIN_ID = 232  # above it there are no ports
 EXIT_BAD_INPUT = 2
 SETTLE_S, POLL_S = 0.3, 0.02  # time until the graph shows all nodes [s]
 ANSWER_S = 1.5  # a node that does not answer within it is dead; the graph shows it for 20 s more
@@ -54,6 +56,9 @@ def open_context(args: Sequence[str] | None = None, domain_id: int | None = None
         context.init(None if args is None else list(args), domain_id=domain_id)
         return context
 
+    asked = os.environ.get("ROS_DOMAIN_ID", "0") if domain_id is None else str(domain_id)
+    if asked.isdecimal() and int(asked) > GREATEST_DOMAIN_ID:  # DDS would end the process
+        raise BackendError(f"ROS 2 does not start: domain {asked} is above {GREATEST_DOMAIN_ID}.")
     try:
         return OF_THIS_PROCESS.open(make)
     except RuntimeError as error:

@@ -162,9 +162,8 @@ def topics_used(mapping: mapped.Mapping, topics: Sequence[str]) -> dict[str, boo
             for each in part:
                 walk(each, own)
         elif isinstance(part, str):
-            heads = [part[:k] for k, sign in enumerate(part) if sign == ":"]
-            named = {part, f"/{part}", *heads, *(f"/{head}" for head in heads)}
-            for topic in (each for each in topics if each in named):
+            named = {part, *(part[:k] for k, sign in enumerate(part) if sign == ":")}
+            for topic in (t for t in topics if t in named or t.removeprefix("/") in named):
                 found[topic] = found.get(topic, False) or own
 
     walk(mapping.model_dump(by_alias=True, exclude={"robot"}, exclude_none=True), False)

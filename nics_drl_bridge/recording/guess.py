@@ -228,7 +228,7 @@ def first_mapping(tables: Sequence[TableSurvey]) -> str:
     elif any(table.t is None and table.rows for table in tables):
         lines.append(f"time: {{rate: 50}}  {GUESSED}: no stamps were found; rows a second")
     if pose is None:
-        lines.append("# no pose was found: give x, y, and heading or quaternion")
+        lines.append("# no pose was found: give x, y, and heading or quaternion, or `pose: /tf`")
     lines += where
     lines += _clock_lines(pose, commands)
     lines.append("command:" if commands else "command:  # none was found: NAME: COLUMN")
@@ -247,9 +247,9 @@ def _clock_lines(
     """Returns the line that gives the pose a clock of its own, if it has one by its stamps."""
     if pose is None or (t := pose.table.t) is None or not pose.table.stamps:
         return []
-    others = [(table.unit, table.t) for table, _ in commands.values() if table.t is not None]
+    others = [(each.unit, np.sort(each.t)) for each, _ in commands.values() if each.t is not None]
     whys = {
-        "shares no time with the commands": [u[-1] < t[0] or u[0] > t[-1] for _, u in others],
+        "shares no time with the commands": [u[-1] < min(t) or u[0] > max(t) for _, u in others],
         "one counts from its first row, and in another unit": [
             unit != pose.table.unit and 0.0 in (u[0], t[0]) for unit, u in others
         ],

@@ -233,7 +233,7 @@ def read_parquet(path: Path) -> Table:
         why = " ".join(str(error).split())[:200]
         raise RecordingError(f"{path}: can't be read as Parquet ({why}).") from None
     stamps = [c.astype("datetime64[ns]").astype(str) if c.dtype.kind == "M" else c for c in columns]
-    texts = [c.astype(np.str_) if c.dtype.kind == "O" else c for c in stamps]
+    texts = [np.array([*map(str, c)], np.str_) if c.dtype.kind == "O" else c for c in stamps]
     return table_of(str(path), tuple(table.column_names), tuple(texts))
 
 

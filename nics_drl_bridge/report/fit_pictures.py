@@ -192,10 +192,9 @@ def alignment(spec: RobotSpec, identified: Identified) -> bytes:
     figure, grid = panels(len(moved), 1, (9.0, 2.5 * len(moved) + 0.6), sharex=True)
     begin = samples.t[0] + SETTLED_S
     shown = (samples.t >= begin) & (samples.t < begin + SHOWN_S)
-    t = samples.t[shown]
+    t, latency = samples.t[shown], calibration.command_latency_s
     for axes, c in zip(grid, moved, strict=True):
         name, unit = spec.command[c].name, spec.command[c].unit
-        latency = calibration.command_latency_s
         acts = latency + float(delays_of([name], calibration.inputs)[0])
         for late, style, label in ((0.0, ":", "as stamped"), (acts, "-", "as it takes effect")):
             value = held(command, spec, t - late, t - late + samples.dt)[:, c]

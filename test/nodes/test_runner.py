@@ -35,6 +35,13 @@ def started(monkeypatch, domain_id):
         context.try_shutdown()
 
 
+@pytest.mark.parametrize(("domain", "variable"), [(240, "0"), (None, "999")])
+def test_a_domain_without_ports_is_one_sentence(monkeypatch, domain, variable):
+    monkeypatch.setenv("ROS_DOMAIN_ID", variable)
+    with pytest.raises(BackendError, match=r"domain (240|999) is above 232"):
+        open_context([], domain_id=domain)
+
+
 def test_what_speaks_to_topics_refuses_a_robot_without_cmd_vel(started, tmp_path):
     file = tmp_path / "kart.yaml"
     file.write_text("kind: ackermann_throttle\nfootprint_radius: 0.2\n")

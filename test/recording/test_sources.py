@@ -63,6 +63,15 @@ def test_parquet_is_read_with_its_stamps(tmp_path, columns):
     assert np.allclose(found.pose.t, columns["t"], atol=1e-6)
 
 
+@pytest.mark.parametrize("each", [["a"], b"\xff\xfe", {"deg": 1.5}, [1.0, 2.0], None])
+def test_a_column_of_parquet_that_holds_no_numbers_is_let_be(tmp_path, columns, each):
+    pyarrow = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    other = pyarrow.array([each] * len(columns["t"]))
+    parquet.write_table(pyarrow.table(columns | {"other": other}), tmp_path / "log.parquet")
+    assert np.allclose(read(tmp_path / "log.parquet").pose.values[:, 0], columns["x"])
+
+
 def test_a_folder_without_tables_and_a_path_that_is_none_are_refused(tmp_path):
     (tmp_path / "notes.md").write_text("none")
     for path, sentence in ((tmp_path, "holds no file of a known"), (tmp_path / "x", "no such")):

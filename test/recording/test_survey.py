@@ -256,6 +256,16 @@ def test_a_pose_that_shares_no_time_with_the_commands_has_a_clock_of_its_own(tmp
     assert found.pose.t[0] == found.command.t[0] == pytest.approx(0.0)
 
 
+def test_a_drive_over_midnight_has_one_clock(tmp_path):
+    columns = drive()
+    times = np.datetime64("2026-01-01T23:59:58") + np.round(columns["t"] * 1e3).astype("m8[ms]")
+    stamps = [str(time).partition("T")[2] for time in times]
+    rest = {"x": columns["x"], "y": columns["y"], "theta": columns["yaw"]}
+    commands = {"v_cmd": columns["v"], "w_cmd": columns["w"]}
+    _, guess = surveyed(write(tmp_path / "log.csv", {"timestamp": stamps} | rest | commands))
+    assert "clock" not in guess["pose"]
+
+
 @pytest.mark.parametrize(
     ("unit", "since", "own"), [(1e9, 0.0, True), (1.0, 0.0, False), (1e9, 5.0, False)]
 )
