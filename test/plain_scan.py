@@ -63,6 +63,7 @@ def fuse(out, middle, low, high, near, far, blend, lidar):  # type: ignore[no-un
     other, other2 = points_of(far[0], far[1], point, shift, hits)
     range_min, range_max = np.float32(lidar.range_min), np.float32(lidar.range_max)
     for j in range(hits):
-        points = one + j, two + j, other + j, other2 + j
-        value = blended(rows, points, share, blend, range_min, range_max)
+        value = blended(
+            rows, one + j, two + j, other + j, other2 + j, share, blend, range_min, range_max
+        )
         out[begin + j] = min(out[begin + j], value)

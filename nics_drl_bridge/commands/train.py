@@ -166,4 +166,5 @@ def _run(
         return
     typer.echo(f"policy files, checkpoints and logs: {folder}; tensorboard --logdir {folder}")
     policy, (world, *_) = folder / f"seed_{results[0].seed}" / "policy.onnx", results[0].summaries
-    typer.echo(f"see it drive: nics watch {policy} --world {world}")
+    task = f" --task {own}" if ":" in (own := order.settings.task) else ""
+    typer.echo(f"see it drive: nics watch {policy} --world {world}{task}")

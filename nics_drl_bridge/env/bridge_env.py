@@ -75,7 +75,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         backend: `sim`, `dds`, or your own object, see `interface.Backend`; it may lack `halt` and
             `facts`, see `env.sim_backend.CompletedBackend`.
         model: a SimulatorModel, its folder, or a shipped robot's name; else `DEFAULT_ROBOT`.
-        world: a World, its YAML file, or the name of a shipped one.
+        world: a World, its YAML file, the name of a shipped one, or a list of these: a set.
         task: a name, `path/to/file.py:ClassName`, a class, or a Task; see `env.registry.make_task`.
         task_options: further arguments of the task's class.
         estimator: True puts the robot's middleware (cache and EKF) between the simulator and the
@@ -108,8 +108,8 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
     ) -> None:  # fmt: skip
         check_render_mode(render_mode, self.metadata)
         self.render_mode = render_mode
-        self.model = open_model(model) if isinstance(model, str) else model
-        self.world = load_worlds(world) if isinstance(world, str) else world
+        self.model = model if isinstance(model, SimulatorModel) else open_model(model)
+        self.world = world if isinstance(world, AnyWorld) else load_worlds(world)
         self.task = make_task(task, self.model, task_options)
         self.robots = self.task.robots
         self.observation_space = team_space(self.task.observation_space, self.robots)

@@ -84,8 +84,8 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             raise ConfigError(f"autoreset_mode {mode!r}: must be one of {', '.join(MODES)}.")
         self._mode = MODES[mode]
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
-        self.model = open_model(model) if isinstance(model, str) else model
-        self.world = load_worlds(world) if isinstance(world, str) else world
+        self.model = model if isinstance(model, SimulatorModel) else open_model(model)
+        self.world = world if isinstance(world, AnyWorld) else load_worlds(world)
         self.task = make_task(task, self.model, task_options)
         self.robots = self.task.robots
         self.single_observation_space = team_space(self.task.observation_space, self.robots)

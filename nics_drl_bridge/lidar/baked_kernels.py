@@ -199,18 +199,17 @@ def points_of(start, place, point, shift, hits):  # type: ignore[no-untyped-def]
 
 
 @kernel(contracts=True, inline=True)
-def blended(rows, points, share, blend, range_min, range_max):  # type: ignore[no-untyped-def]
+def blended(rows, one, two, other, other2, share, blend, least, most):  # type: ignore[no-untyped-def]
     """Range between two points of a row and two of the farther one [m].
 
-    Too far becomes `inf`, too close `-inf` (REP-117).
+    Beyond `most` it is `inf`, below `least` `-inf` (REP-117).
     """
-    one, two, other, other2 = points
     value, farther = rows[np.uintp(one)], rows[np.uintp(other)]
     value += share * (rows[np.uintp(two)] - value)
     farther += share * (rows[np.uintp(other2)] - farther)
     value += blend * (farther - value)
-    value = value if value <= range_max else np.float32(np.inf)
-    return value if value >= range_min else np.float32(-np.inf)
+    value = value if value <= most else np.float32(np.inf)
+    return value if value >= least else np.float32(-np.inf)
 
 
 @kernel(contracts=True)

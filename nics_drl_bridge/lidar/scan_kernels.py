@@ -263,8 +263,9 @@ def fuse(flat, k, lidar, lanes):  # type: ignore[no-untyped-def]
         place = np.int32(-back)
         for j in range(blocks * BLOCK):
             i = np.uintp(j)
-            points = one + i, two + i, other + i, other2 + i
-            value = baked.blended(rows, points, share, blend, least, most)
+            value = baked.blended(
+                rows, one + i, two + i, other + i, other2 + i, share, blend, least, most
+            )
             value = value if np.uint32(place) < np.uint32(hits) else np.float32(np.inf)
             place = np.int32(place + np.int32(1))  # of 32 bits, as the ranges
             flat[at + i] = min(flat[at + i], np.float32(value).view(np.int32))
@@ -272,8 +273,9 @@ def fuse(flat, k, lidar, lanes):  # type: ignore[no-untyped-def]
         at = np.uintp(lanes.wide[k + AT] + back)
         for j in range(hits):
             i = np.uintp(j)
-            points = one + i, two + i, other + i, other2 + i
-            value = baked.blended(rows, points, share, blend, least, most)
+            value = baked.blended(
+                rows, one + i, two + i, other + i, other2 + i, share, blend, least, most
+            )
             flat[at + i] = min(flat[at + i], np.float32(value).view(np.int32))
 
 

@@ -92,8 +92,8 @@ def drive(
             estimates.append(info["pose"])
             total += float(reward)
             ended = bool(terminated or truncated)
-        collided = "collision" if np.any(info["collision"]) else "time-out"
-        believed = "success" if np.all(info["is_success"]) else collided
+        collided = "collision" if np.any(info.get("collision", False)) else "time-out"
+        believed = "success" if np.all(info.get("is_success", False)) else collided
         driven = np.array(paths), np.array(estimates), goal, bodies, total
         planned = None if before is None else (acted(policy) or 0) - before
         if "true_pose" not in info:

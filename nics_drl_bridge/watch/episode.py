@@ -78,8 +78,8 @@ class Lane:
         self.time_s += self.env.model.control_period
         self.trail.add(self.env.snapshot().poses, 1)
         if terminated or truncated:
-            touched = "collision" if np.any(info["collision"]) else "time-out"
-            self.state = "success" if np.all(info["is_success"]) else touched
+            touched = "collision" if np.any(info.get("collision", False)) else "time-out"
+            self.state = "success" if np.all(info.get("is_success", False)) else touched
         return False
 
     def _action(self, command: NDArray[np.float64]) -> Any:
