@@ -76,6 +76,16 @@ def test_registering_twice_changes_nothing():
     assert spec.max_episode_steps == MAX_EPISODE_STEPS
 
 
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
+def test_a_world_may_be_given_by_its_path_or_as_a_list(tmp_path, make):
+    file = tmp_path / "small.yaml"
+    file.write_text("name: small\nsize: [6.0, 6.0]\ngoal_distance: [1.0, 3.0]\n")
+    for world, names in ((file, ["small"]), ([file, "empty"], ["small", "empty"])):
+        env = make(NAVIGATION, world=world)
+        assert [one.name for one in env.unwrapped.world.members] == names
+        env.close()
+
+
 def test_the_same_seed_and_actions_give_the_same_bits_in_another_env():
     one, other = BridgeEnv(), BridgeEnv()
     actions = random_actions(one, 30)

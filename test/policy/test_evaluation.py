@@ -66,6 +66,19 @@ def test_an_episode_that_nobody_ends_is_a_time_out(env):
     assert result.reward == pytest.approx(-0.12, abs=1e-6)
 
 
+class Quiet(Navigation):
+    """Tells neither success nor collision, which are optional."""
+
+    def info(self, view, memory):
+        return {}
+
+
+def test_a_task_that_tells_neither_success_nor_collision_is_driven_to_the_end():
+    task = Quiet(direct_model().robot, direct_model().lidar)
+    env = TimeLimit(BridgeEnv(model=direct_model(), world=field(), task=task), 5)
+    assert drive(env, Constant(0.0, 0.0, 0.3), seed=1).result == "time-out"
+
+
 def test_an_episode_that_drives_on_collides(env):
     result = drive(env, Constant(1.0, 0.0, 0.0), seed=4)
     while result.result == "time-out":
