@@ -167,4 +167,6 @@ def _run(
     typer.echo(f"policy files, checkpoints and logs: {folder}; tensorboard --logdir {folder}")
     policy, (world, *_) = folder / f"seed_{results[0].seed}" / "policy.onnx", results[0].summaries
     task = f" --task {own}" if ":" in (own := order.settings.task) else ""
+    if task and not any(one.success.value for each in results for one in each.summaries.values()):
+        typer.echo("no episode was a success: does `info` of the task tell `is_success`?", err=True)
     typer.echo(f"see it drive: nics watch {policy} --world {world}{task}")

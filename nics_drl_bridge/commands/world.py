@@ -76,7 +76,7 @@ def import_(
     keys = {key: value for key, value in keys.items() if value is not None}
     made = list[Written]()
     for file, place in _places(files, out, name).items():
-        if file.suffix in SDF:
+        if file.suffix.lower() in SDF:
             standing = read_sdf(file, height, tuple(without or ()), skip_unknown)
             made.append(_standing(file, place, standing, keys, height))
         else:
@@ -96,14 +96,14 @@ def import_(
 
 def _places(files: list[Path], out: Path | None, name: str | None) -> dict[Path, Path]:
     """The file to write for each one to read."""
-    one = out is not None and out.suffix in MAPS
+    one = out is not None and out.suffix.lower() in MAPS
     if len(files) > 1 and (one or name is not None):
         given = f"--out {out}" if one else f"--name {name}"
         told = f"{given}: is for one file, not for {len(files)}"
         raise ConfigError(f"{told}; give a folder as --out.")
     if out is not None and one:
         return {files[0]: out}
-    ends = [".yaml" if file.suffix in SDF else "_world.yaml" for file in files]
+    ends = [".yaml" if file.suffix.lower() in SDF else "_world.yaml" for file in files]
     places = [(out or Path()) / f"{file.stem}{end}" for file, end in zip(files, ends, strict=True)]
     if twice := {str(place) for place in places if places.count(place) > 1}:
         raise ConfigError(f"{min(twice)}: two files would be written there; import them in turn.")
@@ -131,17 +131,17 @@ def _mapped(file: Path, place: Path, keys: Keys, resolution: float | None) -> li
     from nics_drl_bridge.config import dump_yaml, validate
     from nics_drl_bridge.lidar.maps import MapFile, load_map, read_image
 
-    if file.suffix not in (*MAPS, *PICTURES):
+    if file.suffix.lower() not in (*MAPS, *PICTURES):
         kinds = ", ".join((*SDF, *MAPS, *PICTURES))
         raise ConfigError(f"{file}: unknown kind of file; give one of {kinds}.")
-    map_file, made = file.with_suffix(".yaml") if file.suffix in PICTURES else file, []
-    if file.suffix in PICTURES and resolution is not None:
+    map_file, made = file.with_suffix(".yaml") if file.suffix.lower() in PICTURES else file, []
+    if file.suffix.lower() in PICTURES and resolution is not None:
         map_file = place.with_name(f"{place.stem}_map.yaml")
         about = {"image": _seen_from(place, file), "resolution": resolution, **NAV2}
         validate(about, MapFile, f"--resolution {resolution:g}")
         rows, columns = read_image(file, str(file))[0].shape
         made = [Written(map_file, dump_yaml(about), f"the map of {file.name}")]
-    elif map_file.is_file() or file.suffix in MAPS:
+    elif map_file.is_file() or file.suffix.lower() in MAPS:
         grid = load_map(map_file)
         (rows, columns), resolution = grid.cells.shape, grid.resolution
     else:
@@ -263,7 +263,7 @@ def map_(
     scene, member = scenes[0], int(scenes.member[0])
     opened = worlds.members[member]
     file = out or Path(Path(f"{opened.name}_map.yaml").name)
-    if file.suffix not in MAPS:
+    if file.suffix.lower() not in MAPS:
         raise ConfigError(f"--out {file}: must end in .yaml.")
     _spare(worlds, Path(name), file, file.with_suffix(".pgm"))
     grid = occupancy(opened, standing(sampler, member, scene.bodies), resolution)

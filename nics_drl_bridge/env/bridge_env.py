@@ -161,7 +161,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         episodes = Episodes(np.array([episode]), starts[None], self.scene.goals[None])
         if not self._rehearsed:
             self._rehearse(episodes)
-        memory = self.task.reset(episodes)
+        memory = self.task.begun(episodes)
         guard.override(memory, options, "start")
         if options and "goal" in options:
             guard.check_places("goal", memory["goal"], [self.scene], self.world)
@@ -183,7 +183,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         free = np.full((1, self.robots, self.model.lidar.beams), np.inf, np.float32)
         sensed, starts = unread(self.model.sensors, 1, self.robots), episodes.starts
         view = RobotView(starts.copy(), 0.0 * starts, free, 0.0, 0.0, 0.0, sensed)
-        memory = self.task.reset(episodes)
+        memory = self.task.begun(episodes)
         with suppress(ConfigError):  # of a view that no step gives
             self.task.step_into(np.empty(self._shape, np.float32), view, view, memory)
         self._rehearsed = True
@@ -217,7 +217,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
             raise gymnasium.error.ResetNeeded("call reset() before step().")
         given = guard.check_action(action, self.action_space, "action")
         made = self.task.command(given.reshape(self._each))[0]
-        command = self._row(guard.check_command(made, self._rest))
+        command = self._row(guard.check_command(made, self._rest.shape))
         waiting = self.robots > 1 and bool(self.ended.any())
         if waiting:
             command = np.where(self.ended[:, None], self._still, command)

@@ -155,10 +155,10 @@ def check_action(action: Any, space: gymnasium.Space[Any], name: str) -> NDArray
     return given
 
 
-def check_command(command: Any, like: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns a command as an array. Raises ConfigError unless finite, of the shape of `like`."""
+def check_command(command: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Returns a task's command as an array. Raises ConfigError unless finite, of this shape."""
     made = np.asarray(command, np.float64)
-    if made.shape != like.shape or not kernels.finite(made.reshape(1, -1)):
-        needed = f"must be finite, of shape {like.shape}; look at its `command`."
-        raise ConfigError(f"the task's command {made}: {needed}")
+    if made.shape != shape or not kernels.finite(made.reshape(1, -1)):
+        needed = f"must be finite, of shape {shape}; look at its `command`."
+        raise ConfigError(f"the task's command {made!r:.80}: {needed}")
     return made

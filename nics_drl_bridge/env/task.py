@@ -166,21 +166,54 @@ class Task(ABC):
         self, out: Observation, before: RobotView, after: RobotView, memory: Memory
     ) -> Outcome:
         """Returns the outcome of a step and writes the observation, maybe in one pass."""
+        given = dict(memory)
         self.update(before, after, memory)
+        if memory.keys() != given.keys():
+            raise self._wrong(f"memory {sorted(memory)}", f"must keep {sorted(given)} of `reset`")
+        for name, rows in given.items():
+            if (new := memory[name]) is not rows:  # bound anew, where rows are those of an env
+                self.valid(f"memory {name!r}", new, rows.shape)
+                if not np.can_cast(np.asarray(new).dtype, rows.dtype, "same_kind"):
+                    raise self._wrong(f"memory {name!r}", f"must stay {rows.dtype} in `update`")
+                rows[...] = new
+                memory[name] = rows
         out[...] = self.valid("observation", self.observation(after, memory), out.shape)
         terms, each = self.reward(before, after, memory), out.shape[:-1]
-        if not isinstance(terms, dict):
-            raise ConfigError(f"task {type(self).__name__}: reward must be a dictionary of terms.")
+        info = self.info(after, memory)
+        for what, part in (("reward", terms), ("info", info)):
+            if not isinstance(part, dict):
+                raise self._wrong(what, "must be a dictionary of arrays")
         for name, term in terms.items():
             self.valid(f"reward term {name!r}", term, each)
-        ended = self.valid("end", self.end(after, memory), each)
-        return Outcome(terms, ended, self.info(after, memory))
+        for name, fact in info.items():
+            self.leads(f"info {name!r}", fact, each)
+        return Outcome(terms, self.valid("end", self.end(after, memory), each), info)
+
+    def begun(self, episodes: Episodes) -> Memory:
+        """Returns the memory of `reset`. Raises ConfigError if it does not fit or lacks `shown`."""
+        memory = self.reset(episodes)
+        if not isinstance(memory, dict) or not memory.keys() >= set(self.shown):
+            raise self._wrong("reset", f"must give a dictionary of arrays, with {[*self.shown]}")
+        for name, rows in memory.items():
+            self.leads(f"memory {name!r}", rows, episodes.starts.shape[:1])
+        for name in self.shown:
+            self.leads(f"memory {name!r}, which is shown,", memory[name], episodes.starts.shape[:2])
+        return memory
+
+    def leads(self, what: str, given: Any, lead: tuple[int, ...]) -> None:
+        """Raises ConfigError unless `given` is an array whose first dimensions are `lead`."""
+        if not isinstance(given, np.ndarray) or given.shape[: len(lead)] != lead:
+            shape = f"{type(given).__name__} of {np.shape(given)}"
+            raise self._wrong(what, f"must be an array of shape {lead} or {lead}..., not {shape}")
+
+    def _wrong(self, what: str, fault: str) -> ConfigError:
+        return ConfigError(f"task {type(self).__name__}: its {what} {fault}.")
 
     def valid(self, what: str, given: Any, shape: tuple[int, ...]) -> Any:
         """Returns what a method gave. Raises ConfigError if it is not finite, or of this shape."""
         if np.shape(given) != shape or not np.isfinite(given).all():
             fault = f"must be finite, of shape {shape}, and is {given!r:.80} of {np.shape(given)}"
-            raise ConfigError(f"task {type(self).__name__}: its {what} {fault}.")
+            raise self._wrong(what, fault)
         return given
 
     @cached_property

@@ -12,7 +12,14 @@ from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
-from nics_drl_bridge.env.guard import check_action, check_places, check_reset, give, override
+from nics_drl_bridge.env.guard import (
+    check_action,
+    check_command,
+    check_places,
+    check_reset,
+    give,
+    override,
+)
 from nics_drl_bridge.env.kernels import episode_seeds
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.snapshot import Snapshot, goals_of
@@ -179,7 +186,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             self._teacher.begin(worlds)
         self._bodies[worlds] = scenes.bodies
         self._starts[worlds] = self.simulator.data.pose[worlds]
-        fresh = self.task.reset(Episodes(seeds, self._starts[worlds], self.simulator.goals[worlds]))
+        fresh = self.task.begun(Episodes(seeds, self._starts[worlds], self.simulator.goals[worlds]))
         override(fresh, options, "start", "reset_mask")
         if options and "goal" in options:
             check_places("goal", fresh["goal"], scenes, self.world)
@@ -232,7 +239,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self, part: slice, actions: NDArray[Any], out: Observation, begun: Flags
     ) -> Outcome:
         data, ended = self.simulator.data, self.ended[part]
-        command = self.task.command(actions)
+        command = check_command(self.task.command(actions), (*ended.shape, len(self._still)))
         if self.robots > 1 and ended.any():
             command = np.where(ended[..., None], self._still, command)
         ranges = data.ranges[part]

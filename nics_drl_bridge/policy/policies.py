@@ -173,7 +173,8 @@ class DynamicWindow:
         fastest = float(np.hypot(twists[:, 0], twists[:, 1]).max())
         slow = (fastest / rate for v, rate in states if v.unit == "m/s")
         share = 1.0 - math.exp(-self.period / lag) if lag > 0.0 else 1.0
-        reach = share * (twists.max(axis=0) - twists.min(axis=0)) + 1e-6
+        steps = [np.diff(np.unique(speeds.round(6))).max(initial=0.0) for speeds in twists.T]
+        reach = np.maximum(share * np.ptp(twists, axis=0), steps) + 1e-6  # one step at least
         rest = 2.0 * self.period + lag + max(slow, default=0.0)
         ahead = kernels.LookAhead(reach, 1.5 * self.period, self.steps, rest)
         return twists, ahead, kernels.TwistWeights(*self.weights)

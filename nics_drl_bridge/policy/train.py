@@ -3,11 +3,14 @@
 import dataclasses
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import filelock
+import gymnasium
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import configure
@@ -20,7 +23,13 @@ from nics_drl_bridge.files import json_of, write_text
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.policy import train_checkpoint as checkpoints
 from nics_drl_bridge.policy.evaluation import FIRST_SEED, Outcomes, Summary, drive_worlds, summarise
-from nics_drl_bridge.policy.train_algorithms import Actor, Sb3Training, act_of, observed
+from nics_drl_bridge.policy.train_algorithms import (
+    Actor,
+    Sb3Training,
+    act_of,
+    observed,
+    refuse_team,
+)
 from nics_drl_bridge.policy.train_export import export_policy
 from nics_drl_bridge.policy.train_ppo import LeanPpo
 from nics_drl_bridge.policy.train_stop import Stop
@@ -29,9 +38,10 @@ from nics_drl_bridge.policy.training_settings import TrainingSettings
 from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-CHECKPOINT, SETTINGS = "checkpoint.pt", "settings.yaml"
+CHECKPOINT, SETTINGS, LOCK = "checkpoint.pt", "settings.yaml", ".lock"
 EVALUATION, POLICY = "evaluation.json", "policy.onnx"
 SEEDS = 2**40
+MOST_WEIGHT = 80.0  # whose exponential, a spread of actions, is just finite
 TRIED = 8  # worlds, and steps in each
 GREATEST_SEED = 2**32 - 1  # of numpy's global generator, from which Stable-Baselines3 draws
 Tell = checkpoints.Tell
@@ -74,16 +84,28 @@ def train(
     busy = env.stepping_s
 
     def save() -> None:
+        refuse_diverged(training)  # before it would replace a checkpoint that goes on
         state = training.state() | stop.state()
         checkpoints.save_checkpoint(path, state, env, about)
 
     if training.steps < settings.steps and not stop.over:
         logger = configure(str(folder), ["tensorboard"])
-        training.learn(checkpoints.Watch(env, seed, settings, save, tell, stop), logger)
+        try:
+            training.learn(checkpoints.Watch(env, seed, settings, save, tell, stop), logger)
+        except (RuntimeError, ValueError, gymnasium.error.InvalidAction):
+            refuse_diverged(training, MOST_WEIGHT)
+            raise
         save()
         logger.close()
     taken = time.perf_counter() - begin
     return Trained(training.policy, training.steps, taken, env.stepping_s - busy)
+
+
+def refuse_diverged(training: LeanPpo | Sb3Training, bound: float = math.inf) -> None:
+    """Raises ConfigError if the weights of a training are not within a bound."""
+    if not all(bool((part.abs() < bound).all()) for part in training.networks.parameters()):
+        fault = f"after {training.steps} steps its weights are beyond all bounds"
+        raise ConfigError(f"the training diverged: {fault}; lower its learning_rate.")
 
 
 def make_train_env(
@@ -192,29 +214,43 @@ def run(
     _check(order.settings, order.seeds, order.out, order.resumed)
     settings, model = order.settings, open_model(order.settings.robot, order.settings.lidar)
     trial = _env_of(settings, next(iter(settings.worlds)), TRIED, model)
+    refuse_team(settings.task, trial.robots)
     trial.reset(seed=FIRST_SEED)
     for _ in range(TRIED):  # a task that gives no numbers is refused before a folder is begun
         trial.step(trial.action_space.sample())
     del trial
-    write_text(order.out / SETTINGS, dump_yaml(settings.model_dump(mode="json")))
     results = []
-    for seed in order.seeds:
-        folder = order.out / f"seed_{seed}"
-        begun = (folder / CHECKPOINT).is_file()
-        trained = learn(settings, seed, folder, tell, order.resumed and begun)
-        summaries = {}
-        for world in settings.worlds:
-            evaluating(world)
-            driven = evaluate(trained.algorithm, settings, world, order.episodes, model)
-            summaries[world] = summarise(driven, model.control_period)
-        result = SeedResult(seed, trained, summaries)
-        plain: dict[str, Any] = {"training_steps": trained.steps}
-        plain |= {world: dataclasses.asdict(one) for world, one in summaries.items()}
-        write_text(folder / EVALUATION, json_of(plain, 2) + "\n")
-        export(settings, result, order.command, folder / POLICY)
-        done(result)
-        results.append(result)
+    with _alone(order.out):
+        write_text(order.out / SETTINGS, dump_yaml(settings.model_dump(mode="json")))
+        for seed in order.seeds:
+            folder = order.out / f"seed_{seed}"
+            begun = (folder / CHECKPOINT).is_file()
+            trained = learn(settings, seed, folder, tell, order.resumed and begun)
+            summaries = {}
+            for world in settings.worlds:
+                evaluating(world)
+                driven = evaluate(trained.algorithm, settings, world, order.episodes, model)
+                summaries[world] = summarise(driven, model.control_period)
+            result = SeedResult(seed, trained, summaries)
+            plain: dict[str, Any] = {"training_steps": trained.steps}
+            plain |= {world: dataclasses.asdict(one) for world, one in summaries.items()}
+            write_text(folder / EVALUATION, json_of(plain, 2) + "\n")
+            export(settings, result, order.command, folder / POLICY)
+            done(result)
+            results.append(result)
     return results
+
+
+@contextmanager
+def _alone(out: Path) -> Iterator[None]:
+    """Keeps other trainings out of the folder of a run. Raises ConfigError if one is there."""
+    out.mkdir(parents=True, exist_ok=True)
+    try:
+        with filelock.FileLock(out / LOCK, timeout=0.0):
+            yield
+    except filelock.Timeout:
+        fix = "wait for its end, or choose another --out"
+        raise ConfigError(f"{out}: another training is at work there; {fix}.") from None
 
 
 def export(settings: TrainingSettings, result: SeedResult, command: str, path: Path) -> None:

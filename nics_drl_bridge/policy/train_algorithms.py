@@ -45,15 +45,22 @@ REPLAYED = ("observations", "next_observations", "actions", "rewards", "dones", 
 
 def check_serves(settings: TrainingSettings, env: TrainVecEnv) -> None:
     """Raises ConfigError if the algorithm does not suit the task."""
-    if len(env.observation_space.shape) != 1:
-        shown = f"task {settings.task!r}: shows {env.observation_space.shape}"
-        raise ConfigError(f"{shown}, not vectors; train a task of one robot.")
+    refuse_team(settings.task, env.envs[0].robots)
     if settings.algorithm == "sac" and not isinstance(env.action_space, gymnasium.spaces.Box):
         raise ConfigError("algorithm 'sac' needs continuous actions; use 'ppo'.")
     size = settings.ppo.rollout * env.num_envs
     if settings.algorithm == "ppo" and settings.ppo.batch > size:
         batch = f"ppo.batch {settings.ppo.batch}: is more than the {size} transitions of a rollout"
         raise ConfigError(f"{batch}; lower it, or raise ppo.rollout or worlds.")
+
+
+def refuse_team(task: str, robots: int) -> None:
+    """Raises ConfigError for a task of more than one robot, which no policy file drives."""
+    if robots > 1:
+        fix = (
+            "train a task of one robot, or its agents with your own learner (docs/environments.md)"
+        )
+        raise ConfigError(f"task {task!r}: is of {robots} robots; {fix}.")
 
 
 def act_of(algorithm: BaseAlgorithm | Actor) -> Act:
@@ -198,6 +205,7 @@ class Sb3Training:
         normaliser: tuple[Array, Array],
     ) -> None:  # fmt: skip
         self.policy = make_algorithm(settings, env, seed, normaliser)
+        self.networks = self.policy.policy
         self._total, self._log_every = settings.steps, LOG_EVERY[settings.algorithm]
 
     @property

@@ -24,6 +24,7 @@ MOST_MEMBERS = 10_000
 YAML = (".yaml", ".yml")
 SPECIAL = "*?["
 KEYS = ("worlds", "generate")  # one of which only a set has
+MAP_KEYS = ("image",)  # of a Nav2 map's file, which may lie beside its world
 BARN = "barn"  # the 250 worlds of a benchmark; one of them is `barn/7`
 
 
@@ -88,7 +89,7 @@ def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
         return _set_of("worlds", _members([str(one) for one in name], Path()))
     text, shipped = str(name), share_folder() / "config" / "world_sets" / f"{name}.yaml"
     path = shipped if shipped.is_file() else Path(name)
-    if (content := _set_in(path)) is not None:
+    if (content := _content(path, KEYS)) is not None:
         return _read_set(path, validate(content, SetFile, text))
     if path.is_dir() or any(sign in text for sign in SPECIAL):
         return _set_of(path.name if path.is_dir() else text, _members([text], Path()))
@@ -99,14 +100,14 @@ def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
     return load_world(name)
 
 
-def _set_in(path: Path) -> dict[str, Any] | None:
-    """Content of a world set's YAML file; None for any other."""
+def _content(path: Path, keys: tuple[str, ...]) -> dict[str, Any] | None:
+    """Content of a YAML file with one of these keys; None for any other."""
     if path.suffix not in YAML or not path.is_file():
         return None
     text = read_text(path)
-    content = parse_yaml(text, str(path)) if any(f"{key}:" in text for key in KEYS) else None
-    is_set = isinstance(content, dict) and any(key in content for key in KEYS)
-    return content if is_set else None
+    content = parse_yaml(text, str(path)) if any(f"{key}:" in text for key in keys) else None
+    known = isinstance(content, dict) and any(key in content for key in keys)
+    return content if known else None
 
 
 def _read_set(path: Path, file: SetFile) -> WorldSet:
@@ -135,7 +136,8 @@ def _members(names: Sequence[str], base: Path) -> list[World]:
         special, path = any(sign in name for sign in SPECIAL), base / name
         if special or path.is_dir():
             pattern = str(path) if special else f"{path}/*"
-            files = [Path(one) for one in sorted(glob(pattern)) if one.endswith(YAML)]
+            every = [Path(one) for one in sorted(glob(pattern)) if one.endswith(YAML)]
+            files = [one for one in every if _content(one, MAP_KEYS) is None]
             if not files:
                 raise ConfigError(f"{pattern}: no world file (.yaml) there; check the path.")
             found += map(_member, files)
@@ -147,6 +149,6 @@ def _members(names: Sequence[str], base: Path) -> list[World]:
 
 
 def _member(path: Path) -> World:
-    if _set_in(path) is not None:
+    if _content(path, KEYS) is not None:
         raise ConfigError(f"{path}: is a world set, and a set holds worlds; name its worlds.")
     return load_world(path)

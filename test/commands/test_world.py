@@ -152,6 +152,12 @@ def test_a_picture_becomes_a_map_and_a_world(tmp_path):
     assert "key 'resolution'" in refused("import", "plan.png", *words, cwd=tmp_path)
 
 
+def test_the_ending_of_a_file_may_be_in_capitals(tmp_path):
+    Image.fromarray(np.full((20, 30), 255, np.uint8)).save(tmp_path / "PLAN.PGM", format="PPM")
+    done("import", "PLAN.PGM", "--resolution", 0.1, cwd=tmp_path)
+    assert load_world(tmp_path / "PLAN_world.yaml").extent == pytest.approx((0.0, 0.0, 3.0, 2.0))
+
+
 def test_a_file_of_another_kind_is_refused(tmp_path):
     (tmp_path / "my.usd").write_text("")
     sentence = refused("import", "my.usd", cwd=tmp_path)

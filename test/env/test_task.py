@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import warnings
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registry import ENVIRONMENTS, TASK, make_task
 from nics_drl_bridge.env.task import (
     DRIVES,
+    Task,
     bearing,
     contact_ranges,
     discrete_commands,
@@ -273,3 +275,78 @@ def test_a_top_speed_that_is_none_is_refused():
     jackal = open_model("jackal")
     with pytest.raises(ConfigError, match=r"top_speed=0\.0: must be above 0 m/s"):
         Navigation(jackal.robot, jackal.lidar, top_speed=0.0)
+
+
+class Counting(Navigation):
+    """Counts the steps of an episode, in an array that is bound anew by each."""
+
+    shown = ("count",)
+
+    def reset(self, episodes):
+        return super().reset(episodes) | {"count": np.zeros(episodes.starts.shape[:2])}
+
+    def update(self, before, after, memory):
+        memory["count"] = memory["count"] + 1.0
+
+    step_into = Task.step_into  # that of all tasks, without the short way of navigation
+
+
+def test_a_memory_that_update_binds_anew_counts_alone_and_in_a_vector():
+    arguments = {"model": direct_model(), "world": field(), "task": Counting}
+    alone, several = gymnasium.make(TASK, **arguments), gymnasium.make_vec(TASK, 3, **arguments)
+    alone.reset(seed=0)
+    several.reset(seed=0)
+    still_there = np.zeros((3, 3), np.float32)
+    for count in (1.0, 2.0, 3.0):
+        assert alone.step(still_there[0])[4]["count"] == count
+        assert several.step(still_there)[4]["count"].tolist() == [count] * 3
+
+
+@pytest.mark.parametrize(
+    ("method", "wrong", "sentence"),
+    [
+        ("update", lambda _: {"gaol": 1}, "task Wrong: its memory ['count', 'gaol', 'goal'] must"),
+        ("update", lambda _: {"count": np.ones(5)}, "its memory 'count' must be finite, of shape"),
+        ("update", lambda rows: {"count": rows + 0.5j}, "'count' must stay float64 in `update`"),
+        ("info", lambda _: {"battery": 0.5}, "its info 'battery' must be an array of shape"),
+        ("info", lambda _: None, "its info must be a dictionary of arrays"),
+        ("reset", lambda rows: {"count": rows, "goal": [[1.0, 2.0]]}, "memory 'goal' must be an"),
+        ("reset", lambda rows: {"goal": rows}, "reset must give a dictionary of arrays, with"),
+        ("reset", lambda rows: {"count": rows[:, 0]}, "memory 'count', which is shown, must be"),
+        ("reset", lambda _: None, "reset must give a dictionary of arrays"),
+    ],
+)
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
+def test_a_method_of_an_own_task_that_gives_what_no_env_can_use_is_named(
+    make, method, wrong, sentence
+):
+    def update(self, before, after, memory):
+        memory.update(wrong(memory["count"]))
+
+    def reset(self, episodes):
+        return wrong(np.zeros(episodes.starts.shape[:2]))
+
+    def info(self, view, memory):
+        return wrong(view.pose)
+
+    methods = {"update": update, "reset": reset, "info": info}
+    task = type("Wrong", (Counting,), {method: methods[method]})
+    env = make(TASK, model=direct_model(), world=field(), task=task)
+
+    def drive():
+        env.reset(seed=0)
+        env.step(np.zeros(env.action_space.shape, np.float32))
+
+    with pytest.raises(ConfigError, match=re.escape(sentence)):
+        drive()
+
+
+def test_a_command_of_no_numbers_is_named_in_a_vector_too():
+    class Senseless(Navigation):
+        def command(self, action):
+            return super().command(action) * np.nan
+
+    env = BridgeVectorEnv(2, direct_model(), field(), Senseless)
+    env.reset(seed=0)
+    with pytest.raises(ConfigError, match=r"^the task's command .* look at its `command`"):
+        env.step(np.zeros((2, 3), np.float32))

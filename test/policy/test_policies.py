@@ -10,6 +10,7 @@ from gymnasium.wrappers import TimeLimit
 from robots import lidar
 from shapely.geometry import LineString, Point
 
+from nics_drl_bridge.config import share_folder
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
@@ -140,6 +141,15 @@ def test_the_planner_reaches_every_goal_of_the_empty_world(robot):
     env = BridgeEnv(model=robot, world="empty")
     policy = make_policy("dynamic_window", env.task)
     assert successes(drive_all(TimeLimit(env, 300), policy, range(3))) == 3
+
+
+@pytest.mark.slow
+def test_the_planner_leaves_its_start_with_wheels_that_answer_slowly(tmp_path):
+    robot = (share_folder() / "config" / "robots" / "differential.yaml").read_text()
+    slow = tmp_path / "slow.yaml"
+    slow.write_text(robot.replace("wheel_lag: 0.1", "wheel_lag: 0.8"))
+    env = BridgeVectorEnv(4, str(slow), "empty", max_episode_steps=300)
+    assert drive_worlds(env, make_policy("dynamic_window", env.task).act, range(4)).success.all()
 
 
 def car(**changes):

@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 from importlib.util import find_spec
 
+import filelock
 import pytest
 from typer.testing import CliRunner
 
@@ -29,14 +30,14 @@ class Reach(Task):
     def end(self, view, memory):
         return self.touches(view.ranges)
 """
-SETTINGS = """
+SETTINGS_OF_ANY_TASK = """
 worlds: {arena: 8}
-task_options: {scan: around}
 steps: 256
 max_episode_steps: 20
 hidden: [8]
 ppo: {rollout: 16, batch: 64, epochs: 1}
 """
+SETTINGS = f"{SETTINGS_OF_ANY_TASK}task_options: {{scan: around}}\n"
 
 
 def nics(*arguments):
@@ -140,6 +141,49 @@ def test_a_task_that_gives_no_numbers_is_refused_before_a_folder_is_begun(
     assert sentence in " ".join(done.output.split())
     assert "Traceback" not in done.output
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.slow
+def test_a_task_that_tells_no_success_is_said_to(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text(REACH)
+    (tmp_path / "settings.yaml").write_text("task: mine.py:Reach\n" + SETTINGS_OF_ANY_TASK)
+    done = nics("--settings", "settings.yaml", "--episodes", 2, "--out", "run")
+    assert done.exit_code == 0, done.output
+    assert "does `info` of the task tell `is_success`?" in done.output
+    assert "--task mine.py:Reach" in done.output.splitlines()[-1]
+
+
+def test_a_task_of_a_team_is_refused_before_a_folder_is_begun(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = nics("--task", "cooperative_reaching", "--steps", 64, "--out", "run")
+    assert done.exit_code == 2
+    assert "task 'cooperative_reaching': is of 3 robots; train a task of one" in done.output
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("engine", ["lean", "sb3"])
+def test_a_training_that_diverges_says_so_and_leaves_no_broken_checkpoint(tmp_path, engine):
+    (tmp_path / "settings.yaml").write_text(
+        SETTINGS.replace("epochs: 1", "epochs: 20, learning_rate: 1.0e+30")
+    )
+    out = tmp_path / "run"
+    done = nics("--settings", tmp_path / "settings.yaml", "--engine", engine, "--out", out)
+    assert done.exit_code == 2
+    assert "nics: the training diverged: after" in done.output
+    assert "its weights are beyond all bounds; lower its learning_rate." in done.output
+    assert not list(out.rglob("checkpoint.pt"))
+
+
+@pytest.mark.slow
+def test_a_training_beside_another_in_one_folder_is_refused(tmp_path, settings):
+    out = tmp_path / "run"
+    out.mkdir()
+    with filelock.FileLock(out / ".lock"):
+        done = nics("--settings", settings, "--out", out)
+    assert done.exit_code == 2
+    assert "another training is at work there; wait for its end" in " ".join(done.output.split())
+    assert nics("--settings", settings, "--episodes", 2, "--out", out).exit_code == 0
 
 
 @pytest.mark.skipif(find_spec("ray") is not None, reason="Ray is there")

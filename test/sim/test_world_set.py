@@ -134,6 +134,13 @@ def test_a_set_is_a_folder_a_glob_a_list_or_a_file(folder):
     assert names(load_worlds("circles")) == ["circles"]
 
 
+def test_the_maps_of_worlds_in_a_folder_are_no_members(folder):
+    (folder / "b_map.yaml").write_text("image: b.png\nresolution: 0.05\norigin: [0, 0, 0]\n")
+    assert names(load_worlds(folder)) == ["a", "b", "c"]
+    with pytest.raises(ConfigError, match="no world file"):
+        load_worlds(f"{folder}/*_map.yaml")
+
+
 def test_sets_of_equal_worlds_share_a_fingerprint_and_others_do_not(folder):
     once, again = load_worlds(str(folder)), load_worlds(str(folder))
     assert once.fingerprint == again.fingerprint
