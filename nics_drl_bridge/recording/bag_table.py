@@ -14,7 +14,7 @@ from nics_drl_bridge.recording import topic_roles as roles
 from nics_drl_bridge.recording.bag_file import BagFile, Message, times_of
 from nics_drl_bridge.recording.bag_reader import latency_of, of_one_body
 from nics_drl_bridge.recording.recording import Stream
-from nics_drl_bridge.recording.stamping import ROBOT_STREAMS, TopicData, streams
+from nics_drl_bridge.recording.stamping import ROBOT_STREAMS, TopicData, go_on_together, streams
 from nics_drl_bridge.recording.table import Column, Source, Table
 from nics_drl_bridge.robot.noise import Latency
 
@@ -143,9 +143,11 @@ class Bag(Source):
                 if which:
                     raise
                 fault = str(error).removeprefix(f"{self.place}: ").partition(";")[0]
-                note = f"{fault}; all messages were stamped by their arrival."
+                stamps = "header" if go_on_together(data.values()) else "receive"
+                by = "headers, whose clock is one" if stamps == "header" else "arrival"
+                note = f"{fault}; all messages were stamped by their {by}."
                 self._notes.setdefault(topic, []).append(note)
-                self._stamps[key] = streams(data, "receive", self.place, robot)
+                self._stamps[key] = streams(data, stamps, self.place, robot)
         return self._stamps[key][topic]
 
 

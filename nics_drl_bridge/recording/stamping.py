@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -91,6 +91,16 @@ def streams(
     return made
 
 
+def go_on_together(parts: Iterable[TopicData]) -> bool:
+    """True if all headers are of one clock without a leap, at whatever rate beside the receipt."""
+    received, stamped = zip(*((part.receive_ns, part.header_ns) for part in parts), strict=True)
+    if any(ns is None or not ns.all() for ns in stamped):
+        return False
+    order = np.argsort(np.concatenate(received), kind="stable")
+    steps = np.abs(np.diff(np.concatenate(stamped)[order])) * S_PER_NS
+    return bool((steps < MAX_WANDER_S).all())
+
+
 def _clocks(
     data: Mapping[str, TopicData], headers: Mapping[str, Nanoseconds | None], place: str
 ) -> dict[str, tuple[str, int]]:
@@ -109,8 +119,8 @@ def _clocks(
                 f"{place}: topic {topic!r}: its header stamps lie {least * S_PER_NS:.3f} to "
                 f"{most * S_PER_NS:.3f} s before their receipt, so they are of several clocks or "
                 "of a simulated time at another rate; write `stamps: receive` into the topics "
-                "file (`time: arrival` into a map), and record a simulation with `ros2 bag record "
-                "--use-sim-time`."
+                "file (`time: arrival` into a map), or for a simulation `stamps: header` (`time: "
+                "header`), and record it with `ros2 bag record --use-sim-time`."
             )
         if not SAME_CLOCK_S[0] <= median * S_PER_NS <= SAME_CLOCK_S[1]:
             alike = (c for c, d in foreign.items() if abs(d - median) * S_PER_NS < SAME_CLOCK_S[1])

@@ -208,3 +208,21 @@ def test_a_bag_whose_headers_were_set_back_is_stamped_by_arrival_and_says_so(tmp
     assert any("stamped by their arrival" in note for note in found.repairs)
     with pytest.raises(RecordingError, match="run backwards"):
         read(tmp_path / "set", command={"v": "/speed:data"}, time="header")
+
+
+@pytest.mark.parametrize("rate", [0.2, 5.0])
+def test_a_bag_of_simulated_time_at_another_rate_is_stamped_by_its_headers_and_says_so(
+    tmp_path, rate
+):
+    store = bags.STORE
+    with Writer(tmp_path / "set", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topics = ("/pose", "/target")
+        poses = [writer.add_connection(t, bags.kinds.POSE, typestore=store) for t in topics]
+        for t in bags.times():
+            message = bags.pose_stamped(100.0 + t, *bags.place_at(t))
+            raw = store.serialize_cdr(message, bags.kinds.POSE)
+            for topic in poses:
+                writer.write(topic, bags.ns(t / rate), raw)
+    found = read(tmp_path / "set", command={"v": "/target:pose.position.x"})
+    assert np.allclose(np.diff(found.pose.t), np.diff(bags.times()))
+    assert any("stamped by their headers, whose clock is one" in note for note in found.repairs)
