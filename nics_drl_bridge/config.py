@@ -25,6 +25,15 @@ MAX_VALUES = 50_000  # keys, values and lists; an alias counts as everything it 
 _LONGEST_PROBLEM = 200
 
 
+def namespace_of(given: str) -> str:
+    """A namespace of ROS 2 as `/robot_1`, or empty. Raises ConfigError for what can't be one."""
+    space = given.strip("/")
+    if space and not re.fullmatch(r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", space, re.ASCII):
+        needed = "must be words of letters, digits and _, none beginning with a digit, as /robot_1"
+        raise ConfigError(f"namespace {given!r}: {needed}.")
+    return f"/{space}" if space else ""
+
+
 def _within(most: float, needed: str) -> AfterValidator:
     def check(value: float) -> float:
         if abs(value) > most:

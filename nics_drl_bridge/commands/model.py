@@ -9,6 +9,7 @@ import typer
 from typer import Argument, Option
 
 from nics_drl_bridge.commands import console
+from nics_drl_bridge.config import namespace_of
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.files import json_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
@@ -67,7 +68,7 @@ def record(
 
 def node_arguments(namespace: str, remap: Sequence[str]) -> list[str]:
     """Returns the command line for `record_node`; ConfigError for a malformed remapping rule."""
-    rules = [f"__ns:=/{namespace.strip('/')}"] if namespace.strip("/") else []
+    rules = [f"__ns:={space}"] if (space := namespace_of(namespace)) else []
     for rule in remap:
         if not all(rule.partition(":=")):
             raise ConfigError(f"--remap {rule!r}: must be NAME:=OTHER, as in odom:=/wheel_odom.")

@@ -170,4 +170,9 @@ def make_backend(name: str, model: SimulatorModel, world: AnyWorld, **options: A
         signature(make).bind(model, world, **options)
     except TypeError as error:
         raise ConfigError(f"backend {name!r}: {error}; look at its arguments.") from None
-    return make(model, world, **options)
+    try:
+        return make(model, world, **options)
+    except TypeError as error:  # of what such a function passes on
+        if not any(f"argument '{name}'" in str(error) for name in options):
+            raise
+        raise ConfigError(f"backend {name!r}: {error}; look at its arguments.") from None

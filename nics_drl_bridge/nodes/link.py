@@ -26,6 +26,7 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from std_srvs.srv import Trigger
 
+from nics_drl_bridge.config import namespace_of
 from nics_drl_bridge.env.guard import uninterrupted
 from nics_drl_bridge.errors import BackendError, ModelError
 from nics_drl_bridge.generator import SimulatorModel
@@ -52,6 +53,7 @@ class Link:
         stamped: bool | None = None, parameters: Mapping[str, Any] | None = None,
         command_timeout_s: float = math.inf, patience_s: float = 0.0,
     ) -> None:  # fmt: skip
+        namespace = namespace_of(namespace)
         # SIGTERM ends Python like an exception, unless the program handles it itself.
         in_main = threading.current_thread() is threading.main_thread()
         if in_main and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:

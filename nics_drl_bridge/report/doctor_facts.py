@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from nics_drl_bridge.config import namespace_of
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
@@ -117,7 +118,7 @@ class Facts:
 
 def names_in(namespace: str) -> dict[str, str]:
     """Role -> topic of a robot in a namespace."""
-    space = f"/{namespace.strip('/')}" if namespace.strip("/") else ""
+    space = namespace_of(namespace)
     return {role: f"{space}/{role}" for role in (SCAN, ODOM, CMD_VEL)} | {CLOCK: CLOCK}
 
 

@@ -13,6 +13,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.sim import contact_kernels, step_kernels
 from nics_drl_bridge.sim.scenes import Scenes
 from nics_drl_bridge.sim.simulator import FastSimulator, Starts
+from nics_drl_bridge.sim.world import room_at
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,16 @@ class DeviceWorld:
             needed = f"{given} robots need {3 * given}: x, y, heading of each."
             raise ConfigError(f"episode_start has {starts.size} numbers; {needed}")
         placed = None if starts is None else starts.reshape(1, given, 3)
-        self.simulator.reset([seed], starts=lambda scenes: self.arrange(scenes, placed))
+
+        def arranged(scenes: Scenes) -> Array | None:
+            world = self.simulator.world.members[int(scenes.member[0])]
+            for x, y, _ in starts.reshape(-1, 3).tolist() if starts is not None else ():
+                if room_at(world, x, y) < 0.0:
+                    fault = f"({x:g}, {y:g}) m lies outside the world"
+                    raise ConfigError(f"episode_start: {fault} {world.name!r}; move it inside.")
+            return self.arrange(scenes, placed)
+
+        self.simulator.reset([seed], starts=arranged)
         self.commands[:] = 0.0
         self._covariance[:] = self._added
         self._before[:] = self.simulator.data.pose[0]

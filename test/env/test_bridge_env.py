@@ -320,6 +320,11 @@ def test_an_unknown_name_gives_the_nearest(arguments, error, sentence):
     assert sentence in str(caught.value)
 
 
+def test_an_option_that_the_simulator_does_not_take_is_named():
+    with pytest.raises(ConfigError, match=r"backend 'sim': .*argument 'sead'; look at its arg"):
+        BridgeEnv(backend_options={"sead": 3})
+
+
 def test_the_exact_renderer_sees_nearly_the_same():
     baked = BridgeEnv()
     exact = BridgeEnv(backend_options={"renderer": "exact"})

@@ -486,6 +486,18 @@ def test_what_topics_can_not_give_is_refused(model):
         BridgeEnv("dds", model, randomisation="mild", backend_options={"mode": "realtime"})
 
 
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"domian_id": 3}, "backend 'dds': .*argument 'domian_id'; look at its arguments"),
+        ({"namespace": "ant 1"}, "namespace 'ant 1': must be words of letters, digits and _"),
+    ],
+)
+def test_an_option_that_a_backend_does_not_take_is_named(model, options, sentence):
+    with pytest.raises(ConfigError, match=sentence):
+        BridgeEnv("dds", model, backend_options=options)
+
+
 @pytest.mark.parametrize("options", [{"mode": "realtime"}, {"namespaces": ["a"]}])
 def test_a_team_is_driven_in_lockstep_in_a_namespace_each(model, options):
     with pytest.raises(ConfigError, match="a team of 2 robots is driven in mode 'lockstep'"):

@@ -5,8 +5,15 @@ import pytest
 from robots import direct_model, lidar
 
 from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model
-from nics_drl_bridge.sim.device import DrivenSimulator, propagate, step_covariance, variances
+from nics_drl_bridge.sim.device import (
+    DeviceWorld,
+    DrivenSimulator,
+    propagate,
+    step_covariance,
+    variances,
+)
 from nics_drl_bridge.sim.randomisation import Randomisation
 from nics_drl_bridge.sim.simulator import FastSimulator
 from nics_drl_bridge.sim.world import load_world
@@ -118,3 +125,13 @@ def test_a_heading_error_widens_the_pose_across_the_way_and_not_along_it():
 def test_odometry_without_noise_is_not_said_to_be_unknown():
     assert (variances((0.0, 0.0)) > 0.0).all()
     assert (np.linalg.eigvalsh(step_covariance((0.0, 0.0), 0.1)) > 0.0).all()
+
+
+def test_an_episode_that_would_begin_outside_the_world_is_refused_and_the_one_at_hand_goes_on():
+    model, world = direct_model(), load_world("empty")
+    device = DeviceWorld(FastSimulator(model, world), model, 1)
+    device.begin(3, np.array([1.0, -1.0, 0.5]))
+    with pytest.raises(ConfigError, match=r"^episode_start: \(99, 0\) m lies outside the world"):
+        device.begin(4, np.array([99.0, 0.0, 0.0]))
+    device.advance()
+    assert device.simulator.data.pose[0, 0] == pytest.approx([1.0, -1.0, 0.5])

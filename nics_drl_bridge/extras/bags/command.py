@@ -10,6 +10,7 @@ from typer import Argument, Option
 
 from nics_drl_bridge.commands import console
 from nics_drl_bridge.commands.console import SalvageOption, intact, needs_ros
+from nics_drl_bridge.config import namespace_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 bag = typer.Typer(help="Records, describes, replays, exports and saves bags.", no_args_is_help=True)
@@ -38,7 +39,7 @@ def record(
     with needs_ros("nics bag record"):
         from nics_drl_bridge.extras.bags.live import BagOrder, record_bag
     names, say = tuple(topics or ()), partial(typer.echo, err=True)
-    order = BagOrder(out, names, everything, namespace, duration, kind, use_sim_time)
+    order = BagOrder(out, names, everything, namespace_of(namespace), duration, kind, use_sim_time)
     counts = dict(sorted(record_bag(order, say).items()))
     lines = [f"{topic}: {count} messages" for topic, count in counts.items()]
     lines.append(f"bag written to {out}")

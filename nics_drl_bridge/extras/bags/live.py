@@ -19,6 +19,7 @@ from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock as ClockMessage
 
+from nics_drl_bridge.config import namespace_of
 from nics_drl_bridge.errors import BackendError, RecordingError, nearest
 from nics_drl_bridge.nodes.conversions import message_texts, message_type, stamp_to_ros
 from nics_drl_bridge.nodes.qos import QosWatch, offer_of, profile_of
@@ -58,7 +59,7 @@ class BagOrder:
 
     def wants(self, topic: str) -> bool:
         """True if a topic is to be recorded."""
-        space = f"/{self.namespace.strip('/')}" if self.namespace.strip("/") else ""
+        space = namespace_of(self.namespace)
         if self.everything:
             return not space or topic.startswith(f"{space}/") or topic in SHARED
         names = self.topics or (*ROBOT, *SHARED)
@@ -150,7 +151,7 @@ class _Player:
         lockstep: str | None,
     ) -> None:  # fmt: skip
         self._node, self._stopping, self._rate = node, stopping, rate
-        self._lockstep, self._space = lockstep, namespace.strip("/")
+        self._lockstep, self._space = lockstep, namespace_of(namespace)
         self.publishers: dict[str, Publisher] = {}
         self._clock = node.create_publisher(ClockMessage, CLOCK, 10) if clock else None
         self._executor = SingleThreadedExecutor(context=node.context)
@@ -165,7 +166,7 @@ class _Player:
         if found is None:
             return False
         shared = topic in (CLOCK, "/tf", "/tf_static")
-        name = topic if shared or not self._space else f"/{self._space}{topic}"
+        name = topic if shared else f"{self._space}{topic}"
         best = Offer(  # matches any subscriber of one of the publishers
             max((offer.depth for offer in offers), default=USUAL_DEPTH),
             not offers or any(offer.reliable for offer in offers),
