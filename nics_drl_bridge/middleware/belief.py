@@ -25,6 +25,7 @@ class Belief(NamedTuple):
     anchor: Anchor | None  # None before the first odometry that was used
     lost: bool  # True if the robot may have moved unobserved since
     error: Array  # (3 + S, S) derivative to a constant error of the state's rates since before
+    roughness: float = 1.0  # factor of the variances of twists, more than 1 after outliers
 
 
 class Foreseen(NamedTuple):

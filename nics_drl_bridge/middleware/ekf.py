@@ -26,6 +26,9 @@ GYRO_STD = 0.02  # of a yaw rate without a covariance [rad/s]: a cheap gyro with
 GATE = {Kind.TWIST: 16.27, Kind.YAW_RATE: 10.83, Kind.POSE: 16.27}
 # Consecutive outliers after which they are believed. A gyro never is: odometry has precedence.
 PATIENCE: dict[Kind, float] = {Kind.TWIST: 3, Kind.YAW_RATE: np.inf, Kind.POSE: 5}
+# Factors of a twist's variances, after each outlier and after each that fits, and the greatest: the
+# noise of odometry may be more than was told, and all of it would then be outliers.
+ROUGHER, SMOOTHER, ROUGHEST = 4.0, 0.98, 100.0
 NEWS = 0.5  # Possible error of the state of a stuck or pushed robot, as a share of its range
 STILL = np.zeros(3)
 REACHABLE = 2.0  # States and commands are cut at this many times their range
@@ -97,7 +100,8 @@ class Estimator:
         known = self._anchor is not None and continuous
         since = anchor._replace(time_ns=time_ns - round(seconds * NS_PER_S)) if known else None
         error = self._suddenly
-        self.belief = Belief(time_ns, anchor.mean, covariance, (0, 0, 0), since, True, error)
+        known_so = anchor.mean, covariance, (0, 0, 0), since, True, error
+        self.belief = Belief(time_ns, *known_so, self._roughness)
         self._log = log_of(np.minimum(np.maximum(command, self._least), self._most))
 
     @property
@@ -105,12 +109,12 @@ class Estimator:
         """State of the filter; set to an earlier one when the past has changed."""
         own = self._filter
         known = self.time_ns, own.x, own.P, self._outliers, self._anchor, self._lost
-        return Belief(*known, self._error)
+        return Belief(*known, self._error, self._roughness)
 
     @belief.setter
     def belief(self, belief: Belief) -> None:
         self.time_ns, self._filter.x, self._filter.P = belief[:3]
-        self._outliers, self._anchor, self._lost, self._error = belief[3:]
+        self._outliers, self._anchor, self._lost, self._error, self._roughness = belief[3:]
         self._foreseen = None
 
     @property
@@ -209,8 +213,8 @@ class Estimator:
         return verdict
 
     def _correct(self, measurement: Measurement, follows: bool) -> Judgement:
-        kind, value, noise, odom = measurement
-        noise = self._noise[kind] if noise is None else noise
+        kind, value, given_noise, odom = measurement
+        noise = self._noise_of(kind) if given_noise is None else given_noise
         expected, derivative = self._expect(kind)
         residual = _between_poses if kind is Kind.POSE else np.subtract
         innovation = residual(value, expected)
@@ -220,11 +224,14 @@ class Estimator:
             outcome = self._surprise(kind, innovation, derivative, noise)
         if outcome is Acceptance.OUTLIER:
             self._count(kind, self._outliers[kind] + 1)
+            self._roughen(kind, ROUGHER)
             return Judgement(distance, outcome)
         anchor, own, way = self._anchor, self._filter, None
         if follows and anchor is not None and anchor.cross is not None:
-            way = np.array(odom), np.array(value), self.time_ns, self._wheels, GATE[Kind.POSE]
-        if way and outcome is Acceptance.USED and noise is self._noise[kind]:
+            wheels, rough = self._wheels, self._roughness
+            wheels = wheels if rough == 1.0 else wheels._replace(walk=rough * wheels.walk)
+            way = np.array(odom), np.array(value), self.time_ns, wheels, GATE[Kind.POSE]
+        if way and outcome is Acceptance.USED and given_noise is None:
             here = self._foreseen_here
             ready = here.gains if here is not None and here.anchor is anchor else None
             ready = ready or self._gains(anchor, derivative, own.P)
@@ -245,14 +252,25 @@ class Estimator:
         if self._outliers[kind] and not (outcome is Acceptance.JUMP and kind is Kind.TWIST):
             self._count(kind, 0)
         self._foreseen = None
+        if outcome is Acceptance.USED:
+            self._roughen(kind, SMOOTHER)
         return Judgement(distance, outcome)
+
+    def _noise_of(self, kind: Kind) -> Array:
+        """Returns the noise (n, n) of measurements that tell none; of twists, that seen lately."""
+        return self._noise[kind] * (self._roughness if kind is Kind.TWIST else 1.0)
+
+    def _roughen(self, kind: Kind, factor: float) -> None:
+        if kind is Kind.TWIST:
+            self._roughness = min(max(1.0, factor * self._roughness), ROUGHEST)
+            self._foreseen = None  # whose gains are those of the former noise
 
     def _gains(self, anchor: Anchor | None, derivative: Array, spread: Array) -> Any:
         """Returns what a twist corrects present and newest odometry by; None without that."""
         # A twist is but a moment's, the way between two odometries all that wheels did since.
         if anchor is None or anchor.cross is None:
             return None
-        noise = self._noise[Kind.TWIST]
+        noise = self._noise_of(Kind.TWIST)
         recall = kernels.recall(anchor, derivative, spread, noise)
         return kernels.gain(spread, derivative, noise), recall
 

@@ -325,6 +325,24 @@ def test_a_wrong_model_leaves_the_estimate_where_odometry_is(robot):
     assert np.abs(geometry.between(odometry, view.pose)).max() < 0.03
 
 
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_odometry_of_four_times_the_noise_that_was_told_is_followed(robot):
+    model, rng = builtin_model(robot), np.random.default_rng(7)
+    told = zip(("odom_linear", "odom_angular"), model.noise.odometry, strict=True)
+    rough = Randomisation(
+        name="rough", odometry={name: (4.0 * std, 4.0 * std) for name, std in told}
+    )
+    backend = SimBackend(model, field(60.0), estimator=True, randomisation=rough)
+    backend.reset(Start(0, np.array([0.0, 0.0, 1.0])))
+    away = []
+    for step in range(150):
+        if step % 7 == 0:
+            command = random_command(model, rng)
+        view, _ = backend.step(command)
+        away.append(geometry.between(backend.simulator.data.odom[0, 0], view.pose))
+    assert np.abs(away).max() < 0.1
+
+
 def stepped(estimator, stamp, twist, odom):
     estimator.predict(stamp)
     estimator.correct(Measurement(Kind.TWIST, np.asarray(twist), odom=np.asarray(odom)))
