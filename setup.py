@@ -41,6 +41,7 @@ EXTRAS = {
     # weights alone could be made to run code (CVE-2025-32434). Of its releases for Linux only some
     # are small, as 2.13 is: no CUDA packages.
     "train": [
+        "filelock>=3.12",  # PyTorch needs it, too
         "onnx>=1.16",
         "onnxruntime>=1.18",  # a policy file is checked by it as it is written
         "onnxscript>=0.1",

@@ -18,10 +18,10 @@ from nics_drl_bridge.errors import MISSING_ROS, ConfigError, nearest
 PACKAGE = "nics_drl_bridge"
 ROS = ("rclpy", "_msgs", "std_srvs", "builtin_interfaces")
 INSTALL = {  # libraries, and the extra of this package that brings each
-    "imageio_ffmpeg": "video", "leapp": "leapp", "mcap": "bags", "mujoco": "mujoco",
-    "onnx": "deploy", "onnxruntime": "deploy", "onnxscript": "train", "pettingzoo": "multi",
-    "ray": "train,distributed", "rerun": "video", "rosbags": "bags", "stable_baselines3": "train",
-    "tensorboard": "train", "torch": "train", "websockets": "view",
+    "filelock": "train", "imageio_ffmpeg": "video", "leapp": "leapp", "mcap": "bags",
+    "mujoco": "mujoco", "onnx": "deploy", "onnxruntime": "deploy", "onnxscript": "train",
+    "pettingzoo": "multi", "ray": "train,distributed", "rerun": "video", "rosbags": "bags",
+    "stable_baselines3": "train", "tensorboard": "train", "torch": "train", "websockets": "view",
 }  # fmt: skip
 TRAINING = ("torch", "stable_baselines3", "tensorboard", "onnx", "onnxruntime")
 
