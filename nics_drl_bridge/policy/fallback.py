@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.policy.local_map_kernels import Clearance
@@ -13,7 +14,7 @@ from nics_drl_bridge.policy.mppi import Mppi
 from nics_drl_bridge.policy.stateful import Policy, begin, resume
 
 KEPT = Clearance(margin=0.05, soft=0.1)  # by the policy's actions; the shield's margin
-READ = ("observation", "observation_space", "step_into", "_see")
+READ = ("observation", "observation_space", "_see")
 """What makes the observations of a navigation task."""
 
 
@@ -63,7 +64,8 @@ def acted(policy: Any) -> int | None:
 def check_readable(task: Navigation, planner: str) -> None:
     """Raises ConfigError for observations that no planner reads, and actions that none gives."""
     kind, named = type(task), f"fallback {planner!r}"
-    if any(getattr(kind, one, None) is not getattr(Navigation, one) for one in READ):
+    own = any(getattr(kind, one, None) is not getattr(Navigation, one) for one in READ)
+    if own or getattr(kind, "step_into", None) not in (Navigation.step_into, Task.step_into):
         reason = f"reads what 'navigation' observes, and {kind.__name__} observes otherwise"
         raise ConfigError(f"{named} {reason}; leave it out.")
     if task.actions == "discrete":

@@ -15,7 +15,6 @@ from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registry import MAX_EPISODE_STEPS, NAVIGATION, register_envs
 from nics_drl_bridge.env.sim_backend import SimBackend
-from nics_drl_bridge.env.task import Task
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError, ModelError
 from nics_drl_bridge.interface import Backend
@@ -417,8 +416,6 @@ def test_many_worlds_begin_at_a_start_where_an_obstacle_stands_in_some_of_them()
 
 def test_a_reward_of_the_scan_is_not_judged_by_a_view_that_no_step_gives():
     class Clear(Navigation):
-        step_into = Task.step_into
-
         def reward(self, before, after, memory):
             return {"clearance": after.ranges.min(axis=-1)}
 

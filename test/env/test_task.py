@@ -16,7 +16,6 @@ from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.registry import ENVIRONMENTS, TASK, make_task
 from nics_drl_bridge.env.task import (
     DRIVES,
-    Task,
     bearing,
     contact_ranges,
     discrete_commands,
@@ -288,7 +287,22 @@ class Counting(Navigation):
     def update(self, before, after, memory):
         memory["count"] = memory["count"] + 1.0
 
-    step_into = Task.step_into  # that of all tasks, without the short way of navigation
+
+def test_a_part_of_navigation_that_is_overridden_alone_counts():
+    class Changing(Navigation):
+        def reward(self, before, after, memory):
+            changed = (before.ranges != after.ranges).sum(axis=-1)
+            return super().reward(before, after, memory) | {"changed": 1.0 * changed}
+
+    arguments = {"model": direct_model(), "world": field(), "task": Changing}
+    alone, several = gymnasium.make(TASK, **arguments), gymnasium.make_vec(TASK, 2, **arguments)
+    alone.reset(seed=0)
+    several.reset(seed=0)
+    ahead = np.ones((2, 3), np.float32)
+    terms = alone.step(ahead[0])[4]["reward_terms"]
+    assert terms["changed"] > 0.0
+    both = several.step(ahead)[4]["reward_terms"]
+    assert terms == {name: both[name][0] for name in terms}
 
 
 def test_a_memory_that_update_binds_anew_counts_alone_and_in_a_vector():
