@@ -228,9 +228,7 @@ class Estimator:
             return Judgement(distance, outcome)
         anchor, own, way = self._anchor, self._filter, None
         if follows and anchor is not None and anchor.cross is not None:
-            wheels, rough = self._wheels, self._roughness
-            wheels = wheels if rough == 1.0 else wheels._replace(walk=rough * wheels.walk)
-            way = np.array(odom), np.array(value), self.time_ns, wheels, GATE[Kind.POSE]
+            way = np.array(odom), np.array(value), self.time_ns, self._slipping, GATE[Kind.POSE]
         if way and outcome is Acceptance.USED and given_noise is None:
             here = self._foreseen_here
             ready = here.gains if here is not None and here.anchor is anchor else None
@@ -259,6 +257,11 @@ class Estimator:
     def _noise_of(self, kind: Kind) -> Array:
         """Returns the noise (n, n) of measurements that tell none; of twists, that seen lately."""
         return self._noise[kind] * (self._roughness if kind is Kind.TWIST else 1.0)
+
+    @property
+    def _slipping(self) -> kernels.Wheels:
+        wheels, rough = self._wheels, self._roughness
+        return wheels if rough == 1.0 else wheels._replace(walk=rough * wheels.walk)
 
     def _roughen(self, kind: Kind, factor: float) -> None:
         if kind is Kind.TWIST:
