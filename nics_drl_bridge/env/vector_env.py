@@ -11,15 +11,8 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
+from nics_drl_bridge.env import guard
 from nics_drl_bridge.env.bridge_env import RENDER_FPS, check_render_mode
-from nics_drl_bridge.env.guard import (
-    check_action,
-    check_command,
-    check_places,
-    check_reset,
-    give,
-    override,
-)
 from nics_drl_bridge.env.kernels import episode_seeds
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.snapshot import Snapshot, goals_of
@@ -146,7 +139,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         options: dict[str, Any] | None = None,
     ) -> tuple[Observation, dict[str, Any]]:  # fmt: skip
         """Begins an episode in every world; world i takes its seeds from `seed + i`."""
-        check_reset(seed, options, self.num_envs)
+        guard.check_reset(seed, options, self.num_envs)
         super().reset(seed=seed if isinstance(seed, int) else None)
         chosen = chosen_worlds(options, self.num_envs)
         if not (self.ready or chosen.all()):
@@ -172,12 +165,12 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         starts = None
         if options and "start" in options:
             starts = np.empty((len(worlds), self.robots, 3))
-            give(starts, "start", options["start"])
+            guard.give(starts, "start", options["start"])
 
         def places(scenes: Scenes) -> Array | None:
             if starts is not None:
                 radius = self.model.robot.footprint_radius
-                check_places("start", starts, scenes, self.world, radius)
+                guard.check_places("start", starts, scenes, self.world, radius)
             moved = None if self._teacher is None else self._teacher.places(worlds, scenes)
             return moved if starts is None else starts
 
@@ -187,9 +180,9 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self._bodies[worlds] = scenes.bodies
         self._starts[worlds] = self.simulator.data.pose[worlds]
         fresh = self.task.begun(Episodes(seeds, self._starts[worlds], self.simulator.goals[worlds]))
-        override(fresh, options, "start", "reset_mask")
+        guard.override(fresh, options, "start", "reset_mask")
         if options and "goal" in options:
-            check_places("goal", fresh["goal"], scenes, self.world)
+            guard.check_places("goal", fresh["goal"], scenes, self.world)
         for name, rows in fresh.items():
             if name not in self.memory:
                 self.memory[name] = np.zeros((self.num_envs, *rows.shape[1:]), rows.dtype)
@@ -209,7 +202,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         """One control period in every world; see Gymnasium."""
         if not self.ready:
             raise gymnasium.error.ResetNeeded("call reset() before step().")
-        given = check_action(actions, self.action_space, "actions").reshape(self._each)
+        given = guard.check_action(actions, self.action_space, "actions").reshape(self._each)
         self.ready = False
         out = np.empty_like(self._out) if self.copy else self._out
         begun = self._over.copy()  # these ignore their action and are reset
@@ -239,7 +232,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
         self, part: slice, actions: NDArray[Any], out: Observation, begun: Flags
     ) -> Outcome:
         data, ended = self.simulator.data, self.ended[part]
-        command = check_command(self.task.command(actions), (*ended.shape, len(self._still)))
+        command = guard.check_command(self.task.command(actions), (*ended.shape, len(self._still)))
         if self.robots > 1 and ended.any():
             command = np.where(ended[..., None], self._still, command)
         ranges = data.ranges[part]

@@ -228,7 +228,7 @@ class Estimator:
             return Judgement(distance, outcome)
         anchor, own, way = self._anchor, self._filter, None
         if follows and anchor is not None and anchor.cross is not None:
-            way = np.array(odom), np.array(value), self.time_ns, self._slipping, GATE[Kind.POSE]
+            way = np.array(odom), np.array(value), self.time_ns, self._wheels_now, GATE[Kind.POSE]
         if way and outcome is Acceptance.USED and given_noise is None:
             here = self._foreseen_here
             ready = here.gains if here is not None and here.anchor is anchor else None
@@ -259,7 +259,7 @@ class Estimator:
         return self._noise[kind] * (self._roughness if kind is Kind.TWIST else 1.0)
 
     @property
-    def _slipping(self) -> kernels.Wheels:
+    def _wheels_now(self) -> kernels.Wheels:
         wheels, rough = self._wheels, self._roughness
         return wheels if rough == 1.0 else wheels._replace(walk=rough * wheels.walk)
 

@@ -57,9 +57,7 @@ def check_serves(settings: TrainingSettings, env: TrainVecEnv) -> None:
 def refuse_team(task: str, robots: int) -> None:
     """Raises ConfigError for a task of more than one robot, which no policy file drives."""
     if robots > 1:
-        fix = (
-            "train a task of one robot, or its agents with your own learner (docs/environments.md)"
-        )
+        fix = "train a task of one, or its agents by a learner of your own (docs/environments.md)"
         raise ConfigError(f"task {task!r}: is of {robots} robots; {fix}.")
 
 

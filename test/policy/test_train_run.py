@@ -158,7 +158,7 @@ def test_a_task_of_a_team_is_refused_before_a_folder_is_begun(tmp_path, monkeypa
     monkeypatch.chdir(tmp_path)
     done = nics("--task", "cooperative_reaching", "--steps", 64, "--out", "run")
     assert done.exit_code == 2
-    assert "task 'cooperative_reaching': is of 3 robots; train a task of one" in done.output
+    assert "task 'cooperative_reaching': is of 3 robots; train a task of one," in done.output
     assert not (tmp_path / "run").exists()
 
 
