@@ -30,7 +30,7 @@ DRIVES = ((0, 0, 0), (1, 0, 0), (1, 0, 1), (1, 0, -1), (-1, 0, 0), (-1, 0, 1), (
 """Stop; ahead, to the left, to the right; and back: signs of linear.x, linear.y, angular.z, as in
 the authors' code (efc-robot/MultiVehicleEnv). What can't reverse stays, and turns if it can."""
 SIDEWAYS = ((0, 1, 0), (0, -1, 0))  # Two more for a robot that moves sideways
-PARTS = {"update", "observation", "judge", "reward", "end", "info"}
+PARTS = ("update", "observation", "judge", "reward", "end", "info")
 """Methods of a step; a class that overrides one is stepped by all, not in one pass of its base."""
 CONTACT_ANGLE = math.radians(4.0)  # 2 cm of what is 0.3 m away
 
@@ -104,8 +104,9 @@ class Task(ABC):
 
     def __init_subclass__(cls, **given: Any) -> None:
         super().__init_subclass__(**given)
-        if vars(cls).keys() & PARTS and "step_into" not in vars(cls):
-            cls.step_into = Task.step_into  # type: ignore[method-assign]  # another's lacks them
+        owner = next(each for each in cls.__mro__ if "step_into" in vars(each))
+        if any(getattr(cls, part, None) is not getattr(owner, part, None) for part in PARTS):
+            cls.step_into = Task.step_into  # type: ignore[method-assign]  # that one lacks them
             if "keeps_last_scan" not in vars(cls):
                 cls.keeps_last_scan = True
 

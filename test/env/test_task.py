@@ -288,13 +288,26 @@ class Counting(Navigation):
         memory["count"] = memory["count"] + 1.0
 
 
-def test_a_part_of_navigation_that_is_overridden_alone_counts():
-    class Changing(Navigation):
-        def reward(self, before, after, memory):
-            changed = (before.ranges != after.ranges).sum(axis=-1)
-            return super().reward(before, after, memory) | {"changed": 1.0 * changed}
+class Changes:
+    """Rewards where the scan changes."""
 
-    arguments = {"model": direct_model(), "world": field(), "task": Changing}
+    def reward(self, before, after, memory):
+        return {"changed": 1.0 * (before.ranges != after.ranges).sum(axis=-1)}
+
+
+class Mixed(Changes, Navigation):
+    """Has the reward from a class that is no task."""
+
+
+class Own(Navigation):
+    """Has the reward by itself."""
+
+    reward = Changes.reward
+
+
+@pytest.mark.parametrize("task", [Mixed, Own])
+def test_a_part_of_navigation_that_is_overridden_alone_counts(task):
+    arguments = {"model": direct_model(), "world": field(), "task": task}
     alone, several = gymnasium.make(TASK, **arguments), gymnasium.make_vec(TASK, 2, **arguments)
     alone.reset(seed=0)
     several.reset(seed=0)
