@@ -1,7 +1,5 @@
 """Errors that a user can cause and fix, each of one sentence: what was wrong, where, what to do."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterable
 
@@ -54,7 +52,7 @@ class PolicyError(BridgeError):
         self.reason = shortened(reason, LONGEST // 2)
         super().__init__(f"{source}: field {self.field!r}: {self.reason}")
 
-    def __reduce__(self) -> tuple[type[PolicyError], tuple[str, str, str]]:
+    def __reduce__(self) -> "tuple[type[PolicyError], tuple[str, str, str]]":
         return type(self), (self.source, self.field, self.reason)  # so that it can be pickled
 
 
@@ -70,7 +68,7 @@ class StaleDataError(BackendError):
             "publisher runs in this ROS domain and namespace."
         )
 
-    def __reduce__(self) -> tuple[type[StaleDataError], tuple[str, float, float]]:
+    def __reduce__(self) -> "tuple[type[StaleDataError], tuple[str, float, float]]":
         return type(self), (self.topic, self.age_s, self.limit_s)  # so that it can be pickled
 
 

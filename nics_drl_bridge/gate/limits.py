@@ -1,7 +1,5 @@
 """Limits of a command: its value and its first and second derivative."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +34,7 @@ class CommandLimit(Schema):
     jerk: float = Field(gt=0.0)  # greatest change of the rate per second
 
     @model_validator(mode="after")
-    def _ordered(self) -> CommandLimit:
+    def _ordered(self) -> "CommandLimit":
         if not self.min < self.max:
             raise ValueError("min must be less than max")
         return self

@@ -1,7 +1,5 @@
 """Drive: a recording of a robot, and whatever several stages derive from it, derived once."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -48,11 +46,11 @@ class Drive:
     spec: RobotSpec
     settings: Settings = field(default_factory=Settings)
 
-    def part(self, recording: Recording) -> Drive:
+    def part(self, recording: Recording) -> "Drive":
         """Returns a drive of the same robot with other streams."""
         return self if recording is self.recording else replace(self, recording=recording)
 
-    def under(self, settings: Settings) -> Drive:
+    def under(self, settings: Settings) -> "Drive":
         """Returns the same drive, as far as it is prepared, with other options."""
         same = replace(self, settings=settings)
         vars(same).update(vars(self) | {"settings": settings})
@@ -64,7 +62,7 @@ class Drive:
         return float(self.recording.pose.t[-1] - self.recording.pose.t[0])
 
     @cached_property
-    def bursts(self) -> Bursts | None:
+    def bursts(self) -> "Bursts | None":
         """Bursts of the poses; None if they arrive one by one."""
         return find_bursts(self.recording.pose.t)
 
@@ -93,7 +91,7 @@ class Drive:
         return pose_noise(self.recording.pose, self.bursts)
 
     @cached_property
-    def twists(self) -> TwistIntervals:
+    def twists(self) -> "TwistIntervals":
         """Twists of the tracked body over spans in which motion stands out of the noise."""
         t, pose, stride, limit = self.dated.t, self.dated.values, 1, MAX_GAP_S
         if self.bursts is not None:

@@ -1,7 +1,5 @@
 """Excitation: what a drive moved, and moved independently, and so what a fit can learn from it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,7 +42,7 @@ class Excitation:
     levels: dict[str, int]  # number of different values of each command, at most 10
 
     @classmethod
-    def of(cls, samples: Samples, spec: RobotSpec) -> Excitation:
+    def of(cls, samples: Samples, spec: RobotSpec) -> "Excitation":
         """Returns the excitation by a drive."""
         together = commands_together(samples, spec)
         return cls(unmoved_variables(samples, spec), together, levels(samples, spec))

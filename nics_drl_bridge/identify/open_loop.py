@@ -1,7 +1,5 @@
 """Open-loop prediction: windows of a drive, and the poses that a model predicts at their ends."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -47,7 +45,7 @@ class Windows:
     end: Array  # (W, 3)
     path: Array  # (W,) length of the measured path between them [m]
 
-    def rows(self, keep: NDArray[np.bool_]) -> Windows:
+    def rows(self, keep: NDArray[np.bool_]) -> "Windows":
         """Returns the windows selected by a mask (W,)."""
         return Windows(*(getattr(self, each.name)[keep] for each in fields(self)))
 

@@ -1,7 +1,5 @@
 """Refinement of a model by its errors over seconds (Ljung, System Identification, ch. 7)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -163,7 +161,7 @@ def _scale(problem: Problem, chosen: open_loop.Windows) -> Array:
 
 
 def prediction_slopes(
-    problem: Problem, model: TaylorModel, calibration: Calibration, free: _Free
+    problem: Problem, model: TaylorModel, calibration: Calibration, free: "_Free"
 ) -> Array:
     """Returns the derivatives (n, P) of `prediction_errors` for a measured state."""
     parts = []
@@ -193,7 +191,7 @@ class _Free:
     names: tuple[str, ...]  # all such fields
 
     @classmethod
-    def of(cls, model: TaylorModel, calibration: Calibration, spec: RobotSpec) -> _Free:
+    def of(cls, model: TaylorModel, calibration: Calibration, spec: RobotSpec) -> "_Free":
         """Frees what neither definition nor measurement fixes."""
         # The rotation is defined by the direction without motion, of which an omnidirectional robot
         # has none. Where it is known apart from a lever arm, and where a time is known, they are

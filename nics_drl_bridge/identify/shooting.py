@@ -4,8 +4,6 @@ Each window starts at a measured state and follows the commands; the derivatives
 coefficients are computed along the way.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -59,7 +57,7 @@ class Inputs:
         """Places of the values that are not known."""
         return np.flatnonzero(self.high > self.low)
 
-    def begun_at(self, other: Inputs) -> Inputs:
+    def begun_at(self, other: "Inputs") -> "Inputs":
         """Starts from the values of other inputs, where these have them."""
         known = dict(zip(other.names, other.start.tolist(), strict=True))
         start = [known.get(name, at) for name, at in zip(self.names, self.start, strict=True)]

@@ -1,7 +1,5 @@
 """LidarFaults: the faults of a real device's ranges, each off by default."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np
@@ -41,7 +39,7 @@ class LidarFaults(Schema):
     dropout_far: float = Field(default=0.0, ge=0.0, le=1.0)  # added to it
 
     @model_validator(mode="after")
-    def _probable(self) -> LidarFaults:
+    def _probable(self) -> "LidarFaults":
         if self.dropout + self.dropout_far > 1.0:
             raise ValueError("dropout and dropout_far must add up to at most 1")
         return self

@@ -1,7 +1,5 @@
 """Static maps of square cells, also from files as Nav2's map_server reads them."""
 
-from __future__ import annotations
-
 import io
 import struct
 import warnings
@@ -117,7 +115,7 @@ class MapFile(Schema):
     mode: Literal["trinary", "scale", "raw"] = "trinary"
 
     @model_validator(mode="after")
-    def _consistent(self) -> MapFile:
+    def _consistent(self) -> "MapFile":
         if not self.free_thresh < self.occupied_thresh:
             raise ValueError("free_thresh must be less than occupied_thresh")
         return self

@@ -3,8 +3,6 @@
 A policy learns on the sectors of one `ScanLayout`, into which any lidar's scan is resampled.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -37,7 +35,7 @@ class ScanLayout(Schema):
     viewpoint: tuple[Place, Place] = (0.0, 0.0)  # x, y in `base_link` [m]
 
     @model_validator(mode="after")
-    def _consistent(self) -> ScanLayout:
+    def _consistent(self) -> "ScanLayout":
         check_angles(self.angle_min, self.angle_max)
         return self
 

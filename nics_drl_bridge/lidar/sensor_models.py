@@ -1,7 +1,5 @@
 """Sensor models, the returns that a device loses: baked into a table, they cost no time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import Annotated, Literal
@@ -69,7 +67,7 @@ class Intensity(Schema):
         return np.asarray(light / np.square(np.maximum(ranges, NEAREST)) < self.threshold)
 
 
-def _one_intensity(models: tuple[SensorModel, ...]) -> tuple[SensorModel, ...]:
+def _one_intensity(models: "tuple[SensorModel, ...]") -> "tuple[SensorModel, ...]":
     if sum(isinstance(model, Intensity) for model in models) > 1:
         raise ValueError("a lidar has one model of the kind intensity; keep one")
     return models

@@ -1,7 +1,5 @@
 """Shapes of obstacles and footprints, and their arrays for the kernels."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,7 +109,7 @@ class Segment(Outlined):
     ends: tuple[tuple[Place, Place], tuple[Place, Place]]  # in the shape's own frame [m]
 
     @model_validator(mode="after")
-    def _extended(self) -> Segment:
+    def _extended(self) -> "Segment":
         if self.ends[0] == self.ends[1]:
             raise ValueError("ends must be two different points")
         if np.ptp(self.ends, axis=0).max() < SMALLEST:
@@ -211,7 +209,7 @@ class Outlines:
     orders: NDArray[np.int64]  # (H,) rotational order
 
     @classmethod
-    def of(cls, shapes: Sequence[Shape]) -> Outlines:
+    def of(cls, shapes: Sequence[Shape]) -> "Outlines":
         """Creates the arrays of some shapes."""
         outlines = [shape.outline for shape in shapes]
         hulls = [convex_hull(o) if len(o) else np.zeros((1, 2)) for o in outlines]

@@ -6,8 +6,6 @@ convention, and only this module handles it. Limits are compared in float32, as 
 m is a little less there, and still a return.
 """
 
-from __future__ import annotations
-
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -66,7 +64,7 @@ class LidarSpec(Schema):
     sensor_model: SensorModels = ()  # effects of surfaces on its returns, baked into its tables
 
     @model_validator(mode="after")
-    def _consistent(self) -> LidarSpec:
+    def _consistent(self) -> "LidarSpec":
         if not self.range_min < self.range_max:
             raise ValueError("range_min must be less than range_max")
         check_angles(self.angle_min, self.angle_max)

@@ -1,7 +1,5 @@
 """LidarTable: the baked rows of every shape, at every distance and rotation (Sec. IV-B)."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math
@@ -39,7 +37,7 @@ class Density(Schema):
     phases: Literal[1, 2, 4, 8] = 1  # points per beam, see `for_beams`
 
     @classmethod
-    def for_beams(cls, beam_angle: float) -> Density:
+    def for_beams(cls, beam_angle: float) -> "Density":
         """Returns the default for an angle between beams [rad]; wide ones need several points."""
         wanted = math.ceil(math.log2(max(beam_angle / POINT_ANGLE, 1.0)))
         return cls.model_validate({"phases": min(2**wanted, MOST_PHASES)})
@@ -84,7 +82,7 @@ class LidarTable:
     sensor_model: tuple[SensorModel, ...] = ()  # named models that were baked in
 
     @classmethod
-    def without_rows(cls, spec: LidarSpec, shapes: Sequence[Shape]) -> LidarTable:
+    def without_rows(cls, spec: LidarSpec, shapes: Sequence[Shape]) -> "LidarTable":
         """Creates a table of shapes that are only scanned exactly: without limits or baking."""
         shapes = tuple(dict.fromkeys(shapes))
         grid = np.ones((len(shapes), 3))
@@ -161,7 +159,7 @@ class LidarTable:
             write_sums(temporary)
 
     @classmethod
-    def load(cls, folder: str | Path, checked: bool = False) -> LidarTable:
+    def load(cls, folder: str | Path, checked: bool = False) -> "LidarTable":
         """Memory-maps a table that `save` wrote, `checked` if its checksums were compared already.
 
         Raises ConfigError, ModelError if a file is missing, damaged or of another format.

@@ -1,7 +1,5 @@
 """An executor that keeps its wait set: 1.5 times as many lock-step steps a second as rclpy's."""
 
-from __future__ import annotations
-
 import contextlib
 import inspect
 import itertools
@@ -122,7 +120,7 @@ class StandingExecutor(SingleThreadedExecutor):
                 task()
                 task.result()  # re-raises the callback's exception
 
-    def _gathered(self) -> _Entities:
+    def _gathered(self) -> "_Entities":
         nodes, now = self.get_nodes() if self._changed else [], self._entities
         if now is None or (self._changed and now.all != _entities_of(nodes)):
             self._release()

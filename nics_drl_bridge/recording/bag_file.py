@@ -1,7 +1,5 @@
 """Opens a bag of ROS 2 or 1, and verifies that it is complete: readers are silent about damage."""
 
-from __future__ import annotations
-
 import sqlite3
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -57,7 +55,7 @@ def is_storage(path: Path) -> bool:
 
 
 @contextmanager
-def opened(path: str | Path) -> Iterator[BagFile]:
+def opened(path: str | Path) -> "Iterator[BagFile]":
     """Opens a bag (folder or only file); RecordingError: missing, damaged, empty, no library."""
     path = Path(path)
     check_libraries(path, "reading")
@@ -96,7 +94,7 @@ def opened(path: str | Path) -> Iterator[BagFile]:
 
 
 @contextmanager
-def _opened_ros_1(path: Path) -> Iterator[BagFile]:
+def _opened_ros_1(path: Path) -> "Iterator[BagFile]":
     from rosbags.rosbag1 import Reader
 
     if not no_device(path).is_file():
@@ -166,7 +164,7 @@ def _check_storage(file: Path) -> None:
         raise ValueError(f"its database is broken: {verdict}")
 
 
-def _check_summary(reader: Reader) -> None:
+def _check_summary(reader: "Reader") -> None:
     from nics_drl_bridge.recording.mcap import check_message
 
     storages: list[Any] = list(getattr(reader.storage, "storages", [reader.storage]))
@@ -207,7 +205,7 @@ def times_of(messages: Sequence[Message]) -> tuple[Nanoseconds, Nanoseconds | No
 class BagFile:
     """A bag in `opened`; ValueError if a topic's messages are not all there and whole."""
 
-    def __init__(self, reader: AnyBag, place: str, is_ros_1: bool = False) -> None:
+    def __init__(self, reader: "AnyBag", place: str, is_ros_1: bool = False) -> None:
         if not reader.message_count:
             raise RecordingError(f"{place}: holds no messages; record a drive of 20 s or more.")
         self._reader, self._is_ros_1 = reader, is_ros_1

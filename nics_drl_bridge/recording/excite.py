@@ -2,8 +2,6 @@
 # Segments reach new levels smoothly and hold them for a random time (Nelles: Nonlinear System
 # Identification, ch. 21). Accepted is one that stays in the circle, and can turn back from its end.
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -46,7 +44,7 @@ ATTEMPTS = 8
 class Exploration:
     """Commands, one per period, that keep a robot in its plan's circle; it rests at both ends."""
 
-    def __init__(self, plan: DrivePlan, rng: np.random.Generator) -> None:
+    def __init__(self, plan: "DrivePlan", rng: np.random.Generator) -> None:
         spec, self._plan = plan.robot, plan
         self._motion, self._rng = expected_motion(spec), rng
         share = np.array([1.0 if c.unit in POSITION_UNITS else plan.speed for c in spec.command])
@@ -91,7 +89,7 @@ class Exploration:
         self._tick += 1
         return command
 
-    def expected(self) -> Pattern | None:
+    def expected(self) -> "Pattern | None":
         """Drives to the end; None if it finds no way back, or shows too little of a command."""
         poses, commands = [self.pose], []
         while not self.done:

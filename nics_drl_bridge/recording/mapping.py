@@ -1,7 +1,5 @@
 """Mapping: which column or message field of a recording is which stream, and in what unit."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -101,7 +99,7 @@ class Time(Schema):
     rate: float | None = Field(default=None, gt=0.0)  # of rows without stamps [Hz]
 
     @model_validator(mode="after")
-    def _one(self) -> Time:
+    def _one(self) -> "Time":
         if (self.from_ is None) == (self.rate is None):
             raise ValueError("time needs either `from`, a column, or `rate` [Hz]")
         return self
@@ -135,7 +133,7 @@ class Value(Schema):
         return None if unit is None else known_unit(unit)
 
     @model_validator(mode="after")
-    def _consistent(self) -> Value:
+    def _consistent(self) -> "Value":
         if self.maximum is not None and (self.unit or "share") not in SHARES:
             raise ValueError("maximum belongs to the units share and %")
         return self
@@ -180,7 +178,7 @@ class PoseSource(Measured):
         return self.frame, self.child_frame
 
     @model_validator(mode="after")
-    def _whole(self) -> PoseSource:
+    def _whole(self) -> "PoseSource":
         if (self.x is None) != (self.y is None):
             raise ValueError("pose needs both x and y")
         if self.x is None and self.in_ is None:

@@ -1,7 +1,5 @@
 """Messages of a bag: their types, their rows of numbers, and the quality of service offered."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Sequence
@@ -44,7 +42,7 @@ def check_libraries(path: Path, what: str, instead: str = "") -> None:
         raise RecordingError(f"{path}: {what} a bag needs the library {library}; {advice}.")
 
 
-def typestore() -> Typestore:
+def typestore() -> "Typestore":
     """Returns the message types of ROS 2, and those of Ackermann drives."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -54,7 +52,7 @@ def typestore() -> Typestore:
     return store
 
 
-def with_types(connections: Sequence[Connection], header: bool = True) -> Typestore:
+def with_types(connections: "Sequence[Connection]", header: bool = True) -> "Typestore":
     """Returns the message types of `typestore`, and before these those that a bag defines.
 
     That of ROS 1 for headers decodes messages, that of ROS 2 (`header` is false) converts them.
@@ -160,7 +158,7 @@ class Offer:
     transient_local: bool = False  # late subscribers get earlier messages; False for volatile
 
 
-def offers_of(profiles: Sequence[Qos]) -> tuple[Offer, ...]:
+def offers_of(profiles: "Sequence[Qos]") -> tuple[Offer, ...]:
     """Converts profiles of rosbags to offers."""
     from rosbags.interfaces import QosDurability, QosReliability
 
@@ -174,7 +172,7 @@ def offers_of(profiles: Sequence[Qos]) -> tuple[Offer, ...]:
     )
 
 
-def profile_of(offer: Offer) -> Qos:
+def profile_of(offer: Offer) -> "Qos":
     """Converts an offer to a profile of rosbags; the other policies keep their defaults."""
     from rosbags import interfaces as rosbags
 

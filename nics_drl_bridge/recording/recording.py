@@ -1,7 +1,5 @@
 """Recording: separately stamped streams of a drive; Samples: these on one time axis (Sec. IV-A)."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile
@@ -71,7 +69,7 @@ class Stream:
         share = np.where(known, self.sigma, usual) / usual
         return np.asarray(np.clip(share**-2.0, *WEIGHTS))
 
-    def rows(self, keep: NDArray[np.bool_] | NDArray[np.intp] | slice) -> Stream:
+    def rows(self, keep: NDArray[np.bool_] | NDArray[np.intp] | slice) -> "Stream":
         """Returns the rows selected by a mask (T,), indices or a slice."""
         sigma = None if self.sigma is None else self.sigma[keep]
         return replace(self, t=self.t[keep], values=self.values[keep], sigma=sigma)
@@ -112,7 +110,7 @@ class Samples:
     dq: Array
     dt: float  # length of a step [s]
 
-    def rows(self, keep: NDArray[np.bool_]) -> Samples:
+    def rows(self, keep: NDArray[np.bool_]) -> "Samples":
         """Returns the samples of the steps for which `keep` (T,) is true."""
         return Samples(self.t[keep], self.q[keep], self.x[keep], self.dq[keep], self.dt)
 

@@ -1,7 +1,5 @@
 """Output of a drive: an `.npz` file, or the folder of a rosbag2, written without ROS."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import tempfile
@@ -81,7 +79,7 @@ def write_bag(
 
 
 def _topics(
-    recording: Recording, spec: RobotSpec, messages: _Messages
+    recording: Recording, spec: RobotSpec, messages: "_Messages"
 ) -> Iterator[tuple[str, str, Stream, Make]]:
     beside = recording.odometry is not None or recording.pose.clock != recording.command.clock
     joints, names, still = recording.wheels, list(msgs.WHEELS), np.zeros(2, dtype=bool)
@@ -111,7 +109,7 @@ def _topics(
 
 
 class _Messages:
-    def __init__(self, store: Typestore) -> None:
+    def __init__(self, store: "Typestore") -> None:
         self._types = store.types
 
     def _new(self, kind: str, *values: Any) -> Any:
@@ -161,7 +159,7 @@ class _Messages:
 class BagSink:
     """An open bag, created by `bag_sink` with an open writer of rosbags."""
 
-    def __init__(self, writer: Writer) -> None:
+    def __init__(self, writer: "Writer") -> None:
         self._writer, self.store = writer, msgs.typestore()  # the known message types
         self._connections: dict[str, Connection] = {}
         self.counts: dict[str, int] = {}  # number of messages by topic

@@ -1,7 +1,5 @@
 """Noise of a robot, drawn by the simulator and expected by the estimator, and its latency."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import numpy as np
@@ -51,7 +49,7 @@ class Noise(Schema):
     state_drift: dict[str, Level] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _units(self) -> Noise:
+    def _units(self) -> "Noise":
         for name, field in type(self).model_fields.items():
             level = getattr(self, name)
             if isinstance(level, Level) and level.unit != field.default.unit:

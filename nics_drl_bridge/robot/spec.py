@@ -5,8 +5,6 @@ YAML files; its `VARIANTS` are kinds of longer names. Other packages add kinds b
 the group `nics_drl_bridge.kinds`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from contextlib import suppress
@@ -83,7 +81,7 @@ class Variable(Schema):
     max: float = Field(ge=-FASTEST, le=FASTEST)
 
     @model_validator(mode="after")
-    def _ordered(self) -> Variable:
+    def _ordered(self) -> "Variable":
         if not self.min < self.max:
             raise ValueError(f"min must be less than max of variable {self.name!r}")
         return self
@@ -169,7 +167,7 @@ class RobotSpec(Schema):
         return {key: value for key, value in data.items() if key not in silent}
 
     @model_validator(mode="after")
-    def _consistent(self) -> RobotSpec:
+    def _consistent(self) -> "RobotSpec":
         if any(part in self.name for part in ("/", "\\", "..")):
             raise ValueError(f"name {self.name!r}: files are named so; leave out .., / and \\")
         if not self.footprint_radius <= LARGEST:
@@ -207,7 +205,7 @@ class RobotSpec(Schema):
                 )
         return self
 
-    def grown(self, margin: float) -> RobotSpec:
+    def grown(self, margin: float) -> "RobotSpec":
         """The robot with a footprint that is larger all around by a margin [m].
 
         With an outline `footprint_radius` stays, by which worlds place robots: where the robot has

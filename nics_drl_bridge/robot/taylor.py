@@ -1,7 +1,5 @@
 """TaylorModel: rates of pose and state as a short polynomial of state and command (Eq. 1)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import combinations_with_replacement
@@ -40,7 +38,7 @@ class TaylorModel:
     assumed: tuple[tuple[str, str], ...] = ()  # terms (dof, term) of the textbook, not of the drive
     # (D, K); NaN for a kept coefficient that was assumed or defined; (0, 0) if none is known
     std_errors: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    quality: Quality | None = None
+    quality: "Quality | None" = None
     bounded: bool = False  # True if the state is held in the recording's box, widened
     inputs: tuple[InputCurve, ...] = ()  # of the commands that have one
     friction: Array = field(default_factory=lambda: np.zeros(0))  # (S,) [unit of the state / s]
@@ -182,7 +180,7 @@ class TaylorModel:
             if known[d].any()
         }
 
-    def with_errors(self, errors: Mapping[str, Mapping[str, float]]) -> TaylorModel:
+    def with_errors(self, errors: Mapping[str, Mapping[str, float]]) -> "TaylorModel":
         """Returns the model with standard errors by dof and term; NaN for kept terms without."""
         if not errors:
             return replace(self, std_errors=np.zeros((0, 0)))
@@ -206,7 +204,7 @@ class TaylorModel:
         return lines
 
     @property
-    def named(self) -> NamedTaylorModel:
+    def named(self) -> "NamedTaylorModel":
         """The model by names, unchecked; every number is bit-identical."""
         names = self.term_names
         terms = {

@@ -4,8 +4,6 @@ Cells are filled at random; then, some times, one with many filled neighbours is
 few is emptied, which leaves clumps with ways between (Perille, Truong, Xiao and Stone, 2020).
 """
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 from typing import Literal
@@ -41,7 +39,7 @@ class Cellular(Schema):
     passage: float = Field(default=0.5, ge=0.0, le=100.0)  # width that the way through has [m]
 
     @model_validator(mode="after")
-    def _consistent(self) -> Cellular:
+    def _consistent(self) -> "Cellular":
         if self.columns * self.rows > MOST_CELLS:
             raise ValueError(f"columns times rows may be {MOST_CELLS}")
         if not 0.0 <= self.fill[0] <= self.fill[1] < 1.0:

@@ -1,7 +1,5 @@
 """Models of entities to spawn: shapes and where they are in the entity, of YAML or SDF."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -33,7 +31,7 @@ class ModelFile(Schema):
     at: tuple[Pose, ...] = ()  # of each shape in the entity [m, m, rad]; at its origin by default
 
     @model_validator(mode="after")
-    def _one_each(self) -> ModelFile:
+    def _one_each(self) -> "ModelFile":
         if self.at and len(self.at) != len(self.shapes):
             raise ValueError(f"at must hold {len(self.shapes)} poses, one of each shape")
         return self

@@ -1,7 +1,5 @@
 """Motion of obstacles: straight ahead, from waypoint to waypoint, or as people walk."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from itertools import pairwise
@@ -49,7 +47,7 @@ class Patrol(Schema):
     pause: float = Field(default=0.0, ge=0.0, le=1e6)  # at each waypoint [s]
 
     @model_validator(mode="after")
-    def _apart(self) -> Patrol:
+    def _apart(self) -> "Patrol":
         corners = [*self.waypoints, *self.waypoints[: int(self.loop)]]
         if any(one == other for one, other in pairwise(corners)):
             raise ValueError("two waypoints that follow each other must differ")

@@ -1,7 +1,5 @@
 """Domain randomisation: robot, sensors and scene of an episode, drawn from ranges in YAML."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -87,7 +85,7 @@ class OdometryRanges(Schema):
     heading_drift: Level | None = None  # [rad/sqrt(s)]
 
     @model_validator(mode="after")
-    def _once(self) -> OdometryRanges:
+    def _once(self) -> "OdometryRanges":
         for factor, (_, levels) in SCALED.items():
             for level in levels:
                 if getattr(self, factor) is not None and getattr(self, level) is not None:
@@ -108,7 +106,7 @@ class LidarRanges(Schema):
     too_close: tuple[TooClose, ...] | None = Field(default=None, min_length=1)
 
     @model_validator(mode="after")
-    def _probable(self) -> LidarRanges:
+    def _probable(self) -> "LidarRanges":
         likely = [name for name in ("dropout", "dropout_far") if getattr(self, name)]
         if sum(getattr(self, name)[1] for name in likely) > 1.0:
             raise ValueError("the greatest dropout and dropout_far must add up to at most 1")
@@ -123,7 +121,7 @@ class ObstacleRanges(Schema):
     rungs: int = Field(default=5, ge=2, le=100)  # number of sizes, evenly spaced: each is baked
 
     @model_validator(mode="after")
-    def _countable(self) -> ObstacleRanges:
+    def _countable(self) -> "ObstacleRanges":
         if self.count and not 0 <= self.count[0] <= self.count[1] <= MOST_OBSTACLES:
             raise ValueError(f"count must be [least, greatest] from 0 to {MOST_OBSTACLES}")
         return self
@@ -147,7 +145,7 @@ class Randomisation(Schema):
         rungs = self.obstacles.rungs if high > low else 1
         return tuple(np.linspace(low, high, rungs).tolist())
 
-    def alone(self) -> dict[str, Randomisation]:
+    def alone(self) -> "dict[str, Randomisation]":
         """Each of the given ranges without the others, by the name of its field."""
         given = {name: getattr(self, name) for name in type(self).model_fields}
         names = (name for name in given if name in self.model_fields_set - {"name"})

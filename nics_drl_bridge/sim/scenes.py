@@ -1,7 +1,5 @@
 """Scenes drawn from worlds: obstacles, starts and goals of each seed, in connected free space."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -49,7 +47,7 @@ class Scenes(Scene):
     member: NDArray[np.int64]
 
     @classmethod
-    def of(cls, n: int, obstacles: int, robots: int) -> Scenes:
+    def of(cls, n: int, obstacles: int, robots: int) -> "Scenes":
         """Allocates n scenes, without anything in them."""
         starts, goals = np.zeros((n, robots, 3)), np.zeros((n, robots, 2))
         return cls(np.zeros((n, obstacles, BODY)), starts, goals, np.zeros(n, np.int64))
@@ -74,7 +72,7 @@ class Catalogue:
     spaces: dict[str, FreeSpace]  # of worlds that differ in their obstacles alone
 
     @classmethod
-    def of(cls, world: AnyWorld, sizes: Sequence[float]) -> Catalogue:
+    def of(cls, world: AnyWorld, sizes: Sequence[float]) -> "Catalogue":
         """Lists the shapes of a world or set, scaled."""
         shapes = tuple(scaled(shape, size) for size in sizes for shape in world.shapes)
         place = {shape: i for i, shape in enumerate(world.shapes)}

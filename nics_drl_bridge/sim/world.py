@@ -1,7 +1,5 @@
 """World files: the field of the episodes and its obstacles."""
 
-from __future__ import annotations
-
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated
@@ -49,7 +47,7 @@ class Obstacles(Schema):
         return count
 
     @model_validator(mode="after")
-    def _consistent(self) -> Obstacles:
+    def _consistent(self) -> "Obstacles":
         if (self.count is None) == (not self.at):
             raise ValueError("a group needs either `count` or `at`")
         return self
@@ -69,7 +67,7 @@ class Places(Schema):
     at: tuple[Pose | Point, ...] = Field(default=(), max_length=MOST_PLACES)
 
     @model_validator(mode="after")
-    def _one(self) -> Places:
+    def _one(self) -> "Places":
         if bool(self.regions) == bool(self.at):
             raise ValueError("give either `regions` or `at`")
         return self
@@ -106,7 +104,7 @@ class World(Schema):
     _spare: tuple[Shape, ...] = PrivateAttr(default=())
 
     @model_validator(mode="after")
-    def _consistent(self) -> World:
+    def _consistent(self) -> "World":
         if self.size is None and self.bounds is None and self.map is None:
             raise ValueError("a world needs a `size`, `bounds`, or a `map`")
         if self.size is not None and self.bounds is not None:
@@ -121,7 +119,7 @@ class World(Schema):
         return self
 
     @property
-    def members(self) -> tuple[World, ...]:
+    def members(self) -> "tuple[World, ...]":
         """The world itself, as the only one of its set."""
         return (self,)
 
@@ -130,7 +128,7 @@ class World(Schema):
         """Shapes for which a simulator keeps room, one body each; scenes are drawn without them."""
         return self._spare
 
-    def with_spare(self, shapes: tuple[Shape, ...]) -> World:
+    def with_spare(self, shapes: tuple[Shape, ...]) -> "World":
         """Returns the world with room for further bodies of some shapes."""
         copy = self.model_copy()
         copy._spare = shapes

@@ -1,7 +1,5 @@
 """Frames as a LeRobot dataset, format v3.0: Parquet and JSON, which `LeRobotDataset` opens."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Collection, Mapping
 from importlib.util import find_spec
@@ -153,7 +151,7 @@ def _described(column: NDArray[Any], feature: Feature | None) -> dict[str, Any]:
     return told | ({"info": dict(feature.info)} if feature and feature.info else {})
 
 
-def _table(columns: Columns) -> Table:
+def _table(columns: Columns) -> "Table":
     import pyarrow
 
     def array(column: NDArray[Any]) -> Any:
@@ -165,7 +163,7 @@ def _table(columns: Columns) -> Table:
     return pyarrow.table({name: array(column) for name, column in columns.items()})
 
 
-def _tasks(task: str) -> Table:
+def _tasks(task: str) -> "Table":
     """The tasks as pandas writes them: the text is the index of the table."""
     import pyarrow
 
@@ -180,7 +178,7 @@ def _tasks(task: str) -> Table:
     return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
 
 
-def _write(table: Table, path: Path) -> None:
+def _write(table: "Table", path: Path) -> None:
     from pyarrow import parquet
 
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,7 +1,5 @@
 """The standard services of simulators, simulation_interfaces, where its messages are installed."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 from nics_drl_bridge.nodes import conversions, runner
@@ -11,7 +9,7 @@ if TYPE_CHECKING:
     from nics_drl_bridge.nodes.simulation_interfaces.server import Server
 
 
-def open_services(node: Any) -> Server | None:
+def open_services(node: Any) -> "Server | None":
     """Offers the standard services at a device node; None without its messages, or if unwanted."""
     if not runner.declare_row(node, STANDARD):
         return None
