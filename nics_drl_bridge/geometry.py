@@ -101,6 +101,21 @@ def edges_cross(corners: Array) -> bool:
     return bool(crossing.any() or (folded & ~ahead).any())
 
 
+def depths(points: Array, corners: Array) -> Array:
+    """Distances (n,) of points (n, 2) to the border of an outline (V, 2), below 0 outside [m]."""
+    side = np.roll(corners, -1, axis=0) - corners
+    apart = points[:, None] - corners
+    length2 = np.maximum((side * side).sum(axis=-1), 1e-300)  # two corners may coincide
+    share = np.clip((apart * side).sum(axis=-1) / length2, 0.0, 1.0)
+    away = np.linalg.norm(apart - share[..., None] * side, axis=-1).min(axis=1)
+    above = apart[..., 1] >= 0.0
+    crosses = above != np.roll(above, -1, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        where = apart[..., 0] - apart[..., 1] * side[:, 0] / side[:, 1]
+    inside = (crosses & (where < 0.0)).sum(axis=1) % 2 == 1
+    return np.asarray(np.where(inside, away, -away))
+
+
 @dataclass(frozen=True)
 class Bicycle:
     """Geometry of a robot that steers; `base_link` is the middle of the unsteered axle."""

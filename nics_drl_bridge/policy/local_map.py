@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from nics_drl_bridge.env.navigation import Navigation
-from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.geometry import Array, depths
 from nics_drl_bridge.policy import local_map_kernels as kernels
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -47,20 +47,6 @@ def outline_of(robot: RobotSpec) -> kernels.FootprintDiscs:
     return kernels.FootprintDiscs(
         np.array(chosen), lattice[middle], float(depth.max()), float(reach[middle])
     )
-
-
-def depths(points: Array, corners: Array) -> Array:
-    """Distances (n,) of points (n, 2) to the border of an outline (V, 2), below 0 outside [m]."""
-    side = np.roll(corners, -1, axis=0) - corners
-    apart = points[:, None] - corners
-    share = np.clip((apart * side).sum(axis=-1) / (side * side).sum(axis=-1), 0.0, 1.0)
-    away = np.linalg.norm(apart - share[..., None] * side, axis=-1).min(axis=1)
-    above = apart[..., 1] >= 0.0
-    crosses = above != np.roll(above, -1, axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        where = apart[..., 0] - apart[..., 1] * side[:, 0] / side[:, 1]
-    inside = (crosses & (where < 0.0)).sum(axis=1) % 2 == 1
-    return np.asarray(np.where(inside, away, -away))
 
 
 def scratch_of(

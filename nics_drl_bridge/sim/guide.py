@@ -6,7 +6,7 @@ Only a simulator knows it: it is for the reward of a training.
 import numpy as np
 from numpy.typing import NDArray
 
-from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.geometry import Array, depths
 from nics_drl_bridge.lidar.shapes import Circle, Polygon
 from nics_drl_bridge.sim import guide_kernels as kernels
 from nics_drl_bridge.sim.guide_kernels import GuideGrid
@@ -41,7 +41,7 @@ class Guide:
         frames = np.column_stack([extents[:, :2], cells])
         inner = footprint.radius
         if isinstance(footprint, Polygon):
-            inner = _inscribed(np.array(footprint.outline))
+            inner = abs(float(depths(np.zeros((1, 2)), np.array(footprint.outline))[0]))
         self._grid = GuideGrid(
             walls, frames, sizes, stands, sampler.samplers[0].plan.outlines, inner,
             footprint.radius,
@@ -71,11 +71,3 @@ class Guide:
         out = np.empty(poses.shape[:2])
         kernels.lengths(out, poses, data.member[rows], self.fields[rows], self._grid)
         return out
-
-
-def _inscribed(outline: Array) -> float:
-    """Distance of the origin from the nearest side of an outline (V, 2) [m]."""
-    sides = np.roll(outline, -1, axis=0) - outline
-    shares = np.clip(-(outline * sides).sum(axis=1) / (sides * sides).sum(axis=1), 0.0, 1.0)
-    nearest = outline + shares[:, None] * sides
-    return float(np.hypot(*nearest.T).min())

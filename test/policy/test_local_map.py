@@ -9,7 +9,8 @@ import pytest
 from shapely.geometry import Point, Polygon
 from shapely.prepared import prep
 
-from nics_drl_bridge.policy.local_map import CELL_M, depths, outline_of, scratch_of
+from nics_drl_bridge.geometry import depths
+from nics_drl_bridge.policy.local_map import CELL_M, outline_of, scratch_of
 from nics_drl_bridge.policy.local_map_kernels import (
     Clearance,
     ScanRays,

@@ -117,15 +117,5 @@ class Region:
         x, y, z = self._points[0]
         above = max(-z, z - HEIGHT, 0.0)
         room = self._points[1, 0] ** 2 - above**2
-        return bool(room >= 0.0 and distance(np.array([x, y]), outline) <= math.sqrt(room))
-
-
-def distance(point: Array, outline: Array) -> float:
-    """Returns the distance of a point (2,) from a convex polygon (V, 2), 0 inside [m]."""
-    nxt = np.roll(outline, -1, axis=0)
-    along, to = nxt - outline, point - outline
-    inside = along[:, 0] * to[:, 1] - along[:, 1] * to[:, 0] >= 0.0
-    if len(outline) > 2 and inside.all():
-        return 0.0
-    share = np.clip((along * to).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-300), 0, 1)
-    return float(np.hypot(*(to - share[:, None] * along).T).min())
+        apart = -float(geometry.depths(np.array([[x, y]]), outline)[0])  # below 0 inside
+        return bool(room >= 0.0 and apart <= math.sqrt(room))
