@@ -74,9 +74,7 @@ def drive_in(
     parameters["randomisation"] = conditions.randomisation or ""
     options = {"domain_id": domain_id, "simulator": node, "timeout_s": START_S, "truth": True}
     options["randomisation"] = drawn
-    with (
-        NodeProcess(node, logs, parameters, domain_id) as process, Witness(domain_id) as witness
-    ):  # fmt: skip
+    with NodeProcess(node, logs, parameters, domain_id) as process, Witness(domain_id) as witness:
         say(f"started {node} as process {process.pid} in ROS domain {domain_id}")
         try:
             env, opened = env_of(policy, model, world, "dds", conditions, **options)

@@ -1,6 +1,7 @@
 """Judgement of a model: its predictions of unseen data, their band, and those of yardsticks."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -35,7 +36,10 @@ def judged(
     `bands` are distances within which 95 % of the ends are expected [m], by horizon [s].
     """
     begin, told = drive.settings.train_until_s, []
-    textbook = None if calibration.is_exact else textbook_of(drive, calibration)
+    textbook: Yardstick | None = None
+    if not calibration.is_exact:
+        with suppress(RecordingError):  # the training part is too short
+            textbook = fit_yardstick(drive, begin, calibration.clock_offset_s)
     for horizon in HORIZONS_S:
         chosen = windows(drive, calibration, begin, drive.duration_s, horizon, SPACING_S)
         if not len(chosen.start_t):
@@ -51,14 +55,6 @@ def judged(
             band, None if band is None else float((far <= band).mean()),
         ))  # fmt: skip
     return tuple(told)
-
-
-def textbook_of(drive: Drive, calibration: Calibration) -> Yardstick | None:
-    """Fits the textbook to the training part; None if that is too short."""
-    try:
-        return fit_yardstick(drive, drive.settings.train_until_s, calibration.clock_offset_s)
-    except RecordingError:
-        return None
 
 
 def errors_of_ends(ends: Array, chosen: Windows) -> EndErrors:

@@ -198,7 +198,10 @@ class _Search:
         inside: Mask | None, pull: float,
     ) -> None:  # fmt: skip
         self.problem, self.model, self.free, self.inputs = problem, model, free, inputs
-        self.unit = scale_of(problem.samples, model)[free]
+        size = np.sqrt((taylor.evaluate(problem.samples.x, model.powers) ** 2).mean(axis=0))
+        spread = np.maximum(problem.samples.dq.std(axis=0), 1e-6)
+        # Coefficients (D, K) that make each term as large as the rates usually are.
+        self.unit = (spread[:, None] / np.maximum(size, 1e-9))[free]
         self.first, self.steps = problem.starts(inside)
         self.wanted = self.steps > 0
         weight = np.array([1.0, 1.0, HEADING_ARM_M])
@@ -286,10 +289,3 @@ class _Search:
             errors[self.sought] = clustered_errors(late_slope, rest, span)
         error = float(np.sqrt(np.mean(rest**2)))
         return Predictive(best, late, error, slope, rest, self.free, starts, errors)
-
-
-def scale_of(samples: Samples, model: TaylorModel) -> Array:
-    """Returns the coefficients (D, K) that make each term as large as the rates usually are."""
-    size = np.sqrt((taylor.evaluate(samples.x, model.powers) ** 2).mean(axis=0))
-    spread = np.maximum(samples.dq.std(axis=0), 1e-6)
-    return np.asarray(spread[:, None] / np.maximum(size, 1e-9))

@@ -253,7 +253,9 @@ class Composer:
         if part.output is not None:
             return self._past[f"output {part.output}"]
         if of == "last":
-            if not self._commands_twist():
+            choices = self._mapping.choices
+            rows = [self._mapping.outputs] if choices is None else choices.commands
+            if not all(name in foreign_mapping.TWIST for row in rows for name in row):
                 reason = "is known of policies that command forward, left and turn alone."
                 raise self._fault(f"inputs.{name}", f"{part.of} {reason}")
             return build.pick(self._past["twist"], [foreign_mapping.TWIST.index(which)])
@@ -265,11 +267,6 @@ class Composer:
         return {"distance": distance, "cosine": cosine, "sine": sine}[which]
 
     # Outputs.
-
-    def _commands_twist(self) -> bool:
-        choices = self._mapping.choices
-        rows = [self._mapping.outputs] if choices is None else choices.commands
-        return all(name in foreign_mapping.TWIST for row in rows for name in row)
 
     def _flat(self, name: str) -> str:
         """An output as a row of float32."""

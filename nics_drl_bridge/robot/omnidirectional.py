@@ -15,6 +15,4 @@ def kinematics(spec: RobotSpec) -> Textbook:
     return wheeled(spec, np.eye(3), np.eye(3), POSE_RATES, POSE_RATES)
 
 
-KIND = RobotKind(
-    kinematics, disc, Template((COMMANDS,), POSE_RATES, (), LAGS), sideways=True
-)  # fmt: skip
+KIND = RobotKind(kinematics, disc, Template((COMMANDS,), POSE_RATES, (), LAGS), sideways=True)

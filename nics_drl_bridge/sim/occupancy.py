@@ -47,9 +47,14 @@ def occupancy(world: World, obstacles: Sequence[Placed] = (), cell: float = CELL
     if world.size is not None:
         _enclose(made, np.array(world.size) / 2.0)
     if grid is not None:
-        _paste(made.cells, grid, first, round(grid.resolution / cell))
+        parts, (column, row) = round(grid.resolution / cell), -first
+        own = grid.cells.repeat(parts, axis=0).repeat(parts, axis=1)
+        into = made.cells[row : row + own.shape[0], column : column + own.shape[1]]
+        into[:] = np.where(into == OCCUPIED, into, own)
     for wall in np.array(world.walls, np.float64).reshape(-1, 2, 2):
-        _occupy(made, _along(wall, cell))
+        at = made.world_to_cell(_along(wall, cell))
+        at = at[((at >= 0) & (at < made.cells.shape)).all(axis=-1)]
+        made.cells[at[:, 0], at[:, 1]] = OCCUPIED
     for shape, pose in obstacles:
         _fill(made, shape, np.asarray(pose, np.float64))
     return made
@@ -87,13 +92,6 @@ def _enclose(made: GridMap, half: Array) -> None:
     made.cells[(away > half).any(axis=-1)] = OCCUPIED
 
 
-def _paste(cells: NDArray[np.int8], grid: GridMap, first: NDArray[np.int_], parts: int) -> None:
-    own = grid.cells.repeat(parts, axis=0).repeat(parts, axis=1)
-    column, row = -first
-    into = cells[row : row + own.shape[0], column : column + own.shape[1]]
-    into[:] = np.where(into == OCCUPIED, into, own)
-
-
 def _along(corners: Array, cell: float) -> Array:
     """Points (P, 2) on straight lines from corner to corner (V, 2), several in each cell."""
     parts = []
@@ -101,12 +99,6 @@ def _along(corners: Array, cell: float) -> Array:
         count = max(2, math.ceil(math.dist(begin, end) / cell * SAMPLES))
         parts.append(begin + np.linspace(0.0, 1.0, count)[:, None] * (end - begin))
     return np.concatenate(parts)
-
-
-def _occupy(made: GridMap, points: Array) -> None:
-    at = made.world_to_cell(points)
-    at = at[((at >= 0) & (at < made.cells.shape)).all(axis=-1)]
-    made.cells[at[:, 0], at[:, 1]] = OCCUPIED
 
 
 def _fill(made: GridMap, shape: Shape, pose: Array) -> None:

@@ -175,13 +175,13 @@ class _Scope:
             reason = f"the pose of {name!r} is relative to itself; give it another frame"
             raise ConfigError(f"{self.where}: {reason}.")
         self._open.add(name)
-        pose = self.of_model(found) if isinstance(found, _Scope) else self._of_element(found)
+        if isinstance(found, _Scope):
+            pose = self.of_model(found)
+        else:
+            bases = {"joint": _text(found, "child"), "frame": found.get("attached_to", "")}
+            pose = self.posed(found.find("pose"), bases.get(found.tag, ""))
         self._open.remove(name)
         return pose
-
-    def _of_element(self, element: Element) -> Array:
-        bases = {"joint": _text(element, "child"), "frame": element.get("attached_to", "")}
-        return self.posed(element.find("pose"), bases.get(element.tag, ""))
 
     def posed(
         self, pose: Element | None, base: str = "", start: Array | None = None, where: str = ""
@@ -217,7 +217,10 @@ class _Body(NamedTuple):
         if shape.tag == "empty":
             return None
         if shape.tag == "plane":
-            return self._ground(shape)
+            normal = self.pose[:3, :3] @ _floats(shape.findtext("normal", "0 0 1"), 3, self.where)
+            if abs(normal[2]) < math.cos(sections.TILT) * np.linalg.norm(normal):
+                raise ShapelessError("a plane that is not level")
+            return None
         if shape.tag == "box":
             return sections.Box(self._lengths(shape, "size", 3))
         if shape.tag == "sphere":
@@ -230,11 +233,6 @@ class _Body(NamedTuple):
         what = "polyline with holes" if shape.tag == "polyline" else shape.tag
         article = "an" if what[0] in "aeiou" else "a"
         raise ShapelessError(f"{article} {what} {_text(shape, 'uri')}".rstrip())
-
-    def _ground(self, plane: Element) -> None:
-        normal = self.pose[:3, :3] @ _floats(plane.findtext("normal", "0 0 1"), 3, self.where)
-        if abs(normal[2]) < math.cos(sections.TILT) * np.linalg.norm(normal):
-            raise ShapelessError("a plane that is not level")
 
     def _prism(self, polyline: Element) -> Solid:
         texts = [point.text or "" for point in polyline.findall("point")]

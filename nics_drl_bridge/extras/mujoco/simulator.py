@@ -260,7 +260,10 @@ class MujocoSimulator(DrivenSimulator):
         for part in range(self._subperiods):
             for rig, command in zip(rigs, self.in_force(part * part_s), strict=True):
                 rig.command(data, command)
-            self._place_obstacles((part + 1) * part_s)
+            bodies = self.move_obstacles((part + 1) * part_s)
+            for k, mocap in self._mocap:
+                data.mocap_pos[mocap, :2] = bodies[k, :2]
+                data.mocap_quat[mocap] = scenery.quaternion(bodies[k, 2])
             self._mujoco.mj_step(self._simulation, data, nstep=self._steps)
             bumped = self._bumper_of[data.contact.geom.ravel()]
             touched[bumped[bumped >= 0]] = True
@@ -275,12 +278,6 @@ class MujocoSimulator(DrivenSimulator):
         readings = [rig.read(data) for rig in rigs]
         pose, twist, state = (np.array([getattr(r, n) for r in readings]) for n in MOTION)
         self.end_period(pose, twist, state, wheels, counted, touched)
-
-    def _place_obstacles(self, time: float) -> None:
-        bodies = self.move_obstacles(time)
-        for k, mocap in self._mocap:
-            self._data.mocap_pos[mocap, :2] = bodies[k, :2]
-            self._data.mocap_quat[mocap] = scenery.quaternion(bodies[k, 2])
 
 
 def divide(period: float, longest: float) -> tuple[int, int, float]:

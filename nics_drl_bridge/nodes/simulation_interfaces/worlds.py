@@ -79,7 +79,10 @@ class Worlds:
         codes = self._codes
         try:
             if found.form == resources.SDF:
-                return self._of_sdf(found, request)
+                if found.path is not None:
+                    return self._standing(found.path, found.path.stem, request)
+                with file_of(found.text) as file:
+                    return self._standing(file, "resource_string", request)
             if found.path is not None:
                 return load_worlds(str(found.path))
             world = validate(parse_yaml(found.text, found.source), World, found.source)
@@ -94,12 +97,6 @@ class Worlds:
                 raise RefusalError(Result.RESULT_NOT_FOUND, str(error)) from None
             code = codes.missing_assets if "no such file" in str(error) else codes.parse_error
             raise RefusalError(code, str(error)) from None
-
-    def _of_sdf(self, found: resources.Found, request: Any) -> World:
-        if found.path is None:
-            with file_of(found.text) as file:
-                return self._standing(file, "resource_string", request)
-        return self._standing(found.path, found.path.stem, request)
 
     def _standing(self, file: Path, name: str, request: Any) -> World:
         skip = bool(request.ignore_missing_or_unsupported_assets)
