@@ -21,7 +21,7 @@ from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCA
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.recording import topic_roles
 from nics_drl_bridge.recording.bag_file import BagFile, Message, opened
-from nics_drl_bridge.recording.messages import commanded, stamp, twist_row, whole_pose
+from nics_drl_bridge.recording.messages import commanded, gyro, stamp, twist_row, whole_pose
 
 SCAN_TYPE = "sensor_msgs/msg/LaserScan"
 TYPES: Mapping[str, tuple[str, ...]] = {
@@ -183,18 +183,15 @@ class Playback:
         return True
 
     def _pose(self, arrival_ns: int, message: Any) -> bool:
-        covariance = None
-        if hasattr(message.pose, "covariance"):
-            six = np.reshape(message.pose.covariance, (6, 6))
-            covariance = six[np.ix_([0, 1, 5], [0, 1, 5])]
+        covariance = getattr(message.pose, "covariance", None)
+        if covariance is not None:
+            covariance = np.reshape(covariance, (6, 6))[np.ix_([0, 1, 5], [0, 1, 5])]
         return self.middleware.pose(stamp(message), arrival_ns, whole_pose(message), covariance)
 
     def _imu(self, arrival_ns: int, message: Any) -> bool:
-        covariance = message.angular_velocity_covariance
-        if covariance[0] == -1.0:
+        if (measured := gyro(message)) is None:
             return self.middleware.cache.reject(f"{IMU}: no angular velocity")
-        rate, variance = float(message.angular_velocity.z), float(covariance[8])
-        return self.middleware.imu(stamp(message), arrival_ns, rate, variance)
+        return self.middleware.imu(stamp(message), arrival_ns, *measured)
 
 
 def in_order(messages: Mapping[str, list[Message]]) -> Iterator[tuple[str, Message]]:

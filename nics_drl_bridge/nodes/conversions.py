@@ -16,7 +16,7 @@ from geometry_msgs import msg as geometry
 from nav_msgs.msg import OccupancyGrid, Odometry
 from numpy.typing import ArrayLike, NDArray
 from rclpy.serialization import deserialize_message
-from sensor_msgs.msg import Imu, JointState, LaserScan
+from sensor_msgs.msg import JointState, LaserScan
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import NS_PER_S, Array
@@ -178,14 +178,6 @@ def map_from_ros(message: OccupancyGrid) -> GridMap:
     place, turn = info.origin.position, info.origin.orientation
     origin = place.x, place.y, heading_of(turn.x, turn.y, turn.z, turn.w)
     return GridMap(cells.reshape(info.height, info.width), float(info.resolution), origin)
-
-
-def imu_from_ros(message: Imu) -> tuple[float, float] | None:
-    """Returns yaw rate [rad/s] and its variance [rad^2/s^2]; None if no rates are measured."""
-    covariance = message.angular_velocity_covariance
-    if covariance[0] == -1.0:
-        return None
-    return float(message.angular_velocity.z), float(covariance[8])
 
 
 def joints_to_ros(spec: RobotSpec, state: ArrayLike, time_ns: int) -> JointState:

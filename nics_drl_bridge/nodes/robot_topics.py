@@ -25,6 +25,7 @@ from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.conversions import INITIAL_POSE, initial_pose
 from nics_drl_bridge.nodes.parameters import NO_POSE, POSE_TYPES, STAMPED, sensors
 from nics_drl_bridge.nodes.runner import declare_row
+from nics_drl_bridge.recording import messages
 
 TWIST, TWIST_STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 KINDS_OF_POSE = {each.__name__: each for each in (PoseStamped, PoseWithCovarianceStamped)}
@@ -165,7 +166,7 @@ class RobotTopics:
         return self.middleware.view(self.newest_ns)
 
     def _take_scan(self, message: LaserScan) -> None:
-        stamp = conversions.stamp_from_ros(message.header.stamp)
+        stamp = messages.stamp(message)
         if stamp < self._since_ns:
             return
         reader = self._reader_for(message)
@@ -198,7 +199,7 @@ class RobotTopics:
         return self._reader
 
     def _take_odometry(self, message: Odometry) -> None:
-        stamp = conversions.stamp_from_ros(message.header.stamp)
+        stamp = messages.stamp(message)
         pose, twist = conversions.odometry_from_ros(message)
         self.frames = message.header.frame_id, message.child_frame_id
         if not self._started and np.isfinite(pose).all():
@@ -212,24 +213,22 @@ class RobotTopics:
             self._on_odometry(stamp)
 
     def _take_pose(self, message: PoseStamped | PoseWithCovarianceStamped) -> None:
-        stamp = conversions.stamp_from_ros(message.header.stamp)
-        self.middleware.pose(stamp, self.now_ns(), *conversions.pose_from_ros(message))
+        measured = conversions.pose_from_ros(message)
+        self.middleware.pose(messages.stamp(message), self.now_ns(), *measured)
 
     def _take_imu(self, message: Imu) -> None:
-        stamp = conversions.stamp_from_ros(message.header.stamp)
-        if (measured := conversions.imu_from_ros(message)) is None:
+        if (measured := messages.gyro(message)) is None:
             self.middleware.cache.reject(f"{measurement.IMU}: no angular velocity")
         else:
-            self.middleware.imu(stamp, self.now_ns(), *measured)
+            self.middleware.imu(messages.stamp(message), self.now_ns(), *measured)
 
     def _take_reading(self, sensor: Sensor, message: Any) -> None:
-        stamp = conversions.stamp_from_ros(message.header.stamp)
         try:
             reading = sensor.read(message)
         except ValueError as error:
             self.middleware.cache.reject(f"{sensor.name}: {error}")
         else:
-            self.middleware.sense(sensor.name, stamp, self.now_ns(), reading)
+            self.middleware.sense(sensor.name, messages.stamp(message), self.now_ns(), reading)
 
     def _take_command(self, message: Twist | TwistStamped) -> None:
         self.middleware.command(None, self._robot.from_cmd_vel(conversions.twist_from_ros(message)))

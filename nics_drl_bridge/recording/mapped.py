@@ -9,26 +9,11 @@ import numpy as np
 
 from nics_drl_bridge.errors import ConfigError, RecordingError
 from nics_drl_bridge.geometry import Array, east_and_north, wrap_angle
+from nics_drl_bridge.recording import mapping as schema
+from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording import stamping
-from nics_drl_bridge.recording.mapping import (
-    COVARIANCES,
-    ROBOT_CLOCK,
-    SI,
-    UNITS,
-    Mapping,
-    Measured,
-    PoseSource,
-    Reference,
-    Value,
-)
-from nics_drl_bridge.recording.recording import (
-    W_FIRST,
-    Recording,
-    Stream,
-    check_streams,
-    implausible_pose,
-    w_first,
-)
+from nics_drl_bridge.recording.mapping import Mapping, Measured, PoseSource, Reference, Value
+from nics_drl_bridge.recording.recording import Recording, Stream, check_streams, implausible_pose
 from nics_drl_bridge.recording.table import Source
 from nics_drl_bridge.recording.values import MappedReader, Series, together, unit_of
 
@@ -60,7 +45,7 @@ def read_mapped(source: Source, mapping: Mapping) -> Recording:
     names, streams = (*mapping.state, *mapping.command), cast(Any, found)
     made = Recording(**streams, source=source.place, variables=names, latency=source.latency)
     check_streams(made, {"command": len(mapping.command), "state": len(mapping.state), "wheels": 2})
-    shifted: Any = _from_zero(found, mapping.clock or ROBOT_CLOCK, reader)
+    shifted: Any = _from_zero(found, mapping.clock or schema.ROBOT_CLOCK, reader)
     return replace(made, **shifted, repairs=tuple(reader.notes))
 
 
@@ -79,7 +64,7 @@ def _check_units(reader: MappedReader, pose: Stream) -> None:
 def _measured(reader: MappedReader, name: str, stream: Measured) -> Stream:
     """Reads a stream of measurements; values that it lacks are zero."""
     parts: list[Series | None] = []
-    for key, kinds in SI[name].items():
+    for key, kinds in schema.SI[name].items():
         value: Value | None = getattr(stream, key)
         if value is not None and value.unit is not None and unit_of(value).si not in kinds:
             fault = f"{name}.{key}: is in {unit_of(value).si}"
@@ -97,11 +82,11 @@ def read_pose(reader: MappedReader, pose: PoseSource) -> Stream:
     if pose.x is None:
         pose = _of_message(reader, pose)
     parts, factors, whole = [], [], list[Value]()
-    for key, kinds in SI["pose"].items():
+    for key, kinds in schema.SI["pose"].items():
         value: Value | None = getattr(pose, key)
         if value is None:
             parts.append(_heading(reader, pose, pose.quaternion or ""))
-            factors.append(UNITS[pose.heading_unit].factor)
+            factors.append(schema.UNITS[pose.heading_unit].factor)
             continue
         unit = value.unit or (pose.heading_unit if key == "heading" else pose.unit)
         value = value.model_copy(update={"unit": unit})
@@ -145,8 +130,8 @@ def _heading(reader: MappedReader, pose: PoseSource, given: str | Sequence[Refer
         where = f"{reader.source.place}: pose: {made.t[k] - made.t[0]:.3f} s from the start"
         fault = f"{where} the quaternion has the length {norm[k]:.3f} and not 1"
         raise RecordingError(f"{fault}; list its columns in the order x, y, z, w.")
-    if w_first(made.values):
-        raise RecordingError(f"{reader.source.place}: pose: {W_FIRST}.")
+    if recordings.w_first(made.values):
+        raise RecordingError(f"{reader.source.place}: pose: {recordings.W_FIRST}.")
     x, y, z, w = made.values.T
     tilt = np.degrees(np.median(np.arccos(np.clip(np.abs(1.0 - 2.0 * (x * x + y * y)), 0.0, 1.0))))
     if tilt > MOST_TILT_DEG:
@@ -189,12 +174,12 @@ def _deviations(
     if isinstance(given, str):
         table, which = reader.place(given, pose.in_)
         count = sum(name.startswith(f"{which}[") for name in table.names)
-        if count not in COVARIANCES:
+        if count not in schema.COVARIANCES:
             fault = f"{table.place}: {which!r} has {count} numbers"
             raise RecordingError(f"{fault}; a covariance has 3, 9 or 36.")
         given = [f"{given}[{k}]" for k in range(count)]
     columns = []
-    for k in COVARIANCES[len(given)]:
+    for k in schema.COVARIANCES[len(given)]:
         value = Value.model_validate({"from": given[k]})
         part = reader.series("pose.covariance", value, pose, held=False, infinite=True)
         positive = part.values > 0.0

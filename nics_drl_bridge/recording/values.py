@@ -13,17 +13,7 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.recording import mapping as schema
 from nics_drl_bridge.recording import stamping
-from nics_drl_bridge.recording.mapping import (
-    RATES,
-    ROBOT_CLOCK,
-    UNITS,
-    Mapping,
-    Measured,
-    Reference,
-    UnitOfData,
-    Value,
-    to_si,
-)
+from nics_drl_bridge.recording.mapping import Mapping, Measured, Reference, UnitOfData, Value
 from nics_drl_bridge.recording.recording import Stream, likely_unit
 from nics_drl_bridge.recording.table import Column, Source, Table, numbers_of
 
@@ -139,7 +129,7 @@ class MappedReader:
             fault = f"{table.place}: the stamps {time.columns[0]!r} are {usual}"
             advice = f"write `time: {{from: {time.columns[0]}, unit: {unit}}}` into the mapping"
             raise RecordingError(f"{fault}; {advice} (`unit: s` if they are).")
-        t, order, note = stamping.in_order(t * UNITS[time.unit or "s"].factor, name)
+        t, order, note = stamping.in_order(t * schema.UNITS[time.unit or "s"].factor, name)
         self.say(note)
         return Stamped(t, known[order], "", len(raw))
 
@@ -172,7 +162,7 @@ class MappedReader:
         table, which = self.place(value.from_, stream.in_)
         column, time = numbers_of(table, which), value.time or stream.time
         at = self.stamped(table, column, time)
-        clock = value.clock or stream.clock or self.mapping.clock or at.clock or ROBOT_CLOCK
+        clock = value.clock or stream.clock or self.mapping.clock or at.clock or schema.ROBOT_CLOCK
         raw = column[at.rows]
         for k in np.flatnonzero(np.isinf(raw) & (not infinite))[:1]:
             where = f"{table.place}: {table.row(int(at.rows[k]))}"
@@ -239,8 +229,8 @@ class MappedReader:
 def unit_of(value: Value) -> UnitOfData:
     """Returns the unit in SI and the factor of a value, of a counter those of its rate."""
     unit = value.unit or ("ticks" if value.ticks_per_turn else None)
-    si, factor = to_si(unit, value.ticks_per_turn) if unit else UnitOfData("", 1.0)
-    return UnitOfData(RATES.get(si, si) if value.counts else si, factor)
+    si, factor = schema.to_si(unit, value.ticks_per_turn) if unit else UnitOfData("", 1.0)
+    return UnitOfData(schema.RATES.get(si, si) if value.counts else si, factor)
 
 
 def _table_name(wanted: str, names: Sequence[str]) -> str | None:

@@ -161,8 +161,7 @@ def actuated(spec: RobotSpec) -> Textbook:
 
 def has_textbook(spec: RobotSpec) -> bool:
     """True if a robot's textbook kinematics are known, but maybe for a parameter."""
-    kind = None if spec.textbook is None else find_kind(spec.textbook)
-    return getattr(kind, "kinematics", None) is not None
+    return getattr(find_kind(spec.textbook or ""), "kinematics", None) is not None
 
 
 def _through_lags(spec: RobotSpec, book: Textbook) -> Textbook:
@@ -285,8 +284,7 @@ def commands_twist(spec: RobotSpec) -> bool:
 
 def slips(spec: RobotSpec) -> bool:
     """True if a robot's kind moves otherwise than the twist that is commanded."""
-    kind = None if spec.textbook is None else find_kind(spec.textbook)
-    return bool(getattr(kind, "slips", False))
+    return bool(getattr(find_kind(spec.textbook or ""), "slips", False))
 
 
 def steered(
