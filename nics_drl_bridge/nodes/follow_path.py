@@ -8,17 +8,18 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from builtin_interfaces.msg import Duration
 from nav_msgs.msg import OccupancyGrid
+from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.node import Node, NodeNameNonExistentError
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.interface import S_PER_NS, Array
+from nics_drl_bridge.interface import NS_PER_S, S_PER_NS, Array
 from nics_drl_bridge.lidar.maps import GridMap
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.nodes import conversions, qos, runner
-from nics_drl_bridge.nodes import held_action as held
 from nics_drl_bridge.nodes.device_parameters import number
 from nics_drl_bridge.nodes.goal_frames import GoalFrames
 from nics_drl_bridge.nodes.nav2_parameters import ControllerParameters, chosen
@@ -29,6 +30,7 @@ from nics_drl_bridge.recording.messages import pose_row
 
 FOLLOW, NAVIGATE = "follow_path", "navigate_to_pose"
 KINDS = {FOLLOW: "nav2_msgs/action/FollowPath", NAVIGATE: "nav2_msgs/action/NavigateToPose"}
+SUCCEED, ABORT, CANCELED = "succeed", "abort", "canceled"
 SPEED_LIMIT = "nav2_msgs/msg/SpeedLimit"
 LOOK_S = 2.0  # time between two looks for another server of `navigate_to_pose` [s]
 PATIENT_PERIODS = 10  # silence of this many control periods is no silence
@@ -51,12 +53,40 @@ class Wish(NamedTuple):
     touched: bool
 
 
+class HeldActionServer(ActionServer):
+    """Accepts goals while `open_` says so, and hands each to `begin`, until `finish` ends it.
+
+    None is waited for in a callback: rclpy polls what waits, in every turn of an executor.
+    """
+
+    def __init__(
+        self, node: Node, kind: Any, name: str, open_: Callable[[], bool],
+        begin: Callable[[Any], None],
+    ) -> None:  # fmt: skip
+        self._begin = begin
+        accept, reject = GoalResponse.ACCEPT, GoalResponse.REJECT
+        super().__init__(
+            node, kind, name, lambda _: None,
+            goal_callback=lambda _: accept if open_() else reject,
+            cancel_callback=lambda _: CancelResponse.ACCEPT,
+        )  # fmt: skip
+
+    def notify_execute(self, goal_handle: Any, execute_callback: Any) -> None:
+        """Holds an accepted goal, which counts as executing from now on; see rclpy."""
+        self._begin(goal_handle)
+
+    def finish(self, goal_handle: Any, end: str, result: Any) -> None:
+        """Ends a goal, by the name of a method of it, with a result."""
+        getattr(goal_handle, end)()
+        super().notify_execute(goal_handle, lambda _: result)
+
+
 class Goal(NamedTuple):
     """A goal that was accepted."""
 
     name: str  # of its action
     kind: Any  # its type
-    server: held.HeldActionServer
+    server: HeldActionServer
     handle: Any
 
     @property
@@ -97,7 +127,7 @@ class PathActions:
         self._limit = math.inf  # of the speed [m/s]
         self._period_s = model.control_period
         self._undo: list[Callable[[], Any]] = []
-        self._servers: dict[str, held.HeldActionServer] = {}
+        self._servers: dict[str, HeldActionServer] = {}
         self._kinds = {name: conversions.message_type(kind) for name, kind in KINDS.items()}
         if None in self._kinds.values():
             why = "the package nav2_msgs is not installed, so that its actions are not served"
@@ -122,7 +152,7 @@ class PathActions:
         def take(handle: Any) -> None:
             self._accept(Goal(name, kind, self._servers[name], handle), begin)
 
-        self._servers[name] = held.HeldActionServer(self._node, kind, name, self._open, take)
+        self._servers[name] = HeldActionServer(self._node, kind, name, self._open, take)
 
     def close(self) -> None:
         """Ends all goals and topics."""
@@ -190,9 +220,9 @@ class PathActions:
             if before is None or not np.array_equal(before.path.end, run.path.end):
                 self._anew()  # not where the same way is planned again
         except Refusal as refusal:
-            self._end(goal, held.ABORT, refusal.code, str(refusal))
+            self._end(goal, ABORT, refusal.code, str(refusal))
         if before is not None:
-            self._end(before.goal, held.ABORT, "UNKNOWN", "a newer goal has taken its place.")
+            self._end(before.goal, ABORT, "UNKNOWN", "a newer goal has taken its place.")
 
     def _follow(self, goal: Goal) -> Run:
         asked, names = goal.handle.request, []
@@ -286,7 +316,7 @@ class PathActions:
             return False
         if run.goal.handle.is_cancel_requested:
             self._run = None
-            self._end(run.goal, held.CANCELED, "NONE")
+            self._end(run.goal, CANCELED, "NONE")
             return True
         longest = number(self._node, "costmap_update_timeout")
         longest = max(longest, PATIENT_PERIODS * self._period_s)
@@ -298,7 +328,7 @@ class PathActions:
         if silent and time.monotonic() - run.valid_s > longest:
             self._run = None
             told = f"nothing on {' and '.join(silent)} for {longest:g} s."
-            self._end(run.goal, held.ABORT, "CONTROLLER_TIMED_OUT", told)
+            self._end(run.goal, ABORT, "CONTROLLER_TIMED_OUT", told)
             return True
         return False
 
@@ -310,7 +340,7 @@ class PathActions:
             return self._steer(run)
         except Refusal as refusal:
             self._run = None
-            self._end(run.goal, held.ABORT, refusal.code, str(refusal))
+            self._end(run.goal, ABORT, refusal.code, str(refusal))
             return np.zeros(3)
 
     def _steer(self, run: Run) -> Array:
@@ -319,7 +349,7 @@ class PathActions:
         turn = run.arrival.turn_left(place, robot, run.path.end)
         if turn == 0.0:
             self._run = None
-            self._end(run.goal, held.SUCCEED, "NONE")
+            self._end(run.goal, SUCCEED, "NONE")
             return np.zeros(3)
         now_s = self._topics.newest_ns * S_PER_NS
         if run.progress.stuck(now_s, robot):
@@ -359,8 +389,8 @@ class PathActions:
             "position_tracking_error": place.left, "heading_tracking_error": place.turned,
             "current_path_index": place.nearest, "remaining_path_length": place.remaining,
             "current_pose": pose, "distance_remaining": place.remaining, "header": pose.header,
-            "navigation_time": held.duration_to_ros(times[0]),
-            "estimated_time_remaining": held.duration_to_ros(times[1]),
+            "navigation_time": duration_to_ros(times[0]),
+            "estimated_time_remaining": duration_to_ros(times[1]),
         }  # fmt: skip
         feedback = run.goal.kind.Feedback()
         for part in (feedback, getattr(feedback, "tracking_feedback", None)):
@@ -372,14 +402,30 @@ class PathActions:
         """Aborts the goal, if there is one."""
         run, self._run = self._run, None
         if run is not None:
-            self._end(run.goal, held.ABORT, "UNKNOWN", f"{why}.")
+            self._end(run.goal, ABORT, "UNKNOWN", f"{why}.")
 
     def _end(self, goal: Goal, end: str, code: str, sentence: str = "") -> None:
         if goal.handle.is_cancel_requested:
-            end = held.CANCELED
-        if end == held.ABORT:
+            end = CANCELED
+        if end == ABORT:
             self._node.get_logger().warning(f"goal aborted: {sentence}")
         else:
-            told = "goal reached" if end == held.SUCCEED else "goal cancelled"
+            told = "goal reached" if end == SUCCEED else "goal cancelled"
             self._node.get_logger().info(told)
-        goal.server.finish(goal.handle, end, held.result_of(goal.kind, code, sentence))
+        goal.server.finish(goal.handle, end, result_of(goal.kind, code, sentence))
+
+
+def duration_to_ros(seconds: float) -> Duration:
+    """Returns seconds as a Duration."""
+    whole = int(seconds)
+    return Duration(sec=whole, nanosec=int((seconds - whole) * NS_PER_S))
+
+
+def result_of(kind: Any, code: str, sentence: str = "") -> Any:
+    """Returns an action's result; distributions differ in what it tells: nothing, code, or both."""
+    result = kind.Result()
+    if hasattr(result, "error_code"):
+        result.error_code = getattr(kind.Result, code, getattr(kind.Result, "UNKNOWN", 0))
+    if hasattr(result, "error_msg"):
+        result.error_msg = sentence
+    return result

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from nics_drl_bridge.env.mirror import mirrored_commands
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot.kinds import steady_twist
-from nics_drl_bridge.robot.mirror import mirrored_commands
 from nics_drl_bridge.robot.spec import load_robot, robot_from
 
 SIZE = {"footprint_radius": 0.2}

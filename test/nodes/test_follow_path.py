@@ -334,7 +334,7 @@ def test_a_policy_begins_anew_with_another_goal_and_not_with_another_way_to_it(t
 
 
 def test_results_of_distributions_without_codes_are_filled_as_far_as_they_go():
-    from nics_drl_bridge.nodes.held_action import result_of
+    from nics_drl_bridge.nodes.follow_path import result_of
 
     class Bare:
         class Result:
