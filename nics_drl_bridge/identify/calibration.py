@@ -110,16 +110,12 @@ def align(drive: Drive, calibration: Calibration) -> Samples:
     half_width = SMOOTHING_BURSTS * calibration.burst_period_s
     if not half_width and (calibration.position_noise_m or calibration.heading_noise_rad):
         half_width = SMOOTHING_S
-    t = drive.sample_t + calibration.clock_offset_s
-    tracked = resample(
-        t, unwrapped(recording.pose.values), grid, half_width, recording.pose.weights
-    )
     begin = grid - calibration.command_latency_s
     samples = samples_on_one_clock(
-        grid, calibration.to_base(tracked), states_at(drive, calibration, grid),
+        grid, poses_at(drive, calibration, grid, half_width), states_at(drive, calibration, grid),
         taken(recording.command, drive.spec, calibration.inputs, begin, begin + step),
     )  # fmt: skip
-    known = outside_gaps(samples.t, t, step)
+    known = outside_gaps(samples.t, drive.sample_t + calibration.clock_offset_s, step)
     if recording.state is not None:
         known &= outside_gaps(samples.t, recording.state.t, step, STATE_GAP, 0.0)
     return replace(samples.rows(known), dt=step)
@@ -132,12 +128,17 @@ def part_of(period: float, step: float) -> float:
     return step if abs(count - whole) < WHOLE else period / whole
 
 
+def poses_at(drive: Drive, calibration: Calibration, grid: Array, half_width: float) -> Array:
+    """Returns poses (T, 3) of `base_link` at times on the commands' clock, by a half-width [s]."""
+    t, pose = drive.sample_t + calibration.clock_offset_s, drive.recording.pose
+    return calibration.to_base(resample(t, unwrapped(pose.values), grid, half_width, pose.weights))
+
+
 def states_at(drive: Drive, calibration: Calibration, grid: Array) -> Array:
     """Returns states (T, S), measured or inferred, at uniform times (T,) on the commands' clock."""
     recording = drive.recording
     if recording.state is not None:
-        columns = recording.state.values.T
-        states = [np.interp(grid, recording.state.t, c) for c in columns]
+        states = [np.interp(grid, recording.state.t, c) for c in recording.state.values.T]
         return np.stack(states, axis=-1) if states else np.zeros((*grid.shape, 0))
     lags = np.array([r.lag_s for r in calibration.responses])
     gains = np.array([r.gain for r in calibration.responses])

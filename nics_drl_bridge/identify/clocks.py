@@ -277,8 +277,7 @@ def responses_of(
     gains, speed = np.ones(len(spec.state)), signals.speed_index(spec)
     moved = signals.moved_inputs(drive.recording.command, spec)
     if speed is not None and expected is not None and moved[speed]:
-        along = speed_along(drive, calibration)
-        gains[speed] = float(expected @ along / (expected @ expected))
+        gains[speed] = float(expected @ speed_along(drive, calibration) / (expected @ expected))
     return tuple(
         Response(v.name, str(v.follows), float(lag), float(gain))
         for v, lag, gain in zip(spec.state, timing.lags, gains, strict=True)

@@ -109,8 +109,7 @@ class Drive:
         t, pose = t[::stride], pose[::stride]
         span = np.diff(t)
         usable = (span > 0.0) & (span < max(limit, 3.0 * float(np.median(span))))
-        relative = geometry.between(pose[:-1], pose[1:])[usable]
-        twist = geometry.log(relative) / span[usable, None]
+        twist = geometry.log(geometry.between(pose[:-1], pose[1:])[usable]) / span[usable, None]
         return TwistIntervals(t[:-1][usable], t[1:][usable], twist)
 
 

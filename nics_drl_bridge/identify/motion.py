@@ -8,9 +8,9 @@ from scipy.signal import savgol_filter
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.identify.calibration import Calibration, outside_gaps
+from nics_drl_bridge.identify.calibration import Calibration, outside_gaps, poses_at
 from nics_drl_bridge.identify.drive import Drive
-from nics_drl_bridge.identify.signals import inferred_states, resample, taken, unwrapped
+from nics_drl_bridge.identify.signals import inferred_states, taken, unwrapped
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream, samples_on_one_clock
 from nics_drl_bridge.robot.spec import POSE_RATES, CommandVariable, RobotSpec, StateVariable
 
@@ -49,11 +49,7 @@ def with_motion(drive: Drive, calibration: Calibration, grid: Array, width: floa
     states that follow a command do so with the calibration's lags.
     """
     recording, spec, step = drive.recording, drive.spec, float(grid[1] - grid[0])
-    t = drive.sample_t + calibration.clock_offset_s
-    tracked = resample(
-        t, unwrapped(recording.pose.values), grid, 0.5 * width, recording.pose.weights
-    )
-    pose = unwrapped(calibration.to_base(tracked))
+    pose = unwrapped(poses_at(drive, calibration, grid, 0.5 * width))
     rows = 2 * max(2, round(width / step)) + 1
     rates = savgol_filter(pose, rows, 2, deriv=1, delta=step, axis=0)
     twist = np.concatenate([geometry.rotate(rates[:, :2], -pose[:, 2]), rates[:, 2:]], axis=1)
@@ -87,14 +83,12 @@ def samples_of(drive: Drive, calibration: Calibration, width: float) -> Samples:
     state, spec = known_state(drive), drive.spec
     grid = state.t
     step = round(float(grid[-1] - grid[0]) / (len(grid) - 1), 9)
-    t = drive.sample_t + calibration.clock_offset_s
-    tracked = resample(
-        t, unwrapped(drive.recording.pose.values), grid, 0.5 * width, drive.recording.pose.weights
-    )
+    pose = poses_at(drive, calibration, grid, 0.5 * width)
     begin = grid - calibration.command_latency_s
     command = taken(drive.recording.command, spec, calibration.inputs, begin, begin + step)
-    samples = samples_on_one_clock(grid, calibration.to_base(tracked), state.values, command)
-    return replace(samples.rows(outside_gaps(samples.t, t, step)), dt=step)
+    samples = samples_on_one_clock(grid, pose, state.values, command)
+    known = outside_gaps(samples.t, drive.sample_t + calibration.clock_offset_s, step)
+    return replace(samples.rows(known), dt=step)
 
 
 def known_state(drive: Drive) -> Stream:

@@ -103,8 +103,7 @@ def _by_one_rollout(
     grid = start.min() + model.dt * np.arange(-lead, (end.max() - start.min()) / model.dt + 2.0)
     begin = grid - calibration.command_latency_s
     command = taken(recording.command, spec, model.inputs, begin, begin + model.dt)
-    gains = np.array([r.gain for r in calibration.responses])
-    state = gains * command[0, followed(spec)]
+    state = np.array([r.gain for r in calibration.responses]) * command[0, followed(spec)]
     path = _roll(model, state[None], command[None])[0][0, :-1]
     at = [np.stack([np.interp(t, grid, column) for column in path.T], axis=1) for t in (start, end)]
     return geometry.between(at[0], at[1])
@@ -117,8 +116,7 @@ def _from_measured_states(
     start, end = (t + calibration.clock_offset_s for t in (chosen.start_t, chosen.end_t))
     steps = int(np.ceil(float((end - start).max()) / model.dt - 1e-6)) + 1
     begin = start[:, None] + model.dt * np.arange(steps) - calibration.command_latency_s
-    sent = drive.recording.command
-    command = taken(sent, drive.spec, model.inputs, begin, begin + model.dt)
+    command = taken(drive.recording.command, drive.spec, model.inputs, begin, begin + model.dt)
     poses, states = _roll(model, states_at(drive, calibration, start), command)
     exact = (end - start) / model.dt
     step = np.floor(exact + 1e-6).astype(np.intp)
@@ -169,8 +167,7 @@ def course_of(
 ) -> Course:
     """Returns the course of X over windows, each started from its measured state."""
     states, command, steps, share = _from_measured_states(model, calibration, drive, chosen)[1:]
-    ones = np.ones((*command.shape[:2], 1))
-    x = np.concatenate([states[:, :-1], command, ones], axis=2)
+    x = np.concatenate([states[:, :-1], command, np.ones((*command.shape[:2], 1))], axis=2)
     return Course(chosen, np.ascontiguousarray(x), steps, share)
 
 

@@ -178,8 +178,7 @@ def prediction_slopes(
         slope[:, 2] *= HEADING_ARM_M
         slope *= _scale(problem, course.chosen)[..., None]
         parts.append(slope.reshape(-1, slope.shape[2]))
-    slopes = np.nan_to_num(np.concatenate(parts), nan=0.0)
-    return np.clip(slopes, -STEEPEST, STEEPEST)
+    return np.clip(np.nan_to_num(np.concatenate(parts), nan=0.0), -STEEPEST, STEEPEST)
 
 
 @dataclass(frozen=True)

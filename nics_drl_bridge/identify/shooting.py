@@ -104,8 +104,7 @@ class Shooting:
 
     def paths(self, first: Rows, steps: Rows) -> Array:
         """Returns the lengths (W, H) of the measured paths over windows [m]."""
-        step = np.hypot(*np.diff(self.samples.q[:, :2], axis=0).T)
-        length = np.append(0.0, np.cumsum(step))
+        length = np.append(0.0, np.cumsum(np.hypot(*np.diff(self.samples.q[:, :2], axis=0).T)))
         return np.asarray(length[first[:, None] + steps] - length[first][:, None])
 
     def predict(

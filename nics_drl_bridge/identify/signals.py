@@ -168,8 +168,7 @@ def resample(
     inside = (index < high[:, None]) & (index < len(t))
     index = np.minimum(index, len(t) - 1)
     weight = inside[..., None] * weights[index]
-    tau = (t[index] - at[:, None]) / half_width
-    basis = tau[..., None] ** np.arange(3)
+    basis = ((t[index] - at[:, None]) / half_width)[..., None] ** np.arange(3)
     normal = np.einsum("nki,nkd,nkj->ndij", basis, weight, basis) + 1e-9 * np.eye(3)
     right = np.einsum("nki,nkd,nkd->ndi", basis, weight, pose[index] - pose[low][:, None])
     return np.asarray(np.linalg.solve(normal, right[..., None])[:, :, 0, 0] + pose[low])

@@ -111,8 +111,7 @@ def correlation_reach(residual: Array) -> int:
         return usual
     longest = max(usual, int(LONGEST * count))
     size = 1 << (2 * count - 1).bit_length()
-    spectrum = np.abs(np.fft.rfft(rest, size)) ** 2
-    alike = np.fft.irfft(spectrum, size)[1 : longest + 1] / power
+    alike = np.fft.irfft(np.abs(np.fft.rfft(rest, size)) ** 2, size)[1 : longest + 1] / power
     unlike = np.flatnonzero(alike < UNLIKE)
     apart = int(unlike[0]) + 1 if len(unlike) else longest
     return min(max(usual, 2 * apart), longest, count - 1)

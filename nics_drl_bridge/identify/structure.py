@@ -28,8 +28,7 @@ def structures(
 
     `unmoved` variables hold nothing but noise; `tried` is the greatest order that was tried.
     """
-    every = np.arange(len(samples.t)) % (1 + len(samples.t) // ROWS) == 0
-    samples = samples.rows(every)
+    samples = samples.rows(np.arange(len(samples.t)) % (1 + len(samples.t) // ROWS) == 0)
     block = np.floor((samples.t - samples.t[0]) / BLOCK_S).astype(np.intp)
     x, moved = samples.x, np.ptp(samples.x, axis=0) > 0.0
     moved &= [name not in unmoved for name in model.variables]

@@ -262,8 +262,7 @@ def with_quality(
 
     figures: dict[str, Any] = {"held_out_rmse": {}, "held_out_r2": {}, "judgement": judgement}
     if unseen is not None:
-        believed = unseen.rows(plausible(unseen.x, spec))
-        errors = map(by_dof, errors_of(model, believed))
+        errors = map(by_dof, errors_of(model, unseen.rows(plausible(unseen.x, spec))))
         figures |= zip(("held_out_rmse", "held_out_r2"), errors, strict=True)
     if held_out is not None:
         figures |= {

@@ -16,7 +16,6 @@ OUTLIER = 0.3  # greatest allowed error of any beam [m]
 DEVIATIONS = 2.0  # safety margin on the squared error, in standard deviations: rare beams dominate
 SLANT = np.radians(1.5)  # between line of sight and edge at most, in the search for outliers [rad]
 NARROWEST = 0.1  # least interval of looked-up distances, as a share of the lidar's range
-NO_WALLS = np.zeros((0, 4))
 
 
 def lookup_distances(
@@ -82,7 +81,7 @@ def _scans(bodies: Array, exact: LidarArrays, baked: LidarArrays) -> tuple[Array
     scans = np.empty((2, PLACES, 1, directions.shape[1]), np.float32)
     worlds, lanes = np.arange(PLACES), scan_kernels.scan_lanes()
     cells, nothing = body_cells(0, bodies.shape[1]), np.zeros(PLACES, np.int64)
-    around = stack_fixtures([NO_WALLS], [None], nothing)
+    around = stack_fixtures([np.zeros((0, 4))], [None], nothing)
     for ranges, sensor in zip(scans, (exact, baked), strict=True):
         scan_kernels.scan_worlds(ranges, robots, worlds, bodies, -1, around, sensor, cells, lanes)
     one, other = scans[:, :, 0].astype(np.float64)

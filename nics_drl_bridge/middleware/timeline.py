@@ -20,7 +20,6 @@ HISTORY_NS = NS_PER_S  # Length of the past that may still change [ns]
 BEFORE_START = "not after the reset"
 TOO_OLD = f"older than {HISTORY_NS / NS_PER_S:g} s"
 DUPLICATE = "duplicate"
-NO_STAMP = "stamp is no number"
 FUTURE_NS = NS_PER_S  # By which a stamp may be early [ns], or two control periods if longer
 CLOCK_JUMP = 10  # Odometries rejected in a row for their stamps that show that a clock was set
 NEAR_NS = HISTORY_NS + 2 * NS_PER_S  # Stamps farther back [ns] are all rejected, see `Stamps`
@@ -145,7 +144,7 @@ class Stamps:
         try:
             index(stamp_ns)
         except TypeError:
-            return NO_STAMP
+            return "stamp is no number"
         if arrival_ns is None or self._stamp_ns is None:
             return ""
         latest_ns = self._stamp_ns + self._tolerance_ns

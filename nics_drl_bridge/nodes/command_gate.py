@@ -73,8 +73,7 @@ def declare_black_box(node: Node) -> Path:
     given = str(runner.declare_row(node, parameters.BLACK_BOX))
     home = Path(os.environ.get("ROS_HOME") or Path.home() / ".ros")
     # So that no gate of another namespace removes its files.
-    namespace = str(node.get_namespace()).strip("/")
-    return (Path(given) if given else home / "black_box") / namespace
+    return (Path(given) if given else home / "black_box") / str(node.get_namespace()).strip("/")
 
 
 def _declare_shield(

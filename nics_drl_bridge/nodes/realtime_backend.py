@@ -20,7 +20,6 @@ from nics_drl_bridge.nodes.robot_topics import RobotTopics, data_facts, declare_
 from nics_drl_bridge.nodes.runner import holds
 from nics_drl_bridge.sim.world_set import AnyWorld
 
-RAW = "cmd_vel_raw"
 POLL_S, SAY_EVERY_S = 0.01, 2.0
 SERVICES_S = 0.5  # a peer that shows no services this long after its topics is a vehicle [s]
 COMMAND_S, PERIODS = 0.5, 2  # least time and periods that a command lasts; then a zero follows
@@ -56,7 +55,7 @@ class RealtimeOptions(Schema):
     @property
     def gated(self) -> bool:
         """True if commands pass a `command_gate`."""
-        return self.command_topic.rsplit("/", 1)[-1] == RAW
+        return self.command_topic.rsplit("/", 1)[-1] == "cmd_vel_raw"
 
 
 class RealtimeBackend:

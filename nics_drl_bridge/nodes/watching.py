@@ -78,8 +78,7 @@ class RosSource:
     def _take_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             if status.name.endswith(GATE):
-                fine = status.level in (DiagnosticStatus.OK, 0)
-                self._gate = "" if fine else status.message
+                self._gate = "" if status.level in (DiagnosticStatus.OK, 0) else status.message
 
     def stage(self) -> Stage:
         """See `show.FrameSource`."""

@@ -57,8 +57,7 @@ class PlannedPath:
             raise ConfigError("the path is empty; give one with at least one pose.")
         if not (np.abs(poses) < FARTHEST).all():
             raise ConfigError("the path has a coordinate that is no number, or out of all reach.")
-        steps = np.hypot(*np.diff(poses[:, :2], axis=0).T)
-        along = np.concatenate([[0.0], np.cumsum(steps)])
+        along = np.append(0.0, np.cumsum(np.hypot(*np.diff(poses[:, :2], axis=0).T)))
         if along[-1] > LONGEST:
             raise ConfigError(f"the path has {along[-1]:.3g} m, and {LONGEST:g} m are the most.")
         count = max(1, math.ceil(along[-1] / SPACING)) + 1

@@ -353,8 +353,7 @@ class Composer:
     def _chosen(self, choices: foreign_mapping.Choices) -> str:
         """The command by the greatest element of an output, or by a whole number."""
         build, robot = self._build, self._task.robot
-        known = {name: 0.0 for row in choices.commands for name in row}
-        names = self._names(known, "choices")
+        names = self._names({name: 0.0 for row in choices.commands for name in row}, "choices")
         rows = np.array([[row.get(name, 0.0) for name in names] for row in choices.commands])
         size = self._output_size(choices.of)
         kind = self._network.outputs[choices.of].type.tensor_type.elem_type

@@ -171,8 +171,7 @@ class Bundle:
             for key, entry in head.items():
                 if key != "__metadata__":
                     begin, end = entry["data_offsets"]
-                    part = data[8 + size :][begin:end]
-                    values = np.frombuffer(part, kinds[entry["dtype"]])
+                    values = np.frombuffer(data[8 + size :][begin:end], kinds[entry["dtype"]])
                     found[key] = tuple(values.astype(float).tolist())
         except (struct.error, ValueError, KeyError, TypeError, AttributeError):
             reason = f"{name!r} is no file of safetensors with numbers; export the bundle anew."

@@ -24,7 +24,6 @@ from nics_drl_bridge.robot.kinds import steady_twist
 from nics_drl_bridge.robot.taylor import TaylorModel
 from nics_drl_bridge.threads import run_parts
 
-Sense = tuple[ScanRays, FootprintDiscs, Clearance]
 SETTLED_S = 3.0  # after which a held command has led to its state
 LONGEST_STOP_S = 10.0  # for which a stop is looked at
 FINEST = 0.25  # share of a lag that a step of the roll-outs may take
@@ -116,7 +115,7 @@ class Mppi:
         )  # fmt: skip
 
     @cached_property
-    def _sense(self) -> Sense:
+    def _sense(self) -> tuple[ScanRays, FootprintDiscs, Clearance]:
         return rays_of(self.task), outline_of(self.task.robot), self.clearance
 
     @cached_property
@@ -147,8 +146,7 @@ class Mppi:
 
     @cached_property
     def _sampling(self) -> kernels.Sampling:
-        shape = self.samples, self.knots, len(self.task.robot.command)
-        offers, noise = np.empty((2, *shape))
+        offers, noise = np.empty((2, self.samples, self.knots, len(self.task.robot.command)))
         low, high = self.task.command_limits
         rest = 2.0 * (still(self.task.robot) - low) / (high - low) - 1.0
         kernels.draw(offers, noise, rest, self.seed)

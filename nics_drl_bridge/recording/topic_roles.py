@@ -14,7 +14,6 @@ from nics_drl_bridge.errors import ConfigError, RecordingError, nearest
 Stamps = Literal["auto", "header", "receive"]
 NONE = "none"
 ROLES = ("cmd_vel", "pose", "odom", "joint_states", "imu")
-REQUIRED = "cmd_vel"
 MOST_LISTED = 20  # maximum number of topics listed in an error
 TWIST, TWIST_STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 ACKERMANN = "ackermann_msgs/msg/AckermannDrive"
@@ -137,7 +136,7 @@ class _Topics:
         for pattern in USUAL[role]:
             found = [topic for topic in full if re.search(pattern, topic)]
             if len(found) > 1:
-                without = "" if role == REQUIRED else f", or {role}={NONE} for none"
+                without = "" if role == "cmd_vel" else f", or {role}={NONE} for none"
                 several = ", ".join(f"{t} ({self.types[t]})" for t in found)
                 fault = f"{self.place}: each of several topics could be {role}: {several}"
                 raise RecordingError(f"{fault}; say which with --topic {role}={found[0]}{without}.")

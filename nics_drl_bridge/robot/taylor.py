@@ -56,8 +56,7 @@ class TaylorModel:
             none = np.zeros((self.state_size, len(self.variables) - self.state_size))
             object.__setattr__(self, "back_emf", none)
         if not self.limits.size:
-            unlimited = np.tile([-np.inf, np.inf], (self.state_size, 1))
-            object.__setattr__(self, "limits", unlimited)
+            object.__setattr__(self, "limits", np.tile([-np.inf, np.inf], (self.state_size, 1)))
 
     @property
     def state_size(self) -> int:
@@ -161,8 +160,7 @@ class TaylorModel:
         if d < 0:
             return ""
         friction, drag, name = self.friction[d], self.drag[d], self.variables[d]
-        shown = self.shown_names[self.state_size :]
-        emf = zip(self.back_emf[d].tolist(), shown, strict=True)
+        emf = zip(self.back_emf[d].tolist(), self.shown_names[self.state_size :], strict=True)
         less = "".join(f", less {k:.4g}*{name}*|{command}|" for k, command in emf if k)
         less += f", less {drag:.4g}*{name}*|{name}|" if drag else ""
         less += f", less dry friction of {friction:.4g}" if friction else ""

@@ -25,7 +25,6 @@ REACH = 10.0  # twist that a robot may be given, as a multiple of its greatest c
 CORNERS = 32  # of the outline that stands for a circle
 
 # Makes the simulator of a world for a number of robots.
-Make = Callable[[AnyWorld, int], FastSimulator]
 
 
 class UnknownEntityError(BridgeError):
@@ -63,7 +62,7 @@ class Entities:
     device: DeviceWorld
     world: AnyWorld
     robots: tuple[str, ...]  # names of those that the simulator began with
-    make: Make
+    make: Callable[[AnyWorld, int], FastSimulator]
     removed: set[int] = field(default_factory=set)  # slots of the world's own obstacles
     spawned: dict[str, Entity] = field(default_factory=dict)
 

@@ -111,13 +111,11 @@ def _fill(made: GridMap, shape: Shape, pose: Array) -> None:
         return
     box = made.cells[low[0] : high[0], low[1] : high[1]]
     middles = made.cell_to_world(np.moveaxis(np.indices(box.shape), 0, -1) + low)
-    local = rotate(middles - pose[:2], -pose[2])
-    inside = _inside(shape, local)
+    inside = _inside(shape, rotate(middles - pose[:2], -pose[2]))
     box[inside] = OCCUPIED
     if len(shape.outline):
         edge = _along(np.concatenate([shape.outline, shape.outline[:1]]), made.resolution)
-        points = pose[:2] + rotate(edge, pose[2])
-        at = made.world_to_cell(points) - low
+        at = made.world_to_cell(pose[:2] + rotate(edge, pose[2])) - low
         kept = ((at >= 0) & (at < box.shape)).all(axis=-1)
         seen = ndimage.maximum_filter(inside, 3)
         thin = at[kept][~seen[at[kept][:, 0], at[kept][:, 1]]]

@@ -143,8 +143,7 @@ def _of_cylinder(body: Cylinder, pose: Array, up: float) -> _Cut:
 def _of_capsule(body: Capsule, pose: Array, up: float) -> _Cut:
     if _axis(pose) != 2:
         raise ShapelessError("a capsule that leans or lies")
-    beyond = max(abs(up) - body.length / 2.0, 0.0)
-    return _disc(pose, body.radius**2 - beyond**2)
+    return _disc(pose, body.radius**2 - max(abs(up) - body.length / 2.0, 0.0) ** 2)
 
 
 def _of_box(box: Box, pose: Array, up: float) -> _Cut:

@@ -97,8 +97,7 @@ def _check_speed(model: TaylorModel, robot: RobotSpec, world: AnyWorld) -> None:
     first = len(robot.state)
     most = np.maximum(np.abs(model.low), np.abs(model.high))
     ends = model.in_effect([robot.command_low, robot.command_high])
-    limits = np.abs(ends).max(axis=0)
-    most[first:] = np.maximum(most[first:], limits)
+    most[first:] = np.maximum(most[first:], np.abs(ends).max(axis=0))
     products = np.prod(most**model.powers, axis=1)
     step = float((np.abs(model.coefficients[:2]) @ products).max() * model.dt)
     sides = np.array([member.extent for member in world.members]).reshape(-1, 2, 2)
@@ -110,8 +109,7 @@ def _check_speed(model: TaylorModel, robot: RobotSpec, world: AnyWorld) -> None:
 
 def _check_memory(model: SimulatorModel, world: AnyWorld, worlds: int, robots: int) -> None:
     """Raises ConfigError for more copies of a world than fit in memory, before any allocation."""
-    counts = (sum(group.counts[1] for group in one.obstacles) for one in world.members)
-    obstacles = max(counts)
+    obstacles = max(sum(group.counts[1] for group in one.obstacles) for one in world.members)
     each = robots * (model.lidar.beams + PER_BODY) + obstacles * PER_BODY
     if robots > MOST_ROBOTS or worlds * each > MOST_NUMBERS:
         raise ConfigError(

@@ -112,9 +112,7 @@ def place_of(model: SimulatorModel, shots: list[Snapshot]) -> World:
     poses = np.concatenate([shot.poses[:, :2] for shot in shots])
     some = shots[:: max(1, len(shots) // 50)]
     seen = [hits_of(model.lidar, shot.poses[0], shot.ranges[0]) for shot in some]
-    points = np.concatenate([poses, *seen])
-    ends = np.percentile(points, [100.0 - WITHIN, WITHIN], axis=0)
+    ends = np.percentile(np.concatenate([poses, *seen]), [100.0 - WITHIN, WITHIN], axis=0)
     low = np.minimum(ends[0], poses.min(axis=0)) - MARGIN_M
     high = np.maximum(ends[1], poses.max(axis=0)) + MARGIN_M
-    bounds = (*low.tolist(), *high.tolist())
-    return World(name="bag", bounds=bounds, goal_distance=(0.0, 1.0))
+    return World(name="bag", bounds=(*low.tolist(), *high.tolist()), goal_distance=(0.0, 1.0))

@@ -198,8 +198,7 @@ class EpisodeSource:
         """Advances all worlds by one control period; see `show.FrameSource`."""
         held = time.monotonic() - self._asked_s < HELD_S
         command = self._command if held else 0.0 * self._command
-        given = command if self._by_hand else None
-        changed = [lane.advance(given) for lane in self.lanes]
+        changed = [lane.advance(command if self._by_hand else None) for lane in self.lanes]
         return any(changed)
 
     def take(self, request: Request) -> bool:

@@ -19,7 +19,6 @@ STORAGES = ("mcap", "sqlite3")
 TASK = "Drive to the goal without touching anything."
 BagArgument = Annotated[Path, Argument(help="Folder or file of a rosbag2.")]
 StorageOption = Annotated[str, Option(help="mcap (checksums) or sqlite3.", metavar="mcap|sqlite3")]
-NamespaceOption = Annotated[str, Option(help="Namespace of the robot's topics.")]
 
 
 @bag.command()
@@ -27,7 +26,7 @@ def record(
     out: Annotated[Path, Argument(help="Folder of the bag to write.")],
     topics: Annotated[list[str] | None, Option(help="A topic to record; repeatable.")] = None,
     everything: Annotated[bool, Option("--all", help="Record every topic.")] = False,
-    namespace: NamespaceOption = "",
+    namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
     duration: Annotated[float | None, Option(min=0.0,
         help="Stop after so long [s]; else at Ctrl-C.")] = None,
     storage: StorageOption = "mcap",

@@ -115,7 +115,6 @@ class Region:
         if not self._sphere:
             return bool(low <= HEIGHT and high >= 0.0 and overlap(self._corners, outline))
         x, y, z = self._points[0]
-        above = max(-z, z - HEIGHT, 0.0)
-        room = self._points[1, 0] ** 2 - above**2
+        room = self._points[1, 0] ** 2 - max(-z, z - HEIGHT, 0.0) ** 2
         apart = -float(geometry.depths(np.array([[x, y]]), outline)[0])  # below 0 inside
         return bool(room >= 0.0 and apart <= math.sqrt(room))
