@@ -194,7 +194,7 @@ def evaluate(order: EvaluationOrder, say: Say, tell: Tell) -> list[Evaluated]:
             given = place, policy, name, order.world, seeds, logs
             runs[place] = drive_in(*given, on_episode, say, under)
         evaluated.append(judged(policy, runs, model, world, order.out, PANELS, order.policies))
-    write_evaluation(replace(order, conditions=under), name, model, evaluated)
+        write_evaluation(replace(order, conditions=under), name, model, evaluated)
     return evaluated
 
 

@@ -218,19 +218,20 @@ def _timing_of_two_clocks(recording: Recording, spec: RobotSpec, target: Target)
 
 def _timing_of_measured_state(drive: Drive, state: Stream) -> TimingEstimate:
     recording, twists = drive.recording, drive.twists
-    sigma, latency, offset = {}, 0.0, 0.0
+    sigma, latency, offset, early = {}, 0.0, 0.0, 0.0
     separated = bool(signals.moved_commands(recording.command).any())
     if separated:
         found = _search_or_zero(state_residual(recording.command, state, drive.spec))
         sigma["command_latency_s"] = found.sigma
         least = 0.05 * float(np.median(np.diff(state.t)))
         latency = if_certain(max(found.value, 0.0), found.sigma, least)
+        early = if_certain(max(-found.value, 0.0), found.sigma, MIN_EARLY_S)
     if recording.pose.clock != state.clock:
         by_shift = residual_by_shift(state, (twists.start, twists.end, twists.twist))
         delay = _search_or_zero(by_shift, _likely_shifts(recording))
         sigma["clock_offset_s"] = delay.sigma
         offset = -if_certain(delay.value, delay.sigma, MIN_TIME_S)
-    return TimingEstimate(offset, latency, sigma, np.zeros(0), np.zeros(0), separated)
+    return TimingEstimate(offset, latency, sigma, np.zeros(0), np.zeros(0), separated, early)
 
 
 def _likely_shifts(recording: Recording) -> tuple[float, ...]:

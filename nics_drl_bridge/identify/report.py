@@ -11,7 +11,7 @@ from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.fit import Alpha
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.statistics import Curve
-from nics_drl_bridge.identify.verdict import FAR_OFF
+from nics_drl_bridge.identify.verdict import EARLY, FAR_OFF
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.robot.taylor import EndErrors, HorizonErrors, TaylorModel
 
@@ -325,6 +325,8 @@ def _suspicion(identified: Identified, spec: RobotSpec) -> str:
     if identified.alpha != "auto" or identified.drive.settings.order == 1:
         return "it may lack terms, so leave order and alpha at `auto`"
     for note in identified.notes:
+        if note.startswith(EARLY):
+            return f"{note[0].lower()}{note[1:].rstrip('.')}"
         if note.startswith("pose: jumps "):
             return f"its pose {note.removeprefix('pose: ').partition(';')[0]}, so record anew"
     got = "that nothing held the robot up, that it got each command, that its pose did not jump"

@@ -30,6 +30,7 @@ UNEXPLAINED = 0.5
 WORSE = 1.25  # times the trial's error on the part that both know; a refit beyond is not believed
 MANY_OUTLIERS = 0.001
 LINEAR = "Predictions by terms of a higher order ran away, so the model has those of order 1 alone."
+EARLY = "The robot moves"  # begins a note on motion before its commands
 MIRRORED = -0.5  # correlation of yaw rate and steering below which the robot turns the wrong way
 
 
@@ -62,8 +63,10 @@ def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate)
         finding = "Pose and commands are stamped by different clocks"
         yield f"{finding}: {offset} added to the pose's stamps gives the commands' clock."
     if timing.early > 0.0 and calibration.command_latency_s <= 0.0:
-        finding = f"The robot moves {timing.early:.2f} s before its commands"
+        finding = f"{EARLY} {timing.early:.2f} s before its commands"
         cause = "the pose is stamped by another clock; give it a `clock:` of its own in the mapping"
+        if recording.state is not None:
+            cause = "its state is stamped by another clock; stamp both by one, and record anew"
         yield f"{finding}: {cause}."
     if not moved_commands(recording.command).any():
         yield Gap("No command ever changed, so clock offset and latency could not be learnt.")

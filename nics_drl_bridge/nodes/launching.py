@@ -5,7 +5,6 @@ An argument that is left empty leaves what the file of parameters says.
 
 import re
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from ament_index_python.packages import get_packages_with_prefixes
@@ -25,6 +24,10 @@ TRANSFORMS = ("/tf", "/tf_static")
 # RViz names topics absolutely; here they are those of the robot's namespace.
 SHOWN = ("scan", "odom", "odometry/filtered", "ground_truth", "goal_pose", "robot_description")
 
+FLAGS = (
+    "autostart", "e_stop_required", "rviz", "stamped", "use_robot_state_pub", "use_rviz",
+    "use_sim_time",
+)  # fmt: skip
 Values = dict[str, str]  # of the launch arguments
 Start = Callable[["Setup"], Iterator[Any]]
 
@@ -41,7 +44,7 @@ class Setup:
     """The request that launch arguments and the file of parameters make together."""
 
     def __init__(self, values: Values) -> None:
-        self.values = values
+        self.values = values | {name: flag_of(name, values.get(name, "")) for name in FLAGS}
         self._file = parse_yaml(read_text(file), file) if (file := self["params_file"]) else {}
         self.model = self["model"] or str(self._of_file("model", "") or MODEL.default)
         shipped = share_folder() / "urdf" / f"{self.model}.urdf"
@@ -82,7 +85,7 @@ class Setup:
     def description(self) -> str:
         """Returns the URDF of the robot."""
         if self.urdf:
-            return Path(self.urdf).read_text(encoding="utf-8")
+            return read_text(self.urdf)
         from nics_drl_bridge.robot.urdf import urdf_of
 
         lidar, further = self._opened.lidar, {s.frame: s.mount for s in self._opened.sensors}
@@ -119,6 +122,14 @@ def value(given: str, kind: Any = str) -> Any:
     return ParameterValue(TextSubstitution(text=given), value_type=kind) if given else None
 
 
+def flag_of(name: str, given: str) -> str:
+    """Returns `true` or `false` of an argument, or nothing if it was left empty. ConfigError."""
+    words = {"true": "true", "1": "true", "false": "false", "0": "false", "": ""}
+    if given.lower() not in words:  # refused here, before any node is started
+        raise ConfigError(f"launch argument {name!r} is {given!r}; give true or false.")
+    return words[given.lower()]
+
+
 def names_of(robots: Any) -> tuple[str, ...]:
     """Returns the namespaces of a fleet by a count or their list; none for one robot."""
     if not isinstance(robots, str):
@@ -130,6 +141,8 @@ def names_of(robots: Any) -> tuple[str, ...]:
             fix = "give a count from 1, or namespaces, as in robots:='[ant, bee]'"
             raise ConfigError(f"launch argument 'robots' is {count}; {fix}.")
         return tuple(f"robot{k + 1}" for k in range(count)) if count > 1 else ()
+    if twice := {word for word in words if words.count(word) > 1}:
+        raise ConfigError(f"launch argument 'robots' names {min(twice)!r} twice; name each once.")
     return tuple(words)
 
 

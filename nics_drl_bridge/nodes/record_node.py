@@ -232,6 +232,9 @@ class RecordNode(qos.QosWatch):
             if others > 0:
                 reason = f"{others} other publisher(s) would drive the robot too; end them, or"
                 raise BackendError(f"topic {topic!r}: {reason} remap the topic.")
+            if not self._sim_time and self.count_publishers("/clock"):
+                fix = "--use-sim-time takes the time of a simulator"
+                self.get_logger().warning(f"/clock is published, but not used; {fix}")
             self._start, self._origin_ns = self._pose, self._now_ns()
             return True
         if time.monotonic() - self._began > PATIENCE_S:

@@ -14,6 +14,7 @@ from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.guard import uninterrupted
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy.fallback import acted
 from nics_drl_bridge.policy.stateful import Policy, begin
@@ -87,7 +88,8 @@ def drive(
             goal = env.get_wrapper_attr("scene").goals[0]
         paths, estimates, total, ended = [info["start"]], [info["pose"]], 0.0, False
         while not ended:
-            observation, reward, terminated, truncated, info = env.step(policy.act(observation))
+            action = _answer(policy.act, observation, len(paths))
+            observation, reward, terminated, truncated, info = env.step(action)
             paths.append(info.get("true_pose", info["pose"]))
             estimates.append(info["pose"])
             total += float(reward)
@@ -111,6 +113,13 @@ def drive(
             with uninterrupted():
                 env.unwrapped.halt()
         raise
+
+
+def _answer(act: Act, observation: NDArray[np.float32], step: int) -> NDArray[Any]:
+    action = act(observation)
+    if not np.isfinite(action).all():
+        raise ConfigError(f"the policy's action in step {step} holds NaN or inf; train it anew.")
+    return action
 
 
 def truly_near(task: Any, poses: Array, goals: Array) -> Flags:
@@ -185,7 +194,8 @@ def _drive_once(env: BridgeVectorEnv, act: Act, seeds: NDArray[np.int64]) -> tup
     steps, (length, reward) = np.zeros(count, np.int64), np.zeros((2, count))
     running = np.ones(count, np.bool_)
     while running.any():
-        observation, gain, terminated, truncated, info = env.step(act(observation))
+        action = _answer(act, observation, int(steps.max()) + 1)
+        observation, gain, terminated, truncated, info = env.step(action)
         there = np.reshape(info["true_pose"], (count, -1, 3))[..., :2]
         moved = np.hypot(*np.moveaxis(there - where, -1, 0)).mean(axis=-1)
         where = there

@@ -355,11 +355,16 @@ class Composer:
         build, robot = self._build, self._task.robot
         names = self._names({name: 0.0 for row in choices.commands for name in row}, "choices")
         rows = np.array([[row.get(name, 0.0) for name in names] for row in choices.commands])
-        size = self._output_size(choices.of)
+        size, beyond = self._output_size(choices.of), ""
         kind = self._network.outputs[choices.of].type.tensor_type.elem_type
         if kind in onnx_graph.INTEGERS and size == 1:
-            one = build.constant([1], np.int64)
-            index = build.add("Reshape", THEIRS + choices.of, one)
+            one, *ends = (build.constant(k, np.int64) for k in ([1], 0, len(rows) - 1))
+            given = build.add("Reshape", THEIRS + choices.of, one)
+            given = build.add("Cast", given, to=TensorProto.INT64)
+            index = build.add("Clip", given, *ends)
+            # Of a number that chooses nothing the command is NaN, which no robot is sent.
+            beyond = build.add("Cast", build.add("Sub", given, index), to=TensorProto.FLOAT)
+            beyond = build.add("Sqrt", build.add("Neg", build.add("Abs", beyond)))
         elif size == len(rows):
             index = build.add("ArgMax", self._flat(choices.of), axis=1, keepdims=0)
         else:
@@ -372,7 +377,8 @@ class Composer:
                 speed, angle = robot.bicycle.command(rows)
                 commands = np.stack([speed, rows[:, 1], angle], axis=-1)
             commands = robot.of_fields(commands)
-        return build.add("Gather", build.constant(commands), index, axis=0)
+        chosen = build.add("Gather", build.constant(commands), index, axis=0)
+        return build.add("Add", chosen, beyond) if beyond else chosen
 
     def _remember(self) -> None:
         self._next["begun"] = self._build.constant([[1.0]])

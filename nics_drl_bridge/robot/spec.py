@@ -183,6 +183,8 @@ class RobotSpec(Schema):
                     f"{radius:.6g} m; leave footprint_radius out"
                 )
         for name, size in self.parameters.items():
+            if not size > 0.0 and (name in LENGTHS or name.endswith("_lag")):
+                raise ValueError(f"{name} {size:g}: must be more than 0")
             if name in LENGTHS and abs(size) > LONGEST * self.footprint_radius:
                 told = f"{name} {size:g} m is too long for a robot of {self.footprint_radius:.3g} m"
                 raise ValueError(f"{told} around base_link; lengths are in metres")

@@ -70,6 +70,17 @@ def test_a_robot_that_moves_before_its_commands_has_poses_of_another_clock(car, 
     assert ("The robot moves 0.15 s before its commands" in told) == (ahead > 0.0)
 
 
+def test_a_measured_state_that_moves_before_its_commands_is_of_another_clock(car):
+    recording = drive(car, 4, 20.0, latency=0.05, noise=(0.001, 0.002))
+    ahead = {
+        name: replace(stream, t=stream.t - 0.2)
+        for name, stream in (("pose", recording.pose), ("state", recording.state))
+    }
+    tried = Drive(replace(recording, **ahead), car)
+    told = " ".join(about_clocks(tried, Calibration(), timing_of(tried)))
+    assert "The robot moves 0.15 s before its commands: its state is stamped by another" in told
+
+
 def test_what_the_pose_tells_is_not_asked_to_be_measured(car, differential):
     recording = replace(drive(car, duration=10.0), state=None)
     speed, steering = car.state

@@ -38,6 +38,23 @@ def test_no_robots_at_all_are_refused():
         names_of("0")
 
 
+def test_a_robot_that_is_named_twice_is_refused():
+    with pytest.raises(ConfigError, match="'robots' names 'ant' twice; name each once"):
+        names_of("[ant, bee, ant]")
+
+
+@pytest.mark.parametrize("name", launching.FLAGS)
+def test_a_flag_that_is_neither_true_nor_false_is_refused_before_any_node_starts(name):
+    with pytest.raises(ConfigError, match=f"launch argument '{name}' is 'maybe'; give true or"):
+        setup_of(**{name: "maybe"})
+    assert [setup_of(**{name: one})[name] for one in ("True", "0", "")] == ["true", "false", ""]
+
+
+def test_a_missing_file_of_the_robot_is_one_sentence():
+    with pytest.raises(ConfigError, match=r"^/nope\.urdf: no such file"):
+        setup_of(urdf="/nope.urdf").description()
+
+
 def test_one_robot_of_an_argument_goes_before_the_fleet_of_a_file(tmp_path, monkeypatch):
     file = tmp_path / "fleet.yaml"
     file.write_text("simulator_node:\n  ros__parameters:\n    robots: [ant, bee]\n")

@@ -77,6 +77,35 @@ def three_mapping():
 FLAT = 2 * SECTORS + 5
 
 
+def chooser(least=0.0, most=2.0):
+    """A whole number between limits: by how many metres the goal (n, 1) is farther than 2 m."""
+    nodes = [
+        helper.make_node("Reshape", ["goal", "shape"], ["distance"]),
+        helper.make_node("Sub", ["distance", "near"], ["farther"]),
+        helper.make_node("Max", ["farther", "least"], ["bounded"]),
+        helper.make_node("Min", ["bounded", "most"], ["within"]),
+        helper.make_node("Cast", ["within"], ["choice"], to=TensorProto.INT32),
+    ]
+    weights = {
+        "shape": np.int64([-1]), "near": np.float32([2.0]),
+        "least": np.float32([least]), "most": np.float32([most]),
+    }  # fmt: skip
+    return model_of(nodes, {"goal": ["n", 1]}, {"choice": (["n"], TensorProto.INT32)}, weights)
+
+
+def chooser_mapping():
+    """Chooses among three commands."""
+    return {
+        "kind": "foreign policy",
+        "network": "net.onnx",
+        "robot": "differential",
+        "control_period": 0.1,
+        "scan": {"sectors": SECTORS, "range_max": FAR},
+        "inputs": {"goal": {"parts": [{"of": "goal.distance"}]}},
+        "choices": {"of": "choice", "commands": [{}, {"forward": 0.5}, {"turn": 1.0}]},
+    }
+
+
 def flat():
     """One vector of 64-bit numbers, fixed to one row, and a choice of five commands."""
     rng = np.random.default_rng(3)
@@ -181,6 +210,7 @@ NETS = {
     "three": (three, three_mapping),
     "flat": (flat, flat_mapping),
     "gru": (with_gru, with_gru_mapping),
+    "chooser": (chooser, chooser_mapping),
 }
 
 

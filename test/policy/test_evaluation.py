@@ -15,6 +15,7 @@ from scipy import stats
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import json_of
 from nics_drl_bridge.policy.evaluation import (
     ELSEWHERE,
@@ -77,6 +78,14 @@ def test_a_task_that_tells_neither_success_nor_collision_is_driven_to_the_end():
     task = Quiet(direct_model().robot, direct_model().lidar)
     env = TimeLimit(BridgeEnv(model=direct_model(), world=field(), task=task), 5)
     assert drive(env, Constant(0.0, 0.0, 0.3), seed=1).result == "time-out"
+
+
+def test_an_action_that_is_no_number_is_told_with_its_step(env):
+    with pytest.raises(ConfigError, match="the policy's action in step 1 holds NaN or inf"):
+        drive(env, Constant(np.nan, 0.0, 0.0), seed=1)
+    many = BridgeVectorEnv(2, direct_model(), field())
+    with pytest.raises(ConfigError, match="the policy's action in step 1 holds NaN or inf"):
+        drive_worlds(many, lambda seen: np.full((len(seen), 3), np.nan), [1, 2])
 
 
 def test_an_episode_that_drives_on_collides(env):

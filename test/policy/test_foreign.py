@@ -53,6 +53,22 @@ def commands_of(path, robot, rows):
     return np.array(commands)
 
 
+def test_a_whole_number_chooses_a_command(tmp_path, robot):
+    rows, _ = seen(20)
+    found = commands_of(write(tmp_path, "chooser"), robot, rows)
+    choices = np.clip(rows[:, SECTORS] - 2.0, 0.0, 2.0).astype(int)
+    assert set(choices) == {0, 1, 2}
+    assert found == pytest.approx(np.array([[0.0, 0.0], [0.5, 0.0], [0.0, 1.0]])[choices])
+
+
+@pytest.mark.parametrize("limits", [(-1.0, -1.0), (3.0, 3.0)])
+def test_a_whole_number_that_chooses_nothing_is_no_command(tmp_path, robot, limits):
+    path = write(tmp_path, "chooser")
+    write_bytes(tmp_path / "net.onnx", foreign_nets.chooser(*limits).SerializeToString())
+    with pytest.raises(PolicyError, match="gives NaN or inf"):
+        open_policy(str(path), robot)
+
+
 # What it commands is what the network alone says of inputs that are made by hand.
 
 
