@@ -358,7 +358,10 @@ class PathActions:
         ahead = geometry.compose(estimate.pose, geometry.between(robot, [*place.ahead, 0.0]))
         drive = self._drive(ahead[:2])
         if drive.touched:
-            self._wait(run)
+            patience = number(self._node, "failure_tolerance")
+            if 0.0 <= patience < time.monotonic() - run.valid_s:  # it has waited for long enough
+                code = "PATIENCE_EXCEEDED" if patience else "NO_VALID_CONTROL"
+                raise Refusal(code, "the robot touches something, so that no command is valid.")
         else:
             run.valid_s = time.monotonic()
         twist: Array = np.zeros(3) if drive.touched else drive.twist
@@ -372,13 +375,6 @@ class PathActions:
         twist = twist * np.array([share, share, 1.0 if steers else share])
         self._report(run, robot, place, estimate.twist)
         return twist
-
-    def _wait(self, run: Run) -> None:
-        """Raises Refusal when a robot that touches something has waited for long enough."""
-        patience = number(self._node, "failure_tolerance")
-        if 0.0 <= patience < time.monotonic() - run.valid_s:
-            code = "PATIENCE_EXCEEDED" if patience else "NO_VALID_CONTROL"
-            raise Refusal(code, "the robot touches something, so that no command is valid.")
 
     def _report(self, run: Run, robot: Array, place: Place, twist: Array) -> None:
         speed = float(np.hypot(*twist[:2]))

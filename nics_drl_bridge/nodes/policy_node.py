@@ -49,7 +49,14 @@ class PolicyNode(ManagedNode):
         self._goal: Array = np.array(self.get_parameter("goal").value, dtype=np.float64)
         if len(self._goal) != 2:
             raise ConfigError(f"parameter 'goal': must be [x, y], not {self._goal.tolist()}")
-        self._pace, self._deadline = self._declared_pace(model.control_period)
+        names = ("rate", "deadline", "late_limit")
+        rate, limit, patience = (self.get_parameter(name).value for name in names)
+        if rate < 0.0 or limit <= 0.0 or patience < 1:
+            told = f"parameters rate {rate}, deadline {limit}, late_limit {patience}"
+            raise ConfigError(f"{told}: must be at least 0, more than 0, and at least 1.")
+        period = model.control_period
+        self._deadline = Deadline(0.5 * period if np.isnan(limit) else limit, patience)
+        self._pace = ActionPace(period if np.isnan(rate) else 1.0 / rate if rate > 0.0 else 0.0)
         self._acted_ns = 0
         self._raw = self.create_lifecycle_publisher(TwistStamped, "cmd_vel_raw", qos.COMMAND)
         goals = self.create_subscription(PoseStamped, "goal_pose", self._on_goal, qos.COMMAND)
@@ -73,16 +80,6 @@ class PolicyNode(ManagedNode):
         """Leaves a zero command behind."""
         self._actions.stop("the node is deactivated")
         runner.last_word(self._raw, self._message(np.zeros(3), self._acted_ns))
-
-    def _declared_pace(self, control_period: float) -> tuple[ActionPace, Deadline]:
-        names = ("rate", "deadline", "late_limit")
-        rate, limit, patience = (self.get_parameter(name).value for name in names)
-        if rate < 0.0 or limit <= 0.0 or patience < 1:
-            given = f"parameters rate {rate}, deadline {limit}, late_limit {patience}"
-            raise ConfigError(f"{given}: must be at least 0, more than 0, and at least 1.")
-        period = control_period if np.isnan(rate) else 1.0 / rate if rate > 0.0 else 0.0
-        limit = 0.5 * control_period if np.isnan(limit) else limit
-        return ActionPace(period), Deadline(limit, patience)
 
     def _open_policy(self, model: SimulatorModel) -> None:
         name, fallback = (str(self.get_parameter(key).value) for key in ("policy", "fallback"))

@@ -8,7 +8,7 @@ import base64
 import hashlib
 import json
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -60,7 +60,7 @@ def export_bundle(policy: PolicyFile, folder: str | Path) -> Path:
         state = policy.contract.state
         if state is not None:
             start = np.full((1, state.size), state.start, np.float32)
-            data = _safetensors({f"{NODE}/{onnx_graph.STATE_IN}": start})
+            data = _safetensors(f"{NODE}/{onnx_graph.STATE_IN}", start)
             write_bytes(temporary / f"{place.resolve().name}_initial_values.safetensors", data)
         write_text(temporary / marker, dump_yaml(_described(policy, pieces, made, place)))
     return place / marker
@@ -199,13 +199,9 @@ def _tensor(name: str, shape: list[int], dtype: str = "float32", **facts: Any) -
     return {"name": name, "dtype": dtype, "shape": shape, "type": "tensor", **facts}
 
 
-def _safetensors(arrays: Mapping[str, NDArray[np.float32]]) -> bytes:
-    """Arrays in the format of safetensors: length of the head, JSON head, numbers."""
-    head, body = {}, b""
-    for name, array in arrays.items():
-        ends = [len(body), len(body) + array.nbytes]
-        head[name] = {"dtype": "F32", "shape": list(array.shape), "data_offsets": ends}
-        body += array.astype("<f4").tobytes()
-    text = json.dumps(head).encode()
+def _safetensors(name: str, array: NDArray[np.float32]) -> bytes:
+    """An array in the format of safetensors: length of the head, JSON head, numbers."""
+    facts = {"dtype": "F32", "shape": list(array.shape), "data_offsets": [0, array.nbytes]}
+    text = json.dumps({name: facts}).encode()
     text += b" " * (-len(text) % 8)
-    return struct.pack("<Q", len(text)) + text + body
+    return struct.pack("<Q", len(text)) + text + array.astype("<f4").tobytes()

@@ -1,7 +1,7 @@
 """Surveys a recording of any form: tables, their stamps and what is odd in them, columns."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -99,20 +99,16 @@ def survey(source: Source) -> list[TableSurvey]:
             unread = unread or error
     if unread is not None and not any(table.columns for table in found):
         raise unread
-    _units_by_span(found)
-    return found
-
-
-def _units_by_span(tables: Sequence[TableSurvey]) -> None:
-    """Chooses units of stamps so that all tables last about as long as those in seconds."""
-    lasting = [float(np.ptp(each.t)) for each in tables if each.t is not None and not each.unit]
-    for table in tables:
+    # Units of stamps are such that all tables last about as long as those in seconds.
+    lasting = [float(np.ptp(each.t)) for each in found if each.t is not None and not each.unit]
+    for table in found:
         if table.t is None or not table.unit or not lasting:
             continue
         raw = table.t / UNITS[table.unit].factor
         ratio = {u: np.ptp(raw) * UNITS[u].factor / np.median(lasting) for u in ("ms", "us", "ns")}
         table.unit = min(ratio, key=lambda unit: abs(np.log(max(ratio[unit], 1e-30))))
         table.t = raw * UNITS[table.unit].factor
+    return found
 
 
 def _surveyed(name: str, table: Table) -> TableSurvey:

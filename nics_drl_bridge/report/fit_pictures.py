@@ -405,24 +405,20 @@ def noise(identified: Identified) -> bytes | None:
     columns = 2 if count == 4 else min(count, 3)
     rows = -(-count // columns)
     figure, grid = panels(rows, columns, (4.3 * columns, 3.4 * rows))
-    for axes, histogram in zip(grid, histograms, strict=False):
-        _histogram(axes, *histogram)
+    for axes, (name, level, rest) in zip(grid, histograms, strict=False):
+        edges = np.linspace(-REACH * level.std, REACH * level.std, BINS + 1)
+        axes.hist(rest - np.median(rest), list(edges), density=True, color=MEASURED, alpha=0.55)
+        normal = np.exp(-0.5 * (edges / level.std) ** 2) / (level.std * np.sqrt(2.0 * np.pi))
+        axes.plot(edges, normal, "--", color=MODEL)
+        axes.xaxis.set_major_locator(MaxNLocator(5))
+        axes.set(xlabel=f"residual [{level.unit}]", ylabel="density")
+        axes.set_title(f"noise of the {name}\n{_value(level)}")
     if drifts and grown is not None:
         horizon, position, heading = grown
         after = grid[len(histograms) :]
         _growth(after[0], horizon, "position", levels.position_drift, position, "m")
         _growth(after[1], horizon, "heading", levels.heading_drift, heading, "rad")
     return png(figure)
-
-
-def _histogram(axes: Axes, name: str, level: Level, rest: Array) -> None:
-    edges = np.linspace(-REACH * level.std, REACH * level.std, BINS + 1)
-    axes.hist(rest - np.median(rest), list(edges), density=True, color=MEASURED, alpha=0.55)
-    normal = np.exp(-0.5 * (edges / level.std) ** 2) / (level.std * np.sqrt(2.0 * np.pi))
-    axes.plot(edges, normal, "--", color=MODEL)
-    axes.xaxis.set_major_locator(MaxNLocator(5))
-    axes.set(xlabel=f"residual [{level.unit}]", ylabel="density")
-    axes.set_title(f"noise of the {name}\n{_value(level)}")
 
 
 def _growth(axes: Axes, horizon: Array, name: str, level: Level, error: Array, unit: str) -> None:

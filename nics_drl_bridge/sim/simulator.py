@@ -285,9 +285,7 @@ class FastSimulator:
         if len(scenes) != len(chosen) or begin.shape != scenes.starts.shape:
             needed = f"{len(chosen)} worlds with {self.data.pose.shape[1]} robots each."
             raise ConfigError(f"{len(scenes)} seeds and starts {begin.shape} must be of {needed}")
-        self._place(chosen, np.asarray(seeds, dtype=np.int64), scenes, begin)
-        if draws is not None:
-            self._assign(chosen, draws)
+        self._place(chosen, np.asarray(seeds, dtype=np.int64), scenes, begin, draws)
         for part in self.parts:
             of_part = chosen[(chosen >= part.start) & (chosen < part.stop)]
             if len(of_part):
@@ -315,7 +313,9 @@ class FastSimulator:
         bodies[..., SHAPE] = index[bodies[..., SHAPE].astype(np.int64)]
         return bodies
 
-    def _place(self, chosen: Indices, seeds: Indices, scenes: Scenes, starts: Array) -> None:
+    def _place(
+        self, chosen: Indices, seeds: Indices, scenes: Scenes, starts: Array, draws: Draws | None
+    ) -> None:
         data = self.data
         data.pose[chosen], data.odom[chosen] = starts, starts
         for name in ("state", "history", "twist", "collided", "steps", "velocity"):
@@ -326,9 +326,8 @@ class FastSimulator:
         data.bodies[chosen, :count, SHAPE] = self._in_table[shapes]
         data.bodies[chosen, count:] = place(starts, self.footprint.radius, self._in_table[-1])
         self.goals[chosen] = scenes.goals
-
-    def _assign(self, chosen: Indices, draws: Draws) -> None:
-        data = self.data
+        if draws is None:
+            return
         data.coefficient[chosen], data.noise[chosen] = draws.coefficient, draws.noise
         data.delay[chosen], data.age[chosen] = draws.delay, draws.age
         data.faults[chosen] = draws.faults

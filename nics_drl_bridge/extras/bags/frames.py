@@ -75,7 +75,11 @@ def frames_of(
     for some in messages.values():
         some.sort(key=lambda message: message.receive_ns)
     received = {role: _received(some) for role, some in messages.items()}
-    fps = _rate(str(path), received[CMD_VEL]) if fps is None else fps
+    if fps is None:
+        apart = np.diff(received[CMD_VEL])
+        if not (apart > 0).any():
+            raise RecordingError(f"{path}: its commands have no rate; say one with --fps.")
+        fps = max(1, round(NS_PER_S / float(np.median(apart[apart > 0]))))
     ticks = _ticks(str(path), received, fps)
     rows = {role: np.searchsorted(ns, ticks, side="right") - 1 for role, ns in received.items()}
     set_anew = resets(messages[ODOM])
@@ -93,13 +97,6 @@ def frames_of(
 
 def _received(messages: Sequence[Message]) -> Nanoseconds:
     return np.array([message.receive_ns for message in messages], dtype=np.int64)
-
-
-def _rate(place: str, received: Nanoseconds) -> int:
-    apart = np.diff(received)
-    if not (apart > 0).any():
-        raise RecordingError(f"{place}: its commands have no rate; say one with --fps.")
-    return max(1, round(NS_PER_S / float(np.median(apart[apart > 0]))))
 
 
 def _ticks(place: str, received: Mapping[str, Nanoseconds], fps: int) -> Nanoseconds:
