@@ -25,7 +25,8 @@ class Belief(NamedTuple):
     anchor: Anchor | None  # None before the first odometry that was used
     lost: bool  # True if the robot may have moved unobserved since
     error: Array  # (3 + S, S) derivative to a constant error of the state's rates since before
-    roughness: float = 1.0  # factor of the variances of twists, more than 1 after outliers
+    roughness: tuple[float, ...] = (1.0, 1.0, 1.0)  # factors of variances, by kind
+    missed: Array = np.zeros(3)  # by what the newest outlier of a pose was off
 
 
 class Foreseen(NamedTuple):

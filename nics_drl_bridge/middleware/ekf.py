@@ -26,8 +26,8 @@ GYRO_STD = 0.02  # of a yaw rate without a covariance [rad/s]: a cheap gyro with
 GATE = {Kind.TWIST: 16.27, Kind.YAW_RATE: 10.83, Kind.POSE: 16.27}
 # Consecutive outliers after which they are believed. A gyro never is: odometry has precedence.
 PATIENCE: dict[Kind, float] = {Kind.TWIST: 3, Kind.YAW_RATE: np.inf, Kind.POSE: 5}
-# Factors of a twist's variances, after each outlier and after each that fits, and the greatest: the
-# noise of odometry may be more than was told, and all of it would then be outliers.
+# Factors of variances, after each outlier and after each measurement that fits, and the greatest:
+# noise may be more than was told, and nearly all measurements would then be outliers.
 ROUGHER, SMOOTHER, ROUGHEST = 4.0, 0.98, 100.0
 NEWS = 0.5  # Possible error of the state of a stuck or pushed robot, as a share of its range
 STILL = np.zeros(3)
@@ -101,7 +101,7 @@ class Estimator:
         since = anchor._replace(time_ns=time_ns - round(seconds * NS_PER_S)) if known else None
         error = self._suddenly
         known_so = anchor.mean, covariance, (0, 0, 0), since, True, error
-        self.belief = Belief(time_ns, *known_so, self._roughness)
+        self.belief = Belief(time_ns, *known_so, self._roughness, self._missed)
         self._log = log_of(np.minimum(np.maximum(command, self._least), self._most))
 
     @property
@@ -109,12 +109,13 @@ class Estimator:
         """State of the filter; set to an earlier one when the past has changed."""
         own = self._filter
         known = self.time_ns, own.x, own.P, self._outliers, self._anchor, self._lost
-        return Belief(*known, self._error, self._roughness)
+        return Belief(*known, self._error, self._roughness, self._missed)
 
     @belief.setter
     def belief(self, belief: Belief) -> None:
         self.time_ns, self._filter.x, self._filter.P = belief[:3]
-        self._outliers, self._anchor, self._lost, self._error, self._roughness = belief[3:]
+        self._outliers, self._anchor, self._lost, self._error = belief[3:7]
+        self._roughness, self._missed = belief[7:]
         self._foreseen = None
 
     @property
@@ -214,7 +215,7 @@ class Estimator:
 
     def _correct(self, measurement: Measurement, follows: bool) -> Judgement:
         kind, value, given_noise, odom = measurement
-        noise = self._noise_of(kind) if given_noise is None else given_noise
+        noise = self._noise_of(kind, given_noise)
         expected, derivative = self._expect(kind)
         residual = _between_poses if kind is Kind.POSE else np.subtract
         innovation = residual(value, expected)
@@ -224,7 +225,7 @@ class Estimator:
             outcome = self._surprise(kind, innovation, derivative, noise)
         if outcome is Acceptance.OUTLIER:
             self._count(kind, self._outliers[kind] + 1)
-            self._roughen(kind, ROUGHER)
+            self._doubt(kind, innovation)
             return Judgement(distance, outcome)
         anchor, own, way = self._anchor, self._filter, None
         if follows and anchor is not None and anchor.cross is not None:
@@ -254,19 +255,25 @@ class Estimator:
             self._roughen(kind, SMOOTHER)
         return Judgement(distance, outcome)
 
-    def _noise_of(self, kind: Kind) -> Array:
-        """Returns the noise (n, n) of measurements that tell none; of twists, that seen lately."""
-        return self._noise[kind] * (self._roughness if kind is Kind.TWIST else 1.0)
+    def _noise_of(self, kind: Kind, given: Array | None = None) -> Array:
+        """Returns the noise (n, n) of measurements, that told or as much more as was seen."""
+        return self._roughness[kind] * (self._noise[kind] if given is None else given)
 
     @property
     def _wheels_now(self) -> kernels.Wheels:
-        wheels, rough = self._wheels, self._roughness
+        wheels, rough = self._wheels, self._roughness[Kind.TWIST]
         return wheels if rough == 1.0 else wheels._replace(walk=rough * wheels.walk)
 
+    def _doubt(self, kind: Kind, innovation: Array) -> None:
+        if kind is Kind.POSE:  # off in one direction all the time, a robot was carried
+            scattered, self._missed = innovation @ self._missed < 0.0, innovation
+        if kind is Kind.TWIST or (kind is Kind.POSE and scattered):
+            self._roughen(kind, ROUGHER)
+
     def _roughen(self, kind: Kind, factor: float) -> None:
-        if kind is Kind.TWIST:
-            self._roughness = min(max(1.0, factor * self._roughness), ROUGHEST)
-            self._foreseen = None  # whose gains are those of the former noise
+        rough = min(max(1.0, factor * self._roughness[kind]), ROUGHEST)
+        self._roughness = tuple(rough if k == kind else r for k, r in enumerate(self._roughness))
+        self._foreseen = None  # whose gains are those of the former noise
 
     def _gains(self, anchor: Anchor | None, derivative: Array, spread: Array) -> Any:
         """Returns what a twist corrects present and newest odometry by; None without that."""

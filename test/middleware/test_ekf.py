@@ -166,7 +166,7 @@ def test_a_heading_is_corrected_the_short_way_round(believed, measured):
     assert abs(geometry.wrap_angle(heading - measured)) < 0.002
 
 
-def simulated_drive(model, seconds, seed, pose_std=None):
+def simulated_drive(model, seconds, seed, pose_std=None, noise=1.0):
     """Errors (T, 3) of the estimate, of the odometry, and covariances, all in the robot's frame."""
     simulator, estimator = FastSimulator(model, field(60.0)), Estimator(model)
     rng = np.random.default_rng(seed)
@@ -185,7 +185,8 @@ def simulated_drive(model, seconds, seed, pose_std=None):
         estimator.update(Kind.TWIST, simulator.data.twist[0, 0])
         true = simulator.data.pose[0, 0]
         if pose_std is not None and step % 10 == 9:
-            estimator.update(Kind.POSE, true + rng.normal(size=3) * pose_std, np.full(3, pose_std))
+            measured = true + rng.normal(size=3) * noise * pose_std
+            estimator.update(Kind.POSE, measured, np.full(3, pose_std))
         errors.append(geometry.between(true, estimator.at(now)[0]))
         drifts.append(geometry.between(true, simulator.data.odom[0, 0]))
         turn = np.eye(3)
@@ -341,6 +342,13 @@ def test_odometry_of_four_times_the_noise_that_was_told_is_followed(robot):
         view, _ = backend.step(command)
         away.append(geometry.between(backend.simulator.data.odom[0, 0], view.pose))
     assert np.abs(away).max() < 0.1
+
+
+@pytest.mark.slow
+def test_poses_of_four_times_the_noise_that_was_told_still_mend_the_estimate():
+    model, told = builtin_model("differential"), 0.02
+    errors, _, _ = simulated_drive(model, 60, 1, told, noise=4.0)
+    assert np.sqrt((errors[100:, :2] ** 2).mean()) < 2.0 * told
 
 
 def stepped(estimator, stamp, twist, odom):
