@@ -96,7 +96,7 @@ def import_(
 
 def _places(files: list[Path], out: Path | None, name: str | None) -> dict[Path, Path]:
     """The file to write for each one to read."""
-    one = out is not None and out.suffix.lower() in MAPS
+    one = out is not None and out.suffix in MAPS
     if len(files) > 1 and (one or name is not None):
         given = f"--out {out}" if one else f"--name {name}"
         told = f"{given}: is for one file, not for {len(files)}"
@@ -131,7 +131,7 @@ def _mapped(file: Path, place: Path, keys: Keys, resolution: float | None) -> li
     from nics_drl_bridge.config import dump_yaml, validate
     from nics_drl_bridge.lidar.maps import MapFile, load_map, read_image
 
-    if file.suffix.lower() not in (*MAPS, *PICTURES):
+    if file.suffix not in MAPS and file.suffix.lower() not in PICTURES:
         kinds = ", ".join((*SDF, *MAPS, *PICTURES))
         raise ConfigError(f"{file}: unknown kind of file; give one of {kinds}.")
     map_file, made = file.with_suffix(".yaml") if file.suffix.lower() in PICTURES else file, []
@@ -141,7 +141,7 @@ def _mapped(file: Path, place: Path, keys: Keys, resolution: float | None) -> li
         validate(about, MapFile, f"--resolution {resolution:g}")
         rows, columns = read_image(file, str(file))[0].shape
         made = [Written(map_file, dump_yaml(about), f"the map of {file.name}")]
-    elif map_file.is_file() or file.suffix.lower() in MAPS:
+    elif map_file.is_file() or file.suffix in MAPS:
         grid = load_map(map_file)
         (rows, columns), resolution = grid.cells.shape, grid.resolution
     else:
@@ -263,7 +263,7 @@ def map_(
     scene, member = scenes[0], int(scenes.member[0])
     opened = worlds.members[member]
     file = out or Path(Path(f"{opened.name}_map.yaml").name)
-    if file.suffix.lower() not in MAPS:
+    if file.suffix not in MAPS:
         raise ConfigError(f"--out {file}: must end in .yaml.")
     _spare(worlds, Path(name), file, file.with_suffix(".pgm"))
     grid = occupancy(opened, standing(sampler, member, scene.bodies), resolution)

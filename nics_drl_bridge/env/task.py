@@ -4,6 +4,7 @@ import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import takewhile
 from typing import Any, ClassVar, Literal
 
 import gymnasium
@@ -104,8 +105,8 @@ class Task(ABC):
 
     def __init_subclass__(cls, **given: Any) -> None:
         super().__init_subclass__(**given)
-        owner = next(each for each in cls.__mro__ if "step_into" in vars(each))
-        if any(getattr(cls, part, None) is not getattr(owner, part, None) for part in PARTS):
+        own = takewhile(lambda each: "step_into" not in vars(each), cls.__mro__)
+        if any(part in vars(each) for each in own for part in PARTS):
             cls.step_into = Task.step_into  # type: ignore[method-assign]  # that one lacks them
             if "keeps_last_scan" not in vars(cls):
                 cls.keeps_last_scan = True
@@ -180,13 +181,14 @@ class Task(ABC):
         self.update(before, after, memory)
         if memory.keys() != given.keys():
             raise self._wrong(f"memory {sorted(memory)}", f"must keep {sorted(given)} of `reset`")
-        for name, rows in given.items():
-            if (new := memory[name]) is not rows:  # bound anew, where rows are those of an env
-                self.valid(f"memory {name!r}", new, rows.shape)
-                if not np.can_cast(np.asarray(new).dtype, rows.dtype, "same_kind"):
-                    raise self._wrong(f"memory {name!r}", f"must stay {rows.dtype} in `update`")
-                rows[...] = new
-                memory[name] = rows
+        # What is bound anew goes into the rows, which are an env's; one may be another of before.
+        anew = {n: np.array(memory[n]) for n, rows in given.items() if memory[n] is not rows}
+        for name, new in anew.items():
+            rows = memory[name] = given[name]
+            if new.shape != rows.shape or not np.can_cast(new.dtype, rows.dtype, "same_kind"):
+                like = f"must stay {rows.dtype} of {rows.shape} in `update`"
+                raise self._wrong(f"memory {name!r}", f"{like}, not {new.dtype} of {new.shape}")
+            rows[...] = new
         out[...] = self.valid("observation", self.observation(after, memory), out.shape)
         terms, each = self.reward(before, after, memory), out.shape[:-1]
         info = self.info(after, memory)

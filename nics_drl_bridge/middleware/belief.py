@@ -26,7 +26,7 @@ class Belief(NamedTuple):
     lost: bool  # True if the robot may have moved unobserved since
     error: Array  # (3 + S, S) derivative to a constant error of the state's rates since before
     roughness: tuple[float, ...] = (1.0, 1.0, 1.0)  # factors of variances, by kind
-    missed: Array = np.zeros(3)  # by what the newest outlier of a pose was off
+    missed: Array = np.zeros((3, 3))  # the newest innovation of each kind
 
 
 class Foreseen(NamedTuple):

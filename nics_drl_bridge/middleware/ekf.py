@@ -26,9 +26,10 @@ GYRO_STD = 0.02  # of a yaw rate without a covariance [rad/s]: a cheap gyro with
 GATE = {Kind.TWIST: 16.27, Kind.YAW_RATE: 10.83, Kind.POSE: 16.27}
 # Consecutive outliers after which they are believed. A gyro never is: odometry has precedence.
 PATIENCE: dict[Kind, float] = {Kind.TWIST: 3, Kind.YAW_RATE: np.inf, Kind.POSE: 5}
-# Factors of variances, after each outlier and after each measurement that fits, and the greatest:
-# noise may be more than was told, and nearly all measurements would then be outliers.
-ROUGHER, SMOOTHER, ROUGHEST = 4.0, 0.98, 100.0
+# Factors of variances, after each outlier and after each measurement that fits well, and the
+# greatest: noise may be more than was told, and nearly all measurements would then be outliers.
+ROUGHER, SMOOTHER, ROUGHEST = 4.0, 0.93, 100.0
+WELL = 2.37  # less is half of the squared, normalised innovations of three numbers
 NEWS = 0.5  # Possible error of the state of a stuck or pushed robot, as a share of its range
 STILL = np.zeros(3)
 REACHABLE = 2.0  # States and commands are cut at this many times their range
@@ -220,12 +221,11 @@ class Estimator:
         residual = _between_poses if kind is Kind.POSE else np.subtract
         innovation = residual(value, expected)
         distance = kernels.distance(innovation, derivative, self._filter.P, noise)
-        outcome = Acceptance.USED
+        outcome, scattered = Acceptance.USED, self._scatters(kind, innovation)
         if not distance <= GATE[kind]:
-            outcome = self._surprise(kind, innovation, derivative, noise)
+            outcome = self._surprise(kind, innovation, derivative, noise, scattered)
         if outcome is Acceptance.OUTLIER:
             self._count(kind, self._outliers[kind] + 1)
-            self._doubt(kind, innovation)
             return Judgement(distance, outcome)
         anchor, own, way = self._anchor, self._filter, None
         if follows and anchor is not None and anchor.cross is not None:
@@ -251,7 +251,7 @@ class Estimator:
         if self._outliers[kind] and not (outcome is Acceptance.JUMP and kind is Kind.TWIST):
             self._count(kind, 0)
         self._foreseen = None
-        if outcome is Acceptance.USED:
+        if outcome is Acceptance.USED and not (scattered and distance > WELL):
             self._roughen(kind, SMOOTHER)
         return Judgement(distance, outcome)
 
@@ -264,16 +264,18 @@ class Estimator:
         wheels, rough = self._wheels, self._roughness[Kind.TWIST]
         return wheels if rough == 1.0 else wheels._replace(walk=rough * wheels.walk)
 
-    def _doubt(self, kind: Kind, innovation: Array) -> None:
-        if kind is Kind.POSE:  # off in one direction all the time, a robot was carried
-            scattered, self._missed = innovation @ self._missed < 0.0, innovation
-        if kind is Kind.TWIST or (kind is Kind.POSE and scattered):
-            self._roughen(kind, ROUGHER)
+    def _scatters(self, kind: Kind, innovation: Array) -> bool:
+        """True if a measurement errs in another way than the one before, as noise alone does."""
+        before, size = self._missed[kind], len(innovation)
+        self._missed = self._missed.copy()
+        self._missed[kind, :size] = np.clip(innovation, -FARTHEST, FARTHEST)
+        return bool(self._missed[kind] @ before < 0.0)
 
     def _roughen(self, kind: Kind, factor: float) -> None:
         rough = min(max(1.0, factor * self._roughness[kind]), ROUGHEST)
-        self._roughness = tuple(rough if k == kind else r for k, r in enumerate(self._roughness))
-        self._foreseen = None  # whose gains are those of the former noise
+        if rough != self._roughness[kind] and kind is not Kind.YAW_RATE:
+            self._roughness = _with(self._roughness, kind, rough)
+            self._foreseen = None  # whose gains are those of the former noise
 
     def _gains(self, anchor: Anchor | None, derivative: Array, spread: Array) -> Any:
         """Returns what a twist corrects present and newest odometry by; None without that."""
@@ -308,12 +310,15 @@ class Estimator:
         return foreseen if foreseen is not None and foreseen.mean is self._filter.x else None
 
     def _surprise(
-        self, kind: Kind, innovation: Array, derivative: Array, noise: Array
+        self, kind: Kind, innovation: Array, derivative: Array, noise: Array, scattered: bool
     ) -> Acceptance:
         """Decides on a measurement beyond its gate; that of a stuck or pushed robot is news."""
         if not (np.abs(innovation) < FARTHEST).all():
             return Acceptance.OUTLIER
-        believed = self._outliers[kind] + 1 >= PATIENCE[kind]
+        most = noise * (ROUGHEST / self._roughness[kind])
+        far = kernels.distance(innovation, derivative, self._filter.P, most) > GATE[kind]
+        noisy = scattered and not far  # neither off in one way, nor a glitch
+        believed = self._outliers[kind] + 1 >= PATIENCE[kind] and not noisy
         if kind is Kind.TWIST:
             doubt = np.maximum(self._news - np.diag(self._filter.P), 0.0)
             # What moved the state moved the pose, too, since the prediction began.
@@ -325,6 +330,8 @@ class Estimator:
             if believed:
                 self._filter.P = parted(doubtful)
                 self._part()
+        if noisy:
+            self._roughen(kind, ROUGHER)
         return Acceptance.JUMP if believed else Acceptance.OUTLIER
 
     def _part(self) -> None:
@@ -339,7 +346,11 @@ class Estimator:
         self._filter.x = mean
 
     def _count(self, kind: Kind, outliers: int) -> None:
-        self._outliers = tuple(outliers if k == kind else n for k, n in enumerate(self._outliers))
+        self._outliers = _with(self._outliers, kind, outliers)
+
+
+def _with(values: tuple[Any, ...], kind: Kind, value: Any) -> tuple[Any, ...]:
+    return *values[:kind], value, *values[kind + 1 :]
 
 
 def _widened(low: Array, high: Array) -> tuple[Array, Array]:

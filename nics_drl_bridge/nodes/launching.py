@@ -190,7 +190,7 @@ def bridge(setup: Setup) -> Iterator[Any]:
 def description(setup: Setup) -> Iterator[Any]:
     """Starts robot_state_publisher of each robot, and RViz."""
     timed = {"use_sim_time": value(setup["use_sim_time"], bool)}
-    wanted = IfCondition(setup["use_robot_state_pub"])
+    wanted = IfCondition(setup["use_robot_state_pub"] or "false")
     for robot in setup.robots:
         given = timed | {
             "robot_description": value(setup.description()),
@@ -198,7 +198,7 @@ def description(setup: Setup) -> Iterator[Any]:
         }
         yield setup.node(STATE_PUBLISHER, STATE_PUBLISHER, robot, given, condition=wanted)
     topics = [(f"/{topic}", topic) for topic in SHOWN]
-    words, wanted = ("-d", setup["rviz_config"]), IfCondition(setup["rviz"])
+    words, wanted = ("-d", setup["rviz_config"]), IfCondition(setup["rviz"] or "false")
     yield setup.node("rviz2", "rviz2", setup.robots[0], timed, words, topics, condition=wanted)
 
 

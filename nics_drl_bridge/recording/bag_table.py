@@ -144,7 +144,7 @@ class Bag(Source):
                     raise
                 fault = str(error).removeprefix(f"{self.place}: ").partition(";")[0]
                 stamps = "header" if go_on_together(data.values()) else "receive"
-                by = "headers, whose clock is one" if stamps == "header" else "arrival"
+                by = "headers, which go on together" if stamps == "header" else "arrival"
                 note = f"{fault}; all messages were stamped by their {by}."
                 self._notes.setdefault(topic, []).append(note)
                 self._stamps[key] = streams(data, stamps, self.place, robot)

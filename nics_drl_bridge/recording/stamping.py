@@ -92,7 +92,7 @@ def streams(
 
 
 def go_on_together(parts: Iterable[TopicData]) -> bool:
-    """True if all headers are of one clock without a leap, at whatever rate beside the receipt."""
+    """True if the headers of all go on without a leap, at whatever rate beside the receipt."""
     received, stamped = zip(*((part.receive_ns, part.header_ns) for part in parts), strict=True)
     if any(ns is None or not ns.all() for ns in stamped):
         return False

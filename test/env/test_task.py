@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
@@ -305,6 +306,24 @@ class Own(Navigation):
     reward = Changes.reward
 
 
+class Pass:
+    """Does all of a step, though it is no task."""
+
+    def step_into(self, out, before, after, memory):
+        outcome = super().step_into(out, before, after, memory)
+        return replace(outcome, info=outcome.info | {"passed": np.ones(out.shape[:-1])})
+
+
+class Passed(Pass, Navigation):
+    """Has that before the one of navigation."""
+
+
+def test_a_step_of_ones_own_in_one_pass_is_kept():
+    env = gymnasium.make(TASK, model=direct_model(), world=field(), task=Passed)
+    env.reset(seed=0)
+    assert env.step(np.zeros(3, np.float32))[4]["passed"] == 1.0
+
+
 @pytest.mark.parametrize("task", [Mixed, Own])
 def test_a_part_of_navigation_that_is_overridden_alone_counts(task):
     arguments = {"model": direct_model(), "world": field(), "task": task}
@@ -329,12 +348,41 @@ def test_a_memory_that_update_binds_anew_counts_alone_and_in_a_vector():
         assert several.step(still_there)[4]["count"].tolist() == [count] * 3
 
 
+class Shifting(Navigation):
+    """Remembers the count of the step before, and what nothing bounds."""
+
+    shown = ("older", "last", "nearest")
+
+    def reset(self, episodes):
+        rows = np.zeros((3, *episodes.starts.shape[:2]))
+        return super().reset(episodes) | {
+            "last": rows[0],
+            "older": rows[1],
+            "nearest": rows[2] + np.inf,
+        }
+
+    def update(self, before, after, memory):
+        memory["older"] = memory["last"]
+        memory["last"] = memory["last"] + 1.0
+        memory["nearest"] = np.minimum(memory["nearest"], np.inf)
+
+
+@pytest.mark.parametrize("make", [gymnasium.make, gymnasium.make_vec])
+def test_a_memory_that_update_shifts_holds_what_was_there(make):
+    env = make(TASK, model=direct_model(), world=field(), task=Shifting)
+    env.reset(seed=0)
+    for step in range(3):
+        info = env.step(np.zeros(env.action_space.shape, np.float32))[4]
+        assert (info["older"], info["last"]) == (step, step + 1.0)
+        assert np.isposinf(info["nearest"])
+
+
 @pytest.mark.parametrize(
     ("method", "wrong", "sentence"),
     [
         ("update", lambda _: {"gaol": 1}, "task Wrong: its memory ['count', 'gaol', 'goal'] must"),
-        ("update", lambda _: {"count": np.ones(5)}, "its memory 'count' must be finite, of shape"),
-        ("update", lambda rows: {"count": rows + 0.5j}, "'count' must stay float64 in `update`"),
+        ("update", lambda _: {"count": np.ones(5)}, "its memory 'count' must stay float64 of ("),
+        ("update", lambda rows: {"count": rows + 0.5j}, "in `update`, not complex128 of ("),
         ("info", lambda _: {"battery": 0.5}, "its info 'battery' must be an array of shape"),
         ("info", lambda _: None, "its info must be a dictionary of arrays"),
         ("reset", lambda rows: {"count": rows, "goal": [[1.0, 2.0]]}, "memory 'goal' must be an"),

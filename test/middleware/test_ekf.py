@@ -344,6 +344,22 @@ def test_odometry_of_four_times_the_noise_that_was_told_is_followed(robot):
     assert np.abs(away).max() < 0.1
 
 
+@pytest.mark.parametrize("glitch", [0.2, 1.0, 1e9])
+def test_odometry_with_glitches_is_not_given_up_for_a_wrong_model(glitch):
+    """The robot is slower than its model; each twentieth twist is off to the side."""
+    estimator, odom, twist = Estimator(builtin_model("differential")), np.zeros(3), np.zeros(3)
+    estimator.reset(0, odom)
+    rng = np.random.default_rng(0)
+    for k in range(1, 300):
+        estimator.command((k - 1) * PERIOD, [0.5, 0.3])
+        twist = twist + 0.6 * (np.array([0.3, 0.0, 0.18]) - twist)
+        way = (twist + rng.normal(0.0, 0.01, 3)) * 0.1
+        odom = geometry.compose(odom, way)
+        seen = way / 0.1 + [0.0, glitch if k % 20 == 0 else 0.0, 0.0]
+        stepped(estimator, k * PERIOD, seen, odom)
+        assert np.abs(geometry.between(odom, estimator.at(k * PERIOD)[0])).max() < 0.05
+
+
 @pytest.mark.slow
 def test_poses_of_four_times_the_noise_that_was_told_still_mend_the_estimate():
     model, told = builtin_model("differential"), 0.02
