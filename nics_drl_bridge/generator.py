@@ -155,8 +155,11 @@ def lidar_of(robot: RobotSpec, name: str | None = None) -> LidarSpec:
 
 
 @lru_cache(maxsize=8)
-def builtin_model(robot: str) -> SimulatorModel:
-    """The model of a shipped robot, generated from a drive of its textbook kinematics."""
+def builtin_model(robot: str, content: str = "") -> SimulatorModel:
+    """The model of a shipped robot, generated from a drive of its textbook kinematics.
+
+    Each is generated once, that of a file once for each `content` of the file.
+    """
     spec = load_robot(robot)
     if Path(robot, MODEL_FILE).is_file():
         sys.stderr.write(f"nics_drl_bridge: {robot!r} is shipped; the folder is ./{robot}\n")
@@ -178,7 +181,7 @@ def open_model(name: str | Path, lidar: str | None = None) -> SimulatorModel:
     if "/" in (name := str(name)) and not name.endswith((".yaml", ".yml")):
         raise ModelError(f"{name}: no such folder; make one with `nics generate`.")
     try:
-        return builtin_model(name)
+        return builtin_model(name, *([read_text(name)] if Path(name).is_file() else []))
     except ConfigError as error:
         reason = str(error).removesuffix(".")
         raise ModelError(f"{reason}; there is no folder of this name either.") from None

@@ -336,6 +336,15 @@ def test_a_shipped_robot_goes_before_a_folder_of_its_name_which_is_told(
     assert capsys.readouterr().err == ""
 
 
+def test_a_robots_file_that_has_changed_is_opened_anew(tmp_path):
+    file = tmp_path / "mine.yaml"
+    text = find_config("differential", "robots").read_text()
+    file.write_text(text)
+    assert open_model(file) is open_model(str(file))
+    file.write_text(text.replace("wheel_lag: 0.1", "wheel_lag: 0.3"))
+    assert open_model(file).robot.parameters["wheel_lag"] == 0.3
+
+
 def test_no_folder_is_made_that_has_the_name_of_a_shipped_robot():
     for folder in ("jackal", Path("./jackal")):
         with pytest.raises(

@@ -198,7 +198,7 @@ class Task(ABC):
         for name, term in terms.items():
             self.valid(f"reward term {name!r}", term, each)
         for name, fact in info.items():
-            self.leads(f"info {name!r}", fact, each)
+            self._leads(f"info {name!r}", fact, each)
         return Outcome(terms, self.valid("end", self.end(after, memory), each), info)
 
     def begun(self, episodes: Episodes) -> Memory:
@@ -207,16 +207,17 @@ class Task(ABC):
         if not isinstance(memory, dict) or not memory.keys() >= set(self.shown):
             raise self._wrong("reset", f"must give a dictionary of arrays, with {[*self.shown]}")
         for name, rows in memory.items():
-            self.leads(f"memory {name!r}", rows, episodes.starts.shape[:1])
+            self._leads(f"memory {name!r}", rows, episodes.starts.shape[:1])
         for name in self.shown:
-            self.leads(f"memory {name!r}, which is shown,", memory[name], episodes.starts.shape[:2])
+            self._leads(
+                f"memory {name!r}, which is shown,", memory[name], episodes.starts.shape[:2]
+            )
         return memory
 
-    def leads(self, what: str, given: Any, lead: tuple[int, ...]) -> None:
-        """Raises ConfigError unless `given` is an array whose first dimensions are `lead`."""
+    def _leads(self, what: str, given: Any, lead: tuple[int, ...]) -> None:
         if not isinstance(given, np.ndarray) or given.shape[: len(lead)] != lead:
-            shape = f"{type(given).__name__} of {np.shape(given)}"
-            raise self._wrong(what, f"must be an array of shape {lead} or {lead}..., not {shape}")
+            fault = f"must be an array whose shape begins with {lead}"
+            raise self._wrong(what, f"{fault}, and is {type(given).__name__} of {np.shape(given)}")
 
     def _wrong(self, what: str, fault: str) -> ConfigError:
         return ConfigError(f"task {type(self).__name__}: its {what} {fault}.")

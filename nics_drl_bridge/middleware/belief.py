@@ -25,8 +25,8 @@ class Belief(NamedTuple):
     anchor: Anchor | None  # None before the first odometry that was used
     lost: bool  # True if the robot may have moved unobserved since
     error: Array  # (3 + S, S) derivative to a constant error of the state's rates since before
-    roughness: tuple[float, ...] = (1.0, 1.0, 1.0)  # factors of variances, by kind
-    missed: Array = np.zeros((3, 3))  # the newest innovation of each kind
+    roughness: tuple[float, ...] = (1.0, 1.0, 1.0)  # (3,) factors of variances, by kind
+    missed: Array = np.zeros((3, 3))  # (3, 3) the newest innovation, by kind
 
 
 class Foreseen(NamedTuple):

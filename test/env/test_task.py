@@ -383,7 +383,11 @@ def test_a_memory_that_update_shifts_holds_what_was_there(make):
         ("update", lambda _: {"gaol": 1}, "task Wrong: its memory ['count', 'gaol', 'goal'] must"),
         ("update", lambda _: {"count": np.ones(5)}, "its memory 'count' must stay float64 of ("),
         ("update", lambda rows: {"count": rows + 0.5j}, "in `update`, not complex128 of ("),
-        ("info", lambda _: {"battery": 0.5}, "its info 'battery' must be an array of shape"),
+        (
+            "info",
+            lambda _: {"battery": 0.5},
+            "info 'battery' must be an array whose shape",
+        ),
         ("info", lambda _: None, "its info must be a dictionary of arrays"),
         ("reset", lambda rows: {"count": rows, "goal": [[1.0, 2.0]]}, "memory 'goal' must be an"),
         ("reset", lambda rows: {"goal": rows}, "reset must give a dictionary of arrays, with"),

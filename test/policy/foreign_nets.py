@@ -95,14 +95,12 @@ def chooser(least=0.0, most=2.0):
 
 def chooser_mapping():
     """Chooses among three commands."""
-    return {
-        "kind": "foreign policy",
-        "network": "net.onnx",
-        "robot": "differential",
-        "control_period": 0.1,
-        "scan": {"sectors": SECTORS, "range_max": FAR},
+    data = three_mapping()
+    del data["outputs"]
+    commands = [{}, {"forward": 0.5}, {"turn": 1.0}]
+    return data | {
         "inputs": {"goal": {"parts": [{"of": "goal.distance"}]}},
-        "choices": {"of": "choice", "commands": [{}, {"forward": 0.5}, {"turn": 1.0}]},
+        "choices": {"of": "choice", "commands": commands},
     }
 
 

@@ -1,11 +1,14 @@
 from __future__ import annotations
 
+import json
+
 import gymnasium
 import numpy as np
 import onnx
 import onnxruntime
 import pytest
 
+from nics_drl_bridge.commands.episodes import FAST, EvaluationOrder, evaluate
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import BridgeError, ConfigError, PolicyError
@@ -67,6 +70,21 @@ def test_a_whole_number_that_chooses_nothing_is_no_command(tmp_path, robot, limi
     write_bytes(tmp_path / "net.onnx", foreign_nets.chooser(*limits).SerializeToString())
     with pytest.raises(PolicyError, match="gives NaN or inf"):
         open_policy(str(path), robot)
+
+
+def test_an_evaluation_names_a_command_that_is_none_and_keeps_what_was_driven_before(tmp_path):
+    path = write(tmp_path, "chooser")
+    # Beyond the last command from 5 m on, farther than where policies are tried as they are opened.
+    write_bytes(tmp_path / "net.onnx", foreign_nets.chooser(0.0, 3.0).SerializeToString())
+    world = tmp_path / "far.yaml"
+    world.write_text("name: far\nsize: [16.0, 16.0]\ngoal_distance: [6.0, 7.0]\n")
+    order = EvaluationOrder(
+        ["straight", str(path)], tmp_path / "out", "differential", str(world), 1, places=(FAST,)
+    )
+    with pytest.raises(ConfigError, match="the policy's action in step 1 holds NaN or inf"):
+        evaluate(order, lambda _: None, lambda *_: None)
+    kept = json.loads((tmp_path / "out" / "evaluation.json").read_text())
+    assert list(kept["policies"]) == ["straight"]
 
 
 # What it commands is what the network alone says of inputs that are made by hand.
