@@ -53,6 +53,17 @@ def simulated(launch, meet, module_domain_id):
     simulator.check()
 
 
+def begin_another_episode(simulated, seed):
+    """What was heard last is of the new episode, as of a clock that begins to be heard in it."""
+    peer, _, truths, odoms, _ = simulated
+    assert peer.set_parameters("simulator_node", episode_seed=seed).successful
+    assert peer.call(Trigger, "simulator_node/reset").success
+    clocks = peer.listen(Clock, "/clock")
+    peer.until(lambda: clocks, "the clock")
+    now_ns = conversions.stamp_from_ros(clocks[0].clock)
+    peer.until(lambda: min(stamp_ns(truths[-1]), stamp_ns(odoms[-1])) > now_ns, "the episode")
+
+
 def wanted(model, seed):
     world = load_worlds("arena")
     sampler = SetSampler(world, model.robot.footprint_radius)
@@ -76,8 +87,7 @@ def test_the_map_of_the_next_episode_comes_by_itself(simulated, model):
     peer = simulated[0]
     maps = peer.listen(OccupancyGrid, "map", qos.LATCHED)
     peer.until(lambda: maps, "the map")
-    assert peer.set_parameters("simulator_node", episode_seed=SEED + 1).successful
-    assert peer.call(Trigger, "simulator_node/reset").success
+    begin_another_episode(simulated, SEED + 1)
     new = wanted(model, SEED + 1).cells.tobytes()
     peer.until(lambda: maps[-1].data.tobytes() == new, "the map of the next episode")
 
@@ -108,8 +118,7 @@ def test_the_map_has_the_simulated_time(simulated):
     maps = peer.listen(OccupancyGrid, "map", qos.LATCHED)
     peer.until(lambda: maps, "the map")
     known = maps[-1].header.stamp
-    assert peer.set_parameters("simulator_node", episode_seed=SEED + 2).successful
-    assert peer.call(Trigger, "simulator_node/reset").success
+    begin_another_episode(simulated, SEED + 2)
     peer.until(lambda: maps[-1].header.stamp != known, "another map")
     period_ns = 100_000_000  # of the odometry, and so of a step
     first = stamp_ns(truths[0])
