@@ -293,7 +293,7 @@ tables: setup ## make the tables of README and docs from benchmarks/results.json
 
 docs: setup ## build the site of docs/ into build/docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
-	@echo "to read and search it: $(BIN)/python -m http.server -b 127.0.0.1 -d build/docs"
+	@echo "to read and search it: open build/docs/index.html in a browser"
 
 reference: setup ## make docs/reference/ from the schemas of the files, the commands and the nodes
 	$(BIN)/python docs/site/reference.py

@@ -13,10 +13,10 @@ from nbconvert import MarkdownExporter
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "nics_drl_bridge"
 AT_THE_TOP = ("CHANGELOG.md", "CONTRIBUTING.md")
-# The theme's for pages from the disk, which have no workers, as its search is one; served pages do
-# without, and nothing here is loaded from elsewhere.
+# The theme's for pages on disk would be loaded from elsewhere: ours takes its place.
 SHIM = re.compile(r"<script[^>]*unpkg\.com/iframe-worker[^>]*></script>")
 NAMED = re.compile(r"(?<!\[)`docs/(?P<page>[\w/]+\.md)`")
+FROM_DISK = f"<script>{Path(__file__).with_name('search_from_disk.js').read_text()}</script>"
 LINK = re.compile(r"\[(?P<text>[^\]]*)\]\((?P<to>[^)#\s:]+)(?P<anchor>#[^)]*)?\)")
 
 
@@ -57,13 +57,13 @@ def on_page_markdown(markdown: str, page: Any, config: MkDocsConfig, files: File
 
 
 def on_post_page(output: str, page: Any, config: MkDocsConfig) -> str:
-    """Takes out what would be loaded from elsewhere."""
-    return SHIM.sub("", output)
+    """Lets pages on disk be searched, too."""
+    return SHIM.sub(lambda _: FROM_DISK, output)
 
 
 def on_post_template(output_content: str, template_name: str, config: MkDocsConfig) -> str:
-    """Takes out what would be loaded from elsewhere."""
-    return SHIM.sub("", output_content)
+    """Lets pages on disk be searched, too."""
+    return SHIM.sub(lambda _: FROM_DISK, output_content)
 
 
 def rooms() -> list[str]:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from browser import Browser, needs_chromium
+from browser import Browser, needs_chromium, until
 
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.sim.world import World
@@ -110,3 +110,18 @@ def test_a_browser_shows_every_page_of_the_site_without_a_flaw(site, tmp_path):
             name = page.relative_to(site).as_posix()
             assert browser.flaws(f"http://127.0.0.1:{server.server_port}/{name}") == []
         server.shutdown()
+
+
+@needs_chromium
+@pytest.mark.process
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_a_word_typed_into_the_search_of_the_site_on_disk_finds_its_page(site, tmp_path):
+    with closing(Browser(tmp_path)) as browser:
+        field = "document.querySelector('.md-search__input')"
+        browser.open((site / "index.html").as_uri(), 1280, 800, ready=f"!!{field}")
+        browser.ask(f"{field}.focus()")
+        browser.call("Input.insertText", text="covariance")
+        first = "document.querySelector('.md-search-result__link')?.href"
+        assert until(lambda: browser.ask(first), "a result").startswith(site.as_uri())
+        assert browser.complaints == []
