@@ -3,9 +3,10 @@
     python -m measuring.run_all [--quick] [--only NAME ...]
 
 A run ends with its bars met, with some missed, or broken: crashed, hung, killed, or without one
-JSON object on standard output. All that is kept, with what was measured, the machine, the commit
-and the load. The file is written anew after each run, so what was measured before an interruption
-stays. Ends with 1 if any run missed a bar or broke, 130 when it was interrupted.
+JSON object on standard output. All that is kept, with what was measured, its machine, the commit
+and the load: bars are ratios within a run, so runs on several machines may stand in one file. It is
+written anew after each run, so what was measured before an interruption stays. Ends with 1 if any
+run missed a bar or broke, 130 when it was interrupted.
 """
 
 from __future__ import annotations
@@ -160,13 +161,16 @@ def write(results: Mapping[str, Any], file: Path) -> None:
 
 
 def known(file: Path) -> dict[str, Any]:
-    """What the file holds already; ends with a sentence if it is none of ours."""
+    """The runs that the file holds already; ends with a sentence if it is none of ours."""
     if not file.exists():
         return {}
     try:
         found = json.loads(file.read_text(encoding="utf-8"))
-        return {"machine": dict(found["machine"]), "runs": dict(found["runs"])}
-    except (OSError, ValueError, KeyError, TypeError):
+        return {
+            name: {**entry, "machine": dict(entry["machine"])}
+            for name, entry in found["runs"].items()
+        }
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         raise SystemExit(
             f"{file}: holds no results; remove it, or name another (make benchmark "
             "OUT=runs/results.json, or --out of the runner)."
@@ -184,26 +188,18 @@ def line_of(name: str, entry: Mapping[str, Any]) -> str:
 def run_all(runs: Mapping[str, Run], given: argparse.Namespace) -> dict[str, dict[str, Any]]:
     """Runs all, one after the other, and writes the file after each."""
     commit, machine = commit_of(given.scripts.parent), describe()
-    kept = known(given.out)
-    if kept and any(kept["machine"].get(key) != machine[key] for key in ("cpu", "cores")):
-        raise SystemExit(
-            f"{given.out}: its figures are from {kept['machine'].get('cores')} cores of "
-            f"{kept['machine'].get('cpu')}, this machine has {machine['cores']} of "
-            f"{machine['cpu']}; name another file (make benchmark OUT=runs/results.json, or --out "
-            "of the runner), or remove this one."
-        )
     every = runs_of(given.scripts)
-    entries = {name: one for name, one in kept.get("runs", {}).items() if name in every}
+    entries = {name: one for name, one in known(given.out).items() if name in every}
     done: dict[str, dict[str, Any]] = {}
     for k, (name, run) in enumerate(runs.items(), 1):
         arguments = run.quick if given.quick else run.full
         words = " ".join([run.script, *arguments])
         sys.stderr.write(f"[{k}/{len(runs)}] {name}: {words}\n")
         timeout_s = given.timeout or run.timeout_s
-        about = {"script": run.script, "quick": given.quick, **commit}
+        about = {"script": run.script, "quick": given.quick, "machine": machine, **commit}
         entry = {**about, **run_one(given.scripts / run.script, arguments, timeout_s)}
         done[name] = entries[name] = entry
-        write({"machine": machine, "runs": dict(sorted(entries.items()))}, given.out)
+        write({"runs": dict(sorted(entries.items()))}, given.out)
         sys.stderr.write(f"[{k}/{len(runs)}] {line_of(name, entry)}")
     return done
 

@@ -12,6 +12,7 @@ import argparse
 import json
 import re
 import sys
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from textwrap import shorten
@@ -28,7 +29,7 @@ PLACEHOLDER = re.compile(
     r"(?: x(?P<factor>[0-9.e+-]+))?(?:\|(?P<format>[^{}]*))?\}"
 )
 HOW = {"max": max, "min": min, "sum": sum}
-NOT_MEASURED, OF_MISSED, OF_QUICK = "not measured", "†", "‡"
+NOT_MEASURED, OF_MISSED, OF_QUICK, ELSEWHERE = "not measured", "†", "‡", "§"
 VERSIONS = ("numba", "numpy")
 MACHINE = "machine"
 """The name of the region that says on what was measured."""
@@ -73,7 +74,9 @@ class Page:
 
     def __init__(self, results: Mapping[str, Any]) -> None:
         self.runs: Mapping[str, Any] = results.get("runs", {})
-        self.machine: Mapping[str, Any] = results.get("machine", {})
+        cpus = Counter(entry["machine"]["cpu"] for entry in self.runs.values())
+        self.cpus = [cpu for cpu, _ in cpus.most_common()]
+        """Of the machines, that of most runs first."""
 
     def figure(self, match: re.Match[str], run: str) -> str:
         """One placeholder. Raises UnknownFigureError."""
@@ -95,11 +98,19 @@ class Page:
             return NOT_MEASURED, runs
         return "".join([text, *(f" {mark}" for mark in self.marks(runs))]), runs
 
+    def elsewhere(self, run: str) -> bool:
+        """Whether a run was made on another machine than most."""
+        return bool(self.runs[run]["machine"]["cpu"] != self.cpus[0])
+
     def marks(self, runs: set[str]) -> list[str]:
-        """Signs for a cell whose runs missed a bar or were short."""
-        entries = [self.runs[name] for name in runs if name in self.runs]
-        missed = any(entry["state"] != MET for entry in entries)
-        return [OF_MISSED] * missed + [OF_QUICK] * any(entry["quick"] for entry in entries)
+        """Signs for a cell whose runs missed a bar, were short, or made on another machine."""
+        known = [name for name in runs if name in self.runs]
+        signs = {
+            OF_MISSED: any(self.runs[name]["state"] != MET for name in known),
+            OF_QUICK: any(self.runs[name]["quick"] for name in known),
+            ELSEWHERE: any(map(self.elsewhere, known)),
+        }
+        return [sign for sign, holds in signs.items() if holds]
 
     def table(self, table: Table) -> str:
         """A table, and below it what is not as it should be with its runs."""
@@ -122,25 +133,31 @@ class Page:
                 notes.append(f"{OF_MISSED} `{entry['script']}` {entry['state']}: {wrong}")
             if entry["quick"]:
                 notes.append(f"{OF_QUICK} `{entry['script']}`: a short run")
+        away = sorted({name for name in runs & set(self.runs) if self.elsewhere(name)})
+        if away:
+            notes.append(f"{ELSEWHERE} on {', '.join(self.cpus[1:])}")
         return [line for note in notes for line in ("", note)]
 
     def about(self) -> str:
         """On what was measured."""
         if not self.runs:
             return "Nothing is measured yet.\n"
-        commits = sorted({
-            f"{entry['commit']}{' and changes' if entry['dirty'] else ''}"
-            for entry in self.runs.values()
-        })  # fmt: skip
-        loads = [entry["load_before"][0] for entry in self.runs.values()]
-        libraries = self.machine.get("libraries", {})
-        versions = [f"Python {self.machine['python']}"]
+        entries = [self.runs[name] for name in self.runs]
+        machine = next(e["machine"] for e in entries if e["machine"]["cpu"] == self.cpus[0])
+        others = "".join(f", or on {cpu} where marked {ELSEWHERE}" for cpu in self.cpus[1:])
+        commits = {(e["commit"], e["dirty"]) for e in entries}
+        changed = " and changes" if any(dirty for _, dirty in commits) else ""
+        told = f"{len(commits)} commits" if len(commits) > 1 else f"commit {entries[0]['commit']}"
+        days = sorted(e["started"][:10] for e in entries)
+        loads = [e["load_before"][0] for e in entries]
+        versions = [f"Python {machine['python']}"]
+        libraries = machine.get("libraries", {})
         versions += [f"{name} {libraries[name]}" for name in VERSIONS if name in libraries]
         return (
-            f"On {self.machine['cores']} shared cores ({self.machine['cpu']}, "
-            f"{self.machine['memory_gb']:.0f} GB), "
-            f"{', '.join(versions)}; load average before "
-            f"each run {min(loads):.1f} to {max(loads):.1f}; commit {', '.join(commits)}:\n"
+            f"On {machine['cores']} shared cores ({machine['cpu']}, {machine['memory_gb']:.0f} GB)"
+            f"{others}, {', '.join(versions)}; load average before "
+            f"each run {min(loads):.1f} to {max(loads):.1f}; {told}{changed}, {days[0]} to "
+            f"{days[-1]}, each in `benchmarks/results.json`:\n"
         )
 
     def text(self, name: str) -> str:

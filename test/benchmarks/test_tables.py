@@ -8,7 +8,9 @@ ROOT = BENCHMARKS.parent
 ENTRY = {
     "script": "parity.py",
     "quick": False,
+    "machine": {"cores": 2, "cpu": "Zuse Z3", "memory_gb": 24.7, "python": "3.11.7"},
     "commit": "0123456789ab",
+    "started": "2026-11-27T09:00:00+00:00",
     "dirty": False,
     "load_before": [1.5, 1.0, 1.0],
     "state": "met",
@@ -37,11 +39,7 @@ def tables(monkeypatch):
 
 
 def page(tables, **changes):
-    results = {
-        "machine": {"cores": 2, "cpu": "Zuse Z3", "memory_gb": 24.7, "python": "3.11.7"},
-        "runs": {"parity": {**ENTRY, "result": RESULT, **changes}},
-    }
-    return tables.Page(results)
+    return tables.Page({"runs": {"parity": {**ENTRY, "result": RESULT, **changes}}})
 
 
 @pytest.mark.parametrize(
@@ -94,8 +92,18 @@ def test_the_machine_the_commit_and_the_load_are_told(tables):
     assert "measured yet" in tables.Page({}).text("machine")
 
 
+def test_what_was_measured_on_another_machine_than_most_is_marked(tables):
+    entry = {**ENTRY, "result": RESULT}
+    away = {**entry, "machine": {**ENTRY["machine"], "cpu": "Analytical Engine"}}
+    found = tables.Page({"runs": {"parity": entry, "soak": entry, "shield": away}})
+    table = tables.Table(("",), (("parity", "{rate|.0e}"), ("shield", "{rate|.0e}")))
+    assert found.table(table) == "| |\n|---|\n| 5e5 |\n| 5e5 § |\n\n§ on Analytical Engine\n"
+    assert "or on Analytical Engine where marked §" in found.text("machine")
+    assert "§" not in page(tables).text("machine")
+
+
 def test_every_table_is_written_whatever_there_is(tables):
-    for results in ({}, {"machine": {}, "runs": {"parity": {**ENTRY, "result": {"runs": []}}}}):
+    for results in ({}, {"runs": {"parity": {**ENTRY, "result": {"runs": []}}}}):
         for name in tables.TABLES:
             assert "not measured" in tables.Page(results).text(name)
 
