@@ -168,7 +168,7 @@ def rows(schema: type[BaseModel], properties: dict[str, Any], required: list[str
     names = {field.alias or name: name for name, field in schema.model_fields.items()}
     for key, part in properties.items():
         default = "required" if key in required else ""
-        if "default" in part and not isinstance(part["default"], dict):
+        if "default" in part and "$ref" not in part:  # a schema's is that of its own keys
             default = shown(part["default"])
         cells = (f"`{key}`", type_of(part), default, range_of(part), meaning(schema, names[key]))
         yield "|" + "|".join(f" {re.sub(r'[|]', '&#124;', cell)} " for cell in cells) + "|"

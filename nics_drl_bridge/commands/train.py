@@ -19,7 +19,7 @@ from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.files import json_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
-OWN = ("lean", "sb3")  # the engines of PPO in this process, see `training_settings.Engine`
+OWN = ("lean", "sb3")  # the engines of PPO in this process, see `training_settings.PpoSettings`
 
 
 def train(

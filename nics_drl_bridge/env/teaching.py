@@ -34,13 +34,12 @@ class Curriculum(Schema):
 class Teaching(Schema):
     """Rewards by what only the simulator knows, repetition, easy starts; nothing by default."""
 
-    # reward of a contact that the task does not notice, e.g. behind a lidar of 270 deg, and its end
-    contact: float | None = None
+    contact: float | None = None  # reward of a contact that the task misses, which ends the episode
     path: float = 0.0  # reward of each metre by which the way around obstacles gets shorter
     retries: int = Field(default=0, ge=0, le=1000)  # times that a failed episode is driven again
     # by which robots are larger all around while they learn [m], to keep away from what stands
     margin: float = Field(default=0.0, ge=0.0, le=1.0)
-    curriculum: Curriculum | None = None
+    curriculum: Curriculum | None = None  # starts near the goal first; None: as worlds draw them
 
 
 class Teacher:

@@ -28,8 +28,8 @@ SPEED, TURN = "m/s", "rad/s"
 class CommandLimit(Schema):
     """Limits of one command, in its unit; an angle's rate is the steering rate."""
 
-    min: float = Field(le=0.0)
-    max: float = Field(ge=0.0)
+    min: float = Field(le=0.0)  # least value that the gate lets pass
+    max: float = Field(ge=0.0)  # greatest value that the gate lets pass
     rate: float = Field(gt=0.0)  # greatest change per second, in both directions
     jerk: float = Field(gt=0.0)  # greatest change of the rate per second
 

@@ -31,12 +31,12 @@ class LidarFaults(Schema):
     the square of the range, in full at range_max.
     """
 
-    skew: Skew = "none"
-    too_close: TooClose = "minus_inf"
+    skew: Skew = "none"  # which way it turns while the robot moves; none: all beams at once
+    too_close: TooClose = "minus_inf"  # what it reports for a return nearer than range_min
     noise_proportional: float = Field(default=0.0, ge=0.0, le=10.0)  # added to noise_std, per metre
     quantisation: float = Field(default=0.0, ge=0.0, le=1e4)  # returns are multiples of it [m]
     dropout: float = Field(default=0.0, ge=0.0, le=1.0)  # probability that a return is lost
-    dropout_far: float = Field(default=0.0, ge=0.0, le=1.0)  # added to it
+    dropout_far: float = Field(default=0.0, ge=0.0, le=1.0)  # added to dropout in full at range_max
 
     @model_validator(mode="after")
     def _probable(self) -> "LidarFaults":

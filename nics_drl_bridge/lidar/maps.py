@@ -112,7 +112,7 @@ class MapFile(Schema):
     negate: bool  # 0 or 1; True if white is occupied, rather than black
     occupied_thresh: float = Field(ge=0.0, le=1.0)  # from this darkness on pixels are occupied
     free_thresh: float = Field(ge=0.0, le=1.0)  # up to this darkness they are free
-    mode: Literal["trinary", "scale", "raw"] = "trinary"
+    mode: Literal["trinary", "scale", "raw"] = "trinary"  # how pixels become cells, see above
 
     @model_validator(mode="after")
     def _consistent(self) -> "MapFile":

@@ -19,7 +19,7 @@ NEAREST = 1e-3  # a surface nearer than this is as bright as one at this range [
 class IncidenceDropout(Schema):
     """Loses returns at oblique incidence, as from polished metal."""
 
-    kind: Literal["incidence_dropout"] = "incidence_dropout"
+    kind: Literal["incidence_dropout"] = "incidence_dropout"  # which sensor model this is
     greatest_incidence: float = Field(gt=0.0, lt=math.pi / 2.0)  # of the ray to the normal [rad]
 
     def __str__(self) -> str:
@@ -43,7 +43,7 @@ class Intensity(Schema):
     the angle, and more than 1 for glossy surfaces.
     """
 
-    kind: Literal["intensity"] = "intensity"
+    kind: Literal["intensity"] = "intensity"  # which sensor model this is
     gain: float = Field(default=1.0, gt=0.0)  # white, at normal incidence, at 1 m [device's unit]
     reflectivity: float = Field(default=0.5, gt=0.0)  # of walls, maps, shapes without their own
     exponent: float = Field(default=1.0, ge=0.0, le=100.0)  # of the cosine

@@ -48,7 +48,7 @@ class Outlined(Surface):
 class Circle(Surface):
     """A disc around its own origin."""
 
-    kind: Literal["circle"] = "circle"
+    kind: Literal["circle"] = "circle"  # which kind of shape this is
     radius: Size  # [m]
 
     @property
@@ -60,7 +60,7 @@ class Circle(Surface):
 class Rectangle(Outlined):
     """A rectangle centred at its own origin, along its own axes."""
 
-    kind: Literal["rectangle"] = "rectangle"
+    kind: Literal["rectangle"] = "rectangle"  # which kind of shape this is
     size: tuple[Size, Size]  # length along x and width along y [m]
 
     @field_validator("size", mode="before")
@@ -80,7 +80,7 @@ class Rectangle(Outlined):
 class Polygon(Outlined):
     """An outline of straight edges, convex or concave; the last corner is joined to the first."""
 
-    kind: Literal["polygon"] = "polygon"
+    kind: Literal["polygon"] = "polygon"  # which kind of shape this is
     # in the shape's own frame, in either orientation [m]
     points: tuple[tuple[Place, Place], ...] = Field(min_length=3, max_length=MOST_CORNERS)
 
@@ -105,7 +105,7 @@ class Polygon(Outlined):
 class Segment(Outlined):
     """A straight wall without thickness."""
 
-    kind: Literal["segment"] = "segment"
+    kind: Literal["segment"] = "segment"  # which kind of shape this is
     ends: tuple[tuple[Place, Place], tuple[Place, Place]]  # in the shape's own frame [m]
 
     @model_validator(mode="after")

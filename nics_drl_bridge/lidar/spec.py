@@ -49,7 +49,7 @@ class LidarSpec(Schema):
     If the limits span a full circle, the last beam is one increment short of it.
     """
 
-    name: str = "lidar"
+    name: str = "lidar"  # used in messages and reports
     beams: int = Field(ge=1, le=100_000)  # B
     angle_min: float  # of the first beam, in the frame of the lidar [rad]
     angle_max: float  # of the last beam, or of the end of the circle [rad]

@@ -20,10 +20,10 @@ MOST_SCANS = 64  # of a history
 class Scaled(Schema):
     """Numbers as a network takes them: cut to `limits`, (x - subtract) / divide, cut to `clip`."""
 
-    limits: Limits | None = None
-    subtract: Numbers = 0.0
-    divide: Numbers = 1.0
-    clip: Limits | None = None
+    limits: Limits | None = None  # least and greatest before scaling; None: not cut
+    subtract: Numbers = 0.0  # subtracted first: one number for all elements, or one for each
+    divide: Numbers = 1.0  # by which that is divided: one number for all elements, or one for each
+    clip: Limits | None = None  # least and greatest after scaling; None: not cut
 
     @field_validator("divide")
     @classmethod
@@ -43,10 +43,9 @@ class Scaled(Schema):
 class InputPart(Scaled):
     """Consecutive elements of an input: one quantity, in SI units unless scaled."""
 
-    of: Quantity
+    of: Quantity  # the quantity; the guide lists them with their units
     clockwise: bool = False  # order of a scan
-    # So many of it, of this step and those before, which at the beginning are like the first
-    history: int = Field(default=1, ge=1, le=MOST_SCANS)
+    history: int = Field(default=1, ge=1, le=MOST_SCANS)  # steps of it, this and earlier ones
     newest_first: bool = False  # order of a history
     output: str | None = None  # the network's, whose numbers of the step before are `last.output`
     value: Numbers | None = None  # of a `constant`
@@ -65,32 +64,32 @@ class InputPart(Scaled):
 class ForeignInput(Scaled):
     """An input of the network: its parts in order, then scaled as a whole."""
 
-    parts: tuple[InputPart, ...] = Field(min_length=1)
+    parts: tuple[InputPart, ...] = Field(min_length=1)  # quantities that fill it, in order
 
 
 class ForeignState(Schema):
     """A state of the network, an input that takes an output of the step before."""
 
-    next: str  # that output
-    start: Numbers = 0.0  # when an episode begins
+    next: str  # name of that output
+    start: Numbers = 0.0  # its value when an episode begins
 
 
 class OutputCommand(Schema):
     """A command by an element of an output: cut to `limits`, x * multiply + add, cut to `clip`."""
 
     of: str | None = None  # the output; None: the command is always `add`
-    index: int = Field(default=0, ge=0)
-    limits: Limits | None = None
-    multiply: float = 1.0
-    add: float = 0.0
-    clip: Limits | None = None
+    index: int = Field(default=0, ge=0)  # which element of the flattened output
+    limits: Limits | None = None  # least and greatest before scaling; None: not cut
+    multiply: float = 1.0  # factor on the element
+    add: float = 0.0  # added after that, in the unit of the command
+    clip: Limits | None = None  # least and greatest command; None: the robot's own limits alone
 
 
 class Choices(Schema):
     """Commands to choose from: by the greatest number of an output, or by its whole number."""
 
-    of: str
-    commands: tuple[dict[str, float], ...] = Field(min_length=1)  # what a row omits is 0
+    of: str  # name of the output that chooses
+    commands: tuple[dict[str, float], ...] = Field(min_length=1)  # in order; what a row omits is 0
 
 
 class ForeignPolicy(Schema):
@@ -99,15 +98,15 @@ class ForeignPolicy(Schema):
     Commands are `forward` and `left` [m/s] and `turn` [rad/s], or have the robot's own names.
     """
 
-    kind: Literal["foreign policy"]
+    kind: Literal["foreign policy"]  # says what the file is
     network: str = Field(min_length=1)  # an .onnx file or a LEAPP bundle, relative to the mapping
     robot: str | None = None  # that it drives where none is named: a shipped one or a model
     control_period: float | None = Field(default=None, gt=0.0, le=10.0)  # None: the robot's [s]
     scan: Any = None  # as in `sectors.layout_of`; None: the beams of the robot's lidar
-    inputs: dict[str, ForeignInput] = Field(min_length=1)
-    states: dict[str, ForeignState] = Field(default_factory=dict)
-    outputs: dict[str, OutputCommand] = Field(default_factory=dict)
-    choices: Choices | None = None
+    inputs: dict[str, ForeignInput] = Field(min_length=1)  # the network's inputs, by their names
+    states: dict[str, ForeignState] = Field(default_factory=dict)  # its recurrent inputs, by name
+    outputs: dict[str, OutputCommand] = Field(default_factory=dict)  # the commands, by their names
+    choices: Choices | None = None  # instead of `outputs`: fixed commands, of which it chooses one
 
     @model_validator(mode="after")
     def _one_way_out(self) -> "ForeignPolicy":

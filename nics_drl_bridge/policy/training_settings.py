@@ -17,7 +17,6 @@ Count = Annotated[int, Field(ge=1, le=10**12)]
 MOST_WORLDS = 65_536  # maximum number of copies of all worlds together
 MOST_LAYERS, MOST_WIDE = 16, 8_192
 MOST_KEPT = 2**26  # stored transitions: of a roll-out in all worlds, or of SAC's buffer
-Engine = Literal["lean", "sb3"]
 Width = Annotated[int, Field(ge=1, le=MOST_WIDE)]
 
 
@@ -27,15 +26,15 @@ class PpoSettings(Schema):
     The engine `lean` learns on one core while it collects on another; `sb3` is Stable-Baselines3.
     """
 
-    engine: Engine = "lean"
+    engine: Literal["lean", "sb3"] = "lean"  # implementation, see above
     learning_rate: float = Field(default=1e-3, gt=0.0)  # at the start; falls linearly to a fiftieth
     rollout: Count = 32  # steps in each world between two updates
     batch: Count = 2048  # transitions of one gradient step
     epochs: Count = 5  # passes of an update through the roll-outs
-    discount: Share = 0.98
-    gae_lambda: Share = 0.95
-    clip: float = Field(default=0.2, gt=0.0)
-    entropy: float = Field(default=0.0, ge=0.0)
+    discount: Share = 0.98  # gamma, per step
+    gae_lambda: Share = 0.95  # lambda of generalised advantage estimation
+    clip: float = Field(default=0.2, gt=0.0)  # range of the probability ratio around 1
+    entropy: float = Field(default=0.0, ge=0.0)  # weight of the entropy bonus; more explores more
     log_std: float = -0.5  # of the actions at the start
     mirror: bool = False  # True learns from each transition with left and right exchanged, too
 
@@ -43,7 +42,7 @@ class PpoSettings(Schema):
 class StackMemory(Schema):
     """Earlier scans beside the present one (Mnih and others 2015)."""
 
-    kind: Literal["stack"] = "stack"
+    kind: Literal["stack"] = "stack"  # which kind of memory this is
     scans: int = Field(default=4, ge=2, le=16)  # with the present one
     every: int = Field(default=2, ge=1, le=16)  # steps between two of them
 
@@ -51,19 +50,19 @@ class StackMemory(Schema):
 class GruMemory(Schema):
     """A gated recurrent unit (Cho and others 2014), learnt through the steps of a rollout."""
 
-    kind: Literal["gru"] = "gru"
-    units: int = Field(default=64, ge=1, le=1024)
+    kind: Literal["gru"] = "gru"  # which kind of memory this is
+    units: int = Field(default=64, ge=1, le=1024)  # size of its state
 
 
 class SacSettings(Schema):
     """Soft actor-critic (Haarnoja and others 2018), as in Stable-Baselines3."""
 
-    learning_rate: float = Field(default=1e-3, gt=0.0)
+    learning_rate: float = Field(default=1e-3, gt=0.0)  # of all networks, constant
     buffer: Count = 300_000  # transitions that are stored of all worlds together
     batch: Count = 512  # transitions of one gradient step
     updates: Count = 8  # gradient steps after each step of the worlds
     begin_after: Count = 5_000  # transitions of random actions before the first update
-    discount: Share = 0.98
+    discount: Share = 0.98  # gamma, per step
     soft_update: Share = 0.01  # by which each gradient step moves the target critics
 
 
@@ -87,23 +86,27 @@ class TrainingSettings(Schema):
     """A training, as in `config/training/*.yaml`; `worlds` maps names or files to their copies."""
 
     task: str = "navigation"  # a name, or `path/to/file.py:ClassName`
-    task_options: dict[str, Any] = Field(default_factory=dict)  # of the task's class
+    task_options: dict[str, Any] = Field(default_factory=dict)  # arguments of the task's class
     robot: str = DEFAULT_ROBOT  # name of a shipped robot, or the folder of a model
     lidar: str | None = None  # a shipped one or a file, instead of the model's own
-    worlds: dict[str, Count] = Field(default_factory=lambda: {"circles": 256}, min_length=1)
+    worlds: dict[str, Count] = Field(default={"circles": 256}, min_length=1)  # copies of each world
     randomisation: str | None = None  # quantities drawn in each episode: a shipped one or a file
     teaching: Teaching = Teaching()  # rewards by what only the simulator knows, and repetition
     steps: Count = 1_000_000  # environment steps of all worlds together, at most with `stop`
-    stop: StopSettings | None = None  # ends earlier
-    max_episode_steps: Count = 300  # an episode ends as a time-out after this many steps
-    algorithm: Literal["ppo", "sac"] = "ppo"
+    stop: StopSettings | None = None  # early end; None: after all steps
+    # time limit of an episode [steps]; left out, `nics train` makes it 30 s, or 1.8 times what the
+    # longest straight way to a goal of the worlds takes at top speed, if that is more
+    max_episode_steps: Count = 300
+    algorithm: Literal["ppo", "sac"] = "ppo"  # learning algorithm; its settings are under its name
+    # sizes of the hidden layers, in actor and critic alike
     hidden: tuple[Width, ...] = Field(default=(64, 64), min_length=1, max_length=MOST_LAYERS)
+    # what the actor remembers between steps, with the engine `lean` only; None: nothing
     memory: Annotated[StackMemory | GruMemory, Field(discriminator="kind")] | None = None
-    threads: Annotated[int, Field(ge=1, le=1024)] = 1
+    threads: Annotated[int, Field(ge=1, le=1024)] = 1  # of PyTorch; results depend on it slightly
     checkpoint_every: Count = 200_000  # environment steps between two checkpoints
-    ppo: PpoSettings = PpoSettings()
-    sac: SacSettings = SacSettings()
-    imitation: ImitationSettings | None = None
+    ppo: PpoSettings = PpoSettings()  # used if `algorithm` is `ppo`
+    sac: SacSettings = SacSettings()  # used if `algorithm` is `sac`
+    imitation: ImitationSettings | None = None  # start by imitating an expert; None: from scratch
 
     @field_validator("task_options")
     @classmethod

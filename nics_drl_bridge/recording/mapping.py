@@ -95,7 +95,7 @@ class Time(Schema):
 
     # also `header` or `arrival` of the messages of a bag
     from_: Reference | tuple[Reference, Reference] | None = Field(default=None, alias="from")
-    unit: Annotated[str | None, _of_kind(("s",))] = None
+    unit: Annotated[str | None, _of_kind(("s",))] = None  # of the stamps; None: s
     rate: float | None = Field(default=None, gt=0.0)  # of rows without stamps [Hz]
 
     @model_validator(mode="after")
@@ -113,19 +113,19 @@ class Time(Schema):
 class Value(Schema):
     """A number in each row: SI value = unit x scale x what stands there + offset."""
 
-    from_: Reference = Field(alias="from")
+    from_: Reference = Field(alias="from")  # column by name or number, TABLE:COLUMN or /topic:field
     unit: str | None = None  # by default that of the stream, or SI
     maximum: float | None = None  # value in SI of a full share
     scale: float = 1.0  # -1 turns the sign
     offset: float = 0.0  # in SI
-    ticks_per_turn: float | None = Field(default=None, gt=0.0)
+    ticks_per_turn: float | None = Field(default=None, gt=0.0)  # of an encoder, makes ticks angles
     differentiate: bool | None = None  # by default true for `ticks`, which are counters
     wrap: float | None = Field(default=None, gt=0.0)  # where a counter overflows; found if left out
     # other columns, flags, and the values at which this one counts; `otherwise` stands in its place
     when: dict[str, Condition] = Field(default_factory=dict)
-    otherwise: float = 0.0
-    time: Annotated[Time | None, _short("from")] = None
-    clock: str | None = None
+    otherwise: float = 0.0  # in SI, where a flag is not as `when` needs it
+    time: Annotated[Time | None, _short("from")] = None  # stamps of this value; None: of its stream
+    clock: str | None = None  # name of the clock of these stamps; None: of its stream
 
     @field_validator("unit")
     @classmethod
@@ -151,26 +151,26 @@ AValue = Annotated[Value, _short("from")]
 class Measured(Schema):
     """Keys of all streams: table of their columns, stamps, clock."""
 
-    in_: str | None = Field(default=None, alias="in")  # a file or a topic, for columns without
-    time: Annotated[Time | None, _short("from")] = None
-    clock: str | None = None  # between two clocks there is an unknown offset
+    in_: str | None = Field(default=None, alias="in")  # file or topic of columns that name none
+    time: Annotated[Time | None, _short("from")] = None  # stamps; None: those of the whole mapping
+    clock: str | None = None  # clock of the stamps; two clocks differ by an unknown offset
 
 
 class PoseSource(Measured):
     """Pose of the tracked body in a fixed frame."""
 
-    x: AValue | None = None  # both by default in the message of the topic `in`
-    y: AValue | None = None
-    heading: AValue | None = None
+    x: AValue | None = None  # position; None: the messages of the topic `in` are poses
+    y: AValue | None = None  # position along y, 90 degrees counter-clockwise from x
+    heading: AValue | None = None  # direction of the body, counter-clockwise from x
     # instead of the heading: x, y, z, w, or the field of a message
     quaternion: str | tuple[Reference, Reference, Reference, Reference] | None = None
     # of x and y, and in the covariance; an angle if they are longitude and latitude
     unit: Annotated[str, _of_kind(("m", "rad"))] = "m"
-    heading_unit: Annotated[str, _of_kind(("rad",))] = "rad"
+    heading_unit: Annotated[str, _of_kind(("rad",))] = "rad"  # of the heading and its variance
     # variances of x, y, heading; or all of a 3 x 3 or 6 x 6 matrix, by rows; or a message's field
     covariance: str | list[Reference] | None = None
-    frame: str | None = None  # parent and child of the transforms to use, of a topic like /tf
-    child_frame: str | None = None
+    frame: str | None = None  # parent of the transforms to use, of a topic like /tf
+    child_frame: str | None = None  # their child, the tracked body
 
     @property
     def frames(self) -> tuple[str | None, str | None]:
@@ -193,39 +193,39 @@ class PoseSource(Measured):
 class WheelSource(Measured):
     """Wheel speeds, in the encoder's units or rad/s."""
 
-    left: AValue
-    right: AValue
+    left: AValue  # speed of the left wheel
+    right: AValue  # speed of the right wheel
 
 
 class ImuSource(Measured):
     """Acceleration along x, y and yaw rate."""
 
-    ax: AValue | None = None
-    ay: AValue | None = None
-    yaw_rate: AValue
+    ax: AValue | None = None  # acceleration along x, forward [m/s^2]; None: 0
+    ay: AValue | None = None  # acceleration along y, to the left [m/s^2]; None: 0
+    yaw_rate: AValue  # turn rate, counter-clockwise [rad/s]
 
 
 class OdometrySource(Measured):
     """Body velocity by the robot's own odometry."""
 
-    vx: AValue
-    vy: AValue | None = None
-    wz: AValue
+    vx: AValue  # forward [m/s]
+    vy: AValue | None = None  # to the left [m/s]; None: 0
+    wz: AValue  # turn rate, counter-clockwise [rad/s]
 
 
 class Mapping(Schema):
     """A recording of any form as the streams of a Recording."""
 
     robot: str | dict[str, Any] | None = None  # a shipped robot's name, a path, or its definition
-    in_: str | None = Field(default=None, alias="in")  # as in a stream, for all that name none
-    time: Annotated[Time | None, _short("from")] = None
-    clock: str | None = None
-    pose: Annotated[PoseSource, BeforeValidator(lambda v: {"in": v} if isinstance(v, str) else v)]
+    in_: str | None = Field(default=None, alias="in")  # file or topic of streams that name none
+    time: Annotated[Time | None, _short("from")] = None  # stamps of all streams; None: a bag's own
+    clock: str | None = None  # clock of all streams; None: `robot`, unless a bag's headers differ
+    pose: Annotated[PoseSource, _short("in")]  # of the tracked body; a topic alone means its `in`
     command: dict[str, AValue] = Field(min_length=1)  # by the names of the robot's commands
-    state: dict[str, AValue] = Field(default_factory=dict)  # likewise
-    wheels: WheelSource | None = None
-    imu: ImuSource | None = None
-    odometry: OdometrySource | None = None
+    state: dict[str, AValue] = Field(default_factory=dict)  # measured states, by their names
+    wheels: WheelSource | None = None  # wheel speeds, if they were recorded
+    imu: ImuSource | None = None  # acceleration and yaw rate, if they were recorded
+    odometry: OdometrySource | None = None  # the robot's own body velocity, if it was recorded
 
 
 SI: dict[str, dict[str, tuple[str, ...]]] = {

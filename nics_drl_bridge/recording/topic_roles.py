@@ -66,8 +66,7 @@ class TopicRoles(Schema):
     child_frame: str | None = None  # their child, the robot
     # joint of each state variable; by default guessed by the joints' names
     state: dict[str, JointSource | str] = Field(default_factory=dict)
-    # left and right joint whose velocities are the wheel speeds; likewise
-    wheels: tuple[str, str] | None = None
+    wheels: tuple[str, str] | None = None  # left and right joint of wheel speeds; None: guessed
     # `header` takes all times from the messages' headers, `receive` from their receipt by the bag,
     # `auto` from the header if there is one
     stamps: Stamps = "auto"

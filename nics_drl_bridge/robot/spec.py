@@ -75,10 +75,10 @@ def _own_kinds(module: str) -> dict[str, Any]:
 class Variable(Schema):
     """A component of the state or of the command."""
 
-    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")
-    unit: Unit
-    min: float = Field(ge=-FASTEST, le=FASTEST)
-    max: float = Field(ge=-FASTEST, le=FASTEST)
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]*$")  # unique; small letters, digits and _
+    unit: Unit  # of its values, in SI; 1 is a ratio or a count
+    min: float = Field(ge=-FASTEST, le=FASTEST)  # least value, in this unit
+    max: float = Field(ge=-FASTEST, le=FASTEST)  # greatest value, in this unit
 
     @model_validator(mode="after")
     def _ordered(self) -> "Variable":
@@ -90,7 +90,7 @@ class Variable(Schema):
 class StateVariable(Variable):
     """A component of the state: measured, or `follows` a command with a lag, or of the `twist`."""
 
-    follows: str | None = None
+    follows: str | None = None  # name of the command that it follows with a lag
     # the component of the body twist that it is: taken from the pose where nothing measures it
     twist: PoseRate | None = None
 
@@ -103,7 +103,7 @@ class StateVariable(Variable):
 class CommandVariable(Variable):
     """A component of the command, with its field of `cmd_vel` if that drives the robot."""
 
-    cmd_vel: CmdVelField | None = None
+    cmd_vel: CmdVelField | None = None  # field of `cmd_vel` that carries it; None: in process only
 
     @property
     def turns(self) -> bool:
@@ -124,8 +124,8 @@ class CommandVariable(Variable):
 class RobotSpec(Schema):
     """Definition of a robot."""
 
-    name: str
-    description: str = ""
+    name: str  # used in messages and in names of files
+    description: str = ""  # one sentence for people who read the file
     # its kind: textbook kinematics, to make recordings, or to assume what a drive did not show
     textbook: str | None = None
     parameters: dict[str, float] = Field(default_factory=dict)  # [m, s], see the module of its kind
@@ -143,8 +143,9 @@ class RobotSpec(Schema):
     lidar: str | None = Field(default=None, min_length=1)
     # where that is, x, y [m] and heading [rad] in `base_link`; None: as the lidar's own file says
     lidar_mount: Mount | None = None
-    # S and C components, in the order of every state and command vector
+    # what follows commands with a lag, or is measured, in the order of every state vector
     state: tuple[StateVariable, ...] = Field(default=(), max_length=MOST_VARIABLES)
+    # what drives it, in the order of every command vector
     command: tuple[CommandVariable, ...] = Field(min_length=1, max_length=MOST_VARIABLES)
 
     @field_validator("textbook")

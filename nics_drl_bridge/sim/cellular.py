@@ -27,9 +27,9 @@ FINE = 2  # points of the search for a way, along a cell
 class Cellular(Schema):
     """Parameters of the worlds; each draws its own fill and smoothing between the two given."""
 
-    kind: Literal["cellular"] = "cellular"
-    worlds: int = Field(ge=1, le=10_000)
-    seed: int = Field(default=0, ge=0)
+    kind: Literal["cellular"] = "cellular"  # which kind of generator this is
+    worlds: int = Field(ge=1, le=10_000)  # how many of them are made
+    seed: int = Field(default=0, ge=0)  # of the generator; another one makes other worlds
     columns: int = Field(default=30, ge=4)  # of cells across the field
     rows: int = Field(default=30, ge=4)  # along it
     cell: float = Field(default=0.15, ge=0.01, le=10.0)  # side, and diameter of a cylinder [m]

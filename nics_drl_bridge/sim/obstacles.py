@@ -32,14 +32,14 @@ Distance = Annotated[float, Field(ge=1e-3, le=STRONGEST)]
 class Wander(Schema):
     """Moves straight ahead, by a speed drawn per episode, and turns when something is near."""
 
-    kind: Literal["wander"] = "wander"
-    speed: Speed
+    kind: Literal["wander"] = "wander"  # which kind of motion this is
+    speed: Speed  # range to draw from, per episode [m/s]
 
 
 class Patrol(Schema):
     """Moves from waypoint to waypoint, and waits while something is in the way."""
 
-    kind: Literal["patrol"] = "patrol"
+    kind: Literal["patrol"] = "patrol"  # which kind of motion this is
     # x, y in `map` [m]
     waypoints: tuple[tuple[Coordinate, Coordinate], ...] = Field(min_length=2, max_length=1000)
     speed: float = Field(gt=0.0, le=FASTEST)  # [m/s]
@@ -63,7 +63,7 @@ class Pedestrian(Schema):
     speeds are the paper's 1.34 m/s, plus or minus one standard deviation of 0.26 m/s.
     """
 
-    kind: Literal["pedestrian"] = "pedestrian"
+    kind: Literal["pedestrian"] = "pedestrian"  # which kind of motion this is
     speed: Speed = (1.08, 1.6)  # range of the desired one, per episode; its end is a limit [m/s]
     relaxation: float = Field(default=0.5, ge=0.1, le=10.0)  # tau, to the desired velocity [s]
     repulsion: Strength = 2.1  # V0 [m^2/s^2] of walkers, obstacles and robots

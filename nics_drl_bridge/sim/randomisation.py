@@ -94,16 +94,15 @@ class OdometryRanges(Schema):
 
 
 class LidarRanges(Schema):
-    """The lidar's noise and faults, instead of the model's; the fields of `LidarFaults`."""
+    """Noise and faults instead of the model's, see `LidarFaults`; words are all equally likely."""
 
     noise_std: Level | None = None  # see `LidarSpec` [m]
-    noise_proportional: Level | None = None
-    quantisation: Level | None = None
-    dropout: Level | None = None
-    dropout_far: Level | None = None
-    # `skew`, `too_close`: the words that may be drawn, all equally likely
-    skew: tuple[Skew, ...] | None = Field(default=None, min_length=1)
-    too_close: tuple[TooClose, ...] | None = Field(default=None, min_length=1)
+    noise_proportional: Level | None = None  # added to it for each metre of range [m/m]
+    quantisation: Level | None = None  # returns are multiples of it [m]
+    dropout: Level | None = None  # probability that a return is lost
+    dropout_far: Level | None = None  # added to it at range_max
+    skew: tuple[Skew, ...] | None = Field(default=None, min_length=1)  # words to draw from
+    too_close: tuple[TooClose, ...] | None = Field(default=None, min_length=1)  # words to draw from
 
     @model_validator(mode="after")
     def _probable(self) -> "LidarRanges":
@@ -130,13 +129,13 @@ class ObstacleRanges(Schema):
 class Randomisation(Schema):
     """Ranges that are drawn from in every episode; all else stays as in model and world."""
 
-    name: str
-    kinematics: KinematicRanges = KinematicRanges()
+    name: str  # used in messages
+    kinematics: KinematicRanges = KinematicRanges()  # factors on the motion of the model
     action_latency: Latency = (0.0, 0.0)  # in addition to the model's [control periods]
     observation_latency: Latency = (0.0, 0.0)  # age of scan and odometry [control periods]
-    odometry: OdometryRanges = OdometryRanges()
-    lidar: LidarRanges = LidarRanges()
-    obstacles: ObstacleRanges = ObstacleRanges()
+    odometry: OdometryRanges = OdometryRanges()  # errors of odometry and of motion
+    lidar: LidarRanges = LidarRanges()  # noise and faults of the lidar
+    obstacles: ObstacleRanges = ObstacleRanges()  # number and size of the obstacles
 
     @property
     def sizes(self) -> tuple[float, ...]:

@@ -63,7 +63,7 @@ class Obstacles(Schema):
 class Places(Schema):
     """Places in regions, x1, y1, x2, y2 of opposite corners [m], or at poses or points."""
 
-    regions: tuple[Region, ...] = Field(default=(), max_length=MOST_PLACES)
+    regions: tuple[Region, ...] = Field(default=(), max_length=MOST_PLACES)  # x1, y1, x2, y2 [m]
     at: tuple[Pose | Point, ...] = Field(default=(), max_length=MOST_PLACES)
 
     @model_validator(mode="after")
@@ -74,15 +74,15 @@ class Places(Schema):
 
 
 class Starts(Places):
-    """Places where robots start."""
+    """Places where robots start: any point of the regions, or one of the poses."""
 
-    at: tuple[Pose, ...] = Field(default=(), max_length=MOST_PLACES)
+    at: tuple[Pose, ...] = Field(default=(), max_length=MOST_PLACES)  # x, y [m], heading [rad]
 
 
 class Goals(Places):
-    """Places that robots are to reach."""
+    """Places that robots are to reach: any point of the regions, or one of the given points."""
 
-    at: tuple[Point, ...] = Field(default=(), max_length=MOST_PLACES)
+    at: tuple[Point, ...] = Field(default=(), max_length=MOST_PLACES)  # x, y [m]
 
 
 class World(Schema):
@@ -98,8 +98,8 @@ class World(Schema):
     obstacles: tuple[Obstacles, ...] = ()  # groups of obstacles, see `Obstacles`
     clearance: Distance = 0.3  # around the footprint at start, goal, and on a path between [m]
     goal_distance: tuple[Distance, Distance]  # least and greatest, from start straight to goal [m]
-    starts: Starts | None = None  # `starts`, `goals`: by default anywhere
-    goals: Goals | None = None
+    starts: Starts | None = None  # where robots start; None: anywhere with room
+    goals: Goals | None = None  # where goals lie; None: anywhere with room
     _file: str | None = PrivateAttr(default=None)
     _spare: tuple[Shape, ...] = PrivateAttr(default=())
 

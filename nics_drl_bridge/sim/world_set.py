@@ -31,7 +31,7 @@ BARN = "barn"  # the 250 worlds of a benchmark; one of them is `barn/7`
 class SetFile(Schema):
     """The keys of a world set's YAML file."""
 
-    name: str
+    name: str  # used in messages and results
     # names, files, folders and globs; paths count from the folder of this file
     worlds: tuple[str, ...] = Field(default=(), max_length=MOST_MEMBERS)
     without: tuple[str, ...] = ()  # of those, the ones to leave out

@@ -29,6 +29,14 @@ def test_the_reference_is_what_the_schemas_and_commands_say():
         assert written == text, f"docs/reference/{name} is out of date; run `make reference`"
 
 
+def test_no_key_argument_or_parameter_of_the_reference_is_without_a_meaning():
+    for name, text in reference.pages().items():
+        rows = [line.split("|")[1:-1] for line in text.splitlines() if line.startswith("| `")]
+        bare = [row[0].strip() for row in rows if not row[-1].strip()]
+        assert rows, name
+        assert not bare, f"docs/reference/{name}: say beside the field what it is: {bare}"
+
+
 def test_a_key_has_its_type_default_range_and_the_comment_at_its_field():
     schema = World.model_json_schema()
     found = reference.rows(World, schema["properties"], schema["required"])
