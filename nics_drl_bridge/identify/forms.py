@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.signal import lfilter
+import scipy  # .signal loads in a second, when it is used
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify import shooting
@@ -77,7 +77,7 @@ def _of_component(samples: Samples, spec: RobotSpec, place: int, dof: int) -> Ca
             for c in range(command.shape[1]):
                 u = curve.of(command[:, c]) if c == place else command[:, c]
                 share = 1.0 - np.exp(-samples.dt / lag)
-                low = lfilter([share], [1.0, share - 1.0], u)
+                low = scipy.signal.lfilter([share], [1.0, share - 1.0], u)
                 columns += [low] if dof == 0 else [low, low * speed]
             chi = np.stack(columns, axis=1)[::stride]
             rest = target[::stride] - chi @ np.linalg.lstsq(chi, target[::stride], rcond=None)[0]

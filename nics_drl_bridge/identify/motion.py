@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.signal import savgol_filter
+import scipy  # .signal loads in a second, when it is used
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import RecordingError
@@ -51,7 +51,7 @@ def with_motion(drive: Drive, calibration: Calibration, grid: Array, width: floa
     recording, spec, step = drive.recording, drive.spec, float(grid[1] - grid[0])
     pose = unwrapped(poses_at(drive, calibration, grid, 0.5 * width))
     rows = 2 * max(2, round(width / step)) + 1
-    rates = savgol_filter(pose, rows, 2, deriv=1, delta=step, axis=0)
+    rates = scipy.signal.savgol_filter(pose, rows, 2, deriv=1, delta=step, axis=0)
     twist = np.concatenate([geometry.rotate(rates[:, :2], -pose[:, 2]), rates[:, 2:]], axis=1)
     columns = [
         twist[:, POSE_RATES.index(v.twist)] if v.twist else _following(v, drive, calibration, grid)
@@ -66,7 +66,7 @@ def as_smooth(command: Array, step: float, width: float) -> Array:
     """Returns commands (T, C) at uniform times as smooth as a twist that parabolas gave."""
     sums = np.cumsum(command, axis=0) * step
     rows = 2 * max(2, round(width / step)) + 1
-    return np.asarray(savgol_filter(sums, rows, 2, deriv=1, delta=step, axis=0))
+    return np.asarray(scipy.signal.savgol_filter(sums, rows, 2, deriv=1, delta=step, axis=0))
 
 
 def _following(

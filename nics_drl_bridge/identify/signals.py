@@ -4,9 +4,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # .signal loads in a second, when it is used
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
-from scipy.signal import lfilter
 
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.kernels import limp
@@ -132,7 +132,8 @@ def inferred_states(
     states = np.empty((len(grid), len(follows)))
     for i, a in enumerate(np.exp(-dt / np.maximum(lags, 1e-6))):
         if np.isinf([fall[i], rise[i]]).all():
-            states[:, i] = lfilter([0.0, 1.0 - a], [1.0, -a], target[:, i], zi=[initial[i]])[0]
+            lag, begin = ([0.0, 1.0 - a], [1.0, -a]), initial[i : i + 1]
+            states[:, i] = scipy.signal.lfilter(*lag, target[:, i], zi=begin)[0]
         else:
             states[0, i] = initial[i]
             limp(states[:, i], target[:, i], 1.0 - a, dt * fall[i], dt * rise[i])

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # .signal loads in a second, when it is used
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.signal import lfilter
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import ConfigError, RecordingError
@@ -134,8 +134,9 @@ def _relative_ends(response: TextbookResponse, course: _Course, twist: Array) ->
         more = np.maximum(np.abs(target[:, 0]) + response.offset[0], 0.0)
         target = np.stack([np.sign(target[:, 0]) * more, 0.0 * more, target[:, 2]], axis=1)
         target[:, 2] += response.offset[2]
-        share = 1.0 - np.exp(-STEP_S / response.lag_s[2])
-        angle = lfilter([0.0, share], [1.0, share - 1.0], target[:, 2], zi=[target[0, 2]])[0]
+        share, angle = 1.0 - np.exp(-STEP_S / response.lag_s[2]), target[:, 2]
+        lag = [0.0, share], [1.0, share - 1.0]
+        angle = scipy.signal.lfilter(*lag, angle, zi=angle[:1])[0]
         actuator[:, 1] = 0.0
         actuator[:, 2] = np.interp(begin / STEP_S, np.arange(len(angle)), angle)
         if bicycle.front_drive:

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+from scipy import special
 
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.guard import uninterrupted
@@ -242,7 +242,7 @@ def rate(hits: int, trials: int) -> ConfidenceInterval:
     """A share of trials with Wilson's score interval (1927), valid for few trials too."""
     if trials < 1:
         return ConfidenceInterval(math.nan, 0.0, 1.0)
-    share, z = hits / trials, float(stats.norm.ppf(0.5 + CONFIDENCE / 2.0))
+    share, z = hits / trials, float(special.ndtri(0.5 + CONFIDENCE / 2.0))
     scale = 1.0 + z * z / trials
     middle = (share + z * z / (2.0 * trials)) / scale
     half = z / scale * math.sqrt(share * (1.0 - share) / trials + (z / (2.0 * trials)) ** 2)
@@ -257,7 +257,7 @@ def mean(values: ArrayLike) -> ConfidenceInterval:
     middle = float(seen.mean()) if len(seen) else math.nan
     if len(seen) < 2:
         return ConfidenceInterval(middle, -math.inf, math.inf)
-    quantile = float(stats.t.ppf(0.5 + CONFIDENCE / 2.0, len(seen) - 1))
+    quantile = float(special.stdtrit(len(seen) - 1, 0.5 + CONFIDENCE / 2.0))
     half = quantile * float(seen.std(ddof=1)) / math.sqrt(len(seen))
     return ConfidenceInterval(middle, middle - half, middle + half)
 
