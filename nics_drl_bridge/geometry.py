@@ -38,8 +38,7 @@ def between(pose: ArrayLike, other: ArrayLike) -> Array:
     """The pose `other` as seen from `pose`; both (..., 3). `compose(pose, result) == other`."""
     pose, other = np.asarray(pose, dtype=np.float64), np.asarray(other, dtype=np.float64)
     position = rotate(other[..., :2] - pose[..., :2], -pose[..., 2])
-    heading = wrap_angle(other[..., 2] - pose[..., 2])
-    return np.concatenate([position, heading[..., None]], axis=-1)
+    return np.concatenate([position, wrap_angle(other[..., 2] - pose[..., 2])[..., None]], axis=-1)
 
 
 def exp(twist: ArrayLike) -> Array:

@@ -1,12 +1,30 @@
 """Entry point of `nics`: one sentence, not a traceback, where a library is missing or too old."""
 
+import signal
 import sys
+import threading
+from types import FrameType
 
 EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
+ENDING = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    while frame is not None and not frame.f_code.co_name.startswith("_raw_object_cache"):
+        frame = frame.f_back
+    if frame is not None:  # llvmlite's callback, out of which no exception comes: a little later
+        threading.Timer(0.01, signal.raise_signal, (number,)).start()
+    elif number == signal.SIGINT:
+        raise KeyboardInterrupt
+    else:
+        raise SystemExit(128 + number)
 
 
 def main() -> None:
     """Runs a command, which imports what it needs as it runs."""
+    for number, usual in ENDING.items():
+        if signal.getsignal(number) is usual:  # else somebody wants it ignored
+            signal.signal(number, _end)
     try:
         from nics_drl_bridge.commands.cli import main as run
 

@@ -265,8 +265,7 @@ class BridgeVectorEnv(gymnasium.vector.VectorEnv[Observation, NDArray[Any], NDAr
             infos |= masked({"final_info": self._known() | facts}, over, True)
             if self._teacher is not None:
                 success = np.reshape(facts.get("is_success", over), (self.num_envs, -1))
-                once_more = self._teacher.again(over, np.asarray(success.all(axis=1)))
-                self._episode[once_more] -= 1
+                self._episode[self._teacher.again(over, np.asarray(success.all(axis=1)))] -= 1
             run = self.simulator.run_parts
             run(lambda part: self._begin(part.start + np.flatnonzero(over[part]), out))
         self._tell(infos, facts, over)

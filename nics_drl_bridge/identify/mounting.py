@@ -226,8 +226,7 @@ def _by_commands(
     recording, spec = drive.recording, drive.spec
     inferred = recording.state is None and any(v.twist for v in spec.state)
     if spec.state and not inferred:
-        expected = clocks.expected_states(drive, twists, timing)
-        command = _as_commands(expected, drive, timing.latency)
+        command = _as_commands(clocks.expected_states(drive, twists, timing), drive, timing.latency)
     else:
         begin = twists.start + timing.offset - timing.latency
         command = held(recording.command, spec, begin, begin + twists.end - twists.start)

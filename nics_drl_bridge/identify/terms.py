@@ -163,8 +163,7 @@ def linear_fit(
         if v.name in unmoved
     }
     held = tuple(c.name for c in spec.command if at.get(c.name))
-    regression = regress(samples, spec, order, allowed=partial(allowed, held=held))
-    found = pruned(regression, spec, 1.0)
+    found = pruned(regress(samples, spec, order, allowed=partial(allowed, held=held)), spec, 1.0)
     still = samples.dq.std(axis=0) <= NOTHING
     still[3:] |= np.array([v.name in at for v in spec.state], dtype=np.bool_)
     coefficients = np.where(still[:, None], 0.0, found.model.coefficients)

@@ -276,8 +276,7 @@ def with_quality(
         }
     measures = ("outliers", "condition", "rmse", "r2")
     figures |= {name: by_dof(getattr(linear, name)) for name in measures}
-    quality = Quality(samples=len(linear.regression.samples.t), **figures)
-    return replace(model, quality=quality)
+    return replace(model, quality=Quality(samples=len(linear.regression.samples.t), **figures))
 
 
 def refitted(until: float, duration: float, worse: bool) -> str:

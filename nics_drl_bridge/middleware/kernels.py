@@ -301,8 +301,7 @@ def retrace(  # type: ignore[no-untyped-def]
     shared = covariance @ here.T + anchor.cross @ there.T
     past = anchor.cross.T @ here.T + anchor.covariance[:3, :3].copy() @ there.T
     total = here @ shared + there @ past + wheels.walk * seconds
-    turn = robot.wrap(turned - mean[2] + then[2])
-    innovation = np.array([along - ahead, aside - before, turn])
+    innovation = np.array([along - ahead, aside - before, robot.wrap(turned - mean[2] + then[2])])
     # Between two twists the robot may have had either.
     slack = np.diag((0.5 * seconds * (twist - anchor.twist)) ** 2)
     if innovation @ np.linalg.solve(total + slack, innovation) <= gate:

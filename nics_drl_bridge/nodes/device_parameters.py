@@ -104,8 +104,7 @@ def timed_model(node: Node, model: SimulatorModel, time: DeviceTiming) -> Simula
     if time.lockstep:
         return model
     if (latency := number(node, "command_latency")) >= 0.0:
-        calibration = replace(model.calibration, command_latency_s=latency)
-        model = replace(model, calibration=calibration)
+        model = replace(model, calibration=replace(model.calibration, command_latency_s=latency))
     dt = model.timing[0]
     steps = round(time.step_ns / NS_PER_S / dt)
     return model if steps == model.timing[1] else replace(model, control_period=steps * dt)
