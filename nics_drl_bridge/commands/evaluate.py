@@ -62,8 +62,9 @@ def evaluate(
     if shadow is not None:
         _shadow(shadow, policies, model, topic or [], place, ahead, out, as_json)
         return
-    from nics_drl_bridge.commands import episodes as driving
-    from nics_drl_bridge.commands.conditions import Conditions
+    with console.progress_bar():
+        from nics_drl_bridge.commands import episodes as driving
+        from nics_drl_bridge.commands.conditions import Conditions
 
     count, tell = episodes or (1 if hardware else 20), partial(typer.echo, err=True)
     under = Conditions(lidar, randomisation, gate, fallback, kind=task)
