@@ -7,7 +7,7 @@ import numpy as np
 from onnx import TensorProto, helper, numpy_helper, save
 from PIL import Image
 
-import nics_drl_bridge  # noqa: F401 - makes the environments known
+import nics_drl_bridge  # noqa: F401 - registers the environments
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.policy.evaluation import drive
 from nics_drl_bridge.policy.policies import open_policy

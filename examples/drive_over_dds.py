@@ -5,7 +5,7 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 
-import nics_drl_bridge  # noqa: F401 - makes the environments known
+import nics_drl_bridge  # noqa: F401 - registers the environments
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.nodes.processes import NodeProcess, free_domain_id
 from nics_drl_bridge.policy.evaluation import drive

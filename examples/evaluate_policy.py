@@ -4,7 +4,7 @@ from pathlib import Path
 
 import gymnasium
 
-import nics_drl_bridge  # noqa: F401 - makes the environments known
+import nics_drl_bridge  # noqa: F401 - registers the environments
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.policy.evaluation import drive_all, drive_worlds, summarise

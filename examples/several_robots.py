@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 from PIL import Image
 
-import nics_drl_bridge  # noqa: F401 - makes the environments known
+import nics_drl_bridge  # noqa: F401 - registers the environments
 
 ROBOTS, SEED = 3, 2
 

@@ -134,7 +134,7 @@ def test_a_recording_too_coarse_for_a_useful_model_is_one_sentence(tmp_path):
     save_recording(replace(fine, pose=pose, state=state), tmp_path / "slow.npz")
     words = ("generate", "slow.npz", "--robot", "differential", "--out", "car")
     sentence = refused(nics(*words, cwd=tmp_path))
-    assert "slow.npz: the fitted model is of no use" in sentence
+    assert "slow.npz: the fitted model is useless" in sentence
     assert sentence.endswith("between rows that are 0.8 s apart, so record at a higher rate.")
     assert names(tmp_path) == {"slow.npz"}
     wanted = nics(*words, "--anyway", cwd=tmp_path)

@@ -34,7 +34,8 @@ README = told(
     ),
     (
         "real_drives",
-        "a real car, 5 s open-loop on each segment of 11 s of a 45 s drive, left out in turn",
+        "a real car, 5 s open-loop predictions on 11 s segments of a 45 s drive, each held out in "
+        "turn",
         "{left_out.xtark_random_drive_45s.error_m|.3f} m and "
         "{left_out.xtark_random_drive_45s.heading_error_rad|.3f} rad over a path of "
         "{left_out.xtark_random_drive_45s.path_m|.2f} m",
@@ -63,7 +64,7 @@ README = told(
     ),
     (
         "env_throughput",
-        "the same per second",
+        "env steps per second, same workload",
         "{single_thread_env_steps_per_s|.1e} on one thread, {all_threads_env_steps_per_s|.1e} on "
         "{threads}; {single_env_gym_steps_per_s|.1e} by `gymnasium.make`, "
         "{single_env_with_estimator_steps_per_s|.1e} with the estimator",
@@ -311,7 +312,7 @@ MUJOCO = Table(
 ERRORS = ("{%s.error_m|.3f} m", "{%s.share_of_path|.1%%}", "{%s.yardstick_share|.1%%}",
           "{%s.constant_twist_share|.1%%}", "{%s.coverage_95|.0%%}")  # fmt: skip
 REAL_DRIVES = Table(
-    ("drive", "error", "of the path", "fitted textbook", "twist kept", "95 % band holds"),
+    ("drive", "error", "of the path", "fitted textbook", "constant twist", "95 % band holds"),
     tuple(
         ("real_drives", title, *(each % place for each in ERRORS))
         for title, place in (

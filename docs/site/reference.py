@@ -261,9 +261,9 @@ def pages() -> dict[str, str]:
     """All pages of the reference by file name."""
     found = {f"{name}.md": page(kind) for name, kind in KINDS.items()}
     every = [command_section(*one) for one in commands(get_command(app), "nics")]
-    head = "# Commands\n\nEvery command of `nics`, as `nics COMMAND --help` tells it.\n"
+    head = "# Commands\n\nEvery command of `nics`, as shown by `nics COMMAND --help`.\n"
     found["commands.md"] = "\n".join([head, *every])
-    head = "# Nodes\n\nEvery node, as `ros2 run nics_drl_bridge NODE --help` tells it.\n"
+    head = "# Nodes\n\nEvery node, as shown by `ros2 run nics_drl_bridge NODE --help`.\n"
     found["nodes.md"] = "\n".join([head, *map(node_section, NODES)])
     return found
 

@@ -59,14 +59,14 @@ WorldOption = Annotated[str, Option("--world", "--scene", autocompletion=WORLDS,
 JsonOption = Annotated[bool, Option("--json", help="Print one JSON object instead.")]
 TopicsOption = Annotated[Path | None, Option(help="YAML file: a bag's topic for each role.")]
 SalvageOption = Annotated[
-    bool, Option("--salvage", help="Take what is intact of a damaged bag, and tell the rest.")
+    bool, Option("--salvage", help="Use what is intact of a damaged bag; report the rest.")
 ]
 OtherLidarOption = Annotated[str | None, Option(autocompletion=completing("lidars"),
     help="A shipped lidar (rplidar_a2) or a YAML file, instead of the model's.")]  # fmt: skip
 RandomisationOption = Annotated[str | None, Option(autocompletion=completing("randomisation"),
     help="Drawn in each episode: a shipped one (mild) or a YAML file.")]  # fmt: skip
 TaskOption = Annotated[
-    str | None, Option(help="path/to/file.py:ClassName, of a policy of a task of your own.")
+    str | None, Option(help="Your own task that the policy is for: path/to/file.py:ClassName.")
 ]
 GateOption = Annotated[str | None, Option(
     metavar="LIMITS", help="Drive through the gate and its shield, with these limits: shipped ones "

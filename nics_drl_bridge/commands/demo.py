@@ -15,9 +15,9 @@ def demo(
     out: Annotated[Path, Option(help="Folder for everything the demo writes.")] = Path("runs/demo"),
     robot: console.DrivenRobotOption = None,
     world: console.WorldOption = "arena",
-    episodes: Annotated[int, Option(min=1, help="How many, in process and again over DDS.")] = 5,
+    episodes: Annotated[int, Option(min=1, help="Episodes in process, and again over DDS.")] = 5,
     policy: Annotated[str | None, Option(autocompletion=console.POLICIES,
-        help="Train none; drive by a policy file, a shipped one or a baseline.")] = None,
+        help="Skip training: use a policy file, a shipped one or a baseline.")] = None,
     train_steps: Annotated[int | None, Option(min=1, help="Environment steps to train.")] = None,
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip

@@ -310,7 +310,7 @@ def _verdict(
         ),
         (
             f"{same} of {len(there)}",
-            f"episodes succeed over DDS; of the same in process, {successes(here)} of {len(here)}",
+            f"episodes succeed over DDS; in process, {successes(here)} of the same {len(here)}",
             same >= GOOD * len(there),
         ),
         ("arrived" if arrived else "did not arrive", "deployed, in real time", arrived),
@@ -318,23 +318,23 @@ def _verdict(
     conclusion = conclude(identified)
     tiles = tiles if of.live else tiles[:2]
     if conclusion.ready:
-        more = "drive more episodes, or take a recording of your own robot"
-        next_step = more if share.value >= GOOD else "train for longer, by --train-steps"
+        more = "drive more episodes, or use a recording of your own robot"
+        next_step = more if share.value >= GOOD else "train longer, with --train-steps"
         conclusion = conclusion._replace(advice=f"Next: {next_step}.")
     return verdict_blocks(
         tiles, conclusion,
         f"nics watch {learned.policy} --model {plan.model} --world {plan.world}",
         f"nics evaluate {learned.policy} --model {plan.model} --world {plan.world}",
-        "nics demo --recording DRIVE --robot ROBOT.yaml  # of your own robot",
+        "nics demo --recording DRIVE --robot ROBOT.yaml  # your own robot",
     )  # fmt: skip
 
 
 def _policy(plan: DemoPlan, learned: Learned, of: DemoEpisodes) -> list[str]:
     summary, drawn = of.summary, list[tuple[bytes, str]]()
     if learned.curve:
-        caption = "Success and collisions while it explores; all episodes are new ones."
+        caption = "Success and collisions during exploration; every episode is new."
         drawn.append((pictures.training_curve(learned.curve), caption))
-    caption = f"Success as it is, and with each perturbation of {PERTURBED!r} alone (95 %)."
+    caption = f"Success unperturbed, and with each perturbation of {PERTURBED!r} alone (95 %)."
     shares = {what: each.success for what, each in of.summaries.items()}
     drawn.append((pictures.robustness(shares), caption))
     blocks = [html.paragraph(learned.how), html.gallery(drawn)]
@@ -345,8 +345,8 @@ def _policy(plan: DemoPlan, learned: Learned, of: DemoEpisodes) -> list[str]:
         known = (f"{value:.2f}" if isfinite(value) else "-" for value in astuple(amount))
         rows.append((name, *known))
     text = (
-        f"{summary.episodes} unseen episodes in the world {plan.world!r}, side by side in the fast "
-        "simulator, the policy at its best; path and time are means of the successful ones."
+        f"{summary.episodes} unseen episodes in the world {plan.world!r}, in parallel in the fast "
+        "simulator, without exploration; path and time are means of the successful ones."
     )
     table = html.table(("", "value", "95 % from", "to"), rows)
     return [*blocks, html.paragraph(text), table]
@@ -376,8 +376,8 @@ def _episodes(plan: DemoPlan, model: SimulatorModel, of: DemoEpisodes) -> list[s
     text = (
         f"{successes(here)} of {len(here)} episodes reached the goal in process, "
         f"{successes(there)} of {len(there)} over DDS in lock-step. Then simulator_node in real "
-        "time, middleware_node, policy_node and command_gate ran as processes of their own; nobody "
-        f"stepped them. The robot {'reached' if live.result == 'success' else 'did not reach'} "
+        "time, middleware_node, policy_node and command_gate ran as separate processes, not in "
+        f"lock-step. The robot {'reached' if live.result == 'success' else 'did not reach'} "
         f"its goal, that of seed {live.seed}."
     )
     about = "Deviation is the greatest distance between the two true paths at the same step."

@@ -15,17 +15,17 @@ EXIT_FINDINGS = 1
 
 
 def doctor(
-    bag: Annotated[Path | None, Argument(help="A bag to look at; else the live robot.")] = None,
+    bag: Annotated[Path | None, Argument(help="A bag to check; else the live robot.")] = None,
     model: Annotated[str | None, Option(autocompletion=console.ROBOTS,
-        help=f"What it must fit: a model's folder, or a shipped robot ({DEFAULT_ROBOT}).")] = None,
-    policy: Annotated[str | None, Option(help="What it must fit instead: a policy file.")] = None,
+        help=f"Check against a model's folder, or a shipped robot ({DEFAULT_ROBOT}).")] = None,
+    policy: Annotated[str | None, Option(help="Check against a policy file instead.")] = None,
     namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
     duration: Annotated[float, Option(min=1.0, help="How long to listen to a robot [s].")] = 5.0,
     install: Annotated[bool, Option("--install",
-        help="Look at this machine instead: what works here.")] = False,
+        help="Check this machine instead: what works here.")] = False,
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
-    """Tells what of a robot or a bag does not fit; it sends nothing."""
+    """Checks a robot or a bag against a model; sends nothing."""
     if install:
         _tell_installation(as_json)
         return
@@ -69,10 +69,10 @@ def _tell_installation(as_json: bool) -> None:
 
 
 def explain(
-    file: Annotated[Path, Argument(help="What command_gate wrote at a stop, *.jsonl.")],
+    file: Annotated[Path, Argument(help="Black box written at a stop, *.jsonl.")],
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
-    """Tells why command_gate stopped a robot, from what it wrote down."""
+    """Explains why command_gate stopped a robot, from its black box."""
     from nics_drl_bridge.gate import black_box
 
     again = black_box.replay(file)

@@ -22,7 +22,7 @@ def evaluate(
     world: Annotated[str, Option("--world", "--scene", autocompletion=console.WORLDS,
         help="A shipped world (circles) or a YAML file.")] = "circles",
     places: Annotated[list[str] | None, Option(
-        "--in", help="fast, dds or mujoco_dds; several times; else all that work here.")] = None,
+        "--in", help="fast, dds or mujoco_dds; repeatable; by default all that work here.")] = None,
     episodes: Annotated[int | None, Option(min=1, help="How many; 20, or 1 on a vehicle.")] = None,
     seed: Annotated[int, Option(min=0, help="Seed of the first episode.")] = 1_000_000,
     lidar: console.OtherLidarOption = None,
@@ -31,19 +31,19 @@ def evaluate(
     fallback: Annotated[str, Option(
         metavar="PLANNER", help="dynamic_window or mppi: acts where the policy asks for what can't "
         "be stopped before a touch.")] = "",
-    out: Annotated[Path, Option(help="Folder for all that is written.")] = Path("runs/evaluate"),
-    shadow: Annotated[Path | None, Option(help="A bag: compare policies with its drive.")] = None,
+    out: Annotated[Path, Option(help="Folder for all output.")] = Path("runs/evaluate"),
+    shadow: Annotated[Path | None, Option(help="Compare policies with the drive in a bag.")] = None,
     topic: Annotated[list[str] | None, Option(
-        metavar="ROLE=TOPIC", help="For --shadow: as scan=/front/scan.")] = None,
+        metavar="ROLE=TOPIC", help="For --shadow: for example scan=/front/scan.")] = None,
     ahead: Annotated[float, Option(
-        help="For --shadow without --goal: the goal is where it was so much later.")] = 4.0,
+        help="For --shadow without --goal: goal: where the robot is this much later [s].")] = 4.0,
     backend: Annotated[str | None, Option(help="dds, with --hardware.", metavar="dds")] = None,
     hardware: Annotated[bool, Option(
         "--hardware", help="Drive the vehicle, through command_gate.")] = False,
     start: Annotated[str, Option(
-        help="For --hardware: wait until it stands there, or take the present.")] = "wait",
+        help="For --hardware: wait until it stands at the start, or start where it is.")] = "wait",
     goal: Annotated[str | None, Option(metavar="X,Y", help="In map [m]; else the world's.")] = None,
-    namespace: Annotated[str, Option(help="For --hardware: of the vehicle's topics.")] = "",
+    namespace: Annotated[str, Option(help="For --hardware: namespace of its topics.")] = "",
     pose_type: Annotated[str, Option(help="For --hardware: type of `pose`, in map.")] = "none",
     yes: Annotated[bool, Option("--yes", help="For --hardware: ask no questions.")] = False,
     arm: Annotated[bool, Option("--arm", help="For --hardware: arm command_gate.")] = False,

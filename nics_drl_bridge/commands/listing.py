@@ -24,7 +24,7 @@ class Listed(str, Enum):
 def list_(
     what: Annotated[Listed, Argument(help="What to list.")], as_json: JsonOption = False
 ) -> None:
-    """Lists the robots, worlds, lidars or policies that are shipped."""
+    """Lists the shipped robots, worlds, lidars or policies."""
     rows = ROWS[what]()
     cells = [tuple(map(str, row.values())) for row in rows]
     say(as_json, table(tuple(rows[0]), cells), **{what.value: rows})

@@ -27,15 +27,15 @@ def record(
     speed: Annotated[float, Option(help="Share of the greatest speeds to use.")] = 1.0,
     seed: Annotated[int, Option(help="Seed of the pattern.")] = 0,
     namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
-    remap: Annotated[list[str] | None, Option(help="A topic's other name: odom:=/wheels.")] = None,
-    topics: Annotated[Path | None, Option(help="YAML file of the state's, wheels' joints.")] = None,
+    remap: Annotated[list[str] | None, Option(help="Rename a topic: odom:=/wheels.")] = None,
+    topics: Annotated[Path | None, Option(help="YAML: joints of state and wheels.")] = None,
     stamped: Annotated[bool | None, Option(help="Send cmd_vel as TwistStamped.")] = None,
     use_sim_time: Annotated[bool, Option("--use-sim-time", help="Take time from /clock.")] = False,
-    preview: Annotated[bool, Option("--preview", help="Show the drive's plan, and stop.")] = False,
+    preview: Annotated[bool, Option("--preview", help="Only show the planned drive.")] = False,
     yes: Annotated[bool, Option("--yes", help="Do not ask before the robot moves.")] = False,
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
-    """Drives a robot so that it shows its whole motion; records it."""
+    """Drives a robot through its full range of motion and records it."""
     arguments = node_arguments(namespace, remap or ())
     given = {
         "robot": robot, "out": str(out), "bound": bound, "duration": duration, "speed": speed,
@@ -114,10 +114,10 @@ def drive_summary(recording: Any, given: dict[str, Any]) -> tuple[str, ...]:
 def inspect(
     source: Annotated[Path, Argument(help="A bag, a table, or a folder of tables.")],
     mapping: Annotated[Path | None, Option("--map",
-        help="YAML file to begin: a first mapping, with guesses.")] = None,
+        help="YAML file to write: a draft mapping, with guesses.")] = None,
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
-    """Lists what a recording of any form holds and begins its mapping."""
+    """Lists the contents of any recording and drafts its mapping."""
     from nics_drl_bridge.files import write_text
     from nics_drl_bridge.recording.guess import NOT_USED, first_mapping
     from nics_drl_bridge.recording.readers import open_source
@@ -151,11 +151,11 @@ def inspect(
 
 def import_(
     source: Annotated[Path, Argument(help="A bag, a table, or a folder of tables.")],
-    mapping: Annotated[Path, Option("--map", help="YAML: what is what, docs/recordings.md.")],
+    mapping: Annotated[Path, Option("--map", help="YAML mapping, docs/recordings.md.")],
     out: Annotated[Path, Option(help="The .npz file to write.")],
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
-    """Keeps a recording of any form as an .npz, read by its mapping."""
+    """Converts a recording of any format to .npz, using its mapping."""
     from nics_drl_bridge.recording.readers import read_recording
     from nics_drl_bridge.recording.recording import save_recording
     from nics_drl_bridge.recording.write import check_out
@@ -197,13 +197,13 @@ def generate(
     out: Annotated[Path, Option(help="Folder of the model to write.")],
     robot: console.DrivenRobotOption = None,
     mapping: Annotated[Path | None, Option("--map",
-        help="YAML: what is what in the recording, docs/recordings.md.")] = None,
+        help="YAML mapping of the recording, docs/recordings.md.")] = None,
     topics: console.TopicsOption = None,
     topic: console.TopicOption = None,
     world: console.WorldOption = "arena",
     lidar: console.LidarOption = None,
     sensor: Annotated[list[Path] | None,
-        Option(help="YAML of a further sensor, docs/sensors.md; repeatable.")] = None,
+        Option(help="YAML of an additional sensor, docs/sensors.md; repeatable.")] = None,
     order: Annotated[str, Option(help="Order of the Taylor model, 1 to 4, or auto.")] = "auto",
     alpha: Annotated[str, Option(help="Pruning of Eq. 2, 0 to 1, or auto for the knee.")] = "auto",
     assume_textbook: Annotated[bool,
@@ -211,11 +211,11 @@ def generate(
     strict: Annotated[bool, Option(help="Refuse if an input was not moved on its own.")] = False,
     salvage: console.SalvageOption = False,
     anyway: Annotated[bool, Option("--anyway",
-        help="Write it even if predictions of unseen data are of no use.")] = False,
+        help="Write the model even if its predictions of unseen data are useless.")] = False,
     pictures: Annotated[bool, Option(help="Draw the fit into the model's pictures/.")] = False,
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
-    """Generates a simulator from a recording, and writes its folder."""
+    """Generates a simulator from a recording and writes its folder."""
     from nics_drl_bridge.generator import check_place, lidar_of, save_model
     from nics_drl_bridge.generator import generate as generate_model
     from nics_drl_bridge.identify.fit import parse_alpha, parse_order
@@ -271,18 +271,18 @@ def fit_facts(out: Path, robot: str, identified: "Identified") -> dict[str, Any]
 
 
 def drive(
-    out: Annotated[Path | None, Option(help="The model's folder; <robot>_model.")] = None,
+    out: Annotated[Path | None, Option(help="Folder to write; by default <robot>_model.")] = None,
     robot: console.RobotOption = DEFAULT_ROBOT,
     recording: Annotated[Path | None,
-        Option(help="An .npz to keep the drive in, as one of a real robot.")] = None,
+        Option(help="An .npz to save the drive in, like one of a real robot.")] = None,
     lidar: console.LidarOption = None,
     duration: Annotated[float, Option(min=5.0, max=3600.0, help="Duration [s].")] = 60.0,
     seed: Annotated[int, Option(min=0, help="Seed of the random commands.")] = 0,
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
-    """Drives a robot's textbook model and generates a simulator of it.
+    """Generates a simulator from a drive of a robot's textbook model.
 
-    For training before there is a recording; with one, `nics generate` makes a truer simulator.
+    For training without a recording; `nics generate` makes a more accurate simulator from one.
     """
     import numpy as np
 
@@ -312,7 +312,7 @@ def drive(
 def urdf(
     model: Annotated[str, Argument(autocompletion=console.ROBOTS,
         help="A shipped robot, or the folder of a model.")],
-    out: Annotated[Path | None, Option(help="The file to write; <robot>.urdf.")] = None,
+    out: Annotated[Path | None, Option(help="File to write; by default <robot>.urdf.")] = None,
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
     """Writes a robot's URDF, for RViz and robot_state_publisher."""

@@ -11,7 +11,7 @@ from nics_drl_bridge.commands.console import POLICIES, ROBOTS, JsonOption, say
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.files import write_bytes
 
-policy = typer.Typer(help="Policy files.", no_args_is_help=True)
+policy = typer.Typer(help="Checks, exports and imports policy files.", no_args_is_help=True)
 
 
 @policy.command()
@@ -20,7 +20,7 @@ def info(
         help="A policy file, the name of a shipped one, or a foreign one's mapping.")],
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
-    """Checks a policy file and tells what it was trained on and needs."""
+    """Checks a policy file and shows its training and requirements."""
     from nics_drl_bridge.policy.foreign import load_any
     from nics_drl_bridge.policy.policy_file import summary
 
@@ -36,7 +36,7 @@ def export(
     leapp: Annotated[Path, Option(help="Folder of the bundle: network, YAML file, start values.")],
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
-    """Writes a policy file in a format of others: Isaac's LEAPP."""
+    """Converts a policy file to another format: Isaac's LEAPP."""
     from nics_drl_bridge.policy.foreign import load_any
     from nics_drl_bridge.policy.leapp import export_bundle
 
@@ -53,7 +53,7 @@ def import_(
         help="A shipped robot, or the folder of a model.")] = None,
     as_json: JsonOption = False,
 ) -> None:  # fmt: skip
-    """Makes a policy file of somebody else's policy."""
+    """Makes a policy file from a policy trained elsewhere."""
     from nics_drl_bridge.generator import open_model
     from nics_drl_bridge.policy.contract import SUFFIX
     from nics_drl_bridge.policy.foreign import import_policy

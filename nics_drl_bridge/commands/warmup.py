@@ -16,7 +16,7 @@ WORLD = "arena"
 
 
 def warmup(as_json: JsonOption = False) -> None:
-    """Compiles all kernels ahead, on two cores, once on a machine."""
+    """Compiles all kernels in advance, once per machine, on two cores."""
     begin = time.monotonic()
     typer.echo("compiling the kernels: a minute or two, once on this machine", err=True)
     # Fresh processes: what a fork shares with its parent's threads may be locked for ever.

@@ -29,13 +29,13 @@ def watch(
     gate: console.GateOption = None,
     task: console.TaskOption = None,
     ros: Annotated[bool, Option("--ros", help="Show live topics instead.")] = False,
-    namespace: Annotated[str, Option(help="For --ros: of the robot's topics.")] = "",
+    namespace: Annotated[str, Option(help="For --ros: namespace of its topics.")] = "",
     bag: Annotated[Path | None, Option(help="Show a recorded drive instead.")] = None,
     topic: Annotated[list[str] | None, Option(metavar="ROLE=TOPIC", help="For --bag: as "
         "odom=/wheel_odom. Roles: scan, odom, cmd_vel, pose, imu.")] = None,
     record: Annotated[Path | None, Option(
         metavar="FILE", help="Write .mp4, .gif or .rrd (Rerun) instead of a page.")] = None,
-    episodes: Annotated[int, Option(min=1, help="For --record: how many.")] = 1,
+    episodes: Annotated[int, Option(min=1, help="For --record: number of episodes.")] = 1,
     port: Annotated[int | None, Option(
         min=0, max=65535, help="Port of the page; 0 takes any (default 8765).")] = None,
     browser: Annotated[bool, Option(help="Open the page in a browser.")] = True,

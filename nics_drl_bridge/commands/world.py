@@ -1,4 +1,4 @@
-"""`nics world`: imports worlds of others, draws a world, and writes its map."""
+"""`nics world`: imports worlds made by other tools, draws worlds, and writes their maps."""
 
 import math
 import os
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from nics_drl_bridge.sim.sections import Standing
 
 world = typer.Typer(
-    help="Imports worlds of others, draws worlds, and writes their maps.", no_args_is_help=True
+    help="Imports worlds made by other tools, draws worlds, writes maps.", no_args_is_help=True
 )
 
 SDF, MAPS, PICTURES = (".world", ".sdf"), (".yaml", ".yml"), (".png", ".pgm", ".bmp")
@@ -54,19 +54,19 @@ def import_(
         metavar="LEAST GREATEST", help="From start to goal [m]; else from 2 m on.")] = None,
     clearance: Annotated[float, Option(help="Free space around the footprint [m].")] = CLEARANCE,
     height: Annotated[float, Option(
-        help="Of SDF: what stands this far above z = 0 counts, the lidar's height [m].")] = HEIGHT,
+        help="For SDF: height above z = 0 at which geometry counts, the lidar's [m].")] = HEIGHT,
     bounds: Annotated[tuple[float, float, float, float] | None, Option(
-        metavar="X1 Y1 X2 Y2", help="Of SDF: the field [m]; else what holds everything.")] = None,
+        metavar="X1 Y1 X2 Y2", help="For SDF: the field [m]; else just all obstacles.")] = None,
     without: Annotated[list[str] | None, Option(
-        metavar="MODEL", help="Of SDF: a model to leave out, as a robot; * stands for anything. "
+        metavar="MODEL", help="For SDF: a model to leave out, such as a robot; * matches anything. "
         "May be given several times.")] = None,
     skip_unknown: Annotated[bool, Option(
-        "--skip-unknown", help="Of SDF: leave out, and list, meshes and what else is no shape.")
+        "--skip-unknown", help="For SDF: leave out, and list, meshes and other unknowns.")
     ] = False,
-    resolution: Annotated[float | None, Option(help="Of a picture: side of a pixel [m].")] = None,
+    resolution: Annotated[float | None, Option(help="For a picture: side of a pixel [m].")] = None,
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
-    """Makes worlds of Gazebo's worlds, of Nav2's maps, or of pictures."""
+    """Imports Gazebo worlds, Nav2 maps, or pictures as worlds."""
     from nics_drl_bridge.sim.sdf import read_sdf
 
     keys = {
@@ -194,15 +194,15 @@ def _flow(value: Any) -> str:
 @world.command()
 def draw(
     name: Shown,
-    out: Annotated[Path | None, Option(help="The .png to write; <world>_drawn.png.")] = None,
+    out: Annotated[Path | None, Option(help="File to write; by default <world>_drawn.png.")] = None,
     seed: Annotated[int, Option(min=0, help="Seed of the episode.")] = 0,
     robot: console.RobotOption = DEFAULT_ROBOT,
-    footprint: Annotated[float | None, Option(help="Instead: radius of a round robot [m].")] = None,
+    footprint: Annotated[float | None, Option(help="Radius of a round robot instead [m].")] = None,
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
-    """Draws a world as an episode finds it, with start and goal.
+    """Draws the world of an episode, with start and goal.
 
-    Of a set, such as barn or a folder of files, it is the world of the episode.
+    For a set, such as barn or a folder of files, it draws the world of the episode.
     """
     from nics_drl_bridge.files import write_bytes
     from nics_drl_bridge.report.pictures import world_picture
@@ -238,15 +238,15 @@ def _spare(worlds: Any, given: Path, *written: Path) -> None:
 @world.command("map")
 def map_(
     name: Shown,
-    out: Annotated[Path | None, Option(help="The .yaml to write; <world>_map.yaml.")] = None,
+    out: Annotated[Path | None, Option(help="File to write; by default <world>_map.yaml.")] = None,
     seed: Annotated[int, Option(min=0, help="Seed of the episode.")] = 0,
     robot: console.RobotOption = DEFAULT_ROBOT,
     resolution: Annotated[float, Option(help="Greatest side of a cell [m].")] = 0.01,
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
-    """Writes the map of an episode, as Nav2's map_server reads it.
+    """Writes the map of an episode for Nav2's map_server.
 
-    Obstacles that move are left out. `nics world map room`, then
+    Moving obstacles are left out. `nics world map room`, then
     `ros2 run nav2_map_server map_server --ros-args -p yaml_filename:=room_map.yaml`.
     """
     from nics_drl_bridge.lidar.maps import map_files

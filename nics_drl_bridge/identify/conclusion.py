@@ -11,7 +11,8 @@ from nics_drl_bridge.robot.kinds import overdriven
 from nics_drl_bridge.robot.taylor import EndErrors
 
 OF_PATH = " of the path"
-UNTRIED = "The drive was too short to try the model on data that it had not seen."
+UNSEEN = "otherwise a policy would rely on motion the model never saw"
+UNTRIED = "The drive was too short to test the model on unseen data."
 
 
 class Conclusion(NamedTuple):
@@ -37,13 +38,13 @@ def conclude(identified: Identified) -> Conclusion:
     beyond = *narrow(identified.recording, spec), overdriven(spec)
     gaps = *identified.gaps, *(one for one in beyond if one)
     if wrong:
-        advice = "mend the mapping as said above, or the robot's own driver, and generate anew"
+        advice = "fix the mapping as described above, or the robot's own driver, and generate again"
     elif about or not identified.judgement:
-        advice = "drive once more, for 60 s or longer, and generate anew before a policy is trained"
+        advice = "record another drive, 60 s or longer, and generate again before training a policy"
     elif missed(identified.fit, spec) or identified.model.assumed:
-        advice = "drive once more as said above: a policy would act by what was not learnt"
+        advice = f"record another drive as described above; {UNSEEN}"
     else:
-        first = ", or first see to what is said above" if gaps else ""
+        first = ", or first fix the points above" if gaps else ""
         advice, ready = f"train a policy in the simulator{first}", True
     return Conclusion(accuracy(identified), about, gaps, f"Next: {advice}.", ready)
 
@@ -53,7 +54,7 @@ def accuracy(identified: Identified) -> str:
     for at in usual(identified.judgement):
         if not isfinite(at.model.position_m):
             return f"On unseen data the predictions run away within {at.horizon_s:g} s."
-        named = {"a fitted textbook": at.textbook, "a kept twist": at.kept_twist}
+        named = {"a fitted textbook": at.textbook, "constant twist": at.kept_twist}
         ends = {name: end_of(each, at.path_m) for name, each in named.items() if each}
         beside = (f"{name} {end.removesuffix(OF_PATH)}" for name, end in ends.items())
         found = f"On unseen data the predictions end {at.model.position_m:.3g} m off"

@@ -72,7 +72,7 @@ def usual(judgement: tuple[HorizonErrors, ...]) -> list[HorizonErrors]:
 def shortfall(judgement: tuple[HorizonErrors, ...]) -> Iterator[str]:
     """Says which yardsticks a model does not beat after 5 s, or the most that was held out."""
     for at in usual(judgement):
-        named = {"the fitted textbook": at.textbook, "a robot that keeps its twist": at.kept_twist}
+        named = {"the fitted textbook": at.textbook, "a constant twist": at.kept_twist}
         better = {name: errors.position_m for name, errors in named.items() if errors is not None}
         better = {name: m for name, m in better.items() if not at.model.position_m < m}
         if better:

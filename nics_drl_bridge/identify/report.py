@@ -36,11 +36,11 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
         f"Fit report: robot {spec.name!r} from {source}": map(listed, conclude(identified).lines),
         f"Kept {model.terms_kept}{of} terms, step {model.dt:g} s "
         f"(X = {', '.join(model.variables)}), with standard errors:": equations_with_errors(model),
-        **({"What motors do around the terms (standard uncertainties):": around} if around else {}),
+        **({"Effect of the motors (standard uncertainties):": around} if around else {}),
         **_linear_fit(identified),
         f"Open loop, on data held out from the fit (after {until:.1f} s):": _held_out(identified),
         **_compared(identified.judgement),
-        "Valid where the drive was:": (
+        "Valid range, as covered by the drive:": (
             f"{name:<24} {low:.4g} to {high:.4g} {units[name]}"
             + " (assumed)" * (model.bounded and f"d_{name}" in dict(model.assumed))
             for name, low, high in ranges
@@ -49,8 +49,8 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
         "Noise that the simulator and the estimator use (standard deviations):": (
             identified.noise.sentences()
         ),
-        **({"Latency of the device, which simulator_node has too:": latency} if latency else {}),
-        "Found, and not learnt:": map(listed, notes),
+        **({"Latency of the device, also used by simulator_node:": latency} if latency else {}),
+        "Findings, and what was not learnt:": map(listed, notes),
     }
     paragraphs = ([head, *(f"  {line}" for line in lines)] for head, lines in sections.items())
     return "\n\n".join("\n".join(lines) for lines in paragraphs) + "\n"
@@ -97,10 +97,10 @@ def stages(spec: RobotSpec, identified: Identified) -> Iterator[str]:
         for curve in model.inputs
         for name, words, unit, usual in (
             ("dead", "dead zone on both sides of 0", units[curve.command], 0.0),
-            ("least", "does no more below", units[curve.command], -np.inf),
-            ("most", "does no more above", units[curve.command], np.inf),
-            ("back", "gain backwards, of that forwards", "", 1.0),
-            ("delay", "acts after the latency of all by", "s", 0.0),
+            ("least", "saturates below", units[curve.command], -np.inf),
+            ("most", "saturates above", units[curve.command], np.inf),
+            ("back", "gain backwards, relative to forwards", "", 1.0),
+            ("delay", "delay after the common latency", "s", 0.0),
         )
     ]
     actuators = model.limits, model.friction, model.drag
@@ -188,7 +188,7 @@ def _held_out(identified: Identified) -> Iterator[str]:
             yield f"{dof:<24} RMSE {rmse:.3g} {unit}, R2 {r2:.6f}"
 
 
-HEADS = ("after", "path", "model", "fitted textbook", "twist kept", "95 % within", "held")
+HEADS = ("after", "path", "model", "fitted textbook", "constant twist", "95 % within", "held")
 COMPARED = "By horizon, mean errors of position [m] (share of the path) and heading [rad]:"
 
 
@@ -299,8 +299,8 @@ def why_useless(identified: Identified, spec: RobotSpec) -> str:
         return ""
     end = f"end {error:.3g} m off" if np.isfinite(error) else "have run away"
     way = f"after {held_out.horizon_s:g} s and a path of {held_out.mean_path_m:.2f} m"
-    still = f"where a robot that stood still would be {standing:.2f} m off"
-    fault = f"the fitted model is of no use: on unseen data its predictions {end} {way}, {still}"
+    still = f"while a robot standing still would be {standing:.2f} m off"
+    fault = f"the fitted model is useless: on unseen data its predictions {end} {way}, {still}"
     return f"{recording.source}: {fault}; {_suspicion(identified, spec)}."
 
 
@@ -321,7 +321,7 @@ def _suspicion(identified: Identified, spec: RobotSpec) -> str:
         return f"{coarse}, so record at a higher rate"
     if still := ", ".join(c.name for c in spec.command if c.name in unmoved):
         reason = f"{still} never moved in its first {identified.train_until_s:.0f} s"
-        return f"{reason}, from which it is learnt, so change it from the beginning on"
+        return f"{reason}, which the fit learns from, so change it from the start"
     if identified.alpha != "auto" or identified.drive.settings.order == 1:
         return "it may lack terms, so leave order and alpha at `auto`"
     for note in identified.notes:

@@ -71,8 +71,8 @@ def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate)
     if not moved_commands(recording.command).any():
         yield Gap("No command ever changed, so clock offset and latency could not be learnt.")
     elif not timing.separated and clocks_differ:
-        why = "since nothing measured on the commands' clock follows them"
-        advice = "the latency is taken as zero. Record the wheels or the state to tell them apart"
+        why = "since no measurement on the commands' clock follows them"
+        advice = "the latency is taken as zero. Record the wheels or the state to separate them"
         yield Gap(
             f"Only the sum of clock offset and command latency can be known, {why}; {advice}."
         )
@@ -101,7 +101,7 @@ def about_mounting(
     if x_hidden:
         finding = f"Where the tracked point lies on the robot could not be learnt, since {x_hidden}"
         advice = "it is taken as base_link, and the rotation holds for this curvature"
-        drive_so = "drive left, right and straight on, forwards and backwards, to learn it"
+        drive_so = "drive left, right and straight, forwards and backwards, to learn it"
         yield Gap(f"{finding}: {advice}; {drive_so}.")
     elif (x, y) != (0.0, 0.0):
         yield f"The tracked point lies at x {x:.4f} m, y {y:.4f} m of base_link."
@@ -162,7 +162,7 @@ def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> Iterator
     excitation = linear.regression.excitation
     if unmoved := ", ".join(missed(linear, spec)):
         finding = f"The model has no terms of {unmoved}, which never moved"
-        yield Gap(f"{finding}: it holds for this drive's constant value only.")
+        yield Gap(f"{finding}: it is valid for this drive's constant value only.")
     still = _commands(excitation.unmoved, spec)
     if missing := ", ".join(name for name in still if name not in already):
         yield Gap(f"Drive with {missing} changing over the whole range to learn them.")
@@ -174,8 +174,8 @@ def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> Iterator
             f"{together} always moved together, so their effects can't be told apart: {holds}."
         )
     if copies := _list([v.name for v in spec.state if v.name in linear.regression.dependent]):
-        why = "always followed from the other variables, so their effects can't be told apart"
-        yield Gap(f"{copies} {why}: the model does without, and holds for as long as that is so.")
+        why = "always depended on the other variables, so their effects can't be separated"
+        yield Gap(f"{copies} {why}: the model omits them, and is valid only while that is so.")
     levels = {n: v for n, v in excitation.levels.items() if n not in excitation.unmoved}
     if coarse := _list([name for name, count in levels.items() if count == FEW_LEVELS]):
         finding = "between them the model is a straight line, whatever the robot does"
@@ -191,7 +191,7 @@ def doubts_of_fit(linear: Fit, exact: bool) -> Iterator[str]:
         if condition > ILL_CONDITIONED:
             alike = f"nearly copies of each other on this drive (condition number {condition:.1g})"
             advice = "lower the order or drive with more variety"
-            useless = "their coefficients are no use one by one"
+            useless = "their individual coefficients mean little"
             yield f"The terms of {dof} are {alike}: {useless}; {advice}."
     fitted = {dofs[d] for d in linear.regression.moving} - {"vy"} if exact else set()
     explained = zip(dofs, linear.r2, strict=True)
@@ -207,7 +207,7 @@ def doubts(held_out: OpenLoop | None) -> Iterator[str]:
     share = held_out.mean_position_error_m / held_out.mean_path_m
     if not share <= FAR_OFF:
         end = f"end {share:.0%} of their path away" if isfinite(share) else "run away"
-        finding = "the response does not follow the commands as the model has it"
+        finding = "the response does not follow the commands as modelled"
         yield f"On unseen data the predictions {end}: {finding}; do not train with this model."
 
 

@@ -58,7 +58,7 @@ def managed() -> list[Row]:
 
 def sensors() -> list[Row]:
     """Returns the parameters of the sensors that a robot has beside scan and odometry."""
-    upside_down = "Whether the lidar hangs with its z axis down, so that its beams come clockwise."
+    upside_down = "Whether the lidar is mounted upside down, so that its beams run clockwise."
     types = ", ".join((NO_POSE, *POSE_TYPES))
     return [
         Row("pose_type", NO_POSE, f"Type of `pose`, in the map frame: {types}."),
@@ -74,8 +74,8 @@ def middleware() -> list[Row]:
         Row("map_frame", "map", "Frame id of the estimate.", fixed=False),
         BASE_FRAME,
         Row("publish_map_to_odom", True,
-            "Whether to publish map -> odom on /tf by the estimate, where no other node does."),
-        Row("transform_tolerance", 0.2, "By which the stamp of map -> odom is ahead [s].",
+            "Whether to publish map -> odom on /tf from the estimate, if no other node does."),
+        Row("transform_tolerance", 0.2, "How far the stamp of map -> odom is ahead [s].",
             (0.0, 10.0)),
     ]  # fmt: skip
 
@@ -89,15 +89,15 @@ def policy() -> list[Row]:
             "A policy file (*.onnx), the mapping of a foreign one (*.yaml), or the name of a "
             "shipped one or of a baseline."),
         Row("fallback", "",
-            "A planner (dynamic_window, mppi) that acts where the policy asks for what can't be "
+            "A planner (dynamic_window, mppi) that acts where the policy's command can't be "
             "stopped before a touch; empty for none."),
         Row("goal", [math.nan] * 2, "x, y in map [m]; NaN waits for goal_pose."),
         Row("rate", math.nan,
-            "Actions per second of the steady clock; NaN: of the control period; 0: one for each "
-            "scan, for a simulator that is not in real time."),
+            "Actions per second of the steady clock; NaN: one per control period; 0: one per "
+            "scan, for a simulator that does not run in real time."),
         Row("deadline", math.nan,
             "Longest time of an inference [s]; NaN: half the control period."),
-        Row("late_limit", 3, "So many late inferences in a row command zero.", (1, 1000)),
+        Row("late_limit", 3, "Late inferences in a row that cause a zero command.", (1, 1000)),
     ]  # fmt: skip
 
 
@@ -105,35 +105,35 @@ def nav2() -> list[Row]:
     """Returns the parameters of Nav2's controller server that `policy_node` knows, too."""
     return [
         Row("navigate_to_pose", True,
-            "Whether to serve this action, too, where no other node does."),
+            "Whether to serve this action too, if no other node does."),
         Row("lookahead", 1.0, "From the robot to the sub-goal on a path [m].", (0.1, 100.0), False),
         Row("controller_plugins", ["FollowPath"], "Names that goals of follow_path may ask for."),
-        Row("goal_checker_plugins", ["general_goal_checker"], "The same, of the goal's checks."),
-        Row("progress_checker_plugins", ["progress_checker"], "The same, of the progress' checks."),
+        Row("goal_checker_plugins", ["general_goal_checker"], "The same for goal checkers."),
+        Row("progress_checker_plugins", ["progress_checker"], "The same for progress checkers."),
         Row("path_handler_plugins", ["PathHandler"], "Names of path handlers; all do the same."),
-        Row("progress_checker_plugin", "", "The only one, as Humble names it; empty for these."),
+        Row("progress_checker_plugin", "", "Humble's single progress checker; empty for the list."),
         Row("failure_tolerance", 0.3,
-            "So long a robot that touches something waits [s]; -1 for ever.", (-1.0, 1e6), False),
+            "How long a robot that touches something waits [s]; -1 for ever.", (-1.0, 1e6), False),
         Row("costmap_update_timeout", 1.0,
             "Silence of scan or odom that ends a path [s]; ten control periods at least.",
             (0.0, 1e6), False),
-        Row("speed_limit_topic", "speed_limit", "Where a SpeedLimit comes from."),
+        Row("speed_limit_topic", "speed_limit", "Topic of SpeedLimit messages."),
     ]  # fmt: skip
 
 
 def checkers(goals: Sequence[str], progress: Sequence[str]) -> list[Row]:
     """Returns the parameters of the checks of these names, as of Nav2's own checkers."""
-    span, plugin = (0.0, 1e6), "Nav2's checker that it is to be as."
+    span, plugin = (0.0, 1e6), "Nav2's checker to imitate."
     rows: tuple[list[tuple[str, Any, str, tuple[float, float] | None]], ...] = [
         ("xy_goal_tolerance", 0.25, "Greatest distance from the goal [m].", span),
-        ("yaw_goal_tolerance", 0.25, "Of the heading there [rad]; not of robots that steer.", span),
-        ("stateful", True, "Whether a place that was reached stays so.", None),
-        ("path_length_tolerance", 1.0, "Greatest way that may be left at the goal [m].", span),
+        ("yaw_goal_tolerance", 0.25, "Heading tolerance [rad]; not for robots that steer.", span),
+        ("stateful", True, "Whether a position once reached stays reached.", None),
+        ("path_length_tolerance", 1.0, "Greatest remaining path length at the goal [m].", span),
         ("plugin", "nav2_controller::SimpleGoalChecker", plugin, None),
     ], [
         ("plugin", "nav2_controller::SimpleProgressChecker", plugin, None),
-        ("required_movement_radius", 0.5, "That the robot has to leave [m].", span),
-        ("required_movement_angle", 0.5, "Or turn by [rad], for a PoseProgressChecker.", span),
+        ("required_movement_radius", 0.5, "Radius the robot must leave [m].", span),
+        ("required_movement_angle", 0.5, "Or turn by this [rad], for a PoseProgressChecker.", span),
         ("movement_time_allowance", 10.0, "Within this time [s].", span),
     ]  # fmt: skip
     return [
@@ -156,41 +156,41 @@ def device(laser_frame: str = "") -> list[Row]:
     return [
         Row("world", "arena", "World file, or the name of a shipped world."),
         STANDARD,
-        Row("randomisation", "", "Draws in each episode: a file, mild or strong; none if empty."),
+        Row("randomisation", "", "Drawn in each episode: mild, strong or a file; none if empty."),
         Row("mode", MODES[0], f"How time runs: {', '.join(MODES)}."),
         stamped("cmd_vel"),
-        Row("frame_prefix", "", "Put before the robot's frames; in a fleet before its namespace."),
+        Row("frame_prefix", "", "Prefix of the robot's frames; in a fleet, of its namespace."),
         Row("map_frame", "map", "Frame id of map."),
         Row("odom_frame", "odom", "Frame id of odom."),
         Row("base_frame", "base_link", "Frame id of base_link."),
         Row("laser_frame", laser_frame, "Frame id of the lidar.", shown="that of the model"),
         Row("footprint_frame", "",
-            "Frame id of a further frame at base_link, as base_footprint; none if empty."),
-        Row("map_resolution", 0.01, "Greatest side of the cells of map [m].", (0.001, 10.0)),
+            "Additional frame at base_link, such as base_footprint; none if empty."),
+        Row("map_resolution", 0.01, "Greatest cell size of map [m].", (0.001, 10.0)),
         Row("publish_map_to_odom", False,
             "Whether to publish the true map -> odom on /tf, in place of a localiser."),
         Row("rate", 1.0, "Simulated seconds per second in realtime.", (0.01, 1000.0)),
-        Row("odom_rate", 0.0, "Of odom [Hz]; 0 for one per control period.", (0.0, 1000.0)),
-        Row("scan_rate", 0.0, "Of scan [Hz]; 0 for the lidar's own.", (0.0, 1000.0)),
+        Row("odom_rate", 0.0, "Rate of odom [Hz]; 0 for one per control period.", (0.0, 1000.0)),
+        Row("scan_rate", 0.0, "Rate of scan [Hz]; 0 for the lidar's own.", (0.0, 1000.0)),
         Row("scan_latency", OWN,
-            "From the end of a scan to its publication [s]; -1 for the measured one of the model.",
+            "From the end of a scan to its publication [s]; -1 for the model's measured one.",
             (OWN, 10.0)),
         Row("odom_latency", OWN,
-            "From the stamp of odom to its publication [s]; -1 for the measured one of the model.",
+            "From the stamp of odom to its publication [s]; -1 for the model's measured one.",
             (OWN, 10.0)),
         Row("latency_jitter", OWN,
-            "Greatest further delay of both, drawn evenly [s]; -1 for the measured ones.",
+            "Maximum extra delay of both, drawn uniformly [s]; -1 for the measured ones.",
             (OWN, 10.0)),
         Row("command_latency", OWN,
-            "From a command to its effect [s]; -1 for the measured one of the model.", (OWN, 10.0)),
+            "From a command to its effect [s]; -1 for the model's measured one.", (OWN, 10.0)),
         Row("command_timeout", 0.5,
             "Stops after this silence on cmd_vel [simulated s]; not in lockstep.", (0.0, 3600.0),
             fixed=False),
         Row("episode_seed", 0, "Seed of the episode that ~/reset begins.", fixed=False),
         Row("episode_start", [0.0, 0.0, 0.0],
-            "Start x, y, heading of the episodes, of each robot; once it is set.", fixed=False),
+            "Start x, y, heading of each robot in the episodes, once set.", fixed=False),
         Row("episode_start_given", False,
-            "Whether episode_start holds, or the seed's own start; true once episode_start is set.",
+            "Whether episode_start applies, or the seed's start; true once episode_start is set.",
             fixed=False),
     ]  # fmt: skip
 
@@ -209,17 +209,17 @@ def renderer(default: str) -> Row:
 LIMITS = Row("limits", "", "Limits of the robot: a shipped file, or a YAML file; no default.")
 SHIELD = Row("shield", True, "Whether to stop before obstacles.")
 SHIELD_NUMBERS = [
-    Row(f"shield_{name}", math.nan, f"{about}; NaN: by the limits' file, or from the model.")
+    Row(f"shield_{name}", math.nan, f"{about}; NaN: from the limits' file, or the model.")
     for name, about in (
-        ("latency", "Until the robot has taken up a command, measured [s]"),
-        ("deceleration", "Of the robot, measured [m/s^2]"),
+        ("latency", "Measured time until the robot follows a command [s]"),
+        ("deceleration", "Measured deceleration of the robot [m/s^2]"),
         ("margin", "Kept free around the footprint [m]"),
-        ("obstacle_speed", "At which what moves may come on [m/s]"),
+        ("obstacle_speed", "Greatest speed of approaching obstacles [m/s]"),
     )
 ]
 BLACK_BOX = Row(
     "black_box", "",
-    "Where a stop's last 30 s are written, by namespace; ~/.ros/black_box if empty.",
+    "Folder for the last 30 s before a stop, by namespace; ~/.ros/black_box if empty.",
 )  # fmt: skip
 PRIORITY = Row(
     "priority", 0, "Real-time priority (SCHED_FIFO) of its process, 1 to 99; 0 for none.",
@@ -232,15 +232,15 @@ def gate_rules(odom_rate: float = math.nan, scan_age: float = math.nan) -> list[
     from nics_drl_bridge.gate.state import GateConfig as Default
 
     seconds = (0.01, 10.0)
-    heard = "Whether e_stop must have been heard before arming; false in simulations alone."
+    heard = "Whether e_stop must have been received before arming; false only in simulations."
     return [
-        Row("odom_rate", odom_rate, "Of odom [Hz].", (0.1, 1e4), shown="1 per control period"),
-        Row("scan_age", scan_age, "Oldest scan, and behind a command [s].", seconds,
+        Row("odom_rate", odom_rate, "Rate of odom [Hz].", (0.1, 1e4), shown="1 per control period"),
+        Row("scan_age", scan_age, "Oldest scan, also behind a command [s].", seconds,
             shown=f"{Default.scan_age_s:g}, or more for a slow lidar"),
         Row("odom_age", Default.odom_age_s, "Oldest odometry [s].", seconds),
         Row("command_age", Default.command_age_s, "Oldest command [s].", seconds),
-        Row("rate_tolerance", Default.rate_tolerance, "Of both rates.", (0.01, 0.9)),
-        Row("clock_rate", 1.0, "Of stamps: simulated seconds per second.", (0.01, 100.0)),
+        Row("rate_tolerance", Default.rate_tolerance, "Tolerance of both rates.", (0.01, 0.9)),
+        Row("clock_rate", 1.0, "Rate of stamps: simulated seconds per second.", (0.01, 100.0)),
         Row("e_stop_required", True, heard),
         Row("e_stop_silence", Default.e_stop_silence_s, "Silence of e_stop [s].", seconds),
         Row("estimate_required", True, "Whether arming needs odometry/filtered."),
@@ -254,8 +254,8 @@ RULES_IN_SECONDS = ("scan_age", "odom_age", "command_age", "e_stop_silence")
 
 FOREIGN = Row(
     "foreign_commands", "none",
-    "Type of cmd_vel_raw of a controller that does not stamp it with its scan, as Nav2's: Twist or "
-    "TwistStamped; the newest scan's age then counts. none: of the policy.",
+    "Type of cmd_vel_raw from a controller that does not stamp it with its scan, like Nav2's: "
+    "Twist or TwistStamped; the newest scan's age then counts. none: from the policy.",
 )  # fmt: skip
 
 
@@ -270,10 +270,10 @@ def drive() -> list[Row]:
     return [
         Row("robot", DEFAULT_ROBOT, "A shipped robot, or its YAML file."),
         Row("out", "drive.npz", "File *.npz of the recording, or folder of a rosbag2."),
-        Row("bound", 2.0, "Radius of the circle around the start to keep within [m]."),
-        Row("duration", 60.0, "Of the drive [s]."),
+        Row("bound", 2.0, "Radius of the circle around the start to stay within [m]."),
+        Row("duration", 60.0, "Duration of the drive [s]."),
         Row("speed", 1.0, "Share of the greatest speeds to use."),
-        Row("seed", 0, "Of the pattern."),
+        Row("seed", 0, "Seed of the pattern."),
         Row("topics", "", "YAML file that names joints; none if empty."),
         Row("odom_timeout", 0.5, "Stops after this silence of odom [s].", (0.05, 10.0)),
         stamped("cmd_vel")._replace(name="stamped"),
@@ -332,7 +332,7 @@ NODES: dict[str, Callable[[], NodeFacts]] = {
         f"-p limits:={DEFAULT_ROBOT}",
     ),
     "record_node": lambda: NodeFacts(
-        "Drives a robot so that it shows its whole motion, and records it; the robot moves.",
+        "Drives a robot through its full range of motion and records it; the robot moves.",
         ("odom", "joint_states", "imu", "pose"), ("cmd_vel",), (), drive(),
         "-p bound:=3.0 -p out:=drive.npz",
     ),

@@ -19,13 +19,13 @@ Tile = tuple[str, str, bool]
 def fit_tile(identified: Identified) -> Tile:
     """Returns the accuracy of a fit as a figure, its meaning, and false if it is doubtful."""
     for at in usual(identified.judgement):
-        beside = {"": at.model, "fitted textbook ": at.textbook, "twist kept ": at.kept_twist}
+        beside = {"": at.model, "fitted textbook ": at.textbook, "constant twist ": at.kept_twist}
         told = [name + end_of(each, at.path_m) for name, each in beside.items() if each]
         figure, *others = (text.removesuffix(OF_PATH) for text in told)
         off = f"{OF_PATH} off".lstrip() if told[0] != figure else "off"
         meaning = f"{off} after {at.horizon_s:g} s, on unseen data; {', '.join(others)}"
         return figure, meaning, not conclude(identified).doubts
-    return "untried", "on data that it had not seen, as the drive is too short", False
+    return "untested", "on unseen data, as the drive is too short", False
 
 
 def verdict_blocks(tiles: Sequence[Tile], conclusion: Conclusion, *commands: str) -> Blocks:
@@ -34,9 +34,9 @@ def verdict_blocks(tiles: Sequence[Tile], conclusion: Conclusion, *commands: str
     if conclusion.doubts:
         blocks.append(html.bullets(conclusion.doubts))
     if conclusion.gaps:
-        blocks += [html.paragraph("The drive could not teach all:"), html.bullets(conclusion.gaps)]
+        blocks += [html.paragraph("What the drive could not teach:"), html.bullets(conclusion.gaps)]
     else:
-        blocks.append(html.paragraph("The drive taught all that the model needs."))
+        blocks.append(html.paragraph("The drive taught everything the model needs."))
     blocks.append(html.paragraph(conclusion.advice))
     return [*blocks, html.code("\n".join(commands))] if commands else blocks
 
@@ -46,16 +46,14 @@ def path_blocks(identified: Identified) -> Blocks:
     if identified.held_out is None or not identified.judgement:
         return [html.paragraph("The drive is too short to hold data out.")]
     drawn = [(each, "") for each in fit_pictures.unseen_paths(identified.trial, PATHS_SHOWN)]
-    caption = (
-        "Mean errors of predictions of unseen data: of a good model they are below the others."
-    )
+    caption = "Mean prediction errors on unseen data: those of a good model lie below the others."
     if any(at.band_m for at in identified.judgement):
-        caption += " Bars: distances within which 95 % of its ends are expected."
+        caption += " Bars: distances within which 95 % of its predictions should end."
     rows = html.table(HEADS, judgement_rows(identified.judgement))
     return [
         html.gallery(drawn),
         html.picture(fit_pictures.yardsticks(identified), caption),
-        html.details("The same in figures", [html.paragraph(COMPARED), rows]),
+        html.details("The same in numbers", [html.paragraph(COMPARED), rows]),
     ]
 
 

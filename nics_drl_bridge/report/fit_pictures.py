@@ -41,18 +41,18 @@ CURVE_POINTS = 400  # of an input curve
 REACH = 5.0  # histograms end at this many standard deviations
 REACH_S, TRIALS = 0.5, 81  # largest shift in time of a curve, and number of its points
 CAPTIONS = {
-    "accuracy": "The error by the number of terms; circles mark how many are kept.",
-    "residuals": "Rates on unseen data, those of the model, and what is left.",
+    "accuracy": "Error against the number of terms; circles mark how many are kept.",
+    "residuals": "Rates on unseen data, those of the model, and the residuals.",
     "alignment": "Commands as stamped and as they take effect, and the response of the robot.",
-    "timing": "What each shift in time leaves unexplained; the estimate lies at the least.",
-    "bursts": "Poses that arrive in bursts, and the times that they were taken to be of.",
+    "timing": "Unexplained motion for each shift in time; the estimate is at the minimum.",
+    "bursts": "Poses that arrive in bursts, and the times assigned to them.",
     "mounting": "Velocities before and after correction: base_link of a robot that can't move "
     "sideways has no lateral velocity.",
     "wheels": "Wheel speeds against the motion: the scale, and which wheel is the left one.",
-    "inputs": "What motors make of commands, over the range that the drive sent, and of the rates "
-    "that the terms ask of them.",
-    "noise": "Noise of the sensors, and how the error of predictions grows beside the drift that "
-    "simulator and estimator use.",
+    "inputs": "How motors change commands, over the range of the drive, and the rates that the "
+    "terms ask for.",
+    "noise": "Sensor noise, and the growth of prediction errors, next to the drift that simulator "
+    "and estimator use.",
 }
 
 
@@ -148,7 +148,7 @@ def yardsticks(identified: Identified) -> bytes:
     judgement = identified.judgement
     for name, label, colour, line in (
         ("model", "model", MODEL, "o-"), ("textbook", "fitted textbook", MEASURED, "s--"),
-        ("kept_twist", "twist kept", OTHER, "^:"),
+        ("kept_twist", "constant twist", OTHER, "^:"),
     ):  # fmt: skip
         known = [(at.horizon_s, each) for at in judgement if (each := getattr(at, name))]
         if known:

@@ -33,7 +33,7 @@ def judged(found, position, path=2.0):
     [
         (0.0228, 2.0, "end 0.0228 m off after 5 s (1.1 % of the path); a fitted textbook 25.0 %"),
         (1e-5, 2.0, "(< 0.1 % of the path)"),
-        (0.02, 0.0, "end 0.02 m off after 5 s; a fitted textbook 0.5 m, a kept twist 1 m."),
+        (0.02, 0.0, "end 0.02 m off after 5 s; a fitted textbook 0.5 m, constant twist 1 m."),
         (math.inf, 2.0, "the predictions run away within 5 s."),
         (math.nan, 2.0, "the predictions run away within 5 s."),
     ],
@@ -47,14 +47,14 @@ def test_the_accuracy_is_a_share_of_the_path_beside_those_of_the_yardsticks(
 def test_a_model_that_was_not_tried_says_so(found):
     untried = replace(found, findings=replace(found.findings, judgement=()))
     assert accuracy(untried) == UNTRIED
-    assert "generate anew" in conclude(untried).advice
+    assert "generate again" in conclude(untried).advice
 
 
 def test_a_model_that_is_beaten_is_not_to_be_trained_with(found):
     assert conclude(found).doubts == ()
     beaten = conclude(judged(found, 2.0))
     assert any("does not beat" in doubt for doubt in beaten.doubts)
-    assert "before a policy is trained" in beaten.advice
+    assert "before training a policy" in beaten.advice
 
 
 def test_the_report_opens_with_the_conclusion_and_the_model(found):
@@ -75,7 +75,7 @@ def test_gaps_are_those_notes_that_tell_what_the_drive_could_not_teach(found):
     gap = "turn_command never moved."
     told = conclude(replace(found, notes=("Poses arrive in bursts.", Gap(gap))))
     assert told.gaps == (gap,)
-    assert "first see to what is said above" in told.advice
+    assert "first fix the points above" in told.advice
     assert type(told.gaps[0]) is str  # a file takes no other
 
 
@@ -85,7 +85,7 @@ def test_a_mistake_of_the_mapping_is_told_first_and_to_be_mended_before_a_traini
     told = conclude(replace(judged(found, 2.0), notes=(Mistake(mistake),)))
     assert told.doubts[0] == mistake
     assert type(told.doubts[0]) is str  # a file takes no other
-    assert told.advice.startswith("Next: mend the mapping as said above, or the robot")
+    assert told.advice.startswith("Next: fix the mapping as described above, or the robot")
     assert not told.ready
 
 

@@ -74,7 +74,7 @@ def test_straight_only_gives_a_model_without_turning_and_says_so(car, noise):
     assert {"steering", "steering_command"} <= set(found.fit.unmoved)
     assert said(found, "Drive with steering_command changing")
     assert any("steering_command changing" in gap for gap in found.gaps)
-    assert "drive once more" in conclude(found).advice
+    assert "record another drive" in conclude(found).advice
     assert not found.model.powers[:, [1, 3]].any()
     assert harmless(found, car)
     with pytest.raises(FitError, match="steering_command never moved"):
@@ -94,7 +94,7 @@ def test_straight_only_of_a_differential_robot_names_the_turn_command(differenti
 @pytest.mark.parametrize(
     ("column", "constant", "name", "advice"),
     [
-        (0, 0.6, "speed_command", "holds for this drive's constant value only"),
+        (0, 0.6, "speed_command", "is valid for this drive's constant value only"),
         (1, -0.4, "steering_command", "drive with steering_command changing over its whole range"),
     ],
 )

@@ -194,9 +194,9 @@ def test_a_wheel_that_always_follows_from_the_others_is_named(name, request):
     spec = request.getfixturevalue(name)
     notes = " ".join(identify(drive(spec, duration=20.0), spec).notes)
     # Four wheels that roll without slip have three speeds to choose.
-    told = "rear_right_wheel always followed from the other variables" in notes
+    told = "rear_right_wheel always depended on the other variables" in notes
     assert told == (name == "mecanum")
-    assert "left_wheel always followed" not in notes
+    assert "left_wheel always depended" not in notes
 
 
 def by_throttle(steering: float, **given) -> tuple[RobotSpec, TaylorModel]:

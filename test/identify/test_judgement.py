@@ -59,7 +59,7 @@ def test_the_judgement_is_kept_in_the_file_of_the_model(found):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("yardstick", "named"),
-    [("textbook", "the fitted textbook"), ("kept_twist", "a robot that keeps its twist")],
+    [("textbook", "the fitted textbook"), ("kept_twist", "a constant twist")],
 )
 def test_a_model_that_does_not_beat_a_yardstick_says_so_on_top(found, yardstick, named):
     at = replace(found.judgement[3], **{yardstick: EndErrors(1e-3, 0.1)})

@@ -84,7 +84,7 @@ def test_standing_still_is_off_by_the_way_from_start_to_end(car):
 def test_rows_too_far_apart_are_named(name, request):
     spec = request.getfixturevalue(name)
     sentence = verdict_on(coarse(spec, every=30), spec)
-    start = f"textbook {spec.name}: the fitted model is of no use: on unseen data its predictions "
+    start = f"textbook {spec.name}: the fitted model is useless: on unseen data its predictions "
     assert sentence.startswith(start)
     assert any(f"; {v.name} changes by " in sentence for v in spec.state)
     assert sentence.endswith("between rows that are 0.3 s apart, so record at a higher rate.")
@@ -158,7 +158,7 @@ def test_a_model_that_predicts_nothing_is_told_of_in_one_sentence(name, request)
         warnings.simplefilter("error")
         found = identify(recording, spec)
         sentence = why_useless(found, spec)
-    assert "is of no use: on unseen data its predictions end" in sentence
+    assert "is useless: on unseen data its predictions end" in sentence
     assert any("of their path away" in note and "do not train" in note for note in found.notes)
     ran_away = replace(found.held_out, mean_position_error_m=np.inf)
     sentence = why_useless(replace(found, held_out=ran_away), spec)

@@ -160,11 +160,11 @@ def test_motors_are_drawn_and_reported_with_what_is_known_of_them(exact):
         f"{name:<24} dead zone on both sides of 0: 0.12 +- 0.004 {spec.command[0].unit}" in report
     )
     assert f"{state:<24} dry friction: 0.2 rad/s/s" in report
-    assert "does no more" in report
+    assert "saturates" in report
     assert model.equations()[0] == curve.equation
     assert calibration_pictures(spec, motors)["inputs"].startswith(PNG)
 
 
 def test_a_robot_whose_motors_do_no_more_than_its_terms_has_no_section_on_them(exact):
     spec, found = exact
-    assert "What motors do" not in fit_report("drive", spec, found)
+    assert "Effect of the motors" not in fit_report("drive", spec, found)

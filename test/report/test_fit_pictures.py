@@ -54,7 +54,7 @@ def test_a_figure_that_a_yardstick_beats_is_doubtful(found):
     beaten = replace(identified, findings=replace(identified.findings, judgement=(at,)))
     assert fit_tile(beaten)[2] is False
     untried = replace(identified, findings=replace(identified.findings, judgement=()))
-    assert fit_tile(untried)[0] == "untried"
+    assert fit_tile(untried)[0] == "untested"
 
 
 @slow
@@ -70,7 +70,7 @@ def test_a_short_drive_has_fewer_pictures():
 def test_the_report_names_errors_pruning_and_validity(found):
     spec, identified = found
     text = fit_report("here", spec, identified)
-    for part in ("with standard errors", "Eq. 2", "knee", "condition number", "Valid where"):
+    for part in ("with standard errors", "Eq. 2", "knee", "condition number", "Valid range"):
         assert part in text
 
 

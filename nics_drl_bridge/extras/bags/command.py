@@ -13,7 +13,7 @@ from nics_drl_bridge.commands.console import SalvageOption, intact, needs_ros
 from nics_drl_bridge.config import namespace_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
-bag = typer.Typer(help="Records, describes, replays, exports and saves bags.", no_args_is_help=True)
+bag = typer.Typer(help="Records, describes, replays, exports, salvages bags.", no_args_is_help=True)
 
 STORAGES = ("mcap", "sqlite3")
 TASK = "Drive to the goal without touching anything."
@@ -28,12 +28,12 @@ def record(
     everything: Annotated[bool, Option("--all", help="Record every topic.")] = False,
     namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
     duration: Annotated[float | None, Option(min=0.0,
-        help="Stop after so long [s]; else at Ctrl-C.")] = None,
+        help="Stop after this time [s]; else at Ctrl-C.")] = None,
     storage: StorageOption = "mcap",
-    use_sim_time: Annotated[bool, Option("--use-sim-time", help="Receipts by /clock.")] = False,
+    use_sim_time: Annotated[bool, Option("--use-sim-time", help="Take time from /clock.")] = False,
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
-    """Records the topics of a robot as they are, without driving it."""
+    """Records a robot's topics without driving it."""
     kind = _storage(storage)
     with needs_ros("nics bag record"):
         from nics_drl_bridge.extras.bags.live import BagOrder, record_bag
@@ -49,7 +49,7 @@ def record(
 def info(
     path: BagArgument, as_json: console.JsonOption = False, salvage: SalvageOption = False
 ) -> None:  # fmt: skip
-    """Tells a bag's topics, rates and gaps, and whose clock stamped it."""
+    """Shows a bag's topics, rates, gaps, and the clock of its stamps."""
     from nics_drl_bridge.extras.bags.info import bag_info
 
     with intact(path, salvage) as whole:
@@ -65,14 +65,14 @@ def info(
 def replay(
     path: BagArgument,
     rate: Annotated[float, Option(min=0.001, help="Seconds of the bag per second.")] = 1.0,
-    loop: Annotated[bool, Option("--loop", help="Begin anew at the end.")] = False,
+    loop: Annotated[bool, Option("--loop", help="Start again at the end.")] = False,
     clock: Annotated[bool, Option(help="Publish the bag's time on /clock.")] = True,
     topics: Annotated[list[str] | None, Option(help="Play this topic only; repeatable.")] = None,
-    namespace: Annotated[str, Option(help="Put in front of the topics' names.")] = "",
+    namespace: Annotated[str, Option(help="Prefix of the topics' names.")] = "",
     lockstep: Annotated[str | None, Option(metavar="NODE",
-        help="Wait after each message till this node has it.")] = None,
+        help="Wait after each message until this node has received it.")] = None,
     estimate: Annotated[bool, Option("--estimate",
-        help="Run the middleware on it in process instead.")] = False,
+        help="Run the middleware on the bag in process instead.")] = False,
     model: Annotated[str, Option(autocompletion=console.ROBOTS,
         help="For --estimate: folder of a model, or a shipped robot.")] = DEFAULT_ROBOT,
     topic: Annotated[list[str] | None, Option(metavar="ROLE=TOPIC",
@@ -81,7 +81,7 @@ def replay(
     salvage: SalvageOption = False,
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
-    """Plays a bag over ROS 2, or gives the middleware's estimate of it."""
+    """Plays a bag over ROS 2, or runs the middleware's estimator on it."""
     with intact(path, salvage) as whole:
         if estimate:
             from nics_drl_bridge.generator import open_model
@@ -111,22 +111,22 @@ def export(
     lerobot: Annotated[Path | None, Option(metavar="FOLDER",
         help="Write a LeRobot dataset, format v3.0.")] = None,
     mcap: Annotated[Path | None, Option(metavar="FOLDER",
-        help="Write a bag in MCAP, as Foxglove opens it.")] = None,
+        help="Write an MCAP bag for Foxglove.")] = None,
     model: Annotated[str | None,
-        Option(help="A model's folder, or a shipped robot: its commands, its lidar and its mount.",
+        Option(help="A model's folder, or a shipped robot: for commands, lidar and its mount.",
         autocompletion=console.ROBOTS)] = None,
     topic: Annotated[list[str] | None, Option(metavar="ROLE=TOPIC",
-        help="As odom=/car/odom. Roles: scan, odom, cmd_vel, pose.")] = None,
+        help="For example odom=/car/odom. Roles: scan, odom, cmd_vel, pose.")] = None,
     fps: Annotated[int | None, Option(min=1,
         help="Frames per second; the commands' rate by default.")] = None,
     gap: Annotated[float, Option(help="Data older than this end an episode [s].")] = 0.5,
-    task: Annotated[str, Option(help="What the robot was to do, in words.")] = TASK,
+    task: Annotated[str, Option(help="The robot's task, in words.")] = TASK,
     succeeded: Annotated[str | None, Option(metavar="all|none|NUMBERS",
-        help="Episodes that succeeded, as 0,2,5; if known.")] = None,
+        help="Episodes that succeeded, such as 0,2,5; if known.")] = None,
     salvage: SalvageOption = False,
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
-    """Writes a bag for others: as a dataset, or as MCAP to look at."""
+    """Converts a bag to a LeRobot dataset, or to MCAP for Foxglove."""
     with intact(path, salvage) as whole:
         from nics_drl_bridge.errors import ConfigError
         from nics_drl_bridge.generator import open_model
@@ -168,7 +168,7 @@ def salvage(
     out: Annotated[Path, Argument(help="Folder of the bag to write.")],
     storage: StorageOption = "mcap", as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
-    """Writes what is intact of a damaged bag as a new one."""
+    """Writes the intact part of a damaged bag to a new one."""
     from nics_drl_bridge.recording.messages import check_libraries
 
     check_libraries(path, "reading")
