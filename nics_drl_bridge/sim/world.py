@@ -211,6 +211,16 @@ def check_places(world: World) -> None:
                 raise ConfigError(f"{where}.motion.waypoints.{n}': {reason}; move it.")
 
 
+def check_place(what: str, world: World, x: float, y: float, radius: float = 0.0) -> None:
+    """Raises ConfigError for a place off a world's field, or in a wall within a radius [m]."""
+    solid = 0.0 if world.grid is None else world.grid.resolution  # room in a full cell
+    if (room := room_at(world, x, y)) <= max(radius, solid):
+        reason = "is in a wall" if room >= 0.0 else "lies outside the world"
+        x1, y1, x2, y2 = world.extent
+        field = f"the field is {x1:g} to {x2:g} m by {y1:g} to {y2:g} m"
+        raise ConfigError(f"{what}: ({x:g}, {y:g}) m {reason}; {field}.")
+
+
 def _inside(world: World, x: float, y: float) -> bool:
     x1, y1, x2, y2 = world.extent
     return x1 <= x <= x2 and y1 <= y <= y2
