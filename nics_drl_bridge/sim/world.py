@@ -1,5 +1,6 @@
 """World files: the field of the episodes and its obstacles."""
 
+from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated
@@ -184,9 +185,9 @@ class World(Schema):
         return np.array([*sides, *self.walls], dtype=np.float64).reshape(-1, 4)
 
 
-def load_world(name: str | Path) -> World:
-    """Loads a shipped world by name (`arena`), or any other by the path of its YAML file."""
-    path = find_config(name, "worlds")
+def load_world(name: str | Path, also: Iterable[str] = ()) -> World:
+    """Loads a shipped world by name (`arena`), or a YAML file; an error may offer `also` others."""
+    path = find_config(name, "worlds", also)
     world = load_yaml(path, World)
     if world.map is not None and Path(world.map).suffix in (".yaml", ".yml"):
         world = world.model_copy(update={"map": str(path.parent / world.map)})
