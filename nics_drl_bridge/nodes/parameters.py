@@ -2,10 +2,12 @@
 
 import math
 import os
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, distribution
 from typing import Any, NamedTuple
 
+from nics_drl_bridge.errors import shortened
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 MODES = ("realtime", "lockstep", "as_fast_as_possible")
@@ -14,6 +16,7 @@ OWN = -1.0  # of a delay: as in the model
 HIGHEST_PRIORITY = 99
 PLAIN_TWISTS = ("humble", "iron", "jazzy")  # distributions whose robots are driven by a Twist
 STAMPED = "enable_stamped_cmd_vel"
+FRAME, MAY_BE_EMPTY = re.compile(r"[^\s/]\S{0,254}"), ("footprint_frame",)
 
 
 class Row(NamedTuple):
@@ -48,6 +51,20 @@ def stamped(what: str) -> Row:
 
 MODEL = Row("model", DEFAULT_ROBOT, "Folder of a SimulatorModel, or a shipped robot.")
 BASE_FRAME = Row("base_frame", "base_link", "Frame id of the robot.", fixed=False)
+
+
+def frame_fault(values: Mapping[str, Any]) -> str:
+    """Returns a sentence about the frames among parameters that can't be so; empty if all can."""
+    frames = {name: str(value) for name, value in values.items() if name.endswith("_frame")}
+    for name, frame in frames.items():
+        if not FRAME.fullmatch(frame) and (frame or name not in MAY_BE_EMPTY):
+            needed = "must be 1 to 255 characters, without blanks, the first of them no /"
+            return f"parameter {name!r}: {needed}, not {shortened(frame, 80)!r}."
+    apart = [f"{name}_frame" for name in ("map", "odom", "base") if f"{name}_frame" in frames]
+    if len({frames[name] for name in apart}) < len(apart):
+        given = ", ".join(f"{name!r} is {frames[name]!r}" for name in apart)
+        return f"parameter {given}: they must differ; rename one."
+    return ""
 
 
 def managed() -> list[Row]:
@@ -211,10 +228,10 @@ SHIELD = Row("shield", True, "Whether to stop before obstacles.")
 SHIELD_NUMBERS = [
     Row(f"shield_{name}", math.nan, f"{about}; NaN: by the limits' file, or from the model.")
     for name, about in (
-        ("latency", "Until the robot has taken up a command, measured [s]"),
+        ("latency", "Until the robot has taken up a command, measured, 10 at most [s]"),
         ("deceleration", "Of the robot, measured [m/s^2]"),
-        ("margin", "Kept free around the footprint [m]"),
-        ("obstacle_speed", "At which what moves may come on [m/s]"),
+        ("margin", "Kept free around the footprint, 10 at most [m]"),
+        ("obstacle_speed", "At which what moves may come on, 100 at most [m/s]"),
     )
 ]
 BLACK_BOX = Row(

@@ -42,7 +42,7 @@ class RosSource:
         half = SIDE_M / 2.0
         bounds = (-half, -half, half, half)
         self._world = world or World(name="map", bounds=bounds, goal_distance=(0.0, 1.0))
-        self._within = world and world.members[0]  # the one that is shown
+        self._within = None if world is None else world.members[0]  # the one that is shown
         self._model, self.period_s, self._title = model, PERIOD_S, namespace or "live topics"
         self._trail, self._goal = Track(), np.zeros((0, 2))
         self._gate: str | None = None
