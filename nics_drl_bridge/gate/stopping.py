@@ -19,8 +19,7 @@ UNKNOWN_LAG_S = 0.5  # lag of a robot whose model shows none [s]
 SLOWEST_LAG_S = 5.0  # slower modes are not lags but combinations that no command moves [s]
 UNKNOWN_DECELERATION = 0.5  # deceleration of a robot whose limits are not known [m/s^2]
 SHIELD_SPANS = {  # beyond them the robot could never move
-    "latency": (0.0, 10.0), "deceleration": (1e-3, 1e4), "margin": (0.0, 10.0),
-    "obstacle_speed": (0.0, 100.0),
+    "latency": (0, 10), "deceleration": (1e-3, 1e4), "margin": (0, 10), "obstacle_speed": (0, 100),
 }  # fmt: skip
 LEAST_DATA = 2  # least number that must arrive while the gate settles, for a rate to be known
 

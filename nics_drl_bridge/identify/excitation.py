@@ -154,8 +154,7 @@ def plausible(x: Array, spec: RobotSpec) -> NDArray[np.bool_]:
     low, high = np.array([[v.min, v.max] for v in (*spec.state, *spec.command)]).T
     margin = BEYOND * (high - low)
     inside = ((x >= low - margin) & (x <= high + margin)).all(axis=1)
-    everything = np.ones(len(x), dtype=np.bool_)
-    return np.asarray(inside) if inside.mean() >= 1.0 - MOST else everything
+    return np.asarray(inside) if inside.mean() >= 1.0 - MOST else np.ones(len(x), dtype=np.bool_)
 
 
 def _concentrated(chi: Array, target: Array, chosen: NDArray[np.intp]) -> Array:

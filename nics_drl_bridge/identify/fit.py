@@ -164,8 +164,7 @@ def prune(beta: Array, alpha: float, noise_floor: float = 0.0) -> NDArray[np.boo
     # With the one that crosses it (Eq. 2); those up to `noise_floor` are rounding errors.
     order = by_weight(beta, noise_floor)
     size = np.abs(beta[order])
-    kept = order[np.cumsum(size) - size < alpha * size.sum()]
-    return np.isin(np.arange(len(beta)), kept)
+    return np.isin(np.arange(len(beta)), order[np.cumsum(size) - size < alpha * size.sum()])
 
 
 def pruned(regression: Regression, spec: RobotSpec, alpha: Alpha = ALPHA) -> Fit:

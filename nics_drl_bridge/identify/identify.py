@@ -182,8 +182,7 @@ def inputs(drive: Drive, findings: Findings) -> Findings:
 
 def _with_delay(findings: Findings, samples: Samples) -> Findings:
     delay = likely_delay(findings.training, findings.calibration, samples)
-    calibration = replace(findings.calibration, command_latency_s=delay)
-    return replace(findings, calibration=calibration)
+    return replace(findings, calibration=replace(findings.calibration, command_latency_s=delay))
 
 
 def _fit_of_motion(drive: Drive, findings: Findings) -> Findings:

@@ -132,8 +132,7 @@ def errors_of(model: TaylorModel, samples: Samples) -> tuple[Array, Array]:
     rmse = np.sqrt((residual**2).mean(axis=0))
     variance = samples.dq.var(axis=0)
     unexplained = (residual**2).mean(axis=0) / np.maximum(variance, 1e-18)
-    r2 = np.where(variance > 1e-18, 1.0 - unexplained, 1.0)
-    return rmse, r2
+    return rmse, np.where(variance > 1e-18, 1.0 - unexplained, 1.0)
 
 
 def significant(chi: Array, target: Array) -> NDArray[np.bool_]:

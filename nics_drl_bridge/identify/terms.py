@@ -137,8 +137,7 @@ def by_textbook(
         part = POSE_RATES.index(variable.twist)
         allowed[3 + i] = False
         if tyres and paced and variable.twist != "vx":  # by the lateral acceleration
-            turn = [v.twist for v in spec.state].index("wz")
-            has(3 + i, 2 * first[speed[0]] + first[turn])
+            has(3 + i, 2 * first[speed[0]] + first[[v.twist for v in spec.state].index("wz")])
         has(3 + i, first[i])  # without a constant: who gets no command comes to rest
         commands = first[states:][np.abs(moves[part]) > 0.0]
         if bicycle.used and variable.twist == "wz" and paced:
@@ -163,8 +162,7 @@ def linear_fit(
         if v.name in unmoved
     }
     held = tuple(c.name for c in spec.command if at.get(c.name))
-    regression = regress(samples, spec, order, allowed=partial(allowed, held=held))
-    found = pruned(regression, spec, 1.0)
+    found = pruned(regress(samples, spec, order, allowed=partial(allowed, held=held)), spec, 1.0)
     still = samples.dq.std(axis=0) <= NOTHING
     still[3:] |= np.array([v.name in at for v in spec.state], dtype=np.bool_)
     coefficients = np.where(still[:, None], 0.0, found.model.coefficients)

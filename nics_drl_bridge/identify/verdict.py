@@ -78,8 +78,7 @@ def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate)
         )
     latency, spread = calibration.command_latency_s, sigma.get("command_latency_s", np.inf)
     if timing.separated and latency > CERTAIN * spread:
-        late = f"{latency:.4f} s (+- {spread:.4f} s)"
-        yield f"Commands take effect {late} after their stamps."
+        yield f"Commands take effect {latency:.4f} s (+- {spread:.4f} s) after their stamps."
 
 
 def about_mounting(
@@ -276,8 +275,7 @@ def with_quality(
         }
     measures = ("outliers", "condition", "rmse", "r2")
     figures |= {name: by_dof(getattr(linear, name)) for name in measures}
-    quality = Quality(samples=len(linear.regression.samples.t), **figures)
-    return replace(model, quality=quality)
+    return replace(model, quality=Quality(samples=len(linear.regression.samples.t), **figures))
 
 
 def refitted(until: float, duration: float, worse: bool) -> str:

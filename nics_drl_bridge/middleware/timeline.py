@@ -228,8 +228,7 @@ class Trail:
         """Time since the last used odometry, by its arrival and by the stamps since [s]."""
         if not self._recent:
             return 0.0
-        last = self._recent[-1]
-        waited = max(now.arrival_ns - last.arrival_ns, 0)
+        waited = max(now.arrival_ns - self._recent[-1].arrival_ns, 0)
         stamped = now.stamp_ns - (*self._refused, now)[0].stamp_ns
         # The last used one may have been a second late; the arrivals then show too little time.
         return max(waited, min(stamped, waited + HISTORY_NS)) / NS_PER_S
@@ -265,5 +264,4 @@ def _seconds(before: ReportedPose, after: ReportedPose, standing: float) -> floa
     mean = (before.twist + after.twist) / 2.0
     if not (np.abs(mean) > STILL).any():
         return standing
-    path = geometry.log(geometry.between(before.pose, after.pose))
-    return float(path @ mean / (mean @ mean))
+    return float(geometry.log(geometry.between(before.pose, after.pose)) @ mean / (mean @ mean))

@@ -15,8 +15,8 @@ from rclpy.parameter import Parameter
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.nodes.parameters import MODES, ROBOTS, device
-from nics_drl_bridge.nodes.runner import check_frames, declare_row, given_values
+from nics_drl_bridge.nodes.parameters import MODES, ROBOTS, device, frame_fault
+from nics_drl_bridge.nodes.runner import declare_row, given_values
 from nics_drl_bridge.robot.noise import Delay
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
 
@@ -57,10 +57,7 @@ class Frames(NamedTuple):
 
 
 def declare_device(node: Node, laser_frame: str) -> None:
-    """Declares all but the parameters of one kind of simulator, and checks later changes.
-
-    Raises ConfigError for frames that can't be.
-    """
+    """Declares, and checks, all but the parameters of one kind of simulator. ConfigError."""
     # First, so that it also checks the values that the node is started with.
     node.add_on_set_parameters_callback(partial(_check_episode, node))
     fleet = ParameterDescriptor(description=ROBOTS.about, read_only=True, dynamic_typing=True)
@@ -69,7 +66,7 @@ def declare_device(node: Node, laser_frame: str) -> None:
         if row.name == GIVEN:
             row = row._replace(default=START in given_values(node))
         declare_row(node, row)
-    if fault := check_frames(node):
+    if fault := frame_fault(node._parameters.values()):
         raise ConfigError(fault)
 
 
@@ -109,8 +106,7 @@ def timed_model(node: Node, model: SimulatorModel, time: DeviceTiming) -> Simula
     if time.lockstep:
         return model
     if (latency := number(node, "command_latency")) >= 0.0:
-        calibration = replace(model.calibration, command_latency_s=latency)
-        model = replace(model, calibration=calibration)
+        model = replace(model, calibration=replace(model.calibration, command_latency_s=latency))
     dt = model.timing[0]
     steps = round(time.step_ns / NS_PER_S / dt)
     return model if steps == model.timing[1] else replace(model, control_period=steps * dt)

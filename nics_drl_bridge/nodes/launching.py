@@ -208,8 +208,7 @@ def launched(starts: Sequence[Start], arguments: Sequence[DeclareLaunchArgument]
 
     def start(context: Any) -> list[Any]:
         declared = {one.name for one in arguments}
-        given = context.launch_configurations
-        setup = Setup({name: given[name] for name in declared})
+        setup = Setup({name: context.launch_configurations[name] for name in declared})
         return [action for each in starts for action in each(setup)]
 
     return LaunchDescription([*arguments, OpaqueFunction(function=start)])

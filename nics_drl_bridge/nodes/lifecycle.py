@@ -12,9 +12,9 @@ from rclpy.publisher import Publisher
 
 from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.nodes.ending import at_once
-from nics_drl_bridge.nodes.parameters import Row, managed, sensors
+from nics_drl_bridge.nodes.parameters import Row, frame_fault, managed, sensors
 from nics_drl_bridge.nodes.qos import QosWatch
-from nics_drl_bridge.nodes.runner import ACTIVE, INACTIVE, UNCONFIGURED, check_frames, declare_row
+from nics_drl_bridge.nodes.runner import ACTIVE, INACTIVE, UNCONFIGURED, declare_row
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 
@@ -30,7 +30,7 @@ class ManagedNode(QosWatch, LifecycleNode):
         self.fixed: set[str] = set()
         self.undo = ExitStack()
         values = [declare_row(self, row) for row in (*managed(), *sensors(), *rows)]
-        if fault := check_frames(self):
+        if fault := frame_fault(self._parameters.values()):
             raise ConfigError(fault)
         self._autostart = bool(values[0])
         self.state, self._starting = UNCONFIGURED, False  # `state`: the last primary one
@@ -71,7 +71,7 @@ class ManagedNode(QosWatch, LifecycleNode):
 
     def _check_fixed(self, parameters: list[Parameter]) -> SetParametersResult:
         late = sorted(self.fixed & {parameter.name for parameter in parameters})
-        reason = check_frames(self, parameters)
+        reason = frame_fault((*self._parameters.values(), *parameters))
         if late and self.state != UNCONFIGURED:
             lead = f"`ros2 lifecycle set {self.get_fully_qualified_name()} deactivate`"
             fix = f"lead it to unconfigured by {lead}, then `cleanup`."

@@ -69,8 +69,7 @@ class MapToOdom:
         self._frames = frames
         if self._kind is None or time.monotonic() - self._heard_s < QUIET_S or not all(frames):
             return
-        stamp = conversions.stamp_to_ros(stamp_ns + self._ahead_ns)
-        one = transform_to_ros(*frames, odom, stamp)
+        one = transform_to_ros(*frames, odom, conversions.stamp_to_ros(stamp_ns + self._ahead_ns))
         self._own.append(one)
         self._publisher.publish(self._kind(transforms=[one]))
 

@@ -7,6 +7,7 @@ from functools import partial
 from nav_msgs.msg import Odometry
 from rclpy.context import Context
 
+from nics_drl_bridge.errors import LONGEST, shortened
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.middleware.measurement import Health
 from nics_drl_bridge.middleware.middleware import rehearse
@@ -18,7 +19,6 @@ from nics_drl_bridge.nodes.robot_topics import RobotTopics
 from nics_drl_bridge.nodes.runner import ACTIVE, UNCONFIGURED
 
 SILENCE_S = 5.0  # diagnostics warn of a topic that has been silent for this long [s]
-MOST_TOLD = 3  # reasons why data are refused that the log tells of at a time
 
 
 class MiddlewareNode(ManagedNode):
@@ -71,10 +71,9 @@ class MiddlewareNode(ManagedNode):
         if self.state == UNCONFIGURED:
             return runner.Condition(self.state, warns=False, facts={})
         health = self._topics.middleware.health(self._topics.now_ns())
-        new = [each for each in health.rejected if each not in self._rejected][:MOST_TOLD]
-        for reason in new:
-            told = "is not used; /diagnostics counts what else is not, and why"
-            self.get_logger().warning(f"{reason}: {told}")
+        if new := sorted(health.rejected.keys() - self._rejected.keys()):
+            told = shortened("; ".join(new), LONGEST)
+            self.get_logger().warning(f"not used, but counted in /diagnostics: {told}")
         trouble = silence(health, self._topics.expected, self._rejected)
         self._rejected = health.rejected
         message = trouble or ("receiving" if self.state == ACTIVE else self.state)
@@ -86,17 +85,17 @@ def silence(health: Health, expected: Sequence[str], before: Mapping[str, int]) 
 
     `before` are earlier counts of `health.rejected`: what has grown since is refused, not silent.
     """
-    missing, since, told = [topic for topic in expected if topic not in health.topics], "yet", []
-    if not missing:
-        missing = [topic for topic in expected if health.topics[topic].age_s > SILENCE_S]
+    silent, since, told = [topic for topic in expected if topic not in health.topics], "yet", []
+    if not silent:
+        silent = [topic for topic in expected if health.topics[topic].age_s > SILENCE_S]
         since = f"for {SILENCE_S:g} s"
-    for topic in tuple(missing):
+    for topic in tuple(silent):
         counts = {r: n for r, n in health.rejected.items() if r.startswith(f"{topic}: ")}
         if grown := [reason for reason, n in counts.items() if n > before.get(reason, 0)]:
-            missing.remove(topic)
+            silent.remove(topic)
             reason = grown[-1].removeprefix(f"{topic}: ")
             told.append(f"{topic}: {sum(counts.values())} refused, the last: {reason}")
-    return "; ".join(([f"nothing on {', '.join(missing)} {since}"] if missing else []) + told)
+    return "; ".join([*([f"nothing on {', '.join(silent)} {since}"] if silent else ()), *told])
 
 
 def facts(health: Health) -> dict[str, str]:

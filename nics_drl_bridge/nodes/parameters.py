@@ -3,7 +3,7 @@
 import math
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, distribution
 from typing import Any, NamedTuple
 
@@ -53,9 +53,9 @@ MODEL = Row("model", DEFAULT_ROBOT, "Folder of a SimulatorModel, or a shipped ro
 BASE_FRAME = Row("base_frame", "base_link", "Frame id of the robot.", fixed=False)
 
 
-def frame_fault(values: Mapping[str, Any]) -> str:
-    """Returns a sentence about the frames among parameters that can't be so; empty if all can."""
-    frames = {name: str(value) for name, value in values.items() if name.endswith("_frame")}
+def frame_fault(parameters: Iterable[Any]) -> str:
+    """Returns a sentence about frames that can't be so; empty if all can. The last of a name is."""
+    frames = {each.name: str(each.value) for each in parameters if each.name.endswith("_frame")}
     for name, frame in frames.items():
         if not FRAME.fullmatch(frame) and (frame or name not in MAY_BE_EMPTY):
             needed = "must be 1 to 255 characters, without blanks, the first of them no /"

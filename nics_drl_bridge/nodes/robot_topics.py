@@ -72,8 +72,7 @@ class RobotTopics:
         self._header, self._told = b"", ""
         self._placed: tuple[Array, Array] | None = None  # pose and covariance of `initialpose`
         self._subscriptions: list[Any] = []
-        stamped = bool(node.get_parameter(STAMPED).value)
-        command = TwistStamped if stamped else Twist
+        command = TwistStamped if node.get_parameter(STAMPED).value else Twist
         self._subscribe(measurement.CMD_VEL, command, self._take_command, qos.COMMAND)
         heard: dict[str, tuple[Any, Callable[[Any], None]]] = {
             measurement.SCAN: (LaserScan, self._take_scan),

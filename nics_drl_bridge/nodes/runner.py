@@ -31,7 +31,7 @@ from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.ending import ENDING, at_once
 from nics_drl_bridge.nodes.executor import StandingExecutor
-from nics_drl_bridge.nodes.parameters import MODEL, Row, frame_fault
+from nics_drl_bridge.nodes.parameters import MODEL, Row
 from nics_drl_bridge.nodes.transport import OF_THIS_PROCESS
 
 SPIN_S = 0.1
@@ -241,12 +241,6 @@ def declare(
             value = [float(each) for each in value] if many else float(value)
             given[name] = Parameter(name, types.DOUBLE_ARRAY if many else types.DOUBLE, value)
     return node.declare_parameter(name, default, descriptor).value
-
-
-def check_frames(node: Node, changes: Sequence[Parameter] = ()) -> str:
-    """Returns a sentence about frames that can't be as parameters say, or would after changes."""
-    own = {name: each.value for name, each in node._parameters.items()}
-    return frame_fault(own | {each.name: each.value for each in changes})
 
 
 def given_values(node: Node) -> dict[str, Parameter]:

@@ -267,8 +267,7 @@ class DeviceNode(qos.QosWatch):
         """Simulates a world with the robots that it was started with; `begin` an episode next."""
         simulator = self.make_simulator(world, len(self._names))
         self.world, self.device = world, DeviceWorld(simulator, self.model, len(self._names))
-        drawn = device_parameters.randomisation(self)
-        self._identity = identity(self._given, world, drawn)
+        self._identity = identity(self._given, world, device_parameters.randomisation(self))
         self._size(range(len(self._names)))
 
     def make_simulator(self, world: AnyWorld, robots: int) -> FastSimulator:

@@ -108,8 +108,7 @@ def _content(path: Path, keys: tuple[str, ...]) -> dict[str, Any] | None:
         return None
     text = read_text(path)
     content = parse_yaml(text, str(path)) if any(f"{key}:" in text for key in keys) else None
-    known = isinstance(content, dict) and any(key in content for key in keys)
-    return content if known else None
+    return content if isinstance(content, dict) and any(key in content for key in keys) else None
 
 
 def _read_set(path: Path, file: SetFile) -> WorldSet:

@@ -236,8 +236,8 @@ class EpisodeSource:
 
     def unfinished(self, episodes: int) -> bool:
         """True until so many episodes have been driven and shown to their ends in every world."""
-        last = self._first + episodes
-        return any(lane.seed < last - 1 or not lane.over for lane in self.lanes)
+        last = self._first + episodes - 1
+        return any(lane.seed < last or not lane.over for lane in self.lanes)
 
     def _drive(self, request: Request) -> None:
         """Takes shares of the greatest speed forward, to the left, and turning left."""

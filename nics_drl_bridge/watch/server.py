@@ -20,9 +20,7 @@ from nics_drl_bridge.watch.frame import Frame, Stage
 
 HOST, PORT = "127.0.0.1", 8765
 MOST_REQUESTS, MOST_BYTES = 256, 4096
-QUIET = logging.getLogger(f"{__name__}.pages")  # a page that sleeps or errs is no news
-QUIET.addHandler(logging.NullHandler())
-QUIET.propagate = False
+QUIET = logging.Logger("pages", logging.CRITICAL + 1)  # one that sleeps or errs is no news
 POLICY = "; ".join([  # nothing comes from elsewhere, and nothing goes there
     "default-src 'none'", "script-src 'unsafe-inline'", "style-src 'unsafe-inline'",
     "img-src data:", "connect-src 'self' ws://{host}", "base-uri 'none'", "form-action 'none'",

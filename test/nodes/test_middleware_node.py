@@ -345,4 +345,6 @@ def test_data_that_are_refused_are_told_of_in_its_log_once(launch, meet, domain_
         )
 
     peer.until(refused, "what is refused, several times")
-    assert middleware.read_text().count("scan: shape (7,), not (720,): is not used") == 1
+    assert (
+        middleware.read_text().count("not used, but counted in /diagnostics: scan: shape (7,)") == 1
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import pytest
 
@@ -70,18 +71,23 @@ def test_help_tells_the_topics_and_services_of_a_node(node):
     assert {each.replace("~", f"/{made.get_name()}") for each in always} <= services
 
 
+def given(values):
+    """Parameters of some values."""
+    return [SimpleNamespace(name=name, value=value) for name, value in values.items()]
+
+
 @pytest.mark.parametrize("frame", ["", "a b", "/map", "map ", "m\n", "x" * 5000, "\t"])
 def test_a_frame_that_tf_does_not_know_is_one_short_sentence(frame):
-    told = frame_fault({"map_frame": "map", "base_frame": frame, "rate": 1.0})
+    told = frame_fault(given({"map_frame": "map", "base_frame": frame, "rate": 1.0}))
     assert told.startswith("parameter 'base_frame': must be 1 to 255 characters, without blanks")
     assert len(told) < 250
 
 
 def test_the_frames_of_map_odometry_and_robot_differ_and_a_footprint_may_be_none():
     good = {"map_frame": "map", "odom_frame": "odom", "base_frame": "r/base", "footprint_frame": ""}
-    assert not frame_fault(good)
+    assert not frame_fault(given(good))
     for name in ("odom_frame", "base_frame"):
-        told = frame_fault(good | {name: "map"})
+        told = frame_fault(given(good) + given({name: "map"}))
         assert f"{name!r} is 'map'" in told
         assert told.endswith("they must differ; rename one.")
 

@@ -32,7 +32,7 @@ def test_every_topic_of_the_picture_is_led_to_those_of_the_robot_and_the_map_to_
     for given, place in (({}, "/map"), ({"namespace": "car"}, "/car/map"),
                          ({"namespace": "hall", "robots": "[a, b]"}, "/hall/map")):  # fmt: skip
         setup = launching.Setup(arguments | {"rviz_config": str(FILE)} | given)
-        led, setup.node = [], lambda *given, **_: led.append(given)
-        list(launching.description(setup))
-        assert {**dict(led[-1][5]), "/map": place} == dict(led[-1][5])
-        assert dict(led[-1][5]).keys() == NAMED.keys()
+        setup.node = lambda *given, **_: given
+        *_, (*_, topics) = launching.description(setup)
+        assert dict(topics)["/map"] == place
+        assert dict(topics).keys() == NAMED.keys()
