@@ -7,7 +7,7 @@ grow to gigabytes, and tags, which build objects, are refused.
 
 import re
 import reprlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_type_hints
@@ -200,15 +200,15 @@ def shipped_names(kind: str) -> list[str]:
     return sorted(file.stem for file in files if file.suffix in (".yaml", ".onnx"))
 
 
-def find_config(name: str | Path, kind: str) -> Path:
-    """Finds `arena` in `config/KIND`, or a YAML file by its path; ConfigError names the nearest."""
+def find_config(name: str | Path, kind: str, also: Iterable[str] = ()) -> Path:
+    """Finds `arena` in `config/KIND`, or a YAML file; ConfigError names the nearest, or `also`."""
     name = str(name)
     if name.endswith((".yaml", ".yml")):
         return Path(name)
     path = share_folder() / "config" / kind / f"{name}.yaml"
     if path.is_file():
         return path
-    hint = nearest(name, shipped_names(kind))
+    hint = nearest(name, (*shipped_names(kind), *also))
     unknown = f"unknown {kind.removesuffix('s')} {name!r}"
     raise ConfigError(f"{unknown}; {hint} (or give the path of a YAML file).")
 

@@ -25,8 +25,7 @@ def info(
     from nics_drl_bridge.policy.policy_file import summary
 
     facts = summary(load_any(file))
-    lines = (f"{name:<18} {value}" for name, value in _lines(facts))
-    say(as_json, "\n".join(lines), **facts)
+    say(as_json, "\n".join(f"{name:<18} {value}" for name, value in _lines(facts)), **facts)
 
 
 @policy.command()

@@ -156,8 +156,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         starts = np.array(self.scene.starts)
         if options and "start" in options:
             give(starts[None], "start", options["start"])
-            around = [self.scene], self.world, radius
-            guard.check_places("start", starts[None], *around)
+            guard.check_places("start", starts[None], [self.scene], self.world, radius)
         episodes = Episodes(np.array([episode]), starts[None], self.scene.goals[None])
         if not self._rehearsed:
             self._rehearse(episodes)

@@ -19,7 +19,7 @@ from nics_drl_bridge.lidar.shapes import Shape
 from nics_drl_bridge.seeds import GREATEST_SEED, checked_seeds
 from nics_drl_bridge.sim.collision_kernels import Outline, outline_point
 from nics_drl_bridge.sim.scenes import Scene
-from nics_drl_bridge.sim.world import room_at
+from nics_drl_bridge.sim.world import check_place
 from nics_drl_bridge.sim.world_set import AnyWorld
 
 P = ParamSpec("P")
@@ -110,13 +110,8 @@ def check_places(
     free = not radius
     for scene, rows in zip(scenes, places, strict=True):
         member, at = world.members[int(np.asarray(scene.member))], rows.reshape(-1, rows.shape[-1])
-        solid = 0.0 if member.grid is None else member.grid.resolution  # room in a full cell
         for x, y in at[:, :2].tolist():
-            if (room := room_at(member, x, y)) <= max(radius, solid):
-                reason = "is in a wall" if room >= 0.0 else "lies outside the world"
-                x1, y1, x2, y2 = member.extent
-                field = f"the field is {x1:g} to {x2:g} m by {y1:g} to {y2:g} m"
-                raise ConfigError(f"reset option {option!r}: ({x:g}, {y:g}) m {reason}; {field}.")
+            check_place(f"reset option {option!r}", member, x, y, radius)
         shapes, pairs = world.shapes, product(at[:, :2].tolist(), scene.bodies)
         free = free or not any(_on(x, y, radius, body, shapes) for (x, y), body in pairs)
     if not free and len(places):

@@ -128,8 +128,7 @@ class BridgeParallelEnv(ParallelEnv[str, NDArray[np.float32], NDArray[Any]]):
         if isinstance(value, dict):
             of_world = ("goal", "bodies")
             return {n: one if n in of_world else self._of(one, m) for n, one in value.items()}
-        each = self.env.robots > 1 and isinstance(value, np.ndarray)
-        return value[m] if each else value
+        return value[m] if self.env.robots > 1 and isinstance(value, np.ndarray) else value
 
     @halts_on_error
     def render(self) -> Any:

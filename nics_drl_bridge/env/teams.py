@@ -124,8 +124,7 @@ class CooperativeReaching(Task):
         ways = (task.distance(*pairs(view.pose, memory["goal"])) for view in (before, after))
         gaps = [way.min(axis=-2) for way in ways]
         # A goal just reached still pays its last approach.
-        open_goals = ~memory["reached"] | memory["newly"]
-        approach = np.where(open_goals, gaps[0] - gaps[1], 0.0)
+        approach = np.where(~memory["reached"] | memory["newly"], gaps[0] - gaps[1], 0.0)
         share, nearer = 1.0 / self.robots, task.total(approach)
         newly = task.total(memory["newly"].astype(np.float64))
         return {

@@ -286,7 +286,7 @@ def _leap(config: GateConfig, state: GateState, odometry: inputs.Odometry, now: 
     path = float(np.hypot(x, y))
     if path <= far and abs(heading) <= round_:
         return ""
-    return f"its pose jumped by {path:.2f} m and {abs(heading):.2f} rad in {passed:.3f} s"
+    return f"its pose jumped by {path:.3g} m and {abs(heading):.3g} rad in {passed:.3f} s"
 
 
 def _fresh(topic: str, arrivals: Arrivals, limit_s: float, config: GateConfig, now: float) -> str:

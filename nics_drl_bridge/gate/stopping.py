@@ -18,6 +18,9 @@ ANGLE = "rad"
 UNKNOWN_LAG_S = 0.5  # lag of a robot whose model shows none [s]
 SLOWEST_LAG_S = 5.0  # slower modes are not lags but combinations that no command moves [s]
 UNKNOWN_DECELERATION = 0.5  # deceleration of a robot whose limits are not known [m/s^2]
+SHIELD_SPANS = {  # beyond them the robot could never move
+    "latency": (0, 10), "deceleration": (1e-3, 1e4), "margin": (0, 10), "obstacle_speed": (0, 100),
+}  # fmt: skip
 LEAST_DATA = 2  # least number that must arrive while the gate settles, for a rate to be known
 
 
@@ -54,9 +57,10 @@ def shield_config(
         stopping = Stopping(latency=max(0.0, delay), deceleration=deceleration)
     values = stopping.model_copy(update=dict(given or {}))
     for name, value in values.model_dump().items():
-        least = "greater than 0" if name == "deceleration" else "at least 0"
-        if not (np.isfinite(value) and value >= 0.0) or (value == 0.0 and name == "deceleration"):
-            raise ConfigError(f"parameter 'shield_{name}' is {value:g}; it must be {least}.")
+        least, most = SHIELD_SPANS[name]
+        if not least <= value <= most:
+            needed = f"it must be from {least:g} to {most:g}"
+            raise ConfigError(f"parameter 'shield_{name}' is {value:g}; {needed}.")
     lidar = model.lidar
     config = ShieldConfig(
         latency_s=values.latency, deceleration=values.deceleration, margin=values.margin,

@@ -152,8 +152,7 @@ def _found(drive: Drive, timing: clocks.TimingEstimate, moved: NDArray[np.intp])
     best = _adjusted(left, start, moved, shift, cluster)
     for tries in (_with_limits, _with_dead_zones, _with_limits):  # what one does hides another
         for i in moved:
-            reach = command.values[:, signals.followed(spec)[i]]
-            tried = tries(best.best, i, reach, shift)
+            tried = tries(best.best, i, command.values[:, signals.followed(spec)[i]], shift)
             options = [(float((left(*vars(each).values()) ** 2).sum()), each) for each in tried]
             cost, option = min(options, key=lambda each: each[0])
             if cost < HELPS * best.cost:

@@ -62,8 +62,7 @@ def curve_of(samples: Samples, spec: RobotSpec, place: int) -> Candidate | None:
 
 
 def _of_component(samples: Samples, spec: RobotSpec, place: int, dof: int) -> Candidate | None:
-    states = len(spec.state)
-    command = samples.x[:, states:]
+    command = samples.x[:, len(spec.state) :]
     twist = {v.twist: samples.x[:, i] for i, v in enumerate(spec.state) if v.twist}
     target, speed = twist[POSE_RATES[dof]], twist.get("vx", np.zeros(len(samples.t)))
     stride = max(1, round(STRIDE_S / samples.dt))
@@ -286,8 +285,7 @@ def reached(
             "least": curve.least if least < curve.least - beyond else -np.inf,
             "most": curve.most if most > curve.most + beyond else np.inf,
         })  # fmt: skip
-        edges = curve.of([least, most])
-        low[model.state_size + place], high[model.state_size + place] = edges
+        low[model.state_size + place], high[model.state_size + place] = curve.of([least, most])
         if curve != InputCurve(command=curve.command):
             curves.append(curve)
     free = replace(model, limits=np.zeros((0, 2)), drag=np.zeros(0), friction=np.zeros(0))
@@ -340,5 +338,4 @@ def _left(spec: RobotSpec, samples: Samples, command: Array) -> float:
     states = len(spec.state)
     free = [3 + i for i, v in enumerate(spec.state) if v.twist] or [0, 2]
     x = np.concatenate([samples.x[:, :states], command], axis=1)
-    found = linear_fit(replace(samples, x=x), spec, DELAY_ORDER)
-    return float((1.0 - found.r2[free]).sum())
+    return float((1.0 - linear_fit(replace(samples, x=x), spec, DELAY_ORDER).r2[free]).sum())

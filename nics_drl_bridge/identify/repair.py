@@ -128,8 +128,7 @@ def _joined(drive: Drive, notes: list[str]) -> recordings.Recording:
     place, told = pose.copy(), []
     for k in np.flatnonzero(jump):
         here = geometry.compose(place[k], geometry.exp(expected[k]))
-        onwards = geometry.between(place[k + 1], place[k + 1 :])
-        place[k + 1 :] = geometry.compose(here, onwards)
+        place[k + 1 :] = geometry.compose(here, geometry.between(place[k + 1], place[k + 1 :]))
         size = f"{apart[0, k]:.2f} m, {apart[1, k]:.2f} rad"
         told.append(f"at {t[k + 1] - t[0]:.2f} s ({size})")
     some = ", ".join(told[:TOLD]) + (f" and {len(told) - TOLD} more" if len(told) > TOLD else "")

@@ -137,8 +137,7 @@ def by_textbook(
         part = POSE_RATES.index(variable.twist)
         allowed[3 + i] = False
         if tyres and paced and variable.twist != "vx":  # by the lateral acceleration
-            turn = [v.twist for v in spec.state].index("wz")
-            has(3 + i, 2 * first[speed[0]] + first[turn])
+            has(3 + i, 2 * first[speed[0]] + first[[v.twist for v in spec.state].index("wz")])
         has(3 + i, first[i])  # without a constant: who gets no command comes to rest
         commands = first[states:][np.abs(moves[part]) > 0.0]
         if bicycle.used and variable.twist == "wz" and paced:

@@ -78,8 +78,7 @@ def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate)
         )
     latency, spread = calibration.command_latency_s, sigma.get("command_latency_s", np.inf)
     if timing.separated and latency > CERTAIN * spread:
-        late = f"{latency:.4f} s (+- {spread:.4f} s)"
-        yield f"Commands take effect {late} after their stamps."
+        yield f"Commands take effect {latency:.4f} s (+- {spread:.4f} s) after their stamps."
 
 
 def about_mounting(

@@ -100,8 +100,7 @@ class Estimator:
         covariance = self.unseen.doubted(anchor.covariance, seconds)
         known = self._anchor is not None and continuous
         since = anchor._replace(time_ns=time_ns - round(seconds * NS_PER_S)) if known else None
-        error = self._suddenly
-        known_so = anchor.mean, covariance, (0, 0, 0), since, True, error
+        known_so = anchor.mean, covariance, (0, 0, 0), since, True, self._suddenly
         self.belief = Belief(time_ns, *known_so, self._roughness, self._missed)
         self._log = log_of(np.minimum(np.maximum(command, self._least), self._most))
 

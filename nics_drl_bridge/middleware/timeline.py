@@ -264,5 +264,4 @@ def _seconds(before: ReportedPose, after: ReportedPose, standing: float) -> floa
     mean = (before.twist + after.twist) / 2.0
     if not (np.abs(mean) > STILL).any():
         return standing
-    path = geometry.log(geometry.between(before.pose, after.pose))
-    return float(path @ mean / (mean @ mean))
+    return float(geometry.log(geometry.between(before.pose, after.pose)) @ mean / (mean @ mean))

@@ -15,7 +15,7 @@ from rclpy.parameter import Parameter
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S
-from nics_drl_bridge.nodes.parameters import MODES, ROBOTS, device
+from nics_drl_bridge.nodes.parameters import MODES, ROBOTS, device, frame_fault
 from nics_drl_bridge.nodes.runner import declare_row, given_values
 from nics_drl_bridge.robot.noise import Delay
 from nics_drl_bridge.sim.randomisation import Randomisation, load_randomisation
@@ -57,7 +57,7 @@ class Frames(NamedTuple):
 
 
 def declare_device(node: Node, laser_frame: str) -> None:
-    """Declares all but the parameters of one kind of simulator, and checks later changes."""
+    """Declares, and checks, all but the parameters of one kind of simulator. ConfigError."""
     # First, so that it also checks the values that the node is started with.
     node.add_on_set_parameters_callback(partial(_check_episode, node))
     fleet = ParameterDescriptor(description=ROBOTS.about, read_only=True, dynamic_typing=True)
@@ -66,6 +66,8 @@ def declare_device(node: Node, laser_frame: str) -> None:
         if row.name == GIVEN:
             row = row._replace(default=START in given_values(node))
         declare_row(node, row)
+    if fault := frame_fault(node._parameters.values()):
+        raise ConfigError(fault)
 
 
 def number(node: Node, name: str) -> float:

@@ -303,8 +303,7 @@ class PathActions:
         if off.any():
             k = int(np.argmax(off))
             x, y = points[k].round(2) + 0.0  # no negative zero
-            place = f"({x:.2f}, {y:.2f}) m"
-            why = f"pose {k} of the path, {place}, is off the map; replan it."
+            why = f"pose {k} of the path, ({x:.2f}, {y:.2f}) m, is off the map; replan it."
             raise Refusal(goal.code, f"{goal.name}: {why}")
 
     # A goal is driven to.

@@ -197,7 +197,8 @@ def description(setup: Setup) -> Iterator[Any]:
             "frame_prefix": value(robot.frames),
         }
         yield setup.node(STATE_PUBLISHER, STATE_PUBLISHER, robot, given, condition=wanted)
-    topics = [(f"/{topic}", topic) for topic in SHOWN]
+    topics = [("/map", f"/{setup.robots[0].transforms}/map".replace("//", "/"))]  # of all robots
+    topics += [(f"/{topic}", topic) for topic in SHOWN]
     words, wanted = ("-d", setup["rviz_config"]), IfCondition(setup["rviz"] or "false")
     yield setup.node("rviz2", "rviz2", setup.robots[0], timed, words, topics, condition=wanted)
 
@@ -207,8 +208,7 @@ def launched(starts: Sequence[Start], arguments: Sequence[DeclareLaunchArgument]
 
     def start(context: Any) -> list[Any]:
         declared = {one.name for one in arguments}
-        given = context.launch_configurations
-        setup = Setup({name: given[name] for name in declared})
+        setup = Setup({name: context.launch_configurations[name] for name in declared})
         return [action for each in starts for action in each(setup)]
 
     return LaunchDescription([*arguments, OpaqueFunction(function=start)])

@@ -10,9 +10,9 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 
-from nics_drl_bridge.errors import BridgeError
+from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.nodes.ending import at_once
-from nics_drl_bridge.nodes.parameters import Row, managed, sensors
+from nics_drl_bridge.nodes.parameters import Row, frame_fault, managed, sensors
 from nics_drl_bridge.nodes.qos import QosWatch
 from nics_drl_bridge.nodes.runner import ACTIVE, INACTIVE, UNCONFIGURED, declare_row
 
@@ -30,6 +30,8 @@ class ManagedNode(QosWatch, LifecycleNode):
         self.fixed: set[str] = set()
         self.undo = ExitStack()
         values = [declare_row(self, row) for row in (*managed(), *sensors(), *rows)]
+        if fault := frame_fault(self._parameters.values()):
+            raise ConfigError(fault)
         self._autostart = bool(values[0])
         self.state, self._starting = UNCONFIGURED, False  # `state`: the last primary one
         self._failure: Exception | None = None
@@ -69,12 +71,12 @@ class ManagedNode(QosWatch, LifecycleNode):
 
     def _check_fixed(self, parameters: list[Parameter]) -> SetParametersResult:
         late = sorted(self.fixed & {parameter.name for parameter in parameters})
-        if not late or self.state == UNCONFIGURED:
-            return SetParametersResult(successful=True)
-        name = self.get_fully_qualified_name()
-        fix = f"lead it to unconfigured by `ros2 lifecycle set {name} deactivate`, then `cleanup`."
-        reason = f"parameter {late[0]!r} is read when the node is configured; {fix}"
-        return SetParametersResult(successful=False, reason=reason)
+        reason = frame_fault((*self._parameters.values(), *parameters))
+        if late and self.state != UNCONFIGURED:
+            lead = f"`ros2 lifecycle set {self.get_fully_qualified_name()} deactivate`"
+            fix = f"lead it to unconfigured by {lead}, then `cleanup`."
+            reason = f"parameter {late[0]!r} is read when the node is configured; {fix}"
+        return SetParametersResult(successful=not reason, reason=reason)
 
     def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Configures; a failure leaves it unconfigured."""

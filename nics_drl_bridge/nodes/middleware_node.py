@@ -1,12 +1,13 @@
 """middleware_node: caches a robot's topics and publishes the estimate of its state."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 from nav_msgs.msg import Odometry
 from rclpy.context import Context
 
+from nics_drl_bridge.errors import LONGEST, shortened
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.middleware.measurement import Health
 from nics_drl_bridge.middleware.middleware import rehearse
@@ -25,6 +26,7 @@ class MiddlewareNode(ManagedNode):
 
     def __init__(self, context: Context) -> None:
         super().__init__("middleware_node", context, middleware())
+        self._rejected: dict[str, int] = {}  # as of the last look
         runner.serve(self, "~/reset", self._reset)
         runner.diagnose(self, "topics", self._look)
 
@@ -69,17 +71,31 @@ class MiddlewareNode(ManagedNode):
         if self.state == UNCONFIGURED:
             return runner.Condition(self.state, warns=False, facts={})
         health = self._topics.middleware.health(self._topics.now_ns())
-        trouble = silence(health, self._topics.expected)
+        if new := sorted(health.rejected.keys() - self._rejected.keys()):
+            told = shortened("; ".join(new), LONGEST)
+            self.get_logger().warning(f"not used, but counted in /diagnostics: {told}")
+        trouble = silence(health, self._topics.expected, self._rejected)
+        self._rejected = health.rejected
         message = trouble or ("receiving" if self.state == ACTIVE else self.state)
         return runner.Condition(message, bool(trouble), facts(health), self._hardware)
 
 
-def silence(health: Health, expected: Sequence[str]) -> str:
-    """Returns a sentence about expected topics that are silent; empty if none is."""
-    if missing := [topic for topic in expected if topic not in health.topics]:
-        return f"nothing on {', '.join(missing)} yet"
-    silent = [topic for topic in expected if health.topics[topic].age_s > SILENCE_S]
-    return f"nothing on {', '.join(silent)} for {SILENCE_S:g} s" if silent else ""
+def silence(health: Health, expected: Sequence[str], before: Mapping[str, int]) -> str:
+    """Returns a sentence about expected topics without usable data; empty if all have some.
+
+    `before` are earlier counts of `health.rejected`: what has grown since is refused, not silent.
+    """
+    silent, since, told = [topic for topic in expected if topic not in health.topics], "yet", []
+    if not silent:
+        silent = [topic for topic in expected if health.topics[topic].age_s > SILENCE_S]
+        since = f"for {SILENCE_S:g} s"
+    for topic in tuple(silent):
+        counts = {r: n for r, n in health.rejected.items() if r.startswith(f"{topic}: ")}
+        if grown := [reason for reason, n in counts.items() if n > before.get(reason, 0)]:
+            silent.remove(topic)
+            reason = grown[-1].removeprefix(f"{topic}: ")
+            told.append(f"{topic}: {sum(counts.values())} refused, the last: {reason}")
+    return "; ".join([*([f"nothing on {', '.join(silent)} {since}"] if silent else ()), *told])
 
 
 def facts(health: Health) -> dict[str, str]:

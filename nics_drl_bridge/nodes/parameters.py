@@ -2,10 +2,12 @@
 
 import math
 import os
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, distribution
 from typing import Any, NamedTuple
 
+from nics_drl_bridge.errors import shortened
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 
 MODES = ("realtime", "lockstep", "as_fast_as_possible")
@@ -14,6 +16,7 @@ OWN = -1.0  # of a delay: as in the model
 HIGHEST_PRIORITY = 99
 PLAIN_TWISTS = ("humble", "iron", "jazzy")  # distributions whose robots are driven by a Twist
 STAMPED = "enable_stamped_cmd_vel"
+FRAME, MAY_BE_EMPTY = re.compile(r"[^\s/]\S{0,254}"), ("footprint_frame",)
 
 
 class Row(NamedTuple):
@@ -48,6 +51,19 @@ def stamped(what: str) -> Row:
 
 MODEL = Row("model", DEFAULT_ROBOT, "Folder of a SimulatorModel, or a shipped robot.")
 BASE_FRAME = Row("base_frame", "base_link", "Frame id of the robot.", fixed=False)
+
+
+def frame_fault(parameters: Iterable[Any]) -> str:
+    """Returns a sentence about frames that can't be so; empty if all can. The last of a name is."""
+    frames = {each.name: str(each.value) for each in parameters if each.name.endswith("_frame")}
+    for name, frame in frames.items():
+        if not FRAME.fullmatch(frame) and (frame or name not in MAY_BE_EMPTY):
+            needed = "must be 1 to 255 characters, without blanks, the first of them no /"
+            return f"parameter {name!r}: {needed}, not {shortened(frame, 80)!r}."
+    base = frames.get("base_frame")
+    if taken := [name for name in ("map_frame", "odom_frame") if frames.get(name, "") == base]:
+        return f"parameter 'base_frame': is {base!r}, as {taken[0]!r} is; they must differ."
+    return ""
 
 
 def managed() -> list[Row]:
@@ -211,10 +227,10 @@ SHIELD = Row("shield", True, "Whether to stop before obstacles.")
 SHIELD_NUMBERS = [
     Row(f"shield_{name}", math.nan, f"{about}; NaN: from the limits' file, or the model.")
     for name, about in (
-        ("latency", "Measured time until the robot follows a command [s]"),
+        ("latency", "Measured time until the robot follows a command, at most 10 [s]"),
         ("deceleration", "Measured deceleration of the robot [m/s^2]"),
-        ("margin", "Kept free around the footprint [m]"),
-        ("obstacle_speed", "Greatest speed of approaching obstacles [m/s]"),
+        ("margin", "Kept free around the footprint, at most 10 [m]"),
+        ("obstacle_speed", "Greatest speed of approaching obstacles, at most 100 [m/s]"),
     )
 ]
 BLACK_BOX = Row(

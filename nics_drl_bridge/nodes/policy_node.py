@@ -47,8 +47,9 @@ class PolicyNode(ManagedNode):
         model = self._model = open_model(str(self.get_parameter("model").value))
         self._open_policy(model)
         self._goal: Array = np.array(self.get_parameter("goal").value, dtype=np.float64)
-        if len(self._goal) != 2:
-            raise ConfigError(f"parameter 'goal': must be [x, y], not {self._goal.tolist()}")
+        if len(self._goal) != 2 or not (abs(self._goal).max() <= 1e8 or np.isnan(self._goal).all()):
+            needed = "must be [x, y] within 1e8 m, or NaN both to wait for goal_pose"
+            raise ConfigError(f"parameter 'goal': {needed}, not {self._goal.tolist()}.")
         names = ("rate", "deadline", "late_limit")
         rate, limit, patience = (self.get_parameter(name).value for name in names)
         if rate < 0.0 or limit <= 0.0 or patience < 1:

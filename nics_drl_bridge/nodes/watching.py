@@ -18,7 +18,7 @@ from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.robot_topics import RobotTopics, declare_sensors
 from nics_drl_bridge.nodes.runner import open_context, spin
-from nics_drl_bridge.sim.world import World
+from nics_drl_bridge.sim.world import World, check_place
 from nics_drl_bridge.sim.world_set import AnyWorld
 from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame
 from nics_drl_bridge.watch.server import Request
@@ -42,6 +42,7 @@ class RosSource:
         half = SIDE_M / 2.0
         bounds = (-half, -half, half, half)
         self._world = world or World(name="map", bounds=bounds, goal_distance=(0.0, 1.0))
+        self._within = None if world is None else world.members[0]  # the one that is shown
         self._model, self.period_s, self._title = model, PERIOD_S, namespace or "live topics"
         self._trail, self._goal = Track(), np.zeros((0, 2))
         self._gate: str | None = None
@@ -115,8 +116,10 @@ class RosSource:
         return lidar is not None
 
     def take(self, request: Request) -> bool:
-        """Sends a goal; ignores all else."""
+        """Sends a goal; ignores all else. Raises ConfigError for one off the field."""
         if request.kind == "goal":
+            if self._within is not None:
+                check_place("goal", self._within, request.x, request.y)
             message = PoseStamped()
             message.header.stamp = self._node.get_clock().now().to_msg()
             message.header.frame_id = "map"

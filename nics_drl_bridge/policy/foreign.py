@@ -97,8 +97,7 @@ def _content(order: Order, model: SimulatorModel | None) -> bytes:
         reason = f"is {mapping.control_period:g} s, but the robot's is {period:g} s"
         raise PolicyError(source, "control_period", f"{reason}; use a model with that period.")
     try:
-        layout = layout_of(mapping.scan, model.lidar)
-        task = Navigation(model.robot, model.lidar, scan=layout)
+        task = Navigation(model.robot, model.lidar, scan=layout_of(mapping.scan, model.lidar))
     except ConfigError as error:
         raise ConfigError(f"{source}: key 'scan': {error}") from None
     graph, size = Composer(order.network, mapping, task, source).compose()

@@ -202,8 +202,7 @@ class Composer:
                 size = self._given_size(name)
                 self._check_scaled(one, size or 0, f"inputs.{name}")
                 row = build.scale(parts[0] if len(parts) == 1 else build.join(parts), one)
-            shape = build.constant(self._shape(name), np.int64)
-            row = build.add("Reshape", row, shape)
+            row = build.add("Reshape", row, build.constant(self._shape(name), np.int64))
             build.add("Cast", row, name=THEIRS + name, to=taken[THEIRS + name])
 
     def _check_scaled(self, scaled: foreign_mapping.Scaled, size: int, place: str) -> None:

@@ -287,8 +287,7 @@ def mapping_of(bundle: Bundle, model: SimulatorModel) -> Data:
 
     Raises PolicyError for an input whose meaning is not told.
     """
-    configs = bundle.description.pipeline.configs
-    frequency = configs.get("frequency")
+    frequency = bundle.description.pipeline.configs.get("frequency")
     period = 1.0 / frequency if isinstance(frequency, int | float) and frequency > 0 else None
     data: Data = {
         "kind": "foreign policy", "network": bundle.path.name,

@@ -23,8 +23,7 @@ def route(grid: GridMap, start: ArrayLike, goal: ArrayLike, radius: float) -> Ar
     It keeps more where there is room. Unknown cells count as free. Raises ConfigError for a start
     or goal off the map, and if there is no way.
     """
-    parts = max(1, math.ceil(CELL / grid.resolution - 1e-6))
-    coarse = _coarse(grid, parts)
+    coarse = _coarse(grid, max(1, math.ceil(CELL / grid.resolution - 1e-6)))
     room = coarse.distance_field
     ends = [tuple(coarse.world_to_cell(each).tolist()) for each in (start, goal)]
     for name, cell in zip(("start", "goal"), ends, strict=True):

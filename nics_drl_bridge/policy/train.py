@@ -85,8 +85,7 @@ def train(
 
     def save() -> None:
         refuse_diverged(training)  # before it would replace a checkpoint that goes on
-        state = training.state() | stop.state()
-        checkpoints.save_checkpoint(path, state, env, about)
+        checkpoints.save_checkpoint(path, training.state() | stop.state(), env, about)
 
     if training.steps < settings.steps and not stop.over:
         logger = configure(str(folder), ["tensorboard"])

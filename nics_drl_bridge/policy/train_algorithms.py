@@ -153,8 +153,7 @@ class Actor(torch.nn.Module):
         self.discrete, size = isinstance(actions, gymnasium.spaces.Discrete), actions.shape or ()
         count = int(actions.n if isinstance(actions, gymnasium.spaces.Discrete) else np.prod(size))
         self.normaliser = Normaliser(observations, *normaliser)
-        inputs = self.normaliser.features_dim + self.memory.extra
-        widths = [inputs, *hidden, count]
+        widths = [self.normaliser.features_dim + self.memory.extra, *hidden, count]
         self.layers = layers_of(widths, ACTION_GAIN, activation)
 
     def forward(self, observations: torch.Tensor, *state: torch.Tensor) -> Any:

@@ -48,8 +48,7 @@ class Reflection:
         if not len(self._scale):
             return self._acted[actions], torch.ones(len(actions), dtype=torch.bool)
         mirrored = actions[:, self._acted] * self._scale + self._offset
-        beyond = (mirrored.abs() > 1.0) & self._uneven
-        return mirrored, ~beyond.any(1)
+        return mirrored, ~((mirrored.abs() > 1.0) & self._uneven).any(1)
 
     def doubled(self, rollout: Transitions) -> Transitions:
         """Adds the mirror images of the transitions, of those that the robot can do."""

@@ -189,8 +189,7 @@ class Exploration:
         away = _distance(poses)
         inside = away.max(axis=1) <= limit
         turned = np.abs(np.unwrap(poses[..., 2], axis=1) - poses[:, :1, 2]).max(axis=1) >= np.pi
-        near = NEAR * self._outermost
-        back = (away.min(axis=1) < NEARER * away[:, 0]) | (away[:, 0] < near)
+        back = (away.min(axis=1) < NEARER * away[:, 0]) | (away[:, 0] < NEAR * self._outermost)
         useful = (inside & (turned | back)).reshape(len(pose), many).any(axis=1)
         reached = np.where(inside, away.min(axis=1), np.inf).reshape(len(pose), many).min(axis=1)
         return np.where(useful, reached / self._outermost, np.inf)

@@ -70,8 +70,7 @@ def _measured(reader: MappedReader, name: str, stream: Measured) -> Stream:
             fault = f"{name}.{key}: is in {unit_of(value).si}"
             raise ConfigError(f"{fault}, where {' or '.join(kinds)} is needed; check its unit.")
         parts.append(reader.series(f"{name}.{key}", value, stream, False) if value else None)
-    known = [part for part in parts if part is not None]
-    joined = together(name, known, held=False)
+    joined = together(name, [part for part in parts if part is not None], held=False)
     columns = iter(joined.values.T)
     full = [np.zeros(len(joined.t)) if part is None else next(columns) for part in parts]
     return replace(joined, values=np.stack(full, axis=1))

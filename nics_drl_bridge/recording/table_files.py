@@ -123,14 +123,12 @@ def _first_row(path: Path, rows: list[list[str]]) -> tuple[int, int]:
         full = [field for field in row if field]
         return 2 * sum(map(_is_value, full)) > len(full)
 
-    some = rows[:: 1 + len(rows) // MOST_SAMPLED]
-    widths = Counter(len(row) for row in some if numeric(row))
+    widths = Counter(len(row) for row in rows[:: 1 + len(rows) // MOST_SAMPLED] if numeric(row))
     if not widths:
         advice = "give a table of numbers, a column each, with or without a header"
         raise RecordingError(f"{path}: holds no row of numbers; {advice}.")
     width = widths.most_common(1)[0][0]
-    first = next(k for k, row in enumerate(rows) if len(row) == width and numeric(row))
-    return first, width
+    return next(k for k, row in enumerate(rows) if len(row) == width and numeric(row)), width
 
 
 def _of_one_width(

@@ -260,8 +260,7 @@ def _rate(raw: Series, held: bool) -> Series:
     last = np.append(span > AT_ONCE * span.mean() if len(span) else span > 0.0, True)
     t, values = raw.t[last], raw.values[last]
     rate = np.diff(values) / np.diff(t)
-    at = t[:-1] if held else (t[:-1] + t[1:]) / 2.0
-    return Series(at, rate, raw.clock)
+    return Series(t[:-1] if held else (t[:-1] + t[1:]) / 2.0, rate, raw.clock)
 
 
 def _equals(column: Column, wanted: schema.Condition) -> NDArray[np.bool_]:

@@ -34,8 +34,7 @@ def trajectories(runs: Mapping[str, Sequence[Episode]], world: AnyWorld, footpri
     """Draws a panel per episode with its path in each run, of equal seeds (the paper's Fig. 7)."""
     count = max(len(episodes) for episodes in runs.values())
     columns, rows = min(count, 3), -(-count // 3)
-    size = max(4.2 * columns, LEAST_PANEL), 4.2 * rows + 0.5
-    figure, grid = panels(rows, columns, size)
+    figure, grid = panels(rows, columns, (max(4.2 * columns, LEAST_PANEL), 4.2 * rows + 0.5))
     for axes, *episodes in zip(grid, *runs.values(), strict=False):
         _panel(axes, dict(zip(runs, episodes, strict=True)), world, footprint)
     return png(figure, grid[0])

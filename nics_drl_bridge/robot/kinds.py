@@ -171,8 +171,7 @@ def _through_lags(spec: RobotSpec, book: Textbook) -> Textbook:
     if book.limited.any():
         fault = "a rate limit of an actuator needs the actuators as state"
         raise ConfigError(f"robot {spec.name!r}: {fault}; give lags, or correct `state:`.")
-    usual = [float(book.lag[-1 if dof == 2 else 0]) for dof in dofs]
-    named = zip(spec.state, usual, strict=True)
+    named = zip(spec.state, [float(book.lag[-1 if dof == 2 else 0]) for dof in dofs], strict=True)
     lag = np.array([spec.parameters.get(f"{v.name}_lag", one) for v, one in named])
 
     def twist(state: Array) -> Array:

@@ -224,8 +224,7 @@ class RobotSpec(Schema):
         before = np.roll(after, 1, axis=0)
         bend = 1.0 + np.sum(before * after, axis=-1, keepdims=True)
         moved = corners + margin * (before + after) / np.maximum(bend, SHARPEST)
-        footprint = tuple(map(tuple, moved.tolist()))
-        return self.model_copy(update={"footprint": footprint})
+        return self.model_copy(update={"footprint": tuple(map(tuple, moved.tolist()))})
 
     @property
     def variable_names(self) -> tuple[str, ...]:

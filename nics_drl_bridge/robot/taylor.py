@@ -133,8 +133,7 @@ class TaylorModel:
     def step(self, pose: ArrayLike, state: ArrayLike, command: ArrayLike) -> tuple[Array, Array]:
         """Returns pose (..., 3) and state (..., S) after a step of `dt` along the exact arc."""
         state = np.asarray(state, dtype=np.float64)
-        x = np.concatenate([state, self.in_effect(command)], axis=-1)
-        dq = self._free_rates(x) * self.dt
+        dq = self._free_rates(np.concatenate([state, self.in_effect(command)], axis=-1)) * self.dt
         moved = np.clip(self._moved(state, dq[..., 3:]), *self.state_box)
         return geometry.compose(pose, geometry.exp(dq[..., :3])), moved
 

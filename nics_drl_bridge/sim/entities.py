@@ -111,8 +111,7 @@ class Entities:
         sampler, bodies = self.simulator.sampler, self.bodies()
         motions = sampler.motions[int(self.simulator.data.member[0])]
         for k in np.flatnonzero(bodies[: self._own, RADIUS] > 0.0).tolist():
-            shape = sampler.shapes[int(bodies[k, SHAPE])]
-            part = ((shape, (0.0, 0.0, 0.0)),)
+            part = ((sampler.shapes[int(bodies[k, SHAPE])], (0.0, 0.0, 0.0)),)
             yield Entity(f"{OBSTACLE}{k}", slots=(k,), parts=part, motion=motions[k])
         yield from self.spawned.values()
 

@@ -117,8 +117,7 @@ def _fill(made: GridMap, shape: Shape, pose: Array) -> None:
         edge = _along(np.concatenate([shape.outline, shape.outline[:1]]), made.resolution)
         at = made.world_to_cell(pose[:2] + rotate(edge, pose[2])) - low
         kept = ((at >= 0) & (at < box.shape)).all(axis=-1)
-        seen = ndimage.maximum_filter(inside, 3)
-        thin = at[kept][~seen[at[kept][:, 0], at[kept][:, 1]]]
+        thin = at[kept][~ndimage.maximum_filter(inside, 3)[at[kept][:, 0], at[kept][:, 1]]]
         box[thin[:, 0], thin[:, 1]] = OCCUPIED
 
 
@@ -130,6 +129,5 @@ def _inside(shape: Shape, points: Array) -> NDArray[np.bool_]:
     corners = shape.outline if len(shape.outline) > 2 else np.zeros((0, 2))
     for (x1, y1), (x2, y2) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         if y1 != y2:  # a ray along x crosses an odd number of edges
-            crosses = (y1 > y) != (y2 > y)
-            within ^= crosses & (x < x1 + (y - y1) * (x2 - x1) / (y2 - y1))
+            within ^= ((y1 > y) != (y2 > y)) & (x < x1 + (y - y1) * (x2 - x1) / (y2 - y1))
     return within

@@ -1,5 +1,6 @@
 """World files: the field of the episodes and its obstacles."""
 
+from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated
@@ -184,9 +185,9 @@ class World(Schema):
         return np.array([*sides, *self.walls], dtype=np.float64).reshape(-1, 4)
 
 
-def load_world(name: str | Path) -> World:
-    """Loads a shipped world by name (`arena`), or any other by the path of its YAML file."""
-    path = find_config(name, "worlds")
+def load_world(name: str | Path, also: Iterable[str] = ()) -> World:
+    """Loads a shipped world by name (`arena`), or a YAML file; an error may offer `also` others."""
+    path = find_config(name, "worlds", also)
     world = load_yaml(path, World)
     if world.map is not None and Path(world.map).suffix in (".yaml", ".yml"):
         world = world.model_copy(update={"map": str(path.parent / world.map)})
@@ -209,6 +210,16 @@ def check_places(world: World) -> None:
             if room_at(world, *point) < radius:
                 reason = f"an obstacle of radius {radius:g} m does not fit there, at {list(point)}"
                 raise ConfigError(f"{where}.motion.waypoints.{n}': {reason}; move it.")
+
+
+def check_place(what: str, world: World, x: float, y: float, radius: float = 0.0) -> None:
+    """Raises ConfigError for a place off a world's field, or in a wall within a radius [m]."""
+    solid = 0.0 if world.grid is None else world.grid.resolution  # room in a full cell
+    if (room := room_at(world, x, y)) <= max(radius, solid):
+        reason = "is in a wall" if room >= 0.0 else "lies outside the world"
+        x1, y1, x2, y2 = world.extent
+        field = f"the field is {x1:g} to {x2:g} m by {y1:g} to {y2:g} m"
+        raise ConfigError(f"{what}: ({x:g}, {y:g}) m {reason}; {field}.")
 
 
 def _inside(world: World, x: float, y: float) -> bool:

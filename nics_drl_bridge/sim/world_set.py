@@ -21,7 +21,7 @@ from nics_drl_bridge.sim.cellular import Cellular, grow
 from nics_drl_bridge.sim.world import Region, World, load_world
 
 MOST_MEMBERS = 10_000
-YAML = (".yaml", ".yml")
+YAML, GAZEBO, IMPORT = (".yaml", ".yml"), (".world", ".sdf"), "nics world import"
 SPECIAL = "*?["
 KEYS = ("worlds", "generate")  # one of which only a set has
 MAP_KEYS = ("image",)  # of a Nav2 map's file, which may lie beside its world
@@ -87,17 +87,19 @@ def load_worlds(name: str | Path | Sequence[str | Path]) -> AnyWorld:
     """
     if not isinstance(name, str | Path):
         return _set_of("worlds", _members([str(one) for one in name], Path()))
-    text, shipped = str(name), share_folder() / "config" / "world_sets" / f"{name}.yaml"
-    path = shipped if shipped.is_file() else Path(name)
+    text, sets = str(name), share_folder() / "config" / "world_sets"
+    path = shipped if (shipped := sets / f"{name}.yaml").is_file() else Path(name)
     if (content := _content(path, KEYS)) is not None:
         return _read_set(path, validate(content, SetFile, text))
-    if path.is_dir() or any(sign in text for sign in SPECIAL):
+    if (text and path.is_dir()) or any(sign in text for sign in SPECIAL):
         return _set_of(path.name if path.is_dir() else text, _members([text], Path()))
     if text == BARN:
         return _set_of(text, [barn_world(number) for number in barn_numbers()])
     if (number := text.removeprefix(f"{BARN}/")).isdecimal() and number != text:
         return barn_world(int(number))
-    return load_world(name)
+    if text.endswith((*YAML, *GAZEBO)):
+        return _member(path)
+    return load_world(text, (BARN, *(file.stem for file in sets.glob("*.yaml"))))
 
 
 def _content(path: Path, keys: tuple[str, ...]) -> dict[str, Any] | None:
@@ -106,18 +108,17 @@ def _content(path: Path, keys: tuple[str, ...]) -> dict[str, Any] | None:
         return None
     text = read_text(path)
     content = parse_yaml(text, str(path)) if any(f"{key}:" in text for key in keys) else None
-    known = isinstance(content, dict) and any(key in content for key in keys)
-    return content if known else None
+    return content if isinstance(content, dict) and any(key in content for key in keys) else None
 
 
 def _read_set(path: Path, file: SetFile) -> WorldSet:
-    without = {world.source for world in _members(file.without, path.parent)}
-    chosen = [one for one in _members(file.worlds, path.parent) if one.source not in without]
-    if (given := file.generate) is not None:
-        try:
+    try:
+        without = {world.source for world in _members(file.without, path.parent)}
+        chosen = [one for one in _members(file.worlds, path.parent) if one.source not in without]
+        if (given := file.generate) is not None:
             chosen += [grow(given, number) for number in range(given.worlds)]
-        except ConfigError as error:
-            raise ConfigError(f"{path}: {error}") from None
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
     return _set_of(file.name, chosen, str(path))
 
 
@@ -134,14 +135,15 @@ def _members(names: Sequence[str], base: Path) -> list[World]:
     found: list[World] = []
     for name in names:
         special, path = any(sign in name for sign in SPECIAL), base / name
-        if special or path.is_dir():
+        if special or (name and path.is_dir()):
             pattern = str(path) if special else f"{path}/*"
             every = [Path(one) for one in sorted(glob(pattern)) if one.endswith(YAML)]
             files = [one for one in every if _content(one, MAP_KEYS) is None]
             if not files:
-                raise ConfigError(f"{pattern}: no world file (.yaml) there; check the path.")
+                fix = f"check the path, or make worlds of Gazebo's and of maps by `{IMPORT}`"
+                raise ConfigError(f"{pattern}: no world file (.yaml) there; {fix}.")
             found += map(_member, files)
-        elif name.endswith(YAML):
+        elif name.endswith((*YAML, *GAZEBO)):
             found.append(_member(path))
         else:
             found += load_worlds(name).members
@@ -151,4 +153,7 @@ def _members(names: Sequence[str], base: Path) -> list[World]:
 def _member(path: Path) -> World:
     if _content(path, KEYS) is not None:
         raise ConfigError(f"{path}: is a world set, and a set holds worlds; name its worlds.")
+    if path.suffix in GAZEBO or _content(path, MAP_KEYS) is not None:
+        kind = "a world of Gazebo" if path.suffix in GAZEBO else "a map"
+        raise ConfigError(f"{path}: is {kind}; make a world of it by `{IMPORT} {path}`.")
     return load_world(path)

@@ -19,7 +19,7 @@ from nics_drl_bridge.policy.policies import POLICIES, actions_of, shipped_polici
 from nics_drl_bridge.policy.stateful import Policy, begin
 from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim.scenes import scaled
-from nics_drl_bridge.sim.world import Obstacles, World
+from nics_drl_bridge.sim.world import Obstacles, World, check_place
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 from nics_drl_bridge.watch.frame import Frame, Stage, Track, WorldFrame
 from nics_drl_bridge.watch.server import Request
@@ -87,8 +87,8 @@ class Lane:
             return int(np.abs(self.task.discrete_commands - command).sum(axis=-1).argmin())
         return actions_of(self.task, command)
 
-    def anew(self, seed: int) -> bool:
-        """Begins the episode of a seed in the world as it was at first; True in a new env."""
+    def anew(self, seed: float) -> bool:
+        """Begins a seed's episode in the world as at first; True in a new env. ConfigError."""
         self.seed = int(checked_seeds([seed])[0])
         if changed := self.world is not self._native:
             self.close()
@@ -108,7 +108,8 @@ class Lane:
         self._rebuild(policy)
 
     def aim(self, x: float, y: float) -> None:
-        """Moves the goal [m]; after a success it goes on from here."""
+        """Moves the goal [m]; after a success it goes on from here. ConfigError off the field."""
+        check_place("goal", self.env.world.members[self.env.snapshot().member], x, y)
         self.env.memory["goal"][...] = x, y
         if self.state == "success":
             self._rebuild(self._policy)
@@ -214,7 +215,7 @@ class EpisodeSource:
             self._policy = request.name
         elif request.kind in ("seed", "restart"):
             for each in self.lanes:
-                each.anew(each.seed if request.kind == "restart" else int(request.value))
+                each.anew(each.seed if request.kind == "restart" else request.value)
         else:
             return self._furnish(lane, request)
         return request.kind in ("policy", "seed", "restart")
@@ -235,8 +236,8 @@ class EpisodeSource:
 
     def unfinished(self, episodes: int) -> bool:
         """True until so many episodes have been driven and shown to their ends in every world."""
-        last = self._first + episodes
-        return any(lane.seed < last - 1 or not lane.over for lane in self.lanes)
+        last = self._first + episodes - 1
+        return any(lane.seed < last or not lane.over for lane in self.lanes)
 
     def _drive(self, request: Request) -> None:
         """Takes shares of the greatest speed forward, to the left, and turning left."""

@@ -157,8 +157,7 @@ def _ring(pose: Any, radius: float, shape: Any) -> NDArray[np.float64]:
     if not len(corners):
         turns = np.linspace(0.0, 2.0 * np.pi, CORNERS, endpoint=False)
         corners = radius * np.stack([np.cos(turns), np.sin(turns)], axis=1)
-    closed = np.concatenate([corners, corners[:1]])
-    return np.asarray(geometry.rotate(closed, pose[2]) + pose[:2])
+    return np.asarray(geometry.rotate(np.concatenate([corners, corners[:1]]), pose[2]) + pose[:2])
 
 
 LIBRARIES = {".mp4": ("imageio_ffmpeg",), ".rrd": ("rerun",)}

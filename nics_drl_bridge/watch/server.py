@@ -1,6 +1,8 @@
 """Server of the page on this machine alone: frames to the browsers, requests from them."""
 
 import json
+import logging
+import os
 import queue
 import socket
 import threading
@@ -13,10 +15,12 @@ from pydantic import Field, ValidationError
 from nics_drl_bridge.config import Schema
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.extensions import missing
+from nics_drl_bridge.seeds import GREATEST_SEED
 from nics_drl_bridge.watch.frame import Frame, Stage
 
 HOST, PORT = "127.0.0.1", 8765
 MOST_REQUESTS, MOST_BYTES = 256, 4096
+QUIET = logging.Logger("pages", logging.CRITICAL + 1)  # one that sleeps or errs is no news
 POLICY = "; ".join([  # nothing comes from elsewhere, and nothing goes there
     "default-src 'none'", "script-src 'unsafe-inline'", "style-src 'unsafe-inline'",
     "img-src data:", "connect-src 'self' ws://{host}", "base-uri 'none'", "form-action 'none'",
@@ -37,7 +41,7 @@ class Request(Schema):
     size: float = Field(default=0.2, ge=0.01, le=10.0)  # radius, or half side of a box [m]
     shape: Literal["circle", "box"] = "circle"
     name: str = Field(default="", max_length=500)  # of a policy or a world
-    value: float = 0.0  # speed, seed or time [s]
+    value: int | float = Field(default=0.0, ge=-GREATEST_SEED, le=GREATEST_SEED)  # speed, seed, [s]
     on: bool = True  # of a pause, or of driving by hand
     twist: tuple[float, float, float] = (0.0, 0.0, 0.0)  # shares forward, left, to the left
 
@@ -62,10 +66,10 @@ class PageServer:
         try:
             self._server = serve(
                 self._talk, HOST, port, process_request=self._answer, compression=None,
-                max_size=MOST_BYTES, origins=None,
+                max_size=MOST_BYTES, origins=None, logger=QUIET,
             )  # fmt: skip
         except OSError as error:
-            reason = f"port {port} of {HOST} can't be served ({error.strerror})"
+            reason = f"port {port} of {HOST} can't be served ({os.strerror(error.errno or 0)})"
             raise ConfigError(f"{reason}; take another with --port, 0 for any.") from None
         address = f"{HOST}:{self._server.socket.getsockname()[1]}"
         self.url = f"http://{address}/"
@@ -108,12 +112,12 @@ class PageServer:
         from websockets.datastructures import Headers
         from websockets.http11 import Response
 
-        host = request.headers.get("Host", "")
+        host = ", ".join(request.headers.get_all("Host"))
         if host not in self._hosts:  # a foreign name that was made to point here
             return connection.respond(403, "This page is served to this machine only.\n")
         if request.path == "/socket":
-            origin = request.headers.get("Origin")  # programs send none
-            if origin is None or origin.removeprefix("http://") in self._hosts:
+            origins = request.headers.get_all("Origin")  # programs send none
+            if all(each.removeprefix("http://") in self._hosts for each in origins):
                 return None
             return connection.respond(403, "This socket is open to its own page only.\n")
         if request.path != "/":

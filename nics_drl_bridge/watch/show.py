@@ -64,8 +64,7 @@ class Tempo:
                 self._single, period_s = False, period_s / self.speed
                 self._due = max(self._due + period_s, now)
                 return True
-            left = min(POLL_S, self._due - now) if going else POLL_S
-            request = server.request(left)
+            request = server.request(min(POLL_S, self._due - now) if going else POLL_S)
             if request is not None:
                 self.take(request)
                 handle(request)

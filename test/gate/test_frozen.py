@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -255,6 +257,14 @@ def test_odometry_that_teleports_is_refused_and_stops_the_robot_for_good(leap):
     assert not rig.moves
     assert rig.give(Reset()).granted
     assert rig.arm().granted
+
+
+def test_a_leap_beyond_all_numbers_is_told_in_a_few_digits():
+    rig = driving()
+    rig.pose = np.array([1e308, 0.0, 0.0])
+    rig.until_stopped(0.2)
+    assert rig.rule == "odom_jumped"
+    assert re.search(r"its pose jumped by 1e\+308 m and 0 rad in", rig.decision.cause.line)
 
 
 @pytest.mark.parametrize("armed", [True, False])

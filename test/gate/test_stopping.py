@@ -73,9 +73,11 @@ def test_the_lag_of_a_model_that_shows_none_is_guessed():
 @pytest.mark.parametrize(
     ("name", "value", "sentence"),
     [
-        ("deceleration", 0.0, "'shield_deceleration' is 0; it must be greater than 0"),
-        ("latency", -0.1, "'shield_latency' is -0.1; it must be at least 0"),
-        ("margin", float("inf"), "'shield_margin' is inf; it must be at least 0"),
+        ("deceleration", 0.0, "'shield_deceleration' is 0; it must be from 0.001 to 10000"),
+        ("latency", -0.1, "'shield_latency' is -0.1; it must be from 0 to 10"),
+        ("latency", 1e9, "'shield_latency' is 1e\\+09; it must be from 0 to 10"),
+        ("obstacle_speed", 1e9, "'shield_obstacle_speed' is 1e\\+09; it must be from 0 to 100"),
+        ("margin", float("inf"), "'shield_margin' is inf; it must be from 0 to 10"),
     ],
 )
 def test_a_value_that_makes_no_sense_is_one_sentence(name, value, sentence):

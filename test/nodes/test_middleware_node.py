@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +20,9 @@ from robots import open_field
 from sensor_msgs.msg import Imu, LaserScan
 from std_srvs.srv import Trigger
 
+from nics_drl_bridge.middleware.measurement import Health, TopicHealth
 from nics_drl_bridge.nodes import conversions
+from nics_drl_bridge.nodes.middleware_node import silence
 from nodes.peer import stamp_ns
 
 pytestmark = pytest.mark.ros
@@ -308,3 +312,39 @@ def test_a_pose_type_that_does_not_exist_is_refused_with_the_nearest(launch, dom
     middleware = launch("middleware_node", domain_id, pose_type="PoseStampd")
     assert middleware.wait() == 2
     assert "'PoseStampd'; did you mean 'PoseStamped'" in middleware.read_text()
+
+
+def test_topics_whose_data_are_refused_are_told_apart_from_silent_ones():
+    counts = {"scan: duplicate": 1, "scan: shape (7,), not (720,)": 40, "scans: other": 9}
+    expected, heard = ("scan", "odom"), TopicHealth(1, 10.0, 0.1)
+    told = "scan: 41 refused, the last: shape (7,), not (720,)"
+    first = Health({}, counts)
+    assert silence(first, expected, {}) == f"nothing on odom yet; {told}"
+    assert silence(first, expected, counts) == "nothing on scan, odom yet"
+    before = counts | {"scan: shape (7,), not (720,)": 30}
+    assert silence(Health({"odom": heard}, counts), expected, before) == told
+    stale = {"scan": replace(heard, age_s=6.0), "odom": heard}
+    assert silence(Health(stale, counts), expected, before) == told
+    assert silence(Health(stale, counts), expected, counts) == "nothing on scan for 5 s"
+    assert not silence(Health(dict.fromkeys(expected, heard), counts), expected, before)
+
+
+def test_data_that_are_refused_are_told_of_in_its_log_once(launch, meet, domain_id, model):
+    middleware = launch("middleware_node", domain_id)
+    peer = meet(domain_id)
+    diagnostics = peer.listen(DiagnosticArray, "/diagnostics")
+    scan, sent = peer.speak(LaserScan, "scan"), itertools.count(1)
+
+    def refused():
+        message = conversions.scan_to_ros(model.lidar, np.ones(7, np.float32), 0, "laser")
+        message.header.stamp = conversions.stamp_to_ros(next(sent) * NS_PER_S // 10)
+        scan.publish(message)
+        told = [status.message for each in diagnostics for status in each.status]
+        return (
+            sum("scan: " in each and "refused, the last: shape (7,)" in each for each in told) > 2
+        )
+
+    peer.until(refused, "what is refused, several times")
+    assert (
+        middleware.read_text().count("not used, but counted in /diagnostics: scan: shape (7,)") == 1
+    )

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
+from rclpy.parameter import Parameter
+
 from nics_drl_bridge.nodes import parameters
-from nics_drl_bridge.nodes.parameters import NODES, stamped_by_default
+from nics_drl_bridge.nodes.parameters import NODES, frame_fault, stamped_by_default
 from nics_drl_bridge.nodes.record_node import RecordNode
 from nics_drl_bridge.nodes.runner import open_context
+from nodes.in_process import NodeThread
 from nodes.test_parameter_files import MAKERS
 
 pytestmark = pytest.mark.ros
@@ -65,6 +69,49 @@ def test_help_tells_the_topics_and_services_of_a_node(node):
     services = {service for service, _ in made.get_service_names_and_types_by_node(*place)}
     always = {each for each in facts.services if "(" not in each}  # whatever is installed
     assert {each.replace("~", f"/{made.get_name()}") for each in always} <= services
+
+
+def given(values):
+    """Parameters of some values."""
+    return [SimpleNamespace(name=name, value=value) for name, value in values.items()]
+
+
+@pytest.mark.parametrize("frame", ["", "a b", "/map", "map ", "m\n", "x" * 5000, "\t"])
+def test_a_frame_that_tf_does_not_know_is_one_short_sentence(frame):
+    told = frame_fault(given({"map_frame": "map", "base_frame": frame, "rate": 1.0}))
+    assert told.startswith("parameter 'base_frame': must be 1 to 255 characters, without blanks")
+    assert len(told) < 250
+
+
+def test_the_frames_of_map_odometry_and_robot_differ_and_a_footprint_may_be_none():
+    good = {"map_frame": "map", "odom_frame": "odom", "base_frame": "r/base", "footprint_frame": ""}
+    assert not frame_fault(given(good))
+    for name in ("odom_frame", "base_frame"):
+        told = frame_fault(given(good) + given({name: "map"}))
+        assert f"{name!r} is 'map'" in told
+        assert told.endswith("they must differ; rename one.")
+
+
+@pytest.mark.parametrize("name", ["simulator_node", "middleware_node", "policy_node"])
+def test_a_node_with_such_a_frame_ends_with_code_2(name, domain_id, tmp_path):
+    node = NodeThread(name, tmp_path, {}, domain_id, words=["-p", "base_frame:=map"])
+    assert node.wait() == 2
+    assert node.lines == [line for line in node.lines if "they must differ" in line] != []
+
+
+@pytest.mark.parametrize("frame", ["a b", "map"])
+def test_a_running_node_refuses_such_a_frame_and_keeps_its_own(frame, domain_id):
+    context = open_context(["node", "--ros-args", "-p", "autostart:=false"], domain_id)
+    made = MAKERS["middleware_node"](context)
+    try:
+        (answer,) = made.set_parameters([Parameter("base_frame", value=frame)])
+        assert not answer.successful
+        assert "'base_frame'" in answer.reason
+        assert made.set_parameters([Parameter("base_frame", value="car")])[0].successful
+        assert made.get_parameter("base_frame").value == "car"
+    finally:
+        made.destroy_node()
+        context.try_shutdown()
 
 
 @pytest.mark.parametrize(

@@ -10,10 +10,14 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from geometry_msgs.msg import PoseStamped, Twist, TwistStamped
 from nav_msgs.msg import Odometry
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import LaserScan
 
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.policy_node import PolicyNode
+from nics_drl_bridge.nodes.runner import open_context
 from nodes.peer import stamp_ns
 
 pytestmark = pytest.mark.ros
@@ -164,3 +168,16 @@ def test_it_goes_on_after_a_simulation_has_set_the_clock_back(launch, meet, doma
     commands.clear()
     peer.until(lambda: drives() and stamp_ns(commands[-1]) < 100 * NS_PER_S, "it drives on")
     policy.check()
+
+
+@pytest.mark.parametrize("goal", [[math.nan, 1.0], [1e308, 0.0], [0.0, -math.inf], [1.0]])
+def test_a_goal_that_is_no_place_is_refused_when_it_is_configured(goal, domain_id):
+    context = open_context(["node", "--ros-args", "-p", "autostart:=false"], domain_id)
+    node = PolicyNode(context)
+    try:
+        node.set_parameters([Parameter("goal", value=goal)])
+        with pytest.raises(ConfigError, match=r"^parameter 'goal': must be \[x, y\] within 1e8 m"):
+            node.configure()
+    finally:
+        node.destroy_node()
+        context.try_shutdown()

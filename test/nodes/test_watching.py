@@ -9,9 +9,11 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from geometry_msgs.msg import PoseStamped
 
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.runner import holds
 from nics_drl_bridge.nodes.watching import RosSource
+from nics_drl_bridge.sim.world import load_world
 from nics_drl_bridge.watch.server import Request
 
 pytestmark = pytest.mark.ros
@@ -56,3 +58,10 @@ def test_live_topics_are_shown_and_a_goal_of_the_page_goes_out(watched, meet):
     frame_where(source, lambda world: world.shot.goals.tolist() == [[1.5, -0.5]])
     peer.until(lambda: goals, "the goal")
     assert goals[0].header.frame_id == "map"
+
+
+def test_a_goal_off_the_given_world_is_refused_before_it_goes_out(model, domain_id):
+    with closing(RosSource(model, load_world("arena"), domain_id=domain_id)) as source:
+        for x, reason in ((1e7, "lies outside the world"), (3.0, "is in a wall")):
+            with pytest.raises(ConfigError, match=rf"goal: .* {reason}; the field is"):
+                source.take(Request(kind="goal", x=x))

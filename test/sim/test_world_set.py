@@ -174,6 +174,37 @@ def test_a_wrong_set_is_refused_in_one_sentence(tmp_path, text, reason):
     assert str(refused.value).count("\n") == 0
 
 
+def test_no_name_is_no_world_although_it_would_be_the_present_folder(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    (folder / "set.yaml").write_text("name: s\nworlds: ['']\n")
+    for given in ("", [""], "set.yaml"):
+        with pytest.raises(ConfigError, match="unknown world ''; valid are: 'arena'"):
+            load_worlds(given)
+
+
+def test_a_member_that_is_unknown_is_told_with_the_file_of_its_set_and_the_names_of_sets(tmp_path):
+    file = tmp_path / "set.yaml"
+    file.write_text("name: s\nworlds: [nope]\n")
+    with pytest.raises(ConfigError, match=rf"^{file}: unknown world 'nope'; valid are: ") as told:
+        load_worlds(file)
+    assert "'barn', 'cellular', 'circles'" in str(told.value)
+    with pytest.raises(ConfigError, match="did you mean 'cellular'"):
+        load_worlds("celular")
+
+
+def test_what_has_to_be_imported_is_told_with_the_command_for_it(tmp_path):
+    (tmp_path / "hall.world").write_text("<sdf/>")
+    plan = tmp_path / "plan.yaml"
+    plan.write_text("image: plan.png\nresolution: 0.05\norigin: [0, 0, 0]\n")
+    for file, kind in (("hall.world", "a world of Gazebo"), (str(plan), "a map")):
+        for given in (file, [file]):
+            told = rf"{file}: is {kind}; make a world of it by `nics world import {file}`\."
+            with pytest.raises(ConfigError, match=told):
+                load_worlds(given)
+    with pytest.raises(ConfigError, match=r"no world file .* by `nics world import`\."):
+        load_worlds(tmp_path)
+
+
 def test_a_set_of_sets_is_refused(tmp_path):
     file = tmp_path / "set.yaml"
     file.write_text("name: s\nworlds: [set.yaml]\n")

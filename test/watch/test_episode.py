@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 from contextlib import closing
 from types import SimpleNamespace
 
@@ -10,6 +11,7 @@ from robots import direct_model
 from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.geometry import wrap_angle
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, X, Y
+from nics_drl_bridge.seeds import GREATEST_SEED
 from nics_drl_bridge.sim.world import load_world
 from nics_drl_bridge.watch.episode import standing
 from nics_drl_bridge.watch.server import Request
@@ -60,6 +62,20 @@ def test_a_goal_that_is_dragged_moves(driven):
     assert driven.frame().worlds[0].shot.goals.tolist() == [[1.25, -0.5]]
 
 
+@pytest.mark.parametrize(
+    ("x", "reason"),
+    [(1e7, "lies outside the world"), (3.0, "is in a wall"), (-3.0, "is in a wall")],
+)
+def test_a_goal_off_the_field_is_refused_and_all_else_goes_on(driven, x, reason):
+    driven.take(Request(kind="goal", x=1.25, y=-0.5))
+    told = re.escape(f"goal: ({x:g}, 0) m {reason}; the field is -3 to 3 m by -3 to 3 m.")
+    with pytest.raises(ConfigError, match=f"^{told}$"):
+        driven.take(Request(kind="goal", x=x))
+    assert driven.frame().worlds[0].shot.goals.tolist() == [[1.25, -0.5]]
+    assert driven.take(Request(kind="policy", name="other"))
+    driven.take(Request(kind="clear"))
+
+
 @pytest.mark.parametrize("shape", ["circle", "box"])
 def test_an_obstacle_is_added_while_all_else_stays_where_it_is(driven, shape):
     driven.take(Request(kind="goal", x=1.25, y=-0.5))
@@ -103,6 +119,15 @@ def test_the_next_episode_is_in_the_world_as_it_was_at_first(driven):
     assert driven.take(Request(kind="seed", value=9))
     assert len(bodies(driven)) == 2
     assert driven.frame().worlds[0].name.endswith("episode 9")
+
+
+def test_the_greatest_seed_stays_itself_and_what_is_no_seed_is_refused(driven):
+    asked = Request.model_validate_json(f'{{"kind": "seed", "value": {GREATEST_SEED}}}')
+    assert driven.take(asked)
+    assert driven.frame().worlds[0].name.endswith(f"episode {GREATEST_SEED}")
+    with pytest.raises(ConfigError, match=r"seed 1\.5: must be a whole number"):
+        driven.take(Request(kind="seed", value=1.5))
+    assert driven.lanes[0].seed == GREATEST_SEED
 
 
 def test_a_person_drives_while_keys_are_held_and_the_robot_stops_once_they_are_silent(

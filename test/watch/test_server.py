@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import logging
 import socket
 import sys
 import threading
 import urllib.error
 import urllib.request
 from contextlib import closing
+from functools import partial
 
 import pytest
 from browser import until
@@ -38,6 +40,23 @@ def status(url, **headers):
         return error.code
 
 
+def talk(server, text):
+    """A connection that has sent a text."""
+    address, port = server.url.removeprefix("http://").strip("/").split(":")
+    page = socket.create_connection((address, int(port)), timeout=30)
+    page.sendall(text.encode())
+    return page
+
+
+def handshake(server):
+    """What a browser sends to open the socket."""
+    host = server.url.removeprefix("http://").strip("/")
+    return (
+        f"GET /socket HTTP/1.1\r\nHost: {host}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
+        "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+    )
+
+
 def test_the_page_is_one_file_that_may_load_nothing_from_elsewhere(server):
     with get(server.url) as answer:
         page = answer.read().decode()
@@ -56,6 +75,14 @@ def test_a_foreign_name_that_points_here_is_refused(server):
     assert status(server.url, Host="rebound.example") == 403
     assert status(server.url) == 200
     assert status(f"{server.url}else") == 404
+
+
+@pytest.mark.parametrize("header", ["Host", "Origin"])
+def test_a_header_that_stands_twice_is_refused_as_a_foreign_one_is(server, header):
+    own = server.url.removeprefix("http://").strip("/")
+    twice = f"Host: {own}\r\n" + f"{header}: {own}\r\n" + f"{header}: evil.example\r\n"
+    with talk(server, f"GET /socket HTTP/1.1\r\n{twice}\r\n") as page:
+        assert page.recv(12, socket.MSG_WAITALL) == b"HTTP/1.1 403"
 
 
 def test_the_page_of_a_foreign_site_can_not_open_the_socket(server):
@@ -108,14 +135,7 @@ def test_a_page_that_floods_the_server_does_not_fill_its_memory(server):
 
 
 def test_a_page_that_reads_nothing_does_not_hold_up_the_end(server):
-    host = server.url.removeprefix("http://").strip("/")
-    address, port = host.split(":")
-    with socket.create_connection((address, int(port))) as page:
-        page.sendall(
-            f"GET /socket HTTP/1.1\r\nHost: {host}\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"
-            "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
-            "".encode()
-        )
+    with talk(server, handshake(server)) as page:
         until(lambda: server.watched, "the page")
         server.tell("x" * 50_000_000)  # more than all buffers between the two hold
         page.recv(100_000, socket.MSG_WAITALL)  # its beginning: the rest is stuck
@@ -125,9 +145,27 @@ def test_a_page_that_reads_nothing_does_not_hold_up_the_end(server):
         assert not end.is_alive()
 
 
+def test_a_page_that_falls_asleep_or_errs_is_no_traceback(monkeypatch):
+    import websockets.sync.server as library
+
+    handler, heard = logging.Handler(), []
+    handler.emit = heard.append
+    monkeypatch.setattr(logging.root, "handlers", [handler])
+    quick = partial(library.serve, ping_interval=0.05, ping_timeout=0.05)
+    monkeypatch.setattr(library, "serve", quick)
+    with closing(PageServer(port=0)) as server:
+        with talk(server, handshake(server)):
+            until(lambda: server.watched, "the page")
+            until(lambda: not server.watched, "that its silence is noticed")
+        with talk(server, "no request\r\n\r\n") as page:
+            page.recv(1000)
+    assert not heard
+
+
 def test_a_taken_port_and_a_missing_library_are_one_sentence(server, monkeypatch):
     port = int(server.url.rsplit(":", 1)[1].strip("/"))
-    with pytest.raises(ConfigError, match=r"port \d+ of 127.0.0.1 can't be served .*--port"):
+    told = rf"^port {port} of 127\.0\.0\.1 can't be served \(Address already in use\); .*--port"
+    with pytest.raises(ConfigError, match=told):
         PageServer(port)
     monkeypatch.setitem(sys.modules, "websockets.sync.server", None)
     with pytest.raises(ConfigError, match=r"pip install 'nics_drl_bridge\[view\]'"):

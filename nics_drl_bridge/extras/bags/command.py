@@ -175,8 +175,7 @@ def salvage(
     from nics_drl_bridge.extras.bags.salvage import salvage as salvage_bag
 
     lines = salvage_bag(path, out, _storage(storage)).lines()
-    line = "\n".join((*lines, f"bag written to {out}"))
-    console.say(as_json, line, path=str(out), told=lines)
+    console.say(as_json, "\n".join((*lines, f"bag written to {out}")), path=str(out), told=lines)
 
 
 def _storage(name: str) -> Any:

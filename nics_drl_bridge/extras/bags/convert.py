@@ -71,6 +71,5 @@ def _transform(
 ) -> bytes:
     types = store.types
     moved = types["geometry_msgs/msg/Transform"](types["geometry_msgs/msg/Vector3"](*place), turned)
-    single = types[topic_roles.TRANSFORM](header, child, moved)
-    message = types[topic_roles.TRANSFORMS]([single])
+    message = types[topic_roles.TRANSFORMS]([types[topic_roles.TRANSFORM](header, child, moved)])
     return bytes(store.serialize_cdr(message, topic_roles.TRANSFORMS))

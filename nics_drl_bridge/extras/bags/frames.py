@@ -82,8 +82,7 @@ def frames_of(
         fps = max(1, round(NS_PER_S / float(np.median(apart[apart > 0]))))
     ticks = _ticks(str(path), received, fps)
     rows = {role: np.searchsorted(ns, ticks, side="right") - 1 for role, ns in received.items()}
-    set_anew = resets(messages[ODOM])
-    episode = _episodes(ticks, rows, received, set_anew, gap_s)
+    episode = _episodes(ticks, rows, received, resets(messages[ODOM]), gap_s)
     numbers, lengths = np.unique(episode[episode >= 0], return_counts=True)
     long_enough = lengths >= LEAST_FRAMES
     if not long_enough.any():

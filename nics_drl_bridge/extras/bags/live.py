@@ -165,8 +165,7 @@ class _Player:
         found = message_type(kind)
         if found is None:
             return False
-        shared = topic in (CLOCK, "/tf", "/tf_static")
-        name = topic if shared else f"{self._space}{topic}"
+        name = topic if topic in (CLOCK, "/tf", "/tf_static") else f"{self._space}{topic}"
         best = Offer(  # matches any subscriber of one of the publishers
             max((offer.depth for offer in offers), default=USUAL_DEPTH),
             not offers or any(offer.reliable for offer in offers),

@@ -71,8 +71,7 @@ def salvage(path: str | Path, out: str | Path, storage: Storage = "mcap") -> Sal
     """Writes a bag's intact messages to a new bag; RecordingError if none is, or `out` exists."""
     path, found = Path(path), _Found()
     for file in _files(path):
-        read = _read_database if file.suffix == DATABASE else _read_mcap
-        read(file, found)
+        (_read_database if file.suffix == DATABASE else _read_mcap)(file, found)
     messages = sorted(_decodable(found), key=lambda message: message[1])
     if not messages:
         raise RecordingError(f"{path}: holds no message that is intact; record the drive anew.")

@@ -304,8 +304,7 @@ def roller_size(radius: float, rollers: int) -> tuple[float, float]:
     """Semi-axes [m], thickness and length, of ellipsoidal rollers that best outline a circle."""
     a, q = THICKNESS * radius, np.pi / rollers
     reach = radius - (radius - a) * np.cos(q)
-    b = np.sqrt(a**2 + 2.0 * (reach**2 - a**2) / np.sin(q) ** 2)
-    return float(a), float(b)
+    return float(a), float(np.sqrt(a**2 + 2.0 * (reach**2 - a**2) / np.sin(q) ** 2))
 
 
 def _roller_wheel(
