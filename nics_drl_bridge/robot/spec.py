@@ -224,8 +224,7 @@ class RobotSpec(Schema):
         before = np.roll(after, 1, axis=0)
         bend = 1.0 + np.sum(before * after, axis=-1, keepdims=True)
         moved = corners + margin * (before + after) / np.maximum(bend, SHARPEST)
-        footprint = tuple(map(tuple, moved.tolist()))
-        return self.model_copy(update={"footprint": footprint})
+        return self.model_copy(update={"footprint": tuple(map(tuple, moved.tolist()))})
 
     @property
     def variable_names(self) -> tuple[str, ...]:
@@ -402,11 +401,11 @@ def robot_from(given: str | Path | Mapping[str, Any], ranges: Ranges | None = No
 
 
 def definition(given: str | Path | Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the content of a robot's YAML file, by what `robot_from` takes."""
+    """Returns the content of a robot's YAML file, called as the file unless it says."""
     if isinstance(given, Mapping):
         return dict(given)
     path = find_config(given, "robots")
-    return parse_yaml(read_text(path), str(path))
+    return {"name": path.stem} | parse_yaml(read_text(path), str(path))
 
 
 def _of_kind(data: dict[str, Any], ranges: Ranges, source: str) -> dict[str, Any]:
