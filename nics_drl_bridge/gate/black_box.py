@@ -192,8 +192,7 @@ def from_plain(value: Any) -> Any:
     try:
         if kind == "array":
             data = base64.b64decode(content["data"])
-            array = np.frombuffer(data, np.dtype(content["type"])).reshape(content["shape"])
-            return array.copy()
+            return np.frombuffer(data, np.dtype(content["type"])).reshape(content["shape"]).copy()
         return KINDS[kind](**{name: from_plain(each) for name, each in content.items()})
     except (KeyError, TypeError) as error:
         raise ValueError(f"{kind!r} can't be read ({error})") from None

@@ -58,8 +58,7 @@ def with_motion(drive: Drive, calibration: Calibration, grid: Array, width: floa
         for v in spec.state
     ]
     values = np.array(columns).reshape(len(columns), len(grid)).T
-    state = Stream(grid, values, recording.command.clock)
-    return drive.part(replace(recording, state=state))
+    return drive.part(replace(recording, state=Stream(grid, values, recording.command.clock)))
 
 
 def as_smooth(command: Array, step: float, width: float) -> Array:

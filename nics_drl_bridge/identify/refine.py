@@ -216,8 +216,7 @@ class _Free:
             if own is not None and command is not None and not self.coefficients[3 + i, command]:
                 coefficients[3 + i, command] = -response.gain * coefficients[3 + i, own]
         values: dict[str, Any] = dict(zip(self.names, map(float, theta[count:]), strict=True))
-        model = replace(self.model, coefficients=coefficients)
-        return model, replace(self.calibration, **values)
+        return replace(self.model, coefficients=coefficients), replace(self.calibration, **values)
 
     def bounds(self) -> tuple[Array, Array]:
         """Returns bounds (P,) by which no state that follows a command overshoots it in a step."""

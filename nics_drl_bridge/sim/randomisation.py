@@ -356,8 +356,7 @@ def _faults(ranges: Randomisation, lidar: LidarSpec, where: str) -> Bounds:
     spans = {name: span for name, span in ranges.lidar if span is not None and name not in CHOICES}
     for end in range(2):
         numbers = {name: span[end] for name, span in spans.items()}
-        std = numbers.pop("noise_std", lidar.noise_std)
-        spec = lidar.model_dump() | {"noise_std": std}
+        spec = lidar.model_dump() | {"noise_std": numbers.pop("noise_std", lidar.noise_std)}
         spec["faults"] |= numbers
         bounds.append(validate(spec, LidarSpec, f"{where} of the lidar {lidar.name!r}"))
     return bounds[0].fault_parameters, bounds[1].fault_parameters

@@ -46,8 +46,7 @@ def compile_scene(
         maker.map(world.grid)
     for k, body in enumerate(bodies):
         if body[RADIUS] > 0.0:
-            moves = motions[k] is not None
-            maker.obstacle(k, shapes[int(body[SHAPE])], body[:3], moves)
+            maker.obstacle(k, shapes[int(body[SHAPE])], body[:3], motions[k] is not None)
     return spec.compile()
 
 

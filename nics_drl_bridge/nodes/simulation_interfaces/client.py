@@ -107,8 +107,7 @@ class StandardEpisodes:
         for feature, service in NEEDED.items():
             self._require(feature, f", which {service} serves" if service else "")
         self.clients += self._services.values()
-        paused = kinds.SimulationState(state=kinds.SimulationState.STATE_PAUSED)
-        self._paused = {"state": paused}
+        self._paused = {"state": kinds.SimulationState(state=kinds.SimulationState.STATE_PAUSED)}
         self._pause(timeout_s)
         step_ns = self._measured(timeout_s) if self._options.step_s is None else round(
             self._options.step_s * NS_PER_S
