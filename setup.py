@@ -70,6 +70,8 @@ EXTRAS = {
         "colcon-bash",
         "colcon-package-selection",
         "colcon-ros",
+        "dockerfile-parse",
+        "flake8",
         "hypothesis",
         "mypy",
         "pre-commit",

@@ -53,6 +53,13 @@ SINGLE_BAR, ESTIMATOR_BAR = 0.04, 0.007
 SHARES_OF_USUAL = {"lidar": 0.75, "obstacles": 0.65}
 """Of the env steps per second of the usual env, on one thread, at least."""
 CLEAN_BAR = 1.3
+SHARES = {
+    "share_of_write_limit": "share of the rate at which observations alone can be written",
+    "share_of_cartpole": "share of CartPole's rate, single env",
+    "share_of_cartpole_with_estimator": "share of CartPole's rate, single env with the estimator",
+    "share_of_usual": "left of the usual env's speed",
+}
+"""In words, for those that miss their bar."""
 SCENES = 50
 """That the peers go through, one for each episode."""
 ACTIONS, CHUNK, SINGLE_CHUNK, WRITES = 64, 50, 500, 50
@@ -281,15 +288,16 @@ def judge(result: dict[str, Any], found: peers.Measured, case: Case = USUAL) -> 
         least = [each for name, each in SHARES_OF_USUAL.items()
                  if getattr(case, name) != getattr(USUAL, name)]  # fmt: skip
         bars = [("share_of_usual", float(np.prod(least)))]
-    missed = [f"{key}: {result[key]:.4f}, bar {bar}" for key, bar in bars if not result[key] >= bar]
-    if not result.get(key := "times_as_long_as_clean", 1.0) <= CLEAN_BAR:
-        missed.append(f"{key}: {result[key]:.3f}, bar {CLEAN_BAR}")
+    missed = [
+        f"{SHARES[key]}: {100.0 * result[key]:.3g} %, bar {100.0 * bar:g} %"
+        for key, bar in bars
+        if not result[key] >= bar
+    ]
+    if not (times := result.get("times_as_long_as_clean", 1.0)) <= CLEAN_BAR:
+        missed.append(f"times as long as without the lidar's faults: {times:.3f}, bar {CLEAN_BAR}")
     for name, ratio in result["times_as_fast_at_equal_work"].items():
-        if not ratio >= EQUAL_WORK_BARS[name]:
-            missed.append(
-                f"times_as_fast_at_equal_work: {ratio:.0f} times {name}, "
-                f"bar {EQUAL_WORK_BARS[name]:.0f}"
-            )
+        if not ratio >= (bar := EQUAL_WORK_BARS[name]):
+            missed.append(f"times as fast as {name} at equal work: {ratio:.0f}, bar {bar:.0f}")
     missed += peers.missed_by(found)
     for name, drove in result["drove"].items():
         missed += peers.missed_by_robots(f"our env {name!r}", drove)

@@ -26,7 +26,7 @@ def main() -> None:
     figure, (axes,) = panels(1, 1, (5.5, 3.6))
     value, low, high = 100.0 * np.array([(one.value, one.low, one.high) for one in found]).T
     axes.bar(POLICIES, value, yerr=[value - low, high - value], capsize=6)
-    axes.set(title="100 episodes in `clutter`", ylabel="success [%]", ylim=(0, 105))
+    axes.set(title="100 episodes in clutter", ylabel="success [%]", ylim=(0, 105))
     Path("compare_with_planner.png").write_bytes(png(figure))
 
 

@@ -2,15 +2,13 @@
 
 from pathlib import Path
 
-import gymnasium
 import numpy as np
 from onnx import TensorProto, helper, numpy_helper, save
-from PIL import Image
 
-import nics_drl_bridge  # noqa: F401 - registers the environments
-from nics_drl_bridge.generator import open_model
+from nics_drl_bridge import load_world, make, open_model
 from nics_drl_bridge.policy.evaluation import drive
 from nics_drl_bridge.policy.policies import open_policy
+from nics_drl_bridge.report.pictures import trajectories
 
 MAPPING = """
 kind: foreign policy
@@ -44,13 +42,12 @@ def network():
 def main():
     save(network(), "theirs.onnx")
     Path("theirs.yaml").write_text(MAPPING, encoding="utf-8")
-    robot = open_model("differential")
-    policy, task = open_policy("theirs.yaml", robot)
-    make = {"model": robot, "world": "empty", "task": task, "render_mode": "rgb_array"}
-    env = gymnasium.make("NicsBridge/Navigation-v0", **make)
-    episode = drive(env, policy, seed=0)
+    model, world = open_model("differential"), load_world("empty")
+    policy, task = open_policy("theirs.yaml", model)
+    episode = drive(make(model=model, world=world, task=task), policy, seed=0)
     print(episode.result)
-    Image.fromarray(env.render()).quantize(64).save("drive_foreign_policy.png")
+    picture = trajectories({"theirs": [episode]}, world, model.robot.footprint_radius)
+    Path("drive_foreign_policy.png").write_bytes(picture)
 
 
 if __name__ == "__main__":

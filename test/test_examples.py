@@ -11,14 +11,14 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 NEEDS_ROS = "drive_over_dds"
-MOST_LINES, MOST_BYTES = 60, 100_000  # lines that are not empty; a picture of the docs
+MOST_LINES, MOST_BYTES = 60, 100_000  # of an example; of a picture of the docs
 SAYS = {
     "compare_with_planner": r"differential: (8|9|10)\d%",
     "drive_foreign_policy": "success",
     "drive_over_dds": "success over DDS; the estimates are 0 apart",
     "evaluate_policy": r"success (9\d|100)",
     "fit_model": r"vx = 0\.\d+\*left_wheel",
-    "own_task": "3 arrivals",
+    "own_task": r"success after \d+ steps",
     "pass_the_gate": "rule 'command_malformed'",
     "several_robots": "reached: True",
 }
@@ -42,7 +42,7 @@ def test_every_example_runs_in_a_process_of_its_own(example, tmp_path):
 @pytest.mark.parametrize("example", EXAMPLES, ids=lambda path: path.stem)
 def test_every_example_is_short_has_a_main_and_stands_in_the_docs_with_its_picture(example):
     text = example.read_text(encoding="utf-8")
-    assert sum(bool(line.strip()) for line in text.splitlines()) < MOST_LINES
+    assert len(text.splitlines()) < MOST_LINES
     assert "\ndef main()" in text
     assert example.name in (ROOT / "docs" / "examples.md").read_text(encoding="utf-8")
     picture = ROOT / "docs" / "examples" / f"{example.stem}.png"

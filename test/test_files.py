@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+import errno
 import io
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -82,6 +84,32 @@ def test_a_crash_while_writing_leaves_the_old_file_and_no_other(tmp_path, monkey
     with pytest.raises(Crash):
         write_bytes(path, b"new")
     assert tree(tmp_path) == {"file": b"old"}
+
+
+def in_folder(path):
+    with whole_folder(path, MARKER):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("write", "fails"),
+    [
+        (write_text, (tempfile, "mkstemp")),
+        (write_text, (os, "replace")),
+        (lambda path, _: in_folder(path), (tempfile, "mkdtemp")),
+    ],
+    ids=["create", "replace", "folder"],
+)
+def test_what_can_not_be_written_is_told_by_the_name_that_was_asked_for(
+    tmp_path, monkeypatch, write, fails
+):
+    def refuse(*_, **__):
+        raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / ".out.9m2ta3id"))
+
+    monkeypatch.setattr(*fails, refuse)
+    with pytest.raises(PermissionError) as caught:
+        write(tmp_path / "out", "")
+    assert caught.value.filename == str(tmp_path / "out")
 
 
 @pytest.mark.process

@@ -282,6 +282,11 @@ def test_every_requirement_is_pinned_to_a_version_that_it_allows(metadata: Messa
         assert one.specifier.contains(pins[canonicalize_name(one.name)]), one
 
 
+def test_the_linter_of_ros_2_finds_nothing_in_the_package() -> None:
+    pytest.importorskip("flake8", reason="needs flake8 of the extra `test`")
+    run(sys.executable, "-m", "flake8", "--config", "setup.cfg", PACKAGE, "launch", cwd=ROOT)
+
+
 def test_a_sourced_ros_2_replaces_the_ros_wheels_and_nothing_else(metadata: Message) -> None:
     core, everything, without_ros, ros = (
         {one.name for one in requirements(metadata, extra)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import subprocess
@@ -29,13 +30,6 @@ def run(*command: str | Path, cwd: Path) -> str:
     )  # fmt: skip
     assert done.returncode == 0, f"{command} ended with {done.returncode}:\n{done.stdout}"
     return done.stdout
-
-
-def container_lines() -> list[tuple[str, str]]:
-    """The instructions of the Containerfile, each with its arguments on one line."""
-    text = re.sub(r"^#.*\n", "", text_of("Containerfile"), flags=re.MULTILINE)
-    lines = text.replace("\\\n", " ").splitlines()
-    return [tuple(line.split(maxsplit=1)) for line in lines if line.strip()]
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +60,10 @@ def test_a_release_runs_the_demo_outside_of_the_repository(dist, kind, tmp_path)
 
 
 def test_the_container_file_copies_what_there_is_and_runs_what_is_installed():
-    lines = container_lines()
+    parser = pytest.importorskip("dockerfile_parse", reason="needs dockerfile-parse of `test`")
+    file = io.BytesIO((ROOT / "Containerfile").read_bytes())
+    every = parser.DockerfileParser(fileobj=file).structure
+    lines = [(one["instruction"], one["value"]) for one in every if one["instruction"] != "COMMENT"]
     assert lines[0][0] == "FROM"
     assert {name for name, _ in lines} == INSTRUCTIONS
     for name, words in lines:

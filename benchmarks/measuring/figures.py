@@ -160,6 +160,14 @@ README = told(
                                  ("ackermann", "car"))
         ) + " with the evaluation",
     ),
+    (
+        "first_hour",
+        "what a new user waits for from a clean clone on: the first picture; a policy of a Burger "
+        "by its YAML file; the report of a recording; a policy of a task of one's own",
+        "picture {seconds.picture|.0f} s, {setup_s|.0f} s of them set-up; Burger "
+        "{seconds.robot|.0f} s, success {success.robot|.1%}; report {seconds.recording|.0f} s; "
+        "own task {seconds.task|.0f} s, success {success.task|.1%}",
+    ),
 )  # fmt: skip
 SAFETY = told(
     (

@@ -31,6 +31,7 @@ PLACEHOLDER = re.compile(
 HOW = {"max": max, "min": min, "sum": sum}
 NOT_MEASURED, OF_MISSED, OF_QUICK, ELSEWHERE = "not measured", "†", "‡", "§"
 VERSIONS = ("numba", "numpy")
+MOST_TOLD = 3  # bars that a run missed; of more, one fewer and how many more there are
 MACHINE = "machine"
 """The name of the region that says on what was measured."""
 
@@ -128,8 +129,12 @@ class Page:
         for name in sorted(runs & set(self.runs)):
             entry = self.runs[name]
             if entry["state"] != MET:
-                wrong = "; ".join(entry["failures"] or [entry["error"] or ""])
+                told = entry["failures"] or [entry["error"] or ""]
+                shown = told if len(told) <= MOST_TOLD else told[: MOST_TOLD - 1]
+                wrong = "; ".join(shown)
                 wrong = shorten(wrong, 300, placeholder=" ...")  # between words
+                if more := len(told) - len(shown):
+                    wrong += f"; and {more} more"
                 notes.append(f"{OF_MISSED} `{entry['script']}` {entry['state']}: {wrong}")
             if entry["quick"]:
                 notes.append(f"{OF_QUICK} `{entry['script']}`: a short run")

@@ -348,8 +348,7 @@ def _policy(plan: DemoPlan, learned: Learned, of: DemoEpisodes) -> list[str]:
         f"{summary.episodes} unseen episodes in the world {plan.world!r}, in parallel in the fast "
         "simulator, without exploration; path and time are means of the successful ones."
     )
-    table = html.table(("", "value", "95 % from", "to"), rows)
-    return [*blocks, html.paragraph(text), table]
+    return [*blocks, html.paragraph(text), html.table(("", "value", "95 % from", "to"), rows)]
 
 
 def _episodes(plan: DemoPlan, model: SimulatorModel, of: DemoEpisodes) -> list[str]:

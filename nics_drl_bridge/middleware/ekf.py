@@ -239,8 +239,8 @@ class Estimator:
             if kind is Kind.POSE and outcome is Acceptance.JUMP:
                 self._jump(value, noise)
             else:
-                given = lambda _: derivative, lambda _: expected
-                own.update(value, *given, R=noise, residual=residual)
+                matrix, model = (lambda _: derivative), (lambda _: expected)
+                own.update(value, matrix, model, R=noise, residual=residual)
             kernels.settle(own.x, own.P, *self._limits)
             if way:
                 since: Any = self._anchor

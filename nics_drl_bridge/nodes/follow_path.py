@@ -405,8 +405,7 @@ class PathActions:
         if end == ABORT:
             self._node.get_logger().warning(f"goal aborted: {sentence}")
         else:
-            told = "goal reached" if end == SUCCEED else "goal cancelled"
-            self._node.get_logger().info(told)
+            self._node.get_logger().info("goal reached" if end == SUCCEED else "goal cancelled")
         goal.server.finish(goal.handle, end, result_of(goal.kind, code, sentence))
 
 

@@ -27,8 +27,8 @@ from nics_drl_bridge.policy.train_algorithms import (
     Actor,
     Sb3Training,
     act_of,
+    check_serves,
     observed,
-    refuse_team,
 )
 from nics_drl_bridge.policy.train_export import export_policy
 from nics_drl_bridge.policy.train_ppo import LeanPpo
@@ -213,7 +213,7 @@ def run(
     _check(order.settings, order.seeds, order.out, order.resumed)
     settings, model = order.settings, open_model(order.settings.robot, order.settings.lidar)
     trial = _env_of(settings, next(iter(settings.worlds)), TRIED, model)
-    refuse_team(settings.task, trial.robots)
+    check_serves(settings, trial)
     trial.reset(seed=FIRST_SEED)
     for _ in range(TRIED):  # a task that gives no numbers is refused before a folder is begun
         trial.step(trial.action_space.sample())
@@ -244,12 +244,17 @@ def run(
 def _alone(out: Path) -> Iterator[None]:
     """Keeps other trainings out of the folder of a run. Raises ConfigError if one is there."""
     out.mkdir(parents=True, exist_ok=True)
+    known = (out / SETTINGS).is_file()
     try:
         with filelock.FileLock(out / LOCK, timeout=0.0):
             yield
     except filelock.Timeout:
         fix = "wait for its end, or choose another --out"
         raise ConfigError(f"{out}: another training is at work there; {fix}.") from None
+    except ConfigError:
+        if not known and not seeds_of(out):  # settings that no training began with bar no others
+            (out / SETTINGS).unlink(missing_ok=True)
+        raise
 
 
 def export(settings: TrainingSettings, result: SeedResult, command: str, path: Path) -> None:

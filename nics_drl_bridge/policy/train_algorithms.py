@@ -21,6 +21,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
+from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy.evaluation import Act
@@ -43,22 +44,18 @@ LAST = ("_last_obs", "_last_episode_starts")
 REPLAYED = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
-def check_serves(settings: TrainingSettings, env: TrainVecEnv) -> None:
-    """Raises ConfigError if the algorithm does not suit the task."""
-    refuse_team(settings.task, env.envs[0].robots)
-    if settings.algorithm == "sac" and not isinstance(env.action_space, gymnasium.spaces.Box):
+def check_serves(settings: TrainingSettings, env: BridgeVectorEnv) -> None:
+    """Raises ConfigError if the algorithm does not suit the task, or the task is of a team."""
+    if env.robots > 1:
+        fix = "train a task of one, or its agents by a learner of your own (docs/environments.md)"
+        raise ConfigError(f"task {settings.task!r}: is of {env.robots} robots; {fix}.")
+    continuous = isinstance(env.single_action_space, gymnasium.spaces.Box)
+    if settings.algorithm == "sac" and not continuous:
         raise ConfigError("algorithm 'sac' needs continuous actions; use 'ppo'.")
-    size = settings.ppo.rollout * env.num_envs
+    size = settings.ppo.rollout * settings.num_envs
     if settings.algorithm == "ppo" and settings.ppo.batch > size:
         batch = f"ppo.batch {settings.ppo.batch}: is more than the {size} transitions of a rollout"
         raise ConfigError(f"{batch}; lower it, or raise ppo.rollout or worlds.")
-
-
-def refuse_team(task: str, robots: int) -> None:
-    """Raises ConfigError for a task of more than one robot, which no policy file drives."""
-    if robots > 1:
-        fix = "train a task of one, or its agents by a learner of your own (docs/environments.md)"
-        raise ConfigError(f"task {task!r}: is of {robots} robots; {fix}.")
 
 
 def act_of(algorithm: BaseAlgorithm | Actor) -> Act:
@@ -263,7 +260,7 @@ def make_algorithm(
     settings: TrainingSettings, env: TrainVecEnv, seed: int, normaliser: tuple[Array, Array]
 ) -> BaseAlgorithm:
     """Makes an untrained algorithm; `normaliser` is mean and deviation (O,). See `check_serves`."""
-    check_serves(settings, env)
+    check_serves(settings, env.envs[0])
     torch.set_num_threads(settings.threads)
     shared: dict[str, Any] = {"seed": seed, "device": "cpu", "stats_window_size": RECENT}
     network: dict[str, Any] = {

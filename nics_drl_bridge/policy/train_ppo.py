@@ -262,7 +262,7 @@ class LeanPpo:
         self, settings: TrainingSettings, env: TrainVecEnv, seed: int,
         normaliser: tuple[Array, Array],
     ) -> None:  # fmt: skip
-        train_algorithms.check_serves(settings, env)
+        train_algorithms.check_serves(settings, env.envs[0])
         torch.set_num_threads(settings.threads)
         torch.manual_seed(seed)
         self._total, self._ppo, hidden = settings.steps, settings.ppo, settings.hidden

@@ -222,8 +222,7 @@ def _in_chunk(walk: _Walk, record: Record) -> None:
         message = walk.data.see(inner)
         if message is not None:
             times.append(message.log_time)
-            entries = walk.places.setdefault(message.channel_id, [])
-            entries.append((message.log_time, inner.offset))
+            walk.places.setdefault(message.channel_id, []).append((message.log_time, inner.offset))
     span = record.content.message_start_time, record.content.message_end_time
     if times and (min(times), max(times)) != span:
         raise DamageError(record.offset, "a chunk's messages are not of the time that it names")

@@ -141,8 +141,7 @@ def check(recording: Recording, spec: RobotSpec) -> Recording:
         problem = f"{recording.source}: is a drive of a robot with {', '.join(recording.variables)}"
         advice = f"the robot {spec.name!r} has {', '.join(spec.variable_names)}"
         raise RecordingError(f"{problem}; {advice}: choose the robot that drove.")
-    width = {"command": len(spec.command), "state": len(spec.state), "wheels": 2}
-    check_streams(recording, width)
+    check_streams(recording, {"command": len(spec.command), "state": len(spec.state), "wheels": 2})
     speeds = [v for v in spec.command if v.unit == "m/s"]
     fastest = max((max(abs(v.min), abs(v.max)) for v in speeds), default=np.inf)
     pose, radius = recording.pose, spec.footprint_radius

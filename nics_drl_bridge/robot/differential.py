@@ -30,8 +30,5 @@ def drawing(spec: RobotSpec) -> Drawing:
 
 
 KIND = RobotKind(kinematics, drawing, Template((TWIST,), MOVES, (), LAGS, LENGTHS))
-VARIANTS = {
-    "differential_wheels": RobotKind(
-        kinematics, drawing, Template((WHEELS,), (), (), LAGS, LENGTHS)
-    )
-}
+BY_WHEELS = Template((WHEELS,), (), (), LAGS, LENGTHS)
+VARIANTS = {"differential_wheels": RobotKind(kinematics, drawing, BY_WHEELS)}

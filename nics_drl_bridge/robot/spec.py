@@ -401,11 +401,11 @@ def robot_from(given: str | Path | Mapping[str, Any], ranges: Ranges | None = No
 
 
 def definition(given: str | Path | Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the content of a robot's YAML file, by what `robot_from` takes."""
+    """Returns the content of a robot's YAML file, called as the file unless it says."""
     if isinstance(given, Mapping):
         return dict(given)
     path = find_config(given, "robots")
-    return parse_yaml(read_text(path), str(path))
+    return {"name": path.stem} | parse_yaml(read_text(path), str(path))
 
 
 def _of_kind(data: dict[str, Any], ranges: Ranges, source: str) -> dict[str, Any]:

@@ -78,6 +78,8 @@ def test_a_table_of_a_run_that_missed_its_bar_shows_it(tables):
         "| what | |\n|---|---|\n| rate | 4.9e5 † |\n| | x |\n"
         "\n† `parity.py` missed: rate: 4.9e5, bar 9e5\n"
     )
+    many = page(tables, state="missed", failures=["a: 1", "b: 2", "c: 3", "d: 4"]).table(table)
+    assert many.endswith("† `parity.py` missed: a: 1; b: 2; and 2 more\n")
     broken = page(tables, state="broken", result=None, error="was ended").table(table)
     assert "| rate | not measured |" in broken
     assert "† `parity.py` broken: was ended" in broken

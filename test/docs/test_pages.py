@@ -13,6 +13,7 @@ import pytest
 from typer.main import get_command
 
 from nics_drl_bridge.commands.cli import app
+from nics_drl_bridge.commands.listing import worlds
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -147,3 +148,10 @@ def test_names_are_found_and_one_that_is_not_there_is_noticed():
         resolved(names[1])
     with pytest.raises(ModuleNotFoundError):
         resolved("highfidelity.simulator.MujocoSimulator")
+
+
+def test_every_world_and_set_that_is_listed_stands_in_the_table_of_worlds():
+    page = (ROOT / "docs" / "worlds.md").read_text(encoding="utf-8")
+    table = page.partition("## The shipped ones")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE)
+    assert sorted(rows) == sorted(row["name"] for row in worlds())

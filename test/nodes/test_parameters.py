@@ -83,13 +83,12 @@ def test_a_frame_that_tf_does_not_know_is_one_short_sentence(frame):
     assert len(told) < 250
 
 
-def test_the_frames_of_map_odometry_and_robot_differ_and_a_footprint_may_be_none():
+def test_the_frame_of_the_robot_is_its_own_and_a_footprint_may_be_none():
     good = {"map_frame": "map", "odom_frame": "odom", "base_frame": "r/base", "footprint_frame": ""}
     assert not frame_fault(given(good))
-    for name in ("odom_frame", "base_frame"):
-        told = frame_fault(given(good) + given({name: "map"}))
-        assert f"{name!r} is 'map'" in told
-        assert told.endswith("they must differ; rename one.")
+    assert not frame_fault(given(good) + given({"map_frame": "odom"}))  # without localisation
+    told = frame_fault(given(good) + given({"base_frame": "odom"}))
+    assert told == "parameter 'base_frame': is 'odom', as 'odom_frame' is; they must differ."
 
 
 @pytest.mark.parametrize("name", ["simulator_node", "middleware_node", "policy_node"])

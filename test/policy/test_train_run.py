@@ -162,6 +162,23 @@ def test_a_task_of_a_team_is_refused_before_a_folder_is_begun(tmp_path, monkeypa
     assert not (tmp_path / "run").exists()
 
 
+def test_a_batch_of_more_than_a_rollout_is_refused_before_a_folder_is_begun(tmp_path, settings):
+    settings.write_text(SETTINGS.replace("batch: 64", "batch: 4096"))
+    done = nics("--settings", settings, "--out", tmp_path / "run")
+    assert done.exit_code == 2
+    assert "ppo.batch 4096: is more than the 128 transitions of a rollout" in done.output
+    assert not (tmp_path / "run").exists()
+
+
+def test_settings_that_are_refused_late_do_not_bar_the_corrected_ones(tmp_path, settings):
+    out = tmp_path / "run"
+    settings.write_text(f"{SETTINGS}imitation: {{expert: nobody, steps: 64}}\n")
+    done = nics("--settings", settings, "--out", out)
+    assert done.exit_code == 2
+    assert "nobody" in done.output
+    assert not (out / "settings.yaml").exists()
+
+
 @pytest.mark.parametrize("engine", ["lean", "sb3"])
 def test_a_training_that_diverges_says_so_and_leaves_no_broken_checkpoint(tmp_path, engine):
     (tmp_path / "settings.yaml").write_text(

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from nics_drl_bridge.config import shipped_names
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.robot.kinds import find_kind, kind_names, textbook
-from nics_drl_bridge.robot.spec import RobotSpec, load_robot, robot_from
+from nics_drl_bridge.robot.spec import RobotSpec, definition, load_robot, robot_from
 
 WHEELED = "differential_wheels"
 SLIPPING = ("ackermann", "ackermann_throttle", "free", "mecanum", "omnidirectional", "skid_steer")
@@ -123,6 +124,18 @@ def test_a_file_may_say_it_in_a_few_words_too(tmp_path):
     robot = load_robot(file)
     assert (robot.name, robot.textbook) == ("husky", "skid_steer")
     assert robot_from(str(file)) == robot
+
+
+def test_a_file_without_a_name_is_a_robot_of_the_files_name(tmp_path):
+    file = tmp_path / "husky.yaml"
+    file.write_text("kind: skid_steer\nfootprint_radius: 0.6\n")
+    assert load_robot(file).name == definition(file)["name"] == "husky"
+    assert robot_from({"kind": "skid_steer", "footprint_radius": 0.6}).name == "skid_steer"
+    shipped = [load_robot(name).name for name in shipped_names("robots")]
+    assert shipped == shipped_names("robots")
+
+
+def test_the_content_of_a_file_is_a_robot_too():
     assert robot_from(load_robot("mecanum").model_dump()) == load_robot("mecanum")
 
 

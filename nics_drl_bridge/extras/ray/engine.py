@@ -345,7 +345,7 @@ def _algorithm(settings: TrainingSettings, seed: int, done: int, runners: int) -
     scenes = {name: load_worlds(name) for name in settings.worlds}
     rng = np.random.default_rng(seed)
     env = train.make_train_env(settings, model, scenes)
-    train_algorithms.check_serves(settings, env)
+    train_algorithms.check_serves(settings, env.envs[0])
     env.seed(int(rng.integers(train.SEEDS)))
     normaliser = train_algorithms.observed(env, rng)
     spaces = env.observation_space, env.action_space

@@ -3,7 +3,7 @@
 import re
 from typing import Any
 
-from geometry_msgs.msg import Twist
+from geometry_msgs.msg import Accel, Twist
 from simulation_interfaces.msg import EntityCategory, EntityInfo, EntityState, Result, TagsFilter
 from simulation_interfaces.srv import SetEntityState
 
@@ -180,7 +180,7 @@ class EntityServices:
         if request.set_twist:
             twist = plane.twist_from_ros(asked.twist, base[2], FAILED)
         still = entity.robot < 0 and entity.motion is None
-        pushed = request.set_acceleration and asked.acceleration != type(asked.acceleration)()
+        pushed = request.set_acceleration and asked.acceleration != Accel()
         if still and (pushed or (request.set_twist and asked.twist != Twist())):
             what = "acceleration" if pushed else "twist"
             told = f"{entity.name!r} stands still and takes no {what}; leave it out."
