@@ -56,8 +56,7 @@ def _marked(
     *before, (time, stamp, number, greatest) = arrivals.marks
     if now - time < MARK_S:
         return (*before, (time, stamp, number, max(lead, greatest)))
-    oldest = now - settle_s - 2.0 * MARK_S
-    kept = (mark for mark in arrivals.marks if mark[0] >= oldest)
+    kept = (mark for mark in arrivals.marks if mark[0] >= now - settle_s - 2.0 * MARK_S)
     return (*kept, (now, stamp_ns, arrivals.count + 1, lead))
 
 

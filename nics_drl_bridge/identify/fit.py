@@ -196,8 +196,7 @@ def pruned(regression: Regression, spec: RobotSpec, alpha: Alpha = ALPHA) -> Fit
     rmse, r2 = statistics.errors_of(model, samples)
     for d in regression.moving:
         if not (inside := regression.inliers[d]).all():
-            found = statistics.errors_of(model, samples.rows(inside))
-            rmse[d], r2[d] = (each[d] for each in found)
+            rmse[d], r2[d] = (each[d] for each in statistics.errors_of(model, samples.rows(inside)))
     outliers = 1.0 - (1.0 - regression.left_out) * regression.inliers.mean(axis=1)
     return Fit(model, regression, rmse, r2, alpha, outliers, conditions)
 

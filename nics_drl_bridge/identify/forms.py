@@ -262,8 +262,7 @@ def with_dead(form: Form, drive: Drive, samples: Samples) -> Form:
 
 def with_back(form: Form, curves: tuple[InputCurve, ...]) -> Form:
     """Returns a form in which the commands of curves have gains of their own backwards."""
-    bent = {c.command for c in form.curves}
-    more = tuple(c for c in curves if c.command not in bent)
+    more = tuple(c for c in curves if c.command not in {c.command for c in form.curves})
     return replace(form, curves=form.curves + more, back=tuple(c.command for c in curves))
 
 

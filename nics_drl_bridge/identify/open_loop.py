@@ -192,8 +192,7 @@ def tracked_slopes(course: Course, calibration: Calibration, ends: Array, moved:
     """Returns derivatives (W, 3, P) of `tracked_ends`, from those of the relative poses."""
     heading = calibration.to_base(course.chosen.start)[:, 2]
     arm = geometry.rotate(np.broadcast_to(calibration.mounting[:2], (len(ends), 2)), ends[:, 2])
-    across = np.stack([-arm[:, 1], arm[:, 0]], axis=1)[:, :, None]
-    inside = moved[:, :2] + across * moved[:, 2:]
+    inside = moved[:, :2] + np.stack([-arm[:, 1], arm[:, 0]], axis=1)[:, :, None] * moved[:, 2:]
     c, s = np.cos(heading)[:, None], np.sin(heading)[:, None]
     x, y = inside[:, 0], inside[:, 1]
     return np.stack([c * x - s * y, s * x + c * y, moved[:, 2]], axis=1)

@@ -161,8 +161,7 @@ def _miss(
         for later in (0, 1):
             last = distances.shape[0] - later
             x = corner[:, :last, :, 0] + distances[later:, None]
-            bearing = np.arctan2(corner[:, :last, :, 1], x)
-            off = np.abs(bearing - true[:, later:, None]).min(axis=-1)
+            off = np.abs(np.arctan2(corner[:, :last, :, 1], x) - true[:, later:, None]).min(axis=-1)
             worst[:, :last] = np.maximum(worst[:, :last], off)
     return worst
 

@@ -255,8 +255,7 @@ class Trail:
         moved = geometry.between(before.pose, after.pose)
         off = np.abs(geometry.between(geometry.exp(mean * seconds), moved))
         span = abs(seconds)
-        allowed = LEAST + SIGMA * np.sqrt(self._walk * span) + change * span / 2.0
-        return bool((off <= allowed).all())
+        return bool((off <= LEAST + SIGMA * np.sqrt(self._walk * span) + change * span / 2.0).all())
 
 
 def _seconds(before: ReportedPose, after: ReportedPose, standing: float) -> float:

@@ -165,8 +165,7 @@ class PolicyNode(ManagedNode):
         view = self._topics.view()
         if told := resume(self._policy, self._acted_ns * S_PER_NS):
             self.get_logger().warning(told, throttle_duration_sec=5.0)
-        touched = bool(self._task.judge(view, {"goal": goal}).touched)
-        return Wish(self._asked(view, goal), touched)
+        return Wish(self._asked(view, goal), bool(self._task.judge(view, {"goal": goal}).touched))
 
     def _asked(self, view: RobotView, goal: Array) -> Array:
         try:

@@ -123,8 +123,7 @@ def _golden(graph: Any, seen: Rows, size: int, source: str) -> dict[str, Rows]:
             words = " ".join(str(error).split())[:120]
             raise PolicyError(source, "network", f"onnxruntime can't run it ({words}).") from None
 
-    turn = run if size else lambda one, state: [*run(one), state]
-    rows = policy_file.in_turn(turn, seen, start)
+    rows = policy_file.in_turn(run if size else lambda one, state: [*run(one), state], seen, start)
     if not all(np.isfinite(part).all() for part in rows):
         reason = "gives NaN or inf for ordinary observations; check scaling and weights."
         raise PolicyError(source, "network", reason)

@@ -58,8 +58,7 @@ def pace_of(model: SimulatorModel, worlds: Iterable[AnyWorld], top: float | None
         for one in members
     )
     near = min(member.goal_distance[0] for member in members)
-    speed = min(top or math.inf, top_speed(model.robot))
-    return Pace(name, near, far, speed, model.control_period)
+    return Pace(name, near, far, min(top or math.inf, top_speed(model.robot)), model.control_period)
 
 
 def top_speed(robot: RobotSpec) -> float:

@@ -150,8 +150,7 @@ def load_policy(path: str | Path) -> PolicyFile:
         file = contracts.shipped() / f"{path}{suffix}"
         if not file.is_file():
             hint = nearest(str(path), (each.stem for each in file.parent.glob(f"*{suffix}")))
-            reason = f"is neither a file nor a shipped policy; {hint}"
-            raise PolicyError(str(path), "file", reason)
+            raise PolicyError(str(path), "file", f"is neither a file nor a shipped policy; {hint}")
     source = str(file)
     try:
         size, limit = file.stat().st_size, onnx_graph.SIZE_LIMIT

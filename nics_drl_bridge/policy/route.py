@@ -52,8 +52,7 @@ def route(grid: GridMap, start: ArrayLike, goal: ArrayLike, radius: float) -> Ar
     while cells[-1] != end:
         cells.append(int(before[cells[-1]]))
     middles = coarse.cell_to_world(np.stack(np.divmod(cells[1:-1], room.shape[1]), axis=-1))
-    ways = [np.asarray(start, np.float64)[:2], *middles, np.asarray(goal, np.float64)[:2]]
-    return np.array(ways)
+    return np.array([np.asarray(start, np.float64)[:2], *middles, np.asarray(goal, np.float64)[:2]])
 
 
 def _coarse(grid: GridMap, parts: int) -> GridMap:

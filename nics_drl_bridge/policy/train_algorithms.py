@@ -93,8 +93,7 @@ class Normaliser(BaseFeaturesExtractor):
 
     def forward(self, observations: torch.Tensor) -> torch.Tensor:
         """Normalises observations (N, O)."""
-        seen = bend(observations, self.shares)
-        return torch.clamp((seen - self.mean) / self.std, -LIMIT, LIMIT)
+        return torch.clamp((bend(observations, self.shares) - self.mean) / self.std, -LIMIT, LIMIT)
 
 
 def shares_of(space: gymnasium.spaces.Box) -> NDArray[np.float32]:

@@ -130,10 +130,8 @@ def loss_of(
     gains = batch.advantages
     gains = (gains - gains.mean()) / (gains.std() + 1e-8)
     ratio = torch.exp(networks.log_probs(raw, batch.actions) - batch.log_probs)
-    bounded = ratio.clamp(1.0 - ppo.clip, 1.0 + ppo.clip)
-    policy = -torch.min(gains * ratio, gains * bounded).mean()
-    value = torch.nn.functional.mse_loss(values.squeeze(-1), batch.returns)
-    loss = policy + VALUE_WEIGHT * value
+    policy = -torch.min(gains * ratio, gains * ratio.clamp(1.0 - ppo.clip, 1.0 + ppo.clip)).mean()
+    loss = policy + VALUE_WEIGHT * torch.nn.functional.mse_loss(values.squeeze(-1), batch.returns)
     return loss - ppo.entropy * networks.entropy(raw) if ppo.entropy else loss
 
 
@@ -156,8 +154,7 @@ class Learner:
         with torch.no_grad():
             values, rewards = networks.critic(driven.seen).squeeze(-1), driven.rewards.clone()
             # What would have come after the time limits:
-            after = networks.critic(driven.final).squeeze(-1)
-            rewards.view(-1)[driven.cut] += ppo.discount * after
+            rewards.view(-1)[driven.cut] += ppo.discount * networks.critic(driven.final).squeeze(-1)
         gains = advantages_of(rewards, values, driven.done, ppo.discount, ppo.gae_lambda)
         rows = driven.seen[:-1], driven.actions, driven.log_probs, gains, gains + values[:-1]
         rollout = Transitions(*(each.flatten(0, 1) for each in rows))

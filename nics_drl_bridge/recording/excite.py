@@ -164,8 +164,7 @@ class Exploration:
 
     def _towards(self, levels: Array, length: int) -> Array:
         """Returns commands (K, T, C) that go smoothly from the present one to levels (K, C)."""
-        done = np.minimum(np.arange(1, length + 1) / self._ramp, 1.0)
-        share = (1.0 - np.cos(np.pi * done)) / 2.0
+        share = (1.0 - np.cos(np.pi * np.minimum(np.arange(1, length + 1) / self._ramp, 1.0))) / 2.0
         return np.asarray(self._command + share[None, :, None] * (levels - self._command)[:, None])
 
     def _ways_back(self, factor: Array) -> Array:

@@ -59,8 +59,7 @@ def records(data: memoryview, place: int = 0) -> Iterator[Record]:
     """Yields the records from an offset until a footer or the end; DamageError at a broken one."""
     stream = _View(data, place)
     source = cast("IO[bytes]", stream)
-    reader = StreamReader(source, skip_magic=True, emit_chunks=True, record_size_limit=None)
-    parsed = reader.records
+    parsed = StreamReader(source, skip_magic=True, emit_chunks=True, record_size_limit=None).records
     while place < len(data):
         start = place + PREFIX
         op, size = struct.unpack_from("<BQ", data, place) if start <= len(data) else (0, start)

@@ -285,8 +285,7 @@ def _degrees(t: Array, pose: Array) -> Implausible | None:
         return Implausible(reason, cause, "heading_unit: deg")
     if np.abs(heading).max() <= 2.0 * np.pi + 0.1:
         return None
-    step = np.diff(heading)
-    around = np.abs(np.abs(step) - FULL_TURN_DEG) < FULL_TURN_DEG / 10.0
+    around = np.abs(np.abs(np.diff(heading)) - FULL_TURN_DEG) < FULL_TURN_DEG / 10.0
     every = _spaced(t)
     rate = np.abs(np.diff(np.unwrap(heading, period=FULL_TURN_DEG)[every])) / np.diff(t[every])
     turns = len(rate) > 0 and np.percentile(rate, 90) > FASTEST_TURN

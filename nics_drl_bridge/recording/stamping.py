@@ -97,8 +97,7 @@ def go_on_together(parts: Iterable[TopicData]) -> bool:
     if any(ns is None or not ns.all() for ns in stamped):
         return False
     order = np.argsort(np.concatenate(received), kind="stable")
-    steps = np.abs(np.diff(np.concatenate(stamped)[order])) * S_PER_NS
-    return bool((steps < MAX_WANDER_S).all())
+    return bool((np.abs(np.diff(np.concatenate(stamped)[order])) * S_PER_NS < MAX_WANDER_S).all())
 
 
 def _clocks(

@@ -127,8 +127,7 @@ def _unseen_paths(identified: Identified) -> list[tuple[Array, Array, float]]:
     paths = []
     for n, path in enumerate(_predicted(identified, chosen)[:PATHS]):
         during = (pose.t >= chosen.start_t[n]) & (pose.t <= chosen.end_t[n])
-        apart = float(np.hypot(*(path[-1] - chosen.end[n])[:2]))
-        paths.append((pose.values[during], path, apart))
+        paths.append((pose.values[during], path, float(np.hypot(*(path[-1] - chosen.end[n])[:2]))))
     return paths
 
 

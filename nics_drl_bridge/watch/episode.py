@@ -236,8 +236,7 @@ class EpisodeSource:
 
     def unfinished(self, episodes: int) -> bool:
         """True until so many episodes have been driven and shown to their ends in every world."""
-        last = self._first + episodes - 1
-        return any(lane.seed < last or not lane.over for lane in self.lanes)
+        return any(lane.seed < self._first + episodes - 1 or not lane.over for lane in self.lanes)
 
     def _drive(self, request: Request) -> None:
         """Takes shares of the greatest speed forward, to the left, and turning left."""

@@ -104,8 +104,7 @@ class Rig:
     def heading(self, data: Any) -> float:
         """Returns the heading [rad]."""
         w, x, y, z = data.qpos[self._place + 3 : self._place + 7]
-        yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        return float(geometry.wrap_angle(yaw))
+        return float(geometry.wrap_angle(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))))
 
     def encoders(self, data: Any) -> Array:
         """(J,) positions of the joints that have encoders [rad]."""
