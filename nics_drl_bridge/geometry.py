@@ -111,8 +111,7 @@ def depths(points: Array, corners: Array) -> Array:
     crosses = above != np.roll(above, -1, axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         where = apart[..., 0] - apart[..., 1] * side[:, 0] / side[:, 1]
-    inside = (crosses & (where < 0.0)).sum(axis=1) % 2 == 1
-    return np.asarray(np.where(inside, away, -away))
+    return np.asarray(np.where((crosses & (where < 0.0)).sum(axis=1) % 2 == 1, away, -away))
 
 
 @dataclass(frozen=True)

@@ -200,8 +200,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         info["reward_terms"] = {name: v[0] for name, v in values.items()} if alone else terms
         if self.render_mode == "human":
             self.render()
-        over = bool(self.ended.all())
-        return observation.reshape(-1), reduce(add, each, 0.0), over, False, info
+        return observation.reshape(-1), reduce(add, each, 0.0), bool(self.ended.all()), False, info
 
     @halts_on_error
     def advance(

@@ -89,8 +89,8 @@ class RealtimeBackend:
             clients = self._episodes.clients if chosen.vehicle is False else []
             self._link.wait_for_peers(self._topics.expected, clients, chosen.timeout_s, ADVICE)
             # A simulator's services may be found later than its topics.
-            known = chosen.vehicle is not None
-            holds(lambda: known or not self._is_vehicle(), SERVICES_S, POLL_S)
+            if chosen.vehicle is None:
+                holds(lambda: not self._is_vehicle(), SERVICES_S, POLL_S)
         except BaseException:
             self.close()
             raise

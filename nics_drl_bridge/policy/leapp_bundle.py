@@ -31,6 +31,7 @@ GOAL = {f"goal.{name}": f"goal.{name}" for name in
 SEEN = {  # meaning of elements by kind and name; without names they are in this order
     "state/body/linear_velocity": LINEAR, "state/body/angular_velocity": ANGULAR,
     "state/body/velocity": BOTH, "command/goal/polar": GOAL, "command/goal": GOAL,
+    "command/body/pose": {"x": "goal.x", "y": "goal.y", "z": ZERO},
 }  # fmt: skip
 DONE = {  # the same of outputs
     "target/body/linear_velocity": LINEAR, "target/body/angular_velocity": ANGULAR,

@@ -241,9 +241,16 @@ def inputs_of(row):
 
 
 @pytest.mark.slow
-def test_a_bundle_of_others_becomes_a_policy_file_by_its_kinds(tmp_path):
+@pytest.mark.parametrize(
+    ("kind", "names"), [("command/goal", ["goal.x", "goal.y"]), ("command/body/pose", ["x", "y"])]
+)
+def test_a_bundle_of_others_becomes_a_policy_file_by_its_kinds(kind, names, tmp_path):
     leapp = pytest.importorskip("leapp", reason="needs the extra 'leapp'")
-    bundle, model = write_foreign(tmp_path), direct_model()
+
+    def goal(data, _):
+        data["models"]["scaling"]["inputs"][1] |= {"kind": kind, "element_names": [names]}
+
+    bundle, model = write_foreign(tmp_path, goal), direct_model()
     policy = policy_of(import_policy(bundle, model), tmp_path / "ours.onnx")
     task = policy.make_task(model)
     manager = leapp.InferenceManager(str(bundle))
