@@ -70,14 +70,20 @@ def line_of(cells: Sequence[str]) -> str:
     return "|".join(["", *(f" {cell} " if cell else " " for cell in cells), ""])
 
 
+def machine_of(entry: Mapping[str, Any]) -> str:
+    """On what a run was made, in words."""
+    machine = entry["machine"]
+    return f"{machine['cores']} shared cores ({machine['cpu']})"
+
+
 class Page:
     """The tables of one set of results."""
 
     def __init__(self, results: Mapping[str, Any]) -> None:
         self.runs: Mapping[str, Any] = results.get("runs", {})
-        cpus = Counter(entry["machine"]["cpu"] for entry in self.runs.values())
-        self.cpus = [cpu for cpu, _ in cpus.most_common()]
-        """Of the machines, that of most runs first."""
+        machines = Counter(map(machine_of, self.runs.values()))
+        self.machines = [machine for machine, _ in machines.most_common()]
+        """In words, that of most runs first."""
 
     def figure(self, match: re.Match[str], run: str) -> str:
         """One placeholder. Raises UnknownFigureError."""
@@ -101,7 +107,7 @@ class Page:
 
     def elsewhere(self, run: str) -> bool:
         """Whether a run was made on another machine than most."""
-        return bool(self.runs[run]["machine"]["cpu"] != self.cpus[0])
+        return machine_of(self.runs[run]) != self.machines[0]
 
     def marks(self, runs: set[str]) -> list[str]:
         """Signs for a cell whose runs missed a bar, were short, or made on another machine."""
@@ -140,7 +146,7 @@ class Page:
                 notes.append(f"{OF_QUICK} `{entry['script']}`: a short run")
         away = sorted({name for name in runs & set(self.runs) if self.elsewhere(name)})
         if away:
-            notes.append(f"{ELSEWHERE} on {', '.join(self.cpus[1:])}")
+            notes.append(f"{ELSEWHERE} on {', '.join(self.machines[1:])}")
         return [line for note in notes for line in ("", note)]
 
     def about(self) -> str:
@@ -148,10 +154,10 @@ class Page:
         if not self.runs:
             return "Nothing is measured yet.\n"
         entries = [self.runs[name] for name in self.runs]
-        machine = next(e["machine"] for e in entries if e["machine"]["cpu"] == self.cpus[0])
-        others = "".join(f", or on {cpu} where marked {ELSEWHERE}" for cpu in self.cpus[1:])
-        commits = {(e["commit"], e["dirty"]) for e in entries}
-        changed = " and changes" if any(dirty for _, dirty in commits) else ""
+        machine = next(e["machine"] for e in entries if machine_of(e) == self.machines[0])
+        others = "".join(f", or on {one} where marked {ELSEWHERE}" for one in self.machines[1:])
+        commits = {e["commit"] for e in entries}
+        changed = " and changes" if any(e["dirty"] for e in entries) else ""
         told = f"{len(commits)} commits" if len(commits) > 1 else f"commit {entries[0]['commit']}"
         days = sorted(e["started"][:10] for e in entries)
         loads = [e["load_before"][0] for e in entries]
@@ -159,9 +165,9 @@ class Page:
         libraries = machine.get("libraries", {})
         versions += [f"{name} {libraries[name]}" for name in VERSIONS if name in libraries]
         return (
-            f"On {machine['cores']} shared cores ({machine['cpu']}, {machine['memory_gb']:.0f} GB)"
-            f"{others}, {', '.join(versions)}; load average before "
-            f"each run {min(loads):.1f} to {max(loads):.1f}; {told}{changed}, {days[0]} to "
+            f"On {self.machines[0]} with {machine['memory_gb']:.0f} GB{others}, "
+            f"{', '.join(versions)}; load average before each run "
+            f"{min(loads):.1f} to {max(loads):.1f}; {told}{changed}, {days[0]} to "
             f"{days[-1]}, each in `benchmarks/results.json`:\n"
         )
 

@@ -4,7 +4,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from functools import wraps
 from glob import glob
 from inspect import signature
@@ -23,7 +23,6 @@ EXIT_BAD_INPUT = 2
 EXIT_INTERRUPTED = 130
 WIDEST = 10_000
 PATIENCE_S, REPEATED_S = 2.0, 10.0  # silence before the first line about work, and between lines
-DRAWING = "draw", "map_"  # commands that have no other word until they are done
 Tell = Callable[[str, int, int], None]  # what is done, how much of it, of how much (0: unknown)
 
 
@@ -115,8 +114,7 @@ def checked(command: Callable[..., Any]) -> Callable[..., Any]:
                     if other in told:
                         fix = f"does not go with {_option(name)}; leave out {_option(other)}"
                         raise ConfigError(f"{_option(other)} {fix}, or {_option(name)}.")
-            with progress_bar() if command.__name__ in DRAWING else nullcontext():
-                return command(**given)
+            return command(**given)
 
     return run
 

@@ -204,13 +204,14 @@ def draw(
 
     For a set, such as barn or a folder of files, it draws the world of the episode.
     """
-    from nics_drl_bridge.files import write_bytes
-    from nics_drl_bridge.report.pictures import world_picture
-    from nics_drl_bridge.robot.spec import load_robot
-    from nics_drl_bridge.sim.scenes import member_of
-    from nics_drl_bridge.sim.world_set import load_worlds
+    with console.progress_bar():
+        from nics_drl_bridge.files import write_bytes
+        from nics_drl_bridge.report.pictures import world_picture
+        from nics_drl_bridge.robot.spec import load_robot
+        from nics_drl_bridge.sim.scenes import member_of
+        from nics_drl_bridge.sim.world_set import load_worlds
 
-    worlds = load_worlds(name)
+        worlds = load_worlds(name)
     opened = worlds.members[member_of(worlds, seed)]
     outline = None if footprint is not None else load_robot(robot).footprint
     radius = load_robot(robot).footprint_radius if footprint is None else footprint
@@ -249,11 +250,12 @@ def map_(
     Moving obstacles are left out. `nics world map room`, then
     `ros2 run nav2_map_server map_server --ros-args -p yaml_filename:=room_map.yaml`.
     """
-    from nics_drl_bridge.lidar.maps import map_files
-    from nics_drl_bridge.robot.spec import load_robot
-    from nics_drl_bridge.sim.occupancy import occupancy, standing
-    from nics_drl_bridge.sim.scenes import SetSampler
-    from nics_drl_bridge.sim.world_set import load_worlds
+    with console.progress_bar():
+        from nics_drl_bridge.lidar.maps import map_files
+        from nics_drl_bridge.robot.spec import load_robot
+        from nics_drl_bridge.sim.occupancy import occupancy, standing
+        from nics_drl_bridge.sim.scenes import SetSampler
+        from nics_drl_bridge.sim.world_set import load_worlds
 
     if not 1e-3 <= resolution <= 100.0:
         raise ConfigError(f"--resolution {resolution:g}: must be from 0.001 to 100 m.")

@@ -34,8 +34,7 @@ def help_of(node: str) -> str:
 
 
 def _line(row: Row) -> str:
-    default = row.shown or _words(row.default)
-    return _hanging(f"    {row.name} = {default}: {row.about}", 2 * INDENT)
+    return _hanging(f"    {row.name} = {row.shown or _words(row.default)}: {row.about}", 2 * INDENT)
 
 
 def _words(value: Any) -> str:

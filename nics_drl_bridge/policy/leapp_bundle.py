@@ -320,7 +320,7 @@ def _parts(bundle: Bundle, name: str, entry: Tensor, data: Data) -> list[Data]:
         return [{"of": "scan", "divide": far.get("range_max", 1.0) if share else 1.0}]
     size = math.prod(entry.shape) if isinstance(entry.shape, list) else 0
     meanings, names = SEEN.get(kind, {}), entry.names
-    if not names and len(meanings) == size:
+    if not names and len(meanings) == size and "pose" not in kind:  # that may have a heading
         names = list(meanings)
     if not names or len(names) != size or not all(one in meanings for one in names):
         told = f"kind {entry.kind!r}" + (f" with elements {names}" if names else "")

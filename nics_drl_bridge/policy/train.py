@@ -244,17 +244,18 @@ def run(
 def _alone(out: Path) -> Iterator[None]:
     """Keeps other trainings out of the folder of a run. Raises ConfigError if one is there."""
     out.mkdir(parents=True, exist_ok=True)
-    known = (out / SETTINGS).is_file()
     try:
         with filelock.FileLock(out / LOCK, timeout=0.0):
-            yield
+            known = (out / SETTINGS).is_file()
+            try:
+                yield
+            except ConfigError:
+                if not known and not seeds_of(out):  # settings of no training bar no others
+                    (out / SETTINGS).unlink(missing_ok=True)
+                raise
     except filelock.Timeout:
         fix = "wait for its end, or choose another --out"
         raise ConfigError(f"{out}: another training is at work there; {fix}.") from None
-    except ConfigError:
-        if not known and not seeds_of(out):  # settings that no training began with bar no others
-            (out / SETTINGS).unlink(missing_ok=True)
-        raise
 
 
 def export(settings: TrainingSettings, result: SeedResult, command: str, path: Path) -> None:

@@ -114,8 +114,7 @@ class Template:
         usual = [dict(one) for one in self.state]
         for one in usual:  # it follows a command, by whatever name
             place = one.pop("cmd_vel")
-            fields = {c.get("cmd_vel"): c.get("name") for c in command}
-            one["follows"] = fields.get(place)
+            one["follows"] = {c.get("cmd_vel"): c.get("name") for c in command}.get(place)
             one["name"] = f"actual_{one['name']}" if one["name"] in taken else one["name"]
         usual += [{"name": f"body_{d}" if d in taken else d, "twist": d} for d in self.moves]
         if own is not None and not _mappings(own):

@@ -88,7 +88,7 @@ def test_a_table_of_a_run_that_missed_its_bar_shows_it(tables):
 
 def test_the_machine_the_commit_and_the_load_are_told(tables):
     told = page(tables, dirty=True).text("machine")
-    for words in ("2 shared cores (Zuse Z3, 25 GB)", "Python 3.11.7", "0123456789ab and changes"):
+    for words in ("2 shared cores (Zuse Z3) with 25 GB", "Python 3.11.7", "789ab and changes"):
         assert words in told
     assert "1.5 to 1.5" in told
     assert "measured yet" in tables.Page({}).text("machine")
@@ -99,9 +99,13 @@ def test_what_was_measured_on_another_machine_than_most_is_marked(tables):
     away = {**entry, "machine": {**ENTRY["machine"], "cpu": "Analytical Engine"}}
     found = tables.Page({"runs": {"parity": entry, "soak": entry, "shield": away}})
     table = tables.Table(("",), (("parity", "{rate|.0e}"), ("shield", "{rate|.0e}")))
-    assert found.table(table) == "| |\n|---|\n| 5e5 |\n| 5e5 § |\n\n§ on Analytical Engine\n"
-    assert "or on Analytical Engine where marked §" in found.text("machine")
+    told = "§ on 2 shared cores (Analytical Engine)\n"
+    assert found.table(table) == f"| |\n|---|\n| 5e5 |\n| 5e5 § |\n\n{told}"
+    assert "or on 2 shared cores (Analytical Engine) where marked §" in found.text("machine")
     assert "§" not in page(tables).text("machine")
+    more = {**entry, "machine": {**ENTRY["machine"], "cores": 16}}
+    found = tables.Page({"runs": {"parity": entry, "soak": entry, "shield": more}})
+    assert "§ on 16 shared cores (Zuse Z3)" in found.table(table)
 
 
 def test_every_table_is_written_whatever_there_is(tables):
