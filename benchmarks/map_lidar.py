@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from nics_drl_bridge.lidar import map_kernels
-from nics_drl_bridge.lidar.exact_kernels import Beams, LidarPose
+from nics_drl_bridge.lidar.exact_kernels import LidarPose, beams_of
 from nics_drl_bridge.lidar.maps import OCCUPIED, GridMap
 from nics_drl_bridge.lidar.scan_kernels import scan_lanes
 from nics_drl_bridge.lidar.spec import load_lidar
@@ -120,7 +120,7 @@ def measure(seed: int, control: str | None) -> dict[str, Any]:
         for lidar in LIDARS:
             spec = load_lidar(lidar)
             directions = np.ascontiguousarray(spec.directions.T)
-            beams = Beams(directions, spec.angle_min, spec.angle_increment, spec.full_circle)
+            beams = beams_of(directions, spec.angle_min, spec.angle_increment, spec.full_circle)
             at = poses(grid, seed + 1)
             arguments = (beams, at, spec.range_max, grid.arrays)
             exact, exact_speed = timed(*arguments, True, scan_lanes())

@@ -3,13 +3,14 @@
 No state is kept, so a world draws the same numbers in any batch and thread. SplitMix64 (Steele,
 Lea, Flood 2014) mixes the counters; Box-Muller makes normals. Each purpose has a stream of its own.
 
-Draws by the thousand, as for the beams of a scan, take a `key` once and `bits` for each: whole
-numbers of 32 bits and functions without branches, which LLVM vectorises.
+Draws by the thousand, as for the beams of a scan, take a `key` once: uniform draws then `bits` for
+each, normal ones a `run` for each `RUN` of them, without branches, so that LLVM vectorises them.
 """
 
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nics_drl_bridge.kernels import kernel
 
@@ -19,9 +20,9 @@ from nics_drl_bridge.kernels import kernel
     PLANNER_STREAM,
 ) = range(1, 12)  # fmt: skip
 
-# From scaled sums of four bytes to the standard normal distribution: 1.2e-4 off its shares.
-PER_STD = 1.0 / 18992.5
-N1, N3, N5, N7, N9 = 0.96324387, 7.0641293e-3, 3.1552132e-3, -6.4405445e-4, 5.5402501e-5
+GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+RUN, POOL_SIZE = 32, 2**16
+PER_STD = 1.0 / 5300.0  # so that the sum of two numbers of the pool fits 16 bits
 
 
 @kernel(allocates=True)
@@ -29,6 +30,19 @@ def _mix(z):  # type: ignore[no-untyped-def]
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return z ^ (z >> np.uint64(31))
+
+
+def _pool() -> NDArray[np.int16]:
+    """Whole numbers as often as in a normal distribution, mixed: two add up to a draw / PER_STD."""
+    most = math.ceil(3.3 / PER_STD)
+    below = [0.5 + 0.5 * math.erf((k + 0.5) * PER_STD) for k in range(-most, most)]
+    often = np.diff(np.rint(POOL_SIZE * np.array([0.0, *below, 1.0]))).astype(np.int64)
+    mixed = np.argsort(_mix.py_func(np.arange(POOL_SIZE, dtype=np.uint64)))
+    pool = np.repeat(np.arange(-most, most + 1), often)[mixed]
+    return np.concatenate([pool, pool[:RUN]]).astype(np.int16)
+
+
+POOL = _pool()
 
 
 @kernel(allocates=True)
@@ -40,15 +54,14 @@ def uniform(seed, stream, counter):  # type: ignore[no-untyped-def]
 @kernel(allocates=True)
 def source(seed, stream):  # type: ignore[no-untyped-def]
     """Returns what all draws of a seed and stream have in common, for `uniform_of`."""
-    step = np.uint64(0x9E3779B97F4A7C15)
-    z = _mix(np.uint64(seed) * step + step)
-    return _mix(z + (np.uint64(stream) + np.uint64(1)) * step)
+    z = _mix(np.uint64(seed) * GOLDEN + GOLDEN)
+    return _mix(z + (np.uint64(stream) + np.uint64(1)) * GOLDEN)
 
 
 @kernel(allocates=True)
 def uniform_of(source, counter):  # type: ignore[no-untyped-def]
     """The same draw as `uniform`."""
-    z = _mix(source + (np.uint64(counter) + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15))
+    z = _mix(source + (np.uint64(counter) + np.uint64(1)) * GOLDEN)
     return float(z >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
@@ -61,18 +74,17 @@ def normal(seed, stream, counter):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=True)
 def key(seed, stream, counter):  # type: ignore[no-untyped-def]
-    """Returns two numbers of 32 bits, the key of many draws by `bits`."""
-    step = np.uint64(0x9E3779B97F4A7C15)
-    z = _mix(source(seed, stream) + (np.uint64(counter) + np.uint64(1)) * step)
-    return np.uint32(z), np.uint32(z >> np.uint64(32))
+    """Returns 64 bits, the key of many draws."""
+    return _mix(source(seed, stream) + (np.uint64(counter) + np.uint64(1)) * GOLDEN)
 
 
 @kernel(inline=True)
 def bits(by, i):  # type: ignore[no-untyped-def]
     """Returns 32 random bits, the i-th of a key."""
-    z = np.uint32(np.uint32(i) * np.uint32(0x9E3779B9) + by[0])
+    z = np.uint32(np.uint32(i) * np.uint32(0x9E3779B9) + np.uint32(by))
     z = np.uint32((z ^ (z >> np.uint32(16))) * np.uint32(0x7FEB352D))
-    z = np.uint32((z ^ (z >> np.uint32(15)) ^ by[1]) * np.uint32(0x846CA68B))
+    other = np.uint32(by >> np.uint64(32))
+    z = np.uint32((z ^ (z >> np.uint32(15)) ^ other) * np.uint32(0x846CA68B))
     return np.uint32(z ^ (z >> np.uint32(16)))
 
 
@@ -83,21 +95,24 @@ def share_of(drawn):  # type: ignore[no-untyped-def]
     return (whole + np.float32(0.5)) * np.float32(2.0**-31)
 
 
-@kernel(contracts=True, inline=True)
-def normal_of(drawn):  # type: ignore[no-untyped-def]
-    """A draw from the standard normal distribution, float32, of 32 random bits; below 5.3.
+@kernel(inline=True)
+def run(by, k):  # type: ignore[no-untyped-def]
+    """Returns the k-th run of normal draws of a key: their signs, and two places in the pool."""
+    z = _mix(by + np.uint64(k) * GOLDEN)
+    one, two = (z >> np.uint64(32)) & np.uint64(POOL_SIZE - 1), z >> np.uint64(48)
+    return np.uint32(z), np.uintp(one), np.uintp(two)
 
-    The sum of four uniform draws, a byte each, is nearly normal; a polynomial takes it there
-    (Teichroew 1953). Two of the bytes count 129/128, so that few sums are the same.
+
+@kernel(contracts=True, inline=True)
+def normal_of(run, j):  # type: ignore[no-untyped-def]
+    """The j-th draw of a run from the standard normal distribution, float32; below 6.2.
+
+    The sum of two normal numbers, from a pool (Wallace 1996), is normal. Signs of their own leave
+    no two draws correlated.
     """
-    even = np.uint32(0xFF00FF)
-    pairs = np.uint32((drawn & even) + ((drawn >> np.uint32(8)) & even))
-    low, high = np.int32(pairs & np.uint32(0xFFFF)), np.int32(pairs >> np.uint32(16))
-    total = np.int32((low + high) * np.int32(128) + high - np.int32(65535))
-    x = np.float32(total) * np.float32(PER_STD)
-    square = x * x
-    value = np.float32(N5) + square * (np.float32(N7) + square * np.float32(N9))
-    return x * (np.float32(N1) + square * (np.float32(N3) + square * value))
+    total = np.float32(np.int16(POOL[run[1] + np.uintp(j)] + POOL[run[2] + np.uintp(j)]))
+    sign = np.int32(run[0] << np.uint32(j)) & np.int32(-(2**31))
+    return np.int32(total.view(np.int32) ^ sign).view(np.float32) * np.float32(PER_STD)
 
 
 @kernel(allocates=True)

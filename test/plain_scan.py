@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from nics_drl_bridge.kernels import kernel
+from nics_drl_bridge.lidar import exact_kernels
 from nics_drl_bridge.lidar.baked_kernels import (
     LOOKED_UP,
     beams_between,
@@ -22,7 +23,7 @@ from nics_drl_bridge.lidar.baked_kernels import (
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, LidarPose, X, Y
 
 
-@kernel
+@kernel(allocates=True)
 def scan_robot(out, pose, bodies, me, walls, lidar):  # type: ignore[no-untyped-def]
     """One scan (B,): the minimum over all bodies (K, 7) but the robot's own, and walls (Eq. 4)."""
     for i in range(out.shape[0]):
@@ -32,7 +33,8 @@ def scan_robot(out, pose, bodies, me, walls, lidar):  # type: ignore[no-untyped-
         if k != me and way_of(bodies[k], x, y, lidar) == LOOKED_UP:
             look_up(out, x, y, heading, bodies[k], lidar)
     here = LidarPose(x, y, math.cos(heading), math.sin(heading))
-    compute(out, here, bodies, me, range(bodies.shape[0]), walls, lidar)
+    found = np.zeros(11 * exact_kernels.TOGETHER)
+    compute(out, here, bodies, me, range(bodies.shape[0]), walls, lidar, found)
 
 
 @kernel(contracts=True, inline=True)

@@ -65,7 +65,8 @@ def normals(seeds, counters, count):
         for j in range(counters):
             by = random.key(i, 3, j)
             for k in range(count):
-                out[i, j, k] = random.normal_of(random.bits(by, k))
+                run = random.run(by, k // random.RUN)
+                out[i, j, k] = random.normal_of(run, k % random.RUN)
     return out
 
 
@@ -82,25 +83,25 @@ def test_normals_by_the_thousand_are_standard_normal_far_out_too():
             assert tail.sum() == pytest.approx(expected, abs=4.0 * np.sqrt(expected))
 
 
-def test_normals_of_all_bits_are_the_standard_normal_distribution_within_a_5000th():
-    byte, chance = np.arange(511), np.convolve(np.ones(256), np.ones(256)) / 256**2
-    low, high = np.meshgrid(np.minimum(byte, 255), np.minimum(byte, 255))  # of two bytes each
-    rest_low, rest_high = np.meshgrid(byte - np.minimum(byte, 255), byte - np.minimum(byte, 255))
-    bits = (low << 0) + (rest_low << 8) + (high << 16) + (rest_high << 24)
+def test_sums_of_two_numbers_of_the_pool_are_standard_normal_within_a_50000th():
+    pool = random.POOL[: random.POOL_SIZE].astype(np.int64)
+    often = np.bincount(pool - pool.min()) / random.POOL_SIZE
+    chance = np.convolve(often, often)
+    drawn = (np.arange(chance.size) + 2 * pool.min()) * random.PER_STD
+    below = np.cumsum(chance) - 0.5 * chance
+    assert np.abs(below - stats.norm.cdf(drawn)).max() < 2e-5
+    assert (chance * drawn).sum() == pytest.approx(0.0, abs=1e-4)
+    assert (chance * drawn**2).sum() == pytest.approx(1.0, abs=1e-4)
+    assert 2 * max(pool.max(), -pool.min()) < 2**15  # the sum of two
+    assert 5.0 < drawn.max() < 6.2
+    assert np.array_equal(random.POOL[-random.RUN :], random.POOL[: random.RUN])
 
-    @njit
-    def of_all(bits):
-        out = np.empty(bits.shape[0], np.float32)
-        for i in range(bits.shape[0]):
-            out[i] = random.normal_of(bits[i])
-        return out
 
-    drawn = of_all(bits.ravel().astype(np.uint32)).astype(np.float64)
-    share = np.outer(chance, chance).ravel()[order := np.argsort(drawn)]
-    below = np.cumsum(share) - 0.5 * share
-    assert np.abs(below - stats.norm.cdf(drawn[order])).max() < 2e-4
-    assert (share * drawn[order] ** 2).sum() == pytest.approx(1.0, abs=1e-3)
-    assert drawn.max() == -drawn.min() < 5.3
+@pytest.mark.slow
+def test_signs_of_draws_are_independent_of_each_other_and_of_their_sizes():
+    sample = normals(30, 60, 1056).astype(np.float64).reshape(-1, random.RUN)
+    apart = np.corrcoef(sample, rowvar=False)[np.triu_indices(random.RUN, 1)]
+    assert np.abs(apart).max() < 5.0 / np.sqrt(len(sample))
 
 
 @pytest.mark.slow

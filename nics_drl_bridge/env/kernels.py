@@ -16,6 +16,7 @@ from nics_drl_bridge.lidar.sector_kernels import SectorPlan, resample
 from nics_drl_bridge.random_kernels import episode_seed
 
 LIMIT = 1000.0  # Maximum distance [m], speed [m/s] and turn rate [rad/s] in an observation
+ONE = np.float32(1.0).view(np.int32)
 FURTHEST = np.float32(0.04)  # What a beam may say for or against a contact, at most [m]
 
 
@@ -58,20 +59,27 @@ def finite(values):  # type: ignore[no-untyped-def]
 @kernel(allocates=True)
 def look(shares, ranges, scale):  # type: ignore[no-untyped-def]
     """Writes a scan (B,) as shares (P,), 1 no return, 0 too close; True if it shows a contact."""
-    zero, one = np.float32(0.0), np.float32(1.0)
     hits = np.int32(0)
-    for b in range(ranges.shape[0]):
-        hits |= np.int32(ranges[b] < scale.leaves[b])
-    seen = ranges
     if scale.sectors > 0:
         resample(shares, ranges, scale.plan)
-        ranges = shares
-    for s in range(shares.shape[0]):
-        # A comparison with NaN (unknown) is False; -inf (too close) is below every range.
-        share = ranges[s] * scale.per_metre
-        share = share if share > zero else zero
-        shares[s] = share if share < one else one
-    return hits != 0 and contact(seen, scale)
+        for s in range(shares.shape[0]):
+            shares[s] = _share(shares[s], scale)
+        for b in range(ranges.shape[0]):
+            hits = np.int32(hits | np.int32(ranges[b] < scale.leaves[b]))
+    else:
+        for b in range(ranges.shape[0]):
+            hits = np.int32(hits | np.int32(ranges[b] < scale.leaves[b]))
+            shares[b] = _share(ranges[b], scale)
+    return hits != 0 and contact(ranges, scale)
+
+
+@kernel(inline=True)
+def _share(value, scale):  # type: ignore[no-untyped-def]
+    # A comparison with NaN (unknown) is False; -inf (too close) is below every range.
+    share = value * scale.per_metre
+    share = share if share > np.float32(0.0) else np.float32(0.0)
+    # As whole numbers, in the same order: of two limits to a float LLVM makes masks.
+    return np.int32(min(np.float32(share).view(np.int32), ONE)).view(np.float32)
 
 
 @kernel(allocates=True)

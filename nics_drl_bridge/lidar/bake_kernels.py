@@ -6,7 +6,6 @@ import numpy as np
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar import exact_kernels
-from nics_drl_bridge.lidar.exact_kernels import Beams
 
 EDGE = 1e-6  # ranges at an edge are taken this far inside it, as a share of the whole width
 
@@ -44,7 +43,7 @@ def along(angle, corners, radius, distance, cos, sin):  # type: ignore[no-untype
     """Range to a shape straight ahead in one direction [rad]; see `row`."""
     ray, out = np.empty((2, 1)), np.full(1, np.inf, np.float32)
     ray[0, 0], ray[1, 0] = math.cos(angle), math.sin(angle)
-    beams = Beams(ray, angle, 1.0, False)
+    beams = exact_kernels.beams_of(ray, angle, 1.0, False)
     if corners.shape[0] == 0:
         exact_kernels.circle(out, beams, distance, 0.0, radius, np.inf)
     else:
@@ -103,7 +102,7 @@ def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # 
         angles = (begin * phases + np.arange(points)) * (step / phases)
         directions = np.stack((np.cos(angles), np.sin(angles)))
         fine = np.empty(points, np.float32)
-        beams = Beams(directions, angles[0], step / phases, False)
+        beams = exact_kernels.beams_of(directions, angles[0], step / phases, False)
         row(fine, beams, corners, radius, distances[d], c, s, edges[d])
         into_phases(rows[start : start + points], fine, width, phases)
 
@@ -112,7 +111,7 @@ def rows_of_turn(rows, layout, shape, distances, turn, edges, step, phases):  # 
 def incidences(angles, step, corners, radius, distance, c, s):  # type: ignore[no-untyped-def]
     """Cosines (P,) of the incidence on a shape straight ahead, 0 where a ray misses it."""
     directions = np.stack((np.cos(angles), np.sin(angles)))
-    beams, count = Beams(directions, angles[0], step, False), len(angles)
+    beams, count = exact_kernels.beams_of(directions, angles[0], step, False), len(angles)
     nearest, cosines = np.full(count, np.inf, np.float32), np.zeros(count, np.float32)
     if corners.shape[0] == 0:
         exact_kernels.circle(nearest, beams, distance, 0.0, radius, np.inf)

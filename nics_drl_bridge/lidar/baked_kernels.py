@@ -73,16 +73,17 @@ def sensor_pose(pose, mount):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def compute(out, here, bodies, me, near, walls, lidar):  # type: ignore[no-untyped-def]
+def compute(out, here, bodies, me, near, walls, lidar, found):  # type: ignore[no-untyped-def]
     """Fuses walls, and of the bodies `near` those that are not looked up."""
     computed = False
     for k in near:
         if k != me and way_of(bodies[k], here.x, here.y, lidar) == COMPUTED:
             body, outlines, computed = bodies[k], lidar.outlines, True
             exact_kernels.body_into(out, lidar.beams, here, body, outlines, lidar.range_max)
-    near = exact_kernels.walls_into(out, lidar.beams, here, walls, lidar.range_max)
-    if near > 0 or computed:
+    limits = lidar.range_min, lidar.range_max
+    if computed:
         exact_kernels.finish(out, lidar.range_min, lidar.range_max)
+    exact_kernels.walls_into(out, lidar.beams, here, walls, limits, found)
 
 
 @kernel(contracts=True, inline=True)

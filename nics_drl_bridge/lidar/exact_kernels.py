@@ -23,6 +23,13 @@ ATAN = (
 )  # fmt: skip
 X, Y, HEADING, COS, SIN, RADIUS, SHAPE = range(7)
 """Columns of a placed body; the radius of an absent one is 0, `SHAPE` is an index."""
+INF, MINUS_INF = np.array([np.inf, -np.inf], np.float32).view(np.int32)
+BLOCK = 48  # Beams that meet a wall at once
+TOGETHER = 8  # Walls whose beams are found at once
+AX, AY, BX, BY, CROSS, EX, EY, FIRST, END, FIRST_AGAIN, END_AGAIN = (
+    np.uintp(k * TOGETHER) for k in range(11)
+)
+"""Of a wall: its ends; what `edge` calls so; its beams, and those beyond the seam of a circle."""
 
 
 class Beams(NamedTuple):
@@ -32,6 +39,7 @@ class Beams(NamedTuple):
     first: float  # angle of beam 0 [rad]
     step: float  # between beams [rad]
     closed: bool  # True for a full circle
+    turns: NDArray[np.float32]  # (2 BLOCK,) cosines and sines of beams from the first of a block
 
 
 class LidarPose(NamedTuple):
@@ -48,6 +56,14 @@ class OutlineArrays(NamedTuple):
 
     corners: NDArray[np.float64]  # (sum V, 2) of all outlines [m]
     first: NDArray[np.int64]  # (H + 1,) first corner of each outline; a circle has none
+
+
+@kernel(allocates=True)
+def beams_of(directions, first, step, closed):  # type: ignore[no-untyped-def]
+    """Returns the beams of directions (2, B) that are a `step` apart, from `first` on [rad]."""
+    angles = step * np.arange(BLOCK)
+    turns = np.concatenate((np.cos(angles), np.sin(angles))).astype(np.float32)
+    return Beams(directions, first, step, closed, turns)
 
 
 @kernel(inline=True)
@@ -195,28 +211,86 @@ def finish(out, range_min, range_max):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def walls_into(out, beams, lidar, walls, range_max):  # type: ignore[no-untyped-def]
-    """Fuses walls (W, 4) into a scan from a `LidarPose`; returns how many are in range."""
-    near, c, s = 0, lidar.c, lidar.s
-    for w in range(walls.shape[0]):
-        ax, ay = walls[w, 0] - lidar.x, walls[w, 1] - lidar.y
-        bx, by = walls[w, 2] - lidar.x, walls[w, 3] - lidar.y
+def walls_into(out, beams, lidar, walls, limits, found):  # type: ignore[no-untyped-def]
+    """Fuses walls (W, 4) into a scan from a `LidarPose`, as `finish` would leave them.
+
+    Limits are range_min and range_max [m]; `found` (11 TOGETHER,) is scratch memory.
+    """
+    whole = out.view(np.int32)
+    for begin in range(0, walls.shape[0], TOGETHER):
+        _find_walls(found, beams, lidar, walls, begin, limits[1], out.shape[0])
+        for j in range(min(TOGETHER, walls.shape[0] - begin)):
+            w = np.uintp(j)
+            for first, end in ((FIRST, END), (FIRST_AGAIN, END_AGAIN)):
+                if found[w + first] < found[w + end]:
+                    line = found[w + CROSS], found[w + EX], found[w + EY]
+                    _wall(whole, beams, int(found[w + first]), int(found[w + end]), line, limits)
+
+
+@kernel(inline=True)
+def _find_walls(found, beams, lidar, walls, begin, range_max, count):  # type: ignore[no-untyped-def]
+    """Finds the beams that meet some walls in range, none for the others; without branches."""
+    c, s, per_beam = lidar.c, lidar.s, 1.0 / beams.step
+    turn = TWO_PI * per_beam
+    for j in range(min(TOGETHER, walls.shape[0] - begin)):
+        for i in range(4):
+            found[np.uintp(j + i * TOGETHER)] = walls[begin + j, i]
+    for j in range(TOGETHER):  # unused ones contain old values
+        k = np.uintp(j)
+        ax, ay = found[k + AX] - lidar.x, found[k + AY] - lidar.y
+        bx, by = found[k + BX] - lidar.x, found[k + BY] - lidar.y
         ax, ay = c * ax + s * ay, c * ay - s * ax
         bx, by = c * bx + s * by, c * by - s * bx
         ex, ey = bx - ax, by - ay
         length2, cross = ex * ex + ey * ey, ax * ey - ay * ex
         chord2 = range_max * range_max * length2 - cross * cross
-        if chord2 < 0.0 or length2 == 0.0:
-            continue
         # As shares of its length: the wall is nearest at `foot`, and in range within +-`half`.
-        foot, half = -(ax * ex + ay * ey) / length2, math.sqrt(chord2) / length2 + ROUNDING
-        first, last = max(foot - half, 0.0), min(foot + half, 1.0)
-        if first <= last:
-            near += 1
-            one = arctan2(ay + first * ey, ax + first * ex)
-            other = arctan2(ay + last * ey, ax + last * ex)
-            edge(out, beams, ax, ay, one, bx, by, other, False)
-    return near
+        foot, half = -(ax * ex + ay * ey) / length2, math.sqrt(max(chord2, 0.0)) / length2
+        begins, ends = max(foot - half - ROUNDING, 0.0), min(foot + half + ROUNDING, 1.0)
+        seen = (chord2 >= 0.0) & (begins <= ends) & (cross != 0.0)
+        one = arctan2(ay + begins * ey, ax + begins * ex)
+        other = arctan2(ay + ends * ey, ax + ends * ex)
+        low, wide = one if cross > 0.0 else other, (other - one if cross > 0.0 else one - other)
+        wide += TWO_PI if wide < 0.0 else 0.0
+        low = (low - beams.first) * per_beam
+        low -= np.floor(low / turn) * turn
+        high = low + wide * per_beam
+        found[k + CROSS], found[k + EX], found[k + EY] = cross, ex, ey
+        found[k + FIRST] = np.ceil(low - ROUNDING)
+        found[k + END] = min(np.floor(high + ROUNDING) + 1.0, count) if seen else 0.0
+        found[k + FIRST_AGAIN] = max(np.ceil(low - turn - ROUNDING), 0.0)
+        found[k + END_AGAIN] = min(np.floor(high - turn + ROUNDING) + 1.0, count) if seen else 0.0
+
+
+@kernel(inline=True)
+def _wall(whole, beams, first, end, line, limits):  # type: ignore[no-untyped-def]
+    last = whole.shape[0] - BLOCK
+    if last < 0:
+        _wall_block(whole, beams, 0, whole.shape[0], first, end, line, limits)
+        return
+    for begin in range(first, end, BLOCK):
+        _wall_block(whole, beams, min(begin, last), BLOCK, begin, end, line, limits)
+
+
+@kernel(contracts=True, inline=True)
+def _wall_block(whole, beams, block, width, begin, end, line, limits):  # type: ignore[no-untyped-def]
+    """Fuses a wall into those beams of a block that are in [begin, end).
+
+    They are turned from the first one in single precision, of which a division takes half the time.
+    Ranges are whole numbers in the same order; those of a negative range are the greatest.
+    """
+    cross, ex, ey = np.float32(line[0]), line[1], line[2]
+    least, most = np.float32(limits[0]).view(np.int32), np.float32(limits[1]).view(np.uint32)
+    first, skip, hits = np.uintp(block), np.int32(block - begin), np.uint32(end - begin)
+    c, s = beams.directions[0, first], beams.directions[1, first]
+    across, along = np.float32(c * ey - s * ex), np.float32(s * ey + c * ex)
+    for k in range(width):
+        j = np.uintp(k)
+        distance = cross / (across * beams.turns[j] - along * beams.turns[j + np.uintp(BLOCK)])
+        place = np.float32(distance).view(np.int32)
+        meets = (np.uint32(skip + np.int32(k)) < hits) & (np.uint32(place) <= most)
+        place = place if meets else INF
+        whole[first + j] = min(whole[first + j], place if place >= least else MINUS_INF)
 
 
 @kernel

@@ -56,7 +56,7 @@ def distort(ranges, limits, faults, seed, counter):  # type: ignore[no-untyped-d
     elif coarse:
         for i in range(ranges.shape[0]):
             value = _closed(ranges[i], device)
-            coarser = _limited(_coarse(value, device), device)
+            coarser = _coarse(value, device)
             ranges[i] = coarser if abs(value) < np.float32(np.inf) else value
     elif device.close != -np.inf:
         _close(ranges, device.close)
@@ -72,12 +72,15 @@ def _device(limits, faults):  # type: ignore[no-untyped-def]
         close = limits[0]
     elif faults[TOO_CLOSE] == AS_MINUS_INF:
         close = -np.inf
-    per_step = 1.0 / step if step > 0.0 else 0.0
+    per_step, rest = 1.0 / step if step > 0.0 else 0.0, single(step - single(step))
+    least, most = single(limits[0]), single(limits[1])
+    first = single(math.ceil((limits[0] - ROUNDING) * per_step))
+    last = single(math.floor((limits[1] + ROUNDING) * per_step))
+    first += single(_multiple(first, single(step), rest) < least)
+    last -= single(_multiple(last, single(step), rest) > most)
     return Distortion(
-        single(limits[0]), single(limits[1]), single(close), single(faults[NOISE_STD]),
-        single(faults[NOISE_PROPORTIONAL]), single(per_step), single(step),
-        single(step - single(step)), single(math.ceil((limits[0] - ROUNDING) * per_step)),
-        single(math.floor((limits[1] + ROUNDING) * per_step)),
+        least, most, single(close), single(faults[NOISE_STD]), single(faults[NOISE_PROPORTIONAL]),
+        single(per_step), single(step), rest, first, last,
     )  # fmt: skip
 
 
@@ -97,13 +100,23 @@ def _close(ranges, close):  # type: ignore[no-untyped-def]
         whole[i] = max(whole[i], value if whole[i] == MINUS_INF else NONE)
 
 
-@kernel(allocates=True, contracts=True, inline=True)
+@kernel(allocates=True, inline=True)
 def _noise(ranges, device, by, coarse):  # type: ignore[no-untyped-def]
-    for i in range(ranges.shape[0]):
+    runs = ranges.shape[0] // random.RUN
+    for k in range(runs):
+        _noise_run(ranges, random.RUN, device, by, k, coarse)
+    _noise_run(ranges, ranges.shape[0] - runs * random.RUN, device, by, runs, coarse)
+
+
+@kernel(contracts=True, inline=True)
+def _noise_run(ranges, count, device, by, k, coarse):  # type: ignore[no-untyped-def]
+    run, begin = random.run(by, k), np.uintp(k * random.RUN)
+    for j in range(count):
+        i = begin + np.uintp(j)
         value = _closed(ranges[i], device)
-        noise = (device.std + device.grows * value) * random.normal_of(random.bits(by, i))
-        noisy = _coarse(value + noise, device) if coarse else value + noise
-        ranges[i] = _limited(noisy, device) if abs(value) < np.float32(np.inf) else value
+        noisy = value + (device.std + device.grows * value) * random.normal_of(run, j)
+        noisy = _coarse(noisy, device) if coarse else _limited(noisy, device)
+        ranges[i] = noisy if abs(value) < np.float32(np.inf) else value
 
 
 @kernel(inline=True)
@@ -113,11 +126,16 @@ def _closed(value, device):  # type: ignore[no-untyped-def]
 
 @kernel(contracts=True, inline=True)
 def _coarse(value, device):  # type: ignore[no-untyped-def]
-    """Returns the nearest multiple of the step that is within the limits, but for float32."""
+    """Returns the nearest multiple of the step that is within the limits."""
     count = np.floor(value * device.per_step + np.float32(0.5))
     count = device.first if count < device.first else count
     count = device.last if count > device.last else count
-    return count * device.step + count * device.rest  # rounded once
+    return _multiple(count, device.step, device.rest)
+
+
+@kernel(contracts=True, inline=True)
+def _multiple(count, step, rest):  # type: ignore[no-untyped-def]
+    return count * step + count * rest  # rounded once
 
 
 @kernel(inline=True)

@@ -45,12 +45,16 @@ class ScanLanes(NamedTuple):
     wide: NDArray[np.float64]
     single: NDArray[np.float32]
     whole: NDArray[np.int32]
+    walls: NDArray[np.float64]
 
 
 def scan_lanes() -> ScanLanes:
     """Allocates the memory that one thread needs to scan."""
     return ScanLanes(
-        np.zeros(20 * LANES), np.zeros(4 * LANES, np.float32), np.zeros(15 * LANES, np.int32)
+        np.zeros(20 * LANES),
+        np.zeros(4 * LANES, np.float32),
+        np.zeros(15 * LANES, np.int32),
+        np.zeros(11 * exact_kernels.TOGETHER),
     )
 
 
@@ -93,7 +97,7 @@ def scan_worlds(ranges, poses, chosen, bodies, first, fixtures, lidar, cells, la
             if computed > 0 or walls.shape[0] > 0:
                 here = LidarPose(x, y, math.cos(heading), math.sin(heading))
                 near = cells.found[: count if computed > 0 else 0]
-                baked.compute(out, here, bodies[n], me, near, walls, lidar)
+                baked.compute(out, here, bodies[n], me, near, walls, lidar, lanes.walls)
     look_up(found, ranges, lidar, lanes)
     if fixtures.squares.size > 0:
         add_maps(ranges, poses, chosen, fixtures, lidar, lanes)

@@ -15,7 +15,7 @@ from nics_drl_bridge.lidar import scan_kernels
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.baked_kernels import LidarArrays
 from nics_drl_bridge.lidar.cell_kernels import body_cells
-from nics_drl_bridge.lidar.exact_kernels import SHAPE, Beams
+from nics_drl_bridge.lidar.exact_kernels import SHAPE, beams_of
 from nics_drl_bridge.lidar.fixture_kernels import Fixtures
 from nics_drl_bridge.lidar.lookup_error import lookup_distances
 from nics_drl_bridge.lidar.maps import GridMap, stack_fixtures
@@ -73,7 +73,7 @@ class Scanner:
         spec, table = self.spec, self.table
         return LidarArrays(
             np.array(spec.mount),
-            Beams(np.ascontiguousarray(spec.directions.T), spec.angle_min, spec.angle_increment,
+            beams_of(np.ascontiguousarray(spec.directions.T), spec.angle_min, spec.angle_increment,
                   spec.full_circle),
             spec.range_min, spec.range_max, spec.sweep_time, self._looked_up(),
             table.outlines.arguments, table.arrays, self.renderer == "exact",

@@ -5,7 +5,7 @@ import pytest
 import shapely
 
 from nics_drl_bridge.lidar import map_kernels
-from nics_drl_bridge.lidar.exact_kernels import Beams, LidarPose
+from nics_drl_bridge.lidar.exact_kernels import LidarPose, beams_of
 from nics_drl_bridge.lidar.maps import NO_MAP, GridMap
 from nics_drl_bridge.lidar.scan_kernels import scan_lanes
 
@@ -25,7 +25,7 @@ def scan(kernel, grid, pose, range_max=100.0, rays=None, before=np.inf):
     out = np.full(len(rays), before, np.float32)
     c, s = np.cos(pose[2]), np.sin(pose[2])
     arrays = grid if isinstance(grid, tuple) else grid.arrays
-    beams = Beams(np.ascontiguousarray(rays.T), -np.pi, 2.0 * np.pi / len(rays), True)
+    beams = beams_of(np.ascontiguousarray(rays.T), -np.pi, 2.0 * np.pi / len(rays), True)
     lidar = LidarPose(*map(float, pose[:2]), c, s)
     map_kernels.map_into(out, beams, lidar, range_max, arrays, kernel == "exact", scan_lanes())
     return out
