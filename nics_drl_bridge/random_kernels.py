@@ -33,7 +33,7 @@ def _mix(z):  # type: ignore[no-untyped-def]
 
 
 def _pool() -> NDArray[np.int16]:
-    """Whole numbers as often as in a normal distribution, mixed: two add up to a draw / PER_STD."""
+    """Normal whole numbers, mixed; the sum of two, times PER_STD, is a draw."""
     most = math.ceil(3.3 / PER_STD)
     below = [0.5 + 0.5 * math.erf((k + 0.5) * PER_STD) for k in range(-most, most)]
     often = np.diff(np.rint(POOL_SIZE * np.array([0.0, *below, 1.0]))).astype(np.int64)
@@ -105,14 +105,14 @@ def run(by, k):  # type: ignore[no-untyped-def]
 
 @kernel(contracts=True, inline=True)
 def normal_of(run, j):  # type: ignore[no-untyped-def]
-    """The j-th draw of a run from the standard normal distribution, float32; below 6.2.
+    """The j-th draw of a run, times PER_STD standard normal, float32; below 6.2 / PER_STD.
 
     The sum of two normal numbers, from a pool (Wallace 1996), is normal. Signs of their own leave
     no two draws correlated.
     """
     total = np.float32(np.int16(POOL[run[1] + np.uintp(j)] + POOL[run[2] + np.uintp(j)]))
     sign = np.int32(run[0] << np.uint32(j)) & np.int32(-(2**31))
-    return np.int32(total.view(np.int32) ^ sign).view(np.float32) * np.float32(PER_STD)
+    return np.int32(total.view(np.int32) ^ sign).view(np.float32)
 
 
 @kernel(allocates=True)

@@ -66,7 +66,7 @@ def normals(seeds, counters, count):
             by = random.key(i, 3, j)
             for k in range(count):
                 run = random.run(by, k // random.RUN)
-                out[i, j, k] = random.normal_of(run, k % random.RUN)
+                out[i, j, k] = random.normal_of(run, k % random.RUN) * random.PER_STD
     return out
 
 

@@ -17,6 +17,7 @@ from nics_drl_bridge.random_kernels import episode_seed
 
 LIMIT = 1000.0  # Maximum distance [m], speed [m/s] and turn rate [rad/s] in an observation
 ONE = np.float32(1.0).view(np.int32)
+BLOCK = 64  # Beams that are looked at together
 FURTHEST = np.float32(0.04)  # What a beam may say for or against a contact, at most [m]
 
 
@@ -59,17 +60,15 @@ def finite(values):  # type: ignore[no-untyped-def]
 @kernel(allocates=True)
 def look(shares, ranges, scale):  # type: ignore[no-untyped-def]
     """Writes a scan (B,) as shares (P,), 1 no return, 0 too close; True if it shows a contact."""
-    hits = np.int32(0)
     if scale.sectors > 0:
         resample(shares, ranges, scale.plan)
         for s in range(shares.shape[0]):
             shares[s] = _share(shares[s], scale)
-        for b in range(ranges.shape[0]):
-            hits = np.int32(hits | np.int32(ranges[b] < scale.leaves[b]))
-    else:
-        for b in range(ranges.shape[0]):
-            hits = np.int32(hits | np.int32(ranges[b] < scale.leaves[b]))
-            shares[b] = _share(ranges[b], scale)
+        return contact(ranges, scale)
+    hits = np.int32(0)
+    for b in range(ranges.shape[0]):
+        hits = np.int32(hits | np.int32(ranges[b] < scale.leaves[b]))
+        shares[b] = _share(ranges[b], scale)
     return hits != 0 and contact(ranges, scale)
 
 
@@ -88,16 +87,25 @@ def contact(ranges, scale):  # type: ignore[no-untyped-def]
 
     A beam alone may do so by its noise: of hundreds one nearly always errs by three deviations.
     """
-    for b in range(ranges.shape[0]):
-        if ranges[b] < scale.leaves[b]:
-            gap = np.float32(0.0)
-            for k in range(max(b - scale.beside, 0), min(b + scale.beside + 1, ranges.shape[0])):
-                beyond = ranges[k] - scale.leaves[k]
-                if beyond == beyond:  # else unknown
-                    gap += min(max(beyond, -FURTHEST), FURTHEST)
-            if gap < np.float32(0.0):
+    count = ranges.shape[0]
+    for begin in range(0, count, BLOCK):
+        end, hits = min(begin + BLOCK, count), np.int32(0)
+        for b in range(begin, end):
+            hits = np.int32(hits | np.int32(ranges[b] < scale.leaves[b]))
+        for b in range(begin, end if hits != 0 else begin):
+            if ranges[b] < scale.leaves[b] and _gap(b, ranges, scale) < np.float32(0.0):
                 return True
     return False
+
+
+@kernel(inline=True)
+def _gap(b, ranges, scale):  # type: ignore[no-untyped-def]
+    gap = np.float32(0.0)
+    for k in range(max(b - scale.beside, 0), min(b + scale.beside + 1, ranges.shape[0])):
+        beyond = ranges[k] - scale.leaves[k]
+        if beyond == beyond:  # else unknown
+            gap += min(max(beyond, -FURTHEST), FURTHEST)
+    return gap
 
 
 @kernel(allocates=True)

@@ -231,7 +231,7 @@ def walls_into(out, beams, lidar, walls, limits, found):  # type: ignore[no-unty
 def _find_walls(found, beams, lidar, walls, begin, range_max, count):  # type: ignore[no-untyped-def]
     """Finds the beams that meet some walls in range, none for the others; without branches."""
     c, s, per_beam = lidar.c, lidar.s, 1.0 / beams.step
-    turn = TWO_PI * per_beam
+    turn, per_turn = TWO_PI * per_beam, beams.step / TWO_PI
     for j in range(min(TOGETHER, walls.shape[0] - begin)):
         for i in range(4):
             found[np.uintp(j + i * TOGETHER)] = walls[begin + j, i]
@@ -243,9 +243,9 @@ def _find_walls(found, beams, lidar, walls, begin, range_max, count):  # type: i
         bx, by = c * bx + s * by, c * by - s * bx
         ex, ey = bx - ax, by - ay
         length2, cross = ex * ex + ey * ey, ax * ey - ay * ex
-        chord2 = range_max * range_max * length2 - cross * cross
+        chord2, share = range_max * range_max * length2 - cross * cross, 1.0 / length2
         # As shares of its length: the wall is nearest at `foot`, and in range within +-`half`.
-        foot, half = -(ax * ex + ay * ey) / length2, math.sqrt(max(chord2, 0.0)) / length2
+        foot, half = -(ax * ex + ay * ey) * share, math.sqrt(max(chord2, 0.0)) * share
         begins, ends = max(foot - half - ROUNDING, 0.0), min(foot + half + ROUNDING, 1.0)
         seen = (chord2 >= 0.0) & (begins <= ends) & (cross != 0.0)
         one = arctan2(ay + begins * ey, ax + begins * ex)
@@ -253,7 +253,7 @@ def _find_walls(found, beams, lidar, walls, begin, range_max, count):  # type: i
         low, wide = one if cross > 0.0 else other, (other - one if cross > 0.0 else one - other)
         wide += TWO_PI if wide < 0.0 else 0.0
         low = (low - beams.first) * per_beam
-        low -= np.floor(low / turn) * turn
+        low -= np.floor(low * per_turn) * turn
         high = low + wide * per_beam
         found[k + CROSS], found[k + EX], found[k + EY] = cross, ex, ey
         found[k + FIRST] = np.ceil(low - ROUNDING)

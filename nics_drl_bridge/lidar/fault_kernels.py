@@ -30,8 +30,8 @@ class Distortion(NamedTuple):
     least: np.float32  # [m]
     most: np.float32
     close: np.float32  # value for what is too close
-    std: np.float32  # [m]
-    grows: np.float32  # [1]
+    std: np.float32  # of a range of 0, for a draw of 1 [m]
+    grows: np.float32  # with the range [1]
     per_step: np.float32  # 1 / step of the quantisation [1/m]
     step: np.float32  # [m]
     rest: np.float32  # of the step, beyond float32
@@ -79,8 +79,9 @@ def _device(limits, faults):  # type: ignore[no-untyped-def]
     first += single(_multiple(first, single(step), rest) < least)
     last -= single(_multiple(last, single(step), rest) > most)
     return Distortion(
-        least, most, single(close), single(faults[NOISE_STD]), single(faults[NOISE_PROPORTIONAL]),
-        single(per_step), single(step), rest, first, last,
+        least, most, single(close), single(faults[NOISE_STD] * random.PER_STD),
+        single(faults[NOISE_PROPORTIONAL] * random.PER_STD), single(per_step), single(step), rest,
+        first, last,
     )  # fmt: skip
 
 
@@ -116,7 +117,7 @@ def _noise_run(ranges, count, device, by, k, coarse):  # type: ignore[no-untyped
         value = _closed(ranges[i], device)
         noisy = value + (device.std + device.grows * value) * random.normal_of(run, j)
         noisy = _coarse(noisy, device) if coarse else _limited(noisy, device)
-        ranges[i] = noisy if abs(value) < np.float32(np.inf) else value
+        ranges[i] = noisy if np.float32(value).view(np.uint32) < np.uint32(INF) else value  # finite
 
 
 @kernel(inline=True)
