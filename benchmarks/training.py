@@ -3,7 +3,8 @@
 Trains a shipped robot among ten random obstacles with the shipped settings, then drives unseen
 episodes there. Wall time counts from the first random weight to the last evaluated episode; the
 kernels are compiled before. Of several seeds, `--json` gives the one with the least success, and
-the longest time, the greatest share and the lowest speed of all.
+the longest time, the greatest share and the lowest speed of all. `--lidar` learns and drives with
+another than the robot's, as `rplidar_a2`, by the same bars.
 """
 
 from __future__ import annotations
@@ -139,11 +140,13 @@ def main() -> None:
     """Prints a table, or one JSON object."""
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--robot", choices=sorted(BARS), default="differential")
+    parser.add_argument("--lidar", help="instead of the robot's own, a shipped one or a file")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--seeds", type=int, nargs="+", help="several seeds instead of one")
     parser.add_argument("--episodes", type=int, default=500)
     given = parser.parse_args()
     settings = load_training(f"navigation_{given.robot}")
+    settings = settings.model_copy(update={"lidar": given.lidar})
     if given.control == "untrained":
         settings = untrained(settings)
     else:

@@ -81,15 +81,13 @@ RUNS: dict[str, Run] = {
     "standards": row("standards", "", "--parts leapp", HOUR),
     "table2_lidar": row("table2_lidar", "", "--scans 512 --repeats 5"),
     "table3_density": row("table3_density", "", "--scans 256"),
-    "training_differential": row(
-        "training", "--robot differential --seeds 0 1 2", "--robot differential --episodes 50"
-    ),
-    "training_ackermann": row(
-        "training", "--robot ackermann --seeds 0 1 2", "--robot ackermann --episodes 50"
-    ),
-    "training_mecanum": row(
-        "training", "--robot mecanum --seeds 0 1 2", "--robot mecanum --episodes 50"
-    ),
+    **{
+        f"training_{robot}{name}": row(
+            "training", f"--robot {robot}{lidar} --seeds 0 1 2", f"--robot {robot} --episodes 50"
+        )
+        for name, lidar in (("", ""), ("_rplidar", " --lidar rplidar_a2"))
+        for robot in ("differential", "ackermann", "mecanum")
+    },
     **{
         f"robustness_{robot}": row(
             "robustness",

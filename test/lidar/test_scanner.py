@@ -230,6 +230,33 @@ def test_a_scan_in_a_batch_is_the_scan_alone_to_the_bit(renderer):
     assert np.array_equal(into, batch)
 
 
+def cross(a, b):
+    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
+
+
+@pytest.mark.parametrize("view", [4.0, 2.0 * np.pi])
+@pytest.mark.parametrize("beams", [1, 7, 47, 48, 49, 720, 1081])
+def test_any_number_of_walls_is_met_by_any_number_of_beams(beams, view):
+    spec = lidar(beams=beams, angle_min=-0.5 * view, angle_max=0.5 * view, range_max=6.0)
+    scanner, rng = make_scanner(spec, ()), np.random.default_rng(beams)
+    for count in (1, 7, 8, 9, 20):
+        robot, walls = rng.uniform(-1.0, 1.0, 3), rng.uniform(-5.0, 5.0, (count, 4))
+        seen = scanner.scan(robot, np.zeros((1, 0, 3)), walls)[0]
+        angles = spec.angles + robot[2]
+        ahead = np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None]
+        start, along = walls[:, :2] - robot[:2], walls[:, 2:] - walls[:, :2]
+        across = cross(ahead, along)
+        share, expected = cross(start, ahead) / across, cross(start, along) / across
+        expected[(share < 0.0) | (share > 1.0) | (expected < 0.0)] = np.inf
+        expected = expected.min(axis=1)
+        doubtful = (np.abs(share) < 1e-5) | (np.abs(share - 1.0) < 1e-5)
+        sure = ~doubtful.any(axis=1) & (np.abs(expected - spec.range_max) > 1e-5)
+        expected[expected > spec.range_max] = np.inf
+        expected[expected < spec.range_min] = -np.inf
+        assert np.allclose(seen[sure], expected[sure], rtol=1e-5, atol=0.0)
+        assert sure.mean() > 0.9 or beams < 50
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("beams", [7, 20, 40, 720])
 def test_a_world_of_more_bodies_than_lanes_is_the_minimum_of_its_parts_to_the_bit(beams):
