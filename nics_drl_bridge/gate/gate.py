@@ -8,16 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nics_drl_bridge.gate import frozen, inputs, limits, shield, stops
-from nics_drl_bridge.gate.state import (
-    Arrivals,
-    Cause,
-    Decision,
-    GateConfig,
-    GateState,
-    Motion,
-    SensorState,
-    replace,
-)  # fmt: skip
+from nics_drl_bridge.gate import state as records
+from nics_drl_bridge.gate.state import Arrivals, Cause, GateConfig, GateState, Motion, replace
 from nics_drl_bridge.gate.stops import ODOM, SCAN, settled
 from nics_drl_bridge.geometry import between
 from nics_drl_bridge.interface import S_PER_NS, Array
@@ -34,7 +26,7 @@ Check = Callable[[GateConfig, GateState, inputs.Arm, float], str]  # what is wro
 
 def decide(
     config: GateConfig, state: GateState, given: inputs.Input, now: float
-) -> tuple[GateState, Decision]:
+) -> tuple[GateState, records.Decision]:
     """Decides on an input at a steady time [s]; returns the state after it, and the decision."""
     # Only a tick publishes a motion; a stop is published at the input that causes it, and at every
     # tick while it lasts. A stop is an immediate zero: limits of rate and jerk apply to motion.
@@ -69,7 +61,7 @@ def decide(
             )  # fmt: skip
             state, shielded = frozen.watch_motion(config, state, now), motion.shielded
     twist = config.cmd_vel(state.value)
-    return state, Decision(twist, publish, cause, refused, answer, granted, shielded)
+    return state, records.Decision(twist, publish, cause, refused, answer, granted, shielded)
 
 
 def _serve(
@@ -263,7 +255,7 @@ def _take_reading(
         config, state.sensors[place].arrivals, reading.stamp_ns, now, config.scan_age_s, state.armed
     )
     points = state.sensors[place].points if fault else reading.points
-    state = replace(state, sensors=(*before, SensorState(arrivals, points), *after))
+    state = replace(state, sensors=(*before, records.SensorState(arrivals, points), *after))
     if fault:
         jumped = reading.name if fault == "jumped" else ""
         return replace(state, jumped=jumped), f"{reading.name}: its stamp {fault}"
