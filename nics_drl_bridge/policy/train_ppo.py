@@ -20,15 +20,9 @@ from numpy.typing import NDArray
 from stable_baselines3.common.logger import Logger
 
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.policy import train_algorithms, train_imitation
+from nics_drl_bridge.policy import train_algorithms, train_imitation, train_kernels
 from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch
-from nics_drl_bridge.policy.train_kernels import (
-    LOG_NORM,
-    Batch,
-    Net,
-    actor_gradients,
-    critic_gradients,
-)
+from nics_drl_bridge.policy.train_kernels import LOG_NORM, Batch, Net
 from nics_drl_bridge.policy.train_memory import memory_of
 from nics_drl_bridge.policy.train_mirror import Reflection
 from nics_drl_bridge.policy.train_rollout import Driven, Transitions
@@ -183,8 +177,8 @@ class Learner:
         own = spread.detach().numpy(), spread.grad.numpy()
         bounds = np.float32(self.ppo.clip), np.float32(self.ppo.entropy)
         jobs: list[Callable[[], Any]] = [
-            partial(actor_gradients, actor, given, *own, *bounds),
-            partial(critic_gradients, critic, given, np.float32(VALUE_WEIGHT)),
+            partial(train_kernels.actor_gradients, actor, given, *own, *bounds),
+            partial(train_kernels.critic_gradients, critic, given, np.float32(VALUE_WEIGHT)),
         ]
         free = self.core_is_free.is_set()
         return torch.tensor(

@@ -18,15 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array, Bicycle
-from nics_drl_bridge.robot.spec import (
-    CMD_VEL_FIELDS,
-    POSE_RATES,
-    CmdVelField,
-    RobotSpec,
-    StateVariable,
-    find_kind,
-    kind_names,
-)
+from nics_drl_bridge.robot import spec as specs
+from nics_drl_bridge.robot.spec import CMD_VEL_FIELDS, POSE_RATES, RobotSpec, StateVariable
 from nics_drl_bridge.robot.template import Template
 
 BEYOND = 0.01  # share of a limit by which rounded figures may lie beyond it
@@ -161,7 +154,7 @@ def actuated(spec: RobotSpec) -> Textbook:
 
 def has_textbook(spec: RobotSpec) -> bool:
     """True if a robot's textbook kinematics are known, but maybe for a parameter."""
-    return getattr(find_kind(spec.textbook or ""), "kinematics", None) is not None
+    return getattr(specs.find_kind(spec.textbook or ""), "kinematics", None) is not None
 
 
 def _through_lags(spec: RobotSpec, book: Textbook) -> Textbook:
@@ -191,9 +184,9 @@ def drawing(spec: RobotSpec) -> Drawing:
 
 
 def _made(spec: RobotSpec, make: Callable[[RobotKind], T]) -> T:
-    robot, kind = f"robot {spec.name!r}", find_kind(require_textbook(spec))
+    robot, kind = f"robot {spec.name!r}", specs.find_kind(require_textbook(spec))
     if kind is None:
-        known = ", ".join(kind_names())
+        known = ", ".join(specs.kind_names())
         raise ConfigError(f"{robot}: `textbook:` must be one of {known}, not {spec.textbook!r}.")
     try:
         return make(kind)
@@ -283,7 +276,7 @@ def commands_twist(spec: RobotSpec) -> bool:
 
 def slips(spec: RobotSpec) -> bool:
     """True if a robot's kind moves otherwise than the twist that is commanded."""
-    return bool(getattr(find_kind(spec.textbook or ""), "slips", False))
+    return bool(getattr(specs.find_kind(spec.textbook or ""), "slips", False))
 
 
 def steered(
@@ -351,7 +344,7 @@ def _own_state(spec: RobotSpec) -> bool:
 
 
 def _commands(
-    spec: RobotSpec, fields: tuple[CmdVelField, ...], names: tuple[str, ...], count: int
+    spec: RobotSpec, fields: tuple[specs.CmdVelField, ...], names: tuple[str, ...], count: int
 ) -> list[int]:
     have = [c.cmd_vel for c in spec.command]
     if not any(have):
