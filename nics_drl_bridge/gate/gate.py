@@ -14,6 +14,7 @@ from nics_drl_bridge.gate.stops import ODOM, SCAN, settled
 from nics_drl_bridge.geometry import between
 from nics_drl_bridge.interface import S_PER_NS, Array
 
+Taken = tuple[GateState, str]  # and the reason why an input is not taken, or ""
 GREATEST_SPEED = 100.0  # greatest speed that the odometry of a mobile robot can show [m/s, rad/s]
 SLIP, SLIP_SPEED, SLIP_TURN = 2.0, 0.5, 1.0
 """A robot may exceed its limits by this factor, downhill or pushed, plus [m/s] and [rad/s]."""
@@ -165,9 +166,7 @@ REFUSALS: tuple[tuple[type, Callable[[GateConfig, Any], str]], ...] = (
 """By the type of the input, in order: what is wrong with it; empty if nothing is."""
 
 
-def take(
-    config: GateConfig, state: GateState, given: inputs.Input, now: float
-) -> tuple[GateState, str]:
+def take(config: GateConfig, state: GateState, given: inputs.Input, now: float) -> Taken:
     """Takes an input into the state, or returns the reason why not."""
     state = replace(state, jumped="", leap="")
     for kind, judge in REFUSALS:
@@ -208,9 +207,7 @@ def _take_command(state: GateState, command: inputs.Command, now: float) -> Gate
     )  # fmt: skip
 
 
-def _take_scan(
-    config: GateConfig, state: GateState, scan: inputs.Scan, now: float
-) -> tuple[GateState, str]:
+def _take_scan(config: GateConfig, state: GateState, scan: inputs.Scan, now: float) -> Taken:
     arrivals, fault = stops.arrived(
         config, state.scans, scan.stamp_ns, now, config.scan_age_s, state.armed
     )
@@ -232,7 +229,7 @@ def _take_scan(
 
 def _take_odometry(
     config: GateConfig, state: GateState, odometry: inputs.Odometry, now: float
-) -> tuple[GateState, str]:
+) -> Taken:
     arrivals, fault = stops.arrived(
         config, state.odometries, odometry.stamp_ns, now, config.odom_age_s, state.armed
     )
@@ -248,7 +245,7 @@ def _take_odometry(
 
 def _take_reading(
     config: GateConfig, state: GateState, reading: inputs.SensorReading, now: float
-) -> tuple[GateState, str]:
+) -> Taken:
     place = config.sensors.index(reading.name)
     before, after = state.sensors[:place], state.sensors[place + 1 :]
     arrivals, fault = stops.arrived(
