@@ -181,9 +181,8 @@ class Learner:
             partial(train_kernels.critic_gradients, critic, given, np.float32(VALUE_WEIGHT)),
         ]
         free = self.core_is_free.is_set()
-        return torch.tensor(
-            sum(run_parts(lambda job: job(), jobs) if free else (j() for j in jobs))
-        )
+        losses = run_parts(lambda job: job(), jobs) if free else [job() for job in jobs]
+        return torch.tensor(sum(losses))
 
     def _through_time(
         self, batch: Transitions, state: torch.Tensor, done: torch.Tensor
@@ -306,9 +305,8 @@ class LeanPpo:
 
     def _advance(self, rollout: Driven, watch: Watch) -> float:
         """Learns from a rollout, with the next one collected meanwhile."""
-        rate = self._ppo.learning_rate * max(
-            1.0 - self.steps / self._total, train_algorithms.LEAST_RATE
-        )
+        left = 1.0 - self.steps / self._total
+        rate = self._ppo.learning_rate * max(left, train_algorithms.LEAST_RATE)
         self.steps += self._ppo.rollout * self.collector.env.num_envs
         self.collector.networks.load_state_dict(self.networks.state_dict())
         self.learner.core_is_free.clear()
