@@ -91,8 +91,7 @@ def guess_pose(tables: Sequence[TableSurvey]) -> Guess | None:
 
 def _trust(pose: Guess) -> int:
     words = {*words_of(f"{pose.table.name} {pose.keys['x']}")}
-    trusted = 2 * bool(words & TRACKERS) - 2 * bool(words & MEASURING)
-    return trusted + ("quaternion" in pose.keys)
+    return 2 * bool(words & TRACKERS) - 2 * bool(words & MEASURING) + ("quaternion" in pose.keys)
 
 
 def _turned(
