@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array, Bicycle
 from nics_drl_bridge.robot import spec as specs
-from nics_drl_bridge.robot.spec import CMD_VEL_FIELDS, POSE_RATES, RobotSpec, StateVariable
+from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec, StateVariable, find_kind, kind_names
 from nics_drl_bridge.robot.template import Template
 
 BEYOND = 0.01  # share of a limit by which rounded figures may lie beyond it
@@ -154,7 +154,7 @@ def actuated(spec: RobotSpec) -> Textbook:
 
 def has_textbook(spec: RobotSpec) -> bool:
     """True if a robot's textbook kinematics are known, but maybe for a parameter."""
-    return getattr(specs.find_kind(spec.textbook or ""), "kinematics", None) is not None
+    return getattr(find_kind(spec.textbook or ""), "kinematics", None) is not None
 
 
 def _through_lags(spec: RobotSpec, book: Textbook) -> Textbook:
@@ -184,9 +184,9 @@ def drawing(spec: RobotSpec) -> Drawing:
 
 
 def _made(spec: RobotSpec, make: Callable[[RobotKind], T]) -> T:
-    robot, kind = f"robot {spec.name!r}", specs.find_kind(require_textbook(spec))
+    robot, kind = f"robot {spec.name!r}", find_kind(require_textbook(spec))
     if kind is None:
-        known = ", ".join(specs.kind_names())
+        known = ", ".join(kind_names())
         raise ConfigError(f"{robot}: `textbook:` must be one of {known}, not {spec.textbook!r}.")
     try:
         return make(kind)
@@ -276,7 +276,7 @@ def commands_twist(spec: RobotSpec) -> bool:
 
 def slips(spec: RobotSpec) -> bool:
     """True if a robot's kind moves otherwise than the twist that is commanded."""
-    return bool(getattr(specs.find_kind(spec.textbook or ""), "slips", False))
+    return bool(getattr(find_kind(spec.textbook or ""), "slips", False))
 
 
 def steered(
@@ -322,7 +322,7 @@ def wheeled(
         needed = f"have {len(inverse)} wheels as state, not {len(spec.state)} variables"
         raise _unfit(spec, f"{needed}; correct `state:`.")
     dofs = [POSE_RATES.index(dof) for dof in moves]
-    fields = tuple(CMD_VEL_FIELDS[dof] for dof in dofs)
+    fields = tuple(specs.CMD_VEL_FIELDS[dof] for dof in dofs)
     by_wheels = all(c.unit == "rad/s" and c.cmd_vel is None for c in spec.command)
     into = np.eye(len(inverse)) if by_wheels else inverse
     command = _commands(spec, fields, wheels if by_wheels else (), into.shape[1])
