@@ -76,12 +76,10 @@ class SimulatorModel:
         """The content of `model.yaml`."""
         # The kinematics hold what motors do, of which an identification's calibration has a copy.
         calibration = {k: v for k, v in asdict(self.calibration).items() if k not in MOTORS}
+        kinematics = self.kinematics.named.model_dump(exclude_none=True, exclude_defaults=True)
         data = {
             "format": FORMAT, "control_period": self.control_period,
-            "robot": self.robot.model_dump(mode="json"),
-            "kinematics": self.kinematics.named.model_dump(
-                exclude_none=True, exclude_defaults=True
-            ),
+            "robot": self.robot.model_dump(mode="json"), "kinematics": kinematics,
             "calibration": calibration, "lidar": self.lidar.model_dump(mode="json"),
             "noise": self.noise.model_dump(mode="json"),
         }  # fmt: skip

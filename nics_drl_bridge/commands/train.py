@@ -79,10 +79,8 @@ def train(
 
 def _plain(result: Any) -> dict[str, Any]:
     worlds = {world: asdict(summary) for world, summary in result.summaries.items()}
-    trained = result.trained
-    return {
-        "seed": result.seed, "steps": trained.steps, "seconds": trained.wall_s, "worlds": worlds,
-    }  # fmt: skip
+    run = result.trained
+    return {"seed": result.seed, "steps": run.steps, "seconds": run.wall_s, "worlds": worlds}
 
 
 def _told(task: str, settings: str | None, named: dict[str, Any]) -> Any:

@@ -15,7 +15,7 @@ from nics_drl_bridge.env.guard import give, halts_on_error
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.sim_backend import completed, make_backend
 from nics_drl_bridge.env.snapshot import Snapshot, gate_of, goals_of
-from nics_drl_bridge.env.task import Episodes, Memory, Task, still, team_space
+from nics_drl_bridge.env.task import Episodes, Memory, Observation, Task, still, team_space
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.interface import Array, Backend, RobotView, Start
@@ -188,9 +188,7 @@ class BridgeEnv(gymnasium.Env[NDArray[np.float32], NDArray[Any]]):
         self._rehearsed = True
 
     @halts_on_error
-    def step(
-        self, action: NDArray[Any]
-    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+    def step(self, action: NDArray[Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Applies an action for one control period; see Gymnasium."""
         observation, terms, info = self.advance(action)
         values = {name: term.tolist() for name, term in terms.items()}

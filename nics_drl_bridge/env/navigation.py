@@ -119,21 +119,19 @@ class Navigation(Task):
         """Sine of the bearing, velocity to the left and turn rate change their signs."""
         return mirror_of(self, [1, 1, -1, 1, -1, -1])
 
-    def _see(
-        self, out: Observation, before: Array, view: RobotView, memory: Memory
-    ) -> GoalProgress:
-        lead = view.pose.shape[:-1]
+    def _see(self, out: Observation, before: Array, now: RobotView, memory: Memory) -> GoalProgress:
+        lead = now.pose.shape[:-1]
         approach, flags, own = np.empty(lead), np.empty((*lead, 3), np.bool_), out
         if self.sensors:
             own = np.empty((*lead, self.scan_parts + 6), np.float32)
         kernels.navigate(
             own.reshape(-1, own.shape[-1]), approach.reshape(-1), flags.reshape(-1, 3),
-            before.reshape(-1, 3), view.pose.reshape(-1, 3), view.twist.reshape(-1, 3),
-            view.ranges.reshape(-1, view.ranges.shape[-1]), memory["goal"].reshape(-1, 2),
+            before.reshape(-1, 3), now.pose.reshape(-1, 3), now.twist.reshape(-1, 3),
+            now.ranges.reshape(-1, now.ranges.shape[-1]), memory["goal"].reshape(-1, 2),
             self.scale, self.goal_radius,
         )  # fmt: skip
         if self.sensors:
-            np.concatenate([own, self.sensor_shares(view)], axis=-1, out=out)
+            np.concatenate([own, self.sensor_shares(now)], axis=-1, out=out)
         return GoalProgress(approach, flags[..., 0], flags[..., 1], flags[..., 2])
 
     def _terms(self, progress: GoalProgress) -> dict[str, Array]:

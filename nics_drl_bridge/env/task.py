@@ -206,12 +206,11 @@ class Task(ABC):
         memory = self.reset(episodes)
         if not isinstance(memory, dict) or not memory.keys() >= set(self.shown):
             raise self._wrong("reset", f"must give a dictionary of arrays, with {[*self.shown]}")
+        lead = episodes.starts.shape[:2]
         for name, rows in memory.items():
-            self._leads(f"memory {name!r}", rows, episodes.starts.shape[:1])
+            self._leads(f"memory {name!r}", rows, lead[:1])
         for name in self.shown:
-            self._leads(
-                f"memory {name!r}, which is shown,", memory[name], episodes.starts.shape[:2]
-            )
+            self._leads(f"memory {name!r}, which is shown,", memory[name], lead)
         return memory
 
     def _leads(self, what: str, given: Any, lead: tuple[int, ...]) -> None:

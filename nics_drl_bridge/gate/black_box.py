@@ -122,8 +122,7 @@ def replay(path: str | Path) -> Replay:
 
 
 def _damaged(path: str | Path, error: Exception) -> ConfigError:
-    reason = shortened(f"{error}", 120)
-    return ConfigError(f"{path}: is damaged ({reason}); it can't be replayed.")
+    return ConfigError(f"{path}: is damaged ({shortened(str(error), 120)}); it can't be replayed.")
 
 
 def _check_kinds(config: Any, state: Any, given: list[Any], recorded: list[Any]) -> None:

@@ -8,20 +8,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from nics_drl_bridge.gate import frozen, inputs, limits, shield, stops
-from nics_drl_bridge.gate.state import (
-    Arrivals,
-    Cause,
-    Decision,
-    GateConfig,
-    GateState,
-    Motion,
-    SensorState,
-    replace,
-)  # fmt: skip
+from nics_drl_bridge.gate import state as records
+from nics_drl_bridge.gate.state import Arrivals, Cause, GateConfig, GateState, Motion, replace
 from nics_drl_bridge.gate.stops import ODOM, SCAN, settled
 from nics_drl_bridge.geometry import between
 from nics_drl_bridge.interface import S_PER_NS, Array
 
+Taken = tuple[GateState, str]  # and the reason why an input is not taken, or ""
 GREATEST_SPEED = 100.0  # greatest speed that the odometry of a mobile robot can show [m/s, rad/s]
 SLIP, SLIP_SPEED, SLIP_TURN = 2.0, 0.5, 1.0
 """A robot may exceed its limits by this factor, downhill or pushed, plus [m/s] and [rad/s]."""
@@ -34,7 +27,7 @@ Check = Callable[[GateConfig, GateState, inputs.Arm, float], str]  # what is wro
 
 def decide(
     config: GateConfig, state: GateState, given: inputs.Input, now: float
-) -> tuple[GateState, Decision]:
+) -> tuple[GateState, records.Decision]:
     """Decides on an input at a steady time [s]; returns the state after it, and the decision."""
     # Only a tick publishes a motion; a stop is published at the input that causes it, and at every
     # tick while it lasts. A stop is an immediate zero: limits of rate and jerk apply to motion.
@@ -69,7 +62,7 @@ def decide(
             )  # fmt: skip
             state, shielded = frozen.watch_motion(config, state, now), motion.shielded
     twist = config.cmd_vel(state.value)
-    return state, Decision(twist, publish, cause, refused, answer, granted, shielded)
+    return state, records.Decision(twist, publish, cause, refused, answer, granted, shielded)
 
 
 def _serve(
@@ -173,9 +166,7 @@ REFUSALS: tuple[tuple[type, Callable[[GateConfig, Any], str]], ...] = (
 """By the type of the input, in order: what is wrong with it; empty if nothing is."""
 
 
-def take(
-    config: GateConfig, state: GateState, given: inputs.Input, now: float
-) -> tuple[GateState, str]:
+def take(config: GateConfig, state: GateState, given: inputs.Input, now: float) -> Taken:
     """Takes an input into the state, or returns the reason why not."""
     state = replace(state, jumped="", leap="")
     for kind, judge in REFUSALS:
@@ -216,9 +207,7 @@ def _take_command(state: GateState, command: inputs.Command, now: float) -> Gate
     )  # fmt: skip
 
 
-def _take_scan(
-    config: GateConfig, state: GateState, scan: inputs.Scan, now: float
-) -> tuple[GateState, str]:
+def _take_scan(config: GateConfig, state: GateState, scan: inputs.Scan, now: float) -> Taken:
     arrivals, fault = stops.arrived(
         config, state.scans, scan.stamp_ns, now, config.scan_age_s, state.armed
     )
@@ -240,7 +229,7 @@ def _take_scan(
 
 def _take_odometry(
     config: GateConfig, state: GateState, odometry: inputs.Odometry, now: float
-) -> tuple[GateState, str]:
+) -> Taken:
     arrivals, fault = stops.arrived(
         config, state.odometries, odometry.stamp_ns, now, config.odom_age_s, state.armed
     )
@@ -256,14 +245,14 @@ def _take_odometry(
 
 def _take_reading(
     config: GateConfig, state: GateState, reading: inputs.SensorReading, now: float
-) -> tuple[GateState, str]:
+) -> Taken:
     place = config.sensors.index(reading.name)
     before, after = state.sensors[:place], state.sensors[place + 1 :]
     arrivals, fault = stops.arrived(
         config, state.sensors[place].arrivals, reading.stamp_ns, now, config.scan_age_s, state.armed
     )
     points = state.sensors[place].points if fault else reading.points
-    state = replace(state, sensors=(*before, SensorState(arrivals, points), *after))
+    state = replace(state, sensors=(*before, records.SensorState(arrivals, points), *after))
     if fault:
         jumped = reading.name if fault == "jumped" else ""
         return replace(state, jumped=jumped), f"{reading.name}: its stamp {fault}"

@@ -13,16 +13,9 @@ from numpy.typing import NDArray
 
 from nics_drl_bridge import geometry
 from nics_drl_bridge.gate import ground, shield_kernels
+from nics_drl_bridge.gate import state as records
 from nics_drl_bridge.gate.inputs import Scan
-from nics_drl_bridge.gate.state import (
-    GateConfig,
-    GateState,
-    Ground,
-    Motion,
-    ShieldConfig,
-    View,
-    replace,
-)  # fmt: skip
+from nics_drl_bridge.gate.state import GateConfig, GateState, Ground, Motion, ShieldConfig, View
 from nics_drl_bridge.gate.stops import age
 from nics_drl_bridge.interface import S_PER_NS, Array
 from nics_drl_bridge.sim.collision_kernels import Outline
@@ -212,10 +205,10 @@ def shield(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
             low = 0.0
         elif speed and safe(CREEP / speed, 0.0):  # nor does a turn that is barred bar the way back
             value = part(_greatest(lambda share: safe(share, 0.0)), 0.0)
-            return replace(motion, value=value, slope=0.0 * value, shielded=True)
+            return records.replace(motion, value=value, slope=0.0 * value, shielded=True)
     value = part(low, 1.0 if turns else low)
     slope = np.where(turn & turns, motion.slope, 0.0)
-    return replace(motion, value=value, slope=slope, shielded=True)
+    return records.replace(motion, value=value, slope=slope, shielded=True)
 
 
 def _greatest(safe: Callable[[float], bool]) -> float:

@@ -173,9 +173,8 @@ def timing_of(drive: Drive) -> TimingEstimate:
     missing = [v.name for v in spec.state if v.must_be_measured]
     if state is None and missing:
         fault = f"no measured state, and {missing[0]!r} of robot {spec.name!r} follows no command"
-        advice = (
-            f"begin a mapping, whose robots need none, with `nics inspect {place} --map my.yaml`"
-        )
+        inspect = f"`nics inspect {place} --map my.yaml`"
+        advice = f"begin a mapping, whose robots need none, with {inspect}"
         advice += ", or record the state too, or add `follows:` to the robot's YAML file"
         raise RecordingError(f"{place}: {fault}; {advice}.")
     if len(twists.start) < MIN_STAMPS:

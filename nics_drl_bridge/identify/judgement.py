@@ -123,9 +123,8 @@ def _with_motion(
     problem = problem_of(training, calibration, samples, draft.form, draft.inputs)
     problem = replace(problem, spacing_s=hypotheses.SPACING_S)
     free = (model.coefficients != 0.0) & ~defined(training.spec)[:, None]
-    found = shooting.fitted(
-        problem, model, free, draft.inputs, kept, EVALUATIONS, hypotheses.PULLS[-1]
-    )  # fmt: skip
+    pull = hypotheses.PULLS[-1]
+    found = shooting.fitted(problem, model, free, draft.inputs, kept, EVALUATIONS, pull)
     calibration = replace(
         calibration, command_latency_s=draft.form.latency_at(draft.inputs, found.values),
         inputs=draft.form.curves_at(draft.inputs, found.values),

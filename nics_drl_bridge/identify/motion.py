@@ -68,13 +68,11 @@ def as_smooth(command: Array, step: float, width: float) -> Array:
     return np.asarray(scipy.signal.savgol_filter(sums, rows, 2, deriv=1, delta=step, axis=0))
 
 
-def _following(
-    variable: StateVariable, drive: Drive, calibration: Calibration, grid: Array
-) -> Array:
+def _following(variable: StateVariable, drive: Drive, calibration: Calibration, t: Array) -> Array:
     alone = drive.spec.model_copy(update={"state": (variable,)})
     lag = [r.lag_s for r in calibration.responses if r.state == variable.name]
     latency, command = calibration.command_latency_s, drive.recording.command
-    return inferred_states(command, alone, np.array(lag), latency, grid)[:, 0]
+    return inferred_states(command, alone, np.array(lag), latency, t)[:, 0]
 
 
 def samples_of(drive: Drive, calibration: Calibration, width: float) -> Samples:

@@ -102,9 +102,8 @@ def _errors(
         t = begin[:, None] + model.dt * np.arange(course.x.shape[1])
         for i, column in enumerate(state.values.T):
             course.x[:, :, i] = np.interp(t, state.t, column)
-        ends = open_loop.tracked_ends(
-            chosen, calibration, open_loop.relative_ends(course, model)[0]
-        )
+        relative = open_loop.relative_ends(course, model)[0]
+        ends = open_loop.tracked_ends(chosen, calibration, relative)
     return chosen, geometry.between(ends, chosen.end)
 
 

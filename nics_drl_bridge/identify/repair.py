@@ -351,9 +351,8 @@ def check_axes(drive: Drive) -> None:
     ):
         other = some.values * np.array([1.0, 1.0, -1.0])
         as_given, mirrored = (_explained(some.t, p, state) for p in (some.values, other))
-        line = (
-            "scale: -1" if mirrored > max(recordings.MIRRORED, recordings.BETTER + as_given) else ""
-        )
+        least = max(recordings.MIRRORED, recordings.BETTER + as_given)
+        line = "scale: -1" if mirrored > least else ""
     if line:
         fault = "heading and path turn opposite ways; one of x, y and heading is reversed"
         known = "as that of a compass" if "offset" in line else "counted clockwise"

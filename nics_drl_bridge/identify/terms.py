@@ -28,9 +28,8 @@ NOTHING = 1e-9  # spread of a rate that is none
 def mirrored(spec: RobotSpec) -> tuple[str, ...] | None:
     """Names the variables that change sign in a mirror; None if the textbook does not tell."""
     rng = np.random.default_rng(0)
-    some = rng.uniform(0.1, 0.9, (8, len(spec.command))) * np.maximum(
-        spec.command_high, -spec.command_low
-    )
+    reach = np.maximum(spec.command_high, -spec.command_low)
+    some = rng.uniform(0.1, 0.9, (8, len(spec.command))) * reach
     try:
         twist = steady_twist(spec, some) * np.array([1.0, -1.0, -1.0])
         for signs in product((1.0, -1.0), repeat=len(spec.command)):
@@ -183,11 +182,8 @@ def _by_definition(model: TaylorModel, spec: RobotSpec, at: dict[str, float]) ->
     for i, variable in enumerate(spec.state):
         if variable.twist:
             value = at.get(variable.name)
-            own = rows[0] if value is not None else first[i]
-            alone = (powers == own).all(axis=1)
-            coefficients[POSE_RATES.index(variable.twist)] = alone * (
-                1.0 if value is None else value
-            )
+            own, share = (first[i], 1.0) if value is None else (rows[0], value)
+            coefficients[POSE_RATES.index(variable.twist)] = share * (powers == own).all(axis=1)
     kept = coefficients.any(axis=0)
     none = np.zeros((0, 0))
     return replace(

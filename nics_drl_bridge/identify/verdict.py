@@ -49,9 +49,8 @@ def about_stamps(drive: Drive) -> Iterator[str]:
         spread = "the samples of a burst were spread over the time since the one before"
         yield f"{finding}: their stamps are arrival times; {spread}."
     if drive.pose_noise is None:
-        yield Gap(
-            "The noise of the pose was not measured; let the robot stand still for 2 s at first."
-        )
+        fix = "let the robot stand still for 2 s at first"
+        yield Gap(f"The noise of the pose was not measured; {fix}.")
 
 
 def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate) -> Iterator[str]:
@@ -72,10 +71,8 @@ def about_clocks(drive: Drive, calibration: Calibration, timing: TimingEstimate)
         yield Gap("No command ever changed, so clock offset and latency could not be learnt.")
     elif not timing.separated and clocks_differ:
         why = "since no measurement on the commands' clock follows them"
-        advice = "the latency is taken as zero. Record the wheels or the state to separate them"
-        yield Gap(
-            f"Only the sum of clock offset and command latency can be known, {why}; {advice}."
-        )
+        fix = "the latency is taken as zero. Record the wheels or the state to separate them"
+        yield Gap(f"Only the sum of clock offset and command latency can be known, {why}; {fix}.")
     latency, spread = calibration.command_latency_s, sigma.get("command_latency_s", np.inf)
     if timing.separated and latency > CERTAIN * spread:
         yield f"Commands take effect {latency:.4f} s (+- {spread:.4f} s) after their stamps."
@@ -168,10 +165,9 @@ def unlearnt(linear: Fit, calibration: Calibration, spec: RobotSpec) -> Iterator
     if together := _list(excitation.together):
         units = {c.unit for c in spec.command if c.name in excitation.together}
         shares = "all have a share of what they did" if len(units) == 1 else "one has all of it"
-        holds = f"{shares}, and the model holds where they move so; drive each on its own to learn"
-        yield Gap(
-            f"{together} always moved together, so their effects can't be told apart: {holds}."
-        )
+        told = f"{shares}, and the model holds where they move so; drive each on its own to learn"
+        why = "always moved together, so their effects can't be told apart"
+        yield Gap(f"{together} {why}: {told}.")
     if copies := _list([v.name for v in spec.state if v.name in linear.regression.dependent]):
         why = "always depended on the other variables, so their effects can't be separated"
         yield Gap(f"{copies} {why}: the model omits them, and is valid only while that is so.")

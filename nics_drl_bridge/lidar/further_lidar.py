@@ -52,9 +52,8 @@ class FurtherLidar(Sensor):
                 out, state.pose, worlds, state.bodies, around.first, around.fixtures, lidar, cells,
                 lanes,
             )  # fmt: skip
-            fault_kernels.distort_worlds(
-                out, worlds, limits, faults, state.seeds ^ salt, state.steps
-            )
+            seeds = state.seeds ^ salt
+            fault_kernels.distort_worlds(out, worlds, limits, faults, seeds, state.steps)
 
         return render
 

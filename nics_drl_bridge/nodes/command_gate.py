@@ -188,9 +188,8 @@ class CommandGate(qos.QosWatch):
             logger.warning(refused)
 
     def _listen(self) -> None:
-        raw = device_parameters.choice(
-            self, parameters.FOREIGN.name, ("none", TWIST, TWIST_STAMPED)
-        )
+        kinds = ("none", TWIST, TWIST_STAMPED)
+        raw = device_parameters.choice(self, parameters.FOREIGN.name, kinds)
         given = command if raw == "none" else partial(self._foreign, raw)
         readers: tuple[tuple[Any, str, Callable[[bytes], inputs.Input], Any], ...] = (
             (LaserScan, "scan", partial(scan, self._lidar), qos.SENSOR),

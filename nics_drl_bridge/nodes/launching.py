@@ -54,9 +54,7 @@ class Setup:
         space = self["namespace"].strip("/")
         given = self["robots"] or self._of_file("robots", self.simulator)
         self.fleet = names_of(given) if given and "robots" in values else ()
-        self.robots = [
-            Robot(f"{space}/{name}".strip("/"), f"{name}/", space) for name in self.fleet
-        ]
+        self.robots = [Robot(f"{space}/{n}".strip("/"), f"{n}/", space) for n in self.fleet]
         self.robots = self.robots or [Robot(space, "", space)]
 
     def __getitem__(self, name: str) -> str:

@@ -222,9 +222,7 @@ def identity(
 ) -> dict[str, str]:
     """Returns the fingerprints of what a simulator simulates; by `none` of no randomisation."""
     drawn = NO_RANDOMISATION if randomisation is None else randomisation.fingerprint
-    return {
-        "model": model.fingerprint, "world": world.fingerprint, "randomisation": drawn,
-    }  # fmt: skip
+    return {"model": model.fingerprint, "world": world.fingerprint, "randomisation": drawn}
 
 
 class EpisodeServices:

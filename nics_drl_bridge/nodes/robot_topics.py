@@ -128,9 +128,8 @@ class RobotTopics:
             pose = initial_pose(message, str(self._node.get_parameter("map_frame").value))
             spread = START_STD**2 * np.eye(3)  # where nothing corrects it, it defines the map
             if self._posed:
-                given = measurement.checked_covariance(
-                    conversions.pose_from_ros(message)[1], 3, START_STD
-                )
+                covariance = conversions.pose_from_ros(message)[1]
+                given = measurement.checked_covariance(covariance, 3, START_STD)
                 spread = spread if given is None else given
         except (ConfigError, ValueError) as error:
             logger.error(f"{str(error).removesuffix('.')}. The estimate stays as it is.")

@@ -60,9 +60,8 @@ class RosSource:
             (DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.DIAGNOSTICS),
         ):
             self._node.create_subscription(kind, topic, take, quality)
-        self._thread = threading.Thread(
-            target=spin, args=(self._node, threading.Event()), daemon=True
-        )
+        given = (self._node, threading.Event())
+        self._thread = threading.Thread(target=spin, args=given, daemon=True)
         self._thread.start()
 
     def _take_lidar(self, lidar: LidarSpec) -> None:

@@ -61,9 +61,7 @@ class Composer:
         ends = np.cumsum([0, *sizes.values()])
         if sizes:
             ranges = zip(sizes, ends[:-1], ends[1:], strict=True)
-            self._past = {
-                key: build.pick(onnx_graph.STATE_IN, range(k, end)) for key, k, end in ranges
-            }
+            self._past = {n: build.pick(onnx_graph.STATE_IN, range(i, j)) for n, i, j in ranges}
         self._feed(theirs)
         build.nodes += theirs.graph.node
         build.weights += theirs.graph.initializer
@@ -170,8 +168,7 @@ class Composer:
         if hasattr(self, "_made"):
             sizes: Sequence[int] = self._made[THEIRS + name]
         else:
-            dims = self._network.outputs[name].type.tensor_type.shape.dim
-            sizes = [d.dim_value for d in dims]
+            sizes = [d.dim_value for d in self._network.outputs[name].type.tensor_type.shape.dim]
         return math.prod(size or 1 for size in sizes)
 
     def _state_sizes(self) -> dict[str, int]:
@@ -199,8 +196,7 @@ class Composer:
             else:
                 one = self._mapping.inputs[name]
                 parts = [self._part(name, k, part) for k, part in enumerate(one.parts)]
-                size = self._given_size(name)
-                self._check_scaled(one, size or 0, f"inputs.{name}")
+                self._check_scaled(one, self._given_size(name) or 0, f"inputs.{name}")
                 row = build.scale(parts[0] if len(parts) == 1 else build.join(parts), one)
             row = build.add("Reshape", row, build.constant(self._shape(name), np.int64))
             build.add("Cast", row, name=THEIRS + name, to=taken[THEIRS + name])

@@ -154,10 +154,8 @@ class Bundle:
         pipeline = self.description.pipeline
         start = {} if pipeline.initial_values is None else self._initial(pipeline.initial_values)
         return {
-            self.name_of(target): ForeignState(
-                next=self.name_of(output), start=start.get(target, 0.0)
-            )
-            for output, targets in pipeline.feedback_flow.items()
+            self.name_of(target): ForeignState(next=self.name_of(out), start=start.get(target, 0.0))
+            for out, targets in pipeline.feedback_flow.items()
             for target in targets
         }
 
@@ -302,8 +300,7 @@ def mapping_of(bundle: Bundle, model: SimulatorModel) -> Data:
     for name, entry in bundle.outputs.items():
         _add_commands(data["outputs"], name, entry, model)
     missing = [] if data["outputs"].keys() >= {"forward", "turn"} else ["forward", "turn"]
-    own = {command.name for command in model.robot.command}
-    if missing and data["outputs"].keys() != own:
+    if missing and data["outputs"].keys() != {command.name for command in model.robot.command}:
         kinds = ", ".join(f"{name!r} of kind {one.kind!r}" for name, one in bundle.outputs.items())
         reason = f"{kinds}: none is told to be the robot's velocity; {MAPPING}."
         raise bundle.fault("pipeline.outputs", reason)

@@ -21,15 +21,10 @@ from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError, shortened
 from nics_drl_bridge.files import json_of, write_text
 from nics_drl_bridge.generator import SimulatorModel, open_model
+from nics_drl_bridge.policy import train_algorithms as algorithms
 from nics_drl_bridge.policy import train_checkpoint as checkpoints
 from nics_drl_bridge.policy.evaluation import FIRST_SEED, Outcomes, Summary, drive_worlds, summarise
-from nics_drl_bridge.policy.train_algorithms import (
-    Actor,
-    Sb3Training,
-    act_of,
-    check_serves,
-    observed,
-)
+from nics_drl_bridge.policy.train_algorithms import Actor, Sb3Training
 from nics_drl_bridge.policy.train_export import export_policy
 from nics_drl_bridge.policy.train_ppo import LeanPpo
 from nics_drl_bridge.policy.train_stop import Stop
@@ -74,7 +69,7 @@ def train(
     if content is None:
         rng = np.random.default_rng(seed)
         env.seed(int(rng.integers(SEEDS)))
-        training = engine(settings, env, seed, observed(env, rng))
+        training = engine(settings, env, seed, algorithms.observed(env, rng))
         env.seed(int(rng.integers(SEEDS)))  # replaces the algorithm's, near those of other runs
     else:
         check_same(content["about"], about, path)
@@ -158,7 +153,7 @@ def evaluate(
 ) -> Outcomes:  # fmt: skip
     """Drives the episodes of the evaluation protocol in a world with an algorithm's policy."""
     env = _env_of(settings, world, episodes, model or open_model(settings.robot, settings.lidar))
-    return drive_worlds(env, act_of(algorithm), range(FIRST_SEED, FIRST_SEED + episodes))
+    return drive_worlds(env, algorithms.act_of(algorithm), range(FIRST_SEED, FIRST_SEED + episodes))
 
 
 def _stop_of(settings: TrainingSettings) -> Stop:
@@ -213,7 +208,7 @@ def run(
     _check(order.settings, order.seeds, order.out, order.resumed)
     settings, model = order.settings, open_model(order.settings.robot, order.settings.lidar)
     trial = _env_of(settings, next(iter(settings.worlds)), TRIED, model)
-    check_serves(settings, trial)
+    algorithms.check_serves(settings, trial)
     trial.reset(seed=FIRST_SEED)
     for _ in range(TRIED):  # a task that gives no numbers is refused before a folder is begun
         trial.step(trial.action_space.sample())

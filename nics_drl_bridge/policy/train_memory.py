@@ -92,6 +92,4 @@ def memory_of(settings: StackMemory | GruMemory | None, inputs: int, scan_parts:
     """Makes the memory of settings, for observations (n, inputs) that begin with a scan."""
     if settings is None:
         return Memory()
-    if isinstance(settings, GruMemory):
-        return Gru(settings, inputs)
-    return Stack(settings, scan_parts)
+    return Gru(settings, inputs) if isinstance(settings, GruMemory) else Stack(settings, scan_parts)

@@ -20,15 +20,9 @@ from numpy.typing import NDArray
 from stable_baselines3.common.logger import Logger
 
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.policy import train_algorithms, train_imitation
+from nics_drl_bridge.policy import train_algorithms, train_imitation, train_kernels
 from nics_drl_bridge.policy.train_checkpoint import RECENT, Watch
-from nics_drl_bridge.policy.train_kernels import (
-    LOG_NORM,
-    Batch,
-    Net,
-    actor_gradients,
-    critic_gradients,
-)
+from nics_drl_bridge.policy.train_kernels import LOG_NORM, Batch, Net
 from nics_drl_bridge.policy.train_memory import memory_of
 from nics_drl_bridge.policy.train_mirror import Reflection
 from nics_drl_bridge.policy.train_rollout import Driven, Transitions
@@ -183,13 +177,12 @@ class Learner:
         own = spread.detach().numpy(), spread.grad.numpy()
         bounds = np.float32(self.ppo.clip), np.float32(self.ppo.entropy)
         jobs: list[Callable[[], Any]] = [
-            partial(actor_gradients, actor, given, *own, *bounds),
-            partial(critic_gradients, critic, given, np.float32(VALUE_WEIGHT)),
+            partial(train_kernels.actor_gradients, actor, given, *own, *bounds),
+            partial(train_kernels.critic_gradients, critic, given, np.float32(VALUE_WEIGHT)),
         ]
         free = self.core_is_free.is_set()
-        return torch.tensor(
-            sum(run_parts(lambda job: job(), jobs) if free else (j() for j in jobs))
-        )
+        losses = run_parts(lambda job: job(), jobs) if free else [job() for job in jobs]
+        return torch.tensor(sum(losses))
 
     def _through_time(
         self, batch: Transitions, state: torch.Tensor, done: torch.Tensor
@@ -312,9 +305,8 @@ class LeanPpo:
 
     def _advance(self, rollout: Driven, watch: Watch) -> float:
         """Learns from a rollout, with the next one collected meanwhile."""
-        rate = self._ppo.learning_rate * max(
-            1.0 - self.steps / self._total, train_algorithms.LEAST_RATE
-        )
+        left = 1.0 - self.steps / self._total
+        rate = self._ppo.learning_rate * max(left, train_algorithms.LEAST_RATE)
         self.steps += self._ppo.rollout * self.collector.env.num_envs
         self.collector.networks.load_state_dict(self.networks.state_dict())
         self.learner.core_is_free.clear()

@@ -58,9 +58,7 @@ def reader_of_field(path: str) -> Callable[[Any], Any]:
                 message = message[k]
             else:
                 within, message = message, getattr(message, part)
-        if hasattr(message, "nanosec"):
-            return message.sec + message.nanosec * S_PER_NS
-        return message
+        return message.sec + message.nanosec * S_PER_NS if hasattr(message, "nanosec") else message
 
     return read
 

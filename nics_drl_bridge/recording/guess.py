@@ -7,15 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from nics_drl_bridge.geometry import Array, east_and_north
+from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording.mapped import POSES
 from nics_drl_bridge.recording.mapping import UNITS
-from nics_drl_bridge.recording.recording import (
-    along_path,
-    clockwise_line,
-    implausible_pose,
-    led_along,
-    w_first,
-)
+from nics_drl_bridge.recording.recording import along_path, clockwise_line, led_along
 from nics_drl_bridge.recording.survey import Survey, TableSurvey, unit_in, words_of
 from nics_drl_bridge.robot.spec import find_kind, kind_names
 from nics_drl_bridge.robot.template import names_of
@@ -96,8 +91,7 @@ def guess_pose(tables: Sequence[TableSurvey]) -> Guess | None:
 
 def _trust(pose: Guess) -> int:
     words = {*words_of(f"{pose.table.name} {pose.keys['x']}")}
-    trusted = 2 * bool(words & TRACKERS) - 2 * bool(words & MEASURING)
-    return trusted + ("quaternion" in pose.keys)
+    return 2 * bool(words & TRACKERS) - 2 * bool(words & MEASURING) + ("quaternion" in pose.keys)
 
 
 def _turned(
@@ -133,7 +127,7 @@ def _unnamed(table: TableSurvey) -> Iterator[Guess]:
         turns = any(np.ptp(each) > 0.0 for each in four)
         if turns and np.nanmax(np.abs(np.linalg.norm(four, axis=0) - 1.0)) < UNIT_LENGTH:
             turn = names[k : k + 4]
-            turn = [*turn[1:], turn[0]] if w_first(np.stack(four, axis=1)) else turn
+            turn = [*turn[1:], turn[0]] if recordings.w_first(np.stack(four, axis=1)) else turn
             own = [name for name in place if name not in turn]
             x, y = own if len(own) == 2 else names[max(k - 3, 0) :][:2]
             yield Guess(table, {"x": x, "y": y, "quaternion": f"[{', '.join(turn)}]"})
@@ -314,7 +308,7 @@ def _pose_lines(pose: Guess, alone: bool, common: str | None) -> list[str]:
     said = [f"  {key}: {unit}  {GUESSED}" for key, unit in units.items() if unit]
     for _ in range(0 if said else len(units)):
         found = _values(pose, said)
-        fault = implausible_pose(*found, radius=_radius(found, 0.0)) if found else None
+        fault = recordings.implausible_pose(*found, radius=_radius(found, 0.0)) if found else None
         if fault is not None and not fault.line.startswith("time"):
             said.append(f"  {fault.line}  {GUESSED}: else {fault.reason}")
     return [_turned_round(line, pose, said) for line in lines] + said

@@ -224,6 +224,4 @@ def _from_zero(found: dict[str, Stream], main: str, reader: MappedReader) -> dic
         origin[clock] = first if span in together else span[0]
         if span not in together:
             reader.say(f"The clock {clock!r} was set to 0 at its first stamp, {span[0]:.3f} s.")
-    return {
-        name: replace(stream, t=stream.t - origin[stream.clock]) for name, stream in found.items()
-    }
+    return {n: replace(each, t=each.t - origin[each.clock]) for n, each in found.items()}

@@ -149,11 +149,9 @@ class _Messages:
 
     def imu(self, header: Any, row: Array) -> Any:
         ax, ay, w = (float(value) for value in row)
-        level, unknown = self._new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0), np.full(9, -1.0)
+        level, absent = self._new("geometry_msgs/Quaternion", 0.0, 0.0, 0.0, 1.0), np.full(9, -1.0)
         rates, pulls, measured = self._vector(z=w), self._vector(ax, ay), np.zeros(9)
-        return self._new(
-            "sensor_msgs/Imu", header, level, unknown, rates, measured, pulls, measured
-        )
+        return self._new("sensor_msgs/Imu", header, level, absent, rates, measured, pulls, measured)
 
 
 class BagSink:

@@ -18,15 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array, Bicycle
-from nics_drl_bridge.robot.spec import (
-    CMD_VEL_FIELDS,
-    POSE_RATES,
-    CmdVelField,
-    RobotSpec,
-    StateVariable,
-    find_kind,
-    kind_names,
-)
+from nics_drl_bridge.robot import spec as specs
+from nics_drl_bridge.robot.spec import POSE_RATES, RobotSpec, StateVariable, find_kind, kind_names
 from nics_drl_bridge.robot.template import Template
 
 BEYOND = 0.01  # share of a limit by which rounded figures may lie beyond it
@@ -329,7 +322,7 @@ def wheeled(
         needed = f"have {len(inverse)} wheels as state, not {len(spec.state)} variables"
         raise _unfit(spec, f"{needed}; correct `state:`.")
     dofs = [POSE_RATES.index(dof) for dof in moves]
-    fields = tuple(CMD_VEL_FIELDS[dof] for dof in dofs)
+    fields = tuple(specs.CMD_VEL_FIELDS[dof] for dof in dofs)
     by_wheels = all(c.unit == "rad/s" and c.cmd_vel is None for c in spec.command)
     into = np.eye(len(inverse)) if by_wheels else inverse
     command = _commands(spec, fields, wheels if by_wheels else (), into.shape[1])
@@ -351,7 +344,7 @@ def _own_state(spec: RobotSpec) -> bool:
 
 
 def _commands(
-    spec: RobotSpec, fields: tuple[CmdVelField, ...], names: tuple[str, ...], count: int
+    spec: RobotSpec, fields: tuple[specs.CmdVelField, ...], names: tuple[str, ...], count: int
 ) -> list[int]:
     have = [c.cmd_vel for c in spec.command]
     if not any(have):

@@ -16,14 +16,9 @@ from pkgutil import iter_modules
 from typing import Any, Literal
 
 import numpy as np
+import pydantic
 from numpy.typing import ArrayLike, NDArray
-from pydantic import (
-    Field,
-    SerializerFunctionWrapHandler,
-    field_validator,
-    model_serializer,
-    model_validator,
-)
+from pydantic import Field, field_validator, model_serializer, model_validator
 
 from nics_drl_bridge import extensions, geometry
 from nics_drl_bridge.config import Mount, Schema, find_config, parse_yaml, read_text, validate
@@ -161,7 +156,7 @@ class RobotSpec(Schema):
         return _circumscribed(data) if isinstance(data, dict) else data
 
     @model_serializer(mode="wrap")
-    def _without_none(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
+    def _without_none(self, dump: pydantic.SerializerFunctionWrapHandler) -> dict[str, Any]:
         # Models and policies are known by what is written: a key that says nothing is left out.
         data: dict[str, Any] = dump(self)
         silent = [name for name in ("lidar", "lidar_mount") if getattr(self, name) is None]

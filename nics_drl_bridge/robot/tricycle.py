@@ -17,9 +17,8 @@ TEMPLATE = Template(
 
 def kinematics(spec: RobotSpec) -> kinds.Textbook:
     """The front wheel pulls forward by its cosine, and turns the base by its sine."""
-    return kinds.steered(
-        spec, Bicycle(spec.parameters["wheelbase"], front_drive=True), names_of(STEERED)
-    )
+    bicycle = Bicycle(spec.parameters["wheelbase"], front_drive=True)
+    return kinds.steered(spec, bicycle, names_of(STEERED))
 
 
 def drawing(spec: RobotSpec) -> kinds.Drawing:

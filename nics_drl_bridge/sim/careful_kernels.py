@@ -13,29 +13,10 @@ import numpy as np
 
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.lidar.exact_kernels import COS, HEADING, RADIUS, SHAPE, SIN, X, Y
-from nics_drl_bridge.robot.kernels import (
-    bounds_of,
-    delayed,
-    move,
-    next_state,
-    rates,
-    with_coefficients,
-    wrap,
-)
+from nics_drl_bridge.robot import kernels as robot
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import impact_kernels as impact
-from nics_drl_bridge.sim.impact_kernels import (
-    AFTER,
-    DEPTH,
-    FROM,
-    HOLDS,
-    STOP,
-    TIME,
-    TURN,
-    VX,
-    VY,
-    Moving,
-)
+from nics_drl_bridge.sim.impact_kernels import AFTER, DEPTH, STOP, TIME, TURN, VX, VY, Moving
 from nics_drl_bridge.sim.sensing_kernels import drift_of
 from nics_drl_bridge.sim.state import Array, Dynamics, Nearby, Single, State, Surroundings
 
@@ -52,15 +33,15 @@ def rates_at(n: int, m: int, j: int, state: State, motion: Dynamics, single: Sin
         single.x[s] = state.state[n, m, s]
     for c in range(state.history.shape[3]):
         delay = state.delay[n, m] + motion.terms.late[c]
-        row = delayed(j, delay, motion.substeps, sent)
+        row = robot.delayed(j, delay, motion.substeps, sent)
         single.x[size + c] = state.history[n, m, row, c]
-    rates(single.dq, single.x, with_coefficients(motion.terms, state.coefficient[n, m]))
+    robot.rates(single.dq, single.x, robot.with_coefficients(motion.terms, state.coefficient[n, m]))
 
 
 @kernel
 def _fly(body: Array, base: Array, flight: Array, time: float, series: Array) -> None:
     turn = flight[TURN] * time
-    body[X], body[Y], body[COS], body[SIN] = move(
+    body[X], body[Y], body[COS], body[SIN] = robot.move(
         base[X], base[Y], base[COS], base[SIN], flight[VX], flight[VY], turn, time, series
     )
     body[HEADING] = base[HEADING] + turn
@@ -123,7 +104,7 @@ def _hold(
     """Lets robot m, whose point (px, py) approaches something against n, come no nearer."""
     flight, event = moving.flights[moving.first + m], events[m]
     slides = event[impact.PRESSED] != 0.0 and event[DEPTH] >= 0.0 and (nx != 0.0 or ny != 0.0)
-    if slides and flight[HOLDS] < impact.MOST_HOLDS:
+    if slides and flight[impact.HOLDS] < impact.MOST_HOLDS:
         impact.hold(moving.first + m, nx, ny, px, py, time, moving)
     else:
         flight[STOP] = min(flight[STOP], time)
@@ -182,9 +163,9 @@ def _arrive(
             me = velocity.shape[0] + m
             body, flight = bodies[me], moving.flights[me]
             x, y, c, s = impact.pose_at(me, flight[STOP], moving)
-            body[HEADING] += flight[TURN] * (flight[STOP] - flight[FROM])
+            body[HEADING] += flight[TURN] * (flight[STOP] - flight[impact.FROM])
             body[X], body[Y], body[COS], body[SIN] = x, y, c, s
-            if flight[STOP] < motion.dt or flight[HOLDS] > 0.0:
+            if flight[STOP] < motion.dt or flight[impact.HOLDS] > 0.0:
                 single.events[m, impact.PRESSED] = 1.0
             if single.events[m, DEPTH] < 0.0:
                 single.events[m, DEPTH] = single.events[m, AFTER]
@@ -193,7 +174,7 @@ def _arrive(
         if stop < motion.dt:
             start[k, 0] = bodies[k, X] + velocity[k, 0] * stop
             start[k, 1] = bodies[k, Y] + velocity[k, 1] * stop
-            start[k, 2] = wrap(bodies[k, HEADING] + velocity[k, 2] * stop)
+            start[k, 2] = robot.wrap(bodies[k, HEADING] + velocity[k, 2] * stop)
             contacts.put_body(state.bodies, n, k, start[k])
             velocity[k, :] = 0.0
 
@@ -231,10 +212,10 @@ def move_carefully(
                 rates_at(n, m, j, state, motion, single)
                 flight, dq = single.flights[first + m], single.dq
                 flight[VX], flight[VY], flight[TURN], flight[STOP] = dq[0], dq[1], dq[2], dt
-                flight[FROM] = flight[HOLDS] = 0.0
+                flight[impact.FROM] = flight[impact.HOLDS] = 0.0
                 for s in range(state.state.shape[2]):
-                    now, bounds = state.state[n, m, s], bounds_of(motion.terms, s)
-                    state.state[n, m, s] = next_state(now, dq[3 + s], dt, bounds)
+                    now, bounds = state.state[n, m, s], robot.bounds_of(motion.terms, s)
+                    state.state[n, m, s] = robot.next_state(now, dq[3 + s], dt, bounds)
                 if events[m, DEPTH] < 0.0:
                     _leave(m, dt, scene, nearby, single, moving)
         _settle(dt, scene, nearby, events, touched, moving)
@@ -273,7 +254,7 @@ def _average_velocities(n: int, period: float, state: State, single: Single) -> 
         if stopped or start[k, 2] != began[k, 2]:
             for i in range(2):
                 velocity[n, k, i] = (bodies[n, k, i] - began[k, i]) / period
-            velocity[n, k, 2] = wrap(bodies[n, k, HEADING] - began[k, 2]) / period
+            velocity[n, k, 2] = robot.wrap(bodies[n, k, HEADING] - began[k, 2]) / period
 
 
 @kernel
@@ -305,10 +286,10 @@ def drift_carefully(
                 stop, collided[n, m] = events[m, TIME], 1
                 if events[m, impact.WITH] >= first:
                     collided[n, int(events[m, impact.WITH]) - first] = 1
-        x, y, _, _ = move(
+        x, y, _, _ = robot.move(
             pose[n, m, 0], pose[n, m, 1], math.cos(pose[n, m, 2]), math.sin(pose[n, m, 2]),
             ahead, aside, turn * stop, stop, motion.series,
         )  # fmt: skip
-        pose[n, m, 0], pose[n, m, 1], pose[n, m, 2] = x, y, wrap(pose[n, m, 2] + turn * stop)
+        pose[n, m, 0], pose[n, m, 1], pose[n, m, 2] = x, y, robot.wrap(pose[n, m, 2] + turn * stop)
         if meets[m] != contacts.FREE:
             contacts.put_body(state.bodies, n, first + m, pose[n, m])

@@ -128,9 +128,8 @@ class Entities:
             own: Array = self.simulator.data.pose[0, entity.robot].copy()
             return own
         part = np.array(entity.parts[0][1])
-        return geometry.compose(
-            self.bodies()[entity.slots[0], :3], geometry.between(part, np.zeros(3))
-        )
+        body = self.bodies()[entity.slots[0], :3]
+        return geometry.compose(body, geometry.between(part, np.zeros(3)))
 
     def twist(self, entity: Entity) -> Array:
         """Returns vx, vy [m/s], wz [rad/s] (3,) of an entity along the axes of `map`."""

@@ -117,9 +117,8 @@ class _Scope:
             self.pose, self.placement = include.find("pose"), _text(include, "placement_frame")
         self.models: list[_Scope] = []
         self.strange: list[tuple[str, str]] = []  # name of a model, and why it can't be read
-        self._state = {
-            one.get("name", ""): one.find("pose") for one in element.iterfind("state/model")
-        }
+        states = element.iterfind("state/model")
+        self._state = {one.get("name", ""): one.find("pose") for one in states}
         self._named: dict[str, Element | _Scope] = {}
         self._open: set[str] = set()  # frames whose poses are being looked for
         order.count(file)
@@ -145,9 +144,8 @@ class _Scope:
             if file is not None:
                 model = self._order.root(file).find("model")
                 if model is not None:  # else a light
-                    self._add_model(
-                        model, file, _text(child, "name") or model.get("name", ""), child
-                    )
+                    called = _text(child, "name") or model.get("name", "")
+                    self._add_model(model, file, called, child)
             elif name not in HARMLESS and self._order.takes(name):
                 folders = f"{uri!r}, {ABSENT} beside the file nor on {PATHS[0]}"
                 self.strange.append((name, folders))
@@ -319,9 +317,8 @@ def _found(uri: str, file: Path) -> Path | None:
     kind, _, name = uri.rpartition("://")
     here = file.resolve().parent
     near = [here, here / "models", here.parent, here.parent / "models"]
-    listed = [
-        Path(one) for key in PATHS for one in os.environ.get(key, "").split(os.pathsep) if one
-    ]
+    given = (one for key in PATHS for one in os.environ.get(key, "").split(os.pathsep))
+    listed = [Path(one) for one in given if one]
     for folder in () if kind.startswith("http") else (*near, *listed):
         path = folder / name
         if name and path.is_file():

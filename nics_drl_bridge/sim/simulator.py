@@ -192,11 +192,9 @@ class FastSimulator:
 
     @cached_property
     def _members(self) -> Members:
-        motions = self.sampler.motions
+        members, motions = self.world.members, self.sampler.motions
         outlines = self._scanner.table.outlines.arguments
-        return allocation.members_of(
-            self.world.members, motions, outlines, self._sizes, self.data.member
-        )
+        return allocation.members_of(members, motions, outlines, self._sizes, self.data.member)
 
     @property
     def moves(self) -> bool:

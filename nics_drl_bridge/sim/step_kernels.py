@@ -17,19 +17,9 @@ from nics_drl_bridge.robot.kernels import bend, delayed, run, with_coefficients,
 from nics_drl_bridge.sim import contact_kernels as contacts
 from nics_drl_bridge.sim import obstacle_kernels as obstacles
 from nics_drl_bridge.sim import sensing_kernels as sensing
+from nics_drl_bridge.sim import state as records
 from nics_drl_bridge.sim.careful_kernels import drift_carefully, move_carefully, rates_at
-from nics_drl_bridge.sim.state import (
-    Array,
-    Dynamics,
-    Integers,
-    Lanes,
-    MapField,
-    Members,
-    Movers,
-    Scratch,
-    State,
-    Surroundings,
-)
+from nics_drl_bridge.sim.state import Array, Dynamics, Lanes, Members, Scratch, State, Surroundings
 
 TOGETHER = 48  # Robots whose scans, with their faults, are made together: they stay in the L2 cache
 
@@ -40,8 +30,8 @@ def surroundings_of(n: int, members: Members) -> Surroundings:
     p = members.fixtures.member[n]
     frame = members.fixtures.frames[p]
     distances = cells_of(members.distances, members.fields[p])
-    grid = MapField(distances, frame[0], frame[1], frame[2], frame[3], frame[4])
-    movers = Movers(members.moves, members.plans[p], members.waypoints, members.field[p])
+    grid = records.MapField(distances, frame[0], frame[1], frame[2], frame[3], frame[4])
+    movers = records.Movers(members.moves, members.plans[p], members.waypoints, members.field[p])
     return Surroundings(
         walls_of(n, members.fixtures), grid, members.outlines, members.crowded,
         members.standing, movers,
@@ -220,7 +210,7 @@ def sort_worlds(packed: Any, begin: int, end: int) -> None:
 
 
 @kernel(allocates=True)
-def begin(packed: Any, chosen: Integers) -> None:
+def begin(packed: Any, chosen: records.Integers) -> None:
     """Begins episodes in the worlds `chosen` (n,): all is in place and stands still."""
     part = packed.content
     state, waiting = part.state, part.scratch.scans.waiting

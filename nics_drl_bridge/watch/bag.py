@@ -82,9 +82,8 @@ def _read(
 ) -> tuple[list[float], list[Snapshot], Any]:
     """Times from the first on [s], shots, and the lidar of the bag."""
     messages = played(path, topics)
-    playback, stamps, shots = (
-        Playback(model, POSE in messages, any_lidar=True), [], list[Snapshot](),
-    )  # fmt: skip
+    playback = Playback(model, POSE in messages, any_lidar=True)
+    stamps, shots = list[int](), list[Snapshot]()
     middleware, every = playback.middleware, SCAN if SCAN in messages else ODOM
     command: Array | None = None
     for role, message in in_order(messages):

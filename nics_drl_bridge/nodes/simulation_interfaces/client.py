@@ -86,9 +86,8 @@ class StandardEpisodes:
 
     def _client(self, name: str) -> Any:
         prefix = f"{self._options.services.rstrip('/')}/" if self._options.services else ""
-        return self._link.node.create_client(
-            getattr(self._types, name), f"{prefix}{snake_case(name)}"
-        )
+        kind = getattr(self._types, name)
+        return self._link.node.create_client(kind, f"{prefix}{snake_case(name)}")
 
     def _call(self, name: str, timeout_s: float, *fine: int, **fields: Any) -> Any:
         """Calls a service. Raises BackendError for a result that is neither OK nor `fine`."""

@@ -110,9 +110,7 @@ class EntityServices:
         found = []
         for entity in entities:
             info, pose = self.info(entity), entities.pose(entity)
-            outlines = (
-                planar.rotate(each, pose[2]) + pose[:2] for each in entities.outlines(entity)
-            )
+            outlines = (planar.rotate(one, pose[2]) + pose[:2] for one in entities.outlines(entity))
             if (
                 pattern.search(entity.name)
                 and (not categories or info.category.category in categories)

@@ -74,8 +74,7 @@ def find(resource: Any, codes: Codes) -> Found:
     if not text.strip():
         told = "both uri and resource_string are empty; give one of them."
         raise RefusalError(codes.no_resource, told)
-    start = text.lstrip("\ufeff \t\r\n")
-    if start.startswith(("<", "#usda")):
+    if text.lstrip("\ufeff \t\r\n").startswith(("<", "#usda")):
         if "<sdf" not in text:
             told = "the resource_string is XML or USD, but no SDF; give SDF or YAML."
             raise RefusalError(codes.unsupported_format, told)

@@ -170,8 +170,6 @@ class Spawning:
         response.spawnables.append(_spawnable(uri, model.description or model.name, hulls))
 
 
-def _spawnable(uri: str, description: str, hulls: list[Any]) -> Spawnable:
+def _spawnable(uri: str, about: str, hulls: list[Any]) -> Spawnable:
     bounds = plane.box_to_ros(hulls)
-    return Spawnable(
-        entity_resource=Resource(uri=uri), description=description, spawn_bounds=bounds
-    )
+    return Spawnable(entity_resource=Resource(uri=uri), description=about, spawn_bounds=bounds)

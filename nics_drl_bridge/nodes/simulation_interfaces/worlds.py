@@ -172,11 +172,9 @@ def told_of(world: AnyWorld, resource: Resource) -> WorldResource:
     }  # fmt: skip
     x1, y1, x2, y2 = world.extent
     size = f"{x2 - x1:.3g} m x {y2 - y1:.3g} m"
-    description = f"{len(members)} worlds in {size}" if len(members) > 1 else f"a field of {size}"
+    told = f"{len(members)} worlds in {size}" if len(members) > 1 else f"a field of {size}"
     tags = [tag for tag, holds in about.items() if holds]
-    return WorldResource(
-        name=world.name, world_resource=resource, description=description, tags=tags
-    )
+    return WorldResource(name=world.name, world_resource=resource, description=told, tags=tags)
 
 
 def world_of(standing: Standing, name: str) -> World:
