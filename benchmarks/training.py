@@ -146,7 +146,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=500)
     given = parser.parse_args()
     settings = load_training(f"navigation_{given.robot}")
-    settings = settings.model_copy(update={"lidar": given.lidar})
+    settings = settings.model_copy(update={"lidar": given.lidar or settings.lidar})
     if given.control == "untrained":
         settings = untrained(settings)
     else:

@@ -83,7 +83,9 @@ RUNS: dict[str, Run] = {
     "table3_density": row("table3_density", "", "--scans 256"),
     **{
         f"training_{robot}{name}": row(
-            "training", f"--robot {robot}{lidar} --seeds 0 1 2", f"--robot {robot} --episodes 50"
+            "training",
+            f"--robot {robot}{lidar} --seeds 0 1 2",
+            f"--robot {robot}{lidar} --episodes 50",
         )
         for name, lidar in (("", ""), ("_rplidar", " --lidar rplidar_a2"))
         for robot in ("differential", "ackermann", "mecanum")

@@ -14,6 +14,7 @@ from nics_drl_bridge.kernels import kernel
 
 TWO_PI = 2.0 * math.pi
 ROUNDING = 1e-6  # beams this near to an edge, in beams, are candidates; the exact test decides
+IN_LINE = 1e-9  # a wall whose line passes a lidar nearer than this is seen edge-on [m]
 HALF_PI = 0.5 * math.pi
 TINY = 1e-300  # avoids NaN for the angle of a zero vector
 ATAN = (
@@ -25,11 +26,12 @@ X, Y, HEADING, COS, SIN, RADIUS, SHAPE = range(7)
 """Columns of a placed body; the radius of an absent one is 0, `SHAPE` is an index."""
 INF, MINUS_INF = np.array([np.inf, -np.inf], np.float32).view(np.int32)
 BLOCK = 48  # Beams that meet a wall at once
+TURNS = 2 * BLOCK - 1  # angles from any of them to any other, from the least on
 TOGETHER = 8  # Walls whose beams are found at once
 AX, AY, BX, BY, CROSS, EX, EY, FIRST, END, FIRST_AGAIN, END_AGAIN = (
     np.uintp(k * TOGETHER) for k in range(11)
 )
-"""Of a wall: its ends; what `edge` calls so; its beams, and those beyond the seam of a circle."""
+"""Of a wall: its ends; what `edge` calls so; its beams, and those of a turn further."""
 
 
 class Beams(NamedTuple):
@@ -39,7 +41,7 @@ class Beams(NamedTuple):
     first: float  # angle of beam 0 [rad]
     step: float  # between beams [rad]
     closed: bool  # True for a full circle
-    turns: NDArray[np.float32]  # (2 BLOCK,) cosines and sines of beams from the first of a block
+    turns: NDArray[np.float32]  # (2 TURNS,) cosines and sines of angles between a block's beams
 
 
 class LidarPose(NamedTuple):
@@ -61,7 +63,7 @@ class OutlineArrays(NamedTuple):
 @kernel(allocates=True)
 def beams_of(directions, first, step, closed):  # type: ignore[no-untyped-def]
     """Returns the beams of directions (2, B) that are a `step` apart, from `first` on [rad]."""
-    angles = step * np.arange(BLOCK)
+    angles = step * np.arange(1 - BLOCK, BLOCK)
     turns = np.concatenate((np.cos(angles), np.sin(angles))).astype(np.float32)
     return Beams(directions, first, step, closed, turns)
 
@@ -247,11 +249,11 @@ def _find_walls(found, beams, lidar, walls, begin, range_max, count):  # type: i
         # As shares of its length: the wall is nearest at `foot`, and in range within +-`half`.
         foot, half = -(ax * ex + ay * ey) * share, math.sqrt(max(chord2, 0.0)) * share
         begins, ends = max(foot - half - ROUNDING, 0.0), min(foot + half + ROUNDING, 1.0)
-        seen = (chord2 >= 0.0) & (begins <= ends) & (cross != 0.0)
+        seen = (chord2 >= 0.0) & (begins <= ends) & (cross * cross > IN_LINE * IN_LINE * length2)
         one = arctan2(ay + begins * ey, ax + begins * ex)
         other = arctan2(ay + ends * ey, ax + ends * ex)
         low, wide = one if cross > 0.0 else other, (other - one if cross > 0.0 else one - other)
-        wide += TWO_PI if wide < 0.0 else 0.0
+        wide = wide + TWO_PI if wide < -1.0 else max(wide, 0.0)  # a whole turn, or rounding
         low = (low - beams.first) * per_beam
         low -= np.floor(low * per_turn) * turn
         high = low + wide * per_beam
@@ -276,21 +278,28 @@ def _wall(whole, beams, first, end, line, limits):  # type: ignore[no-untyped-de
 def _wall_block(whole, beams, block, width, begin, end, line, limits):  # type: ignore[no-untyped-def]
     """Fuses a wall into those beams of a block that are in [begin, end).
 
-    They are turned from the first one in single precision, of which a division takes half the time.
-    Ranges are whole numbers in the same order; those of a negative range are the greatest.
+    They are turned in single precision, from the one that meets the wall at the flattest angle, so
+    that no error is larger than there. Ranges are whole numbers, in the same order as floats; of
+    the unsigned ones, all that are negative are beyond the limit.
     """
     cross, ex, ey = np.float32(line[0]), line[1], line[2]
     least, most = np.float32(limits[0]).view(np.int32), np.float32(limits[1]).view(np.uint32)
-    first, skip, hits = np.uintp(block), np.int32(block - begin), np.uint32(end - begin)
-    c, s = beams.directions[0, first], beams.directions[1, first]
+    place, skip, hits = np.uintp(block), np.int32(block - begin), np.uint32(end - begin)
+    one = np.uintp(begin - block)
+    c, s = beams.directions[0, place + one], beams.directions[1, place + one]
+    if (s * ey + c * ex) * line[0] > 0.0:  # it is met ever flatter
+        one = np.uintp(min(end - block, width) - 1)
+        c, s = beams.directions[0, place + one], beams.directions[1, place + one]
     across, along = np.float32(c * ey - s * ex), np.float32(s * ey + c * ex)
+    turn, sines = np.uintp(BLOCK - 1) - one, np.uintp(TURNS)
     for k in range(width):
         j = np.uintp(k)
-        distance = cross / (across * beams.turns[j] - along * beams.turns[j + np.uintp(BLOCK)])
-        place = np.float32(distance).view(np.int32)
-        meets = (np.uint32(skip + np.int32(k)) < hits) & (np.uint32(place) <= most)
-        place = place if meets else INF
-        whole[first + j] = min(whole[first + j], place if place >= least else MINUS_INF)
+        cosine, sine = beams.turns[turn + j], beams.turns[turn + j + sines]
+        distance = cross / (across * cosine - along * sine)
+        found = np.float32(distance).view(np.int32)
+        meets = (np.uint32(skip + np.int32(k)) < hits) & (np.uint32(found) <= most)
+        found = found if meets else INF
+        whole[place + j] = min(whole[place + j], found if found >= least else MINUS_INF)
 
 
 @kernel

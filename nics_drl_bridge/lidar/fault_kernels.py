@@ -35,7 +35,7 @@ class Distortion(NamedTuple):
     per_step: np.float32  # 1 / step of the quantisation [1/m]
     step: np.float32  # [m]
     rest: np.float32  # of the step, beyond float32
-    first: np.float32  # least multiple of the step within the limits
+    first: np.float32  # times the step, the least multiple within the limits
     last: np.float32
 
 
@@ -46,7 +46,8 @@ def distort(ranges, limits, faults, seed, counter):  # type: ignore[no-untyped-d
     A return stays within the limits, range_min and range_max [m]; `counter` is that of the scan.
     """
     device = _device(limits, faults)
-    noisy, coarse = device.std > 0.0 or device.grows > 0.0, device.step > 0.0
+    noisy = device.std > 0.0 or device.grows > 0.0
+    coarse = device.step > 0.0 and device.first <= device.last
     if faults[TOO_CLOSE] == AS_GHOST:
         _ghosts(ranges, device, random.key(seed, random.GHOST_STREAM, counter))
     if noisy and coarse:

@@ -127,6 +127,16 @@ def test_a_ghost_may_be_anywhere_within_the_limits():
     assert seen.mean() == pytest.approx(np.mean(LIMITS), abs=4.0 * 2.95 / np.sqrt(12 * BEAMS))
 
 
+@pytest.mark.parametrize("noise_std", [0.0, 0.1])
+def test_a_step_without_a_multiple_within_the_limits_coarsens_nothing(noise_std):
+    faults = LidarFaults().parameters(noise_std)
+    faults[fault_kernels.QUANTISATION] = 5.0
+    out = np.full(100, 0.4, np.float32)
+    fault_kernels.distort(out, (0.1, 3.0), faults, 1, 1)
+    assert out.min() >= np.float32(0.1)
+    assert out.mean() == pytest.approx(0.4, abs=0.1)
+
+
 @pytest.mark.parametrize("beams", [1, 2, 7, 1081])
 def test_a_scan_of_any_length_has_the_noise_of_each_of_its_beams(beams):
     ranges = scan_at(1.0, beams)

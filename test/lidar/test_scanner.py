@@ -181,6 +181,27 @@ def test_a_wall_seen_edge_on_returns_nothing():
     assert np.isinf(scanner.scan(HERE, [], [[1.0, 0.0, 2.0, 0.0]])).all()
 
 
+def test_a_wall_in_line_with_the_lidar_but_for_rounding_hides_nothing():
+    scanner = make_scanner(lidar(beams=360, range_min=0.05, range_max=10.0), ())
+    wall = [-0.19583694396573836, -4.404163056034261, -1.8221825406947976, -2.7778174593052025]
+    assert np.isinf(scanner.scan([-2.6, -2.0, -np.pi], [], [wall])[0]).all()
+    assert (scanner.scan([-2.6, -2.0, -np.pi], [], [wall])[0] > 0.0).all()
+
+
+@pytest.mark.parametrize("beams", [40, 360])
+def test_a_wall_met_at_a_flat_angle_is_as_exact_as_another(beams):
+    scanner, rng = make_scanner(lidar(beams=beams, range_max=25.0), ()), np.random.default_rng(1)
+    for beam in range(beams):
+        along, off = rng.uniform(-3.0, 3.0), rng.uniform(0.01, 0.2)
+        heading = along + np.arcsin(off / 20.0) - scanner.spec.angles[beam]
+        ends = np.array([[-50.0, off], [50.0, off]]) @ [
+            [np.cos(along), np.sin(along)],
+            [-np.sin(along), np.cos(along)],
+        ]
+        seen = scanner.scan([0.0, 0.0, heading], [], [ends.ravel()])[0]
+        assert seen[beam] == pytest.approx(20.0, abs=2e-5)
+
+
 def test_walls_are_seen_from_both_sides_whichever_end_comes_first():
     scanner = make_scanner(lidar(beams=8), ())
     for wall in ([1.0, -5.0, 1.0, 5.0], [1.0, 5.0, 1.0, -5.0]):
