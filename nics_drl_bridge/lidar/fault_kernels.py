@@ -50,17 +50,15 @@ def distort(ranges, limits, faults, seed, counter):  # type: ignore[no-untyped-d
     coarse = device.step > 0.0 and device.first <= device.last
     if faults[TOO_CLOSE] == AS_GHOST:
         _ghosts(ranges, device, random.key(seed, random.GHOST_STREAM, counter))
+    if faults[TOO_CLOSE] == AS_RANGE_MIN or not (noisy or coarse or device.close == -np.inf):
+        _close(ranges, device.close)
     if noisy and coarse:
         _noise(ranges, device, random.key(seed, random.RANGE_STREAM, counter), True)
     elif noisy:
         _noise(ranges, device, random.key(seed, random.RANGE_STREAM, counter), False)
     elif coarse:
         for i in range(ranges.shape[0]):
-            value = _closed(ranges[i], device)
-            coarser = _coarse(value, device)
-            ranges[i] = coarser if abs(value) < np.float32(np.inf) else value
-    elif device.close != -np.inf:
-        _close(ranges, device.close)
+            ranges[i] = _told(ranges[i], _coarse(ranges[i], device), device)
     if faults[DROPOUT] > 0.0 or faults[DROPOUT_FAR] > 0.0:
         by = random.key(seed, random.DROPOUT_STREAM, counter)
         _drop(ranges, faults[DROPOUT], faults[DROPOUT_FAR] / (limits[1] * limits[1]), by)
@@ -115,15 +113,17 @@ def _noise_run(ranges, count, device, by, k, coarse):  # type: ignore[no-untyped
     run, begin = random.run(by, k), np.uintp(k * random.RUN)
     for j in range(count):
         i = begin + np.uintp(j)
-        value = _closed(ranges[i], device)
+        value = ranges[i]
         noisy = value + (device.std + device.grows * value) * random.normal_of(run, j)
         noisy = _coarse(noisy, device) if coarse else _limited(noisy, device)
-        ranges[i] = noisy if np.float32(value).view(np.uint32) < np.uint32(INF) else value  # finite
+        ranges[i] = _told(value, noisy, device)
 
 
 @kernel(inline=True)
-def _closed(value, device):  # type: ignore[no-untyped-def]
-    return device.close if value == np.float32(-np.inf) else value
+def _told(value, measured, device):  # type: ignore[no-untyped-def]
+    """Returns what was measured of a return, else what is told of what is too close or none."""
+    other = device.close if value < device.close else value
+    return measured if np.float32(value).view(np.uint32) < np.uint32(INF) else other
 
 
 @kernel(contracts=True, inline=True)
