@@ -89,10 +89,11 @@ def contact(ranges, scale):  # type: ignore[no-untyped-def]
     """
     count = ranges.shape[0]
     for begin in range(0, count, BLOCK):
-        end, hits = min(begin + BLOCK, count), np.int32(0)
-        for b in range(begin, end):
-            hits = np.int32(hits | np.int32(ranges[b] < scale.leaves[b]))
-        for b in range(begin, end if hits != 0 else begin):
+        beams, hits = min(BLOCK, count - begin), np.int32(0)
+        for k in range(beams):
+            i = np.uintp(begin + k)
+            hits = np.int32(hits | np.int32(ranges[i] < scale.leaves[i]))
+        for b in range(begin, begin + beams if hits != 0 else begin):
             if ranges[b] < scale.leaves[b] and _gap(b, ranges, scale) < np.float32(0.0):
                 return True
     return False

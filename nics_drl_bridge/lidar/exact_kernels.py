@@ -25,8 +25,7 @@ ATAN = (
 X, Y, HEADING, COS, SIN, RADIUS, SHAPE = range(7)
 """Columns of a placed body; the radius of an absent one is 0, `SHAPE` is an index."""
 INF, MINUS_INF = np.array([np.inf, -np.inf], np.float32).view(np.int32)
-BLOCK = 48  # Beams that meet a wall at once
-TURNS = 2 * BLOCK - 1  # angles from any of them to any other, from the least on
+BLOCK = 16  # Beams that meet a wall at once
 TOGETHER = 8  # Walls whose beams are found at once
 AX, AY, BX, BY, CROSS, EX, EY, FIRST, END, FIRST_AGAIN, END_AGAIN = (
     np.uintp(k * TOGETHER) for k in range(11)
@@ -41,7 +40,7 @@ class Beams(NamedTuple):
     first: float  # angle of beam 0 [rad]
     step: float  # between beams [rad]
     closed: bool  # True for a full circle
-    turns: NDArray[np.float32]  # (2 TURNS,) cosines and sines of angles between a block's beams
+    turns: NDArray[np.float32]  # cosines and sines, up to a quarter turn and a block either way
 
 
 class LidarPose(NamedTuple):
@@ -63,7 +62,8 @@ class OutlineArrays(NamedTuple):
 @kernel(allocates=True)
 def beams_of(directions, first, step, closed):  # type: ignore[no-untyped-def]
     """Returns the beams of directions (2, B) that are a `step` apart, from `first` on [rad]."""
-    angles = step * np.arange(1 - BLOCK, BLOCK)
+    most = max(min(int(HALF_PI / step), directions.shape[1]), 1) + BLOCK
+    angles = step * np.arange(-most, most)
     turns = np.concatenate((np.cos(angles), np.sin(angles))).astype(np.float32)
     return Beams(directions, first, step, closed, turns)
 
@@ -266,40 +266,40 @@ def _find_walls(found, beams, lidar, walls, begin, range_max, count):  # type: i
 
 @kernel(inline=True)
 def _wall(whole, beams, first, end, line, limits):  # type: ignore[no-untyped-def]
-    last = whole.shape[0] - BLOCK
-    if last < 0:
-        _wall_block(whole, beams, 0, whole.shape[0], first, end, line, limits)
-        return
-    for begin in range(first, end, BLOCK):
-        _wall_block(whole, beams, min(begin, last), BLOCK, begin, end, line, limits)
+    count, most = whole.shape[0], beams.turns.shape[0] // 4 - BLOCK  # beams of a quarter turn
+    for begin in range(first, end, most):
+        until = min(begin + most, end)
+        width = min((until - begin + BLOCK - 1) // BLOCK * BLOCK, count)
+        _wall_piece(whole, beams, min(begin, count - width), width, begin, until, line, limits)
 
 
 @kernel(contracts=True, inline=True)
-def _wall_block(whole, beams, block, width, begin, end, line, limits):  # type: ignore[no-untyped-def]
-    """Fuses a wall into those beams of a block that are in [begin, end).
+def _wall_piece(whole, beams, place, width, begin, end, line, limits):  # type: ignore[no-untyped-def]
+    """Fuses a wall into those of the beams from a place on that are in [begin, end).
 
-    They are turned in single precision, from the one that meets the wall at the flattest angle, so
-    that no error is larger than there. Ranges are whole numbers, in the same order as floats; of
-    the unsigned ones, all that are negative are beyond the limit.
+    They are turned in single precision, from the one that meets the wall at the flattest angle and
+    by up to a quarter, so that no error is larger than there. Ranges are whole numbers, in the same
+    order as floats; of the unsigned ones, all that are negative are beyond the limit.
     """
     cross, ex, ey = np.float32(line[0]), line[1], line[2]
     least, most = np.float32(limits[0]).view(np.int32), np.float32(limits[1]).view(np.uint32)
-    place, skip, hits = np.uintp(block), np.int32(block - begin), np.uint32(end - begin)
-    one = np.uintp(begin - block)
-    c, s = beams.directions[0, place + one], beams.directions[1, place + one]
+    skip, hits, sines = np.int32(place - begin), np.uint32(end - begin), beams.turns.shape[0] // 2
+    one = np.uintp(begin)
+    c, s = beams.directions[0, one], beams.directions[1, one]
     if (s * ey + c * ex) * line[0] > 0.0:  # it is met ever flatter
-        one = np.uintp(min(end - block, width) - 1)
-        c, s = beams.directions[0, place + one], beams.directions[1, place + one]
+        one = np.uintp(end - 1)
+        c, s = beams.directions[0, one], beams.directions[1, one]
     across, along = np.float32(c * ey - s * ex), np.float32(s * ey + c * ex)
-    turn, sines = np.uintp(BLOCK - 1) - one, np.uintp(TURNS)
+    at, turn = np.uintp(place), np.uintp(sines // 2 + place) - one
     for k in range(width):
         j = np.uintp(k)
-        cosine, sine = beams.turns[turn + j], beams.turns[turn + j + sines]
+        cosine, sine = beams.turns[turn + j], beams.turns[turn + j + np.uintp(sines)]
         distance = cross / (across * cosine - along * sine)
         found = np.float32(distance).view(np.int32)
-        meets = (np.uint32(skip + np.int32(k)) < hits) & (np.uint32(found) <= most)
+        meets = (np.uint32(skip) < hits) & (np.uint32(found) <= most)
+        skip = np.int32(skip + np.int32(1))  # of 32 bits, as the ranges
         found = found if meets else INF
-        whole[place + j] = min(whole[place + j], found if found >= least else MINUS_INF)
+        whole[at + j] = min(whole[at + j], found if found >= least else MINUS_INF)
 
 
 @kernel
