@@ -25,7 +25,7 @@ ATAN = (
 X, Y, HEADING, COS, SIN, RADIUS, SHAPE = range(7)
 """Columns of a placed body; the radius of an absent one is 0, `SHAPE` is an index."""
 INF, MINUS_INF = np.array([np.inf, -np.inf], np.float32).view(np.int32)
-BLOCK = 16  # Beams that meet a wall at once
+BLOCK, UNIT, MANY = 48, 16, 1000  # Beams that meet a wall at once; of MANY a multiple of UNIT
 TOGETHER = 8  # Walls whose beams are found at once
 AX, AY, BX, BY, CROSS, EX, EY, FIRST, END, FIRST_AGAIN, END_AGAIN = (
     np.uintp(k * TOGETHER) for k in range(11)
@@ -40,7 +40,7 @@ class Beams(NamedTuple):
     first: float  # angle of beam 0 [rad]
     step: float  # between beams [rad]
     closed: bool  # True for a full circle
-    turns: NDArray[np.float32]  # cosines and sines, up to a quarter turn and a block either way
+    turns: NDArray[np.float32]  # (4 Q,) cosines, sines of turns by up to Q beams either way
 
 
 class LidarPose(NamedTuple):
@@ -98,8 +98,7 @@ def beam_span(low, high, beams):  # type: ignore[no-untyped-def]
 @kernel
 def circle(out, beams, x, y, radius, range_max):  # type: ignore[no-untyped-def]
     """Fuses the exact ranges to a circle at (x, y)."""
-    d2 = x * x + y * y
-    r2 = radius * radius
+    d2, r2 = x * x + y * y, radius * radius
     d = math.sqrt(d2)
     if d - radius > range_max or radius <= 0.0:
         return
@@ -136,8 +135,7 @@ def segment(out, beams, x1, y1, x2, y2):  # type: ignore[no-untyped-def]
 @kernel(inline=True)
 def edge(out, beams, x1, y1, angle1, x2, y2, angle2, one_sided):  # type: ignore[no-untyped-def]
     """Like `segment`, with directions of its ends [rad]; `one_sided`: visible from its right."""
-    count = out.shape[0]
-    ex, ey = x2 - x1, y2 - y1
+    count, ex, ey = out.shape[0], x2 - x1, y2 - y1
     cross = x1 * ey - y1 * ex
     if cross == 0.0 or (one_sided and cross > 0.0):  # seen edge-on, or from behind
         return
@@ -266,20 +264,24 @@ def _find_walls(found, beams, lidar, walls, begin, range_max, count):  # type: i
 
 @kernel(inline=True)
 def _wall(whole, beams, first, end, line, limits):  # type: ignore[no-untyped-def]
-    count, most = whole.shape[0], beams.turns.shape[0] // 4 - BLOCK  # beams of a quarter turn
+    count, few = whole.shape[0], BLOCK <= whole.shape[0] < MANY
+    most = min(beams.turns.shape[0] // 4 - BLOCK, BLOCK if few else count)  # a quarter turn
     for begin in range(first, end, most):
         until = min(begin + most, end)
-        width = min((until - begin + BLOCK - 1) // BLOCK * BLOCK, count)
-        _wall_piece(whole, beams, min(begin, count - width), width, begin, until, line, limits)
+        width = min((until - begin + UNIT - 1) // UNIT * UNIT, count)
+        if few:
+            _wall_piece(whole, beams, min(begin, count - BLOCK), BLOCK, begin, until, line, limits)
+        else:
+            _wall_piece(whole, beams, min(begin, count - width), width, begin, until, line, limits)
 
 
 @kernel(contracts=True, inline=True)
 def _wall_piece(whole, beams, place, width, begin, end, line, limits):  # type: ignore[no-untyped-def]
     """Fuses a wall into those of the beams from a place on that are in [begin, end).
 
-    They are turned in single precision, from the one that meets the wall at the flattest angle and
-    by up to a quarter, so that no error is larger than there. Ranges are whole numbers, in the same
-    order as floats; of the unsigned ones, all that are negative are beyond the limit.
+    They are turned in single precision from the first, or from the last if they meet it ever
+    flatter: up to a quarter turn, nothing cancels out. Ranges are whole numbers, in the same order
+    as floats; of the unsigned ones, all that are negative are beyond the limit.
     """
     cross, ex, ey = np.float32(line[0]), line[1], line[2]
     least, most = np.float32(limits[0]).view(np.int32), np.float32(limits[1]).view(np.uint32)
