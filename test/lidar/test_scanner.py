@@ -188,7 +188,7 @@ def test_a_wall_in_line_with_the_lidar_but_for_rounding_hides_nothing():
     assert (scanner.scan([-2.6, -2.0, -np.pi], [], [wall])[0] > 0.0).all()
 
 
-@pytest.mark.parametrize("beams", [40, 360])
+@pytest.mark.parametrize("beams", [40, 360, 1100])
 def test_a_wall_met_at_a_flat_angle_is_as_exact_as_another(beams):
     scanner, rng = make_scanner(lidar(beams=beams, range_max=25.0), ()), np.random.default_rng(1)
     for beam in range(beams):
