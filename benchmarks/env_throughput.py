@@ -338,7 +338,7 @@ def main() -> None:
     parser = parser_of(__doc__, CONTROLS)
     parser.add_argument("--worlds", type=int, default=2048, help="of the vector env")
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--repeats", type=int, default=10, help="timed chunks; thrice without peers")
+    parser.add_argument("--repeats", type=int, default=10, help="timed chunks; thrice if alone")
     parser.add_argument("--lidar", help="name or file of another lidar; without peers")
     parser.add_argument("--obstacles", type=int, default=peers.CIRCLES, help="more; without peers")
     parser.add_argument("--without-peers", action="store_true", help="install nothing")
