@@ -41,6 +41,8 @@ class Beams(NamedTuple):
     step: float  # between beams [rad]
     closed: bool  # True for a full circle
     turns: NDArray[np.float32]  # (4 Q,) cosines, sines of turns by up to Q beams either way
+    # (2, 2) unit vectors: what lies farther along both than its radius is behind all beams
+    behind: NDArray[np.float64]
 
 
 class LidarPose(NamedTuple):
@@ -65,7 +67,12 @@ def beams_of(directions, first, step, closed):  # type: ignore[no-untyped-def]
     most = max(min(int(HALF_PI / step), directions.shape[1]), 1) + BLOCK
     angles = step * np.arange(-most, most)
     turns = np.concatenate((np.cos(angles), np.sin(angles))).astype(np.float32)
-    return Beams(directions, first, step, closed, turns)
+    count = directions.shape[1]
+    blind = min(max(math.pi - 0.5 * step * count, 0.0), HALF_PI)  # half of the angle without beams
+    back = first + 0.5 * step * (count - 1) + math.pi
+    sides = np.array([back + blind - HALF_PI, back - blind + HALF_PI])
+    behind = np.stack((np.cos(sides), np.sin(sides)), axis=1)
+    return Beams(directions, first, step, closed, turns, behind)
 
 
 @kernel(inline=True)

@@ -58,15 +58,6 @@ def scan_lanes() -> ScanLanes:
     )
 
 
-class Spot(NamedTuple):
-    """Lidar of one robot: place in its world [m], bearing of beam 0 [rad], index of its scan."""
-
-    x: float
-    y: float
-    heading: float
-    at: int
-
-
 @kernel
 def scan_worlds(ranges, poses, chosen, bodies, first, fixtures, lidar, cells, lanes):  # type: ignore[no-untyped-def]
     """Scans from the robots of the worlds `chosen` (n,), at poses (N, M, 3), into ranges (N, M, B).
@@ -83,19 +74,19 @@ def scan_worlds(ranges, poses, chosen, bodies, first, fixtures, lidar, cells, la
             for i in range(out.shape[0]):
                 out[i] = np.float32(np.inf)
             x, y, heading = baked.sensor_pose(poses[n, m], lidar.mount)
-            spot = Spot(x, y, heading, (n * robots + m) * out.shape[0])
+            here = LidarPose(x, y, math.cos(heading), math.sin(heading))
+            at = (n * robots + m) * out.shape[0]
             count = cell_kernels.around(n, x, y, lidar.range_max, cells)
             begin, computed = 0, 0
             while begin < count:
                 end = min(count, begin + LANES - found)
                 near = cells.found[begin:end]
-                found, more = select(found, near, bodies[n], me, spot, lidar, lanes)
+                found, more = select(found, near, bodies[n], me, here, heading, at, lidar, lanes)
                 begin, computed = end, computed + more
                 if found == LANES:
                     look_up(found, ranges, lidar, lanes)
                     found = 0
             if computed > 0 or walls.shape[0] > 0:
-                here = LidarPose(x, y, math.cos(heading), math.sin(heading))
                 near = cells.found[: count if computed > 0 else 0]
                 baked.compute(out, here, bodies[n], me, near, walls, lidar, lanes.walls)
     look_up(found, ranges, lidar, lanes)
@@ -104,19 +95,23 @@ def scan_worlds(ranges, poses, chosen, bodies, first, fixtures, lidar, cells, la
 
 
 @kernel(contracts=True, inline=True)
-def select(found, near, bodies, me, spot, lidar, lanes):  # type: ignore[no-untyped-def]
-    """Lanes the bodies `near` to look up; returns lanes in use, and bodies computed."""
-    wide, computed = lanes.wide, 0
+def select(found, near, bodies, me, here, heading, at, lidar, lanes):  # type: ignore[no-untyped-def]
+    """Lanes the bodies `near` that may be seen; returns lanes in use, and bodies to compute."""
+    wide, computed, behind = lanes.wide, 0, lidar.beams.behind
     for j in range(near.shape[0]):
         b, k = np.uintp(near[j]), np.uintp(found)
-        dx, dy, radius = bodies[b, X] - spot.x, bodies[b, Y] - spot.y, bodies[b, RADIUS]
+        dx, dy, radius = bodies[b, X] - here.x, bodies[b, Y] - here.y, bodies[b, RADIUS]
         d2, reach, shape = dx * dx + dy * dy, lidar.range_max + radius, np.int32(bodies[b, SHAPE])
         wide[k + DX], wide[k + DY], wide[k + TURNED] = dx, dy, bodies[b, HEADING]
         wide[k + COSINE], wide[k + SINE], wide[k + SIZE] = bodies[b, COS], bodies[b, SIN], radius
-        wide[k + BEARING_0], wide[k + SCAN] = spot.heading, spot.at
+        wide[k + BEARING_0], wide[k + SCAN] = heading, at
         lanes.whole[k + KIND] = shape
         h = np.uintp(shape)
-        seen = (d2 <= reach * reach) & (radius > 0.0) & (near[j] != me)
+        u, v = here.c * dx + here.s * dy, here.c * dy - here.s * dx
+        away = (behind[0, 0] * u + behind[0, 1] * v >= radius) & (
+            behind[1, 0] * u + behind[1, 1] * v >= radius
+        )
+        seen = (d2 <= reach * reach) & (radius > 0.0) & (near[j] != me) & (not away)
         kept = seen & (d2 >= radius * radius)
         kept &= (d2 >= lidar.between[h, 0]) & (d2 <= lidar.between[h, 1])
         found += kept

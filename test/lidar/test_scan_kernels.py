@@ -5,7 +5,15 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import numpy as np
 import pytest
+from robots import lidar
+
+from nics_drl_bridge.lidar import scan_kernels
+from nics_drl_bridge.lidar.bake import bake
+from nics_drl_bridge.lidar.exact_kernels import LidarPose
+from nics_drl_bridge.lidar.scanner import Scanner
+from nics_drl_bridge.lidar.shapes import Circle
 
 BETWEEN_FORBIDDEN_PAGES = """
 import ctypes, mmap, sys
@@ -52,3 +60,27 @@ def test_a_look_up_reads_nothing_outside_of_its_table(beams, side):
     command = [sys.executable, "-c", BETWEEN_FORBIDDEN_PAGES, str(beams), side]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def looked_up(view: float, ahead: float, bearing: float) -> bool:
+    """True if a disc 1 m away of a lidar that looks `ahead`, as wide as `view`, gets a lane."""
+    spec = lidar(beams=91, angle_min=ahead - view / 2.0, angle_max=ahead + view / 2.0)
+    disc = Circle(radius=0.2)
+    scanner = Scanner(spec, bake(spec, [disc]), "baked")
+    body = scanner.place([disc], [[np.cos(bearing), np.sin(bearing), 0.0]])
+    here, lanes, near = LidarPose(0.0, 0.0, 1.0, 0.0), scan_kernels.scan_lanes(), np.zeros(1, int)
+    found, computed = scan_kernels.select(0, near, body, -1, here, 0.0, 0, scanner.arguments, lanes)
+    assert computed == 0
+    return bool(found)
+
+
+@pytest.mark.parametrize("ahead", [0.0, 2.5])
+@pytest.mark.parametrize("view", [0.5, np.pi, 1.5 * np.pi, 1.9 * np.pi])
+def test_of_bodies_only_those_wholly_behind_all_beams_are_not_looked_up(view, ahead):
+    half = np.arcsin(0.2)  # of the angle at which the disc is seen
+    edge = view / 2.0 + half
+    assert looked_up(view, ahead, ahead)
+    assert looked_up(view, ahead, ahead + edge - 0.01)
+    assert looked_up(view, ahead, ahead - edge + 0.01)
+    behind = np.pi - edge > view / 90.0  # the disc fits between the last beam and the first
+    assert looked_up(view, ahead, ahead + np.pi) != behind
