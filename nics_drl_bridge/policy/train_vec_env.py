@@ -79,18 +79,15 @@ class TrainVecEnv(VecEnv):
         """Steps one of the envs and fills the infos of its worlds that ended."""
         observation, reward, terminated, truncated, info = env.step(self._actions[rows])
         done = terminated | truncated
-        for n in np.flatnonzero(done):
-            final = info["final_info"]
-            self._ended.append(rows.start + int(n))
-            self._infos[rows.start + n] = {
-                "terminal_observation": info["final_obs"][n],
-                "TimeLimit.truncated": bool(truncated[n] and not terminated[n]),
-                **{
-                    name: bool(np.all(final[name][n]))
-                    for name in ("is_success", "collision")
-                    if name in final
-                },
-            }
+        if over := np.flatnonzero(done).tolist():
+            flags = {"TimeLimit.truncated": truncated & ~terminated}
+            for name in {"is_success", "collision"} & info["final_info"].keys():
+                flags[name] = info["final_info"][name].reshape(len(done), -1).all(axis=1)
+            told = {name: flag.tolist() for name, flag in flags.items()}
+            for n in over:
+                self._ended.append(rows.start + n)
+                own = {name: each[n] for name, each in told.items()}
+                self._infos[rows.start + n] = own | {"terminal_observation": info["final_obs"][n]}
         return observation, reward, done
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
