@@ -18,7 +18,6 @@ from nics_drl_bridge.generator import (
     save_model,
 )
 from nics_drl_bridge.lidar.maps import load_map
-from nics_drl_bridge.lidar.shapes import load_shapes
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.lidar.table import LidarTable
 from nics_drl_bridge.middleware.playback import EstimatedDrive, write_estimate
@@ -123,7 +122,7 @@ def test_a_policy_is_loaded_from_either(kind):
 
 
 @KINDS
-@pytest.mark.parametrize("load", [read_recording, load_recording, load_shapes, replay, topic_roles])
+@pytest.mark.parametrize("load", [read_recording, load_recording, replay, topic_roles])
 def test_what_is_not_there_is_one_sentence_for_either(tmp_path, kind, load):
     with pytest.raises(BridgeError, match=r"gone: no such f"):
         load(kind(tmp_path / "gone"))

@@ -15,7 +15,7 @@ from nics_drl_bridge.config import dump_yaml, parse_yaml, share_folder
 from nics_drl_bridge.gate.limits import load_limits
 from nics_drl_bridge.lidar.maps import load_map
 from nics_drl_bridge.lidar.scanner import make_scanner
-from nics_drl_bridge.lidar.shapes import Circle, load_shapes
+from nics_drl_bridge.lidar.shapes import Circle
 from nics_drl_bridge.lidar.spec import load_lidar
 from nics_drl_bridge.policy.training_settings import load_training
 from nics_drl_bridge.recording.topic_roles import topic_roles
@@ -41,12 +41,6 @@ def _map(path: str) -> object:
     return load_map(path).arrays
 
 
-def _shapes(path: str) -> object:
-    spec, shapes = load_lidar("paper"), load_shapes(path)
-    scanner = make_scanner(spec, shapes, renderer="exact")
-    return scanner.scan([0.0, 0.0, 0.0], scanner.place(shapes[:1], [[1.0, 0.5, 0.0]]))
-
-
 USES: dict[str, Callable[[str], object]] = {
     "robots/ackermann": load_robot,
     "robots/differential": load_robot,
@@ -60,14 +54,10 @@ USES: dict[str, Callable[[str], object]] = {
     "randomisation/strong": load_randomisation,
     "training/navigation_differential": load_training,
     "maps/room": _map,
-    "shapes": _shapes,
     "topics": topic_roles,
 }
 """What is done with the file of each kind."""
 OWN = {
-    "shapes": "shapes: [{kind: circle, radius: 0.2}, {kind: rectangle, size: [0.4, 0.2]},\n"
-    "  {kind: polygon, points: [[0, 0], [1, 0], [0, 1]]},\n"
-    "  {kind: segment, ends: [[0, 0], [1, 1]]}]\n",
     "topics": "cmd_vel: /cmd_vel\nodom: /odom\nstamps: header\n",
 }
 

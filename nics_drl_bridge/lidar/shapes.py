@@ -2,20 +2,19 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, field_validator, model_validator
 
-from nics_drl_bridge.config import Schema, load_yaml
+from nics_drl_bridge.config import Schema
 from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.lidar.exact_kernels import COS, RADIUS, SHAPE, SIN, OutlineArrays
 
 MOST_CORNERS = 16_384
-MOST_SHAPES = 1_000  # in one file, or in one group of obstacles
+MOST_SHAPES = 1_000  # in one group of obstacles
 SMALLEST, LARGEST = 1e-6, 1e4  # Extent of a shape [m]: less is invisible, more fits in no world
 SAME_PLACE = 1e-9  # corners within this distance, as a share of the shape's radius, coincide
 FARTHEST = 1e8  # greatest coordinate in a map [m], enough for UTM
@@ -123,17 +122,6 @@ class Segment(Outlined):
 
 
 Shape = Annotated[Circle | Rectangle | Polygon | Segment, Field(discriminator="kind")]
-
-
-class ShapeFile(Schema):
-    """The keys of a YAML file of shapes."""
-
-    shapes: tuple[Shape, ...] = Field(min_length=1, max_length=MOST_SHAPES)
-
-
-def load_shapes(path: str | Path) -> tuple[Shape, ...]:
-    """Loads the shapes of a YAML file. Raises ConfigError with file, key and fix."""
-    return load_yaml(path, ShapeFile).shapes
 
 
 SQUARE = Rectangle(size=(0.3, 0.3))

@@ -7,8 +7,9 @@ from pydantic import Field
 from nics_drl_bridge.config import Schema, load_yaml, parse_yaml, validate
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.lidar.sensor_models import IncidenceDropout, Intensity, SensorModels, returned
-from nics_drl_bridge.lidar.shapes import Circle, ShapeFile, describe
+from nics_drl_bridge.lidar.shapes import Circle, describe
 from nics_drl_bridge.lidar.spec import LidarSpec
+from nics_drl_bridge.sim.world import Obstacles
 
 RANGES = np.array([1.0, 1.0, 2.0, 2.0], np.float32)
 INCIDENCE = np.array([0.0, 1.2, 0.0, 1.2])
@@ -88,10 +89,11 @@ def test_a_lidar_names_its_sensor_model_and_has_none_by_default():
 
 
 def test_shapes_of_different_reflectivity_are_different_shapes():
-    text = "shapes: [{kind: circle, radius: 1}, {kind: circle, radius: 1, reflectivity: 0.1}]"
-    plain, dark = validate(parse_yaml(text, "s.yaml"), ShapeFile, "s.yaml").shapes
+    text = "{kind: circle, radius: 1}, {kind: circle, radius: 1, reflectivity: 0.1}"
+    text = f"{{count: 1, shapes: [{text}]}}"
+    plain, dark = validate(parse_yaml(text, "s.yaml"), Obstacles, "s.yaml").shapes
     assert plain == Circle(radius=1.0)
     assert plain != dark
     assert describe(dark) == "circle of radius 1 m, reflectivity 0.1"
     with pytest.raises(ConfigError, match=r"reflectivity': input should be greater than 0, not -1"):
-        validate(parse_yaml(text.replace("0.1", "-1"), "s.yaml"), ShapeFile, "s.yaml")
+        validate(parse_yaml(text.replace("0.1", "-1"), "s.yaml"), Obstacles, "s.yaml")

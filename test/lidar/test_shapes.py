@@ -6,7 +6,7 @@ import shapely
 from lidar_scenes import POLYGONS, random_shapes
 from pydantic import ValidationError
 
-from nics_drl_bridge.errors import ConfigError, ModelError
+from nics_drl_bridge.errors import ModelError
 from nics_drl_bridge.lidar.shapes import (
     SQUARE,
     STRIP,
@@ -15,13 +15,12 @@ from nics_drl_bridge.lidar.shapes import (
     Polygon,
     Rectangle,
     Segment,
-    ShapeFile,
     convex_hull,
     describe,
-    load_shapes,
     place,
     rotational_order,
 )
+from nics_drl_bridge.sim.world import Obstacles
 
 
 def regular(corners, reach=0.3, shift=0.0):
@@ -122,16 +121,7 @@ def test_place_writes_pose_its_direction_radius_and_shape():
 
 def test_every_shape_is_read_back_from_plain_data_and_has_a_description():
     shapes = random_shapes(0)
-    plain = ShapeFile(shapes=shapes).model_dump(mode="json")
-    assert ShapeFile.model_validate(plain).shapes == shapes
+    plain = Obstacles(shapes=shapes, count=1).model_dump(mode="json")
+    assert Obstacles.model_validate(plain).shapes == shapes
     assert describe(Segment(ends=((0.0, 0.0), (3.0, 4.0)))) == "segment of 5 m"
     assert len({describe(shape) for shape in shapes}) > 7
-
-
-def test_shapes_are_loaded_from_a_file_and_a_wrong_one_is_named(tmp_path):
-    path = tmp_path / "shapes.yaml"
-    path.write_text("shapes:\n  - {kind: circle, radius: 0.15}\n")
-    assert load_shapes(path) == (Circle(radius=0.15),)
-    path.write_text("shapes:\n  - {kind: circle, radius: -1}\n")
-    with pytest.raises(ConfigError, match="radius"):
-        load_shapes(path)
