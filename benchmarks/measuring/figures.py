@@ -388,6 +388,7 @@ TABLES: Mapping[str, Table] = {
     "env_scaling": SCALING,
     "table1": TABLE1,
     "table2": lidar.TABLE2,
+    "table2_hokuyo": lidar.TABLE2_HOKUYO,
     "table3": lidar.TABLE3,
     "lidar_complexity": lidar.COMPLEXITY,
     "sensor_models": lidar.MODELS,

@@ -55,6 +55,17 @@ TABLE2 = Table(
         )
     ),
 )  # fmt: skip
+TABLE2_HOKUYO = Table(
+    ("scene", "exact [1/s]", "baked [1/s]", "RMSE [m]", "nearest row's", "of the write limit",
+     "table"),
+    tuple(
+        ("table2_hokuyo", title, f"{{scenes.{name}.exact_scans_per_s|.1e}}",
+         f"{{scenes.{name}.baked_scans_per_s|.1e}}", f"{{scenes.{name}.rmse_m|.4f}}",
+         f"{{scenes.{name}.nearest_row_rmse_m|.3f}}",
+         f"{{scenes.{name}.share_of_write_limit|.0%}}", f"{{table_bytes.{name} x1e-6|.2g}} MB")
+        for name, title in SHAPES.items()
+    ),
+)  # fmt: skip
 DENSITIES = ("100x240", "50x240", "100x120")
 TABLE3 = Table(
     ("look-up", "distances x rotations", *SHAPES, "worse, on average"),

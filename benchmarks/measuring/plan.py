@@ -79,7 +79,10 @@ RUNS: dict[str, Run] = {
     "soak": row("soak", "", "--minutes 0.2 --warm-up 0.1"),
     "soak_env": row("soak_env", "", "--steps 200000"),
     "standards": row("standards", "", "--parts leapp", HOUR),
-    "table2_lidar": row("table2_lidar", "", "--scans 512 --repeats 5"),
+    **{
+        f"table2_{name}": row("table2_lidar", lidar, f"{lidar} --scans 512 --repeats 5".strip())
+        for name, lidar in (("lidar", ""), ("hokuyo", "--lidar hokuyo_ust_10lx"))
+    },
     "table3_density": row("table3_density", "", "--scans 256"),
     **{
         f"training_{robot}{name}": row(

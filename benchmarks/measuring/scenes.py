@@ -119,10 +119,12 @@ def nearest_row(batch: Batch, table: LidarTable, spec: LidarSpec = SPEC) -> Batc
     return Batch(batch.shapes, poses, batch.lidar)
 
 
-def errors(found: Sequence[Ranges], exact: Sequence[Ranges]) -> tuple[float, float]:
+def errors(
+    found: Sequence[Ranges], exact: Sequence[Ranges], spec: LidarSpec = SPEC
+) -> tuple[float, float]:
     """RMSE of the range over all beams [m] and of the area over all scans [m^2]."""
-    a, b = (filled(np.concatenate(list(each))) for each in (found, exact))
-    areas = 0.5 * SPEC.angle_increment * ((a**2).sum(axis=1) - (b**2).sum(axis=1))
+    a, b = (filled(np.concatenate(list(each)), spec) for each in (found, exact))
+    areas = 0.5 * spec.angle_increment * ((a**2).sum(axis=1) - (b**2).sum(axis=1))
     return float(np.sqrt(((a - b) ** 2).mean())), float(np.sqrt((areas**2).mean()))
 
 

@@ -95,7 +95,7 @@ def table_2() -> Found:
 
     found = {}
     for name, shapes in table.SCENES.items():
-        baked = table.bake(table.SPEC, shapes, table.DENSITY)
+        baked = table.bake(table.load_lidar("paper"), shapes, table.DENSITY)
         drawn = table.batches(shapes, 64)
         exact = [table.scan(baked, "exact", batch) for batch in drawn]
         fast = [table.scan(baked, "baked", batch) for batch in drawn]
