@@ -381,15 +381,15 @@ def zeros(shape: tuple[int, ...], dtype: np.dtype[Any]) -> NDArray[Any]:
 def masked(facts: Facts, mask: Flags, alone: bool = False) -> dict[str, Any]:
     """Pairs facts (N, ...) with masks `_name` (N,), as Gymnasium; zero elsewhere if `alone`."""
     paired: dict[str, Any] = {}
-    rows, others = np.flatnonzero(mask), np.flatnonzero(~mask)
+    gone, most = ~mask, 2 * np.count_nonzero(mask) > len(mask)
     for name, values in facts.items():
         paired[name], paired[f"_{name}"] = values, mask.copy()
         if isinstance(values, Mapping):
             paired[name] = masked(values, mask, alone)
-        elif alone and len(rows) > len(others):
+        elif alone and most:
             paired[name] = values.copy()
-            paired[name][others] = 0
+            paired[name][gone] = np.zeros((), values.dtype)
         elif alone:
             paired[name] = zeros(values.shape, values.dtype)
-            paired[name][rows] = values[rows]
+            paired[name][mask] = values[mask]
     return paired

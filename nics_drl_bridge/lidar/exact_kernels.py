@@ -68,7 +68,8 @@ def beams_of(directions, first, step, closed):  # type: ignore[no-untyped-def]
     angles = step * np.arange(-most, most)
     turns = np.concatenate((np.cos(angles), np.sin(angles))).astype(np.float32)
     count = directions.shape[1]
-    blind = min(max(math.pi - 0.5 * step * count, 0.0), HALF_PI)  # half of the angle without beams
+    # Half of the angle without beams, but for half a step, by which no rounding matters:
+    blind = min(max(math.pi - 0.5 * step * count, 0.0), HALF_PI)
     back = first + 0.5 * step * (count - 1) + math.pi
     sides = np.array([back + blind - HALF_PI, back - blind + HALF_PI])
     behind = np.stack((np.cos(sides), np.sin(sides)), axis=1)

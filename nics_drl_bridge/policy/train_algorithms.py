@@ -116,7 +116,8 @@ def observed(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Array]:
 
     The deviation is at least 0.05, and a quarter of the span, or of the mean if that is less.
     """
-    seen, some = [np.array(env.reset())], slice(None, None, max(1, env.num_envs // OBSERVED_WORLDS))
+    some = slice(None, None, max(1, env.num_envs // OBSERVED_WORLDS))
+    seen = [np.array(env.reset()[some])]
     for k in range(OBSERVED_STEPS):
         if k % 8 == 0:  # else a robot with inertia would stay in place
             space: Any = env.action_space
@@ -124,8 +125,8 @@ def observed(env: VecEnv, rng: np.random.Generator) -> tuple[Array, Array]:
                 actions: NDArray[Any] = rng.integers(space.n, size=env.num_envs)
             else:
                 actions = rng.uniform(-1.0, 1.0, (env.num_envs, *space.shape)).astype(np.float32)
-        seen.append(np.array(env.step(actions)[0]))
-    rows = np.stack(seen)[:, some].reshape(-1, seen[0].shape[-1]).astype(np.float64)
+        seen.append(np.array(env.step(actions)[0][some]))
+    rows = np.concatenate(seen).reshape(-1, seen[0].shape[-1]).astype(np.float64)
     rows = bend(rows, shares_of(env.observation_space))
     mean = rows.mean(axis=0)
     # What is seen later may differ by more than what is seen near the starts.

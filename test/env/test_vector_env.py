@@ -343,3 +343,19 @@ def test_many_zeros_are_zeros_where_memory_can_not_be_mapped_privately_as_on_win
     many = vector_env.zeros((vector_env.LARGE,), np.dtype(np.float32))
     assert many.shape == (vector_env.LARGE,)
     assert not many.any()
+
+
+@pytest.mark.parametrize("kept", [(0,), (0, 1, 3)])
+@pytest.mark.parametrize("kind", ["f8", "f4", "i8", "?", "U3", "S3", "O"])
+def test_facts_of_some_worlds_are_copies_and_zeros_elsewhere_however_many_they_are(kind, kept):
+    values = np.array([[1, 2], [3, 4], [5, 6], [7, 8]]).astype(kind)
+    mask = np.isin(np.arange(4), kept)
+    found = vector_env.masked({"of": {"these": values}}, mask, True)["of"]
+    expected = np.zeros_like(values)
+    expected[mask] = values[mask]
+    assert found["these"].dtype == values.dtype
+    assert found["these"].tolist() == expected.tolist()
+    assert found["_these"].tolist() == mask.tolist()
+    assert not np.shares_memory(found["these"], values)
+    with pytest.raises(IndexError):
+        vector_env.masked({"wrong": np.concatenate([values, values])}, mask, True)

@@ -67,9 +67,11 @@ def looked_up(view: float, ahead: float, bearing: float) -> bool:
     spec = lidar(beams=91, angle_min=ahead - view / 2.0, angle_max=ahead + view / 2.0)
     disc = Circle(radius=0.2)
     scanner = Scanner(spec, bake(spec, [disc]), "baked")
-    body = scanner.place([disc], [[np.cos(bearing), np.sin(bearing), 0.0]])
-    here, lanes, near = LidarPose(0.0, 0.0, 1.0, 0.0), scan_kernels.scan_lanes(), np.zeros(1, int)
-    found, computed = scan_kernels.select(0, near, body, -1, here, 0.0, 0, scanner.arguments, lanes)
+    turned = bearing + 0.7  # as the lidar is
+    body = scanner.place([disc], [[np.cos(turned), np.sin(turned), 0.0]])
+    here = LidarPose(0.0, 0.0, np.cos(0.7), np.sin(0.7))
+    lanes, near = scan_kernels.scan_lanes(), np.zeros(1, int)
+    found, computed = scan_kernels.select(0, near, body, -1, here, 0.7, 0, scanner.arguments, lanes)
     assert computed == 0
     return bool(found)
 
