@@ -186,6 +186,18 @@ def test_odometry_of_mecanum_wheels_is_calibrated_for_what_their_rollers_lose():
     assert np.hypot(*(told - driven)[:2]) < 0.004 * np.hypot(*driven[:2])
 
 
+def test_odometry_of_mecanum_wheels_knows_turns_of_a_diagonal_on_which_two_wheels_stand():
+    model = builtin_model("mecanum")
+    simulator = MujocoSimulator(model, load_world("empty"))
+    simulator.reset([0], starts=np.array([[[2.0, -2.0, 0.0]]]))
+    drive(simulator, np.array([[[0.0, 0.0, 0.5]]]), 10)  # they stop beside their rollers' middles
+    start, believed = simulator.data.pose[0, 0].copy(), simulator.wheels[0].copy()
+    drive(simulator, np.array([[[-0.7, 0.7, 0.0]]]), 30)
+    turned = geometry.between(start, simulator.data.pose[0, 0])[2]
+    assert abs(turned) > 0.01
+    assert geometry.between(believed, simulator.wheels[0])[2] == pytest.approx(turned, abs=1e-3)
+
+
 def test_odometry_of_a_robot_that_skids_turns_by_its_gyro():
     model = builtin_model("jackal")
     world = load_world("empty").model_copy(update={"size": (40.0, 40.0)})
