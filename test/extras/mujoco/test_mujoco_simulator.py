@@ -190,11 +190,11 @@ def test_odometry_of_mecanum_wheels_knows_turns_of_a_diagonal_on_which_two_wheel
     model = builtin_model("mecanum")
     simulator = MujocoSimulator(model, load_world("empty"))
     simulator.reset([0], starts=np.array([[[2.0, -2.0, 0.0]]]))
-    drive(simulator, np.array([[[0.0, 0.0, 0.5]]]), 10)  # they stop beside their rollers' middles
+    drive(simulator, np.array([[[0.4, 0.2, 0.3]]]), 8)  # they stop beside their rollers' middles
     start, believed = simulator.data.pose[0, 0].copy(), simulator.wheels[0].copy()
     drive(simulator, np.array([[[-0.7, 0.7, 0.0]]]), 30)
     turned = geometry.between(start, simulator.data.pose[0, 0])[2]
-    assert abs(turned) > 0.01
+    assert abs(turned) > 0.05
     assert geometry.between(believed, simulator.wheels[0])[2] == pytest.approx(turned, abs=1e-3)
 
 
