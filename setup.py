@@ -61,6 +61,7 @@ EXTRAS = {
     # The site of docs/, and what runs and shows its notebooks.
     "docs": [
         "ipykernel>=6.29",
+        "latex2mathml>=3.77",  # formulas without scripts
         "mkdocs-material>=9.6,<10",
         "mkdocstrings[python]>=0.29",
         "nbconvert>=7.16",

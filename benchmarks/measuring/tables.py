@@ -1,9 +1,10 @@
 """Makes the tables of figures in README.md and docs/ from results.json: `make tables`.
 
 What stands between `<!-- results:NAME -->` and `<!-- /results -->` is the table `NAME` of
-`figures.py`. A cell is text with placeholders, `{[max|min|sum ][RUN:]PATH[ xFACTOR][|FORMAT]}`:
-the path goes into the result of the row's run, or of `RUN`, with dots between keys and `*` for
-each; the format is Python's. A cell whose placeholders lead nowhere reads `not measured`.
+`figures.py`. A cell is text with placeholders, `{[REDUCTION ][RUN:]PATH[ xFACTOR][|FORMAT]}`, with
+a reduction of max, min, sum, mean and harmonic_mean. The path goes into the result of the row's
+run, or of `RUN`, with dots between keys and `*` for each; the format is Python's. A cell whose
+placeholders lead nowhere reads `not measured`.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from statistics import harmonic_mean, mean
 from textwrap import shorten
 from typing import Any
 
@@ -25,10 +27,10 @@ from measuring.table import Table
 ROOT = RESULTS.parents[1]
 REGION = re.compile(r"<!-- results:([a-z0-9_]+) -->\n(.*?)<!-- /results -->", re.DOTALL)
 PLACEHOLDER = re.compile(
-    r"\{(?:(?P<how>max|min|sum) )?(?:(?P<run>[a-z0-9_]+):)?(?P<path>[^{}|]+?)"
+    r"\{(?:(?P<how>max|min|sum|mean|harmonic_mean) )?(?:(?P<run>[a-z0-9_]+):)?(?P<path>[^{}|]+?)"
     r"(?: x(?P<factor>[0-9.e+-]+))?(?:\|(?P<format>[^{}]*))?\}"
 )
-HOW = {"max": max, "min": min, "sum": sum}
+HOW = {"max": max, "min": min, "sum": sum, "mean": mean, "harmonic_mean": harmonic_mean}
 NOT_MEASURED, OF_MISSED, OF_QUICK, ELSEWHERE = "not measured", "†", "‡", "§"
 VERSIONS = ("numba", "numpy")
 MOST_TOLD = 3  # bars that a run missed; of more, one fewer and how many more there are

@@ -6,6 +6,7 @@ from pathlib import Path, PurePosixPath
 from posixpath import normpath, relpath
 from typing import Any
 
+from latex2mathml.converter import convert
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from nbconvert import MarkdownExporter
@@ -17,6 +18,10 @@ AT_THE_TOP = ("CHANGELOG.md", "CONTRIBUTING.md")
 SHIM = re.compile(r"<script[^>]*unpkg\.com/iframe-worker[^>]*></script>")
 NAMED = re.compile(r"(?<!\[)`docs/(?P<page>[\w/]+\.md)`")
 FROM_DISK = f"<script>{Path(__file__).with_name('search_from_disk.js').read_text()}</script>"
+DISPLAYED_FORMULA = re.compile(r"^\$\$\n(?P<tex>.+?)\n\$\$$", re.MULTILINE | re.DOTALL)
+INLINE_FORMULA = re.compile(r"(?<![\w$`])\$(?P<tex>[^$`\n]+)\$(?![\w$`])")
+EQUATION_NUMBER = re.compile(r"\\tag\{(\d+)\}")
+CODE = re.compile(r"(^```.*?^```|`[^`\n]*`)", re.MULTILINE | re.DOTALL)
 LINK = re.compile(r"\[(?P<text>[^\]]*)\]\((?P<to>[^)#\s:]+)(?P<anchor>#[^)]*)?\)")
 
 
@@ -53,7 +58,24 @@ def on_page_markdown(markdown: str, page: Any, config: MkDocsConfig, files: File
         leaves = normpath(f"{here}/{match['to']}").startswith("..")
         return match["text"] if leaves else match[0]
 
-    return LINK.sub(within, NAMED.sub(named, markdown))
+    return LINK.sub(within, NAMED.sub(named, with_formulas(markdown)))
+
+
+def with_formulas(markdown: str) -> str:
+    """Replaces LaTeX between dollar signs by MathML, which browsers draw without scripts."""
+    markdown = DISPLAYED_FORMULA.sub(displayed_formula, markdown)
+    parts = CODE.split(markdown)
+    for index in range(0, len(parts), 2):  # every other part is code
+        parts[index] = INLINE_FORMULA.sub(lambda match: convert(match["tex"]), parts[index])
+    return "".join(parts)
+
+
+def displayed_formula(match: re.Match[str]) -> str:
+    """A formula on lines of its own, with the number of its equation."""
+    number = EQUATION_NUMBER.search(match["tex"])
+    formula = convert(EQUATION_NUMBER.sub("", match["tex"]).strip(), display="block")
+    label = f'<span class="equation-number">({number[1]})</span>' if number else ""
+    return f'<div class="equation">{formula}{label}</div>\n'
 
 
 def on_post_page(output: str, page: Any, config: MkDocsConfig) -> str:
