@@ -118,6 +118,7 @@ def gate(domain_id: int, folder: Path, control: str) -> Any:
         "model": ROBOT, "limits": ROBOT, "e_stop_required": "true", "odom_rate": float(ODOM_HZ),
         "black_box": str(folder), "rate_tolerance": 0.6, "shield": "false",
         "enable_stamped_cmd_vel": "false",
+        "stop_when_held": "false",  # the robot's scans do not show how it moves
     }  # fmt: skip
     given = [f"{name}:={value}" for name, value in parameters.items()]
     return started(

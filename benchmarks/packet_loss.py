@@ -165,6 +165,7 @@ class Robot(_End):
 def run_stack(seconds: float, folder: Path, control: str) -> None:
     """The far end, in its namespace; writes what the policy used when the near end has ended."""
     parameters = {"model": ROBOT, "limits": ROBOT, "e_stop_required": True}
+    parameters["stop_when_held"] = False  # the robot's scans do not show how it moves
     parameters["black_box"] = str(folder / "black_box")
     parameters["enable_stamped_cmd_vel"] = False
     domain_id = int(os.environ["ROS_DOMAIN_ID"])

@@ -7,9 +7,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from nics_drl_bridge.gate import frozen, inputs, limits, shield, stops
+from nics_drl_bridge.gate import estimate as estimates
+from nics_drl_bridge.gate import frozen, inputs, limits, scan_motion, shield, stops
 from nics_drl_bridge.gate import state as records
-from nics_drl_bridge.gate.state import Arrivals, Cause, GateConfig, GateState, Motion, replace
+from nics_drl_bridge.gate.state import (
+    Arrivals,
+    Cause,
+    GateConfig,
+    GateState,
+    Motion,
+    ScanMotion,
+    replace,
+)
 from nics_drl_bridge.gate.stops import ODOM, SCAN, settled
 from nics_drl_bridge.geometry import between
 from nics_drl_bridge.interface import S_PER_NS, Array
@@ -18,7 +27,6 @@ Taken = tuple[GateState, str]  # and the reason why an input is not taken, or ""
 GREATEST_SPEED = 100.0  # greatest speed that the odometry of a mobile robot can show [m/s, rad/s]
 SLIP, SLIP_SPEED, SLIP_TURN = 2.0, 0.5, 1.0
 """A robot may exceed its limits by this factor, downhill or pushed, plus [m/s] and [rad/s]."""
-CAR_TURN = 4.0  # greatest turn rate of a robot that is commanded by steering angle [rad/s]
 LEAP, LEAP_TURN = 0.1, 0.2  # jump of an odometry pose that may come from imprecision [m, rad]
 ANGLE_TOLERANCE = 1e-3  # greatest deviation of the last beam from its declared angle [rad]
 BEHIND_S = 0.2  # by which irregular stamps may fall behind while the gate settles
@@ -81,6 +89,7 @@ def _serve(
         return replace(
             state, armed=True, scans=settled(state.scans),
             odometries=settled(state.odometries), sensors=sensors, seen=(), frozen="", push=None,
+            scan_motion=ScanMotion(), estimates=estimates.begin_anew(state),
         ), "armed", True  # fmt: skip
     if isinstance(given, inputs.Reset):
         # The latch is cleared, unless the emergency stop is still pressed.
@@ -140,9 +149,12 @@ def odom_malformed(config: GateConfig, odometry: inputs.Odometry) -> str:
 
 
 def estimate_malformed(config: GateConfig, estimate: inputs.Estimate) -> str:
-    """The estimate is not finite."""
-    finite = np.isfinite(estimate.twist).all() and np.isfinite(estimate.std).all()
-    return "" if finite else "odometry/filtered: NaN or inf"
+    """The estimate is not finite, or its covariance is none."""
+    parts = (estimate.twist, estimate.pose, estimate.covariance)
+    if not all(np.isfinite(part).all() for part in parts):
+        return "odometry/filtered: NaN or inf"
+    negative = bool((np.diag(estimate.covariance) < 0.0).any())
+    return "odometry/filtered: a variance is negative" if negative else ""
 
 
 def command_not_finite(config: GateConfig, command: inputs.Command) -> str:
@@ -168,7 +180,11 @@ REFUSALS: tuple[tuple[type, Callable[[GateConfig, Any], str]], ...] = (
 
 def take(config: GateConfig, state: GateState, given: inputs.Input, now: float) -> Taken:
     """Takes an input into the state, or returns the reason why not."""
-    state = replace(state, jumped="", leap="")
+    state = replace(state, jumped="", leap="", mixed="")
+    if state.estimates.fault:
+        state = replace(state, estimates=replace(state.estimates, fault=""))
+    if isinstance(given, inputs.Command):
+        state = stops.watch_source(state, given, now)
     for kind, judge in REFUSALS:
         reason = judge(config, given) if isinstance(given, kind) else ""
         if reason and kind is inputs.Command:
@@ -182,7 +198,8 @@ def take(config: GateConfig, state: GateState, given: inputs.Input, now: float) 
     if isinstance(given, inputs.SensorReading):
         return _take_reading(config, state, given, now)
     if isinstance(given, inputs.Estimate):
-        state = replace(state, estimate=given, estimate_s=now)
+        track = estimates.track_estimate(config, state, given, now)
+        state = replace(state, estimate=given, estimate_s=now, estimates=track)
     elif isinstance(given, inputs.Command):
         state = _take_command(state, given, now)
     elif isinstance(given, inputs.EStop):
@@ -220,6 +237,7 @@ def _take_scan(config: GateConfig, state: GateState, scan: inputs.Scan, now: flo
     ground = shield.ground_of(config, views, state.ground)
     state = replace(
         state, scans=arrivals, scan=scan, seen=seen, frozen=why, views=views, ground=ground,
+        scan_motion=scan_motion.watch_scan(config, state, scan),
         obstacles=shield.obstacles(config, scan.ranges, views, ground),
     )  # fmt: skip
     if state.pending is not None and state.pending.stamp_ns == scan.stamp_ns:
@@ -238,7 +256,8 @@ def _take_odometry(
         return replace(state, odometries=arrivals, jumped=jumped), f"odom: its stamp {fault}"
     leap = _leap(config, state, odometry, now)
     if leap:  # later poses are judged relative to this one
-        return replace(state, odometry=odometry, leap=leap, push=None, seen=()), f"odom: {leap}"
+        state = replace(state, odometry=odometry, leap=leap, push=None, seen=())
+        return replace(state, scan_motion=ScanMotion()), f"odom: {leap}"
     restless = state.restless_s if frozen.stands_still(config, odometry.twist) else now
     return replace(state, odometries=arrivals, odometry=odometry, restless_s=restless), ""
 
@@ -267,8 +286,7 @@ def _leap(config: GateConfig, state: GateState, odometry: inputs.Odometry, now: 
     stamped = (odometry.stamp_ns - before.stamp_ns) * S_PER_NS
     passed = max(stamped, now - state.odometries.times[-1])  # either of them may jitter
     slip, turned = (frozen.NOISE * std * passed for std in config.odom_std)
-    turn = CAR_TURN if not bounds.turn.any() else limits.greatest(bounds, bounds.turn)
-    speed = float(np.hypot.reduce(np.maximum(-bounds.low, bounds.high)[bounds.linear]))
+    speed, turn = limits.greatest_speeds(bounds)
     far = LEAP + (SLIP * speed + SLIP_SPEED) * passed + slip
     round_ = LEAP_TURN + (SLIP * turn + SLIP_TURN) * passed + turned
     x, y, heading = between(before.pose, odometry.pose)
@@ -328,14 +346,18 @@ def _estimator(config: GateConfig, state: GateState, request: inputs.Arm, now: f
         return ""
     if estimate is None or now - state.estimate_s > config.estimate_silence_s:
         return "odometry/filtered is silent, start the middleware_node"
-    if (worst := float(estimate.std.max())) > config.estimate_std:
-        return f"odometry/filtered is uncertain by {worst:.2f}, the limit is {config.estimate_std}"
+    if doubt := estimates.unsteady(config, state, now):
+        return doubt
     return "" if frozen.stands_still(config, estimate.twist) else "odometry/filtered shows motion"
 
 
 def _publishers(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
     count = request.publishers
     return "" if count == 1 else f"cmd_vel has {count} publishers, not this gate alone"
+
+
+def _policies(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
+    return state.last_mixed if now - state.mixed_s < config.settle_s else ""
 
 
 def _standing(config: GateConfig, state: GateState, request: inputs.Arm, now: float) -> str:
@@ -360,7 +382,7 @@ CHECKS: tuple[tuple[str, Check], ...] = (
     ("odom_fresh", lambda c, s, _, now: _fresh(ODOM, s.odometries, c.odom_age_s, c, now)),
     ("odom_rate", lambda c, s, _, now: _rate(ODOM, s.odometries, c.odom_rate, c, now)),
     ("clocks_agree", _clocks), ("estimator_converged", _estimator), ("one_publisher", _publishers),
-    ("standing_still", _standing),
+    ("standing_still", _standing), ("one_policy", _policies),
 )  # fmt: skip
 
 
@@ -385,7 +407,9 @@ STOPS: tuple[Rule, ...] = (
     Rule(stops.e_stop_pressed, latches=True), Rule(latched), Rule(disarmed), Rule(stops.own_clock),
     Rule(stops.e_stop_silent, latches=True), Rule(stops.stamps_jumped, latches=True),
     Rule(frozen.odom_jumped, latches=True), Rule(frozen.scan_frozen, latches=True),
-    Rule(frozen.no_motion, latches=True), Rule(stops.scan_silent), Rule(stops.sensor_silent),
+    Rule(frozen.no_motion, latches=True), Rule(scan_motion.body_held, latches=True),
+    Rule(estimates.estimate_lost, latches=True), Rule(stops.two_policies, latches=True),
+    Rule(stops.scan_silent), Rule(stops.sensor_silent),
     Rule(stops.odom_silent), Rule(stops.command_malformed), Rule(stops.command_missing),
     Rule(stops.command_silent), Rule(stops.scan_behind_unknown), Rule(stops.scan_behind_old),
 )  # fmt: skip

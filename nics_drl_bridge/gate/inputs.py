@@ -40,7 +40,8 @@ class Estimate:
     """An estimate of the middleware arrived."""
 
     twist: Array  # (3,) vx [m/s], vy [m/s], wz [rad/s]
-    std: Array  # (2,) standard deviation of position [m] and heading [rad]
+    pose: Array  # (3,) x [m], y [m], heading [rad] in `map`
+    covariance: Array  # (3, 3) of that pose, which grows with the way from the origin of `map`
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,8 @@ class Command:
 
     stamp_ns: int  # of the scan it was computed from
     twist: Array  # (3,) linear.x, linear.y, angular.z of `cmd_vel`
+    source: str = ""  # its publisher, in words; empty if the middleware does not tell it
+    publishers: int = 1  # then: how many publish on its topic
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ LEAST_MOTION = 0.01  # if no speed may exceed this, the robot can't be driven [m
 LONGEST_START_S, STARTED = 10.0, 0.01
 """Within the first [s] a command must be able to reach the second (share of its greatest value)."""
 SPEED, TURN = "m/s", "rad/s"
+CAR_TURN = 4.0  # greatest turn rate of a robot that is commanded by steering angle [rad/s]
 
 
 class CommandLimit(Schema):
@@ -124,6 +125,13 @@ def _check(key: str, limit: CommandLimit, variable: CommandVariable) -> None:
 def greatest(limits: Limits, which: NDArray[np.bool_]) -> float:
     """Returns the greatest magnitude allowed for some commands (C,); 0 if there are none."""
     return float(np.maximum(-limits.low, limits.high)[which].max(initial=0.0))
+
+
+def greatest_speeds(limits: Limits) -> tuple[float, float]:
+    """Returns the greatest speed [m/s] and turn rate [rad/s] that the commands allow."""
+    each = np.maximum(-limits.low, limits.high)
+    turn = greatest(limits, limits.turn) if limits.turn.any() else CAR_TURN
+    return float(np.hypot.reduce(each[limits.linear])), turn
 
 
 def implausible(command: Array, limits: Limits) -> bool:

@@ -15,6 +15,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.gate import ground, shield_kernels
 from nics_drl_bridge.gate import state as records
 from nics_drl_bridge.gate.inputs import Scan
+from nics_drl_bridge.gate.scan_motion import pose_at
 from nics_drl_bridge.gate.state import GateConfig, GateState, Ground, Motion, ShieldConfig, View
 from nics_drl_bridge.gate.stops import age
 from nics_drl_bridge.interface import S_PER_NS, Array
@@ -40,8 +41,7 @@ def remember(config: GateConfig, state: GateState, scan: Scan) -> tuple[View, ..
     """Returns the earlier views that still count, oldest first, then that of a new scan."""
     if config.shield is None or state.odometry is None:
         return ()
-    late = np.clip((scan.stamp_ns - state.odometry.stamp_ns) * S_PER_NS, -MEMORY_S, MEMORY_S)
-    pose = geometry.compose(state.odometry.pose, geometry.exp(late * state.odometry.twist))
+    pose = pose_at(state.odometry, scan.stamp_ns, MEMORY_S)
     kept: list[View] = []
     for view in state.views:
         young = (scan.stamp_ns - view.stamp_ns) * S_PER_NS <= MEMORY_S

@@ -72,11 +72,15 @@ class GateConfig:
     e_stop_required: bool = True  # one that was never heard counts as pressed
     e_stop_silence_s: float = 0.25  # after which one that was heard counts as pressed
     estimate_required: bool = True  # arming needs an estimator that has converged
-    estimate_std: float = 0.5  # greatest deviation of position [m] and heading [rad] for that
+    # Greatest standard deviation that the estimate may gain within some seconds, see `estimate`.
+    estimate_position: float = 0.5  # [m]
+    estimate_heading: float = 0.3  # [rad]
     estimate_silence_s: float = 0.5  # greatest age of the estimate for that
     frozen_distance: float = 0.2  # path over which identical scans are frozen [m, or rad turned]
     stuck_s: float = 1.0  # time without motion while commanded that causes a stop
+    stop_when_held: bool = True  # stop when scans show none of the motion that odometry shows
     odom_std: tuple[float, float] = (0.0, 0.0)  # of odometry's twist [m/s, rad/s]
+    range_noise: tuple[float, float] = (0.0, 0.0)  # std, in metres and as a share of the range
     shield: ShieldConfig | None = None
     sensors: tuple[str, ...] = ()  # further ones, which must be as fresh as the scan
     bicycle: Bicycle | None = None
@@ -151,6 +155,42 @@ class View:
 
 
 @dataclass(frozen=True)
+class EstimateMark:
+    """An earlier estimate, from which uncertainty is counted."""
+
+    time_s: float  # of its arrival
+    pose: Array  # (3,) in `map`
+    covariance: Array  # (3, 3) of that pose
+
+
+@dataclass(frozen=True)
+class EstimateTrack:
+    """Whether the estimate goes on from where it was."""
+
+    marks: tuple[EstimateMark, ...] = ()  # recent ones, oldest first; the first is the origin
+    fault: str = ""  # why the newest estimate does not go on from them; it is the new origin
+    last_fault: str = ""  # the newest such reason
+
+
+@dataclass(frozen=True)
+class ReducedScan:
+    """A scan reduced to few directions, and the pose it was taken from."""
+
+    stamp_ns: int  # of its header
+    pose: Array  # (3,) of the robot at that time, by odometry
+    ranges: Ranges  # (K,) median around each direction [m]; NaN where few beams return
+
+
+@dataclass(frozen=True)
+class ScanMotion:
+    """Whether recent scans show the motion that odometry shows."""
+
+    views: tuple[ReducedScan, ...] = ()  # recent ones, oldest first
+    held_since_ns: int | None = None  # stamp of the first scan that contradicts odometry
+    held: str = ""  # what the newest scan contradicts, once others have before
+
+
+@dataclass(frozen=True)
 class Ground:
     """Ground around a robot whose lidar does not see all around it."""
 
@@ -214,6 +254,7 @@ class GateState:
     estimate: Estimate | None = None
     command: Command | None = None
     estimate_s: float = -INF  # arrivals of these
+    estimates: EstimateTrack = EstimateTrack()
     command_s: float = -INF
     pending: Command | None = None  # whose scan has not arrived yet
     pending_s: float | None = None  # since when commands name such scans; None: the newest does not
@@ -223,8 +264,14 @@ class GateState:
     obstacles: Array | None = None
     behind_s: float = -INF  # arrival of the scan behind the newest command, less its delay
     malformed: str = ""  # what is wrong with the newest command
+    source: str = ""  # the publisher of the newest command that named one
+    source_s: float = -INF  # its arrival
+    mixed: str = ""  # at this input: two publishers command the robot in turn
+    last_mixed: str = ""  # the newest such sentence
+    mixed_s: float = -INF  # its time
     seen: tuple[Sameness, ...] = ()  # pictures that the lidar has shown, newest last
     frozen: str = ""  # why the newest scan is an old one
+    scan_motion: ScanMotion = ScanMotion()
     restless_s: float = -INF  # last time that odometry showed motion
     push: Push | None = None  # recent commanded motion; None if the robot was stopped
     # Times and values of the commands that the newest scan may not show yet.

@@ -35,7 +35,7 @@ def gate_config(
         limits=limits, beam_angles=lidar.angles, mount=lidar.mount, range_min=lidar.range_min,
         range_max=lidar.range_max, scan_rate=lidar.rate,
         sensors=tuple(sensor.name for sensor in model.sensors), odom_std=model.noise.odometry,
-        shield=shield, **given,
+        range_noise=(lidar.noise_std, lidar.faults.noise_proportional), shield=shield, **given,
     )  # fmt: skip
 
 

@@ -5,7 +5,7 @@
 
 import math
 
-from nics_drl_bridge.gate.inputs import Input, Tick
+from nics_drl_bridge.gate.inputs import Command, Input, Tick
 from nics_drl_bridge.gate.state import Arrivals, Cause, GateConfig, GateState, Mark, replace
 from nics_drl_bridge.interface import S_PER_NS
 
@@ -15,6 +15,7 @@ MARK_S = 0.05  # time between two marks [s]
 DRIFT = 1e-3  # greatest drift between two clocks [s/s]; that of real machines is 1e-4
 SIMULATED_LAG = 0.2  # share of real time that a simulator may lose
 AHEAD_S = 0.1  # data of an armed gate that lead the envelope by this are from the future [s]
+SOURCE_S = 1.0  # time after which another publisher's first command is no turn, but a new start [s]
 FROZEN_INPUTS = 20  # a running clock does not give this many inputs in a row the same time
 
 
@@ -135,6 +136,25 @@ def take_time(config: GateConfig, state: GateState, given: Input, now: float) ->
 def own_clock(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The gate's clock is not to be trusted, or the gate was asleep."""
     return Cause("own_clock", "", state.clock_fault) if state.clock_fault else None
+
+
+def watch_source(state: GateState, command: Command, now: float) -> GateState:
+    """Records the publisher of a command, and whether another one commanded a moment ago."""
+    mixed = f"{command.publishers} nodes publish on {RAW}" if command.publishers > 1 else ""
+    if command.source:
+        recent = now - state.source_s < SOURCE_S
+        if recent and state.source != command.source:
+            mixed = f"{state.source} and {command.source} both publish on {RAW}"
+        state = replace(state, source=command.source, source_s=now)
+    if not mixed:
+        return state
+    mixed = f"{mixed}: leave one of them, then call ~/reset and ~/arm"
+    return replace(state, mixed=mixed, last_mixed=mixed, mixed_s=now)
+
+
+def two_policies(config: GateConfig, state: GateState, now: float) -> Cause | None:
+    """Two publishers command the robot in turn."""
+    return Cause("two_policies", RAW, state.mixed) if state.mixed else None
 
 
 def command_malformed(config: GateConfig, state: GateState, now: float) -> Cause | None:

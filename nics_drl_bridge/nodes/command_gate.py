@@ -4,7 +4,7 @@ import contextlib
 import math
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,8 @@ from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 
-from nics_drl_bridge.gate import inputs, shield
+from nics_drl_bridge.errors import ConfigError
+from nics_drl_bridge.gate import inputs, scan_motion, shield
 from nics_drl_bridge.gate.black_box import Entry
 from nics_drl_bridge.gate.gate import decide
 from nics_drl_bridge.gate.limits import PERIOD_S, Limits, load_limits
@@ -28,15 +29,15 @@ from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
 from nics_drl_bridge.nodes import device_parameters, parameters, qos, runner, wire
-from nics_drl_bridge.nodes.conversions import sensor_from_ros, sensor_type
+from nics_drl_bridge.nodes.conversions import PLANAR, sensor_from_ros, sensor_type
 from nics_drl_bridge.nodes.gate_log import GateLog
+from nics_drl_bridge.nodes.sources import Sources
 from nics_drl_bridge.recording.messages import is_rotation
 
 TWIST, TWIST_STAMPED = "Twist", "TwistStamped"
 STALE_S = 0.05  # a motion that was decided on longer ago than this is decided on again [s]
 SCAN_PERIODS = 1.75  # for a slow lidar, default age limit of a command's scan, in its periods
 ROTATION = slice(3, 7)  # position of an odometry's quaternion among its numbers
-VARIANCES = [wire.POSE_COVARIANCE + k for k in (0, 7, 35)]  # positions: of x, y and heading
 REFUSED = (
     "parameter 'priority': the system does not allow a real-time priority of {priority} ({error}); "
     "allow it by `ulimit -r {priority}`, `LimitRTPRIO={priority}` in its systemd unit or the "
@@ -46,6 +47,8 @@ REFUSED = (
 
 def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
     """Declares and reads a gate's parameters, logs doubts; ConfigError if one can't be used."""
+    for name in sorted(parameters.SPLIT.keys() & runner.given_values(node).keys()):
+        raise ConfigError(f"parameter {name!r}: is now {parameters.SPLIT[name]}.")
     file = str(runner.declare_row(node, parameters.LIMITS))
     limits = load_limits(file, model.robot) if file else None
     config = gate_config(
@@ -115,10 +118,9 @@ def odometry(content: bytes) -> inputs.Odometry:
 
 def estimate(content: bytes) -> inputs.Estimate:
     """Reads a serialised Odometry of an estimator."""
-    x, y, heading = wire.numbers_of(content)[VARIANCES]
-    with np.errstate(invalid="ignore"):  # a negative variance gives NaN, too
-        std = np.sqrt([np.maximum(x, y), heading])
-    return inputs.Estimate(wire.odometry_of(content)[1], std)
+    pose, twist = wire.odometry_of(content)
+    covariance = wire.numbers_of(content)[wire.POSE_COVARIANCE : wire.TWIST].reshape(6, 6)
+    return inputs.Estimate(twist, pose, covariance[PLANAR].astype(np.float64))
 
 
 def command(content: bytes) -> inputs.Command:
@@ -176,6 +178,7 @@ class CommandGate(qos.QosWatch):
             logger.warning(f"e_stop_required is false: {risk}; set it on a vehicle.")
         if self._config.shield is not None:
             shield.rehearse()
+        scan_motion.rehearse(self._config)
         self._stamped = bool(runner.declare_row(self, parameters.stamped("cmd_vel")))
         runner.declare_row(self, parameters.FOREIGN)
         kind = TwistStamped if self._stamped else Twist
@@ -195,7 +198,6 @@ class CommandGate(qos.QosWatch):
             (LaserScan, "scan", partial(scan, self._lidar), qos.SENSOR),
             (Odometry, "odom", odometry, qos.SENSOR),
             (Odometry, "odometry/filtered", estimate, qos.SENSOR),
-            (Twist if raw == TWIST else TwistStamped, "cmd_vel_raw", given, qos.COMMAND),
             (Bool, "e_stop", e_stop, qos.EVERY_COMMAND),
             *(
                 (sensor_type(each), each.name, partial(reading, each), qos.SENSOR)
@@ -205,6 +207,12 @@ class CommandGate(qos.QosWatch):
         for kind, topic, read, profile in readers:
             taker = partial(self._take, topic, read)
             self.create_subscription(kind, topic, taker, profile, raw=True)
+        kind = Twist if raw == TWIST else TwistStamped
+        command_taker = partial(self._take_command, given)
+        commands = self.create_subscription(
+            kind, "cmd_vel_raw", command_taker, qos.EVERY_POLICY, raw=True
+        )
+        self._sources = Sources(self, commands.topic_name)
         runner.serve(self, "~/arm", self._arm)
         runner.serve(self, "~/reset", lambda: self._answer(inputs.Reset()))
         runner.serve(self, "~/e_stop", self._press)
@@ -216,6 +224,17 @@ class CommandGate(qos.QosWatch):
             self._log.refuse(f"{topic}: {error}")
         else:
             self._decide(given)
+
+    def _take_command(
+        self, read: Callable[[bytes], inputs.Command], content: bytes, info: Mapping[str, Any]
+    ) -> None:
+        source = self._sources.name_of(info)
+        publishers = self._sources.publishers
+
+        def read_with_source(content: bytes) -> inputs.Command:
+            return replace(read(content), source=source, publishers=publishers)
+
+        self._take("cmd_vel_raw", read_with_source, content)
 
     def _foreign(self, kind: str, content: bytes) -> inputs.Command:
         age_ns = round(self._config.command_age_s * NS_PER_S)
@@ -263,6 +282,7 @@ class CommandGate(qos.QosWatch):
         return wire.stamped_twist_to_bytes(twist, int(self.get_clock().now().nanoseconds))
 
     def _look(self) -> runner.Condition:
+        self._sources.count_publishers()
         found = self._log.finding(self._state)
         others = self.count_publishers(self._out.topic_name) - 1
         if others < 1:

@@ -260,11 +260,20 @@ def gate_rules(odom_rate: float = math.nan, scan_age: float = math.nan) -> list[
         Row("e_stop_required", True, heard),
         Row("e_stop_silence", Default.e_stop_silence_s, "Silence of e_stop [s].", seconds),
         Row("estimate_required", True, "Whether arming needs odometry/filtered."),
-        Row("estimate_std", Default.estimate_std,
-            "Greatest standard deviation of the estimate for arming [m, rad].", (1e-3, 1e3)),
+        Row("estimate_position", Default.estimate_position,
+            "Greatest standard deviation that the estimated position may gain within 10 s [m].",
+            (1e-3, 1e3)),
+        Row("estimate_heading", Default.estimate_heading,
+            "The same of the heading [rad].", (1e-3, 1e3)),
+        Row("stop_when_held", Default.stop_when_held,
+            "Whether to stop when the scans show none of the motion that odometry shows."),
     ]  # fmt: skip
 
 
+SPLIT = {  # parameters of earlier versions: what they are now
+    "estimate_std": "'estimate_position' [m] and 'estimate_heading' [rad], which count what the "
+    "estimate became uncertain by within 10 s, but only since arming",
+}
 RULES_IN_SECONDS = ("scan_age", "odom_age", "command_age", "e_stop_silence")
 
 

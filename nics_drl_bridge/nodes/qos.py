@@ -54,6 +54,9 @@ EVERY_COMMAND = profile_of(Offer(10))
 first one's unnoticed. Also `e_stop`, of which no press may be overwritten."""
 
 COMMAND = profile_of(Offer(1))  # commands and goals: only the newest counts, and it has to arrive
+# Commands of which the gate looks at the publisher, too: the one that a second publisher sends
+# at the same moment must not replace the first one's unnoticed.
+EVERY_POLICY = profile_of(Offer(10))
 TRANSFORMS = profile_of(Offer(100))  # `/tf`: like tf2's own, whose listeners request reliable
 LATCHED = profile_of(Offer(1, transient_local=True))  # `/tf_static`, `map`: for late joiners too
 DIAGNOSTICS = profile_of(Offer(10))  # as the diagnostic aggregator expects `/diagnostics`

@@ -33,6 +33,7 @@ def config(robot: str = "ackermann", **changes) -> GateConfig:
             range_max=LIDAR.range_max,
             scan_rate=10.0,
             odom_rate=10.0,
+            stop_when_held=False,  # its scans do not show how it moves
         ),
         **changes,
     )
@@ -45,6 +46,7 @@ class Rig:
         speed: what odometry shows, along x [m/s].
         wish: (3,) what the policy sends.
         frozen: whether the scans stay the same.
+        covariance: (3, 3) of the estimated pose.
     """
 
     def __init__(self, given: GateConfig | None = None) -> None:
@@ -52,6 +54,7 @@ class Rig:
         self.state = begin(self.config)
         self.now, self.ticks, self.stamp = 100.0, 0, START_STAMP
         self.pose, self.speed = np.zeros(3), 0.0
+        self.covariance = np.diag([1e-4, 1e-4, 1e-4])  # of the estimate
         self.wish, self.frozen = np.array([0.5, 0.0, 0.1]), False
         self.ranges = np.linspace(1.0, 2.0, LIDAR.beams, dtype=np.float32)
         self.decision, self.published = None, []
@@ -100,7 +103,8 @@ class Rig:
         if "scan" not in without:
             self.scan()
         if "estimate" not in without:
-            self.give(Estimate(np.array([self.speed, 0.0, 0.0]), np.full(2, 0.01)))
+            twist = np.array([self.speed, 0.0, 0.0])
+            self.give(Estimate(twist, self.pose.copy(), self.covariance.copy()))
         if "e_stop" not in without:
             self.give(EStop(False))
         if "command" not in without:

@@ -268,7 +268,8 @@ def test_bytes_that_are_no_message_are_refused_and_counted(domain_id, tmp_path):
     try:
         for subscription in node.subscriptions:
             if subscription.raw:
-                subscription.callback(b"\x00\x01\x00\x00\x01")
+                takes_info = subscription.topic_name == "/cmd_vel_raw"
+                subscription.callback(b"\x00\x01\x00\x00\x01", *([{}] if takes_info else []))
         facts = node._look().facts
         for topic in ("scan", "odom", "odometry/filtered", "cmd_vel_raw"):
             assert facts[f"refused, {topic}"] == 1

@@ -12,6 +12,7 @@ from rclpy.serialization import serialize_message
 from std_msgs.msg import Bool
 
 from nics_drl_bridge.gate import inputs
+from nics_drl_bridge.gate.gate import estimate_malformed
 from nics_drl_bridge.lidar.spec import from_device, load_lidar
 from nics_drl_bridge.nodes import command_gate, conversions, wire
 
@@ -57,7 +58,8 @@ def test_an_odometry_without_a_rotation_has_no_pose(quaternion):
 def test_an_estimate_is_a_twist_and_how_uncertain_its_pose_is():
     message = odometry()
     read = command_gate.estimate(serialize_message(message))
-    assert read.std.tolist() == np.sqrt([7.0, 35.0]).tolist()
+    assert read.pose.tolist() == command_gate.odometry(serialize_message(message)).pose.tolist()
+    assert np.diag(read.covariance).tolist() == [0.0, 7.0, 35.0]
     assert read.twist.tolist() == [0.3, -0.1, 0.2]
 
 
@@ -81,10 +83,11 @@ def test_bytes_that_end_too_early_are_unreadable(read):
 
 
 @pytest.mark.parametrize(("place", "variance"), [(0, np.nan), (7, np.nan), (35, np.nan), (35, -1)])
-def test_an_estimate_one_of_whose_variances_is_no_number_is_uncertain(place, variance):
+def test_an_estimate_one_of_whose_variances_is_no_number_is_refused(place, variance):
     message = odometry()
     message.pose.covariance[place] = variance
-    assert np.isnan(command_gate.estimate(serialize_message(message)).std).any()
+    read = command_gate.estimate(serialize_message(message))
+    assert estimate_malformed(None, read)
 
 
 def scanned(stamp_ns):

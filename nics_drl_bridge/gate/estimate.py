@@ -1,0 +1,115 @@
+"""The estimate of the robot's pose: it must go on from where it was, and stay about as certain.
+
+Without a localiser the covariance of a pose in `map` grows for ever, by noise and by the distance
+from the origin at which the heading is uncertain. That tells nothing about the next metres: goal
+and scan are near. So uncertainty is counted from a recent estimate, and arming begins anew: of the
+covariance, only that part counts which has come since.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from nics_drl_bridge.gate.inputs import Estimate
+from nics_drl_bridge.gate.limits import greatest_speeds
+from nics_drl_bridge.gate.state import (
+    Cause,
+    EstimateMark,
+    EstimateTrack,
+    GateConfig,
+    GateState,
+)
+from nics_drl_bridge.geometry import between
+
+WINDOW_S = 10.0  # in which uncertainty is counted, but only since arming [s]
+MARK_S = 1.0  # time between two marks [s]
+SLIP = 2.0  # factor by which a robot may exceed its speeds
+TOPIC = "odometry/filtered"
+REMEDY = (
+    "give the pose by `initialpose` or by the localiser, or call `middleware_node/~/reset`, then "
+    "`~/reset` and `~/arm`"
+)
+
+
+class Growth(NamedTuple):
+    """What a pose has become uncertain by since an earlier estimate, as standard deviations."""
+
+    position: float  # [m]
+    heading: float  # [rad]
+
+
+def growth_since(mark: EstimateMark, estimate: Estimate) -> Growth:
+    """Returns the uncertainty of an estimate's pose relative to an earlier one."""
+    # An old error of the heading moves the pose by the way since, at right angles.
+    x, y = (estimate.pose[:2] - mark.pose[:2]).tolist()
+    carried = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+    gained = np.diag(estimate.covariance - carried @ mark.covariance @ carried.T)
+    position = math.sqrt(max(0.0, float(gained[:2].max())))
+    return Growth(position, math.sqrt(max(0.0, float(gained[2]))))
+
+
+def track_estimate(
+    config: GateConfig, state: GateState, estimate: Estimate, now: float
+) -> EstimateTrack:
+    """Returns the track with a new estimate, and what is wrong with that."""
+    track = state.estimates
+    newest = EstimateMark(now, estimate.pose, estimate.covariance)
+    marks = tuple(mark for mark in track.marks if now - mark.time_s <= WINDOW_S)
+    if state.estimate is None or not marks:  # nothing to compare it with
+        return EstimateTrack((newest,), "", track.last_fault)
+    fault = _jump(config, state.estimate, estimate, now - state.estimate_s)
+    fault = fault or _uncertain(config, marks[0], estimate, now)
+    if fault:
+        return EstimateTrack((newest,), fault, fault)
+    if now - marks[-1].time_s >= MARK_S:
+        marks = (*marks, newest)
+    return EstimateTrack(marks, "", track.last_fault)
+
+
+def _jump(config: GateConfig, before: Estimate, after: Estimate, passed_s: float) -> str:
+    """Returns what is wrong with a pose that the robot can't have driven to, or nothing."""
+    x, y, turn = between(before.pose, after.pose).tolist()
+    path = math.hypot(x, y)
+    speed, turn_rate = greatest_speeds(config.limits) if config.limits else (math.inf, math.inf)
+    far = config.estimate_position + SLIP * speed * passed_s
+    round_ = config.estimate_heading + SLIP * turn_rate * passed_s
+    if path <= far and abs(turn) <= round_:
+        return ""
+    return f"it jumped by {path:.3g} m and {abs(turn):.3g} rad in {passed_s:.2f} s"
+
+
+def _uncertain(config: GateConfig, origin: EstimateMark, estimate: Estimate, now: float) -> str:
+    """Returns by how much an estimate has become too uncertain; empty if it has not."""
+    grown = growth_since(origin, estimate)
+    if grown.position <= config.estimate_position and grown.heading <= config.estimate_heading:
+        return ""
+    return (
+        f"it became uncertain by {grown.position:.3g} m and {grown.heading:.3g} rad in "
+        f"{now - origin.time_s:.1f} s, the limits are {config.estimate_position:g} m and "
+        f"{config.estimate_heading:g} rad"
+    )
+
+
+def begin_anew(state: GateState) -> EstimateTrack:
+    """Returns the track of which the newest estimate is the origin, as at arming."""
+    if state.estimate is None:
+        return EstimateTrack()
+    newest = EstimateMark(state.estimate_s, state.estimate.pose, state.estimate.covariance)
+    return EstimateTrack((newest,))
+
+
+def unsteady(config: GateConfig, state: GateState, now: float) -> str:
+    """Returns why the gate can't be armed yet: the estimate was at fault a moment ago."""
+    track = state.estimates
+    if not track.last_fault or now - track.marks[0].time_s >= config.settle_s:
+        return ""
+    return f"{TOPIC}: {track.last_fault}; wait for {config.settle_s:g} s, or {REMEDY}"
+
+
+def estimate_lost(config: GateConfig, state: GateState, now: float) -> Cause | None:
+    """The estimate jumped, or became uncertain in a short time: its localiser is lost."""
+    fault = state.estimates.fault
+    if not fault or not config.estimate_required:
+        return None
+    return Cause("estimate_lost", TOPIC, f"{fault}; {REMEDY}")

@@ -1,0 +1,250 @@
+"""A body that is held: odometry shows motion, but the scans show none.
+
+A recent scan is moved as odometry says, which predicts the newest one. Where that prediction
+differs clearly from the recent scan, the newest scan must have changed; if it has not, the wheels
+spin but the body stands. A scene that looks the same after the motion, as a corridor does along
+its walls, decides nothing.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from nics_drl_bridge.gate import scan_motion_kernels as kernels
+from nics_drl_bridge.gate.inputs import Odometry, Scan
+from nics_drl_bridge.gate.scan_motion_kernels import Directions, Noise
+from nics_drl_bridge.gate.state import (
+    Cause,
+    GateConfig,
+    GateState,
+    Ranges,
+    ReducedScan,
+    ScanMotion,
+    replace,
+)
+from nics_drl_bridge.gate.stops import SCAN
+from nics_drl_bridge.geometry import between, compose, exp
+from nics_drl_bridge.interface import S_PER_NS, Array
+
+FULL_CIRCLE = 2.0 * np.pi
+
+
+@dataclass(frozen=True)
+class Settings:
+    """When scans contradict odometry."""
+
+    # Reduced scan: a direction is the median of the beams within `window` on each side of it.
+    spacing: float = math.radians(2.0)
+    window: float = math.radians(2.0)
+    sector: float = math.radians(20.0)  # a person nearby fills one or two of them
+    # Scans that are compared: the oldest not older than `longest_s`, kept `kept_every_s` apart.
+    longest_s: float = 0.56
+    kept_every_s: float = 0.08
+    # Least motion by odometry between the two [m], [rad], and its least share in either half of
+    # that time: else a scan that is up to a quarter of a second older than its stamp, of a robot
+    # that has just started, would look like that of a held one.
+    least_path: float = 0.04
+    least_turn: float = 0.05
+    least_half: float = 0.25
+    # Turns beyond which the next younger scan is taken, and none is: a room may repeat itself.
+    usual_turn: float = 0.6
+    greatest_turn: float = 1.2
+    # A direction tells something if its range must change by this [m], and by so many standard
+    # deviations of the lidar's noise.
+    least_change: float = 0.03
+    deviations: float = 2.0
+    gap: float = 0.25  # neighbours whose ranges differ by this share are two surfaces
+    # Held: of at least so many sectors that tell something this share shows less than
+    # `sector_share` of the motion, and the median less than `held_share`. A skid-steer robot whose
+    # odometry turns 30 % too far shows 0.77, one on ice 0.5.
+    least_sectors: int = 5
+    agreeing: float = 0.7
+    sector_share: float = 0.45
+    held_share: float = 0.25
+    confirmed_s: float = 0.15  # time over which scans must say so, without one that says otherwise
+    forgotten_s: float = 1.0  # time after which an unconfirmed contradiction is forgotten
+
+
+SETTINGS = Settings()
+
+
+class Verdict(NamedTuple):
+    """What two scans say about the motion in between."""
+
+    sectors: int  # that tell something
+    share: float  # median share of the motion that they show; NaN if too few tell something
+    held: bool  # they contradict odometry
+
+
+UNDECIDED = Verdict(0, math.nan, False)
+
+
+def pose_at(odometry: Odometry, stamp_ns: int, longest_s: float) -> Array:
+    """Returns the pose (3,) at a stamp near the newest odometry, extrapolated by its twist."""
+    late = np.clip((stamp_ns - odometry.stamp_ns) * S_PER_NS, -longest_s, longest_s)
+    return compose(odometry.pose, exp(late * odometry.twist))
+
+
+def watch_scan(
+    config: GateConfig, state: GateState, scan: Scan, settings: Settings = SETTINGS
+) -> ScanMotion:
+    """Returns what is known about the motion in scans after a new one."""
+    before = state.scan_motion
+    if not config.stop_when_held or state.odometry is None or len(config.beam_angles) < 2:
+        return ScanMotion()
+    newest = ReducedScan(
+        scan.stamp_ns,
+        pose_at(state.odometry, scan.stamp_ns, settings.longest_s),
+        _reduce(config, scan.ranges, settings),
+    )
+    oldest_ns = scan.stamp_ns - round(_memory_s(config, settings) / S_PER_NS)
+    kept = tuple(one for one in before.views if one.stamp_ns >= oldest_ns)
+    held_since_ns, held = None, ""
+    if state.push is not None:  # only a robot that is told to move can be held
+        verdict = judge_motion(config, kept, newest, settings)
+        held_since_ns = _held_since(before.held_since_ns, verdict, scan.stamp_ns, settings)
+        held = _contradiction(kept, newest, verdict, held_since_ns, settings)
+    apart_ns = round(settings.kept_every_s / S_PER_NS)
+    if not kept or newest.stamp_ns - kept[-1].stamp_ns >= apart_ns:
+        kept = (*kept, newest)
+    return ScanMotion(kept, held_since_ns, held)
+
+
+def _memory_s(config: GateConfig, settings: Settings) -> float:
+    """Returns for how long scans are kept: two periods of a slow lidar at least."""
+    return max(settings.longest_s, 2.25 / config.scan_rate)
+
+
+def _held_since(
+    before_ns: int | None, verdict: Verdict, now_ns: int, settings: Settings
+) -> int | None:
+    """Returns the stamp of the first scan that contradicted odometry, if none agreed since."""
+    if before_ns is not None and (now_ns - before_ns) * S_PER_NS > settings.forgotten_s:
+        before_ns = None
+    if verdict.held:
+        return now_ns if before_ns is None else before_ns
+    return before_ns if math.isnan(verdict.share) else None
+
+
+def _contradiction(
+    kept: tuple[ReducedScan, ...], newest: ReducedScan, verdict: Verdict,
+    held_since_ns: int | None, settings: Settings,
+) -> str:  # fmt: skip
+    """Returns a sentence once scans have contradicted odometry for long enough, else nothing."""
+    if not verdict.held or held_since_ns is None:
+        return ""
+    if (newest.stamp_ns - held_since_ns) * S_PER_NS < settings.confirmed_s:
+        return ""
+    x, y, turn = between(kept[0].pose, newest.pose).tolist()
+    seconds = (newest.stamp_ns - kept[0].stamp_ns) * S_PER_NS
+    claimed = f"odometry shows {math.hypot(x, y):.2f} m and {abs(turn):.2f} rad in {seconds:.2f} s"
+    return f"{claimed}, the scans show none of it: the body is held, or the wheels slip"
+
+
+def judge_motion(
+    config: GateConfig, kept: tuple[ReducedScan, ...], newest: ReducedScan, settings: Settings
+) -> Verdict:
+    """Judges whether the newest scan shows the motion that odometry shows since an earlier one."""
+    old = _reference(kept, newest, settings)
+    if old is None:
+        return UNDECIDED
+    mount = np.array(config.mount)
+    moved = between(compose(old.pose, mount), compose(newest.pose, mount))
+    directions = directions_of(config, settings)
+    predicted = np.empty_like(old.ranges)
+    kernels.predict_scan(old.ranges, directions, moved, settings.gap, predicted)
+    shares = kernels.compare_sectors(
+        old.ranges, newest.ranges, predicted, round(settings.sector / directions.step) or 1,
+        noise_of(config, directions), settings.deviations, settings.least_change,
+    )  # fmt: skip
+    known = shares[~np.isnan(shares)]
+    if len(known) < max(settings.least_sectors, 1):
+        return UNDECIDED._replace(sectors=len(known))
+    share = float(np.median(known))
+    unmoved = np.count_nonzero(np.abs(known) < settings.sector_share)
+    agree = unmoved >= settings.agreeing * len(known)
+    return Verdict(len(known), share, bool(agree and abs(share) < settings.held_share))
+
+
+def _reference(
+    kept: tuple[ReducedScan, ...], newest: ReducedScan, settings: Settings
+) -> ReducedScan | None:
+    """Returns the scan to compare the newest one with; None if odometry shows too little motion."""
+    chosen = None
+    for index, old in enumerate(kept[:-1]):
+        turn = abs(between(old.pose, newest.pose)[2])
+        if turn > settings.greatest_turn:
+            continue
+        chosen = index
+        if turn <= settings.usual_turn:
+            break
+    if chosen is None:
+        return None
+    old = kept[chosen]
+    half_ns = (old.stamp_ns + newest.stamp_ns) // 2
+    middle = min(kept[chosen + 1 :], key=lambda one: abs(one.stamp_ns - half_ns))
+    whole = _motion(old, newest, settings)
+    halves = min(_motion(old, middle, settings), _motion(middle, newest, settings))
+    enough = whole >= 1.0 and halves >= settings.least_half * whole
+    return old if enough else None
+
+
+def _motion(old: ReducedScan, new: ReducedScan, settings: Settings) -> float:
+    """Returns the motion that odometry shows between two scans; 1 is the least that is judged."""
+    x, y, turn = between(old.pose, new.pose).tolist()
+    path = math.hypot(x, y)
+    tiny = 1e-9  # of a control whose least motion is zero
+    return max(path / max(settings.least_path, tiny), abs(turn) / max(settings.least_turn, tiny))
+
+
+def _reduce(config: GateConfig, ranges: Ranges, settings: Settings) -> Ranges:
+    directions = directions_of(config, settings)
+    out = np.empty(round(len(ranges) / directions.beams), np.float32)
+    kernels.reduce_scan(ranges, directions, out)
+    return out
+
+
+def directions_of(config: GateConfig, settings: Settings = SETTINGS) -> Directions:
+    """Returns the directions of a lidar's reduced scans."""
+    angles = config.beam_angles
+    return _directions(
+        len(angles), float(angles[0]), float(angles[1] - angles[0]),
+        settings.spacing, settings.window,
+    )  # fmt: skip
+
+
+@cache
+def _directions(beams: int, first: float, step: float, spacing: float, window: float) -> Directions:
+    count = min(beams, max(1, round(beams * step / spacing)))
+    each = beams / count
+    reach = min(int(window / step + 1e-6), (kernels.LARGEST_WINDOW - 1) // 2, (beams - 1) // 2)
+    full_circle = beams * step > FULL_CIRCLE - 0.5 * step
+    middle = first + (int(0.5 * each)) * step
+    return Directions(middle, each * step, each, reach, full_circle)
+
+
+def noise_of(config: GateConfig, directions: Directions) -> Noise:
+    """Returns the standard deviation of the change of a reduced range."""
+    # Of the difference of two medians of n normal numbers each.
+    count = 2 * directions.reach + 1
+    factor = math.sqrt(2.0) * min(1.0, 1.25 / math.sqrt(count))
+    constant, proportional = config.range_noise
+    return Noise(factor * constant, factor * proportional)
+
+
+def body_held(config: GateConfig, state: GateState, now: float) -> Cause | None:
+    """The scans show none of the motion that odometry shows: the body is held, its wheels spin."""
+    held = state.scan_motion.held
+    return Cause("body_held", SCAN, held) if held else None
+
+
+def rehearse(config: GateConfig) -> None:
+    """Compiles what a new scan calls: that takes seconds, which a moving robot does not have."""
+    view = ReducedScan(
+        0, np.zeros(3), _reduce(config, np.ones(len(config.beam_angles), np.float32), SETTINGS)
+    )
+    seen = tuple(replace(view, stamp_ns=k, pose=np.array([0.1 * k, 0.0, 0.0])) for k in range(3))
+    judge_motion(config, seen[:2], seen[2], SETTINGS)
