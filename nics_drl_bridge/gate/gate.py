@@ -93,7 +93,7 @@ def _serve(
         ), "armed", True  # fmt: skip
     if isinstance(given, inputs.Reset):
         # The latch is cleared, unless the emergency stop is still pressed.
-        stop = replace(state.e_stop, latched=state.e_stop.held)
+        stop = replace(state.e_stop, latched=state.e_stop.held, reason="")
         state = replace(state, e_stop=stop, latched=None, armed=False)
         if stop.latched:
             return state, "the e-stop is still pressed", False
@@ -207,7 +207,8 @@ def take(config: GateConfig, state: GateState, given: inputs.Input, now: float) 
         stop = replace(known, latched=known.latched or pressed, held=pressed, heard_s=now)
         state = replace(state, e_stop=stop)
     elif isinstance(given, inputs.Press):
-        state = replace(state, e_stop=replace(state.e_stop, latched=True))
+        stop = replace(state.e_stop, latched=True, reason=given.reason)
+        state = replace(state, e_stop=stop)
     return state, ""
 
 

@@ -63,7 +63,9 @@ class EStop:
 
 @dataclass(frozen=True)
 class Press:
-    """The emergency stop was pressed by a service call."""
+    """The emergency stop was pressed by a service call, or may have been pressed unheard."""
+
+    reason: str = ""  # why it may have been; empty for a service call
 
 
 @dataclass(frozen=True)

@@ -219,6 +219,7 @@ class EStopState:
     latched: bool = False  # it was pressed, and not reset since
     held: bool = False  # its topic last reported it as pressed
     heard_s: float | None = None  # time of the last message on its topic; None if there was none
+    reason: str = ""  # why a press may have been missed; empty if it was heard
 
 
 @dataclass(frozen=True)

@@ -196,7 +196,7 @@ def scan_behind_old(config: GateConfig, state: GateState, now: float) -> Cause |
 
 def e_stop_pressed(config: GateConfig, state: GateState, now: float) -> Cause | None:
     """The emergency stop was pressed."""
-    detail = "pressed" if state.e_stop.held else "was pressed"
+    detail = "pressed" if state.e_stop.held else state.e_stop.reason or "was pressed"
     return Cause("e_stop_pressed", E_STOP, detail) if state.e_stop.latched else None
 
 

@@ -30,6 +30,7 @@ from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
 from nics_drl_bridge.nodes import device_parameters, parameters, qos, runner, wire
 from nics_drl_bridge.nodes.conversions import PLANAR, sensor_from_ros, sensor_type
+from nics_drl_bridge.nodes.e_stop_queue import EStopQueue
 from nics_drl_bridge.nodes.gate_log import GateLog
 from nics_drl_bridge.nodes.sources import Sources
 from nics_drl_bridge.recording.messages import is_rotation
@@ -183,8 +184,9 @@ class CommandGate(qos.QosWatch):
         runner.declare_row(self, parameters.FOREIGN)
         kind = TwistStamped if self._stamped else Twist
         self._out = self.create_publisher(kind, "cmd_vel", qos.COMMAND)
+        self._queue = EStopQueue()
         self._listen()
-        runner.steadily(self, PERIOD_S, lambda: self._decide(inputs.Tick()))
+        runner.steadily(self, PERIOD_S, self._tick)
         runner.diagnose(self, "gate", self._look)
         priority = runner.declare_row(self, parameters.PRIORITY)
         if refused := take_priority(priority):  # once all threads exist
@@ -198,7 +200,6 @@ class CommandGate(qos.QosWatch):
             (LaserScan, "scan", partial(scan, self._lidar), qos.SENSOR),
             (Odometry, "odom", odometry, qos.SENSOR),
             (Odometry, "odometry/filtered", estimate, qos.SENSOR),
-            (Bool, "e_stop", e_stop, qos.EVERY_COMMAND),
             *(
                 (sensor_type(each), each.name, partial(reading, each), qos.SENSOR)
                 for each in self._sensors
@@ -213,6 +214,9 @@ class CommandGate(qos.QosWatch):
             kind, "cmd_vel_raw", command_taker, qos.EVERY_POLICY, raw=True
         )
         self._sources = Sources(self, commands.topic_name)
+        self._button = self.create_lossless_subscription(
+            Bool, "e_stop", self._take_e_stop, qos.E_STOP, lost=self._miss_e_stop
+        )
         runner.serve(self, "~/arm", self._arm)
         runner.serve(self, "~/reset", lambda: self._answer(inputs.Reset()))
         runner.serve(self, "~/e_stop", self._press)
@@ -235,6 +239,32 @@ class CommandGate(qos.QosWatch):
             return replace(read(content), source=source, publishers=publishers)
 
         self._take("cmd_vel_raw", read_with_source, content)
+
+    def _take_e_stop(self, content: bytes) -> None:
+        """Decides on all messages that wait, on a press first, so that none waits for the rest."""
+        contents = [content, *qos.take_waiting(self._button)]
+        self._queue.hear(time.monotonic(), len(contents))
+        messages = []
+        for each in contents:
+            try:
+                messages.append(e_stop(each))
+            except wire.UNREADABLE as error:
+                self._log.refuse(f"e_stop: {error}")
+                self._decide(inputs.Press("a message could not be read, and may be a press"))
+        if any(message.pressed for message in messages):
+            self._decide(inputs.EStop(True))
+        if messages:
+            self._decide(messages[-1])
+
+    def _miss_e_stop(self, count: int) -> None:
+        noun = "message was" if count == 1 else "messages were"
+        self._decide(inputs.Press(f"{count} {noun} lost, and may have been a press"))
+
+    def _tick(self) -> None:
+        reason = self._queue.tick(time.monotonic())
+        if reason:
+            self._decide(inputs.Press(reason))
+        self._decide(inputs.Tick())
 
     def _foreign(self, kind: str, content: bytes) -> inputs.Command:
         age_ns = round(self._config.command_age_s * NS_PER_S)

@@ -14,7 +14,26 @@ import sys
 from collections.abc import Iterator
 from typing import NoReturn
 
-ENDING = (signal.SIGINT, signal.SIGTERM)
+from nics_drl_bridge.nodes.output import finish_output
+
+ENDING = (
+    signal.SIGHUP,  # the terminal or the ssh session is gone
+    signal.SIGINT,
+    signal.SIGQUIT,
+    signal.SIGUSR1,
+    signal.SIGUSR2,
+    signal.SIGALRM,
+    signal.SIGTERM,
+    signal.SIGVTALRM,
+    signal.SIGPROF,
+    signal.SIGXCPU,
+    signal.SIGIO,
+    signal.SIGPWR,
+    *range(signal.SIGRTMIN, signal.SIGRTMAX + 1),
+)
+"""Signals that end a process unless it handles them, but SIGKILL, those of a fault in the process
+itself, and those that Python ignores, as SIGPIPE."""
+OUTPUT_S = 1.0  # for which the last lines may take to be written
 _leave: int | None = None  # address of the handler; None in a process that is more than one node
 _within = False  # `at_once`
 
@@ -24,7 +43,17 @@ def leave(code: int) -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(Exception):  # whoever read it has gone
             stream.flush()
+    finish_output(OUTPUT_S)
     os._exit(code)
+
+
+def ending_signals() -> list[int]:
+    """Returns the signals at which this process ends in order.
+
+    If it was started to outlive its terminal, as by `nohup`, SIGHUP is not one of them.
+    """
+    outlives = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    return [number for number in ENDING if not (outlives and number == signal.SIGHUP)]
 
 
 def own_process() -> None:
@@ -37,19 +66,20 @@ def own_process() -> None:
 
 @contextlib.contextmanager
 def at_once() -> Iterator[None]:
-    """Lets SIGINT and SIGTERM end the process with code 0, whatever it is doing."""
+    """Lets the signals that end it end the process with code 0, whatever it is doing."""
     global _within
     if _leave is None or _within:
         yield
         return
     handle = ctypes.CDLL(None).signal
     handle.argtypes, handle.restype = (ctypes.c_int, ctypes.c_void_p), ctypes.c_void_p
-    for number in ENDING:
+    numbers = ending_signals()
+    for number in numbers:
         handle(number, _leave)
     _within = True
     try:
         yield
     finally:
         _within = False
-        for number in ENDING:  # Python's own handlers again
+        for number in numbers:  # Python's own handlers again
             signal.signal(number, signal.getsignal(number))

@@ -32,6 +32,7 @@ from nics_drl_bridge.errors import BackendError, ModelError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import qos
+from nics_drl_bridge.nodes.ending import ENDING
 from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.parameters import stamped_by_default
 from nics_drl_bridge.nodes.robot_topics import heard_stamped
@@ -45,6 +46,13 @@ NO_RANDOMISATION = "none"
 LOST_S = 1.0  # a request to repeat data that stays unanswered for longer was itself lost [s]
 
 
+def _exit_at_signals() -> None:
+    """Lets signals end Python like an exception, unless the program handles them itself."""
+    for number in ENDING:
+        if signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, lambda number, _: sys.exit(128 + number))
+
+
 class Link:
     """A node in its own context and thread, whose end or silence leaves a zero command behind."""
 
@@ -54,10 +62,8 @@ class Link:
         command_timeout_s: float = math.inf, patience_s: float = 0.0,
     ) -> None:  # fmt: skip
         namespace = namespace_of(namespace)
-        # SIGTERM ends Python like an exception, unless the program handles it itself.
-        in_main = threading.current_thread() is threading.main_thread()
-        if in_main and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
-            signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+        if threading.current_thread() is threading.main_thread():
+            _exit_at_signals()
         self._context = open_context(domain_id=domain_id)
         overrides = [Parameter(name, value=value) for name, value in (parameters or {}).items()]
         self.node = qos.QosWatch(

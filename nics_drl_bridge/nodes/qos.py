@@ -4,6 +4,7 @@ Reliable publishers match all subscribers, so this package publishes reliably, a
 effort wherever a lost message does no harm. Nothing is kept for late joiners: old data mislead.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -17,9 +18,17 @@ from rclpy.subscription import Subscription
 from nics_drl_bridge.recording.messages import Offer
 
 try:
-    from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+    from rclpy.event_handler import (
+        PublisherEventCallbacks,
+        SubscriptionEventCallbacks,
+        UnsupportedEventTypeError,
+    )
 except ModuleNotFoundError:  # Humble
-    from rclpy.qos_event import PublisherEventCallbacks, SubscriptionEventCallbacks
+    from rclpy.qos_event import (
+        PublisherEventCallbacks,
+        SubscriptionEventCallbacks,
+        UnsupportedEventTypeError,
+    )
 
 
 def profile_of(offer: Offer) -> QoSProfile:
@@ -51,7 +60,15 @@ SENSOR_RELIABLE = profile_of(Offer(10))  # publishers of the same: subscribers o
 
 EVERY_COMMAND = profile_of(Offer(10))
 """Commands in lock-step: each moves the world, and a second publisher must not replace the
-first one's unnoticed. Also `e_stop`, of which no press may be overwritten."""
+first one's unnoticed."""
+
+E_STOP = QoSProfile(
+    history=rclpy_qos.HistoryPolicy.KEEP_ALL,
+    reliability=rclpy_qos.ReliabilityPolicy.RELIABLE,
+    durability=rclpy_qos.DurabilityPolicy.VOLATILE,
+)
+"""Subscriptions to `e_stop`. A press lasts for a single message, and the heartbeats that follow it,
+also those of another publisher, must not push it out of the queue while nobody reads it."""
 
 COMMAND = profile_of(Offer(1))  # commands and goals: only the newest counts, and it has to arrive
 # Commands of which the gate looks at the publisher, too: the one that a second publisher sends
@@ -62,6 +79,7 @@ LATCHED = profile_of(Offer(1, transient_local=True))  # `/tf_static`, `map`: for
 DIAGNOSTICS = profile_of(Offer(10))  # as the diagnostic aggregator expects `/diagnostics`
 
 MOMENT_S, UNKNOWN = 0.5, "_UNKNOWN_"
+MOST_WAITING = 10_000  # messages that are taken at once, if a publisher never pauses
 
 
 class QosWatch(Node):
@@ -81,9 +99,25 @@ class QosWatch(Node):
         self, kind: Any, topic: str, callback: Any, qos: Any, **options: Any
     ) -> Subscription:
         """Creates a subscription; see rclpy."""
-        warn = partial(self._warn, topic=topic, qos=qos, publishing=False)
-        options = {"event_callbacks": SubscriptionEventCallbacks(incompatible_qos=warn)} | options
+        options = {"event_callbacks": self._subscription_events(topic, qos)} | options
         return super().create_subscription(kind, topic, callback, qos, **options)
+
+    def create_lossless_subscription(
+        self, kind: Any, topic: str, callback: Any, qos: Any, lost: Callable[[int], None]
+    ) -> Subscription:
+        """Creates a raw subscription that reports how many messages the middleware has lost."""
+        events = self._subscription_events(topic, qos)
+        events.message_lost = lambda event: lost(event.total_count_change)
+        options = {"event_callbacks": events, "raw": True}
+        try:
+            return self.create_subscription(kind, topic, callback, qos, **options)
+        except UnsupportedEventTypeError:
+            self.get_logger().warning(f"{topic}: this middleware does not report lost messages")
+            return self.create_subscription(kind, topic, callback, qos, raw=True)
+
+    def _subscription_events(self, topic: str, qos: Any) -> SubscriptionEventCallbacks:
+        warn = partial(self._warn, topic=topic, qos=qos, publishing=False)
+        return SubscriptionEventCallbacks(incompatible_qos=warn)
 
     def _warn(self, event: Any, topic: str, qos: Any, publishing: bool) -> None:
         """Warns after a moment: a peer's name is known later than its quality of service."""
@@ -112,6 +146,18 @@ class QosWatch(Node):
             if rclpy_qos.qos_check_compatible(*pair)[0] == rclpy_qos.QoSCompatibility.ERROR:
                 return owner(peer) or "a peer", peer.qos_profile
         return "a peer", None
+
+
+def take_waiting(subscription: Subscription) -> list[bytes]:
+    """Takes the messages that wait in the queue of a raw subscription, oldest first."""
+    contents: list[bytes] = []
+    with subscription.handle:
+        while len(contents) < MOST_WAITING:
+            taken = subscription.handle.take_message(subscription.msg_type, True)
+            if taken is None:
+                break
+            contents.append(taken[0])
+    return contents
 
 
 def _value(profile: Any, policy: str) -> str:

@@ -29,7 +29,7 @@ from std_srvs.srv import Trigger
 from nics_drl_bridge.errors import BackendError, BridgeError, nearest
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.nodes import qos
-from nics_drl_bridge.nodes.ending import ENDING, at_once
+from nics_drl_bridge.nodes.ending import at_once, ending_signals
 from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.parameters import MODEL, Row
 from nics_drl_bridge.nodes.transport import OF_THIS_PROCESS
@@ -77,7 +77,7 @@ def last_word(publisher: Publisher, message: Any) -> None:
 def run_node(
     make: Callable[[Context], Node], args: Sequence[str] | None = None, sole_name: str = ""
 ) -> Any:
-    """Runs a node until SIGINT or SIGTERM, then stops and destroys it in order, and returns it."""
+    """Runs a node until a signal (`ENDING`), then stops and destroys it in order; returns it."""
     stopping, started = threading.Event(), threading.Event()
 
     def end(*_: Any) -> None:
@@ -86,7 +86,7 @@ def run_node(
             started.set()
             raise SystemExit(0)
 
-    for number in ENDING:
+    for number in ending_signals():
         signal.signal(number, end)
     context, node, alone = None, None, contextlib.ExitStack()
     try:

@@ -14,11 +14,10 @@ EXIT_BAD_INPUT = 2
 
 def start(node: str, args: list[str] | None = None) -> None:
     """Runs a node by its name and ends the process; what can't be used is one sentence, and 2."""
-    for number in (signal.SIGINT, signal.SIGTERM):  # to import takes seconds
-        signal.signal(number, lambda *_: os._exit(0))
-    faulthandler.enable()  # a crash of a library is told with the place in Python
-    from nics_drl_bridge.nodes import ending, usage
+    from nics_drl_bridge.nodes import ending, output, usage
 
+    for number in ending.ending_signals():  # to import the node takes seconds
+        signal.signal(number, lambda *_: os._exit(0))
     words = sys.argv[1:] if args is None else args[1:]
     if any(word in usage.HELP for word in words):
         sys.stdout.write(usage.help_of(node))
@@ -26,6 +25,8 @@ def start(node: str, args: list[str] | None = None) -> None:
     if sentence := usage.wrong_with(node, words):
         sys.stderr.write(f"{sentence}\n")
         ending.leave(EXIT_BAD_INPUT)
+    output.forward_output()
+    faulthandler.enable()  # a crash of a library is told with the place in Python
     # As the log of ROS 2 would say it, which is there seconds later.
     sys.stderr.write(f"[INFO] [{time.time():.9f}] [{node}]: starting\n")
     sys.stderr.flush()

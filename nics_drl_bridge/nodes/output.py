@@ -1,0 +1,113 @@
+"""Output of a node's process that never blocks it.
+
+ROS 2, the libraries below it and Python write to the file descriptors 1 and 2, and wait there for a
+terminal that was halted by Ctrl-S, or a pipe that nobody reads. So both lead into a pipe of our own
+that does not block, and a small process passes on what comes (`output_forwarder.py`). The terminal
+itself must not be made non-blocking: that would change it for every process that uses it.
+"""
+
+import contextlib
+import fcntl
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+PROGRAM = Path(__file__).with_name("output_forwarder.py")
+STDOUT, STDERR = 1, 2
+PIPE_BYTES = 2**20  # most that Linux gives a user's process
+COLOUR = "RCUTILS_COLORIZED_OUTPUT"  # of ROS 2: whether log lines are coloured, "0" or "1"
+
+_forwarder: subprocess.Popen[bytes] | None = None
+
+
+class _DroppingFile(io.RawIOBase):
+    """A file descriptor as Python's output, which drops what can't be written at once."""
+
+    def __init__(self, descriptor: int) -> None:
+        super().__init__()
+        self._descriptor = descriptor
+
+    def fileno(self) -> int:
+        return self._descriptor
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: bytes) -> int:  # type: ignore[override]
+        with contextlib.suppress(OSError):  # the forwarder does not read, or has gone
+            os.write(self._descriptor, data)
+        return len(data)
+
+
+def forward_output() -> None:
+    """Lets a process of its own write the output of this one; call it before threads exist."""
+    global _forwarder
+    if _forwarder is not None:
+        return
+    descriptors = _different_outputs()
+    if os.isatty(STDERR):
+        os.environ.setdefault(COLOUR, "1")
+    pipes = {descriptor: os.pipe() for descriptor in descriptors}
+    try:
+        _forwarder = _start_forwarder(pipes)
+    except OSError as error:
+        sys.stderr.write(f"output is written directly, and may block ({error.strerror})\n")
+    else:
+        for descriptor, (_, entrance) in pipes.items():
+            _lead_into(entrance, descriptor)
+        if STDOUT not in descriptors:
+            os.dup2(STDERR, STDOUT)
+        sys.stdout = io.TextIOWrapper(
+            _DroppingFile(STDOUT), "utf-8", "backslashreplace", write_through=True
+        )
+        sys.stderr = io.TextIOWrapper(
+            _DroppingFile(STDERR), "utf-8", "backslashreplace", write_through=True
+        )
+    for exit_, entrance in pipes.values():
+        os.close(exit_)
+        os.close(entrance)
+
+
+def finish_output(seconds: float) -> None:
+    """Waits until all output is written, or for some time; nothing can be written afterwards."""
+    if _forwarder is None:
+        return
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    for descriptor in (STDOUT, STDERR):
+        os.dup2(nowhere, descriptor)
+    with contextlib.suppress(subprocess.TimeoutExpired):
+        _forwarder.wait(seconds)
+
+
+def _different_outputs() -> list[int]:
+    """Returns the descriptors of the outputs, once if both are the same, so that order is kept."""
+    for descriptor in (0, STDOUT, STDERR):
+        try:
+            os.fstat(descriptor)
+        except OSError:  # it was closed; a pipe must not take its number
+            os.open(os.devnull, os.O_RDWR)
+    if os.path.samestat(os.fstat(STDOUT), os.fstat(STDERR)):
+        return [STDERR]
+    return [STDERR, STDOUT]
+
+
+def _start_forwarder(pipes: dict[int, tuple[int, int]]) -> subprocess.Popen[bytes]:
+    pairs = [f"{exit_}:{descriptor}" for descriptor, (exit_, _) in pipes.items()]
+    return subprocess.Popen(
+        [sys.executable, "-I", "-S", str(PROGRAM), *pairs],
+        stdin=subprocess.DEVNULL,
+        pass_fds=[exit_ for exit_, _ in pipes.values()],
+        start_new_session=True,  # neither Ctrl-C nor Ctrl-Z of the terminal reaches it
+    )
+
+
+def _lead_into(entrance: int, descriptor: int) -> None:
+    """Replaces an output by the entrance of a pipe."""
+    os.set_blocking(entrance, False)
+    with contextlib.suppress(
+        AttributeError, OSError
+    ):  # not on every system; the usual size will do
+        fcntl.fcntl(entrance, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+    os.dup2(entrance, descriptor)

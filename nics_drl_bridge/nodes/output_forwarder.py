@@ -1,0 +1,120 @@
+"""Program that passes on what a node writes, so that the node never waits for who reads it.
+
+`python output_forwarder.py FROM:TO ...` copies lines between file descriptors. If an output takes
+nothing, as a terminal after Ctrl-S, it keeps the newest lines, and drops and counts the older ones.
+It ends when the node has ended and all is told, or nobody has read the rest for a while.
+"""
+
+import os
+import select
+import sys
+import threading
+import time
+from collections import deque
+
+KEPT_BYTES = 65_536  # of lines that wait for an output
+CHUNK_BYTES = 65_536
+PATIENCE_S = 5.0  # for which the rest is offered after the node's end
+
+
+class Output:
+    """Lines on their way to one output, which a thread of its own writes."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self._lines: deque[bytes] = deque()
+        self._bytes = 0  # of these lines
+        self._dropped = 0  # lines since the last that was written
+        self._ended = False
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._write_lines, daemon=True)
+        self._thread.start()
+
+    def put(self, line: bytes) -> None:
+        """Adds a line, and drops the oldest ones if too much waits."""
+        with self._changed:
+            self._lines.append(line)
+            self._bytes += len(line)
+            while self._bytes > KEPT_BYTES and len(self._lines) > 1:
+                self._bytes -= len(self._lines.popleft())
+                self._dropped += 1
+            self._changed.notify()
+
+    def end(self) -> None:
+        """Tells that no line follows."""
+        with self._changed:
+            self._ended = True
+            self._changed.notify()
+
+    def join(self, seconds: float) -> None:
+        """Waits until all lines are written, or for some time."""
+        self._thread.join(seconds)
+
+    def _write_lines(self) -> None:
+        while True:
+            with self._changed:
+                while not self._lines and not self._ended:
+                    self._changed.wait()
+                if not self._lines:
+                    return
+                line = self._lines.popleft()
+                self._bytes -= len(line)
+                dropped = self._dropped
+                self._dropped = 0
+            try:
+                if dropped:
+                    self._write(told_of(dropped))
+                self._write(line)
+            except OSError:  # whoever read it has gone
+                self._descriptor = os.open(os.devnull, os.O_WRONLY)
+
+    def _write(self, data: bytes) -> None:
+        while data:
+            try:
+                data = data[os.write(self._descriptor, data) :]
+            except BlockingIOError:  # somebody has made this output non-blocking
+                select.select([], [self._descriptor], [])
+
+
+def told_of(dropped: int) -> bytes:
+    """Returns the line that tells how many were dropped."""
+    lines = "line was" if dropped == 1 else "lines were"
+    return f"({dropped} {lines} dropped here: nobody read this output)\n".encode()
+
+
+def copy_lines(source: int, output: Output) -> None:
+    """Copies lines from a file descriptor to an output until its end."""
+    rest = b""
+    while chunk := os.read(source, CHUNK_BYTES):
+        *lines, rest = (rest + chunk).split(b"\n")
+        for line in lines:
+            output.put(line + b"\n")
+        if len(rest) > CHUNK_BYTES:
+            output.put(rest)
+            rest = b""
+    if rest:
+        output.put(rest)
+    output.end()
+
+
+def main(pairs: list[str]) -> None:
+    """Copies between pairs of descriptors, given as `FROM:TO`, until all sources have ended."""
+    outputs = []
+    readers = []
+    for pair in pairs:
+        source, descriptor = map(int, pair.split(":"))
+        output = Output(descriptor)
+        reader = threading.Thread(target=copy_lines, args=(source, output))
+        reader.start()
+        outputs.append(output)
+        readers.append(reader)
+    for reader in readers:
+        reader.join()
+    deadline = time.monotonic() + PATIENCE_S
+    for output in outputs:
+        output.join(max(0.0, deadline - time.monotonic()))
+    os._exit(0)  # also while a thread waits for its output
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

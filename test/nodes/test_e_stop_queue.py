@@ -1,0 +1,38 @@
+from __future__ import annotations
+
+import pytest
+
+from nics_drl_bridge.nodes.e_stop_queue import LONGEST_SLEEP_S, QUEUE_MESSAGES, EStopQueue
+
+
+def heard_at(rate, seconds=2.0):
+    """A queue that has heard messages at a rate, up to a last tick at the time 0."""
+    queue = EStopQueue()
+    for k in range(round(rate * seconds), -1, -1):
+        queue.hear(-k / rate, 1)
+    assert queue.tick(0.0) == ""
+    return queue
+
+
+@pytest.mark.parametrize("rate", [5.0, 100.0, 1000.0])
+def test_a_sleep_in_which_all_messages_fit_is_no_press(rate):
+    fits = min(QUEUE_MESSAGES / rate, LONGEST_SLEEP_S)
+    assert heard_at(rate).tick(0.9 * fits) == ""
+
+
+@pytest.mark.parametrize("rate", [5.0, 100.0, 1000.0])
+def test_a_sleep_in_which_more_may_have_come_counts_as_a_press(rate):
+    fits = min(QUEUE_MESSAGES / rate, LONGEST_SLEEP_S)
+    assert "the gate slept for" in heard_at(rate).tick(1.1 * fits)
+
+
+def test_without_a_button_a_sleep_loses_no_press():
+    queue = EStopQueue()
+    queue.tick(0.0)
+    assert queue.tick(100.0) == ""
+
+
+def test_the_first_tick_follows_no_sleep():
+    queue = EStopQueue()
+    queue.hear(0.0, 1)
+    assert queue.tick(100.0) == ""

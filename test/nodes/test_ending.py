@@ -1,0 +1,103 @@
+"""Every signal that would end a node's process lets it leave a zero command behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+
+from geometry_msgs.msg import Twist
+
+from nodes.test_command_gate import PATIENT, Robot
+
+pytestmark = [pytest.mark.ros, pytest.mark.process]
+
+DEADLINE_S = 60.0
+NODE = """
+import sys
+from rclpy.node import Node
+from nics_drl_bridge.nodes import ending, runner
+
+class Left(Node):
+    def stop(self):
+        print("stopped", flush=True)
+
+def make(context):
+    node = Left("left", context=context)
+    runner.steadily(node, 0.1, lambda: print("runs", flush=True))
+    return node
+
+runner.run_node(make)
+ending.leave(0)
+"""
+ENDS = [
+    signal.SIGHUP, signal.SIGINT, signal.SIGQUIT, signal.SIGUSR1, signal.SIGUSR2, signal.SIGALRM,
+    signal.SIGTERM, signal.SIGXCPU, signal.SIGIO, signal.SIGRTMIN, signal.SIGRTMAX,
+]  # fmt: skip
+
+
+def usual_signals():
+    """As in a terminal, whatever the shell that started the tests ignores."""
+    for number in ENDS:
+        signal.signal(number, signal.SIG_DFL)
+
+
+@pytest.fixture
+def node(domain_id):
+    """A node that says when it runs, and when it is stopped in order."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", NODE], env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
+        stdout=subprocess.PIPE, text=True, preexec_fn=usual_signals,
+    )  # fmt: skip
+    assert process.stdout.readline() == "runs\n"
+    yield process
+    process.kill()
+    process.communicate()
+
+
+@pytest.mark.parametrize("number", ENDS)
+def test_a_signal_that_would_end_it_stops_it_in_order(node, number):
+    node.send_signal(number)
+    assert "stopped\n" in node.communicate(timeout=DEADLINE_S)[0]
+    assert node.returncode == 0
+
+
+def test_a_reader_that_has_gone_does_not_end_it(node):
+    node.send_signal(signal.SIGPIPE)
+    assert [node.stdout.readline() for _ in range(5)] == ["runs\n"] * 5
+    assert node.poll() is None
+
+
+def test_a_lost_terminal_does_not_end_what_was_started_by_nohup(domain_id):
+    process = subprocess.Popen(
+        [sys.executable, "-c", NODE], env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
+        stdout=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN),
+    )  # fmt: skip
+    assert process.stdout.readline() == "runs\n"
+    process.send_signal(signal.SIGHUP)
+    assert [process.stdout.readline() for _ in range(5)] == ["runs\n"] * 5
+    process.send_signal(signal.SIGTERM)
+    assert "stopped\n" in process.communicate(timeout=DEADLINE_S)[0]
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGQUIT, signal.SIGUSR1, signal.SIGALRM])
+def test_a_gate_that_lets_a_robot_drive_leaves_a_zero_behind(
+    launch_process, meet, domain_id, model, tmp_path, number
+):
+    if signal.getsignal(number) is signal.SIG_IGN:
+        pytest.skip("the shell that started the tests ignores it")
+    gate = launch_process(
+        "command_gate", domain_id, limits="ackermann", black_box=str(tmp_path), **PATIENT
+    )
+    robot = Robot(meet(domain_id), model.lidar)
+    robot.drives()
+    gate._process.send_signal(number)
+    robot.peer.until(lambda: gate._process.poll() is not None, "its end")
+    assert gate._process.returncode == 0
+    robot.peer.until(lambda: robot.passed[-1] == Twist(), "zero", 5.0)

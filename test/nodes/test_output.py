@@ -1,0 +1,175 @@
+"""A node never waits for who reads its output; what is dropped is counted and told."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pty
+import re
+import signal
+import subprocess
+import sys
+import termios
+
+import pytest
+
+pytestmark = pytest.mark.process
+
+DEADLINE_S = 30.0
+TALKER = """
+import os, sys
+from nics_drl_bridge.nodes.ending import leave
+from nics_drl_bridge.nodes.output import forward_output
+forward_output()
+for number in range(int(sys.argv[1])):
+    os.write(2, f"line {number} {'.' * 80}\\n".encode())
+print("over", flush=True)
+leave(3)
+"""
+
+
+def start(code, *words, **outputs):
+    return subprocess.Popen([sys.executable, "-c", code, *words], **outputs)
+
+
+def full_pipe():
+    """A pipe that takes nothing more until it is read."""
+    exit_, entrance = os.pipe()
+    os.set_blocking(entrance, False)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            os.write(entrance, b"." * 4095 + b"\n")
+    os.set_blocking(entrance, True)
+    return exit_, entrance
+
+
+def read_all(descriptor):
+    """What can be read until the other side is closed."""
+    text = b""
+    while True:
+        try:
+            part = os.read(descriptor, 65536)
+        except OSError:  # of a terminal that was closed
+            return text.decode()
+        if not part:
+            return text.decode()
+        text += part
+
+
+def test_all_lines_arrive_in_order_where_somebody_reads_them():
+    talker = start(TALKER, "50", stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    lines = talker.communicate(timeout=DEADLINE_S)[0].decode().splitlines()
+    assert [line.split(" .")[0] for line in lines] == [f"line {k}" for k in range(50)] + ["over"]
+    assert talker.returncode == 3
+
+
+def test_stdout_and_stderr_stay_apart():
+    talker = start(TALKER, "5", stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    told, errors = talker.communicate(timeout=DEADLINE_S)
+    assert told == b"over\n"
+    assert errors.count(b"line ") == 5
+
+
+@pytest.mark.parametrize("stdio", ["stdout", "stderr"])
+def test_a_closed_output_is_no_error(stdio):
+    closed = {"stdout": "1", "stderr": "2"}[stdio]
+    command = [sys.executable, "-c", TALKER, "5"]
+    done = subprocess.run(
+        ["sh", "-c", f'exec "$@" {closed}>&-', "sh", *command], timeout=DEADLINE_S
+    )
+    assert done.returncode == 3
+
+
+def test_a_pipe_that_nobody_reads_delays_nothing_and_the_dropped_lines_are_told():
+    count = 5000
+    exit_, entrance = os.pipe()
+    talker = start(TALKER, str(count), stdout=entrance, stderr=entrance)
+    os.close(entrance)
+    assert talker.wait(DEADLINE_S) == 3
+    lines = read_all(exit_).splitlines()
+    os.close(exit_)
+    dropped = [int(found[1]) for line in lines if (found := re.match(r"\((\d+) lines were", line))]
+    arrived = [line for line in lines if line.startswith("line ")]
+    assert dropped
+    assert len(arrived) + sum(dropped) == count
+    assert arrived[0].startswith("line 0 ")
+    assert arrived[-1].startswith(f"line {count - 1} ")
+
+
+def test_a_terminal_that_was_halted_delays_nothing():
+    master, slave = pty.openpty()
+    termios.tcflow(slave, termios.TCOOFF)  # as Ctrl-S
+    talker = start(TALKER, "5000", stdout=slave, stderr=slave)
+    os.close(slave)
+    assert talker.wait(DEADLINE_S) == 3
+    os.close(master)
+
+
+def test_a_reader_that_has_gone_ends_nothing():
+    exit_, entrance = os.pipe()
+    talker = start(TALKER, "5000", stdout=entrance, stderr=entrance)
+    os.close(entrance)
+    os.close(exit_)
+    assert talker.wait(DEADLINE_S) == 3
+
+
+def test_a_forwarder_that_is_frozen_or_killed_delays_nothing():
+    code = (
+        "import os, signal\nfrom nics_drl_bridge.nodes import output\noutput.forward_output()\n"
+        "os.kill(output._forwarder.pid, signal.{})\n"
+        "for _ in range(100_000): print('line', 'x' * 80, flush=True)\nos._exit(3)"
+    )
+    for name in ("SIGSTOP", "SIGKILL"):
+        talker = start(code.format(name), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        assert talker.wait(DEADLINE_S) == 3
+
+
+class TestGate:
+    """The gate in a process of its own, whose output nobody reads."""
+
+    @pytest.fixture
+    def gate(self, domain_id, tmp_path):
+        pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
+        exit_, entrance = full_pipe()
+        words = ["-p", "limits:=differential", "-p", f"black_box:={tmp_path}"]
+        gate = subprocess.Popen(
+            [
+                sys.executable, "-m", "nics_drl_bridge.nodes.start", "command_gate", "--ros-args",
+                "-p", "enable_stamped_cmd_vel:=false", *words,
+            ],
+            env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)}, stdin=subprocess.DEVNULL,
+            stdout=entrance, stderr=entrance,
+        )  # fmt: skip
+        os.close(entrance)
+        yield gate, exit_
+        gate.kill()
+        gate.wait()
+        os.close(exit_)
+
+    @pytest.mark.ros
+    def test_it_controls_on_and_ends_at_a_signal_though_nobody_reads_its_log(
+        self, gate, meet, domain_id
+    ):
+        from diagnostic_msgs.msg import DiagnosticArray
+        from geometry_msgs.msg import Twist
+        from std_msgs.msg import Bool
+
+        from nics_drl_bridge.nodes import qos
+
+        process, exit_ = gate
+        peer = meet(domain_id)
+        passed = peer.listen(Twist, "cmd_vel", qos.COMMAND)
+        said = peer.listen(DiagnosticArray, "/diagnostics")
+        button = peer.speak(Bool, "e_stop")
+        peer.until(lambda: len(passed) > 20, "more commands", 10.0)
+        assert passed == [Twist()] * len(passed)
+        button.publish(Bool(data=True))
+        peer.until(
+            lambda: peer.another(said, "diagnostics").status[0].message.startswith("e_stop_press"),
+            "the e-stop is heeded", 10.0,
+        )  # fmt: skip
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(10.0) == 0
+        told = read_all(exit_)
+        assert "[command_gate]: running" in told
+        assert "stopped by e_stop_pressed" in told
