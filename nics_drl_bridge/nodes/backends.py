@@ -87,6 +87,9 @@ class _Mailbox:
     def stamp_ns(self, topic: str) -> int:
         return self._mail[topic].stamp_ns
 
+    def content(self, topic: str) -> bytes:
+        return self._mail[topic].content
+
     def clear(self) -> None:
         with self._lock:
             self._mail, self._worked_ns = dict.fromkeys(self._mail, _Mail()), -1
@@ -187,7 +190,9 @@ class DdsBackend:
         """The second part: waits for the data of a stamp, of a robot that stands at a pose (3,)."""
         self._now_ns = stamp_ns
         self._middleware.reset(stamp_ns, pose)
-        return self.receive()[0]
+        view = self.receive()[0]
+        self._link.frame = _read(ODOM, wire.frames_of, self._mail.content(ODOM))[1]
+        return view
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
         """Publishes a command and waits for the data after it; see `interface.Backend`."""

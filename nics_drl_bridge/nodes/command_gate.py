@@ -17,6 +17,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate import inputs, shield
 from nics_drl_bridge.gate.black_box import Entry
 from nics_drl_bridge.gate.gate import decide
@@ -178,6 +179,9 @@ class CommandGate(qos.QosWatch):
             shield.rehearse()
         self._stamped = bool(runner.declare_row(self, parameters.stamped("cmd_vel")))
         runner.declare_row(self, parameters.FOREIGN)
+        self._frame = str(runner.declare_row(self, parameters.ROBOT_FRAME))
+        if fault := parameters.frame_fault(self._parameters.values(), parameters.ROBOT_FRAME.name):
+            raise ConfigError(fault)
         kind = TwistStamped if self._stamped else Twist
         self._out = self.create_publisher(kind, "cmd_vel", qos.COMMAND)
         self._listen()
@@ -193,7 +197,7 @@ class CommandGate(qos.QosWatch):
         given = command if raw == "none" else partial(self._foreign, raw)
         readers: tuple[tuple[Any, str, Callable[[bytes], inputs.Input], Any], ...] = (
             (LaserScan, "scan", partial(scan, self._lidar), qos.SENSOR),
-            (Odometry, "odom", odometry, qos.SENSOR),
+            (Odometry, "odom", self._read_odometry, qos.SENSOR),
             (Odometry, "odometry/filtered", estimate, qos.SENSOR),
             (Twist if raw == TWIST else TwistStamped, "cmd_vel_raw", given, qos.COMMAND),
             (Bool, "e_stop", e_stop, qos.EVERY_COMMAND),
@@ -216,6 +220,12 @@ class CommandGate(qos.QosWatch):
             self._log.refuse(f"{topic}: {error}")
         else:
             self._decide(given)
+
+    def _read_odometry(self, content: bytes) -> inputs.Odometry:
+        given = odometry(content)
+        if not self._frame:  # no parameter names it
+            self._frame = wire.frames_of(content)[1]
+        return given
 
     def _foreign(self, kind: str, content: bytes) -> inputs.Command:
         age_ns = round(self._config.command_age_s * NS_PER_S)
@@ -260,7 +270,8 @@ class CommandGate(qos.QosWatch):
     def _message(self, twist: Array) -> bytes:
         if not self._stamped:
             return wire.twist_to_bytes(twist)
-        return wire.stamped_twist_to_bytes(twist, int(self.get_clock().now().nanoseconds))
+        now_ns = int(self.get_clock().now().nanoseconds)
+        return wire.stamped_twist_to_bytes(twist, now_ns, self._frame)
 
     def _look(self) -> runner.Condition:
         found = self._log.finding(self._state)

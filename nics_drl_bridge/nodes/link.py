@@ -67,6 +67,7 @@ class Link:
         self._began_s = time.monotonic()
         if stamped is None:
             stamped = self.hears_stamped(command_topic, patience_s)
+        self.frame = ""  # of the robot, in which commands are; unknown until it is set
         self.stamped, self._kind = stamped, TwistStamped if stamped else Twist
         self.commands = self.node.create_publisher(self._kind, command_topic, qos.COMMAND)
         self._topic = self.commands.topic_name
@@ -98,7 +99,7 @@ class Link:
         if self._kind is Twist:
             self.commands.publish(twist_to_bytes(twist))
         else:
-            self.commands.publish(stamped_twist_to_bytes(twist, stamp_ns))
+            self.commands.publish(stamped_twist_to_bytes(twist, stamp_ns, self.frame))
 
     def halt(self) -> None:
         """Publishes a zero command."""

@@ -214,6 +214,7 @@ class RealtimeBackend:
             if missing is None and age_s <= limit_s:
                 facts = data_facts(self._topics.middleware, time.monotonic_ns())
                 self._scan_ns = self._topics.middleware.cache.newest[SCAN].stamp_ns
+                self._link.frame = self._topics.frames[1]
                 view = self._topics.view()
                 known = {"stamp_ns": self._topics.newest_ns, "deadline_misses": self._misses}
                 return view, known | facts

@@ -181,6 +181,7 @@ class RecordNode(qos.QosWatch):
         self._began, self._heard = time.monotonic(), -np.inf
         self._ticks = self._origin_ns = self._stamp_ns = 0
         self._pose: Array | None = None
+        self._frame = ""  # of the robot, by its odometry
         self._start: Array = np.zeros(3)
         # Steady: the robot's guard must not depend on the time source of the node.
         runner.steadily(self, POLL_S, self._on_time)
@@ -205,6 +206,7 @@ class RecordNode(qos.QosWatch):
         if pose is None:
             return
         self._pose, self._heard = pose, time.monotonic()
+        self._frame = message.child_frame_id
         if self._ticks:
             self._drive.see(geometry.between(self._start, pose))
             self._on_time()  # at once: with a fast simulated time a poll may be a tick late
@@ -281,7 +283,7 @@ class RecordNode(qos.QosWatch):
         self._log.add("cmd_vel", 0, robot.through_cmd_vel(command))
 
     def _message(self, twist: Array) -> Twist | TwistStamped:
-        stamped = conversions.stamped_to_ros(twist, self._now_ns(), "")
+        stamped = conversions.stamped_to_ros(twist, self._now_ns(), self._frame)
         return stamped if self._stamped else stamped.twist
 
     def stop(self) -> None:

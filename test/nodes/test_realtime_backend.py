@@ -196,6 +196,7 @@ def test_a_vehicle_is_awaited_at_its_start_and_what_is_missing_is_said(
     vehicle.peer.until(lambda: robot and robot[-1].twist.linear.x == 0.5, heard)
     stamp_ns = backend._topics.middleware.cache.newest["scan"].stamp_ns
     assert conversions.stamp_from_ros(robot[-1].header.stamp) == stamp_ns
+    assert robot[-1].header.frame_id == "base_link"
 
 
 @pytest.fixture

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
@@ -9,6 +10,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 
+from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.backends import DdsBackend
 from nics_drl_bridge.nodes.link import Link
@@ -30,13 +32,53 @@ def test_the_gate_sends_the_type_that_is_asked_for(launch, meet, domain_id, stam
     if stamped:
         before = stamp_ns(heard[-1])
         assert before > 0
-        assert heard[-1].header.frame_id == "base_link"
         assert stamp_ns(peer.another(heard, "zero")) > before
     heard.clear()
     assert gate.close() == 0
     peer.until(lambda: heard, "a zero command")
     twist = heard[-1].twist if stamped else heard[-1]
     assert twist == Twist()
+
+
+def test_the_gate_sends_in_the_frame_of_the_robot_that_odometry_names(launch, meet, domain_id):
+    peer = meet(domain_id)
+    heard = peer.listen(TwistStamped, "cmd_vel", qos.COMMAND)
+    odom = peer.node.create_publisher(Odometry, "odom", qos.SENSOR_RELIABLE)
+    peer.node.create_timer(0.05, lambda: odom.publish(Odometry(child_frame_id="car_1/base")))
+    launch("command_gate", domain_id, enable_stamped_cmd_vel=True)
+    peer.until(lambda: heard and heard[-1].header.frame_id == "car_1/base", "the robot's frame")
+
+
+def test_the_gate_sends_in_the_frame_that_its_parameter_names(launch, meet, domain_id):
+    peer = meet(domain_id)
+    heard = peer.listen(TwistStamped, "cmd_vel", qos.COMMAND)
+    launch("command_gate", domain_id, enable_stamped_cmd_vel=True, base_frame="base_footprint")
+    peer.until(lambda: heard, "a zero")
+    assert heard[-1].header.frame_id == "base_footprint"
+
+
+def test_a_frame_that_is_none_is_refused_by_the_gate_in_one_sentence(launch, domain_id):
+    gate = launch("command_gate", domain_id, base_frame="/base link")
+    assert gate.wait() == 2
+    assert "parameter 'base_frame': must be 1 to 255 characters" in gate.read_text()
+
+
+def test_an_env_sends_in_the_frame_of_the_robot_that_odometry_names(launch, meet, domain_id, model):
+    simulator = launch(
+        "simulator_node", domain_id, mode="lockstep", world="empty",
+        enable_stamped_cmd_vel=True, base_frame="base_footprint", frame_prefix="car_1/",
+    )  # fmt: skip
+    peer = meet(domain_id)
+    peer.until(lambda: simulator.handler is not None, "its start")
+    heard = peer.listen(TwistStamped, "cmd_vel", qos.EVERY_COMMAND)
+    backend = DdsBackend(model, load_world("empty"), domain_id=domain_id)
+    try:
+        backend.reset(Start(seed=1, pose=np.zeros(3)))
+        backend.step(np.array([0.5, 0.0]))
+        peer.until(lambda: heard, "a command")
+        assert heard[-1].header.frame_id == "car_1/base_footprint"
+    finally:
+        backend.close()
 
 
 @pytest.mark.parametrize("stamped", [True, False])
