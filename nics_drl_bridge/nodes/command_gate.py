@@ -28,12 +28,16 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
-from nics_drl_bridge.nodes import device_parameters, parameters, qos, runner, wire
+from nics_drl_bridge.nodes import command_types, device_parameters, parameters, qos, runner, wire
 from nics_drl_bridge.nodes.conversions import sensor_from_ros, sensor_type
 from nics_drl_bridge.nodes.gate_log import GateLog
 from nics_drl_bridge.recording.messages import is_rotation
 
 TWIST, TWIST_STAMPED = "Twist", "TwistStamped"
+FOREIGN_SETTINGS = {
+    command_types.TWIST: f"{parameters.FOREIGN.name}:={TWIST}",
+    command_types.TWIST_STAMPED: f"{parameters.FOREIGN.name}:={TWIST_STAMPED}",
+}
 STALE_S = 0.05  # a motion that was decided on longer ago than this is decided on again [s]
 SCAN_PERIODS = 1.75  # for a slow lidar, default age limit of a command's scan, in its periods
 ROTATION = slice(3, 7)  # position of an odometry's quaternion among its numbers
@@ -194,6 +198,8 @@ class CommandGate(qos.QosWatch):
     def _listen(self) -> None:
         kinds = ("none", TWIST, TWIST_STAMPED)
         raw = device_parameters.choice(self, parameters.FOREIGN.name, kinds)
+        self._raw_kind = command_types.name_of(stamped=raw != TWIST)
+        self._raw_types = command_types.TypeWatch(self, "cmd_vel_raw", FOREIGN_SETTINGS)
         given = command if raw == "none" else partial(self._foreign, raw)
         readers: tuple[tuple[Any, str, Callable[[bytes], inputs.Input], Any], ...] = (
             (LaserScan, "scan", partial(scan, self._lidar), qos.SENSOR),
@@ -275,6 +281,7 @@ class CommandGate(qos.QosWatch):
 
     def _look(self) -> runner.Condition:
         found = self._log.finding(self._state)
+        self._raw_types.look(self._raw_kind)
         others = self.count_publishers(self._out.topic_name) - 1
         if others < 1:
             return found

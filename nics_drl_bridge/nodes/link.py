@@ -32,9 +32,9 @@ from nics_drl_bridge.errors import BackendError, ModelError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import qos
+from nics_drl_bridge.nodes.command_types import deaf_subscribers, heard_stamped
 from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.parameters import stamped_by_default
-from nics_drl_bridge.nodes.robot_topics import heard_stamped
 from nics_drl_bridge.nodes.runner import holds, last_word, open_context
 from nics_drl_bridge.nodes.wire import stamped_twist_to_bytes, twist_to_bytes
 from nics_drl_bridge.sim.randomisation import Randomisation
@@ -156,6 +156,10 @@ class Link:
         left_s = deadline - time.monotonic()
         if not holds(lambda: all(there() for there in needed.values()), left_s, POLL_S):
             missing = ", no ".join(name for name, there in needed.items() if not there())
+            deaf = deaf_subscribers(node, self._topic, self.stamped)
+            if deaf and not commands.get_subscription_count():
+                fix = f"set `stamped` to {not self.stamped}, or leave it out."
+                raise BackendError(f"topic {self._topic}: {deaf}; {fix}")
             raise BackendError(f"after {patience_s:g} s there is still no {missing}; {advice}")
         # A publisher that was killed stays in the graph for a while.
         holds(lambda: not self.others_command(), deadline - time.monotonic(), POLL_S)

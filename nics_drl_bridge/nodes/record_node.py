@@ -23,8 +23,8 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, BridgeError, RecordingError
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes import conversions, qos, runner
+from nics_drl_bridge.nodes.command_types import deaf_subscribers, heard_stamped
 from nics_drl_bridge.nodes.parameters import drive
-from nics_drl_bridge.nodes.robot_topics import heard_stamped
 from nics_drl_bridge.recording.bag_file import Message
 from nics_drl_bridge.recording.bag_reader import joint_streams
 from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S, DrivePlan
@@ -244,6 +244,11 @@ class RecordNode(qos.QosWatch):
             name, missing = odom if self._pose is None else command
             fix = "start the robot, or correct namespace, ROS_DOMAIN_ID or remapping."
             reason = f"{missing} within {PATIENCE_S:g} s"
+            if self._pose is not None and self._topic is not None:
+                deaf = deaf_subscribers(self, "cmd_vel", self._stamped)
+                if deaf:
+                    fix = f"set stamped:={str(not self._stamped).lower()}, or leave it out."
+                    raise BackendError(f"topic {self._place(name)}: {deaf}; {fix}")
             raise BackendError(f"topic {self._place(name)}: {reason}; {fix}")
         return False
 

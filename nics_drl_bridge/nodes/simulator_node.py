@@ -28,10 +28,10 @@ from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.scanner import RENDERERS, Renderer
 from nics_drl_bridge.lidar.spec import to_device
 from nics_drl_bridge.nodes import conversions, device_parameters, parameters, qos, runner, wire
+from nics_drl_bridge.nodes.command_types import TypeWatch, name_of
 from nics_drl_bridge.nodes.conversions import sensor_to_ros, sensor_type
 from nics_drl_bridge.nodes.link import identity
 from nics_drl_bridge.nodes.map_to_odom import odom_in_map, transform_to_ros
-from nics_drl_bridge.nodes.robot_topics import TWIST, TWIST_STAMPED
 from nics_drl_bridge.nodes.simulation_interfaces import open_services
 from nics_drl_bridge.nodes.world_topics import WorldTopics
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -46,8 +46,6 @@ LONGEST_TICK_S = 0.005  # longest time between two checks for delayed data that 
 # Makes the simulator of some robots; may declare its own parameters at the node. Its control
 # period is that of the given model.
 MakeSimulator = Callable[[Node, SimulatorModel, AnyWorld, int], FastSimulator]
-# The setting that selects the other type.
-SWITCH = {TWIST_STAMPED: "enable_stamped_cmd_vel:=false", TWIST: "enable_stamped_cmd_vel:=true"}
 
 
 class Outbox:
@@ -173,11 +171,11 @@ class CommandInlet:
     ) -> None:  # fmt: skip
         self._node, self._robot, self._take, self._too_old = node, robot, take, too_old
         stamped = bool(node.get_parameter("enable_stamped_cmd_vel").value)
-        self._kind = TWIST_STAMPED if stamped else TWIST
+        self._kind = name_of(stamped)
         kind, hear = TwistStamped if stamped else Twist, partial(self._on_bytes, stamped)
         heard = node.create_subscription(kind, f"{namespace}cmd_vel", hear, quality, raw=True)
         self._topic, self.heard = heard.topic_name, [heard]
-        self._warned: set[str] = set()
+        self._types = TypeWatch(node, f"{namespace}cmd_vel")
         kind = conversions.message_type("ackermann_msgs/msg/AckermannDriveStamped")
         if robot.steers and kind is not None:  # its package is optional
             given = kind, f"{namespace}ackermann_cmd", self._on_ackermann, quality
@@ -223,16 +221,7 @@ class CommandInlet:
 
     def watch(self) -> None:
         """Warns once of each node that publishes the other type, which is never received."""
-        for end in self._node.get_publishers_info_by_topic(self._topic):
-            kind, who = end.topic_type, qos.owner(end)
-            if kind == self._kind or who is None or f"{who} {kind}" in self._warned:
-                continue
-            self._warned.add(f"{who} {kind}")
-            switch = SWITCH[self._kind] if kind in SWITCH else "another type there"
-            self._node.get_logger().warning(
-                f"{self._topic}: {who} publishes {kind}, but {self._kind} is expected here, so "
-                f"that its commands are not heard; let it publish that, or set {switch}."
-            )
+        self._types.look(self._kind)
 
 
 class DeviceNode(qos.QosWatch):
