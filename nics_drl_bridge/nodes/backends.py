@@ -87,6 +87,9 @@ class _Mailbox:
     def stamp_ns(self, topic: str) -> int:
         return self._mail[topic].stamp_ns
 
+    def content(self, topic: str) -> bytes:
+        return self._mail[topic].content
+
     def clear(self) -> None:
         with self._lock:
             self._mail, self._worked_ns = dict.fromkeys(self._mail, _Mail()), -1
@@ -153,24 +156,28 @@ class DdsBackend:
             sampler = EpisodeSampler(model, world, randomisation=randomisation)
             self._known["scenes"] = lambda seeds: sampler.draw(seeds)[0]
         self._link = Link(namespace, domain_id, stamped=stamped, patience_s=timeout_s)
-        for topic in self._topics:
-            kind = LaserScan if topic == SCAN else Odometry
-            if topic in self._sensors:
-                kind = sensor_type(self._sensors[topic])
-            put = lambda message, mail=self._mail, topic=topic: mail.put(topic, message)  # noqa: E731
-            self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
-        self._episodes: EpisodeServices | client.StandardEpisodes
-        if by_standard:
-            self._episodes = client.StandardEpisodes(self._link, model, world, options, self._mail)
-        else:
-            self._episodes = EpisodeServices(self._link, simulator, model, world, randomisation)
-        self._link.begin()
         try:
+            for topic in self._topics:
+                kind = LaserScan if topic == SCAN else Odometry
+                if topic in self._sensors:
+                    kind = sensor_type(self._sensors[topic])
+                put = partial(self._mail.put, topic)
+                self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
+            self._episodes = self._services(model, world, simulator, options, randomisation)
+            self._link.begin()
             self._link.wait_for_peers(self._topics, self._episodes.clients, timeout_s, ADVICE)
             self._episodes.open(timeout_s)
         except BaseException:
             self.close()
             raise
+
+    def _services(
+        self, model: SimulatorModel, world: AnyWorld, simulator: str,
+        options: client.StandardOptions, randomisation: Randomisation | None,
+    ) -> EpisodeServices | client.StandardEpisodes:  # fmt: skip
+        if simulator == STANDARD.name:
+            return client.StandardEpisodes(self._link, model, world, options, self._mail)
+        return EpisodeServices(self._link, simulator, model, world, randomisation)
 
     @halts_on_error
     def reset(self, start: Start) -> RobotView:
@@ -187,7 +194,9 @@ class DdsBackend:
         """The second part: waits for the data of a stamp, of a robot that stands at a pose (3,)."""
         self._now_ns = stamp_ns
         self._middleware.reset(stamp_ns, pose)
-        return self.receive()[0]
+        view = self.receive()[0]
+        self._link.frame = _read(ODOM, wire.frames_of, self._mail.content(ODOM))[1]
+        return view
 
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
         """Publishes a command and waits for the data after it; see `interface.Backend`."""

@@ -28,7 +28,7 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.sensor import Sensor
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device
-from nics_drl_bridge.nodes import device_parameters, parameters, qos, runner, wire
+from nics_drl_bridge.nodes import command_types, device_parameters, parameters, qos, runner, wire
 from nics_drl_bridge.nodes.conversions import PLANAR, sensor_from_ros, sensor_type
 from nics_drl_bridge.nodes.e_stop_queue import EStopQueue
 from nics_drl_bridge.nodes.gate_log import GateLog
@@ -36,6 +36,10 @@ from nics_drl_bridge.nodes.sources import Sources
 from nics_drl_bridge.recording.messages import is_rotation
 
 TWIST, TWIST_STAMPED = "Twist", "TwistStamped"
+FOREIGN_SETTINGS = {
+    command_types.TWIST: f"{parameters.FOREIGN.name}:={TWIST}",
+    command_types.TWIST_STAMPED: f"{parameters.FOREIGN.name}:={TWIST_STAMPED}",
+}
 STALE_S = 0.05  # a motion that was decided on longer ago than this is decided on again [s]
 SCAN_PERIODS = 1.75  # for a slow lidar, default age limit of a command's scan, in its periods
 ROTATION = slice(3, 7)  # position of an odometry's quaternion among its numbers
@@ -182,6 +186,9 @@ class CommandGate(qos.QosWatch):
         scan_motion.rehearse(self._config)
         self._stamped = bool(runner.declare_row(self, parameters.stamped("cmd_vel")))
         runner.declare_row(self, parameters.FOREIGN)
+        self._frame = str(runner.declare_row(self, parameters.ROBOT_FRAME))
+        if fault := parameters.frame_fault(self._parameters.values(), parameters.ROBOT_FRAME.name):
+            raise ConfigError(fault)
         kind = TwistStamped if self._stamped else Twist
         self._out = self.create_publisher(kind, "cmd_vel", qos.COMMAND)
         self._queue = EStopQueue()
@@ -195,10 +202,12 @@ class CommandGate(qos.QosWatch):
     def _listen(self) -> None:
         kinds = ("none", TWIST, TWIST_STAMPED)
         raw = device_parameters.choice(self, parameters.FOREIGN.name, kinds)
+        self._raw_kind = command_types.name_of(stamped=raw != TWIST)
+        self._raw_types = command_types.TypeWatch(self, "cmd_vel_raw", FOREIGN_SETTINGS)
         given = command if raw == "none" else partial(self._foreign, raw)
         readers: tuple[tuple[Any, str, Callable[[bytes], inputs.Input], Any], ...] = (
             (LaserScan, "scan", partial(scan, self._lidar), qos.SENSOR),
-            (Odometry, "odom", odometry, qos.SENSOR),
+            (Odometry, "odom", self._read_odometry, qos.SENSOR),
             (Odometry, "odometry/filtered", estimate, qos.SENSOR),
             *(
                 (sensor_type(each), each.name, partial(reading, each), qos.SENSOR)
@@ -266,6 +275,12 @@ class CommandGate(qos.QosWatch):
             self._decide(inputs.Press(reason))
         self._decide(inputs.Tick())
 
+    def _read_odometry(self, content: bytes) -> inputs.Odometry:
+        given = odometry(content)
+        if not self._frame:  # no parameter names it
+            self._frame = wire.frames_of(content)[1]
+        return given
+
     def _foreign(self, kind: str, content: bytes) -> inputs.Command:
         age_ns = round(self._config.command_age_s * NS_PER_S)
         oldest_ns = int(self.get_clock().now().nanoseconds) - age_ns
@@ -309,11 +324,13 @@ class CommandGate(qos.QosWatch):
     def _message(self, twist: Array) -> bytes:
         if not self._stamped:
             return wire.twist_to_bytes(twist)
-        return wire.stamped_twist_to_bytes(twist, int(self.get_clock().now().nanoseconds))
+        now_ns = int(self.get_clock().now().nanoseconds)
+        return wire.stamped_twist_to_bytes(twist, now_ns, self._frame)
 
     def _look(self) -> runner.Condition:
         self._sources.count_publishers()
         found = self._log.finding(self._state)
+        self._raw_types.look(self._raw_kind)
         others = self.count_publishers(self._out.topic_name) - 1
         if others < 1:
             return found

@@ -64,7 +64,8 @@ class StandingExecutor(SingleThreadedExecutor):
             self._call(self._come())
         for answer in asked:
             answer()
-        self._changed |= bool(asked)  # it may have destroyed entities, which can't be waited for
+        # These may have destroyed entities, which can't be waited for.
+        self._changed |= bool(asked or due)
         for timer in due:
             self._tick(timer)
         if left:

@@ -20,6 +20,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes.parameters import BASE_FRAME, MODEL, STAMPED
 
 STATE_PUBLISHER = "robot_state_publisher"
+SHIPPED_LASER = "laser"  # frame of the lidar in the URDFs of the shipped robots
 TRANSFORMS = ("/tf", "/tf_static")
 # RViz names topics absolutely; here they are those of the robot's namespace.
 SHOWN = ("scan", "odom", "odometry/filtered", "ground_truth", "goal_pose", "robot_description")
@@ -81,13 +82,17 @@ class Setup:
         return f"{robot.frames}{base}" if robot.frames else ""
 
     def description(self) -> str:
-        """Returns the URDF of the robot."""
-        if self.urdf:
+        """Returns the URDF of the robot, with the frames that the file of parameters names."""
+        base = str(self._of_file(BASE_FRAME.name, self.simulator) or BASE_FRAME.default)
+        laser = str(self._of_file("laser_frame", self.simulator) or "")
+        shipped = base == BASE_FRAME.default and laser in ("", SHIPPED_LASER)
+        if self["urdf"] or (self.urdf and shipped):
             return read_text(self.urdf)
         from nics_drl_bridge.robot.urdf import urdf_of
 
-        lidar, further = self._opened.lidar, {s.frame: s.mount for s in self._opened.sensors}
-        return urdf_of(self._opened.robot, lidar.mount, lidar.frame, further=further)
+        model = opened(self.model) if self._opened is None else self._opened
+        further = {sensor.frame: sensor.mount for sensor in model.sensors}
+        return urdf_of(model.robot, model.lidar.mount, laser or model.lidar.frame, base, further)
 
     def node(
         self, package: str, name: str, robot: Robot, parameters: dict[str, Any],
@@ -179,7 +184,8 @@ def bridge(setup: Setup) -> Iterator[Any]:
     gate = shared | {"e_stop_required": required, "limits": value(setup.limits())}
     named = {name: value(setup[name]) for name in ("policy", "fallback")}
     for robot in setup.robots:
-        yield setup.node(PACKAGE, "command_gate", robot, gate)
+        framed = {BASE_FRAME.name: value(setup.frame("command_gate", robot))}
+        yield setup.node(PACKAGE, "command_gate", robot, gate | framed)
         for node, own in (("middleware_node", {}), ("policy_node", named)):
             frame = {BASE_FRAME.name: value(setup.frame(node, robot))}
             yield setup.node(PACKAGE, node, robot, managed | own | frame)

@@ -13,7 +13,7 @@ from rclpy.publisher import Publisher
 from nics_drl_bridge.errors import BridgeError, ConfigError
 from nics_drl_bridge.nodes.ending import at_once
 from nics_drl_bridge.nodes.parameters import Row, frame_fault, managed, sensors
-from nics_drl_bridge.nodes.qos import QosWatch
+from nics_drl_bridge.nodes.qos import QosWatch, copied
 from nics_drl_bridge.nodes.runner import ACTIVE, INACTIVE, UNCONFIGURED, declare_row
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
@@ -39,8 +39,9 @@ class ManagedNode(QosWatch, LifecycleNode):
 
     def create_lifecycle_publisher(self, kind: Any, topic: str, qos: Any) -> Publisher:
         """Creates a publisher that is silent unless the node is active, until clean-up."""
-        events = self.publisher_events(topic, qos)
-        made = super().create_lifecycle_publisher(kind, topic, qos, event_callbacks=events)
+        profile = copied(qos)
+        options = self.publisher_options(topic, profile)
+        made = super().create_lifecycle_publisher(kind, topic, profile, **options)
         self.undo.callback(self.destroy_lifecycle_publisher, made)
         return made
 

@@ -12,6 +12,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -32,10 +33,10 @@ from nics_drl_bridge.errors import BackendError, ModelError
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import qos
+from nics_drl_bridge.nodes.command_types import deaf_subscribers, heard_stamped
 from nics_drl_bridge.nodes.ending import ENDING
 from nics_drl_bridge.nodes.executor import StandingExecutor
 from nics_drl_bridge.nodes.parameters import stamped_by_default
-from nics_drl_bridge.nodes.robot_topics import heard_stamped
 from nics_drl_bridge.nodes.runner import holds, last_word, open_context
 from nics_drl_bridge.nodes.wire import stamped_twist_to_bytes, twist_to_bytes
 from nics_drl_bridge.sim.randomisation import Randomisation
@@ -65,19 +66,29 @@ class Link:
         if threading.current_thread() is threading.main_thread():
             _exit_at_signals()
         self._context = open_context(domain_id=domain_id)
-        overrides = [Parameter(name, value=value) for name, value in (parameters or {}).items()]
-        self.node = qos.QosWatch(
-            "bridge_env", namespace=namespace, context=self._context,
-            start_parameter_services=False, parameter_overrides=overrides,
-        )  # fmt: skip
-        self._began_s = time.monotonic()
-        if stamped is None:
-            stamped = self.hears_stamped(command_topic, patience_s)
-        self.stamped, self._kind = stamped, TwistStamped if stamped else Twist
-        self.commands = self.node.create_publisher(self._kind, command_topic, qos.COMMAND)
-        self._topic = self.commands.topic_name
-        self._timeout = CommandTimeout(self.commands, self._kind, command_timeout_s)
-        self._closing: weakref.finalize[Any, Any] | None = None
+        self._resources = Resources(self._context)
+        # Also of a link that is never begun, or whose owner can't be made.
+        self._closing = weakref.finalize(self, _shut_down, self._resources)
+        try:
+            overrides = [Parameter(name, value=it) for name, it in (parameters or {}).items()]
+            self.node = qos.QosWatch(
+                "bridge_env", namespace=namespace, context=self._context,
+                start_parameter_services=False, parameter_overrides=overrides,
+            )  # fmt: skip
+            self._resources.node = self.node
+            self._began_s = time.monotonic()
+            if stamped is None:
+                stamped = self.hears_stamped(command_topic, patience_s)
+            self.frame = ""  # of the robot, in which commands are; unknown until it is set
+            self.stamped = stamped
+            self._kind: Any = TwistStamped if stamped else Twist
+            self.commands = self.node.create_publisher(self._kind, command_topic, qos.COMMAND)
+            self._topic = self.commands.topic_name
+            self._timeout = CommandTimeout(self.commands, self._kind, command_timeout_s)
+            self._resources.timeout = self._timeout
+        except BaseException:
+            self.close()
+            raise
 
     def hears_stamped(self, topic: str, patience_s: float) -> bool:
         """Waits for who hears commands on a topic; True if stamped ones, or by default."""
@@ -92,7 +103,7 @@ class Link:
         given = (self._context, self.node, self._timeout)
         thread = threading.Thread(target=_spin, args=given, daemon=True, name="dds_backend")
         thread.start()
-        self._closing = weakref.finalize(self, _shut_down, self._context, self._timeout, thread)
+        self._resources.thread = thread
 
     def send(self, twist: NDArray[np.float64], stamp_ns: int = 0) -> None:
         """Publishes linear.x, linear.y, angular.z (3,); BackendError and a zero for NaN or inf."""
@@ -104,7 +115,7 @@ class Link:
         if self._kind is Twist:
             self.commands.publish(twist_to_bytes(twist))
         else:
-            self.commands.publish(stamped_twist_to_bytes(twist, stamp_ns))
+            self.commands.publish(stamped_twist_to_bytes(twist, stamp_ns, self.frame))
 
     def halt(self) -> None:
         """Publishes a zero command."""
@@ -114,7 +125,7 @@ class Link:
 
     def check_open(self) -> None:
         """Raises BackendError if the link is closed."""
-        if self._closing is None or not self._closing.alive or not self._context.ok():
+        if not self._closing.alive or not self._context.ok():
             raise BackendError("this backend is closed; make another one.")
 
     def call(self, client: Any, request: Any, timeout_s: float) -> Any:
@@ -161,6 +172,10 @@ class Link:
         left_s = deadline - time.monotonic()
         if not holds(lambda: all(there() for there in needed.values()), left_s, POLL_S):
             missing = ", no ".join(name for name, there in needed.items() if not there())
+            deaf = deaf_subscribers(node, self._topic, self.stamped)
+            if deaf and not commands.get_subscription_count():
+                fix = f"set `stamped` to {not self.stamped}, or leave it out."
+                raise BackendError(f"topic {self._topic}: {deaf}; {fix}")
             raise BackendError(f"after {patience_s:g} s there is still no {missing}; {advice}")
         # A publisher that was killed stays in the graph for a while.
         holds(lambda: not self.others_command(), deadline - time.monotonic(), POLL_S)
@@ -168,8 +183,17 @@ class Link:
 
     def close(self) -> None:
         """Publishes a zero command and ends the node."""
-        if self._closing is not None:
-            self._closing()
+        self._closing()
+
+
+@dataclass
+class Resources:
+    """What a link has opened so far, and its end closes."""
+
+    context: Context
+    node: Node | None = None
+    timeout: CommandTimeout | None = None
+    thread: threading.Thread | None = None  # which destroys the node, once it runs
 
 
 def _spin(context: Context, node: Node, timeout: CommandTimeout) -> None:
@@ -189,14 +213,20 @@ def _spin(context: Context, node: Node, timeout: CommandTimeout) -> None:
         node.destroy_node()
 
 
-def _shut_down(context: Context, timeout: CommandTimeout, thread: threading.Thread) -> None:
+def _shut_down(opened: Resources) -> None:
     with uninterrupted():  # else Python may exit with a thread inside the middleware's library
-        if context.ok():
-            timeout.end()
-            context.try_shutdown()
+        if opened.thread is None:  # it never began, so that nothing was commanded
+            if opened.node is not None:
+                opened.node.destroy_node()
+            opened.context.try_shutdown()
+            return
+        if opened.context.ok():
+            if opened.timeout is not None:
+                opened.timeout.end()
+            opened.context.try_shutdown()
         # Garbage may be collected in any thread, including that one.
-        if thread is not threading.current_thread():
-            thread.join(timeout=2.0)
+        if opened.thread is not threading.current_thread():
+            opened.thread.join(timeout=2.0)
 
 
 class CommandTimeout:

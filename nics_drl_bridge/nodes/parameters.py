@@ -51,17 +51,22 @@ def stamped(what: str) -> Row:
 
 MODEL = Row("model", DEFAULT_ROBOT, "Folder of a SimulatorModel, or a shipped robot.")
 BASE_FRAME = Row("base_frame", "base_link", "Frame id of the robot.", fixed=False)
+ROBOT_FRAME = Row(
+    BASE_FRAME.name, "", "Frame id of the robot, in which cmd_vel is.",
+    shown="the child frame of odom",
+)  # fmt: skip
 
 
-def frame_fault(parameters: Iterable[Any]) -> str:
+def frame_fault(parameters: Iterable[Any], *may_be_empty: str) -> str:
     """Returns a sentence about frames that can't be so; empty if all can. The last of a name is."""
     frames = {each.name: str(each.value) for each in parameters if each.name.endswith("_frame")}
     for name, frame in frames.items():
-        if not FRAME.fullmatch(frame) and (frame or name not in MAY_BE_EMPTY):
+        if not FRAME.fullmatch(frame) and (frame or name not in (*MAY_BE_EMPTY, *may_be_empty)):
             needed = "must be 1 to 255 characters, without blanks, the first of them no /"
             return f"parameter {name!r}: {needed}, not {shortened(frame, 80)!r}."
-    base = frames.get("base_frame")
-    if taken := [name for name in ("map_frame", "odom_frame") if frames.get(name, "") == base]:
+    base = frames.get("base_frame", "")
+    taken = [name for name in ("map_frame", "odom_frame") if frames.get(name, "") == base != ""]
+    if taken:
         return f"parameter 'base_frame': is {base!r}, as {taken[0]!r} is; they must differ."
     return ""
 
@@ -287,7 +292,10 @@ FOREIGN = Row(
 def gate() -> list[Row]:
     """Returns all parameters of `command_gate`."""
     shield = [SHIELD, *SHIELD_NUMBERS]
-    return [MODEL, LIMITS, *shield, *gate_rules(), stamped("cmd_vel"), FOREIGN, BLACK_BOX, PRIORITY]
+    return [
+        MODEL, LIMITS, *shield, *gate_rules(), stamped("cmd_vel"), ROBOT_FRAME, FOREIGN, BLACK_BOX,
+        PRIORITY,
+    ]  # fmt: skip
 
 
 def drive() -> list[Row]:

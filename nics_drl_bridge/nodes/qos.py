@@ -4,6 +4,7 @@ Reliable publishers match all subscribers, so this package publishes reliably, a
 effort wherever a lost message does no harm. Nothing is kept for late joiners: old data mislead.
 """
 
+import copy
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -12,9 +13,11 @@ from rclpy import qos as rclpy_qos
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSPolicyKind, QoSProfile
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
+from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.recording.messages import Offer
 
 try:
@@ -81,26 +84,90 @@ DIAGNOSTICS = profile_of(Offer(10))  # as the diagnostic aggregator expects `/di
 MOMENT_S, UNKNOWN = 0.5, "_UNKNOWN_"
 MOST_WAITING = 10_000  # messages that are taken at once, if a publisher never pauses
 
+OVERRIDES = "qos_overrides."  # parameters of a user for the quality of service of a topic
+# Topics, by the name before any remapping, whose quality of service decides whether a robot stops.
+FIXED_TOPICS = ("cmd_vel", "cmd_vel_raw", "e_stop", "ackermann_cmd")
+CHOICES: dict[str, Any] = {
+    "history": rclpy_qos.HistoryPolicy,
+    "reliability": rclpy_qos.ReliabilityPolicy,
+    "durability": rclpy_qos.DurabilityPolicy,
+    "liveliness": rclpy_qos.LivelinessPolicy,
+}
+FLAG = "avoid_ros_namespace_conventions"
+
+
+def overridden_policies(node: Node, topic: str, end: str) -> list[QoSPolicyKind]:
+    """Returns the policies that a user's parameters set for the `end` of a topic, if any.
+
+    `end` is `publisher` or `subscription`. Raises ConfigError for a topic whose quality of service
+    is fixed, and for a policy or value that does not exist.
+    """
+    prefix = f"{OVERRIDES}{node.resolve_topic_name(topic)}.{end}."
+    given: dict[str, Any] = getattr(node, "_parameter_overrides", {})
+    policies = []
+    for name in sorted(given):
+        if not name.startswith(prefix):
+            continue
+        if topic.rsplit("/", 1)[-1] in FIXED_TOPICS:
+            reason = "can't be overridden, because the robot's stop depends on it"
+            raise ConfigError(f"parameter {name!r}: {reason}; leave it out.")
+        policy = name.removeprefix(prefix)
+        _check_override(name, policy, given[name].value)
+        policies.append(QoSPolicyKind[policy.upper()])
+    return policies
+
+
+def _check_override(name: str, policy: str, value: Any) -> None:
+    known = [kind.name.lower() for kind in QoSPolicyKind if kind.name != "INVALID"]
+    if policy not in known:
+        raise ConfigError(f"parameter {name!r}: there is no policy {policy!r}; "
+                          f"{nearest(policy, known)}")  # fmt: skip
+    if policy in CHOICES:
+        values = [choice.name.lower() for choice in CHOICES[policy] if choice.name != "UNKNOWN"]
+        if str(value).lower() not in values:
+            raise ConfigError(f"parameter {name!r}: is {value!r}; {nearest(str(value), values)}")
+        return
+    is_flag = isinstance(value, bool)
+    if (policy == FLAG) is not is_flag or not isinstance(value, int) or value < 0:
+        needed = "true or false" if policy == FLAG else "a whole number of 0 or more"
+        raise ConfigError(f"parameter {name!r}: must be {needed}, not {value!r}.")
+
 
 class QosWatch(Node):
-    """A node whose publishers and subscriptions report peers that they can't talk to."""
+    """A node whose publishers and subscriptions report peers that they can't talk to.
+
+    As in any ROS 2 node, parameters `qos_overrides.TOPIC.publisher.POLICY` override the quality of
+    service of a topic, and `subscription` likewise; not that of `FIXED_TOPICS`.
+    """
 
     def create_publisher(self, kind: Any, topic: str, qos: Any, **options: Any) -> Publisher:
         """Creates a publisher; see rclpy."""
-        watched = {"event_callbacks": self.publisher_events(topic, qos)}
-        return super().create_publisher(kind, topic, qos, **watched | options)
+        profile = copied(qos)
+        chosen = self.publisher_options(topic, profile)
+        return super().create_publisher(kind, topic, profile, **chosen | options)
 
-    def publisher_events(self, topic: str, qos: Any) -> PublisherEventCallbacks:
-        """Returns the callbacks for a publisher that rclpy makes without `create_publisher`."""
-        warn = partial(self._warn, topic=topic, qos=qos, publishing=True)
-        return PublisherEventCallbacks(incompatible_qos=warn)
+    def publisher_options(self, topic: str, profile: QoSProfile) -> dict[str, Any]:
+        """Returns the options for a publisher that rclpy makes without `create_publisher`.
+
+        The profile is changed where a user has overridden it. Raises ConfigError.
+        """
+        warn = partial(self._warn, topic=topic, qos=profile, publishing=True)
+        options: dict[str, Any] = {
+            "event_callbacks": PublisherEventCallbacks(incompatible_qos=warn)
+        }
+        if policies := overridden_policies(self, topic, "publisher"):
+            options["qos_overriding_options"] = QoSOverridingOptions(policies)
+        return options
 
     def create_subscription(
         self, kind: Any, topic: str, callback: Any, qos: Any, **options: Any
     ) -> Subscription:
         """Creates a subscription; see rclpy."""
-        options = {"event_callbacks": self._subscription_events(topic, qos)} | options
-        return super().create_subscription(kind, topic, callback, qos, **options)
+        profile = copied(qos)
+        chosen: dict[str, Any] = {"event_callbacks": self._subscription_events(topic, profile)}
+        if policies := overridden_policies(self, topic, "subscription"):
+            chosen["qos_overriding_options"] = QoSOverridingOptions(policies)
+        return super().create_subscription(kind, topic, callback, profile, **chosen | options)
 
     def create_lossless_subscription(
         self, kind: Any, topic: str, callback: Any, qos: Any, lost: Callable[[int], None]
@@ -158,6 +225,10 @@ def take_waiting(subscription: Subscription) -> list[bytes]:
                 break
             contents.append(taken[0])
     return contents
+
+def copied(qos: Any) -> QoSProfile:
+    """Returns a profile of its own: rclpy writes overridden policies into the one it is given."""
+    return copy.copy(qos) if isinstance(qos, QoSProfile) else QoSProfile(depth=qos)
 
 
 def _value(profile: Any, policy: str) -> str:

@@ -71,6 +71,7 @@ class RealtimeBackend:
         self._options, self._robot = chosen, model.robot
         self._period_ns = round((chosen.period_s or model.control_period) * NS_PER_S)
         self._deadline_ns = self._misses = 0
+        self._scan_ns = 0  # stamp of the scan in the newest view [ns]
         rehearse(model)
         self._simulated = False
         self._link = Link(
@@ -161,27 +162,38 @@ class RealtimeBackend:
         )
 
     def _oldest(self) -> tuple[str, float]:
+        """Returns the topic that has been silent for longest, and for how long [s]; inf: for ever.
+
+        After a clock jump no datum is left, but when the last one arrived is still known.
+        """
+        now_ns = time.monotonic_ns()
         with self._topics.lock:
-            newest, now = dict(self._topics.middleware.cache.newest), time.monotonic_ns()
-        latest = max((datum.stamp_ns for datum in newest.values()), default=0)
-        ages = {
-            topic: max(now - newest[topic].arrival_ns, latest - newest[topic].stamp_ns) / NS_PER_S
-            if topic in newest
-            else math.inf
-            for topic in self._topics.expected
-        }
-        oldest = max(ages, key=lambda topic: ages[topic])
-        return oldest, ages[oldest]
+            cache = self._topics.middleware.cache
+            newest = dict(cache.newest)
+            arrived_ns = {topic: times[-1] for topic, times in cache.arrivals.items()}
+        latest_ns = max((datum.stamp_ns for datum in newest.values()), default=0)
+        silences = dict.fromkeys(self._topics.expected, math.inf)
+        for topic in self._topics.expected:
+            if topic in newest:
+                behind_ns = latest_ns - newest[topic].stamp_ns
+                silences[topic] = max(now_ns - newest[topic].arrival_ns, behind_ns) / NS_PER_S
+            elif topic in arrived_ns:
+                silences[topic] = (now_ns - arrived_ns[topic]) / NS_PER_S
+        oldest = max(silences, key=lambda topic: silences[topic])
+        return oldest, silences[oldest]
+
+    def _missing_topic(self) -> str | None:
+        """Returns a topic without a datum on the present clock, or None."""
+        with self._topics.lock:
+            there = self._topics.middleware.cache.newest.keys()
+            return next((topic for topic in self._topics.expected if topic not in there), None)
 
     @halts_on_error
     def step(self, command: Array) -> tuple[RobotView, dict[str, Any]]:
         """Publishes a command, waits for the end of the period; see `interface.Backend`."""
         self._link.check_open()
-        stamp_ns = 0
-        if self._link.stamped:
-            with self._topics.lock:
-                stamp_ns = self._topics.middleware.cache.newest[SCAN].stamp_ns
-        self._link.send(self._robot.to_cmd_vel(command), stamp_ns)
+        # A command answers the scan of the view that it was computed from, whatever came since.
+        self._link.send(self._robot.to_cmd_vel(command), self._scan_ns)
         late_ns = time.monotonic_ns() - self._deadline_ns
         if late_ns > 0:
             missed = late_ns // self._period_ns + 1
@@ -193,13 +205,20 @@ class RealtimeBackend:
         return self._fresh_view()
 
     def _fresh_view(self) -> tuple[RobotView, dict[str, Any]]:
-        topic, age_s = self._oldest()
-        if age_s > self._options.stale_after_s:
-            raise StaleDataError(topic, age_s, self._options.stale_after_s)
+        """Returns the present view; after a clock jump, once all topics have come again."""
+        limit_s = self._options.stale_after_s
+        holds(lambda: self._missing_topic() is None, limit_s, POLL_S)
         with self._topics.lock:
-            facts = data_facts(self._topics.middleware, time.monotonic_ns())
-            view, stamp_ns = self._topics.view(), self._topics.newest_ns
-        return view, {"stamp_ns": stamp_ns, "deadline_misses": self._misses, **facts}
+            missing = self._missing_topic()
+            topic, age_s = self._oldest()
+            if missing is None and age_s <= limit_s:
+                facts = data_facts(self._topics.middleware, time.monotonic_ns())
+                self._scan_ns = self._topics.middleware.cache.newest[SCAN].stamp_ns
+                self._link.frame = self._topics.frames[1]
+                view = self._topics.view()
+                known = {"stamp_ns": self._topics.newest_ns, "deadline_misses": self._misses}
+                return view, known | facts
+        raise StaleDataError(topic, age_s, limit_s)
 
     def facts(self) -> BackendFacts:
         """Returns nothing: topics tell all that is known."""

@@ -23,8 +23,8 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.errors import BackendError, BridgeError, RecordingError
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes import conversions, qos, runner
+from nics_drl_bridge.nodes.command_types import deaf_subscribers, heard_stamped
 from nics_drl_bridge.nodes.parameters import drive
-from nics_drl_bridge.nodes.robot_topics import heard_stamped
 from nics_drl_bridge.recording.bag_file import Message
 from nics_drl_bridge.recording.bag_reader import joint_streams
 from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S, DrivePlan
@@ -181,6 +181,7 @@ class RecordNode(qos.QosWatch):
         self._began, self._heard = time.monotonic(), -np.inf
         self._ticks = self._origin_ns = self._stamp_ns = 0
         self._pose: Array | None = None
+        self._frame = ""  # of the robot, by its odometry
         self._start: Array = np.zeros(3)
         # Steady: the robot's guard must not depend on the time source of the node.
         runner.steadily(self, POLL_S, self._on_time)
@@ -205,6 +206,7 @@ class RecordNode(qos.QosWatch):
         if pose is None:
             return
         self._pose, self._heard = pose, time.monotonic()
+        self._frame = message.child_frame_id
         if self._ticks:
             self._drive.see(geometry.between(self._start, pose))
             self._on_time()  # at once: with a fast simulated time a poll may be a tick late
@@ -242,6 +244,11 @@ class RecordNode(qos.QosWatch):
             name, missing = odom if self._pose is None else command
             fix = "start the robot, or correct namespace, ROS_DOMAIN_ID or remapping."
             reason = f"{missing} within {PATIENCE_S:g} s"
+            if self._pose is not None and self._topic is not None:
+                deaf = deaf_subscribers(self, "cmd_vel", self._stamped)
+                if deaf:
+                    fix = f"set stamped:={str(not self._stamped).lower()}, or leave it out."
+                    raise BackendError(f"topic {self._place(name)}: {deaf}; {fix}")
             raise BackendError(f"topic {self._place(name)}: {reason}; {fix}")
         return False
 
@@ -281,7 +288,7 @@ class RecordNode(qos.QosWatch):
         self._log.add("cmd_vel", 0, robot.through_cmd_vel(command))
 
     def _message(self, twist: Array) -> Twist | TwistStamped:
-        stamped = conversions.stamped_to_ros(twist, self._now_ns(), "")
+        stamped = conversions.stamped_to_ros(twist, self._now_ns(), self._frame)
         return stamped if self._stamped else stamped.twist
 
     def stop(self) -> None:

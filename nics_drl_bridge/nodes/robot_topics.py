@@ -22,20 +22,13 @@ from nics_drl_bridge.middleware import measurement
 from nics_drl_bridge.middleware.ekf import ANYWHERE, START_STD
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import conversions, qos
+from nics_drl_bridge.nodes.command_types import CommandListener
 from nics_drl_bridge.nodes.conversions import INITIAL_POSE, initial_pose
 from nics_drl_bridge.nodes.parameters import NO_POSE, POSE_TYPES, STAMPED, sensors
 from nics_drl_bridge.nodes.runner import declare_row
 from nics_drl_bridge.recording import messages
 
-TWIST, TWIST_STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 KINDS_OF_POSE = {each.__name__: each for each in (PoseStamped, PoseWithCovarianceStamped)}
-
-
-def heard_stamped(node: Node, topic: str) -> bool | None:
-    """True if who hears commands on a topic hears a TwistStamped; None if nobody, or both."""
-    ends = node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic))
-    kinds = {end.topic_type for end in ends} & {TWIST, TWIST_STAMPED}
-    return kinds == {TWIST_STAMPED} if len(kinds) == 1 else None
 
 
 def declare_sensors(node: Node, stamped: bool | None = None) -> None:
@@ -72,8 +65,10 @@ class RobotTopics:
         self._header, self._told = b"", ""
         self._placed: tuple[Array, Array] | None = None  # pose and covariance of `initialpose`
         self._subscriptions: list[Any] = []
-        command = TwistStamped if node.get_parameter(STAMPED).value else Twist
-        self._subscribe(measurement.CMD_VEL, command, self._take_command, qos.COMMAND)
+        self._commands = CommandListener(
+            node, measurement.CMD_VEL, bool(node.get_parameter(STAMPED).value),
+            self._locked(self._take_command),
+        )  # fmt: skip
         heard: dict[str, tuple[Any, Callable[[Any], None]]] = {
             measurement.SCAN: (LaserScan, self._take_scan),
             measurement.ODOM: (Odometry, self._take_odometry),
@@ -94,15 +89,20 @@ class RobotTopics:
             self._subscribe(topic, kind, take, qos.SENSOR)
         self.expected = tuple(heard)
 
-    def _subscribe(self, topic: str, kind: Any, take: Callable[[Any], None], quality: Any) -> None:
+    def _locked(self, take: Callable[[Any], None]) -> Callable[[Any], None]:
         def locked(message: Any) -> None:
             with self.lock:
                 take(message)
 
-        self._subscriptions.append(self._node.create_subscription(kind, topic, locked, quality))
+        return locked
+
+    def _subscribe(self, topic: str, kind: Any, take: Callable[[Any], None], quality: Any) -> None:
+        made = self._node.create_subscription(kind, topic, self._locked(take), quality)
+        self._subscriptions.append(made)
 
     def close(self) -> None:
         """Ends the subscriptions."""
+        self._commands.close()
         while self._subscriptions:
             self._node.destroy_subscription(self._subscriptions.pop())
 

@@ -44,8 +44,7 @@ SETTLE_S, POLL_S = 0.3, 0.02  # time until the graph shows all nodes [s]
 ANSWER_S = 1.5  # a node that does not answer within it is dead; the graph shows it for 20 s more
 DIAGNOSTICS_S = 1.0
 RANGES = {int: (IntegerRange, "integer_range"), float: (FloatingPointRange, "floating_point_range")}
-# Parameters that rclpy reads itself; and one that a file sets for nodes that have no model, too.
-QOS, SHARED = "qos_overrides.", "model"
+SHARED = "model"  # a file sets it for nodes that have no model, too
 
 
 def open_context(args: Sequence[str] | None = None, domain_id: int | None = None) -> Context:
@@ -251,12 +250,30 @@ def given_values(node: Node) -> dict[str, Parameter]:
 
 def unknown(node: Node) -> list[str]:
     """Returns a sentence for each value whose parameter the node does not have."""
-    known = [name for name in node._parameters if not name.startswith(QOS)]
+    known = [name for name in node._parameters if not name.startswith(qos.OVERRIDES)]
     ignores = getattr(node, "ignores", lambda _: False)
-    return [
+    sentences = [
         f"there is no parameter {name!r}, its value is ignored; {nearest(name, known)}"
         for name in sorted(given_values(node))
-        if name not in (*known, SHARED) and not name.startswith(QOS) and not ignores(name)
+        if name not in (*known, SHARED) and not name.startswith(qos.OVERRIDES) and not ignores(name)
+    ]
+    return sentences + unused_overrides(node)
+
+
+def unused_overrides(node: Node) -> list[str]:
+    """Returns a sentence for each quality of service that is given for a topic without such an end.
+
+    A managed node that is not configured has no topics yet.
+    """
+    if getattr(node, "state", ACTIVE) == UNCONFIGURED:
+        return []
+    ends = [f"{qos.OVERRIDES}{each.topic_name}.publisher" for each in node.publishers]
+    ends += [f"{qos.OVERRIDES}{each.topic_name}.subscription" for each in node.subscriptions]
+    return [
+        f"parameter {name!r} is ignored: the node has no such publisher or subscription; "
+        f"{nearest(name.rpartition('.')[0], ends)}"
+        for name in sorted(given_values(node))
+        if name.startswith(qos.OVERRIDES) and not node.has_parameter(name)
     ]
 
 

@@ -5,7 +5,7 @@ import itertools
 import json
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from typing import Any, cast
 
@@ -28,10 +28,10 @@ from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.lidar.scanner import RENDERERS, Renderer
 from nics_drl_bridge.lidar.spec import to_device
 from nics_drl_bridge.nodes import conversions, device_parameters, parameters, qos, runner, wire
+from nics_drl_bridge.nodes.command_types import TypeWatch, name_of
 from nics_drl_bridge.nodes.conversions import sensor_to_ros, sensor_type
 from nics_drl_bridge.nodes.link import identity
 from nics_drl_bridge.nodes.map_to_odom import odom_in_map, transform_to_ros
-from nics_drl_bridge.nodes.robot_topics import TWIST, TWIST_STAMPED
 from nics_drl_bridge.nodes.simulation_interfaces import open_services
 from nics_drl_bridge.nodes.world_topics import WorldTopics
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -46,8 +46,6 @@ LONGEST_TICK_S = 0.005  # longest time between two checks for delayed data that 
 # Makes the simulator of some robots; may declare its own parameters at the node. Its control
 # period is that of the given model.
 MakeSimulator = Callable[[Node, SimulatorModel, AnyWorld, int], FastSimulator]
-# The setting that selects the other type.
-SWITCH = {TWIST_STAMPED: "enable_stamped_cmd_vel:=false", TWIST: "enable_stamped_cmd_vel:=true"}
 
 
 class Outbox:
@@ -78,6 +76,13 @@ class Outbox:
             _, _, publisher, content = heapq.heappop(self._waiting)
             publisher.publish(content)
 
+    def drop(self, publishers: Collection[Publisher]) -> None:
+        """Drops what waits for publishers that are about to end."""
+        self._waiting = [waiting for waiting in self._waiting if waiting[2] not in publishers]
+        heapq.heapify(self._waiting)
+        for publisher in publishers:
+            self._latest.pop(publisher, None)
+
     def clear(self) -> None:
         """Drops the waiting messages: they are from an episode that is over."""
         self._waiting.clear()
@@ -92,6 +97,7 @@ class RobotPort:
         time: device_parameters.DeviceTiming, outbox: Outbox,
     ) -> None:  # fmt: skip
         self._node, self._model, self.frames = node, model, frames
+        self._outbox = outbox
         self._publishers: list[Publisher] = []
         self._send = partial(outbox.send, late=time.odom_late_ns)
         self._send_scan = partial(outbox.send, late=time.scan_late_ns)
@@ -124,6 +130,7 @@ class RobotPort:
 
     def close(self) -> None:
         """Ends its topics."""
+        self._outbox.drop(self._publishers)
         for each in self._publishers:
             self._node.destroy_publisher(each)
 
@@ -173,11 +180,11 @@ class CommandInlet:
     ) -> None:  # fmt: skip
         self._node, self._robot, self._take, self._too_old = node, robot, take, too_old
         stamped = bool(node.get_parameter("enable_stamped_cmd_vel").value)
-        self._kind = TWIST_STAMPED if stamped else TWIST
+        self._kind = name_of(stamped)
         kind, hear = TwistStamped if stamped else Twist, partial(self._on_bytes, stamped)
         heard = node.create_subscription(kind, f"{namespace}cmd_vel", hear, quality, raw=True)
         self._topic, self.heard = heard.topic_name, [heard]
-        self._warned: set[str] = set()
+        self._types = TypeWatch(node, f"{namespace}cmd_vel")
         kind = conversions.message_type("ackermann_msgs/msg/AckermannDriveStamped")
         if robot.steers and kind is not None:  # its package is optional
             given = kind, f"{namespace}ackermann_cmd", self._on_ackermann, quality
@@ -223,16 +230,7 @@ class CommandInlet:
 
     def watch(self) -> None:
         """Warns once of each node that publishes the other type, which is never received."""
-        for end in self._node.get_publishers_info_by_topic(self._topic):
-            kind, who = end.topic_type, qos.owner(end)
-            if kind == self._kind or who is None or f"{who} {kind}" in self._warned:
-                continue
-            self._warned.add(f"{who} {kind}")
-            switch = SWITCH[self._kind] if kind in SWITCH else "another type there"
-            self._node.get_logger().warning(
-                f"{self._topic}: {who} publishes {kind}, but {self._kind} is expected here, so "
-                f"that its commands are not heard; let it publish that, or set {switch}."
-            )
+        self._types.look(self._kind)
 
 
 class DeviceNode(qos.QosWatch):
@@ -250,6 +248,8 @@ class DeviceNode(qos.QosWatch):
         self._time = device_parameters.timing(self, model)
         self._names = device_parameters.namespaces(self)
         self._given = model
+        self._command_ns = np.zeros(0, np.int64)
+        self._heard = np.zeros(0, np.bool_)
         self.model = device_parameters.timed_model(self, model, self._time)
         self._make = make
         self.use_world(load_worlds(str(self.get_parameter("world").value)))
@@ -277,10 +277,13 @@ class DeviceNode(qos.QosWatch):
     def _size(self, kept: Sequence[int]) -> None:
         """Keeps what was heard by some robots, and makes room for those beyond them."""
         count = self.device.robots
-        before = getattr(self, "_command_ns", np.zeros(0, np.int64))
-        self._command_ns, self._heard = np.zeros(count, np.int64), np.zeros(count, np.bool_)
-        known = [k for k in kept if k < len(before)]
-        self._command_ns[: len(known)] = before[known]
+        command_ns_before = self._command_ns
+        heard_before = self._heard
+        self._command_ns = np.zeros(count, np.int64)
+        self._heard = np.zeros(count, np.bool_)  # in lock-step: those that have their command
+        known = [k for k in kept if k < len(command_ns_before)]
+        self._command_ns[: len(known)] = command_ns_before[known]
+        self._heard[: len(known)] = heard_before[known]
 
     @property
     def robot_names(self) -> tuple[str, ...]:
@@ -344,10 +347,10 @@ class DeviceNode(qos.QosWatch):
         for k in gone:
             self._ports[k].close()
             self._inlets[k].close()
-        self._outbox.clear()
         self._ports = [self._ports[k] for k in kept]
         self._inlets = [self._inlets[k] for k in kept]
         self._size(kept)
+        self._complete.trigger()  # not here: more robots may be about to leave
 
     def _open_transforms(self) -> None:
         self._transforms: Any = conversions.message_type("tf2_msgs/msg/TFMessage")
@@ -374,6 +377,7 @@ class DeviceNode(qos.QosWatch):
         self._real_time = device_parameters.RealTime(step_ns, self._time.rate)
         self._timer = None
         self._soon = self.create_guard_condition(self._on_time)
+        self._complete = self.create_guard_condition(self._advance_if_complete)
         if self._time.mode == "realtime":
             period = step_ns / NS_PER_S / self._time.rate
             # A tick that divides the step, if data are published later than they are measured.
@@ -413,12 +417,19 @@ class DeviceNode(qos.QosWatch):
         return not self._time.lockstep and self.now_ns - stamp_ns > self._timeout_ns()
 
     def _on_command(self, port: RobotPort, command: Array) -> None:
+        if port not in self._ports:  # its robot has left since the command arrived
+            return
         robot = self._ports.index(port)
-        self.device.commands[robot], self._command_ns[robot] = command, self.now_ns
+        self.device.commands[robot] = command
+        self._command_ns[robot] = self.now_ns
         if self._time.lockstep and not self.paused:
             self._heard[robot] = True
-            if self._heard.all():
-                self.advance()
+            self._advance_if_complete()
+
+    def _advance_if_complete(self) -> None:
+        """In lock-step, moves the world if all robots that are there have their command."""
+        if self._time.lockstep and not self.paused and self._heard.size and self._heard.all():
+            self.advance()
 
     def _on_time(self) -> None:
         if self.paused:

@@ -47,6 +47,7 @@ class RosSource:
         self._trail, self._goal = Track(), np.zeros((0, 2))
         self._gate: str | None = None
         self._truth: Array | None = None
+        self._map_frame = "map"  # in which goals are; as the estimate or the simulator names it
         self._new_lidar: LidarSpec | None = None
         self._drawn_ns = 0
         self._context = open_context([], domain_id)
@@ -57,6 +58,7 @@ class RosSource:
         for kind, topic, take, quality in (
             (PoseStamped, "goal_pose", self._take_goal, qos.COMMAND),
             (Odometry, "ground_truth", self._take_truth, qos.SENSOR),
+            (Odometry, "odometry/filtered", self._take_map_frame, qos.SENSOR),
             (DiagnosticArray, "/diagnostics", self._take_diagnostics, qos.DIAGNOSTICS),
         ):
             self._node.create_subscription(kind, topic, take, quality)
@@ -74,6 +76,9 @@ class RosSource:
     def _take_truth(self, message: Odometry) -> None:
         pose = conversions.odometry_from_ros(message)[0]
         self._truth = pose if np.isfinite(pose).all() else None
+
+    def _take_map_frame(self, message: Odometry) -> None:
+        self._map_frame = message.header.frame_id or self._map_frame
 
     def _take_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -121,7 +126,7 @@ class RosSource:
                 check_place("goal", self._within, request.x, request.y)
             message = PoseStamped()
             message.header.stamp = self._node.get_clock().now().to_msg()
-            message.header.frame_id = "map"
+            message.header.frame_id = self._map_frame
             message.pose.position.x, message.pose.position.y = request.x, request.y
             message.pose.orientation.w = 1.0
             self._goals.publish(message)

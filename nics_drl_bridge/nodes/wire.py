@@ -21,7 +21,6 @@ PLAIN = (0, 1)  # big-endian and little-endian plain CDR
 NATIVE = bytes((0, PLAIN[sys.byteorder == "little"], 0, 0))  # header of this machine
 # Numbers of an odometry before each: pose, its covariance, twist, its covariance.
 POSE_COVARIANCE, TWIST, DOUBLES = 7, 7 + 36, 7 + 36 + 6 + 36
-STAMPED = struct.Struct("=iII10s2x6d")  # stamp, length and text of the frame, twist
 SCAN_FIELDS = 7  # floats of a scan between its header and its ranges
 
 
@@ -35,6 +34,14 @@ def _after_text(content: Bytes, place: int, order: str) -> int:
     place = _aligned(place, 4)  # a text begins there with its length
     (length,) = struct.unpack_from(f"{order}I", content, place)
     return place + 4 + int(length)
+
+
+def _text(content: Bytes, place: int, order: str) -> str:
+    begin = _aligned(place, 4) + 4
+    end = _after_text(content, place, order)
+    if end > len(content):
+        raise ValueError("a text in it is longer than the message")
+    return bytes(content[begin:end]).rstrip(b"\0").decode("utf-8", "replace")
 
 
 def _aligned(place: int, size: int) -> int:
@@ -56,6 +63,12 @@ def numbers_of(content: Bytes) -> Array:
     order = _order(content)
     names_end = _after_text(content, _after_text(content, FRAME, order), order)
     return np.frombuffer(content, f"{order}f8", DOUBLES, _aligned(names_end, 8))
+
+
+def frames_of(content: Bytes) -> tuple[str, str]:
+    """Returns the frame of the header and the child frame of a serialised Odometry."""
+    order = _order(content)
+    return _text(content, FRAME, order), _text(content, _after_text(content, FRAME, order), order)
 
 
 def odometry_of(content: Bytes) -> tuple[Array, Array]:
@@ -136,11 +149,14 @@ class ScanWriter:
         return bytes(self._content)
 
 
-def stamped_twist_to_bytes(twist: ArrayLike, stamp_ns: int) -> bytes:
-    """Serialises linear.x, linear.y, angular.z (3,) as a TwistStamped in `base_link`."""
+def stamped_twist_to_bytes(twist: ArrayLike, stamp_ns: int, frame: str) -> bytes:
+    """Serialises linear.x, linear.y, angular.z (3,) as a TwistStamped in a robot's frame."""
     x, y, w = np.asarray(twist, np.float64).tolist()
     seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
-    return NATIVE + STAMPED.pack(seconds, nanoseconds, 10, b"base_link", x, y, 0.0, 0.0, 0.0, w)
+    text = frame.encode() + b"\0"
+    header = NATIVE + struct.pack(f"=iII{len(text)}s", seconds, nanoseconds, len(text), text)
+    padding = bytes(_aligned(len(header), 8) - len(header))
+    return header + padding + struct.pack("=6d", x, y, 0.0, 0.0, 0.0, w)
 
 
 def twist_to_bytes(twist: ArrayLike) -> bytes:

@@ -117,3 +117,16 @@ def test_the_model_of_the_file_of_parameters_is_drawn_where_none_is_given(tmp_pa
     assert '<robot name="jackal"' in setup_of(params_file=str(file)).description()
     assert '<robot name="differential"' in setup_of().description()
     assert '<robot name="mecanum"' in setup_of(model="mecanum").description()
+
+
+@pytest.mark.parametrize("model", ["mecanum", "own"])
+def test_the_robot_is_drawn_with_the_frames_of_the_file_of_parameters(tmp_path, model):
+    if model == "own":
+        model = str(tmp_path / "model")
+        save_model(builtin_model("mecanum"), tmp_path / "model")
+    file = tmp_path / "own.yaml"
+    file.write_text("/**:\n  ros__parameters: {base_frame: chassis, laser_frame: front_laser}\n")
+    drawn = setup_of(model=model, params_file=str(file)).description()
+    assert '<link name="chassis">' in drawn
+    assert '<link name="front_laser">' in drawn
+    assert '"base_link"' not in drawn

@@ -4,10 +4,12 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
+from rcl_interfaces.srv import GetParameters
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Bool
 
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.qos import QosWatch
 from nics_drl_bridge.nodes.runner import open_context
@@ -61,3 +63,93 @@ def test_a_subscription_that_asks_for_too_much_is_named_with_both_sides_and_a_cu
     assert "the durability that the publisher offers (volatile)" in line
     assert "what the subscription asks for (transient local)" in line
     assert f"let /car/{peer.node.get_name()} ask for volatile" in line
+
+
+@pytest.fixture
+def overridden(domain_id):
+    """Makes nodes with overrides, as `overridden("/scan.publisher.depth:=3")`."""
+    contexts = []
+
+    def make(*overrides, remap=()):
+        words = ["node", "--ros-args"]
+        for each in overrides:
+            words += ["-p", f"qos_overrides.{each}"]
+        for each in remap:
+            words += ["-r", each]
+        contexts.append(open_context(words, domain_id))
+        return QosWatch("node", context=contexts[-1])
+
+    yield make
+    for context in contexts:
+        context.try_shutdown()
+
+
+def test_overrides_of_a_publisher_and_a_subscription_are_honoured(overridden):
+    node = overridden(
+        "/scan.publisher.reliability:=best_effort",
+        "/scan.publisher.depth:=3",
+        "/scan.subscription.durability:=transient_local",
+        "/scan.subscription.deadline:=1000000",
+    )
+    publisher = node.create_publisher(Bool, "scan", qos.SENSOR_RELIABLE)
+    heard = node.create_subscription(Bool, "scan", lambda _: None, qos.SENSOR)
+    (offered,) = node.get_publishers_info_by_topic("/scan")
+    (asked,) = node.get_subscriptions_info_by_topic("/scan")
+    assert offered.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+    assert publisher.qos_profile.depth == 3
+    assert asked.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
+    assert heard.qos_profile.depth == qos.SENSOR.depth
+    assert heard.qos_profile.deadline.nanoseconds == 1_000_000
+    assert node.get_parameter("qos_overrides./scan.publisher.depth").value == 3
+
+
+def test_an_override_of_one_topic_leaves_the_others_as_they_are(overridden):
+    node = overridden("/scan.publisher.depth:=3")
+    node.create_publisher(Bool, "scan", qos.SENSOR_RELIABLE)
+    other = node.create_publisher(Bool, "odom", qos.SENSOR_RELIABLE)
+    assert other.qos_profile.depth == qos.SENSOR_RELIABLE.depth == 10
+    assert not [name for name in node._parameters if name.startswith("qos_overrides./odom")]
+
+
+@pytest.mark.parametrize("topic", qos.FIXED_TOPICS)
+@pytest.mark.parametrize("name", ["same", "elsewhere"])
+def test_the_quality_of_service_that_a_stop_depends_on_can_not_be_overridden(
+    overridden, topic, name
+):
+    final = topic if name == "same" else name
+    node = overridden(f"/{final}.subscription.depth:=1", remap=[f"{topic}:={final}"])
+    with pytest.raises(ConfigError, match=rf"qos_overrides./{final}.subscription.depth.*leave it"):
+        node.create_subscription(Bool, topic, lambda _: None, qos.EVERY_COMMAND)
+
+
+@pytest.mark.parametrize(
+    ("override", "sentence"),
+    [
+        ("reliability:=best_efort", "did you mean 'best_effort'?"),
+        ("reliabilty:=reliable", "did you mean 'reliability'?"),
+        ("depth:=many", "must be a whole number of 0 or more, not 'many'"),
+        ("depth:=-1", "must be a whole number of 0 or more, not -1"),
+        ("avoid_ros_namespace_conventions:=3", "must be true or false, not 3"),
+    ],
+)
+def test_an_override_that_can_not_be_is_one_sentence(overridden, override, sentence):
+    node = overridden(f"/scan.publisher.{override}")
+    with pytest.raises(ConfigError) as caught:
+        node.create_publisher(Bool, "scan", qos.SENSOR_RELIABLE)
+    assert "qos_overrides./scan.publisher." in str(caught.value)
+    assert sentence in str(caught.value)
+
+
+def test_nodes_honour_what_a_file_overrides_and_refuse_it_for_the_emergency_stop(
+    launch, meet, domain_id
+):
+    chosen = {"qos_overrides": {"/odometry/filtered": {"publisher": {"depth": 7}}}}
+    launch("middleware_node", domain_id, **chosen)
+    fixed = {"qos_overrides": {"/e_stop": {"subscription": {"reliability": "best_effort"}}}}
+    gate = launch("command_gate", domain_id, **fixed)
+    assert gate.wait() == 2
+    assert "'qos_overrides./e_stop.subscription.reliability': can't be" in gate.read_text()
+    peer = meet(domain_id)
+    request = GetParameters.Request(names=["qos_overrides./odometry/filtered.publisher.depth"])
+    (depth,) = peer.call(GetParameters, "middleware_node/get_parameters", request).values
+    assert depth.integer_value == 7

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import itertools
 import signal
+import threading
 import time
 from types import SimpleNamespace
 
@@ -62,12 +64,13 @@ def vehicle(meet, domain_id, model):
     sensor = peer.node.create_publisher(PoseStamped, "pose", qos.SENSOR_RELIABLE)
     stamps = iter(range(10**9, 10**12, 10**8))
 
-    def stand(pose, twist=(0.0, 0.0, 0.0)):
-        stamp = next(stamps)
+    def stand(pose, twist=(0.0, 0.0, 0.0), stamp=None, scans=True):
+        stamp = next(stamps) if stamp is None else stamp
         ranges = np.full(model.lidar.beams, 2.0, np.float32)
         frames, variance = ("odom", "base_link"), (1e-4,) * 4
         odom.publish(conversions.odometry_to_ros(pose, twist, stamp, frames, variance))
-        scan.publish(conversions.scan_to_ros(model.lidar, ranges, stamp, "laser"))
+        if scans:
+            scan.publish(conversions.scan_to_ros(model.lidar, ranges, stamp, "laser"))
         measured = PoseStamped()
         measured.header.stamp = conversions.stamp_to_ros(stamp)
         measured.pose.position.x, measured.pose.position.y = float(pose[0]), float(pose[1])
@@ -193,6 +196,62 @@ def test_a_vehicle_is_awaited_at_its_start_and_what_is_missing_is_said(
     vehicle.peer.until(lambda: robot and robot[-1].twist.linear.x == 0.5, heard)
     stamp_ns = backend._topics.middleware.cache.newest["scan"].stamp_ns
     assert conversions.stamp_from_ros(robot[-1].header.stamp) == stamp_ns
+    assert robot[-1].header.frame_id == "base_link"
+
+
+@pytest.fixture
+def standing(vehicle):
+    """The vehicle, which stands and sends; its clock is `offset_ns` ahead of the steady one."""
+    clock, over = SimpleNamespace(offset_ns=100 * 10**9), threading.Event()
+
+    def send():
+        for tick in itertools.count():
+            if over.wait(0.02):
+                return
+            stamp = time.monotonic_ns() + clock.offset_ns
+            vehicle.stand(np.zeros(3), stamp=stamp, scans=tick % 5 == 0)
+
+    thread = threading.Thread(target=send, daemon=True)
+    thread.start()
+    yield SimpleNamespace(**vars(vehicle), clock=clock)
+    over.set()
+    thread.join()
+
+
+def test_a_drive_goes_on_after_the_clock_of_the_stamps_was_set_back(connect, standing):
+    heard = standing.peer.listen(TwistStamped, "cmd_vel_raw")
+    standing.peer.listen(TwistStamped, "cmd_vel")
+    backend = connect(
+        domain_id=standing.domain_id, command_topic="cmd_vel_raw", start="present",
+        stale_after_s=PATIENCE_S,
+    )  # fmt: skip
+    view = backend.reset(START)
+    standing.clock.offset_ns -= 50 * 10**9
+    deadline = time.monotonic() + PATIENCE_S
+    while view.stamp_s > (time.monotonic_ns() + standing.clock.offset_ns) / 1e9 + 1.0:
+        assert time.monotonic() < deadline, "the jump was not followed"
+        view = backend.step(FORWARD)[0]
+    assert not np.isnan(view.ranges).any()
+    backend.step(FORWARD)
+
+    def answers_the_new_clock():
+        stamps = [conversions.stamp_from_ros(one.header.stamp) for one in heard]
+        return any(stamp <= view.stamp_s * 1e9 for stamp in stamps if stamp)
+
+    standing.peer.until(answers_the_new_clock, "a command with the stamp of a scan after the jump")
+
+
+def test_no_scan_after_a_clock_jump_is_one_sentence_with_its_age(connect, standing):
+    standing.peer.listen(TwistStamped, "cmd_vel")
+    backend = connect(domain_id=standing.domain_id, start="present", stale_after_s=1.0)
+    backend.reset(START)
+    with backend._topics.lock:  # as a clock jump leaves it
+        backend._topics.middleware.cache.newest.clear()
+        backend._topics._take_scan = lambda _: None
+        backend._topics.middleware.scan = lambda *_: False
+    with pytest.raises(StaleDataError, match="the last is") as caught:
+        drive_on(backend)
+    assert caught.value.topic == "scan"
 
 
 def test_a_vehicle_that_does_not_come_ends_the_reset_and_the_present_pose_would_do(

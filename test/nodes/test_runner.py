@@ -91,8 +91,16 @@ def test_a_description_and_a_range_are_told_to_ros2_param_describe(started):
 
 
 def test_a_misspelt_parameter_is_named_with_the_nearest_one(started):
-    node = started("command_timout:=2.0", "qos_overrides./scan.publisher.depth:=3")
+    node = started("command_timout:=2.0")
     declare(node, "command_timeout", 0.5, "Silence.")
     (line,) = unknown(node)
     assert "'command_timout'" in line
     assert "did you mean 'command_timeout'?" in line
+
+
+def test_a_quality_of_service_for_a_topic_that_the_node_has_not_is_told(started):
+    node = started("qos_overrides./scam.publisher.depth:=3")
+    node.create_publisher(Bool, "/scan", 1)
+    (line,) = unknown(node)
+    assert "'qos_overrides./scam.publisher.depth' is ignored" in line
+    assert "did you mean 'qos_overrides./scan.publisher'?" in line

@@ -5,6 +5,7 @@ import json
 import math
 import time
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 from domains import claimed_domain
 from geometry_msgs.msg import Twist
 from nav_msgs.msg import Odometry
+from rclpy.executors import SingleThreadedExecutor
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, LaserScan
 from std_srvs.srv import SetBool, Trigger
@@ -24,6 +26,7 @@ from nics_drl_bridge.generator import save_model
 from nics_drl_bridge.nodes import conversions, qos, simulator_node
 from nics_drl_bridge.nodes.runner import open_context
 from nics_drl_bridge.robot.noise import Noise
+from nics_drl_bridge.sim.entities import Entities
 from nics_drl_bridge.sim.world import load_world
 from nodes.peer import stamp_ns
 
@@ -454,3 +457,80 @@ def test_a_wrong_parameter_ends_it_with_code_2_and_one_sentence(refusals, parame
     assert sentence in error
     ours = [line for line in error.splitlines() if not line.startswith("[ERROR]")]  # rcl's own
     assert len(ours) == 1, error
+
+
+@pytest.fixture
+def fleet(domain_id, model_folder):
+    """A node with two robots in lock-step, and its entities as the services know them."""
+    words = ["simulator_node", "--ros-args", "-p", f"model:={model_folder}", "-p", "world:=empty"]
+    words += ["-p", "robots:=[ant, bee]", "-p", "mode:=lockstep"]
+    context = open_context(words, domain_id)
+    node = simulator_node.simulator_node(context)
+    entities = Entities(node.device, node.world, node.robot_names, node.make_simulator)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+
+    def settle():
+        for _ in range(20):
+            executor.spin_once(timeout_sec=0.0)
+
+    yield SimpleNamespace(node=node, entities=entities, settle=settle)
+    executor.shutdown(timeout_sec=1.0)
+    node.destroy_node()
+    context.try_shutdown()
+
+
+def command(node, robot, speed):
+    node._on_command(node._ports[robot], np.array([speed, 0.0]))
+
+
+def test_a_fleet_in_lock_step_keeps_its_commands_where_a_robot_joins(fleet, period_ns):
+    node = fleet.node
+    began_ns = node.now_ns
+    command(node, 0, 0.25)
+    fleet.entities.spawn_robot("cat", np.array([2.0, 2.0, 0.0]))
+    node.add_robot("cat")
+    command(node, 1, 0.5)
+    assert node.now_ns == began_ns, "the new robot has no command yet"
+    command(node, 2, 0.75)
+    assert node.now_ns == began_ns + period_ns
+    assert node.device.commands[:, 0].tolist() == [0.25, 0.5, 0.75]
+
+
+@pytest.mark.parametrize("gone", [0, 1])
+def test_a_fleet_in_lock_step_goes_on_where_the_robot_that_it_waited_for_leaves(
+    fleet, period_ns, gone
+):
+    node = fleet.node
+    began_ns = node.now_ns
+    command(node, 1 - gone, 0.25)
+    left = node._ports[gone]
+    fleet.entities.delete(fleet.entities.find(("ant", "bee")[gone]))
+    node.remove_robots([gone])
+    fleet.settle()
+    assert node.now_ns == began_ns + period_ns
+    assert node.device.commands[:, 0].tolist() == [0.25]
+    node._on_command(left, np.array([0.5, 0.0]))  # which had arrived before it left
+    fleet.settle()
+    assert node.now_ns == began_ns + period_ns
+
+
+class Sender:
+    """A publisher that keeps what it sent."""
+
+    def __init__(self):
+        self.sent = []
+
+    def publish(self, message):
+        self.sent.append(message)
+
+
+def test_what_waits_for_the_robots_that_stay_is_published_where_another_leaves():
+    stays, leaves = Sender(), Sender()
+    outbox = simulator_node.Outbox()
+    for publisher in (leaves, stays):
+        outbox.send(publisher, b"data", 0, (10, 0))
+    outbox.drop([leaves])
+    outbox.flush(10)
+    assert stays.sent == [b"data"]
+    assert leaves.sent == []

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from contextlib import closing
+from functools import partial
+
+import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
@@ -9,10 +13,13 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
 
+from nics_drl_bridge.errors import BackendError
+from nics_drl_bridge.interface import Start
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.backends import DdsBackend
 from nics_drl_bridge.nodes.link import Link
 from nics_drl_bridge.nodes.parameters import stamped_by_default
+from nics_drl_bridge.nodes.watching import RosSource
 from nics_drl_bridge.sim.world import load_world
 from nodes.peer import stamp_ns
 
@@ -30,13 +37,53 @@ def test_the_gate_sends_the_type_that_is_asked_for(launch, meet, domain_id, stam
     if stamped:
         before = stamp_ns(heard[-1])
         assert before > 0
-        assert heard[-1].header.frame_id == "base_link"
         assert stamp_ns(peer.another(heard, "zero")) > before
     heard.clear()
     assert gate.close() == 0
     peer.until(lambda: heard, "a zero command")
     twist = heard[-1].twist if stamped else heard[-1]
     assert twist == Twist()
+
+
+def test_the_gate_sends_in_the_frame_of_the_robot_that_odometry_names(launch, meet, domain_id):
+    peer = meet(domain_id)
+    heard = peer.listen(TwistStamped, "cmd_vel", qos.COMMAND)
+    odom = peer.node.create_publisher(Odometry, "odom", qos.SENSOR_RELIABLE)
+    peer.node.create_timer(0.05, lambda: odom.publish(Odometry(child_frame_id="car_1/base")))
+    launch("command_gate", domain_id, enable_stamped_cmd_vel=True)
+    peer.until(lambda: heard and heard[-1].header.frame_id == "car_1/base", "the robot's frame")
+
+
+def test_the_gate_sends_in_the_frame_that_its_parameter_names(launch, meet, domain_id):
+    peer = meet(domain_id)
+    heard = peer.listen(TwistStamped, "cmd_vel", qos.COMMAND)
+    launch("command_gate", domain_id, enable_stamped_cmd_vel=True, base_frame="base_footprint")
+    peer.until(lambda: heard, "a zero")
+    assert heard[-1].header.frame_id == "base_footprint"
+
+
+def test_a_frame_that_is_none_is_refused_by_the_gate_in_one_sentence(launch, domain_id):
+    gate = launch("command_gate", domain_id, base_frame="/base link")
+    assert gate.wait() == 2
+    assert "parameter 'base_frame': must be 1 to 255 characters" in gate.read_text()
+
+
+def test_an_env_sends_in_the_frame_of_the_robot_that_odometry_names(launch, meet, domain_id, model):
+    simulator = launch(
+        "simulator_node", domain_id, mode="lockstep", world="empty",
+        enable_stamped_cmd_vel=True, base_frame="base_footprint", frame_prefix="car_1/",
+    )  # fmt: skip
+    peer = meet(domain_id)
+    peer.until(lambda: simulator.handler is not None, "its start")
+    heard = peer.listen(TwistStamped, "cmd_vel", qos.EVERY_COMMAND)
+    backend = DdsBackend(model, load_world("empty"), domain_id=domain_id)
+    try:
+        backend.reset(Start(seed=1, pose=np.zeros(3)))
+        backend.step(np.array([0.5, 0.0]))
+        peer.until(lambda: heard, "a command")
+        assert heard[-1].header.frame_id == "car_1/base_footprint"
+    finally:
+        backend.close()
 
 
 @pytest.mark.parametrize("stamped", [True, False])
@@ -63,14 +110,67 @@ def test_without_anybody_who_listens_it_is_the_distributions_type(domain_id):
     link.close()
 
 
-def test_a_drive_keeps_the_type_that_was_chosen(launch, meet, domain_id, tmp_path):
+@pytest.mark.parametrize("stamped", [True, False])
+def test_an_estimator_that_expects_the_other_type_says_so_and_follows(
+    launch, meet, domain_id, stamped
+):
+    peer = meet(domain_id)
+    node = launch("middleware_node", domain_id, enable_stamped_cmd_vel=not stamped)
+    peer.node.create_publisher(KINDS[stamped], "cmd_vel", qos.COMMAND)
+    peer.until(lambda: "is heard from now on" in node.read_text(), "the warning", 20.0)
+    sentence = next(
+        line for line in node.read_text().splitlines() if "is heard from now on" in line
+    )
+    assert f"set enable_stamped_cmd_vel:={str(stamped).lower()}" in sentence
+    node.check()
+
+
+@pytest.mark.parametrize("stamped", [True, False])
+def test_commands_are_heard_whatever_their_type_is_and_whenever_it_changes(
+    meet, domain_id, model, stamped
+):
+    peer = meet(domain_id)
+    messages = {True: TwistStamped(), False: Twist()}
+    messages[True].twist.linear.x = 0.25
+    messages[False].linear.x = 0.5
+    speeds = {True: 0.25, False: 0.5}
+    with closing(RosSource(model, None, domain_id=domain_id)) as source:
+
+        def heard():
+            return source.frame().worlds[0].shot.commands[0, 0]
+
+        for kind in (stamped, not stamped):
+            commands = peer.node.create_publisher(KINDS[kind], "cmd_vel", qos.COMMAND)
+            send = partial(commands.publish, messages[kind])
+            timer = peer.node.create_timer(0.05, send)
+            peer.until(lambda kind=kind: heard() == speeds[kind], "the command", 30.0)
+            peer.node.destroy_timer(timer)
+            peer.node.destroy_publisher(commands)
+
+
+def test_a_drive_whose_chosen_type_nobody_hears_names_who_hears_the_other(
+    launch, meet, domain_id, tmp_path
+):
     peer = meet(domain_id)
     other = not stamped_by_default()
-    heard = peer.listen(KINDS[other], "cmd_vel", qos.COMMAND)
+    peer.listen(KINDS[other], "cmd_vel", qos.COMMAND)
     odom = peer.node.create_publisher(Odometry, "odom", qos.SENSOR_RELIABLE)
-    node = launch(
-        "record_node", domain_id, out=str(tmp_path / "d.npz"), stamped=stamped_by_default()
-    )
     peer.node.create_timer(0.02, lambda: odom.publish(Odometry()))
-    peer.until(lambda: "nobody listened" in node.read_text(), "the chosen type is kept")
-    assert not heard
+    out = str(tmp_path / "d.npz")
+    node = launch("record_node", domain_id, out=out, stamped=not other)
+    peer.until(lambda: f"set stamped:={str(other).lower()}" in node.read_text(), "the reason", 30.0)
+    assert "expects geometry_msgs/msg/" in node.read_text()
+
+
+def test_an_env_whose_chosen_type_nobody_hears_names_who_hears_the_other(meet, domain_id, model):
+    meet(domain_id).listen(Twist, "cmd_vel", qos.COMMAND)
+    sentence = r"/cmd_vel: /peer_\d+ expects geometry_msgs/msg/Twist there.*set `stamped` to False"
+    with pytest.raises(BackendError, match=sentence):
+        DdsBackend(model, load_world("empty"), domain_id=domain_id, stamped=True, timeout_s=3.0)
+
+
+def test_the_gate_names_who_publishes_raw_commands_of_the_other_type(launch, meet, domain_id):
+    peer = meet(domain_id)
+    gate = launch("command_gate", domain_id)
+    peer.node.create_publisher(Twist, "cmd_vel_raw", qos.COMMAND)
+    peer.until(lambda: "set foreign_commands:=Twist" in gate.read_text(), "the warning", 20.0)

@@ -8,6 +8,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
 
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.nodes import qos
@@ -58,6 +59,22 @@ def test_live_topics_are_shown_and_a_goal_of_the_page_goes_out(watched, meet):
     frame_where(source, lambda world: world.shot.goals.tolist() == [[1.5, -0.5]])
     peer.until(lambda: goals, "the goal")
     assert goals[0].header.frame_id == "map"
+
+
+def test_a_goal_goes_out_in_the_frame_that_the_estimate_names(meet, model, domain_id):
+    peer = meet(domain_id)
+    goals = peer.listen(PoseStamped, "goal_pose", qos.COMMAND)
+    estimates = peer.node.create_publisher(Odometry, "odometry/filtered", qos.SENSOR_RELIABLE)
+    message = Odometry()
+    message.header.frame_id = "hall"
+    peer.node.create_timer(0.02, lambda: estimates.publish(message))
+    with closing(RosSource(model, None, domain_id=domain_id)) as source:
+
+        def answered():
+            source.take(Request(kind="goal", x=1.0, y=1.0))
+            return goals and goals[-1].header.frame_id == "hall"
+
+        peer.until(answered, "a goal in the estimate's frame", 20.0)
 
 
 def test_a_goal_off_the_given_world_is_refused_before_it_goes_out(model, domain_id):

@@ -103,6 +103,20 @@ def test_a_twist_is_written_so_that_rclpy_reads_it_and_read_as_rclpy_writes_it()
     assert wire.twist_of(serialize_message(message)) == tuple(TWIST)
 
 
+@pytest.mark.parametrize("frame", TEXTS)
+def test_a_stamped_twist_is_written_in_its_frame_so_that_rclpy_reads_it(frame):
+    content = wire.stamped_twist_to_bytes(TWIST, STAMP_NS, frame)
+    message = conversions.stamped_to_ros(TWIST, STAMP_NS, frame)
+    assert deserialize_message(content, TwistStamped) == message
+    assert tuple(wire.stamped_twist_of(content)) == tuple(TWIST)
+
+
+@pytest.mark.parametrize("child", TEXTS)
+@pytest.mark.parametrize("frame", TEXTS)
+def test_the_frames_of_an_odometry_are_read_from_its_bytes(frame, child):
+    assert wire.frames_of(serialize_message(odometry(frame, child))) == (frame, child)
+
+
 def test_bytes_in_the_other_order_are_read_too():
     body = struct.pack(">iI", 3, 4) + struct.pack(">I", 1) + b"\0" + bytes(3)
     odom = body + struct.pack(">I", 1) + b"\0" + bytes(3)
@@ -119,6 +133,7 @@ def test_bytes_in_the_other_order_are_read_too():
 MESSAGES = {
     wire.stamp_of: odometry("odom", "base_link"),
     wire.odometry_of: odometry("odom", "base_link"),
+    wire.frames_of: odometry("odom", "base_link"),
     wire.twist_of: Twist(),
     wire.ranges_of: scan("laser", 8),
 }
