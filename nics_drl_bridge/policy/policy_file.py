@@ -92,7 +92,8 @@ class PolicyFile:
         """Makes the policy's task for a robot; PolicyError names a field that does not fit."""
         name = self.contract.task.name
         if kind is None and name not in TASKS:
-            reason = f"{name!r} is no shipped task; say --task path/to/file.py:{name}."
+            place = f"path/to/file.py:{name if name.isidentifier() else 'ClassName'}"
+            reason = f"{name!r} is no shipped task; say --task {place}, or task= in Python."
             raise PolicyError(str(self.path), "task.name", reason)
         self.check_fits(model)
         task = make_task(kind or name, model, self.task_options)
