@@ -1,4 +1,10 @@
-"""Extensions by name, in groups of entry points `nics_drl_bridge.GROUP`: `docs/extensions.md`."""
+"""Extensions by name, in groups of entry points `nics_drl_bridge.GROUP`: `docs/extensions.md`.
+
+Two ways lead to code. `load` takes a name, and finds it among installed entry points, and among
+classes that this process was told to import: a name may come from a file of data. `import_class`
+and `module_at` take `path/to/file.py:ClassName` and run that file: only for what a user typed on
+the command line or passed to a Python function, never for what a file says.
+"""
 
 import hashlib
 import re
@@ -34,13 +40,42 @@ def known(group: str) -> dict[str, EntryPoint]:
     return {each.name: each for each in ours_first}
 
 
+_imported: dict[str, dict[str, type]] = {}  # group -> name -> class of a user's file
+
+
 def load(group: str, name: str) -> Any:
-    """An extension by group and name; ConfigError if it, or a library that it needs, is missing."""
+    """An extension by group and name; ConfigError if it, or a library that it needs, is missing.
+
+    The name is only looked up: nothing is imported that is not installed as an entry point, or was
+    imported by `import_class` before.
+    """
+    imported = _imported.get(group, {})
+    if name in imported:
+        return imported[name]
     extensions = known(group)
     if name not in extensions:
-        raise ConfigError(f"unknown {group.rstrip('s')} {name!r}; {nearest(name, extensions)}")
+        names = (*extensions, *imported)
+        raise ConfigError(f"unknown {group.rstrip('s')} {name!r}; {nearest(name, names)}")
     with needed_by(f"{group.rstrip('s')} {name!r}"):
         return extensions[name].load()
+
+
+def import_class(group: str, place: str, base: type) -> type:
+    """Imports a class from `path/to/file.py:ClassName`; files may then name it `ClassName`.
+
+    Only for a place that the user typed or passed, never for one that a file of data says.
+    """
+    what = group.rstrip("s")
+    path, _, name = place.rpartition(":")
+    found = getattr(module_at(path, what), name, None)
+    if not (isinstance(found, type) and issubclass(found, base)):
+        needed = f"{base.__module__.removeprefix(f'{PACKAGE}.')}.{base.__name__}"
+        raise ConfigError(f"{what} kind {place!r}: is no subclass of {needed}.")
+    if name in known(group):
+        fix = "is installed under this name already; rename the class"
+        raise ConfigError(f"{what} {place!r}: another {what} {fix}.")
+    _imported.setdefault(group, {})[name] = found
+    return found
 
 
 @contextmanager

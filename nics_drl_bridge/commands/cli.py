@@ -8,7 +8,7 @@ import typer
 from typer import Option
 
 from nics_drl_bridge import __version__, extensions
-from nics_drl_bridge.commands.console import EXIT_BAD_INPUT
+from nics_drl_bridge.commands.console import EXIT_BAD_INPUT, one_sentence
 from nics_drl_bridge.commands.demo import demo
 from nics_drl_bridge.commands.doctor import doctor, explain
 from nics_drl_bridge.commands.evaluate import evaluate
@@ -41,8 +41,21 @@ def _options(
     version: Annotated[
         bool, Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
+    sensor_kind: Annotated[
+        list[str] | None,
+        Option(
+            help="Import a kind of sensor of your own, which files may then name: "
+            "path/to/file.py:ClassName; repeatable, before the command."
+        ),
+    ] = None,
 ) -> None:
     """Options of every command."""
+    if sensor_kind:
+        from nics_drl_bridge.lidar.sensor import add_sensor_kind
+
+        with one_sentence():
+            for place in sensor_kind:
+                add_sensor_kind(place)
 
 
 for command in (

@@ -65,7 +65,8 @@ def train(
     with console.progress_bar("loading PyTorch"):
         from nics_drl_bridge.policy import train as train_run
 
-    resumed = train_run.settings_of(out) if resume and out is not None else None
+    own_task = task if ":" in task else None
+    resumed = train_run.settings_of(out, own_task) if resume and out is not None else None
     chosen = resumed or _told(task, settings, named)
     folder = out or Path("runs") / chosen.title
     command = shlex.join(["nics", *sys.argv[1:]])

@@ -121,7 +121,7 @@ def _standing(file: Path, place: Path, standing: "Standing", keys: Keys, height:
     head = [f"What stands in {file.name} at a height of {height:g} m."]
     head += [f"Left out: {each}." for each in standing.left_out]
     known = {"name": file.stem, "bounds": field, "obstacles": groups}
-    text = _text(place, head, known | keys, (x2 - x1, y2 - y1))
+    text = _text(file, head, known | keys, (x2 - x1, y2 - y1))
     line = f"obstacles: {len(standing.placed)}, field: {x2 - x1:.4g} m x {y2 - y1:.4g} m"
     return Written(place, text, "\n  left out: ".join([line, *standing.left_out]))
 
@@ -149,7 +149,7 @@ def _mapped(file: Path, place: Path, keys: Keys, resolution: float | None) -> li
         raise ConfigError(f"{file}: there is no {map_file.name} beside the picture; {fix}.")
     x, y = columns * resolution, rows * resolution
     known = {"name": file.stem, "map": _seen_from(place, map_file)}
-    text = _text(place, [f"The map {map_file.name}."], known | keys, (x, y))
+    text = _text(file, [f"The map {map_file.name}."], known | keys, (x, y))
     return [*made, Written(place, text, f"map: {x:.4g} m x {y:.4g} m")]
 
 
@@ -157,8 +157,11 @@ def _seen_from(place: Path, file: Path) -> str:
     return os.path.relpath(file.resolve(), place.parent.resolve())
 
 
-def _text(place: Path, head: list[str], known: Keys, size: tuple[float, float]) -> str:
-    """Returns the text of a world file, which is read back to see that it is one."""
+def _text(file: Path, head: list[str], known: Keys, size: tuple[float, float]) -> str:
+    """Returns the text of a world file, which is read back to see that it is one.
+
+    Raises ConfigError, with the file that was imported: the one to be written does not exist.
+    """
     from nics_drl_bridge.config import dump_yaml, parse_yaml, validate
     from nics_drl_bridge.sim.world import World, check_places
 
@@ -176,8 +179,19 @@ def _text(place: Path, head: list[str], known: Keys, size: tuple[float, float]) 
     for key in ("clearance", "goal_distance", "starts", "goals"):
         lines += [f"{key}: {_flow(known[key])}"] if key in known else []
     text = "\n".join(lines) + "\n"
-    found = validate(parse_yaml(text, str(place)), World, str(place))
+    made = f"{file}: the world made of it"
+    obstacles = sum(len(group["at"]) for group in known.get("obstacles", ()))
+    try:
+        data = parse_yaml(text, made)
+    except ConfigError:
+        if not obstacles:
+            raise
+        reason = f"its {obstacles} bodies make a larger file than is read"
+        fix = "leave some out by --without MODEL, or split the world"
+        raise ConfigError(f"{file}: {reason}; {fix}.") from None
+    found = validate(data, World, made)
     if found.map is None:
+        found._file = made
         check_places(found)
     return text
 

@@ -96,6 +96,8 @@ class GridMap:
 MAX_CELLS = 64_000_000
 MAX_BYTES = 4 * MAX_CELLS + 2**20  # of an image file; larger files are not opened
 FORMATS = {"PPM": (".pgm", ".pnm", ".ppm", ".pbm"), "PNG": (".png",), "BMP": (".bmp",)}
+PIXELS_AT_ONCE = 2**20  # of an image whose brightness is computed
+BRIGHTEST_16 = 65535.0  # of a pixel with 16 bits
 LUMA = np.array([0.212656, 0.715158, 0.072186])  # of R, G, B (Rec. 709), as ImageMagick for Nav2
 
 
@@ -167,6 +169,15 @@ def cells_of(
     grey: NDArray[np.uint8], opaque: NDArray[np.bool_] | None, file: MapFile
 ) -> NDArray[np.int8]:
     """Cells of an image (rows, columns) from its brightness and opacity, in its order of rows."""
+    cells: NDArray[np.int8] = _cells_by_brightness(file)[grey]
+    if opaque is not None and file.mode != "raw":
+        cells[~opaque] = UNKNOWN
+    return cells
+
+
+def _cells_by_brightness(file: MapFile) -> NDArray[np.int8]:
+    """(256,) the cell for each brightness of a pixel."""
+    grey = np.arange(256)
     if file.mode == "raw":
         return np.where(grey <= OCCUPIED, grey, UNKNOWN).astype(np.int8)
     # In float32, as in Nav2: 0.6 and the pixel 102 are equal there.
@@ -179,8 +190,6 @@ def cells_of(
         cells = np.floor(np.clip(between, 0.0, 100.0) + np.float32(0.5)).astype(np.int8)
     cells[dark >= high] = OCCUPIED
     cells[dark <= low] = FREE
-    if opaque is not None:
-        cells[~opaque] = UNKNOWN
     return cells
 
 
@@ -212,14 +221,27 @@ def read_image(path: Path, source: str) -> tuple[NDArray[np.uint8], NDArray[np.b
 
 
 def _pixels(image: Image.Image) -> tuple[NDArray[np.uint8], NDArray[np.bool_] | None]:
-    if image.mode in ("I", "F") or image.mode.startswith("I;"):  # 16 bit, up to 65535
-        grey = np.asarray(image).astype(np.float64) / 257.0
-        return np.floor(grey + 0.5).astype(np.uint8), None
-    if image.mode in ("1", "L") and not image.has_transparency_data:
-        return np.asarray(image.convert("L")), None
-    pixels = np.asarray(image.convert("RGBA"))
-    grey = np.floor(pixels[..., :3] @ LUMA + 0.5).astype(np.uint8)
-    return grey, pixels[..., 3] == 255 if image.has_transparency_data else None
+    """Brightness and opacity, computed in blocks of rows: intermediate numbers are far larger."""
+    shape = (image.height, image.width)
+    grey = np.empty(shape, np.uint8)
+    sixteen_bits = image.mode in ("I", "F") or image.mode.startswith("I;")
+    transparent = image.has_transparency_data and not sixteen_bits
+    opaque = np.empty(shape, np.bool_) if transparent else None
+    rows = max(1, PIXELS_AT_ONCE // max(image.width, 1))
+    for first in range(0, image.height, rows):
+        block = slice(first, first + rows)
+        part = image.crop((0, first, image.width, min(first + rows, image.height)))
+        if sixteen_bits:
+            bright = np.clip(np.asarray(part).astype(np.float64), 0.0, BRIGHTEST_16)
+            grey[block] = np.floor(bright / 257.0 + 0.5)
+        elif image.mode in ("1", "L") and not transparent:
+            grey[block] = np.asarray(part.convert("L"))
+        else:
+            pixels = np.asarray(part.convert("RGBA"))
+            grey[block] = np.floor(pixels[..., :3] @ LUMA + 0.5)
+            if opaque is not None:
+                opaque[block] = pixels[..., 3] == 255
+    return grey, opaque
 
 
 def stack_fixtures(

@@ -49,8 +49,8 @@ Render = Callable[[Readings, NDArray[np.int64]], None]
 class Sensor(Schema, ABC):
     """A sensor of a robot beside its lidar.
 
-    A subclass is found by its `kind`, the name of an entry point of `nics_drl_bridge.sensors` or
-    `path/to/file.py:ClassName`. A reading is S numbers, float32; NaN is unknown.
+    A subclass is found by its `kind`, the name of an entry point of `nics_drl_bridge.sensors`, or
+    of a class that `add_sensor_kind` imported. A reading is S numbers, float32; NaN is unknown.
     """
 
     message: ClassVar[str]  # type of its message, as sensor_msgs/msg/LaserScan, with a header
@@ -99,34 +99,55 @@ class Sensor(Schema, ABC):
         return np.zeros((0, 2))
 
 
+CODE_IN_DATA = (
+    "names a file of code, which a file of data may not; import it with "
+    "`nics --sensor-kind path/to/file.py:ClassName ...` or `add_sensor_kind` in Python, and write "
+    "`kind: ClassName` instead."
+)
+
+
+def add_sensor_kind(place: str) -> type[Sensor]:
+    """Imports a kind of sensor from `path/to/file.py:ClassName`, which files then name `ClassName`.
+
+    It runs the file: call it with a path of your own, never with one that a file of data names.
+    """
+    return extensions.import_class("sensors", place, Sensor)
+
+
 def sensor_of(given: Sensor | Mapping[str, Any]) -> Sensor:
-    """Returns a sensor, made from its entries if it is none. Raises ConfigError if it can't be."""
+    """Returns a sensor of a caller's own entries, whose `kind` may be `path/to/file.py:ClassName`.
+
+    Entries that were read from a file go through `sensor_of_data`. Raises ConfigError.
+    """
+    if not isinstance(given, Sensor) and isinstance(given, Mapping):
+        kind = str(given.get("kind"))
+        if ":" in kind:
+            given = {**given, "kind": add_sensor_kind(kind).__name__}
+    return sensor_of_data(given)
+
+
+def sensor_of_data(given: Sensor | Mapping[str, Any]) -> Sensor:
+    """Returns a sensor of the entries of a file, which name a known kind and never code.
+
+    Raises ConfigError if they describe none.
+    """
     if isinstance(given, Sensor):
         return given
     if not isinstance(given, Mapping) or "kind" not in given:
         raise ConfigError("a sensor needs a 'kind' and a 'name'.")
     kind = str(given["kind"])
-    place, colon, name = kind.rpartition(":")
-    if colon:
-        found = getattr(extensions.module_at(place, "sensor"), name, None)
-    else:
-        found = extensions.load("sensors", kind)
+    if ":" in kind:
+        raise ConfigError(f"sensor kind {kind!r}: {CODE_IN_DATA}")
+    found = extensions.load("sensors", kind)
     if not (isinstance(found, type) and issubclass(found, Sensor)):
         raise ConfigError(f"sensor kind {kind!r}: is no subclass of lidar.sensor.Sensor.")
     return validate(dict(given), found, f"sensor {given.get('name')!r}")
 
 
 def load_sensor(file: Path) -> Sensor:
-    """Reads a sensor from a YAML file. Raises ConfigError for what is wrong with it.
-
-    The path in a `kind` counts from the YAML file, or from where the program runs.
-    """
+    """Reads a sensor from a YAML file. Raises ConfigError for what is wrong with it."""
     try:
-        given = parse_yaml(read_text(file), str(file))
-        place, colon, name = str(given.get("kind")).rpartition(":")
-        if colon and (beside := file.parent / place).is_file():
-            given["kind"] = f"{beside.resolve()}:{name}"
-        return sensor_of(given)
+        return sensor_of_data(parse_yaml(read_text(file), str(file)))
     except ConfigError as error:
         known = str(error).startswith(str(file))
         raise error if known else ConfigError(f"{file}: {error}") from None
@@ -150,7 +171,7 @@ def check_sensors(sensors: tuple[Sensor, ...], frames: tuple[str, ...]) -> None:
 
 def _validated(given: Any) -> Sensor:
     try:
-        return sensor_of(given)
+        return sensor_of_data(given)
     except ConfigError as error:
         raise ValueError(str(error)) from None
 

@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -193,12 +194,27 @@ def joints_to_ros(spec: RobotSpec, state: ArrayLike, time_ns: int) -> JointState
 
 
 def message_type(kind: str) -> Any | None:
-    """Returns the class of a type like `nav_msgs/msg/Odometry`; None if it is not installed."""
-    module, _, name = kind.replace("/", ".").rpartition(".")
+    """Returns the class of a type like `nav_msgs/msg/Odometry`; None if it is not installed.
+
+    Types come from other programs on the network: only a package that has messages is imported.
+    """
+    named = re.fullmatch(r"([A-Za-z]\w*)/(msg|srv|action)/([A-Za-z]\w*)", kind, re.ASCII)
+    if named is None:
+        return None
+    package, interface, name = named.groups()
+    if package not in sys.modules and not _has_interfaces(package, interface):
+        return None
     try:
-        return getattr(import_module(module), name, None) if kind.count("/") == 2 else None
+        return getattr(import_module(f"{package}.{interface}"), name, None)
     except ImportError:
         return None
+
+
+def _has_interfaces(package: str, interface: str) -> bool:
+    """True if a package that is installed has messages; nothing of it is imported for that."""
+    spec = find_spec(package)
+    folders = (spec.submodule_search_locations if spec is not None else None) or ()
+    return any(Path(folder, interface, "__init__.py").is_file() for folder in folders)
 
 
 def sensor_type(sensor: Sensor) -> Any:

@@ -73,6 +73,7 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
         command = [sys.executable, "-m", "nics_drl_bridge.nodes.start", node, "--ros-args"]
         command += ["--params-file", str(file), *(word for rule in rules for word in ("-r", rule))]
         chosen = {"ROS_DOMAIN_ID": str(domain_id), "ROS_AUTOMATIC_DISCOVERY_RANGE": discovery}
+        chosen["PYTHONSAFEPATH"] = "1"  # no modules of the working folder, which may be a model
         with self.log.open("wb") as log:
             # Its own session: Ctrl-C in the terminal reaches the parent alone, which then ends it.
             self._process = subprocess.Popen(

@@ -13,10 +13,12 @@ from nics_drl_bridge.errors import ConfigError, PolicyError
 from nics_drl_bridge.files import sha256
 from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.lidar.sectors import layout_of
-from nics_drl_bridge.policy import leapp_bundle, onnx_graph, policy_file
+from nics_drl_bridge.policy import leapp_bundle, onnx_graph, policy_file, rehearsal
 from nics_drl_bridge.policy.contract import MAPPINGS, SUFFIX, Rows, contract_of, golden_observations
 from nics_drl_bridge.policy.foreign_graph import Composer, Network
 from nics_drl_bridge.policy.foreign_mapping import ForeignPolicy
+from nics_drl_bridge.policy.onnx_graph import STATE_IN
+from nics_drl_bridge.policy.onnx_session import GraphNeeds, in_turn, open_session
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,7 @@ def _ordered(path: Path, model: SimulatorModel | None) -> Order:
     except OSError as error:
         reason = f"{mapping.network!r} can't be read ({error.strerror}); it is beside the mapping."
         raise PolicyError(str(path), "network", reason) from None
+    rehearsal.rehearse_network(content, str(file))
     network = onnx_graph.parsed(content, str(file))
     onnx_graph.check_graph(network, str(file))
     return Order(mapping, Network(network), path, sha256(content))
@@ -107,13 +110,19 @@ def _content(order: Order, model: SimulatorModel | None) -> bytes:
     digest = onnx_graph.graph_hash(graph)
     text = contract_of(task, model, golden, digest, provenance, state, batch=1)
     onnx.helper.set_model_props(graph, {onnx_graph.KEY: text})
-    return onnx_graph.sealed(graph.SerializeToString(deterministic=True))
+    content = onnx_graph.sealed(graph.SerializeToString(deterministic=True))
+    rehearsal.remember(content)  # the same graph, with a contract
+    return content
 
 
 def _golden(graph: Any, seen: Rows, size: int, source: str) -> dict[str, Rows]:
-    onnx_graph.rows_at_once(graph, source, 1)  # before anything of it runs
-    session = policy_file.open_session(graph.SerializeToString(), source)
-    names = (onnx_graph.INPUT, onnx_graph.STATE_IN)
+    content = graph.SerializeToString()
+    widths: dict[str, int | None] = {STATE_IN: size} if size else {}
+    needs = GraphNeeds(widths, batch=1, graph_sha256="", start=0.0 if size else None)
+    rehearsal.rehearse_graph(content, needs, seen, source)  # before anything of it runs here
+    onnx_graph.rows_at_once(graph, source, 1)
+    session = open_session(content, source)
+    names = (onnx_graph.INPUT, STATE_IN)
     start = np.zeros(size, np.float32)
 
     def run(*given: Rows) -> list[Rows]:
@@ -123,7 +132,7 @@ def _golden(graph: Any, seen: Rows, size: int, source: str) -> dict[str, Rows]:
             words = " ".join(str(error).split())[:120]
             raise PolicyError(source, "network", f"onnxruntime can't run it ({words}).") from None
 
-    rows = policy_file.in_turn(run if size else lambda one, state: [*run(one), state], seen, start)
+    rows = in_turn(run if size else lambda one, state: [*run(one), state], seen, start)
     if not all(np.isfinite(part).all() for part in rows):
         reason = "gives NaN or inf for ordinary observations; check scaling and weights."
         raise PolicyError(source, "network", reason)

@@ -11,7 +11,7 @@ from onnx import TensorProto
 
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.errors import PolicyError, nearest
-from nics_drl_bridge.policy import foreign_mapping, graph_folding, onnx_graph
+from nics_drl_bridge.policy import foreign_mapping, graph_folding, onnx_graph, rehearsal
 from nics_drl_bridge.policy.graph_builder import Builder
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -122,6 +122,7 @@ class Composer:
                 shape = one.type.tensor_type.shape
                 for place, size in zip(shape.dim, self._shape(one.name), strict=True):
                     place.dim_value = size
+        rehearsal.rehearse_folding(model.SerializeToString(), max(versions), self._source)
         try:
             model = onnx.compose.add_prefix(model, THEIRS)
             self._made = graph_folding.fold_shapes(model.graph, max(versions))

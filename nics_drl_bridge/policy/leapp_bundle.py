@@ -16,7 +16,7 @@ from nics_drl_bridge.config import parse_yaml, read_text, validate
 from nics_drl_bridge.errors import PolicyError, nearest
 from nics_drl_bridge.files import sha256
 from nics_drl_bridge.generator import SimulatorModel
-from nics_drl_bridge.policy import onnx_graph
+from nics_drl_bridge.policy import onnx_graph, rehearsal
 from nics_drl_bridge.policy.foreign_graph import Network
 from nics_drl_bridge.policy.foreign_mapping import ForeignState
 from nics_drl_bridge.policy.leapp import BEAMS, SECTORS, Data, restored
@@ -214,8 +214,10 @@ def read_bundle(path: Path) -> Bundle:
         if digests[-1] != given.sha256sum:
             reason = f"does not fit {given.model_path!r}, which was changed or damaged."
             raise bundle.fault(f"{place}.sha256sum", reason)
-        models[name] = onnx_graph.parsed(data, str(path.parent / given.model_path))
-        onnx_graph.check_graph(models[name], str(path.parent / given.model_path))
+        file = str(path.parent / given.model_path)
+        rehearsal.rehearse_network(data, file)
+        models[name] = onnx_graph.parsed(data, file)
+        onnx_graph.check_graph(models[name], file)
     return Bundle(path, description, models, sha256("".join(digests).encode()))
 
 

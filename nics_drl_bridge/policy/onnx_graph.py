@@ -68,20 +68,52 @@ def parse(data: bytes, source: str) -> Any:
 
 def parsed(data: bytes, source: str) -> Any:
     """Parses a ModelProto, of anyone, and checks its form alone. Raises PolicyError."""
+    _check_form(data, source)
+    try:
+        model = onnx.load_model_from_string(data)
+        if not model.HasField("graph"):
+            raise ValueError
+    except (DecodeError, ValueError, TypeError):
+        raise _no_policy(source, "is no ONNX model, or is cut off") from None
+    return model
+
+
+def _check_form(data: bytes, source: str) -> None:
+    """Raises PolicyError for another format, and for bytes that are no message of a few parts."""
     for start, kind in OTHER_FORMATS:
         if data.startswith(start):
             reason = f"is {kind}, which is never opened; export the policy with `export_policy`."
             raise PolicyError(source, "file", reason)
     try:
         check_wire(data)
-        model = onnx.load_model_from_string(data)
-        if not model.HasField("graph"):
-            raise ValueError
-    except (DecodeError, ValueError, TypeError) as error:
-        what = str(error) if isinstance(error, WireError) else "is no ONNX model, or is cut off"
-        reason = f"{what}, which no policy is; export or copy it again."
-        raise PolicyError(source, "file", reason) from None
-    return model
+    except WireError as error:
+        raise _no_policy(source, str(error)) from None
+
+
+def _no_policy(source: str, what: str) -> PolicyError:
+    return PolicyError(source, "file", f"{what}, which no policy is; export or copy it again.")
+
+
+def metadata_in(data: bytes, source: str) -> str:
+    """The text of the contract in a file, of which nothing else is parsed. Raises PolicyError."""
+    _check_form(data, source)
+    bare = onnx.ModelProto()
+    field = onnx.ModelProto.DESCRIPTOR.fields_by_name["metadata_props"]
+    view, start, has_graph = memoryview(data), 0, False
+    while start < len(data):
+        key, start = _varint(view, start, len(data))
+        size, start = _size_of(view, start, len(data), key & 7)
+        number, end = key >> 3, start + size
+        if key & 7 == _BYTES and number == field.number:
+            try:
+                bare.metadata_props.add().ParseFromString(bytes(view[start:end]))
+            except DecodeError:
+                raise _no_policy(source, "is no ONNX model, or is cut off") from None
+        has_graph |= number == onnx.ModelProto.GRAPH_FIELD_NUMBER
+        start = end
+    if not has_graph:
+        raise _no_policy(source, "is no ONNX model, or is cut off")
+    return metadata(bare, source)
 
 
 def metadata(model: Any, source: str) -> str:

@@ -1,6 +1,6 @@
 """Policy files: one `.onnx` with network, normaliser, commands and contract; never unpickled."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -15,8 +15,15 @@ from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.lidar.sectors import plan_of
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.policy import contract as contracts
-from nics_drl_bridge.policy import onnx_graph
+from nics_drl_bridge.policy import onnx_graph, rehearsal
 from nics_drl_bridge.policy.contract import Contract, Rows, leaves
+from nics_drl_bridge.policy.onnx_session import (
+    GraphNeeds,
+    cannot_run,
+    check_policy_graph,
+    in_turn,
+    open_session,
+)
 from nics_drl_bridge.robot.spec import RobotSpec
 
 GOLDEN_TOLERANCE = 1e-5
@@ -73,7 +80,7 @@ class PolicyFile:
         try:
             out: list[NDArray[Any]] = self._session.run(None, given)
         except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
-            raise _cannot_run(str(self.path), error) from None
+            raise cannot_run(str(self.path), error) from None
         if any(len(part) != len(rows) for part in out):
             reason = f"gives {[part.shape for part in out]} for {len(rows)} observations."
             raise PolicyError(str(self.path), "graph", reason)
@@ -92,7 +99,8 @@ class PolicyFile:
         """Makes the policy's task for a robot; PolicyError names a field that does not fit."""
         name = self.contract.task.name
         if kind is None and name not in TASKS:
-            reason = f"{name!r} is no shipped task; say --task path/to/file.py:{name}."
+            place = f"path/to/file.py:{name if name.isidentifier() else 'ClassName'}"
+            reason = f"{name!r} is no shipped task; say --task {place}, or task= in Python."
             raise PolicyError(str(self.path), "task.name", reason)
         self.check_fits(model)
         task = make_task(kind or name, model, self.task_options)
@@ -168,61 +176,30 @@ def load_policy(path: str | Path) -> PolicyFile:
 def policy_of(data: bytes, path: Path) -> PolicyFile:
     """Makes a policy from a file's content; see `load_policy`."""
     source = str(path)
-    model = onnx_graph.parse(data, source)
-    contract = contracts.read_contract(onnx_graph.metadata(model, source), source)
-    commands = len(contract.robot.command)
-    action = None if contract.actions == "discrete" else commands
-    widths = {
-        onnx_graph.INPUT: contract.observation.size,
-        onnx_graph.COMMAND: commands, onnx_graph.ACTION: action,
-    }  # fmt: skip
-    if contract.state is not None:
-        widths |= dict.fromkeys((onnx_graph.STATE_IN, onnx_graph.STATE_OUT), contract.state.size)
-    onnx_graph.check_ends(model, widths, source, contract.batch)
-    if onnx_graph.graph_hash(model) != contract.graph_sha256:
-        reason = "does not belong to the graph, which was changed after the export."
-        raise PolicyError(source, "graph_sha256", reason)
-    rows = onnx_graph.rows_at_once(model, source, contract.batch)
-    del model  # the runtime parses the bytes itself
+    contract = contracts.read_contract(onnx_graph.metadata_in(data, source), source)
+    onnx_graph.check_seal(data, source)  # what was changed since has a reason above, if it is known
+    needs = _needs_of(contract)
+    seen = contract.golden.rows("observations")
+    if path.parent != contracts.shipped():  # these are part of the package, as its code is
+        rehearsal.rehearse_policy(data, needs, seen, source)
+    rows = check_policy_graph(data, needs, source)
     policy = PolicyFile(path, contract, open_session(data, source), rows)
     _check_golden(policy, source)
-    onnx_graph.check_seal(data, source)  # last, so that faults with a known field are named first
     return policy
 
 
-def open_session(data: bytes, source: str) -> Any:
-    """An onnxruntime session on one thread; ConfigError without it, PolicyError by the graph."""
-    try:
-        import onnxruntime
-    except ImportError:
-        fix = "pip install 'nics_drl_bridge[deploy]'."
-        raise ConfigError(f"a policy file needs the module 'onnxruntime'; {fix}") from None
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
-    options.log_severity_level = 4
-    try:
-        return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
-        raise _cannot_run(source, error) from None
-
-
-def _cannot_run(source: str, error: Exception) -> PolicyError:
-    words = " ".join(str(error).split())[:120]
-    return PolicyError(source, "graph", f"onnxruntime can't run it ({words}).")
-
-
-def in_turn(
-    run: Callable[..., Sequence[NDArray[Any]]], seen: Rows, start: Rows | None
-) -> list[NDArray[Any]]:
-    """Actions and commands for observations (T, O): of an episode if there is a state (S,)."""
-    if start is None:
-        return list(run(seen))
-    state, rows = start[None], []
-    for k in range(len(seen)):
-        *out, state = run(seen[k : k + 1], state)
-        rows.append(out)
-    return [np.concatenate(parts) for parts in zip(*rows, strict=True)]
+def _needs_of(contract: Contract) -> GraphNeeds:
+    commands = len(contract.robot.command)
+    widths: dict[str, int | None] = {
+        onnx_graph.INPUT: contract.observation.size,
+        onnx_graph.COMMAND: commands,
+        onnx_graph.ACTION: None if contract.actions == "discrete" else commands,
+    }
+    state = contract.state
+    if state is not None:
+        widths |= dict.fromkeys((onnx_graph.STATE_IN, onnx_graph.STATE_OUT), state.size)
+    start = None if state is None else state.start
+    return GraphNeeds(widths, contract.batch, contract.graph_sha256, start)
 
 
 def _check_golden(policy: PolicyFile, source: str) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.logger import configure
 
-from nics_drl_bridge.config import dump_yaml, load_yaml, shipped_names
+from nics_drl_bridge.config import dump_yaml, shipped_names
 from nics_drl_bridge.env.registry import make_task
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError, shortened
@@ -29,7 +29,7 @@ from nics_drl_bridge.policy.train_export import export_policy
 from nics_drl_bridge.policy.train_ppo import LeanPpo
 from nics_drl_bridge.policy.train_stop import Stop
 from nics_drl_bridge.policy.train_vec_env import TrainVecEnv
-from nics_drl_bridge.policy.training_settings import TrainingSettings
+from nics_drl_bridge.policy.training_settings import TrainingSettings, is_code, read_settings
 from nics_drl_bridge.seeds import checked_seeds
 from nics_drl_bridge.sim.world_set import AnyWorld
 
@@ -273,7 +273,8 @@ def _check(settings: TrainingSettings, seeds: Sequence[int], out: Path, resumed:
     if begun and not resumed:
         fix = "add --resume, or choose another --out."
         raise ConfigError(f"{out}: holds checkpoints of these seeds; {fix}")
-    if (out / SETTINGS).is_file() and not resumed and settings_of(out) != settings:
+    own_task = settings.task if is_code(settings.task) else None
+    if (out / SETTINGS).is_file() and not resumed and settings_of(out, own_task) != settings:
         fix = "choose another --out, or remove it."
         raise ConfigError(f"{out}: holds a run with other settings; {fix}")
     if resumed and not begun:
@@ -288,11 +289,14 @@ def seeds_of(out: Path) -> list[int]:
     return sorted(int(seed) for seed in begun if seed.isdecimal())
 
 
-def settings_of(out: Path) -> TrainingSettings:
-    """Reads the settings of an existing run. Raises ConfigError if there is none."""
+def settings_of(out: Path, task: str | None = None) -> TrainingSettings:
+    """Reads the settings of an existing run. Raises ConfigError if there is none.
+
+    A run of a task of the user's own needs that `task` again: its folder never starts a program.
+    """
     if not (out / SETTINGS).is_file():
         raise ConfigError(f"{out}: holds no {SETTINGS}; name the folder of a run with --out.")
-    return load_yaml(out / SETTINGS, TrainingSettings)
+    return read_settings(out / SETTINGS, task)
 
 
 def line_of(summary: Summary) -> str:

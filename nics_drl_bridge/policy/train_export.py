@@ -20,7 +20,8 @@ with extensions.needed_by("the export of a policy"):
     import onnx
     import torch
 
-    from nics_drl_bridge.policy import onnx_graph, policy_file
+    from nics_drl_bridge.policy import onnx_graph, policy_file, rehearsal
+    from nics_drl_bridge.policy.onnx_session import in_turn, open_session
     from nics_drl_bridge.policy.train_memory import Memory
 
 Normaliser = tuple[ArrayLike, ArrayLike, float]
@@ -110,6 +111,7 @@ def export_policy(
     )  # fmt: skip
     onnx.helper.set_model_props(graph, {onnx_graph.KEY: text})
     data = onnx_graph.sealed(graph.SerializeToString(deterministic=True))
+    rehearsal.remember(data)  # the network is one of this process
     policy = policy_file.policy_of(data, file)
     write_bytes(file, data)
     return policy
@@ -117,7 +119,7 @@ def export_policy(
 
 def _golden(deployed: Deployed, graph: Any, task: Task, source: str) -> dict[str, Rows]:
     seen = golden_observations(task)
-    session = policy_file.open_session(graph.SerializeToString(), source)
+    session = open_session(graph.SerializeToString(), source)
     inputs, kept = (onnx_graph.INPUT, onnx_graph.STATE_IN), deployed.state
     start = None if kept is None else np.full(kept[0], kept[1], np.float32)
 
@@ -128,7 +130,7 @@ def _golden(deployed: Deployed, graph: Any, task: Task, source: str) -> dict[str
         with torch.no_grad():
             return [part.numpy() for part in deployed(*map(torch.as_tensor, given))]
 
-    out, wanted = (policy_file.in_turn(run, seen, start) for run in (infer, compute))
+    out, wanted = (in_turn(run, seen, start) for run in (infer, compute))
     for name, ours, theirs in zip(("actions", "commands"), out, wanted, strict=True):
         error = float(np.abs(ours - theirs).max())
         if not error <= policy_file.GOLDEN_TOLERANCE:

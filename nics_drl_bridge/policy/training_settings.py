@@ -85,7 +85,8 @@ class StopSettings(Schema):
 class TrainingSettings(Schema):
     """A training, as in `config/training/*.yaml`; `worlds` maps names or files to their copies."""
 
-    task: str = "navigation"  # a name, or `path/to/file.py:ClassName`
+    # a shipped task's name; `path/to/file.py:ClassName` if the caller names the same, as `--task`
+    task: str = "navigation"
     task_options: dict[str, Any] = Field(default_factory=dict)  # arguments of the task's class
     robot: str = DEFAULT_ROBOT  # name of a shipped robot, or the folder of a model
     lidar: str | None = None  # a shipped one or a file, instead of the model's own
@@ -162,9 +163,28 @@ class TrainingSettings(Schema):
         return sum(self.worlds.values())
 
 
-def load_training(name: str | Path) -> TrainingSettings:
-    """Loads settings by the name of a shipped file, or by path. Raises ConfigError."""
-    return load_yaml(find_config(name, "training"), TrainingSettings)
+def load_training(name: str | Path, task: str | None = None) -> TrainingSettings:
+    """Loads settings by the name of a shipped file, or by path. Raises ConfigError.
+
+    A task of the user's own is a program. A file may tell which one it is for, but only a `task`
+    that the caller names is run: it takes the place of the file's.
+    """
+    return read_settings(find_config(name, "training"), task)
+
+
+def read_settings(path: Path, task: str | None = None) -> TrainingSettings:
+    """Reads settings from a file, with the caller's own task if it names one; see above."""
+    settings = load_yaml(path, TrainingSettings)
+    if is_code(settings.task) and not (task is not None and is_code(task)):
+        reason = "is a program, which a file of data may not start"
+        fix = "name it yourself: --task path/to/file.py:ClassName, or task= in Python"
+        raise ConfigError(f"{path}: key 'task' {settings.task!r}: {reason}; {fix}.")
+    return settings if task is None else settings.model_copy(update={"task": task})
+
+
+def is_code(task: str) -> bool:
+    """True for a task of a user's own, `path/to/file.py:ClassName`."""
+    return ":" in task
 
 
 def chosen_settings(task: str, name: str | None, changes: dict[str, Any]) -> TrainingSettings:
@@ -173,7 +193,7 @@ def chosen_settings(task: str, name: str | None, changes: dict[str, Any]) -> Tra
     if name is None and f"{task}_{robot}" not in shipped_names("training"):
         base = TrainingSettings(task=task, robot=robot)
     else:
-        base = load_training(name or f"{task}_{robot}")
+        base = load_training(name or f"{task}_{robot}", task if is_code(task) else None)
     changed = base.model_dump(mode="json", exclude_unset=True) | changes
     if worlds := changed.pop("world", None):
         changed["worlds"] = dict.fromkeys(worlds, max(1, base.num_envs // len(worlds)))

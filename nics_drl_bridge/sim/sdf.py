@@ -16,14 +16,16 @@ from xml.etree.ElementTree import Element, TreeBuilder
 from xml.parsers import expat
 
 import numpy as np
+from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.geometry import Array
-from nics_drl_bridge.lidar.shapes import FARTHEST, LARGEST, SMALLEST
+from nics_drl_bridge.lidar.shapes import FARTHEST, LARGEST, MOST_CORNERS, SMALLEST
 from nics_drl_bridge.sim import sections
 from nics_drl_bridge.sim.sections import Placed, ShapelessError, Solid, Standing
+from nics_drl_bridge.sim.world import MOST_OBSTACLES
 
 MOST_BYTES = 2**24  # of a file; the largest saved worlds have some megabytes
 MOST_MODELS = 20_000  # with all that are included
@@ -67,11 +69,16 @@ def read_sdf(
         for body in _bodies(_Scope(_world(path), path, "", _Order(without)), np.eye(4)):
             seen += 1
             try:
-                solid = body.solid()
-                found = None if solid is None else sections.section(solid, body.pose, height)
-                placed += [] if found is None else [found]
+                found = _section_of(body, height)
             except ShapelessError as error:
                 unknown.setdefault(body.model, []).append(str(error))
+                continue
+            if found is not None:
+                placed.append(found)
+            if len(placed) > MOST_OBSTACLES:
+                reason = f"holds more than {MOST_OBSTACLES} bodies at a height of {height:g} m"
+                fix = "leave some out by --without MODEL, or split the world"
+                raise ConfigError(f"{path}: {reason}; {fix}.")
     except RecursionError:
         raise ConfigError(f"{path}: is nested too deeply; flatten its models.") from None
     left_out = tuple(f"model {name!r} has {', '.join(what)}" for name, what in unknown.items())
@@ -87,6 +94,22 @@ def read_sdf(
         reason = f"none of its {shapes} collision geometries stands at a height of {height:g} m"
         raise ConfigError(f"{path}: {reason}; choose another --height.")
     return Standing(tuple(placed), left_out)
+
+
+def _section_of(body: "_Body", height: float) -> Placed | None:
+    """The shape of a body at a height [m]; None for the ground, and for what is above or below.
+
+    Raises ShapelessError, and ConfigError for a shape that no world takes.
+    """
+    solid = body.solid()
+    if solid is None:
+        return None
+    try:
+        return sections.section(solid, body.pose, height)
+    except ValidationError as error:
+        problem = error.errors(include_url=False)[0]["msg"].removeprefix("Value error, ")
+        reason = f"its shape at a height of {height:g} m is none of a world ({problem})"
+        raise ConfigError(f"{body.where}: {reason}; change it.") from None
 
 
 class _Order:
@@ -239,6 +262,9 @@ class _Body(NamedTuple):
             points.pop()
         if len(set(points)) < 3:
             raise ConfigError(f"{self.where}: <polyline> needs three different points; add some.")
+        if len(points) > MOST_CORNERS:
+            most = f"has {len(points)} points, a shape at most {MOST_CORNERS}"
+            raise ConfigError(f"{self.where}: <polyline> {most}; coarsen it.")
         return sections.Prism(tuple(points), *self._lengths(polyline, "height"))
 
     def _lengths(self, shape: Element, key: str, count: int = 1) -> tuple[float, ...]:

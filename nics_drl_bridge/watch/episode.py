@@ -168,6 +168,8 @@ class EpisodeSource:
 
     def __init__(self, make: Make, policy: str, worlds: Sequence[AnyWorld], seed: int) -> None:
         self._first = seed
+        self._given_policy = policy
+        self._given_worlds = {world.name: world for world in worlds}
         self.lanes = [Lane(make, policy, world, seed) for world in worlds]
         self.model = self.lanes[0].env.model
         self.period_s, self._policy = self.model.control_period, policy
@@ -180,8 +182,8 @@ class EpisodeSource:
         robot, first = self.model.robot.name, self.lanes[0].world.name
         fitting = [name for name in shipped_policies() if name == robot]
         can = CAN | {"drive"} if self._drives else CAN
-        policies = dict.fromkeys([self._policy, *fitting, *POLICIES])
-        worlds = dict.fromkeys([first, *shipped_names("worlds")])
+        policies = dict.fromkeys([self._policy, self._given_policy, *fitting, *POLICIES])
+        worlds = dict.fromkeys([first, *self._given_worlds, *shipped_names("worlds")])
         return Stage(
             f"{self._policy} in {', '.join(lane.world.name for lane in self.lanes)}", self.model,
             tuple(lane.env.world for lane in self.lanes), can,
@@ -229,7 +231,8 @@ class EpisodeSource:
         elif request.kind == "clear":
             lane.clear()
         elif request.kind == "world":
-            lane.enter(load_worlds(request.name))
+            known = self._given_worlds.get(request.name)
+            lane.enter(load_worlds(request.name) if known is None else known)
         else:
             return False
         return True

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Protocol
 
-from nics_drl_bridge.errors import BridgeError
+from nics_drl_bridge.errors import BridgeError, ConfigError, nearest
 from nics_drl_bridge.watch.frame import Frame, Stage
 from nics_drl_bridge.watch.server import PageServer, Request
 
@@ -75,6 +75,19 @@ class Tempo:
         return {"speed": self.speed, "paused": self.paused}
 
 
+def check_listed(request: Request, stage: Stage) -> None:
+    """Raises ConfigError for a policy or a world that the page does not offer.
+
+    Any program of this machine may speak to the page's socket. It chooses among what whoever
+    started the page may choose from, and opens no other file.
+    """
+    if request.kind in stage.choices:
+        offered = stage.choices[request.kind]
+        if request.name not in offered:
+            hint = nearest(request.name, offered)
+            raise ConfigError(f"{request.kind} {request.name!r}: is not on the page's list; {hint}")
+
+
 def show(source: FrameSource, server: PageServer) -> None:
     """Shows a source until the server is closed."""
     pace, shown_s = Tempo(), 0.0
@@ -84,6 +97,7 @@ def show(source: FrameSource, server: PageServer) -> None:
 
     def handle(request: Request) -> None:
         try:
+            check_listed(request, source.stage())
             if request.kind not in PACE and source.take(request):
                 server.set_stage(source.stage())
         except BridgeError as error:

@@ -258,3 +258,10 @@ def test_what_is_written_is_told_as_json_too(tmp_path):
     (imported,) = json.loads(done("import", "arena_map.yaml", "--json", cwd=tmp_path))["worlds"]
     assert imported["file"] == "arena_map_world.yaml"
     assert (tmp_path / imported["file"]).is_file()
+
+
+def test_a_world_of_too_many_bodies_is_refused_by_the_file_that_holds_them(tmp_path):
+    boxes = [f"<box><size>{0.1 + 1e-5 * k:.5f} 0.1 1</size></box>" for k in range(6000)]
+    many = refused("import", sdf(tmp_path, *boxes), "--out", "made.yaml", cwd=tmp_path)
+    assert many.startswith("my.world: its 6000 bodies make a larger file than is read; ")
+    assert not (tmp_path / "made.yaml").exists()

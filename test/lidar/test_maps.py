@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -114,6 +116,26 @@ def test_all_kinds_of_pgm_give_the_same_map(save, image):
 
 def test_16_bit_png_is_read(save):
     assert cells(save(GREYS.astype(np.uint16) * 257, "map.png", mode="raw"))[0][:3] == [0, 50, 100]
+
+
+@pytest.mark.parametrize("kind", ["16 bit", "RGBA", "palette", "grey"])
+def test_no_kind_of_image_takes_many_bytes_for_a_pixel(save, tmp_path, kind):
+    """A few kilobytes of PNG hold millions of pixels."""
+    side, modes = 3000, {"RGBA": "RGBA", "palette": "P", "grey": "L"}
+    path = save(name="map.png")
+    if kind == "16 bit":
+        image = Image.fromarray(np.full((side, side), 65535, np.uint16))
+    else:
+        image = Image.new(modes[kind], (side, side), 255 if kind == "grey" else None)
+    image.save(tmp_path / "map.png")
+    tracemalloc.start()
+    try:
+        grid = load_map(path)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert grid.cells.shape == (side, side)
+    assert peak < 10 * side**2 + 2**26, f"{peak / side**2:.1f} bytes for a pixel"
 
 
 def test_the_image_may_be_named_absolutely_or_from_the_folder_of_the_yaml(save, tmp_path):

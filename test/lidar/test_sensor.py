@@ -16,7 +16,7 @@ from nics_drl_bridge.errors import BridgeError, ConfigError, PolicyError
 from nics_drl_bridge.generator import load_model, save_model
 from nics_drl_bridge.lidar.further_lidar import FurtherLidar
 from nics_drl_bridge.lidar.scanner import Scanner
-from nics_drl_bridge.lidar.sensor import load_sensor, sensor_of
+from nics_drl_bridge.lidar.sensor import add_sensor_kind, load_sensor, sensor_of
 from nics_drl_bridge.lidar.table import LidarTable
 from nics_drl_bridge.policy.contract import contract_of, read_contract
 from nics_drl_bridge.sim.simulator import FastSimulator
@@ -79,11 +79,15 @@ def sonar(tmp_path):
     return sensor_of({"kind": f"{file}:Nearest", "name": "sonar", "reach": 4.0})
 
 
-def test_the_file_of_a_kind_lies_beside_the_yaml_that_names_it(tmp_path):
+def test_a_yaml_file_names_a_kind_that_the_caller_imported_and_no_file_of_code(tmp_path):
     (tmp_path / "nearest.py").write_text(SONAR)
-    (tmp_path / "sonar.yaml").write_text("{kind: 'nearest.py:Nearest', name: sonar}\n")
-    sensor = load_sensor(tmp_path / "sonar.yaml")
-    assert sensor.kind == f"{tmp_path}/nearest.py:Nearest"
+    file = tmp_path / "sonar.yaml"
+    file.write_text("{kind: 'nearest.py:Nearest', name: sonar}\n")
+    with pytest.raises(ConfigError, match=r"sonar\.yaml: .*names a file of code"):
+        load_sensor(file)
+    kind = add_sensor_kind(f"{tmp_path}/nearest.py:Nearest")
+    file.write_text("{kind: Nearest, name: sonar}\n")
+    assert type(load_sensor(file)) is kind
 
 
 def test_a_second_lidar_scans_what_the_exact_scanner_sees_from_its_place(model):

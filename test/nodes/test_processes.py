@@ -125,3 +125,16 @@ def test_a_wrong_domain_id_of_the_environment_is_one_sentence(monkeypatch, given
     monkeypatch.setenv("ROS_DOMAIN_ID", given)
     with pytest.raises(ConfigError, match=f"ROS_DOMAIN_ID is '{given}'"):
         free_domain_id()
+
+
+def test_the_working_folder_holds_no_modules_for_a_node(tmp_path, monkeypatch, domain_id):
+    """`python -m` looks for modules in the working folder first, which may be that of a model."""
+    canary = tmp_path / "canary"
+    for name in ("yaml", "numpy", "numba", "rclpy"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(canary)!r}, 'w')\n")
+    monkeypatch.chdir(tmp_path)
+    told = {"model": "no/such/model"}
+    with NodeProcess("middleware_node", tmp_path / "log", told, domain_id) as node:
+        assert node._process.wait(60) != 0
+    assert not canary.exists()
+    assert "no such folder" in node.log.read_text()

@@ -148,7 +148,8 @@ def test_a_task_that_tells_no_success_is_said_to(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(REACH)
     (tmp_path / "settings.yaml").write_text("task: mine.py:Reach\n" + SETTINGS_OF_ANY_TASK)
-    done = nics("--settings", "settings.yaml", "--episodes", 2, "--out", "run")
+    own = "--task", "mine.py:Reach"
+    done = nics("--settings", "settings.yaml", *own, "--episodes", 2, "--out", "run")
     assert done.exit_code == 0, done.output
     assert "does `info` of the task tell `is_success`?" in done.output
     assert "--task mine.py:Reach" in done.output.splitlines()[-1]

@@ -17,6 +17,13 @@ BARN = Path("/work/shared/barn")
 HEIGHT = 0.2
 DISC = "<cylinder><radius>0.1</radius><length>1</length></cylinder>"
 POINT = "<polyline><point>0 0</point><height>1</height></polyline>"
+ROUND = "".join(
+    f"<point>{math.cos(k * math.tau / 20_000):.9f} {math.sin(k * math.tau / 20_000):.9f}</point>"
+    for k in range(20_000)
+)
+FINE = f"<polyline>{ROUND}<height>1</height></polyline>"
+CORNERS = "<point>2e4 0</point><point>0 2e4</point><point>0 0</point>"
+FAR = f"<polyline>{CORNERS}<height>1</height></polyline>"
 MESH = "<mesh><uri>model://table/table.dae</uri></mesh>"
 
 
@@ -233,12 +240,21 @@ CYCLE = "<frame name='a'><pose relative_to='b'/></frame><frame name='b' attached
         (model("<box><size>1 1</size></box>"), "must be 3 numbers, not '1 1'"),
         (model("<sphere><radius>-1</radius></sphere>"), "must be above 0 and at most"),
         (model(POINT), "needs three different points"),
+        (model(FINE), "collision 'c': <polyline> has 20000 points, a shape at most 16384; coarsen"),
+        (model(FAR), "collision 'c': its shape at a height of 0.2 m is none of a world (Input"),
         ("", "none of its 0 collision geometries"),
         ("</world><world name='v'>", "holds 2 worlds; give a file with one."),
     ],
 )  # fmt: skip
 def test_a_wrong_file_is_refused_with_what_to_mend(write, inside, sentence):
     assert sentence in refused(write(inside))
+
+
+def test_a_world_of_too_many_bodies_is_refused_by_its_own_name(write):
+    bodies = "".join(model(DISC, f"m{k}") for k in range(sdf.MOST_OBSTACLES + 1))
+    assert "holds more than 10000 bodies at a height of 0.2 m; leave some out" in refused(
+        write(bodies)
+    )
 
 
 @pytest.mark.parametrize("version", ["1.3", "2.0", "", "x"])

@@ -189,6 +189,28 @@ def test_a_page_asks_for_all_of_it_over_its_socket():
         assert client.next("stage")["places"][0]["name"] == "room"
 
 
+def test_a_program_on_the_socket_opens_no_file_that_the_page_does_not_list(tmp_path):
+    world = tmp_path / "other.yaml"
+    world.write_text("name: other\nfield: [5.0, 5.0]\n")
+    with closing(source()) as made, shown(made) as (_, client):
+        stage = client.next("stage")
+        given = stage["chosen"]["world"]
+        client.ask("world", name="room")
+        assert client.next("stage")["places"][0]["name"] == "room"
+        for kind, name in (
+            ("world", str(world)),
+            ("world", "../worlds/room"),
+            ("policy", "/etc/hostname"),
+            ("policy", str(tmp_path / "mine.onnx")),
+            ("policy", ""),
+        ):
+            client.ask(kind, name=name)
+            told = client.next("notice")["text"]
+            assert told.startswith(f"{kind} {name!r}: is not on the page's list; ")
+        client.ask("world", name=given)  # what the page was started with is on it
+        assert client.next("stage")["places"][0]["name"] == given
+
+
 def test_720_beams_are_sent_30_times_a_second_with_much_to_spare():
     import json
     import time

@@ -1,0 +1,90 @@
+"""Opens the graph of a policy in onnxruntime, after all checks; imports little, for `rehearsal`."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge.errors import ConfigError, PolicyError
+from nics_drl_bridge.policy import onnx_graph
+
+Rows = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class GraphNeeds:
+    """What a policy file says about its graph, as plain data."""
+
+    widths: dict[str, int | None]  # of inputs and outputs; None: whole numbers, one for each row
+    batch: int | None  # greatest number of observations in one run; None: any
+    graph_sha256: str
+    start: float | None = None  # of each element of the state; None: the policy has no state
+
+
+def check_policy_graph(data: bytes, needs: GraphNeeds, source: str) -> int:
+    """Checks the graph of a policy file before anything of it runs. Raises PolicyError.
+
+    Returns the number of observations for one run.
+    """
+    model = onnx_graph.parse(data, source)
+    onnx_graph.check_ends(model, needs.widths, source, needs.batch)
+    if onnx_graph.graph_hash(model) != needs.graph_sha256:
+        reason = "does not belong to the graph, which was changed after the export."
+        raise PolicyError(source, "graph_sha256", reason)
+    return onnx_graph.rows_at_once(model, source, needs.batch)
+
+
+def open_session(data: bytes, source: str) -> Any:
+    """An onnxruntime session on one thread; ConfigError without it, PolicyError by the graph."""
+    try:
+        import onnxruntime
+    except ImportError:
+        fix = "pip install 'nics_drl_bridge[deploy]'."
+        raise ConfigError(f"a policy file needs the module 'onnxruntime'; {fix}") from None
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
+    options.log_severity_level = 4
+    try:
+        return onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
+        raise cannot_run(source, error) from None
+
+
+def cannot_run(source: str, error: Exception) -> PolicyError:
+    """The error for a graph that the runtime refuses."""
+    words = " ".join(str(error).split())[:120]
+    return PolicyError(source, "graph", f"onnxruntime can't run it ({words}).")
+
+
+def in_turn(
+    run: Callable[..., Sequence[NDArray[Any]]], seen: Rows, start: Rows | None
+) -> list[NDArray[Any]]:
+    """Actions and commands for observations (T, O): of an episode if there is a state (S,)."""
+    if start is None:
+        return list(run(seen))
+    state, rows = start[None], []
+    for k in range(len(seen)):
+        *out, state = run(seen[k : k + 1], state)
+        rows.append(out)
+    return [np.concatenate(parts) for parts in zip(*rows, strict=True)]
+
+
+def run_once(session: Any, needs: GraphNeeds, seen: Rows, source: str) -> None:
+    """Runs observations (T, O), of an episode if there is a state. Raises PolicyError."""
+    start = None
+    if needs.start is not None:
+        start = np.full(needs.widths[onnx_graph.STATE_IN] or 1, needs.start, np.float32)
+
+    def run(*given: Rows) -> list[NDArray[Any]]:
+        names = (onnx_graph.INPUT, onnx_graph.STATE_IN)
+        try:
+            return list(session.run(None, dict(zip(names, given, strict=False))))
+        except Exception as error:  # noqa: BLE001 - the runtime's errors have no common base class
+            raise cannot_run(source, error) from None
+
+    rows_at_once = 1 if needs.batch == 1 else len(seen)
+    for first in range(0, len(seen), rows_at_once):
+        in_turn(run, seen[first : first + rows_at_once], start)

@@ -1,0 +1,195 @@
+"""Opens a policy's network in a process of its own first, which has little memory and time.
+
+What it costs to parse a graph, to infer its shapes and to prepare it is known only by doing it:
+a few hundred kilobytes can ask for gigabytes. So what comes from a file is done once where it can
+do no harm, and done here only if that went well. A file is remembered by its content, so that it
+costs a fraction of a second once in a process.
+"""
+
+import base64
+import json
+import math
+import os
+import subprocess
+import sys
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from nics_drl_bridge.errors import PolicyError
+from nics_drl_bridge.files import sha256
+from nics_drl_bridge.policy import onnx_graph
+from nics_drl_bridge.policy.onnx_session import (
+    GraphNeeds,
+    Rows,
+    check_policy_graph,
+    open_session,
+    run_once,
+)
+
+MEMORY = 512 * 2**20  # beyond what the libraries use [bytes]
+MEMORY_OF_SIZE = 8  # the same for each byte of the file: a network is held several times
+CPU_S = 10  # time of a processor; a network of 32 MB takes a tenth of it here
+WALL_S = 60.0  # on a computer that is busy with other things
+MOST_REMEMBERED = 10_000
+EXIT_MEMORY = 3
+_CODE = "import sys; sys.path[:] = {path!r}; import {module} as one; one.main()"
+_remembered: dict[str, None] = {}  # digests of what went well, oldest first
+
+
+def rehearse_policy(data: bytes, needs: GraphNeeds, seen: Rows, source: str) -> None:
+    """Opens a policy file elsewhere, and runs observations (T, O). Raises PolicyError."""
+    _rehearse("policy", data, source, needs=_plain(needs), seen=_text(seen))
+
+
+def rehearse_network(data: bytes, source: str) -> None:
+    """Parses and checks somebody else's network elsewhere. Raises PolicyError."""
+    _rehearse("network", data, source)
+
+
+def rehearse_folding(data: bytes, opset: int, source: str) -> None:
+    """Folds the shapes of somebody else's network elsewhere. Raises PolicyError."""
+    _rehearse("folding", data, source, opset=opset)
+
+
+def rehearse_graph(data: bytes, needs: GraphNeeds, seen: Rows, source: str) -> None:
+    """Opens and runs a graph that was composed around a network elsewhere. Raises PolicyError."""
+    _rehearse("graph", data, source, needs=_plain(needs), seen=_text(seen))
+
+
+def remember(data: bytes) -> None:
+    """Takes a policy file for rehearsed: this process made its graph, or rehearsed it before."""
+    _remembered[_digest_of("policy", data)] = None
+    if len(_remembered) > MOST_REMEMBERED:
+        del _remembered[next(iter(_remembered))]
+
+
+def _digest_of(step: str, data: bytes) -> str:
+    return sha256(step.encode() + b"\0" + data)
+
+
+def _rehearse(step: str, data: bytes, source: str, **told: Any) -> None:
+    digest = _digest_of(step, data)
+    if digest in _remembered:
+        return
+    head = json.dumps({"step": step, **told}).encode()
+    refusal = _answer_of(head + b"\n" + data)
+    if refusal is not None:
+        raise PolicyError(source, *refusal)
+    _remembered[digest] = None
+
+
+def _answer_of(request: bytes) -> tuple[str, str] | None:
+    """The field and the reason for which another process refused a request; None if it did not."""
+    # The same modules as here: `python -c` alone would look for them in the working folder.
+    code = _CODE.format(path=sys.path, module=__name__)
+    single = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            input=request,
+            capture_output=True,
+            timeout=WALL_S,
+            env=os.environ | single,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return "graph", f"takes more than {WALL_S:.0f} s to open; not opened."
+    except OSError as error:
+        return "file", f"no process can be started to open it first ({error.strerror})."
+    if done.returncode == 0:
+        answer = json.loads(done.stdout)
+        return None if answer is None else (str(answer[0]), str(answer[1]))
+    if done.returncode == EXIT_MEMORY or done.returncode < 0:  # of a signal: out of time, a crash
+        most = f"{MEMORY // 2**20} MB of memory or {CPU_S} s"
+        return "graph", f"takes more than {most} to open, which no policy does; not opened."
+    last = (done.stderr.decode(errors="replace").strip().splitlines() or ["nothing was said"])[-1]
+    return "file", f"the process that opens it first failed ({last}); not opened."
+
+
+def _plain(needs: GraphNeeds) -> dict[str, Any]:
+    return asdict(needs)
+
+
+def _text(seen: Rows) -> list[Any]:
+    rows = np.ascontiguousarray(seen, "<f4")
+    return [*rows.shape, base64.b64encode(rows.tobytes()).decode()]
+
+
+# In the other process.
+
+
+def main() -> None:
+    """Does what standard input asks for within the limits, and says what was wrong, or null."""
+    import onnxruntime  # noqa: F401 - before the limits: what the libraries take is not counted
+
+    request = sys.stdin.buffer.read()
+    head, _, data = request.partition(b"\n")
+    told = json.loads(head)
+    del request
+    if told["step"] == "folding":
+        from nics_drl_bridge.policy import graph_folding  # noqa: F401 - before the limits
+    _limit(MEMORY + MEMORY_OF_SIZE * len(data))
+    answer = None
+    try:
+        _do(told, data)
+    except Exception as error:
+        if _is_of_memory(error):
+            os._exit(EXIT_MEMORY)
+        if not isinstance(error, PolicyError):
+            raise
+        answer = error.field, error.reason
+    sys.stdout.write(json.dumps(answer))
+    sys.stdout.flush()
+    os._exit(0)  # nothing of a session is worth the time to take it apart
+
+
+def _do(told: dict[str, Any], data: bytes) -> None:
+    step, source = told["step"], "policy"
+    if step in ("network", "folding"):
+        model = onnx_graph.parsed(data, source)
+        if step == "network":
+            onnx_graph.check_graph(model, source)
+            return
+        from nics_drl_bridge.policy.graph_folding import fold_shapes
+
+        try:
+            fold_shapes(model.graph, told["opset"])
+        except Exception as error:
+            words = " ".join(str(error).split())[:120]
+            raise PolicyError(source, "network", f"its shapes do not fit ({words}).") from error
+        return
+    needs = GraphNeeds(**told["needs"])
+    *shape, text = told["seen"]
+    seen = np.frombuffer(base64.b64decode(text), "<f4").reshape(shape)
+    if step == "policy":
+        check_policy_graph(data, needs, source)
+    else:
+        onnx_graph.rows_at_once(onnx_graph.parsed(data, source), source, needs.batch)
+    run_once(open_session(data, source), needs, seen, source)
+
+
+def _limit(memory: int) -> None:
+    """Limits what this process may take from now on; where the system can't, time alone is."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    cpu_s = math.ceil(used.ru_utime + used.ru_stime) + CPU_S
+    resource.setrlimit(resource.RLIMIT_CPU, (cpu_s, cpu_s))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    if sys.platform == "linux":  # others do not heed it
+        with open("/proc/self/statm", encoding="ascii") as file:
+            pages = int(file.read().split()[0])
+        most = pages * resource.getpagesize() + memory
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))
+
+
+def _is_of_memory(error: BaseException | None) -> bool:
+    while error is not None:
+        if isinstance(error, MemoryError):
+            return True
+        error = error.__cause__ or error.__context__
+    return False

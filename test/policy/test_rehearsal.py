@@ -1,0 +1,131 @@
+"""What a policy file costs is measured where it can do no harm, before it is opened here."""
+
+from __future__ import annotations
+
+import resource
+import subprocess
+import sys
+
+import numpy as np
+import onnx
+import pytest
+from onnx import helper, numpy_helper
+
+from nics_drl_bridge.errors import PolicyError
+from nics_drl_bridge.policy import rehearsal
+from nics_drl_bridge.policy.foreign import load_any
+from nics_drl_bridge.policy.policy_file import load_policy
+from policy.policy_rig import bytes_of, export, model_of, signed
+
+MOST_RSS = 1000 * 2**10  # of any process [kB]; without a limit it is 8.8 GB
+MOST_S = 25.0  # of a processor; without a limit 31 s, of which most is swapped or refused here
+MEASURE = """
+import resource, sys, time
+from nics_drl_bridge.errors import PolicyError
+from nics_drl_bridge.policy.policy_file import load_policy
+begun = time.process_time()
+try:
+    load_policy(sys.argv[1])
+except PolicyError as error:
+    print(error)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
+print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime + time.process_time() - begun)
+"""
+
+
+def doubled(proto, times: int, kind=np.float32):
+    """Concatenations of a constant with itself, which nothing else of the graph uses."""
+    proto.graph.initializer.append(numpy_helper.from_array(np.ones(1, kind), "c0"))
+    for k in range(times):
+        node = helper.make_node("Concat", [f"c{k}", f"c{k}"], [f"c{k + 1}"], axis=0)
+        proto.graph.node.append(node)
+    return proto
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "go.onnx"
+    export(path)
+    return path
+
+
+@pytest.fixture
+def forgetful(monkeypatch):
+    """A process that has rehearsed nothing yet."""
+    monkeypatch.setattr(rehearsal, "_remembered", {})
+
+
+def test_concatenations_of_a_constant_take_no_gigabytes(file):
+    file.write_bytes(bytes_of(signed(doubled(onnx.load(file), 31))))
+    command = [sys.executable, "-c", MEASURE, str(file)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
+    sentence, own, childs, seconds = done.stdout.splitlines()
+    assert "takes more than 512 MB of memory or 10 s to open, which no policy does" in sentence
+    assert int(own) < MOST_RSS
+    assert int(childs) < MOST_RSS
+    assert float(seconds) < MOST_S
+
+
+def test_a_network_of_somebody_else_takes_no_gigabytes(tmp_path, forgetful):
+    wide = helper.make_tensor_value_info("x", onnx.TensorProto.FLOAT, [1, 1])
+    out = helper.make_tensor_value_info("y", onnx.TensorProto.FLOAT, [1, 1])
+    graph = helper.make_graph([helper.make_node("Tanh", ["x"], ["y"])], "net", [wide], [out])
+    proto = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    onnx.save(doubled(proto, 31), tmp_path / "net.onnx")
+    mapping = tmp_path / "net.yaml"
+    mapping.write_text(
+        "kind: foreign policy\nnetwork: net.onnx\n"
+        "inputs: {x: {parts: [{of: goal.distance}]}}\n"
+        "outputs: {forward: {of: y}, left: {}, turn: {}}\n"
+    )
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(PolicyError, match="takes more than 512 MB"):
+        load_any(mapping, model_of())
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss < before + MOST_RSS
+
+
+def test_a_file_is_rehearsed_once_and_one_of_this_process_never(file, forgetful, monkeypatch):
+    asked = []
+    answer = rehearsal._answer_of
+    monkeypatch.setattr(rehearsal, "_answer_of", lambda one: asked.append(one) or answer(one))
+    for _ in range(3):
+        load_policy(file)
+    assert len(asked) == 1
+    load_policy("differential")  # shipped, as the code is
+    other = file.parent / "other.onnx"
+    export(other, scan=12)
+    load_policy(other)
+    assert len(asked) == 1
+
+
+def test_what_takes_too_long_or_ends_the_process_is_one_sentence(file, forgetful, monkeypatch):
+    for code, words in (
+        ("import time; time.sleep(60)", "takes more than 0 s to open; not opened."),
+        ("import os; os.abort()", "takes more than 512 MB of memory or 10 s to open"),
+        ("raise SystemExit('no onnx here')", "failed (no onnx here); not opened."),
+    ):
+        monkeypatch.setattr(rehearsal, "_CODE", code)
+        monkeypatch.setattr(rehearsal, "WALL_S", 0.2 if "sleep" in code else 60.0)
+        with pytest.raises(PolicyError) as refused:
+            load_policy(file)
+        assert words in str(refused.value)
+        assert "\n" not in str(refused.value)
+
+
+def test_the_working_folder_holds_no_modules_for_a_rehearsal(file, forgetful, monkeypatch):
+    canary = file.parent / "canary"
+    for name in ("json", "numpy", "onnx", "onnxruntime"):
+        (file.parent / f"{name}.py").write_text(f"open({str(canary)!r}, 'w')\n")
+    monkeypatch.chdir(file.parent)
+    load_policy(file)
+    assert not canary.exists()
+
+
+def test_a_damaged_file_is_refused_before_anything_of_it_is_parsed(file, forgetful, monkeypatch):
+    data = bytearray(file.read_bytes())
+    data[200] ^= 1
+    file.write_bytes(bytes(data))
+    monkeypatch.setattr(rehearsal, "_answer_of", lambda _: pytest.fail("it was opened"))
+    with pytest.raises(PolicyError):
+        load_policy(file)
