@@ -119,27 +119,43 @@ def inspect(
 ) -> None:  # fmt: skip
     """Lists the contents of any recording and drafts its mapping."""
     from nics_drl_bridge.files import write_text
-    from nics_drl_bridge.recording.guess import NOT_USED, first_mapping
-    from nics_drl_bridge.recording.readers import open_source
+    from nics_drl_bridge.recording.guess import DOUBT, NOT_USED, first_mapping
+    from nics_drl_bridge.recording.readers import open_source, why_no_mapping
+    from nics_drl_bridge.recording.recording import is_recording
     from nics_drl_bridge.recording.survey import survey
 
     if mapping is not None and mapping.exists():
         raise ConfigError(f"--map {mapping}: is there already; give another name.")
     with open_source(source) as opened, console.progress_bar(f"reading {source}"):
         tables = survey(opened)
-    text = "" if as_json and mapping is None else first_mapping(tables)
-    if mapping is not None:
-        write_text(mapping, text)
+    why = why_no_mapping(source)
+    is_own = is_recording(source)  # its arrays are no columns that a mapping could name
+    text = "" if is_own else first_mapping(tables)
+    written = None if is_own else mapping
+    if written is not None:
+        write_text(written, text)
+    doubts = [
+        line.removeprefix(f"{DOUBT} ") for line in text.splitlines() if line.startswith(DOUBT)
+    ]
+    needless = ""
+    if why:
+        needless = f"{source}: {why}, and needs no mapping: nics generate {source} --out MODEL"
     if as_json:
-        facts = {"tables": [asdict(table) for table in tables]}
-        typer.echo(json_of(facts | {"mapping": mapping and str(mapping)}))
+        facts = {"tables": [asdict(table) for table in tables], "doubts": doubts}
+        facts |= {"mapping": written and str(written), "needs_mapping": not why}
+        typer.echo(json_of(facts))
         return
+    for line in (*([needless] if needless else ()), *doubts):
+        typer.echo(line)
     for table in tables:
         found = "".join(f"\n  {finding}" for finding in table.regularity + table.findings)
         typer.echo(f"{table.name}: {table.rows} rows{found}")
         rows = [(c.name, f"{c.low:.6g}", f"{c.high:.6g}") for c in table.columns]
         if rows:
             typer.echo(console.table(("column", "least", "greatest"), rows))
+    if is_own:
+        typer.echo(f"no mapping was written: {needless}" if mapping is not None else needless)
+        return
     if mapping is None:
         typer.echo(f"A first mapping, to edit; --map FILE writes it:\n\n{text}")
         return

@@ -3,6 +3,7 @@
 from math import isfinite
 from typing import NamedTuple
 
+from nics_drl_bridge.identify.command_doubts import doubts_of_commands
 from nics_drl_bridge.identify.excitation import narrow
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.judgement import shortfall, usual
@@ -34,7 +35,12 @@ def conclude(identified: Identified) -> Conclusion:
     """Draws the conclusion of a fit."""
     spec, ready = identified.drive.spec, False
     wrong = tuple(str(note) for note in identified.notes if isinstance(note, Mistake))
-    about = *wrong, *shortfall(identified.judgement), *doubts(identified.held_out)
+    about = (
+        *wrong,
+        *doubts_of_commands(identified.judgement, identified.calibration),
+        *shortfall(identified.judgement),
+        *doubts(identified.held_out),
+    )
     beyond = *narrow(identified.recording, spec), overdriven(spec)
     gaps = *identified.gaps, *(one for one in beyond if one)
     if wrong:

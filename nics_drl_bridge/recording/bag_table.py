@@ -112,7 +112,8 @@ class Bag(Source):
         names = tuple(dict.fromkeys(fields_of(messages[0].content)))
         column, stamps = partial(column_of, place, names, messages), partial(self._stamps_of, name)
         notes = self._notes.setdefault(name, [])
-        return Table(place, names, column, "message {}".format, notes, stamps)
+        kind = self._bag.types[name]
+        return Table(place, names, column, "message {}".format, notes, stamps, kind)
 
     def _of(self, topic: str) -> Sequence[Message]:
         if topic not in self._messages:

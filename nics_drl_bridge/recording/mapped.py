@@ -12,9 +12,17 @@ from nics_drl_bridge.geometry import Array, east_and_north, wrap_angle
 from nics_drl_bridge.recording import mapping as schema
 from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording import stamping
-from nics_drl_bridge.recording.mapping import Mapping, Measured, PoseSource, Reference, Value
+from nics_drl_bridge.recording.mapping import (
+    Mapping,
+    Measured,
+    PoseSource,
+    Reference,
+    Value,
+    why_no_command,
+)
+from nics_drl_bridge.recording.names import words_of
 from nics_drl_bridge.recording.recording import Recording, Stream, check_streams, implausible_pose
-from nics_drl_bridge.recording.table import Source
+from nics_drl_bridge.recording.table import Source, numbers_of
 from nics_drl_bridge.recording.values import MappedReader, Series, together, unit_of
 
 QUATERNION_TOLERANCE = 0.05
@@ -22,12 +30,15 @@ MOST_TILT_DEG = 40.0  # median, of a robot that drives on wheels
 MOST_UNTRACKED = 0.05  # share of poses whose quaternion is zero: the tracker had lost the body
 NO_LENGTH = 1e-9
 SHORTEST_S = 1.0
+SHORT_OF_EARTH = {"lat", "lon", "lng", "long"}  # short names of latitude and longitude
+NEAR_DEG = 1.0  # a drive is within so much of its latitude and longitude
 MOST_RATIO = 100.0  # of durations of two streams of a drive
 
 
 def read_mapped(source: Source, mapping: Mapping) -> Recording:
     """Reads the streams of a mapping; ConfigError, RecordingError: what is missing or wrong."""
     reader = MappedReader(source, mapping)
+    _check_commands(reader, mapping.command)
     found: dict[str, Stream] = {"pose": read_pose(reader, mapping.pose)}
     groups: Names[str, Names[str, Value]] = {"command": mapping.command, "state": mapping.state}
     for name, values in groups.items():
@@ -47,6 +58,27 @@ def read_mapped(source: Source, mapping: Mapping) -> Recording:
     check_streams(made, {"command": len(mapping.command), "state": len(mapping.state), "wheels": 2})
     shifted: Any = _from_zero(found, mapping.clock or schema.ROBOT_CLOCK, reader)
     return replace(made, **shifted, repairs=tuple(reader.notes))
+
+
+def _check_commands(reader: MappedReader, commands: Names[str, Value]) -> None:
+    """Refuses what was measured, by the name of its column, where a command is needed."""
+    for name, value in commands.items():
+        table, which = reader.place(value.from_)
+        is_number = isinstance(which, int) or (which not in table.names and which.isdecimal())
+        known = is_number and int(which) < len(table.names)
+        column = table.names[int(which)] if known else str(which)
+        if why := why_no_command(column):
+            raise ConfigError(f"{table.place}: command.{name}: {why}.")
+        words = {*words_of(column)}
+        if words & SHORT_OF_EARTH and _stays_near(numbers_of(table, which)):
+            fault = f"{column!r} looks like a latitude or longitude, and was not sent to the robot"
+            raise ConfigError(f"{table.place}: command.{name}: {fault}; name a column that was.")
+
+
+def _stays_near(values: Array) -> bool:
+    """True for values that stay within a degree, far from zero, as places on the earth do."""
+    known = values[np.isfinite(values)]
+    return len(known) > 0 and np.ptp(known) < NEAR_DEG <= np.abs(known).max()
 
 
 def _check_units(reader: MappedReader, pose: Stream) -> None:

@@ -8,6 +8,7 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from nics_drl_bridge.config import Schema, load_yaml
 from nics_drl_bridge.errors import nearest
+from nics_drl_bridge.recording.names import words_of
 
 TURN = 2.0 * math.pi
 
@@ -58,6 +59,16 @@ def to_si(unit: str, ticks_per_turn: float | None = None) -> UnitOfData:
     return found
 
 
+# Words of columns that can't have been sent to a robot: where it is, and how uncertain that is.
+PLACES_ON_EARTH = {"latitude", "longitude", "altitude"}
+NO_COMMANDS = PLACES_ON_EARTH | {"covariance", "covariances", "cov", "variance"}
+
+NO_COMMAND_NAMED = (
+    "command: names none, but a model learns what the robot does from what was sent to it; name "
+    "its columns, or, if it was not recorded, record it together with the pose, such as "
+    "geometry_msgs/Twist on cmd_vel"
+)
+
 ARRIVAL, HEADER = "arrival", "header"
 ROBOT_CLOCK = "robot"
 # Where the variances of x, y and heading stand: alone, and in a 3 x 3 or 6 x 6 matrix by rows.
@@ -88,6 +99,16 @@ def _of_kind(kinds: tuple[str, ...]) -> Any:
         return unit
 
     return BeforeValidator(check)
+
+
+def why_no_command(column: str) -> str:
+    """Says why a column was not sent to the robot, by the words in its name; empty if it may be."""
+    found = NO_COMMANDS & {*words_of(column)}
+    if not found:
+        return ""
+    is_place = found & PLACES_ON_EARTH
+    what = "where the robot was" if is_place else "how uncertain a measurement is"
+    return f"{column!r} tells {what}, and was not sent to the robot; name a column that was"
 
 
 class Time(Schema):
@@ -221,11 +242,25 @@ class Mapping(Schema):
     time: Annotated[Time | None, _short("from")] = None  # stamps of all streams; None: a bag's own
     clock: str | None = None  # clock of all streams; None: `robot`, unless a bag's headers differ
     pose: Annotated[PoseSource, _short("in")]  # of the tracked body; a topic alone means its `in`
-    command: dict[str, AValue] = Field(min_length=1)  # by the names of the robot's commands
+    command: dict[str, AValue]  # by the names of the robot's commands
     state: dict[str, AValue] = Field(default_factory=dict)  # measured states, by their names
     wheels: WheelSource | None = None  # wheel speeds, if they were recorded
     imu: ImuSource | None = None  # acceleration and yaw rate, if they were recorded
     odometry: OdometrySource | None = None  # the robot's own body velocity, if it was recorded
+
+    @model_validator(mode="before")
+    @classmethod
+    def _names_commands(cls, given: Any) -> Any:
+        if isinstance(given, dict) and "command" in given and given["command"] in (None, {}):
+            raise ValueError(NO_COMMAND_NAMED)
+        return given
+
+    @model_validator(mode="after")
+    def _of_what_was_sent(self) -> "Mapping":
+        for name, value in self.command.items():
+            if why := why_no_command(str(value.from_)):
+                raise ValueError(f"command.{name}: {why}")
+        return self
 
 
 SI: dict[str, dict[str, tuple[str, ...]]] = {

@@ -18,7 +18,7 @@ from nics_drl_bridge.recording.mapping import Mapping, load_mapping
 from nics_drl_bridge.recording.recording import Recording, check, is_recording, load_recording
 from nics_drl_bridge.recording.table import Source
 from nics_drl_bridge.recording.table_files import Files
-from nics_drl_bridge.recording.topic_roles import TopicRoles
+from nics_drl_bridge.recording.topic_roles import TopicRoles, assign
 from nics_drl_bridge.recording.values import unit_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.robot.spec import RobotSpec, definition, robot_from
@@ -90,6 +90,23 @@ def read_recording(
     begin = f"`nics inspect {path.name} --map my.yaml` begins one"
     fault = f"{path}: is neither {names}"
     raise RecordingError(f"{fault}; say what is what in it with --map; {begin}.")
+
+
+def why_no_mapping(path: Path) -> str:
+    """Says why a recording is read without a mapping; empty if it needs one."""
+    if is_recording(path):
+        return "was written by this package"
+    if _holds(path, FILES):
+        return f"has the files of config/recordings/{FOLDER}.yaml, by which it is read"
+    if not is_bag(path):
+        return ""
+    with opened(path) as bag:
+        try:
+            topics = assign(TopicRoles(), bag.types, bag.empty, bag.place)
+        except RecordingError:
+            return ""
+    used = " and ".join(topics[role] for role in ("cmd_vel", "pose", "odom") if role in topics)
+    return f"has topics of known names and types ({used})"
 
 
 def _by_mapping(

@@ -321,15 +321,16 @@ def shows_axes(pose: Array) -> bool:
     return len(pose) >= MIN_DIRECTIONS and turned >= MIN_TURN
 
 
-def clockwise_line(pose: Array) -> str:
+def clockwise_line(pose: Array, least: float = MIRRORED, better: float = BETTER) -> str:
     """Returns the keys that turn the heading of poses (T, 3), apart on their path, round.
 
-    As in `scale: -1`; empty unless the path leads along the mirrored headings alone.
+    As in `scale: -1`; empty unless the path leads along the mirrored headings alone: to the share
+    `least`, and by so much `better` than along those given.
     """
     if not shows_axes(pose):
         return ""
     mirrored = _course(pose, -1.0)
-    if abs(mirrored) < max(MIRRORED, BETTER + led_along(pose, 1.0)):
+    if abs(mirrored) < max(least, better + led_along(pose, 1.0)):
         return ""
     return "scale: -1" if mirrored.real > 0.0 else f"scale: -1, offset: {np.pi / 2.0:.5g}"
 

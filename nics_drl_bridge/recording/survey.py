@@ -11,33 +11,98 @@ from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.recording import stamping
 from nics_drl_bridge.recording.mapping import UNITS
-from nics_drl_bridge.recording.recording import IRREGULAR, likely_unit
+from nics_drl_bridge.recording.names import quoted, words_of
+from nics_drl_bridge.recording.recording import IRREGULAR, UNITS_OF_STEP, likely_unit
 from nics_drl_bridge.recording.table import Column, Source, Table
 from nics_drl_bridge.recording.values import dates_of
 
 GAP = 5.0  # a gap is longer than this many usual steps
 MOST_COLUMNS = 200  # of a table
+SHORTEST_STEP_S = 1e-4  # stamps that would be closer are not in the unit that their name says
 MOST_BACK = 0.05  # share of steps of a column of stamps that may go back
 TIMES = {"time", "times", "stamp", "timestamp", "t", "s", "sec", "secs", "seconds", "elapsed"}
 TIMES |= {"ms", "us", "ns", "millis", "micros", "nanos", "date", "datetime"}
-SPOKEN = {"deg": "deg", "degrees": "deg", "mm": "mm", "cm": "cm", "rpm": "rpm", "kmh": "km/h"}
-SPOKEN |= {"mps": "m/s", "rad": "rad", "m": "m", "pct": "%", "percent": "%"}
-
-
-def words_of(name: str) -> list[str]:
-    """Splits a name into its words: `vicon x`, `q.x`, `Left_Tick`, `cmdVel`."""
-    parts = re.sub(r"([a-z])([A-Z])", r"\1 \2", name)
-    return [word for word in re.split(r"[^A-Za-z]+", parts.lower()) if word]
+# Units as they end a name (`yaw_deg`, `v_m_s`), the longest first.
+ENDINGS: dict[tuple[str, ...], str] = {
+    ("m", "per", "s"): "m/s",
+    ("rad", "per", "s"): "rad/s",
+    ("deg", "per", "s"): "deg/s",
+    ("m", "s"): "m/s",
+    ("rad", "s"): "rad/s",
+    ("deg", "s"): "deg/s",
+    ("mm", "s"): "mm/s",
+    ("cm", "s"): "cm/s",
+    ("km", "h"): "km/h",
+    ("m",): "m",
+    ("cm",): "cm",
+    ("mm",): "mm",
+    ("meters",): "m",
+    ("metres",): "m",
+    ("rad",): "rad",
+    ("radians",): "rad",
+    ("deg",): "deg",
+    ("degrees",): "deg",
+    ("mps",): "m/s",
+    ("kmh",): "km/h",
+    ("kph",): "km/h",
+    ("mph",): "mph",
+    ("rads",): "rad/s",
+    ("radps",): "rad/s",
+    ("degps",): "deg/s",
+    ("dps",): "deg/s",
+    ("rpm",): "rpm",
+    ("pct",): "%",
+    ("percent",): "%",
+}
+# Units as they stand in brackets, `x(m)` or `omega [rad s^-1]`, beside those of a mapping.
+IN_BRACKETS = {
+    "meter": "m",
+    "meters": "m",
+    "metre": "m",
+    "metres": "m",
+    "radian": "rad",
+    "radians": "rad",
+    "degree": "deg",
+    "degrees": "deg",
+    "°": "deg",
+    "sec": "s",
+    "seconds": "s",
+    "µs": "us",
+    "m/sec": "m/s",
+    "m s^-1": "m/s",
+    "m*s^-1": "m/s",
+    "rad/sec": "rad/s",
+    "rad s^-1": "rad/s",
+    "rad*s^-1": "rad/s",
+    "deg s^-1": "deg/s",
+    "°/s": "deg/s",
+    "kmph": "km/h",
+    "m/s2": "m/s^2",
+    "m/s²": "m/s^2",
+    "m s^-2": "m/s^2",
+    "m*s^-2": "m/s^2",
+    "percent": "%",
+}
+NO_UNIT = ("", "-", "1", "none", "unitless")
 
 
 def unit_in(name: str) -> tuple[list[str], str | None]:
-    """Returns the words of a name, and the unit that it ends with, as `x [mm]`, `yaw_deg`."""
-    if (bracket := re.search(r"[\[(]\s*([^\d\])]+?)\s*[\])]$", name)) and bracket[1] in UNITS:
-        return words_of(name[: bracket.start()]), bracket[1]
-    *words, last = words_of(name) or [""]
+    """Returns the words of a name, and the unit that it ends with: `x(m)`, `x [mm]`, `yaw_deg`."""
+    if bracket := re.search(r"[\[(]\s*([^\[\]()]*?)\s*[\])]\s*$", name):
+        said = bracket[1]
+        unit = said if said in UNITS else IN_BRACKETS.get(said.lower())
+        unitless = said.lower() in NO_UNIT and not said.isdecimal()
+        if unit is not None and said != "1":
+            return words_of(name[: bracket.start()]), unit
+        if unitless:
+            return words_of(name[: bracket.start()]), None
+    words = words_of(name) or [""]
     if "rpm" in words:
-        return [word for word in (*words, last) if word != "rpm"], "rpm"
-    return (words, SPOKEN[last]) if words and last in SPOKEN else ([*words, last], None)
+        return [word for word in words if word != "rpm"], "rpm"
+    for ending, unit in ENDINGS.items():
+        if len(words) > len(ending) and tuple(words[-len(ending) :]) == ending:
+            return words[: -len(ending)], unit
+    return words, None
 
 
 class Survey(NamedTuple):
@@ -60,11 +125,16 @@ class TableSurvey:
     findings: list[str] = field(default_factory=list)
     t: Array | None = None  # (T,) [s]
     data: dict[str, Column] = field(default_factory=dict)
+    kind: str = ""  # message type, of a topic
 
     @property
     def time(self) -> str | None:
         """The stamps for a mapping, as `t`, `[s, ns]` or `{from: t, unit: ms}`."""
-        return f"{{from: {self.stamps}, unit: {self.unit}}}" if self.unit else self.stamps
+        if self.stamps is None:
+            return None
+        columns = [quoted(column) for column in self.stamp_columns]
+        listed = columns[0] if len(columns) == 1 else f"[{', '.join(columns)}]"
+        return f"{{from: {listed}, unit: {self.unit}}}" if self.unit else listed
 
     @property
     def numbers(self) -> list[Survey]:
@@ -74,7 +144,10 @@ class TableSurvey:
     @property
     def stamp_columns(self) -> list[str]:
         """The columns of the stamps."""
-        return (self.stamps or "").strip("[]").split(", ")
+        if self.stamps is None:
+            return []
+        split = re.fullmatch(r"\[(.+), (.+)\]", self.stamps)
+        return [split[1], split[2]] if split else [self.stamps]
 
     @property
     def regularity(self) -> list[str]:
@@ -83,9 +156,7 @@ class TableSurvey:
 
     def reference(self, column: str, alone: bool) -> str:
         """Returns how a mapping refers to a column."""
-        text = column if alone else f"{self.name}:{column}"
-        plain = re.fullmatch(r"[A-Za-z/][\w/. -]*(:[\w. -]+)?|\d+", text)
-        return text if plain else f'"{text}"'
+        return quoted(column if alone else f"{self.name}:{column}")
 
 
 def survey(source: Source) -> list[TableSurvey]:
@@ -119,6 +190,7 @@ def _surveyed(name: str, table: Table) -> TableSurvey:
         columns.append(Survey(which, *_range(column)))
     rows = max((len(column) for column in data.values()), default=0)
     found = TableSurvey(name, rows, columns, findings=list(table.notes), data=data)
+    found.kind = table.kind
     given = table.stamps("")
     if given is not None:
         found.t = given.t
@@ -126,9 +198,19 @@ def _surveyed(name: str, table: Table) -> TableSurvey:
         found.stamps, raw = _time(data)
         if raw is not None:
             raw = raw[np.isfinite(raw)]
-            found.unit = likely_unit(raw)
+            found.unit = likely_unit(raw) or _unit_by_name(found.stamps or "", raw)
             found.t = raw * UNITS[found.unit or "s"].factor
     return found
+
+
+def _unit_by_name(name: str, raw: Array) -> str | None:
+    """Returns the unit below a second that a name says of its stamps, as `time_ms`."""
+    said = unit_in(name)[1] or (words_of(name) or [""])[-1]
+    step = np.diff(raw)
+    usual = float(np.median(step[step > 0.0])) if (step > 0.0).any() else 0.0
+    if said not in UNITS_OF_STEP or usual * UNITS[said].factor < SHORTEST_STEP_S:
+        return None
+    return said
 
 
 def _range(column: Column) -> tuple[float, float]:

@@ -28,6 +28,7 @@ class Table:
     notes: Sequence[str] = ()  # a sentence on each thing that reading mended
     # stamps that come with the rows, and in `values` (T, 1) these rows, if any
     stamps: Callable[[str], Stream | None] = lambda _: None
+    kind: str = ""  # message type, of a topic
 
 
 def table_of(

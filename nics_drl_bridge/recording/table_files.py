@@ -47,8 +47,8 @@ def read_text_table(path: Path) -> Table:
     # The last title that has most names: one of units, below it, repeats some.
     titles = [row for row in above if len(row) > 1 or width == 1]
     head = max(reversed(titles), key=lambda row: len(set(row)), default=None)
-    if head is None and comments and len(last := _split(comments[-1], separator)) == width:
-        head = last
+    if head is None and comments:
+        head = _title_in_comment(comments[-1], separator, width)
     if head is None and width == len(TUM) and (separator is None or path.suffix == TUM_SUFFIX):
         head = list(TUM) if _is_tum(columns) else None
     if head is None and (named := _labelled(columns)):
@@ -93,6 +93,14 @@ def _split(line: str, separator: str | None) -> list[str]:
     if '"' in line:
         fields = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
     return list(map(str.strip, fields))
+
+
+def _title_in_comment(comment: str, separator: str | None, width: int) -> list[str] | None:
+    """Returns the names of the columns if a comment lists them; wide gaps may separate them."""
+    for fields in (_split(comment, separator), re.split(r"\t+|\s{2,}", comment.strip())):
+        if len(fields) == width:
+            return fields
+    return None
 
 
 def _is_value(text: str) -> bool:

@@ -30,9 +30,10 @@ TYPES = {
 }  # fmt: skip
 """Allowed message types of each role."""
 NEVER_GUESSED = {"pose": (ODOMETRY, TRANSFORMS)}  # only if the user assigns the role
+GROUND_TRUTH = r"ground_?truth"
 USUAL = {
     "cmd_vel": (r"/cmd_vel$", r"/cmd_vel_stamped$", r"/(ackermann_cmd|drive)$"),
-    "pose": (r"(vrpn|mocap|optitrack|vicon|qualisys)", r"/pose$"),
+    "pose": (r"(vrpn|mocap|optitrack|vicon|qualisys)", GROUND_TRUTH, r"/pose$"),
     "odom": (r"/odom$", r"/(odom|odometry)[^/]*$", r"odom"),
     "joint_states": (r"/joint_states$", r"/joint_state[^/]*$"),
     "imu": (r"/imu(/data)?$", r"/imu[^/]*$", r"imu"),
@@ -130,9 +131,11 @@ class _Topics:
 
     def _guess(self, role: str) -> str | None:
         """Returns the only topic with the most reliable usual name; None if no name matches."""
-        never = NEVER_GUESSED.get(role, ())
-        full = [topic for topic in self._fitting(role) if self.types[topic] not in never]
+        fitting = self._fitting(role)
         for pattern in USUAL[role]:
+            # A simulator tells the true pose as odometry; other odometry is no pose by itself.
+            never = NEVER_GUESSED.get(role, ()) if pattern != GROUND_TRUTH else (TRANSFORMS,)
+            full = [topic for topic in fitting if self.types[topic] not in never]
             found = [topic for topic in full if re.search(pattern, topic)]
             if len(found) > 1:
                 without = "" if role == "cmd_vel" else f", or {role}={NONE} for none"
@@ -146,7 +149,10 @@ class _Topics:
     def missing(self, roles: Sequence[str], words: str) -> str:
         """Tells that no topic has any of the roles, with the fix."""
         kinds = dict.fromkeys(kind for role in roles for kind in TYPES[role])
-        advice = f"record one of type {', '.join(kinds)}, or say what is what with --map, which "
+        advice = f"record one of type {', '.join(kinds)}"
+        if roles == ("cmd_vel",):
+            advice += " with the pose, since a model learns from what was sent to the robot"
+        advice += ", or, if another topic holds them, name it with --map, which "
         advice += "`nics inspect BAG --map my.yaml` begins"
         fitting = [f"{role}={topic}" for role in roles for topic in self._fitting(role)]
         if fitting:

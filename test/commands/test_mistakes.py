@@ -18,6 +18,7 @@ from nics_drl_bridge.commands import start
 from nics_drl_bridge.config import share_folder
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.recording import save_recording
+from nics_drl_bridge.recording.write import write_drive
 from nics_drl_bridge.robot.spec import load_robot
 
 ROBOT = (share_folder() / "config" / "robots" / "differential.yaml").read_text(encoding="utf-8")
@@ -263,7 +264,16 @@ def test_a_first_mapping_is_written_beside_json_too(folder):
         nics("inspect", "table.csv", "--map", "first.yaml", "--json", cwd=folder).stdout
     )
     assert told["mapping"] == "first.yaml"
-    assert (folder / "first.yaml").read_text(encoding="utf-8").startswith("robot: ")
+    assert "\nrobot: " in (folder / "first.yaml").read_text(encoding="utf-8")
+
+
+def test_a_recording_of_this_package_gets_no_mapping_and_says_so(tmp_path):
+    robot = load_robot("differential")
+    driven = textbook.record(robot, np.random.default_rng(0), 5.0)
+    write_drive(driven, tmp_path / "own.npz", robot)
+    said = nics("inspect", "own.npz", "--map", "my.yaml", cwd=tmp_path).stdout
+    assert said.startswith("own.npz: was written by this package, and needs no mapping: nics gen")
+    assert not (tmp_path / "my.yaml").exists()
 
 
 def test_columns_of_text_are_null_in_json(folder):

@@ -223,7 +223,7 @@ def test_a_wrong_mapping_is_told_with_the_line_to_write(tmp_path, columns, chang
             "did you mean 'mph'?",
         ),
         ("pose: {x: 1, y: 2, heading: 3, covariance: [1, 2]}\ncommand: {v: 1}", "3, 9 or 36"),
-        ("pose: {x: 1, y: 2, heading: 3}\ncommand: {}", "number of entries must be at least 1"),
+        ("pose: {x: 1, y: 2, heading: 3}\ncommand: {}", "command: names none, but a model"),
     ],
 )
 def test_a_mapping_that_is_none_is_refused_with_file_and_key(tmp_path, text, sentence):

@@ -7,8 +7,11 @@ from nics_drl_bridge.config import parse_yaml
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.recording.guess import first_mapping
 from nics_drl_bridge.recording.mapping import Mapping
-from nics_drl_bridge.recording.readers import open_source, read_recording
+from nics_drl_bridge.recording.readers import open_source, read_recording, why_no_mapping
 from nics_drl_bridge.recording.survey import survey, words_of
+from nics_drl_bridge.recording.textbook import record
+from nics_drl_bridge.recording.write import write_drive
+from nics_drl_bridge.robot.spec import load_robot
 
 from .tables import drive, write
 
@@ -161,6 +164,7 @@ def test_units_and_places_are_understood_from_names(tmp_path):
 def test_the_heading_of_a_compass_is_guessed_where_the_path_leads_along_it(tmp_path):
     columns = drive(3000)
     columns["yaw"] = np.degrees(np.pi / 2.0 - columns["yaw"]) % 360.0
+    columns |= {"v_cmd": columns.pop("v"), "w_cmd": columns.pop("w")}
     path = write(tmp_path / "log.csv", columns)
     _, guess = surveyed(path)
     assert guess["pose"]["heading"] == {"from": "yaw", "scale": -1, "offset": 1.5708}
@@ -175,17 +179,16 @@ def test_columns_without_names_are_a_pose_if_they_lead_along_their_heading(tmp_p
     _, guess = surveyed(path)
     assert guess["time"] == 0
     assert guess["pose"] == {"x": 1, "y": 2, "heading": 3}
-    assert guess["command"] == {"command_0": 4, "command_1": 5}
+    assert guess["command"] is None
 
 
 @pytest.mark.parametrize(
     ("names", "kind"),
     [
-        (("fl", "fr", "rl", "rr"), "mecanum"),
+        (("fl_cmd", "fr_cmd", "rl_cmd", "rr_cmd"), "mecanum"),
         (("vx_cmd", "vy_cmd", "wz_cmd"), "omnidirectional"),
         (("left_rpm", "right_rpm"), "differential_wheels"),
         (("cmd_vel.linear.x", "cmd_vel.angular.z"), "differential"),
-        (("pump", "valve"), "free"),
     ],
 )
 def test_the_kind_of_robot_is_guessed_by_its_commands(tmp_path, names, kind):
@@ -318,3 +321,13 @@ def test_rows_that_lack_a_pose_are_listed(tmp_path):
         columns[name][40:52] = np.nan
     (table,), _ = surveyed(write(tmp_path / "log.csv", columns))
     assert "12 of 200 rows have no x, y, yaw" in table.regularity
+
+
+def test_a_recording_that_this_package_wrote_needs_no_mapping(tmp_path):
+    robot = load_robot("differential")
+    driven = record(robot, np.random.default_rng(0), 5.0)
+    write_drive(driven, tmp_path / "drive.npz", robot)
+    write_drive(driven, tmp_path / "bag", robot)
+    assert why_no_mapping(tmp_path / "drive.npz") == "was written by this package"
+    assert "/cmd_vel and /odom" in why_no_mapping(tmp_path / "bag")
+    assert why_no_mapping(write(tmp_path / "log.csv", drive())) == ""

@@ -37,6 +37,8 @@ def test_usual_names_need_no_mapping():
     ("role", "topic", "kind"),
     [
         ("cmd_vel", "/car/cmd_vel", kinds.TWIST_STAMPED),
+        ("pose", "/groundtruth", kinds.POSE),
+        ("pose", "/ground_truth/state", kinds.ODOMETRY),
         ("cmd_vel", "/ackermann_cmd", kinds.ACKERMANN),
         ("cmd_vel", "/drive", kinds.ACKERMANN_STAMPED),
         ("pose", "/vrpn_mocap/car/pose", kinds.POSE),

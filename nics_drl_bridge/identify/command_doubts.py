@@ -1,0 +1,31 @@
+"""Doubts whether what a mapping calls commands was sent to the robot, by what the fit found."""
+
+from collections.abc import Iterator, Sequence
+
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.judgement import usual
+from nics_drl_bridge.robot.taylor import HorizonErrors
+
+HARDLY = 0.8  # share of the errors of a constant twist from which on commands hardly help
+LONGEST_S = 1.0  # latencies that are longer,
+EARLIEST_S = -0.2  # or shorter, are implausible
+
+
+def doubts_of_commands(
+    judgement: Sequence[HorizonErrors], calibration: Calibration
+) -> Iterator[str]:
+    """Yields a sentence if the commands hardly help to predict, or act implausibly late."""
+    for at in usual(tuple(judgement)):
+        error, without = at.model.position_m, at.kept_twist.position_m
+        if HARDLY * without < error < without:
+            ends = f"end {error:.3g} m off after {at.horizon_s:g} s, without them {without:.3g} m"
+            yield (
+                f"The commands hardly help: predictions by them {ends} (by a constant twist); "
+                "check that `command:` names what was sent to the robot."
+            )
+    latency = calibration.command_latency_s
+    if not EARLIEST_S <= latency <= LONGEST_S:
+        yield (
+            f"A latency of {latency:.2f} s between command and motion is implausible; check that "
+            "`command:` names what was sent to the robot, and its `time:`."
+        )

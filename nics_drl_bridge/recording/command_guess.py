@@ -1,0 +1,293 @@
+"""Guesses which columns of a recording were sent to the robot, by names, units and types.
+
+A column is taken for a command only if its name, or the name and type of its topic, says so. What
+only may be one is listed as a candidate. Measurements are neither.
+"""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from nics_drl_bridge.recording import topic_roles
+from nics_drl_bridge.recording.mapped import NEAR_DEG, SHORT_OF_EARTH
+from nics_drl_bridge.recording.mapping import NO_COMMANDS
+from nics_drl_bridge.recording.names import words_of
+from nics_drl_bridge.recording.pose_guess import PoseGuess
+from nics_drl_bridge.recording.survey import Survey, TableSurvey, unit_in
+from nics_drl_bridge.robot.spec import find_kind, kind_names
+from nics_drl_bridge.robot.template import names_of
+
+# Words that say that something was sent to the robot: beyond doubt, and of a goal of a controller.
+COMMANDING = {"cmd", "command", "commanded", "commands", "cmdvel", "ctrl", "control", "controls"}
+WISHING = {"ref", "reference", "setpoint", "target", "desired", "des", "input", "inputs", "set"}
+WISHING |= {"u", "req", "request", "requested", "demand"}
+# Words that say that something was measured or computed from measurements.
+MEASURING = {
+    *("odom", "odometry", "imu", "measured", "measurement", "meas", "encoder", "enc", "feedback"),
+    *("fb", "model", "actual", "act", "state", "states", "real", "true", "truth", "gt", "est"),
+    *("groundtruth", "estimated", "estimate", "sensor", "sensors", "gyro", "gps", "gnss", "fix"),
+    *("ekf", "vicon", "mocap", "vrpn", "optitrack", "pf", "filtered", "predicted", "pred", "joint"),
+    *("core", "telemetry", "status", "current", "voltage", "battery", "temp", "temperature"),
+}
+# Words of columns that no robot is driven by.
+NEVER = {
+    *("header", "stamp", "seq", "index", "id", "row", "frame", "time", "timestamp", "layout"),
+    *("range", "ranges", "scan", "laser", "lidar", "beam", "beams", "intensity", "intensities"),
+    *("depth", "image", "pixel", "sonar", "ultrasonic", "bumper", "cliff"),
+    *("slam", "amcl", "orb", "lio", "loam", "cartographer", "rtabmap", "localization", "map"),
+    *("pose", "position", "orientation", "quaternion", "quat", "pos", "translation", "rotation"),
+    *("yaw", "heading", "roll", "pitch", "easting", "northing", "utm", "goal", "waypoint", "path"),
+    *("acc", "accel", "acceleration", "jerk", "mag", "magnetic", "magnetometer", "gravity"),
+    *("gear", "brake", "error", "err", "std", "stddev", "sigma", "var", "fps", "latency"),
+    *("torque", "force", "status", "axes", "buttons", "level", "line"),
+}
+NEVER_WORDS = NEVER | NO_COMMANDS
+TICKS = {"tick", "ticks", "encoder", "enc", "encoders", "count", "counts"}
+WHEEL_WORDS = TICKS | {"wheel", "wheels", "rpm"}
+NO_SPEED = {"pos", "position", "angle", "current", "force", "torque", "slip", "distance", "dist"}
+NO_SPEED |= {"pressure", "load", "temp", "effort", "travel", "accel", "acc", "steer", "steering"}
+LEFT = {"left", "l", "lw", "wl", "vl", "le"}
+RIGHT = {"right", "r", "rw", "wr", "vr", "ri"}
+FRONT = {"front", "f"}
+REAR = {"rear", "back", "b"}
+CORNERS = {
+    "front_left": {"fl", "lf"},
+    "front_right": {"fr", "rf"},
+    "rear_left": {"rl", "bl", "lr"},
+    "rear_right": {"rr", "br"},
+}
+STEERING = {"steering", "steer", "delta", "servo"}
+THROTTLE = {"throttle", "gas", "accelerator", "pedal", "pwm", "duty"}
+TURNING = {"angular", "ang", "omega", "yawrate", "wz", "w", "turn", "rot", "rotational"}
+SPEED = {"speed", "velocity", "vel", "v", "vx", "linear", "lin", "forward", "trans", "cmdvel"}
+# Kinds of robots by the meaning of their commands, and their names for them; kinds that a file of
+# its own describes have theirs in `words`.
+WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
+KINDS: tuple[tuple[str, dict[str, str]], ...] = (
+    ("mecanum", {wheel: f"{wheel}_wheel" for wheel in WHEELS}),
+    ("omnidirectional", {"speed": "vx", "side": "vy", "turn": "wz"}),
+    ("ackermann_throttle", {"throttle": "throttle", "steering": "steering"}),
+    ("ackermann", {"speed": "speed_command", "steering": "steering_command"}),
+    ("differential", {"speed": "forward_command", "turn": "turn_command"}),
+    ("differential_wheels", {"left": "left_wheel", "right": "right_wheel"}),
+)
+# Types of messages that are commands, those that may be, and those that hold measurements.
+ACKERMANN_KINDS = (topic_roles.ACKERMANN, topic_roles.ACKERMANN_STAMPED)
+TWIST_KINDS = (topic_roles.TWIST, topic_roles.TWIST_STAMPED)
+STANDARD_PACKAGES = re.compile(
+    r"^(nav|sensor|tf2|tf|rosgraph|diagnostic|visualization|action|actionlib|move_base|geometry"
+    r"|rcl_interfaces|dynamic_reconfigure|map|stereo|shape|trajectory|bond|theora_image_transport"
+    r"|gazebo|gps_common|geographic)(_msgs)?/"
+)
+ROUNDABOUT = {"raw", "mux", "nav", "navi", "teleop", "joy", "smoother", "unfiltered", "key"}
+BARE_TWIST = {"cmd", "vel"}
+
+CERTAIN, LIKELY, POSSIBLE = 3, 2, 1
+MOST_CANDIDATES = 8
+
+
+class Candidate(NamedTuple):
+    """A column that was or may have been sent to the robot."""
+
+    table: TableSurvey
+    column: Survey
+    meaning: str | None  # as `speed` or `front_left`; None: its name does not tell
+    strength: int  # CERTAIN, LIKELY or POSSIBLE
+    rank: int = 0  # among those of the same strength
+
+    @property
+    def is_still(self) -> bool:
+        """True if it was zero throughout."""
+        return self.column.low == self.column.high == 0.0
+
+
+class CommandGuess(NamedTuple):
+    """The kind of a robot and its commands, or what they may be."""
+
+    kind: str | None  # None: nothing tells it
+    commands: dict[str, Candidate]  # by the robot's names; empty if none is certain
+    candidates: dict[str, Candidate]  # by the robot's names, for the user to choose from
+    of_wheels: bool = False  # True: no command was recorded, the wheels' own motion stands in
+
+
+def guess_command(tables: Sequence[TableSurvey], pose: PoseGuess | None) -> CommandGuess:
+    """Finds the columns that drive a robot of a known kind; else what may be its commands."""
+    found = [each for table in tables for each in _candidates_of(table, tables, pose)]
+    found = _with_partner(found)
+    certain = [each for each in found if each.strength >= LIKELY]
+    kind, commands = _fitting_kind(certain)
+    if kind is not None:
+        return CommandGuess(kind, commands, {})
+    if not certain:
+        kind, commands = _fitting_kind(list(_wheels_of(tables)))
+        if kind is not None:
+            return CommandGuess(kind, commands, {}, of_wheels=True)
+    kind, candidates = _fitting_kind(found)
+    if kind is None:
+        some = sorted(found, key=lambda each: -each.strength)[:MOST_CANDIDATES]
+        candidates = {f"command_{k}": each for k, each in enumerate(some)}
+    return CommandGuess(kind, {}, candidates)
+
+
+def _candidates_of(
+    table: TableSurvey, tables: Sequence[TableSurvey], pose: PoseGuess | None
+) -> Iterator[Candidate]:
+    """Yields the columns of a table that were or may have been sent to the robot."""
+    if STANDARD_PACKAGES.match(table.kind) and table.kind not in TWIST_KINDS:
+        return
+    of_pose = pose is not None and pose.table is table
+    # The name of a file tells what it holds only beside other files, and if the pose is elsewhere.
+    context = {*words_of(table.name)} if table.kind or (len(tables) > 1 and not of_pose) else set()
+    if context & (NEVER_WORDS | MEASURING) and not context & COMMANDING:
+        return
+    taken = {*pose.columns} if pose is not None and of_pose else set()
+    for column in table.numbers:
+        if column.name in taken or column.name in table.stamp_columns:
+            continue
+        words = {*unit_in(column.name)[0]}
+        if words == {"data"}:
+            words = {*words_of(table.name)}
+        if words & (NEVER_WORDS | MEASURING) or _is_place_on_earth(column):
+            continue
+        meaning = meaning_of(words | (context & {"cmd", "vel"} if table.kind else set()))
+        strength = _strength_of(table, words, context, meaning)
+        known = meaning is not None or strength >= LIKELY
+        if known and not (table.kind in TWIST_KINDS and meaning is None):
+            yield Candidate(table, column, meaning, strength, _rank_of(table, context))
+
+
+def _strength_of(
+    table: TableSurvey, words: set[str], context: set[str], meaning: str | None
+) -> int:
+    if table.kind in ACKERMANN_KINDS:
+        return CERTAIN if meaning is not None else POSSIBLE
+    if (words | context) & COMMANDING:
+        return CERTAIN
+    if words & WISHING and meaning is not None:
+        return LIKELY
+    return LIKELY if meaning == "throttle" else POSSIBLE
+
+
+def _rank_of(table: TableSurvey, context: set[str]) -> int:
+    """Returns how near to the robot a topic is: `cmd_vel` itself before what a mux gets."""
+    if not table.kind:
+        return 0
+    if context & ROUNDABOUT:
+        return -1
+    return int(context <= BARE_TWIST)
+
+
+def meaning_of(words: set[str]) -> str | None:
+    """Returns what a command with these words in its name means; None if they do not tell."""
+    moves = words & {"velocity", "vel", "rate", "speed"}
+    left, right = bool(words & LEFT), bool(words & RIGHT)
+    for corner, short in CORNERS.items():
+        ahead, side = corner.split("_")
+        spoken = words & (FRONT if ahead == "front" else REAR)
+        if words & short or (spoken and (left if side == "left" else right)):
+            return corner
+    if words & STEERING and not (left or right):
+        return None if moves else "steering"
+    if left != right:
+        return "left" if left else "right"
+    if left or words & {"motor", "arm", "gripper", "pan", "tilt", "head", "fan"}:
+        return None
+    if words & THROTTLE:
+        return "throttle"
+    if "traction" in words:
+        return "traction"
+    if words & TURNING or {"yaw", "rate"} <= words or (words & {"theta", "th"} and moves):
+        return None if words & {"x", "y", "linear"} else "turn"
+    if "vy" in words or (words & SPEED and "y" in words):
+        return "side"
+    if words & SPEED and not words & {"z", "vz"}:
+        return "speed"
+    return None
+
+
+def _with_partner(found: Sequence[Candidate]) -> list[Candidate]:
+    """Takes a plain `steering` for a command where a throttle is recorded beside it."""
+    throttle = any(each.meaning == "throttle" and each.strength >= LIKELY for each in found)
+    made = []
+    for each in found:
+        words = unit_in(each.column.name)[0]
+        words = words_of(each.table.name) if words == ["data"] else words
+        if throttle and words in (["steering"], ["steer"]):
+            each = each._replace(strength=max(each.strength, LIKELY))
+        made.append(each)
+    return made
+
+
+def _fitting_kind(found: Sequence[Candidate]) -> tuple[str | None, dict[str, Candidate]]:
+    """Returns the kind of robot that these columns drive best, and its commands by its names."""
+    own = [(name, kind.template.words) for name in kind_names() if (kind := find_kind(name))]
+    best: tuple[tuple[int, int, int], str, dict[str, Candidate]] | None = None
+    for order, (kind, names) in enumerate((*own, *KINDS)):
+        commands = _by_meaning(names, found) if names else {}
+        if not commands:
+            continue
+        still = sum(each.is_still for each in commands.values())
+        if still == len(commands):
+            continue
+        strength = min(each.strength for each in commands.values())
+        if best is None or (-strength, still, order) < best[0]:
+            best = (-strength, still, order), kind, commands
+    return (None, {}) if best is None else best[1:]
+
+
+def _by_meaning(names: Mapping[str, str], found: Sequence[Candidate]) -> dict[str, Candidate]:
+    """Finds a column for each of a kind's commands; none if one is missing or can't be told."""
+    commands: dict[str, Candidate] = {}
+    for meaning, name in names.items():
+        fitting = [each for each in found if each.meaning == meaning]
+        if not fitting:
+            return {}
+        most = max((not each.is_still, each.strength, each.rank) for each in fitting)
+        best = [e for e in fitting if (not e.is_still, e.strength, e.rank) == most]
+        if any(not _same_values(best[0], other) for other in best[1:]):
+            return {}
+        commands[name] = best[0]
+    return commands
+
+
+def _same_values(one: Candidate, other: Candidate) -> bool:
+    values = [each.table.data[each.column.name] for each in (one, other)]
+    return np.array_equal(values[0], values[1])
+
+
+def _wheels_of(tables: Sequence[TableSurvey]) -> Iterator[Candidate]:
+    """Yields the measured ticks or speeds of wheels, which stand in where no command was sent."""
+    for table in tables:
+        if STANDARD_PACKAGES.match(table.kind):
+            continue
+        for column in table.numbers:
+            words, _ = unit_in(column.name)
+            spoken = {*words_of(column.name)}
+            if not spoken & WHEEL_WORDS or spoken & NO_SPEED or column.low == column.high:
+                continue
+            meaning = meaning_of({*words} - TICKS - {"speed", "velocity", "vel"})
+            if meaning in ("left", "right", *WHEELS):
+                yield Candidate(table, column, meaning, LIKELY, int(bool(spoken & TICKS)))
+
+
+def _is_place_on_earth(column: Survey) -> bool:
+    """True for `lat` or `lon` whose values stay within a degree, as those of a drive do."""
+    if not {*words_of(column.name)} & SHORT_OF_EARTH:
+        return False
+    return column.high - column.low < NEAR_DEG <= max(abs(column.low), abs(column.high))
+
+
+def look_alikes(kind: str) -> list[str]:
+    """Returns the other kinds of robots that have the same commands."""
+    found = []
+    own = find_kind(kind)
+    ways = [] if own is None else [{*names_of(way)} for way in own.template.commands]
+    for name in kind_names():
+        other = find_kind(name)
+        if name == kind or other is None:
+            continue
+        if any({*names_of(way)} in ways for way in other.template.commands):
+            found.append(name)
+    return found

@@ -1,0 +1,125 @@
+"""Checks guessed commands against the motion: whether they go with it, and how late it follows."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.recording.command_guess import TICKS, Candidate, CommandGuess
+from nics_drl_bridge.recording.names import words_of
+
+STEP_S = 0.1
+SMOOTHED = 3  # steps over which measured rates are averaged
+LONGEST_LATENCY_S = 3.0  # searched
+EARLIEST_S = -1.0
+IMPLAUSIBLE_LATENCY_S = 1.0
+PRECEDES_S = -0.3  # a motion this early before its command
+LEAST_CORRELATION = 0.3
+CLEAR_CORRELATION = 0.6  # from which on a latency is told
+FEWEST = 100  # steps
+
+
+def doubts_of_commands(guess: CommandGuess, pose: tuple[Array, Array] | None) -> Iterator[str]:
+    """Yields sentences on commands that do not go with the motion, or long before or after it.
+
+    `pose` are its stamps (T,) [s] and poses (T, 3).
+    """
+    if pose is None or guess.of_wheels:
+        return
+    motion = _rates(*pose)
+    if motion is None:
+        return
+    t, speed, turn_rate = motion
+    for name, signal in (("speed", speed), ("turn", turn_rate)):
+        found = {each.meaning: each for each in guess.commands.values()}.get(name)
+        if found is None or signal.std() < 1e-3:
+            continue
+        lags = np.arange(EARLIEST_S, LONGEST_LATENCY_S + STEP_S / 2.0, STEP_S)
+        likeness = _likeness(found, t, signal, lags)
+        if likeness is None:
+            continue
+        best = int(np.argmax(likeness))
+        if likeness[best] < LEAST_CORRELATION:
+            yield f"{_place(found)} hardly goes with the motion; is it what was sent to the robot?"
+        elif likeness[best] > CLEAR_CORRELATION and lags[best] > IMPLAUSIBLE_LATENCY_S:
+            late = f"the motion follows {_place(found)} after {lags[best]:.1f} s"
+            yield f"{late}, which no latency explains; check `time:` and the command"
+        elif likeness[best] > CLEAR_CORRELATION and lags[best] < PRECEDES_S:
+            early = f"the motion precedes {_place(found)} by {-lags[best]:.1f} s"
+            yield f"{early}, as a measurement's would; check `time:` and the command"
+
+
+def reversed_wheels(guess: CommandGuess, pose: tuple[Array, Array] | None) -> list[Candidate]:
+    """Returns the measured wheel, left or right, that counts backwards, as the motion shows.
+
+    Both have to turn the same way when the robot moves, and the right one faster when it turns
+    counter-clockwise.
+    """
+    motion = _rates(*pose) if pose is not None and guess.of_wheels else None
+    sides = {each.meaning: each for each in guess.commands.values()}
+    if motion is None or sides.keys() != {"left", "right"}:
+        return []
+    t, speed, turn_rate = motion
+    left, right = (_wheel_rate(sides[side], t) for side in ("left", "right"))
+    if left is None or right is None:
+        return []
+    likeness = [float(np.corrcoef(rate, speed)[0, 1]) for rate in (left, right)]
+    if likeness[0] * likeness[1] > 0.0 or min(map(abs, likeness)) < LEAST_CORRELATION:
+        return []
+    turned_by_left = float(np.corrcoef(right + left, turn_rate)[0, 1])
+    return [sides["left"] if turned_by_left > 0.0 else sides["right"]]
+
+
+def _wheel_rate(wheel: Candidate, t: Array) -> Array | None:
+    """Returns the rate (K,) of a wheel at times t (K,) [s]; None if it is not known, or still."""
+    values = wheel.table.data[wheel.column.name].astype(np.float64)
+    if wheel.table.t is None or len(wheel.table.t) != len(values):
+        return None
+    at = np.interp(t, wheel.table.t, values)
+    is_counter = bool({*words_of(wheel.column.name)} & TICKS)
+    rate = np.gradient(at, STEP_S) if is_counter else at
+    rate = np.convolve(rate, np.ones(SMOOTHED) / SMOOTHED, "same")
+    return np.asarray(rate) if rate.std() > 1e-9 else None
+
+
+def _place(candidate: Candidate) -> str:
+    return f"{candidate.table.name}:{candidate.column.name}"
+
+
+def _rates(t: Array, pose: Array) -> tuple[Array, Array, Array] | None:
+    """Returns times (K,) [s], speeds (K,) along the heading and turn rates (K,) of a pose."""
+    order = np.argsort(t, kind="stable")
+    t, pose = t[order], pose[order]
+    grid = np.arange(t[0], t[-1], STEP_S)
+    if len(grid) < FEWEST or len(grid) > 10 * len(t) + FEWEST:
+        return None
+    heading = np.unwrap(pose[:, 2])
+    x, y, turned = (np.interp(grid, t, column) for column in (*pose[:, :2].T, heading))
+    mean = np.ones(SMOOTHED) / SMOOTHED
+    dx, dy, turn = (np.convolve(np.diff(each) / STEP_S, mean, "same") for each in (x, y, turned))
+    middle = (turned[1:] + turned[:-1]) / 2.0
+    ahead = dx * np.cos(middle) + dy * np.sin(middle)
+    aside = -dx * np.sin(middle) + dy * np.cos(middle)
+    along = ahead if np.abs(ahead).sum() >= np.abs(aside).sum() else aside  # a turned tracker
+    return grid[:-1] + STEP_S / 2.0, along, turn
+
+
+def _likeness(candidate: Candidate, t: Array, signal: Array, lags: Array) -> Array | None:
+    """Returns the correlation of a signal (K,) at t (K,) with a command, by lags (L,) [s]."""
+    table, column = candidate.table, candidate.column
+    values = table.data[column.name].astype(np.float64)
+    if table.t is None or len(table.t) != len(values) or column.low == column.high:
+        return None
+    order = np.argsort(table.t, kind="stable")
+    stamps, values = table.t[order], np.nan_to_num(values[order])
+    if stamps[0] > t[-1] or stamps[-1] < t[0]:
+        return None  # of another clock
+    likeness = []
+    for lag in lags:
+        row = np.searchsorted(stamps, t - lag, side="right") - 1
+        known = row >= 0
+        command = values[np.clip(row, 0, None)]
+        if known.sum() < FEWEST or command[known].std() < 1e-9 or signal[known].std() < 1e-9:
+            return None
+        likeness.append(abs(float(np.corrcoef(command[known], signal[known])[0, 1])))
+    return np.array(likeness)
