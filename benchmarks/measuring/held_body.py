@@ -306,9 +306,8 @@ def hold_bodies(
                     if gate.stopped in (RULE, ""):
                         tally.delays_s.append(delay)
                         if not delay <= 1.0:
-                            tally.missed.append(
-                                f"{delay:.2f} {ordinary.round(2)} {gate.state.scan_motion.held_since_ns}"
-                            )
+                            held_since_ns = gate.state.scan_motion.held_since_ns
+                            tally.missed.append(f"{delay:.2f} {ordinary.round(2)} {held_since_ns}")
                     else:
                         tally.other_stops[gate.stopped] += 1
                 drive.hold(i, False)

@@ -194,7 +194,7 @@ def _reference(
 
 def _motion(old: ReducedScan, new: ReducedScan, settings: Settings) -> float:
     """Returns the motion that odometry shows between two scans; 1 is the least that is judged."""
-    x, y, turn = between(old.pose, new.pose).tolist()
+    x, y, turn = (float(each) for each in between(old.pose, new.pose))
     path = math.hypot(x, y)
     tiny = 1e-9  # of a control whose least motion is zero
     return max(path / max(settings.least_path, tiny), abs(turn) / max(settings.least_turn, tiny))

@@ -226,6 +226,7 @@ def take_waiting(subscription: Subscription) -> list[bytes]:
             contents.append(taken[0])
     return contents
 
+
 def copied(qos: Any) -> QoSProfile:
     """Returns a profile of its own: rclpy writes overridden policies into the one it is given."""
     return copy.copy(qos) if isinstance(qos, QoSProfile) else QoSProfile(depth=qos)

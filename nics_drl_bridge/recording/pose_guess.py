@@ -213,7 +213,8 @@ def _unnamed_poses(table: TableSurvey) -> Iterator[PoseGuess]:
             continue
         led = max(led_along(pose, 1.0), led_along(pose, np.pi / 180.0))
         if led > ALONG > led_along(pose, 0.0):
-            yield PoseGuess(table, *names[k : k + 3])
+            x, y, heading = names[k : k + 3]
+            yield PoseGuess(table, x, y, heading)
 
 
 def _with_quaternion(

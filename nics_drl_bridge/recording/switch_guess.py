@@ -56,9 +56,9 @@ def _on_value(words: set[str], table: TableSurvey, column: Survey) -> str | None
     if data is None or not len(data):
         return None
     if data.dtype.kind in "US":
-        values = {str(each) for each in np.unique(data)}
-        on = [each for each in values if each.lower() in ON_WORDS]
-        return on[0] if words & MODES and len(values) == 2 and len(on) == 1 else None
+        texts = {str(each) for each in np.unique(data)}
+        on = [each for each in texts if each.lower() in ON_WORDS]
+        return on[0] if words & MODES and len(texts) == 2 and len(on) == 1 else None
     if data.dtype.kind not in "fiub":
         return None
     values = {float(each) for each in np.unique(data[np.isfinite(data.astype(np.float64))])}

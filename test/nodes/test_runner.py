@@ -6,6 +6,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
+from std_msgs.msg import Bool
 
 from nics_drl_bridge.errors import BackendError, ConfigError
 from nics_drl_bridge.generator import open_model
