@@ -1,7 +1,6 @@
 """The black box: the last half minute of the gate, written at each stop, for replay."""
 
 import base64
-import hashlib
 import json
 from collections import deque
 from collections.abc import Iterator
@@ -18,12 +17,12 @@ from nics_drl_bridge.files import sha256, write_parts
 from nics_drl_bridge.gate import inputs, limits, state
 from nics_drl_bridge.gate.gate import decide
 from nics_drl_bridge.gate.inputs import Input
+from nics_drl_bridge.gate.seal import SEAL, sealed
 from nics_drl_bridge.gate.state import Decision, GateConfig, GateState
 
 FORMAT = "nics_drl_bridge/black_box/3"
 KEPT_S = 30.0
 LATEST_S = 1e12
-_SEAL = b'{"sha256": "%b"}\n'
 MOST_BYTES = 64 * 2**20  # greatest size of a file that is replayed
 MOST_VALUES = 1_000_000  # greatest number of values in such a file; 30 s of a gate have 100,000
 MOST_INPUTS = 20_000  # greatest number of inputs that are decided on again; each takes some 30 us
@@ -62,15 +61,22 @@ def write(config: GateConfig, entries: tuple[Entry, ...], path: str | Path) -> N
 
 
 def _lines_of(config: GateConfig, entries: tuple[Entry, ...]) -> Iterator[bytes]:
-    """Yields the lines, the last with a checksum, one by one: memory must not grow at a stop."""
-    head: dict[str, Any] = {"format": FORMAT, "config": config, "state": entries[0].before}
-    records = ({"now": one.now, "given": one.given, "decision": one.decision} for one in entries)
-    digest = hashlib.sha256()
-    for record in chain([head], records):
-        line = json.dumps({key: to_plain(part) for key, part in record.items()}).encode() + b"\n"
-        digest.update(line)
-        yield line
-    yield _SEAL % digest.hexdigest().encode()
+    """Yields the lines one by one: memory must not grow at a stop."""
+    yield from sealed(chain([head_line(config, entries[0].before)], map(entry_line, entries)))
+
+
+def head_line(config: GateConfig, state: GateState) -> bytes:
+    """Returns the first line of a file: the state before the first entry."""
+    return _line({"format": FORMAT, "config": config, "state": state})
+
+
+def entry_line(entry: Entry) -> bytes:
+    """Returns the line of an entry."""
+    return _line({"now": entry.now, "given": entry.given, "decision": entry.decision})
+
+
+def _line(record: dict[str, Any]) -> bytes:
+    return json.dumps({key: to_plain(part) for key, part in record.items()}).encode() + b"\n"
 
 
 class Replay(NamedTuple):
@@ -152,8 +158,8 @@ def _lines(path: str | Path) -> list[dict[str, Any]]:
     if not lines or not isinstance(lines[0], dict) or lines[0].get("format") != FORMAT:
         raise ConfigError(f"{path}: is no black box of the gate ({FORMAT}).")
     content = text.encode()
-    rest = content[: -len(_SEAL % sha256(b"").encode())]
-    if content != rest + _SEAL % sha256(rest).encode():
+    rest = content[: -len(SEAL % sha256(b"").encode())]
+    if content != rest + SEAL % sha256(rest).encode():
         raise ConfigError(f"{path}: is damaged (its checksum does not fit); it can't be replayed.")
     return lines[:-1]
 

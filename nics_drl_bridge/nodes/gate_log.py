@@ -1,36 +1,37 @@
 """Reports of `command_gate`: log lines, counters, and the black box. It never waits for a disk."""
 
 import contextlib
-import gc
+import fcntl
+import json
 import os
-import signal
+import subprocess
 import sys
 import time
-import warnings
 from collections import Counter
-from collections.abc import Callable, Sequence
-from mmap import mmap
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
-from nics_drl_bridge.gate.black_box import BlackBox, Entry, write
+from nics_drl_bridge.gate.black_box import Entry, entry_line, head_line
 from nics_drl_bridge.gate.state import Cause, GateConfig, GateState
+from nics_drl_bridge.nodes import black_box_writer
+from nics_drl_bridge.nodes.black_box_writer import ENTRY, FILES_KEPT, PATIENCE_S, STATE, WRITE
 from nics_drl_bridge.nodes.runner import Condition
 
-FILES_KEPT = 20
 BURST_S = 3.0  # for which commands must pass before a stop is not of the same burst
 LINE_S = 2.0  # time between two log lines of a kind [s]; those in between are counted
 LONGEST_LINE_S = 64.0  # the same for a kind that does not cease: each time it is doubled [s]
 CLOSING_S = 0.7  # longest wait at the end for files that are being written [s]
-MOST_AT_WORK = 3  # greatest number of writers at work; each keeps a copy of this process's memory
-PATIENCE_S = 20.0  # a writer that takes longer gives up [s]
-OVERDUE_S = PATIENCE_S + 5.0  # then a writer never gives up [s]: a lock or the disk blocks it
-GRACE_S, POLL_S = 0.5, 0.005
-NICENESS = 5
-MOST_TOLD = 500
-ENDING = (signal.SIGTERM, signal.SIGALRM)
+GRACE_S = 0.5  # in which the writer may clean up what it gives up [s]
+POLL_S = 0.005
+OVERDUE_S = PATIENCE_S + 5.0  # after which a file that is not answered counts as not written [s]
+RESTART_S = 5.0  # shortest time between two starts of the writer [s]
+STATE_S = 10.0  # time between two states of the gate in the black box [s]
+MOST_ENTRIES = 5_000  # between two states
+MOST_BACKLOG = 4 * 2**20  # bytes that wait for the writer; a minute of driving
+MOST_TOLD = 65_536  # bytes of answers that are read at once
+PIPE_BYTES = 2**20  # most that Linux gives a user's process
 
 
 class GateLog:
@@ -38,7 +39,8 @@ class GateLog:
 
     def __init__(self, config: GateConfig, folder: Path, robot: str, logger: RcutilsLogger) -> None:
         self.counters: Counter[str] = Counter()
-        self._box, self._logger = BlackBox(config), logger
+        self._config = config
+        self._logger = logger
         self._folder, self._hardware = folder, robot
         self._cause: Cause | None = None
         self._now = self._since = float("-inf")
@@ -47,12 +49,15 @@ class GateLog:
         # Of each kind: time of the last line, and least time until the next [s].
         self._said: dict[str, tuple[float, float]] = {}
         self._kept: Counter[str] = Counter()  # events of a kind since then
-        self._owed, self._writer = False, BoxWriter()
+        self._owed = False
+        self._writer = BoxWriter()
+        self._state_s = float("-inf")  # time of the last state that the writer was sent [s]
+        self._entries = 0  # that it was sent since
         self._names: list[str] = []
 
     def note(self, entry: Entry) -> None:
         """Accounts for a decision."""
-        self._box.note(entry)
+        self._record(entry)
         decision, cause = entry.decision, entry.decision.cause
         self._now = entry.now
         if decision.refused:
@@ -72,6 +77,16 @@ class GateLog:
                 self._logger.warning(f"stopped by {cause.line}{more}")
         if self._burst and not rule and entry.now - self._since >= BURST_S:
             self._burst.clear()
+
+    def _record(self, entry: Entry) -> None:
+        """Sends an entry to the writer, and now and then the state from which it follows."""
+        passed = entry.now - self._state_s
+        if self._writer.needs_state or passed >= STATE_S or self._entries >= MOST_ENTRIES:
+            self._writer.state(entry.now, head_line(self._config, entry.before))
+            self._state_s = entry.now
+            self._entries = 0
+        self._writer.entry(entry_line(entry))
+        self._entries += 1
 
     def refuse(self, reason: str) -> None:
         """Counts an unused input, by the part of the reason before the colon, and logs it."""
@@ -114,16 +129,7 @@ class GateLog:
     def _write(self, rule: str) -> None:
         name = f"{time.strftime('%Y%m%d_%H%M%S')}_{self.counters.total():06d}_{rule}.jsonl"
         self._names = [*self._names[1 - FILES_KEPT :], name]
-
-        def work() -> None:
-            write(self._box.config, self._box.copy(), self._folder / name)
-            prune(self._folder, self._names)
-
-        try:
-            if not self._writer.begin(work):
-                self._failed("the files before it are still being written")
-        except OSError as error:
-            self._failed(str(error))
+        self._writer.write(self._folder / name, self._names)
 
     def _failed(self, reason: str) -> None:
         self.counters["not written"] += 1
@@ -144,107 +150,148 @@ class GateLog:
             self._failed(failure)
 
 
-def prune(folder: Path, own: Sequence[str]) -> None:
-    """Removes the oldest files beyond `FILES_KEPT`; `own` names are newer than all others."""
-    place = {name: i for i, name in enumerate(own, 1)}
-    files = sorted(folder.glob("*.jsonl"), key=lambda file: (place.get(file.name, 0), file.name))
-    for old in files[:-FILES_KEPT]:
-        old.unlink(missing_ok=True)
-
-
 class BoxWriter:
-    """Writes files, each in a forked copy of this process: a hanging disk blocks only the copy."""
+    """The writer of the black box, a process of its own (`black_box_writer.py`).
+
+    It is started anew if it has ended or does not read. Nothing here waits for it but `close`.
+    """
 
     def __init__(self) -> None:
-        self._writers: dict[int, tuple[mmap, float]] = {}  # pid: what failed, begin [s]
+        self.needs_state = True  # before the next entry
+        self._backlog = bytearray()  # that the pipe has not taken yet
+        self._orders: dict[str, float] = {}  # times [s] of files that are not answered yet, by path
+        self._answers = b""  # the beginning of a line
         self._failed: list[str] = []
+        self._entrance = self._exit = -1  # our ends of its pipes
+        self._start()
 
-    def begin(self, write: Callable[[], object]) -> bool:
-        """Starts a copy of this process that writes; False if too many are at work; OSError."""
-        self._failed = self.failures()
-        if len(self._writers) >= MOST_AT_WORK:
-            return False
-        told = mmap(-1, MOST_TOLD)  # memory that the copy shares, for what failed
-        # The copy must not run the handlers of the original.
-        signals = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, *ENDING))
-        try:
-            with warnings.catch_warnings():
-                # Of Python 3.12: locks that other threads hold stay locked in the copy. It needs
-                # none of theirs, and a copy that hangs nevertheless gives up.
-                warnings.simplefilter("ignore", DeprecationWarning)
-                pid = os.fork()
-                if pid == 0:
-                    _live(write, told)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, signals)
-        self._writers[pid] = told, time.monotonic()
-        return True
+    def __del__(self) -> None:
+        self._close_pipes()  # it ends when they are closed
+
+    def state(self, now: float, line: bytes) -> None:
+        """Sends the gate's state at a time [s], from which the next entries follow."""
+        self.needs_state = False
+        self._send(STATE, f"{now} ".encode() + line)
+
+    def entry(self, line: bytes) -> None:
+        """Sends an entry."""
+        self._send(ENTRY, line)
+
+    def write(self, path: Path, own: Sequence[str]) -> None:
+        """Lets what was sent last be written; `own` are the names of this gate's files."""
+        self._orders[str(path)] = time.monotonic()
+        order = {"path": str(path), "own": list(own)}
+        self._send(WRITE, json.dumps(order).encode() + b"\n")
 
     def failures(self) -> list[str]:
-        """Returns the failures since the last call; kills the writers that are overdue."""
-        for pid, (told, begun_s) in tuple(self._writers.items()):
-            try:
-                ended, status = os.waitpid(pid, os.WNOHANG)
-            except ChildProcessError:  # if SIGCHLD is ignored, no status is kept
-                ended, status = pid, 0
-            if ended:
-                del self._writers[pid]
-                if status != 0:
-                    text = told[:].rstrip(b"\0").decode(errors="replace")
-                    self._failed.append(text or f"its writer ended with {status}")
-            elif time.monotonic() - begun_s > OVERDUE_S:
-                os.kill(pid, signal.SIGKILL)
-        failed, self._failed = self._failed, []
+        """Returns the failures since the last call; starts a new writer if there is none."""
+        self._flush()
+        self._hear()
+        now = time.monotonic()
+        for path, begun_s in tuple(self._orders.items()):
+            if now - begun_s > OVERDUE_S:
+                self._lose(path, "the disk does not answer")
+        if self._process.poll() is not None and now - self._started_s > RESTART_S:
+            self._restart(f"its writer ended with {self._process.returncode}")
+        failed = self._failed
+        self._failed = []
         return failed
 
     def close(self, seconds: float) -> list[str]:
-        """Waits for the writers, and makes those give up that take longer; returns the failures."""
-        failed = self._wait(seconds)
-        for pid in self._writers:
-            os.kill(pid, signal.SIGTERM)
-        failed += self._wait(GRACE_S)
-        for pid in self._writers:  # blocked by the disk; it ends when that releases it
-            os.kill(pid, signal.SIGKILL)
-            failed.append("the disk does not answer")
+        """Waits for files that are being written, then lets the writer give up; see `failures`."""
+        self._finish(seconds)
+        if self._process.poll() is None:
+            self._process.terminate()
+            self._finish(GRACE_S)
+        reason = f"its writer ended with {self._process.poll()}"
+        if self._process.poll() is None:  # blocked by the disk; it ends when that releases it
+            self._process.kill()
+            reason = "the disk does not answer"
+        self._hear()
+        for path in tuple(self._orders):
+            self._lose(path, reason)
+        self._close_pipes()
+        failed = self._failed
+        self._failed = []
         return failed
 
-    def _wait(self, seconds: float) -> list[str]:
-        failed, deadline = self.failures(), time.monotonic() + seconds
-        while self._writers and time.monotonic() < deadline:
+    def _send(self, kind: bytes, line: bytes) -> None:
+        self._backlog += kind + line
+        self._flush()
+        if len(self._backlog) > MOST_BACKLOG:
+            self._process.kill()
+            self._restart("its writer did not read")
+
+    def _flush(self) -> None:
+        with contextlib.suppress(OSError):  # it is full, or the writer has ended
+            while self._backlog:
+                sent = os.write(self._entrance, self._backlog)
+                del self._backlog[:sent]
+
+    def _hear(self) -> None:
+        with contextlib.suppress(OSError):  # there is nothing more
+            while part := os.read(self._exit, MOST_TOLD):
+                self._answers += part
+        *lines, self._answers = self._answers.split(b"\n")
+        for line in lines:
+            answer = json.loads(line)
+            if answer["failed"]:
+                self._lose(answer["path"], answer["failed"])
+            self._orders.pop(answer["path"], None)
+
+    def _lose(self, path: str, reason: str) -> None:
+        if self._orders.pop(path, None) is not None:
+            self._failed.append(reason)
+
+    def _restart(self, reason: str) -> None:
+        self._hear()
+        lost = tuple(self._orders)
+        for path in lost:
+            self._lose(path, reason)
+        if not lost:
+            self._failed.append(reason)
+        try:
+            self._start()
+        except OSError as error:
+            self._failed.append(f"its writer can't be started ({error.strerror})")
+
+    def _start(self) -> None:
+        """Starts the writer; it is executed, not forked, as DDS has threads in this process."""
+        self._close_pipes()
+        self._backlog = bytearray()
+        self._answers = b""
+        self.needs_state = True
+        self._started_s = time.monotonic()
+        source, self._entrance = os.pipe()
+        self._exit, target = os.pipe()
+        os.set_blocking(self._entrance, False)
+        os.set_blocking(self._exit, False)
+        with contextlib.suppress(AttributeError, OSError):  # the usual size will do
+            fcntl.fcntl(self._entrance, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", black_box_writer.__name__],
+                stdin=source,
+                stdout=target,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,  # Ctrl-C reaches all of a session; the gate decides
+            )
+        finally:
+            os.close(source)
+            os.close(target)
+
+    def _close_pipes(self) -> None:
+        for descriptor in (self._entrance, self._exit):
+            if descriptor >= 0:
+                os.close(descriptor)
+        self._entrance = -1
+        self._exit = -1
+
+    def _finish(self, seconds: float) -> None:
+        deadline = time.monotonic() + seconds
+        while self._process.poll() is None and time.monotonic() < deadline:
+            self._flush()
+            if not self._backlog and self._entrance >= 0:
+                os.close(self._entrance)  # it ends once it has read all
+                self._entrance = -1
             time.sleep(POLL_S)
-            failed += self.failures()
-        return failed
-
-
-def _live(write: Callable[[], object], told: mmap) -> NoReturn:
-    code = 1
-    try:
-        gc.disable()  # which would touch, and so copy, all memory
-        _let_go()
-        write()
-        code = 0
-    finally:  # on any exception, also from a signal
-        error = sys.exc_info()[1]
-        if error is not None:
-            told.write((str(error) or type(error).__name__).encode()[:MOST_TOLD])
-        os._exit(code)
-
-
-def _let_go() -> None:
-    for name in os.listdir("/proc/self/fd"):
-        with contextlib.suppress(OSError):
-            os.close(int(name))
-    for _ in range(3):
-        os.open(os.devnull, os.O_RDWR)
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-        os.nice(NICENESS)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the original decides
-    for number in ENDING:
-        signal.signal(number, _give_up)
-    signal.setitimer(signal.ITIMER_REAL, PATIENCE_S)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGINT, *ENDING))
-
-
-def _give_up(*_: object) -> NoReturn:
-    raise TimeoutError("it took too long")

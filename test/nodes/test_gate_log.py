@@ -1,11 +1,13 @@
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import signal
+import threading
 import time
 import tracemalloc
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,17 +17,17 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 from gate.rig import Rig, config
 
 from nics_drl_bridge.files import write_parts
-from nics_drl_bridge.gate.black_box import Entry, replay, write
+from nics_drl_bridge.gate.black_box import MOST_INPUTS, Entry, replay, write
 from nics_drl_bridge.nodes import gate_log
-from nics_drl_bridge.nodes.gate_log import (
-    BURST_S,
+from nics_drl_bridge.nodes.black_box_writer import (
     FILES_KEPT,
-    LINE_S,
     MOST_AT_WORK,
-    BoxWriter,
-    GateLog,
+    MOST_LINES,
+    Disk,
+    Ring,
     prune,
 )
+from nics_drl_bridge.nodes.gate_log import BURST_S, LINE_S, BoxWriter, GateLog
 
 DEADLINE_S = 20.0
 LONG_S = 60.0
@@ -98,13 +100,17 @@ def written(log, folder, count):
     deadline = time.monotonic() + DEADLINE_S
     while len(files(folder)) < count:
         assert time.monotonic() < deadline, f"{len(files(folder))} of {count} files came"
+        log._writer._flush()  # as the gate does at its next tick
         time.sleep(0.01)
     return files(folder)
 
 
-def hang(*_):
-    """A disk that does not answer."""
-    time.sleep(LONG_S)
+def until(condition):
+    """Waits until a condition holds."""
+    deadline = time.monotonic() + DEADLINE_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
 
 
 @pytest.mark.slow
@@ -203,31 +209,63 @@ def test_what_is_the_case_is_said_in_the_end_though_it_was_kept_back_at_first(lo
 
 
 @pytest.mark.slow
-def test_a_disk_that_hangs_delays_neither_a_decision_nor_the_end(log, logger, monkeypatch):
-    monkeypatch.setattr(gate_log, "write", hang)
+def test_a_writer_that_is_frozen_delays_neither_a_decision_nor_the_end(log, logger):
+    os.kill(log._writer._process.pid, signal.SIGSTOP)
     rig = Recorded(log).drive()
     began = time.monotonic()
-    for _ in range(6):
+    for _ in range(3):
         rig.stop_by_nonsense()
         rig.go_on(BURST_S + 1.0)
     log.close()
     assert time.monotonic() - began < LONG_S / 3
-    assert log.counters["not written"] == 6
-    assert "the black box could not be written: it took too long" in logger.errors
+    assert log.counters["not written"] == 3
+    assert "the black box could not be written: the disk does not answer" in logger.errors
 
 
-def test_a_disk_that_is_full_is_told_of_in_the_log_and_the_diagnostics(log, logger, monkeypatch):
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(gate_log, "write", full)
+def test_a_file_that_can_not_be_written_is_told_of_in_the_log_and_the_diagnostics(tmp_path, logger):
+    (tmp_path / "file").touch()
+    log = GateLog(config(), tmp_path / "file", "car", logger)
     rig = Recorded(log).drive()
     rig.stop_by_nonsense()
-    deadline = time.monotonic() + DEADLINE_S
-    while log.finding(rig.state).facts.get("not written") != 1:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    assert "No space left on device" in logger.errors[0]
+    until(lambda: log.finding(rig.state).facts.get("not written") == 1)
+    assert "exists" in logger.errors[0]
+    log.close()
+
+
+def test_a_writer_that_was_killed_is_told_of_and_the_next_stop_is_written(
+    tmp_path, log, logger, monkeypatch
+):
+    monkeypatch.setattr(gate_log, "RESTART_S", 0.0)
+    rig = Recorded(log).drive()
+    killed = log._writer._process
+    killed.kill()
+    until(lambda: log.finding(rig.state) and logger.errors)
+    assert logger.errors == ["the black box could not be written: its writer ended with -9"]
+    rig.run(1.0)
+    rig.stop_by_nonsense()
+    (file,) = written(log, tmp_path, 1)
+    assert replay(file).differing == ()
+    assert killed.poll() == -signal.SIGKILL
+
+
+def test_a_writer_that_does_not_read_is_replaced(tmp_path, log, logger, monkeypatch):
+    monkeypatch.setattr(gate_log, "MOST_BACKLOG", 10_000)
+    os.kill(log._writer._process.pid, signal.SIGSTOP)
+    rig = Recorded(log).drive()
+    while not log._writer.failures():
+        rig.run(1.0)
+    rig.stop_by_nonsense()
+    (file,) = written(log, tmp_path, 1)
+    assert replay(file).differing == ()
+
+
+def test_a_file_that_was_asked_for_is_written_though_the_gate_is_killed(tmp_path, log):
+    rig = Recorded(log).drive()
+    rig.stop_by_nonsense()
+    log._writer._close_pipes()  # as the system does
+    (file,) = written(log, tmp_path, 1)
+    assert replay(file).differing == ()
+    assert log._writer._process.wait(DEADLINE_S) == 0
 
 
 def test_the_oldest_files_go_first(tmp_path):
@@ -260,151 +298,97 @@ def test_writing_a_stop_needs_little_more_memory_than_one_of_its_lines(tmp_path,
     assert most < 0.2 * path.stat().st_size, (most, path.stat().st_size)
 
 
-@pytest.fixture
-def writer():
-    made = BoxWriter()
-    yield made
-    made.close(0.0)
-
-
-def hung():
-    """A disk that does not answer."""
-    time.sleep(LONG_S)
-
-
-def appears(path):
-    deadline = time.monotonic() + DEADLINE_S
-    while not path.exists():
-        assert time.monotonic() < deadline, f"{path} never came"
-        time.sleep(0.01)
-
-
-def test_it_writes_what_there_was_at_the_moment_it_was_asked(tmp_path, writer):
-    known = ["then"]
-    assert writer.begin(lambda: (tmp_path / "file").write_text(known[0]))
-    known[0] = "later"
-    assert writer.close(DEADLINE_S) == []
-    assert (tmp_path / "file").read_text() == "then"
-
-
-@pytest.fixture
-def patient(monkeypatch):
-    """This machine may be busy: a writer that is to give up has all the time to clean up."""
-    monkeypatch.setattr(gate_log, "GRACE_S", DEADLINE_S)
-
-
-@pytest.mark.usefixtures("patient")
-def test_a_disk_that_hangs_holds_up_neither_the_start_nor_the_end(writer):
-    began = time.monotonic()
-    assert writer.begin(hung)
-    assert writer.failures() == []
-    assert writer.close(0.1) == ["it took too long"]
-    assert time.monotonic() - began < LONG_S / 4
-
-
-@pytest.mark.slow
-def test_one_that_does_not_even_hear_that_it_is_to_give_up_is_left_behind(writer):
-    def deaf():
-        signal.pthread_sigmask(signal.SIG_BLOCK, gate_log.ENDING)
-        hung()
-
-    began = time.monotonic()
-    writer.begin(deaf)
-    assert writer.close(0.1) == ["the disk does not answer"]
-    assert time.monotonic() - began < LONG_S / 4
-
-
-@pytest.mark.usefixtures("patient")
-def test_a_file_that_is_given_up_leaves_nothing_behind(tmp_path, writer):
-    def parts():
-        yield b"the beginning"
-        (tmp_path / "begun").touch()
-        hung()
-
-    writer.begin(lambda: write_parts(tmp_path / "file", parts()))
-    appears(tmp_path / "begun")
-    assert writer.close(0.0) == ["it took too long"]
-    assert os.listdir(tmp_path) == ["begun"]
-
-
-def test_one_that_takes_too_long_gives_up_by_itself(writer, monkeypatch):
-    monkeypatch.setattr(gate_log, "PATIENCE_S", 0.05)
-    writer.begin(hung)
-    assert writer.close(DEADLINE_S) == ["it took too long"]
-
-
-def test_there_are_never_more_at_work_than_a_few(writer):
-    begun = [writer.begin(hung) for _ in range(MOST_AT_WORK + 2)]
-    assert begun == [True] * MOST_AT_WORK + [False] * 2
-    assert len(writer.close(0.0)) == MOST_AT_WORK
-    assert writer.begin(lambda: None)
-
-
-def test_those_that_have_ended_make_room_before_anybody_asks_what_failed(tmp_path, writer):
-    for number in range(2 * MOST_AT_WORK):
-        assert writer.begin(lambda name=str(number): (tmp_path / name / "file").write_text(""))
-        with contextlib.suppress(ChildProcessError):
-            os.waitid(os.P_PID, list(writer._writers)[-1], os.WEXITED | os.WNOWAIT)
-    assert len(writer.close(DEADLINE_S)) == 2 * MOST_AT_WORK
-
-
-def test_one_that_does_not_even_give_up_is_ended_for_the_next_to_have_room(writer, monkeypatch):
-    def deaf():
-        signal.pthread_sigmask(signal.SIG_BLOCK, gate_log.ENDING)
-        hung()
-
-    for _ in range(MOST_AT_WORK):
-        writer.begin(deaf)
-    assert not writer.begin(deaf)
-    monkeypatch.setattr(gate_log, "OVERDUE_S", 0.0)
-    deadline = time.monotonic() + DEADLINE_S
-    while not writer.begin(lambda: None):
-        assert time.monotonic() < deadline, "they stay for ever"
-        time.sleep(0.01)
-
-
-def test_an_error_is_told_by_its_sentence(tmp_path, writer):
-    writer.begin(lambda: (tmp_path / "missing" / "file").write_text(""))
-    (failure,) = writer.close(DEADLINE_S)
-    assert "No such file or directory" in failure
-
-
-def test_a_system_that_has_no_room_for_a_copy_leaves_no_file_open(writer, monkeypatch):
-    def full():
-        raise BlockingIOError(11, "Resource temporarily unavailable")
-
-    monkeypatch.setattr(os, "fork", full)
-    before = os.listdir("/proc/self/fd")
-    with pytest.raises(BlockingIOError):
-        writer.begin(lambda: None)
-    assert os.listdir("/proc/self/fd") == before
-    assert writer.failures() == []
-
-
-def test_the_copy_lets_go_of_all_files_and_ignores_ctrl_c(tmp_path, writer):
+def test_the_writer_has_no_file_of_the_gate_open_and_ordinary_priority(log, tmp_path):
     with (tmp_path / "socket").open("w"):
-
-        def look():
-            os.kill(os.getpid(), signal.SIGINT)
-            held = {os.readlink(f"/proc/self/fd/{name}") for name in os.listdir("/proc/self/fd")
-                    if os.path.exists(f"/proc/self/fd/{name}")}  # fmt: skip
-            (tmp_path / "held").write_text("\n".join(sorted(held)))
-
-        writer.begin(look)
+        writer = BoxWriter()
+        pid = writer._process.pid
+        held = [os.readlink(path) for path in Path(f"/proc/{pid}/fd").iterdir()]
+        assert not any("socket" in name for name in held)
+        assert os.sched_getscheduler(pid) == os.SCHED_OTHER
         assert writer.close(DEADLINE_S) == []
-    held = (tmp_path / "held").read_text().splitlines()
-    assert [name for name in held if "pipe" not in name and "fd" not in name] == [os.devnull]
 
 
-def test_the_copy_has_no_real_time_priority(tmp_path, writer):
-    before = os.sched_getscheduler(0)
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
-    except OSError as error:
-        pytest.skip(f"no real-time priority here: {error}")
-    try:
-        writer.begin(lambda: (tmp_path / "kind").write_text(str(os.sched_getscheduler(0))))
-    finally:
-        os.sched_setscheduler(0, before, os.sched_param(0))
-    assert writer.close(DEADLINE_S) == []
-    assert (tmp_path / "kind").read_text() == str(os.SCHED_OTHER)
+class Answers:
+    """Keeps what failed, by path."""
+
+    def __init__(self):
+        self.failed = {}
+
+    def __call__(self, path, failed):
+        self.failed[path] = failed
+
+
+@pytest.fixture
+def answers():
+    return Answers()
+
+
+@pytest.fixture
+def hung():
+    """A disk that does not answer until the event is set, `hung.write`."""
+    released = threading.Event()
+
+    def write(path, parts):
+        released.wait(LONG_S)
+        write_parts(path, parts)
+
+    yield SimpleNamespace(write=write, release=released.set)
+    released.set()
+
+
+def test_there_are_never_more_files_at_work_than_a_few(tmp_path, answers, hung):
+    disk = Disk(answers, hung.write)
+    for number in range(MOST_AT_WORK + 2):
+        disk.write(str(tmp_path / f"{number}.jsonl"), [], [b"line\n"])
+    assert [*answers.failed.values()] == ["the files before it are still being written"] * 2
+    hung.release()
+    assert disk.finish(DEADLINE_S)
+    assert len(files(tmp_path)) == MOST_AT_WORK
+
+
+def test_a_disk_that_hangs_for_ever_is_left_behind(tmp_path, answers, hung):
+    disk = Disk(answers, hung.write)
+    disk.write(str(tmp_path / "file.jsonl"), [], [b"line\n"])
+    assert not disk.finish(0.1)
+
+
+def test_a_file_that_is_given_up_leaves_nothing_behind(tmp_path, answers):
+    disk = Disk(answers)
+    disk.give_up()
+    disk.write(str(tmp_path / "file.jsonl"), [], [b"line\n"])
+    assert disk.finish(DEADLINE_S)
+    assert [*answers.failed.values()] == ["it took too long"]
+    assert os.listdir(tmp_path) == []
+
+
+def test_an_error_is_told_by_its_sentence_and_the_next_file_is_written(tmp_path, answers):
+    (tmp_path / "file").touch()
+    disk = Disk(answers)
+    bad, good = str(tmp_path / "file" / "1.jsonl"), str(tmp_path / "2.jsonl")
+    disk.write(bad, [], [b"line\n"])
+    disk.write(good, [], [b"line\n"])
+    assert disk.finish(DEADLINE_S)
+    assert "exists" in answers.failed[bad]
+    assert answers.failed[good] == ""
+
+
+def test_what_is_kept_begins_with_a_state_and_reaches_back_far_enough():
+    ring = Ring(kept_s=30.0)
+    for second in range(100):
+        if second % 10 == 0:
+            ring.begin(float(second), b"state %d" % second)
+        ring.add(b"entry %d" % second)
+        kept = ring.lines()
+        begin = int(kept[0].removeprefix(b"state "))
+        assert kept[1:] == [b"entry %d" % k for k in range(begin, second + 1)]
+        assert min(second, 30) <= second - begin <= 40
+
+
+def test_what_is_kept_can_always_be_replayed_though_much_comes():
+    ring = Ring(most_lines=100)
+    for second in range(20):
+        ring.begin(float(second), b"state")
+        for _ in range(30):
+            ring.add(b"entry")
+    assert 70 <= len(ring.lines()) <= 100
+    assert MOST_LINES < MOST_INPUTS

@@ -1,0 +1,185 @@
+"""Program that keeps what the gate has seen lately, and writes it to a file at each stop.
+
+The gate starts it at its own start and feeds it by a pipe, so a stop costs the gate nothing, a disk
+that hangs blocks only this process, and a file is completed even if the gate is killed.
+
+Messages on standard input are lines: `STATE` and `ENTRY` are followed by a line of the black box,
+`WRITE` by JSON with the path and the names of the gate's files. An answer on standard output is
+JSON with the path and what failed, empty if nothing did.
+"""
+
+import contextlib
+import json
+import os
+import signal
+import sys
+import threading
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from queue import SimpleQueue
+
+from nics_drl_bridge.files import write_parts
+from nics_drl_bridge.gate.seal import sealed
+
+STATE, ENTRY, WRITE = b"S", b"E", b"W"
+KEPT_S = 30.0  # what is kept reaches back at least as far
+MOST_LINES = 18_000  # fewer than a replay takes
+MOST_BYTES = 48 * 2**20
+MOST_AT_WORK = 3  # files that may wait for the disk
+PATIENCE_S = 20.0  # for which a file may take once the gate has ended
+FILES_KEPT = 20
+NICENESS = 5
+CHUNK_BYTES = 2**20
+
+
+@dataclass
+class Segment:
+    """A state of the gate, and the entries that follow it."""
+
+    begin_s: float  # time of the state
+    lines: list[bytes] = field(default_factory=list)
+    size: int = 0  # of the lines [bytes]
+
+    def add(self, line: bytes) -> None:
+        """Adds a line."""
+        self.lines.append(line)
+        self.size += len(line)
+
+
+class Ring:
+    """The latest lines of the black box, which begin with a state of the gate."""
+
+    def __init__(self, kept_s: float = KEPT_S, most_lines: int = MOST_LINES) -> None:
+        self._kept_s = kept_s
+        self._most_lines = most_lines
+        self._segments: deque[Segment] = deque()
+
+    def begin(self, now: float, state: bytes) -> None:
+        """Begins a segment with a state at a time [s], and drops segments that are too old."""
+        self._segments.append(Segment(now))
+        self._segments[-1].add(state)
+        while len(self._segments) > 1 and self._segments[1].begin_s <= now - self._kept_s:
+            self._segments.popleft()
+
+    def add(self, entry: bytes) -> None:
+        """Adds an entry to the newest segment, and drops old ones if there is too much."""
+        self._segments[-1].add(entry)
+        while len(self._segments) > 1 and self._is_full():
+            self._segments.popleft()
+
+    def _is_full(self) -> bool:
+        lines = sum(len(each.lines) for each in self._segments)
+        size = sum(each.size for each in self._segments)
+        return lines > self._most_lines or size > MOST_BYTES
+
+    def lines(self) -> list[bytes]:
+        """Returns what a file holds now: the oldest state, and all entries since."""
+        kept = [line for each in self._segments for line in each.lines[1:]]
+        return [self._segments[0].lines[0], *kept] if self._segments else []
+
+
+class Disk:
+    """Writes files one after the other, in a thread, which alone waits for the disk."""
+
+    def __init__(
+        self, answer: Callable[[str, str], None], write: Callable[..., None] = write_parts
+    ) -> None:
+        self._answer = answer
+        self._write = write
+        self._orders: SimpleQueue[tuple[str, Sequence[str], list[bytes]] | None] = SimpleQueue()
+        self._room = threading.Semaphore(MOST_AT_WORK)  # for files that are not written yet
+        self._given_up = threading.Event()
+        self._thread = threading.Thread(target=self._work, daemon=True)
+        self._thread.start()
+
+    def write(self, path: str, own: Sequence[str], lines: list[bytes]) -> None:
+        """Lets a file be written; `own` are the names of this gate's files, oldest first."""
+        if not self._room.acquire(blocking=False):
+            self._answer(path, "the files before it are still being written")
+            return
+        self._orders.put((path, own, lines))
+
+    def give_up(self) -> None:
+        """Stops what is being written, and leaves nothing of it behind."""
+        self._given_up.set()
+
+    def finish(self, seconds: float) -> bool:
+        """Waits until all is written, or gives up after some time; False if the disk hangs."""
+        self._orders.put(None)
+        self._thread.join(seconds)
+        if self._thread.is_alive():
+            self.give_up()
+            self._thread.join(1.0)
+        return not self._thread.is_alive()
+
+    def _work(self) -> None:
+        while (order := self._orders.get()) is not None:
+            path, own, lines = order
+            failed = ""
+            try:
+                self._write(path, self._parts(lines))
+                prune(Path(path).parent, own)
+            except OSError as error:
+                failed = str(error)
+            self._room.release()
+            self._answer(path, failed)
+
+    def _parts(self, lines: list[bytes]) -> Iterator[bytes]:
+        for line in sealed(lines):
+            if self._given_up.is_set():
+                raise TimeoutError("it took too long")
+            yield line
+
+
+def prune(folder: Path, own: Sequence[str]) -> None:
+    """Removes the oldest files beyond `FILES_KEPT`; `own` names are newer than all others."""
+    place = {name: i for i, name in enumerate(own, 1)}
+    files = sorted(folder.glob("*.jsonl"), key=lambda file: (place.get(file.name, 0), file.name))
+    for old in files[:-FILES_KEPT]:
+        old.unlink(missing_ok=True)
+
+
+def read_messages(descriptor: int) -> Iterator[tuple[bytes, bytes]]:
+    """Yields the kind and the content of each message, until the gate has ended."""
+    rest = b""
+    while chunk := os.read(descriptor, CHUNK_BYTES):
+        *lines, rest = (rest + chunk).split(b"\n")
+        for line in lines:
+            yield line[:1], line[1:] + b"\n"
+
+
+def answer(path: str, failed: str) -> None:
+    """Tells the gate that a file is written, or why not."""
+    with contextlib.suppress(OSError):  # the gate has ended
+        os.write(1, json.dumps({"path": path, "failed": failed}).encode() + b"\n")
+
+
+def serve(messages: Iterator[tuple[bytes, bytes]], disk: Disk) -> None:
+    """Keeps what the gate sends, and writes it whenever the gate says so."""
+    ring = Ring()
+    for kind, content in messages:
+        if kind == STATE:
+            time_s, _, state = content.partition(b" ")
+            ring.begin(float(time_s), state)
+        elif kind == ENTRY:
+            ring.add(content)
+        else:
+            order = json.loads(content)
+            disk.write(order["path"], order["own"], ring.lines())
+
+
+def main() -> None:
+    """Serves the gate until it ends; SIGTERM lets it give up the files that are not written yet."""
+    with contextlib.suppress(OSError):  # the gate's real-time priority is not for its files
+        os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        os.nice(NICENESS)
+    disk = Disk(answer)
+    signal.signal(signal.SIGTERM, lambda *_: disk.give_up())
+    serve(read_messages(0), disk)
+    os._exit(0 if disk.finish(PATIENCE_S) else 1)  # also while the disk hangs
+
+
+if __name__ == "__main__":
+    sys.exit(main())
