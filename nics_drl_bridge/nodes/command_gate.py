@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import Twist, TwistStamped
 from nav_msgs.msg import Odometry
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.context import Context
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Bool
 
@@ -35,6 +37,7 @@ from nics_drl_bridge.nodes.gate_log import GateLog
 from nics_drl_bridge.nodes.sources import Sources
 from nics_drl_bridge.recording.messages import is_rotation
 
+SIM_TIME = "use_sim_time"
 TWIST, TWIST_STAMPED = "Twist", "TwistStamped"
 FOREIGN_SETTINGS = {
     command_types.TWIST: f"{parameters.FOREIGN.name}:={TWIST}",
@@ -58,12 +61,23 @@ def declare_gate(node: Node, model: SimulatorModel) -> GateConfig:
     limits = load_limits(file, model.robot) if file else None
     config = gate_config(
         model, limits, _declare_shield(node, model, limits, file),
-        simulated=bool(node.get_parameter("use_sim_time").value), **_declare_rules(node, model),
+        simulated=bool(node.get_parameter(SIM_TIME).value), **_declare_rules(node, model),
     )  # fmt: skip
+    node.add_on_set_parameters_callback(partial(_keep_clock, config.simulated))
     require_possible(config)
     if doubt := doubtful(config, model.control_period):
         node.get_logger().warning(doubt)
     return config
+
+
+def _keep_clock(simulated: bool, parameters: list[Parameter]) -> SetParametersResult:
+    """Refuses another clock: the rules were derived for the one that the gate was started with."""
+    for parameter in parameters:
+        if parameter.name == SIM_TIME and parameter.value != simulated:
+            fix = f"start it anew with `-p {SIM_TIME}:={str(not simulated).lower()}`."
+            reason = f"parameter {SIM_TIME!r} can't be changed while the gate runs; {fix}"
+            return SetParametersResult(successful=False, reason=reason)
+    return SetParametersResult(successful=True)
 
 
 def _declare_rules(node: Node, model: SimulatorModel) -> dict[str, Any]:

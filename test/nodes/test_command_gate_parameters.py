@@ -9,6 +9,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
 from dataclasses import replace
 
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 from nics_drl_bridge.config import dump_yaml, find_config
 from nics_drl_bridge.errors import ConfigError
@@ -96,3 +97,23 @@ def test_each_namespace_has_a_black_box_of_its_own(domain_id, tmp_path):
 
     assert folder() == tmp_path
     assert folder("-r", "__ns:=/hall/robot_1") == tmp_path / "hall" / "robot_1"
+
+
+@pytest.mark.parametrize("simulated", [False, True])
+def test_the_clock_of_a_gate_that_runs_can_not_be_changed(domain_id, simulated):
+    context = open_context(
+        ["node", "--ros-args", "-p", f"use_sim_time:={str(simulated).lower()}"], domain_id
+    )
+    node = Node("command_gate", context=context)
+    try:
+        declare_gate(node, declare_model(node))
+        (same,) = node.set_parameters([Parameter("use_sim_time", value=simulated)])
+        (other,) = node.set_parameters([Parameter("use_sim_time", value=not simulated)])
+        assert same.successful
+        assert not other.successful
+        assert "parameter 'use_sim_time' can't be changed while the gate runs" in other.reason
+        assert node.get_parameter("use_sim_time").value is simulated
+        assert node.get_clock().ros_time_is_active is simulated
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
