@@ -12,12 +12,17 @@ import io
 import os
 import subprocess
 import sys
+import time
+from collections.abc import Sequence
 from pathlib import Path
 
 PROGRAM = Path(__file__).with_name("output_forwarder.py")
 STDOUT, STDERR = 1, 2
 PIPE_BYTES = 2**20  # most that Linux gives a user's process
 COLOUR = "RCUTILS_COLORIZED_OUTPUT"  # of ROS 2: whether log lines are coloured, "0" or "1"
+
+DISABLE_FILES = ["--ros-args", "--disable-external-lib-logs"]
+FILE_CHOICES = ("--disable-external-lib-logs", "--enable-external-lib-logs", "--log-file-name")
 
 _forwarder: subprocess.Popen[bytes] | None = None
 
@@ -41,8 +46,31 @@ class _DroppingFile(io.RawIOBase):
         return len(data)
 
 
-def forward_output() -> None:
-    """Lets a process of its own write the output of this one; call it before threads exist."""
+def ros_arguments(words: Sequence[str]) -> list[str]:
+    """Returns arguments of ROS 2 with which it writes no log file, where the forwarder does.
+
+    It leaves that to ROS 2 if the words of the user choose something themselves.
+    """
+    if _forwarder is None or any(word in FILE_CHOICES for word in words):
+        return []
+    return DISABLE_FILES
+
+
+def log_file(node: str, words: Sequence[str]) -> str:
+    """Returns the log file of a node, where ROS 2 would write it; empty if the words choose it."""
+    if any(word in FILE_CHOICES for word in words):
+        return ""
+    home = os.environ.get("ROS_HOME") or os.path.join("~", ".ros")
+    folder = os.environ.get("ROS_LOG_DIR") or os.path.join(home, "log")
+    name = f"{node}_{os.getpid()}_{time.time_ns() // 1_000_000}.log"
+    return os.path.abspath(os.path.join(os.path.expanduser(folder), name))
+
+
+def forward_output(log: str = "") -> None:
+    """Lets a process of its own write the output of this one, also to a file if it is named.
+
+    Call it before threads exist.
+    """
     global _forwarder
     if _forwarder is not None:
         return
@@ -51,7 +79,7 @@ def forward_output() -> None:
         os.environ.setdefault(COLOUR, "1")
     pipes = {descriptor: os.pipe() for descriptor in descriptors}
     try:
-        _forwarder = _start_forwarder(pipes)
+        _forwarder = _start_forwarder(log, pipes)
     except OSError as error:
         sys.stderr.write(f"output is written directly, and may block ({error.strerror})\n")
     else:
@@ -93,10 +121,10 @@ def _different_outputs() -> list[int]:
     return [STDERR, STDOUT]
 
 
-def _start_forwarder(pipes: dict[int, tuple[int, int]]) -> subprocess.Popen[bytes]:
+def _start_forwarder(log: str, pipes: dict[int, tuple[int, int]]) -> subprocess.Popen[bytes]:
     pairs = [f"{exit_}:{descriptor}" for descriptor, (exit_, _) in pipes.items()]
     return subprocess.Popen(
-        [sys.executable, "-I", "-S", str(PROGRAM), *pairs],
+        [sys.executable, "-I", "-S", str(PROGRAM), log, *pairs],
         stdin=subprocess.DEVNULL,
         pass_fds=[exit_ for exit_, _ in pipes.values()],
         start_new_session=True,  # neither Ctrl-C nor Ctrl-Z of the terminal reaches it

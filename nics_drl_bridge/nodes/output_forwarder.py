@@ -1,27 +1,33 @@
 """Program that passes on what a node writes, so that the node never waits for who reads it.
 
-`python output_forwarder.py FROM:TO ...` copies lines between file descriptors. If an output takes
-nothing, as a terminal after Ctrl-S, it keeps the newest lines, and drops and counts the older ones.
-It ends when the node has ended and all is told, or nobody has read the rest for a while.
+`python output_forwarder.py LOG FROM:TO ...` copies lines between file descriptors, and all of them
+to the file LOG, unless that is empty. If an output takes nothing, as a terminal after Ctrl-S or a
+disk that hangs, it keeps the newest lines, and drops and counts the older ones. It ends when the
+node has ended and all is told, or nobody has read the rest for a while.
 """
 
 import os
+import re
 import select
 import sys
 import threading
 import time
 from collections import deque
+from collections.abc import Callable, Sequence
+from functools import partial
 
-KEPT_BYTES = 65_536  # of lines that wait for an output
+KEPT_BYTES = 2**20  # of lines that wait for an output
 CHUNK_BYTES = 65_536
+COLOURS = re.compile(rb"\x1b\[[0-9;]*m")
 PATIENCE_S = 5.0  # for which the rest is offered after the node's end
 
 
 class Output:
     """Lines on their way to one output, which a thread of its own writes."""
 
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor = descriptor
+    def __init__(self, open_output: Callable[[], int]) -> None:
+        self._open_output = open_output  # the disk may hang at that, too
+        self._descriptor = -1
         self._lines: deque[bytes] = deque()
         self._bytes = 0  # of these lines
         self._dropped = 0  # lines since the last that was written
@@ -51,6 +57,10 @@ class Output:
         self._thread.join(seconds)
 
     def _write_lines(self) -> None:
+        try:
+            self._descriptor = self._open_output()
+        except OSError:  # the folder of logs can't be written to
+            self._descriptor = os.open(os.devnull, os.O_WRONLY)
         while True:
             with self._changed:
                 while not self._lines and not self._ended:
@@ -82,29 +92,43 @@ def told_of(dropped: int) -> bytes:
     return f"({dropped} {lines} dropped here: nobody read this output)\n".encode()
 
 
-def copy_lines(source: int, output: Output) -> None:
-    """Copies lines from a file descriptor to an output until its end."""
+def open_log(path: str) -> int:
+    """Opens a file for the log, in a folder that is made if it is missing."""
+    os.makedirs(os.path.dirname(path), exist_ok=True)
+    return os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+
+
+def copy_lines(source: int, outputs: Sequence[Output]) -> None:
+    """Copies lines from a file descriptor to outputs until its end."""
     rest = b""
     while chunk := os.read(source, CHUNK_BYTES):
         *lines, rest = (rest + chunk).split(b"\n")
         for line in lines:
-            output.put(line + b"\n")
+            put_line(line + b"\n", outputs)
         if len(rest) > CHUNK_BYTES:
-            output.put(rest)
+            put_line(rest, outputs)
             rest = b""
     if rest:
-        output.put(rest)
-    output.end()
+        put_line(rest, outputs)
 
 
-def main(pairs: list[str]) -> None:
+def put_line(line: bytes, outputs: Sequence[Output]) -> None:
+    """Adds a line to outputs, of which the first may show colours."""
+    shown, *others = outputs
+    shown.put(line)
+    for output in others:
+        output.put(COLOURS.sub(b"", line))
+
+
+def main(log: str, pairs: Sequence[str]) -> None:
     """Copies between pairs of descriptors, given as `FROM:TO`, until all sources have ended."""
-    outputs = []
+    logs = [Output(partial(open_log, log))] if log else []
+    outputs = [*logs]
     readers = []
     for pair in pairs:
         source, descriptor = map(int, pair.split(":"))
-        output = Output(descriptor)
-        reader = threading.Thread(target=copy_lines, args=(source, output))
+        output = Output(partial(int, descriptor))
+        reader = threading.Thread(target=copy_lines, args=(source, [output, *logs]))
         reader.start()
         outputs.append(output)
         readers.append(reader)
@@ -112,9 +136,11 @@ def main(pairs: list[str]) -> None:
         reader.join()
     deadline = time.monotonic() + PATIENCE_S
     for output in outputs:
+        output.end()
+    for output in outputs:
         output.join(max(0.0, deadline - time.monotonic()))
     os._exit(0)  # also while a thread waits for its output
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main(sys.argv[1], sys.argv[2:])

@@ -31,6 +31,7 @@ from nics_drl_bridge.generator import SimulatorModel, open_model
 from nics_drl_bridge.nodes import qos
 from nics_drl_bridge.nodes.ending import at_once, ending_signals
 from nics_drl_bridge.nodes.executor import StandingExecutor
+from nics_drl_bridge.nodes.output import ros_arguments
 from nics_drl_bridge.nodes.parameters import MODEL, Row
 from nics_drl_bridge.nodes.transport import OF_THIS_PROCESS
 
@@ -90,7 +91,8 @@ def run_node(
     context, node, alone = None, None, contextlib.ExitStack()
     try:
         with at_once():
-            context = open_context(sys.argv if args is None else args)
+            words = sys.argv if args is None else args
+            context = open_context([*words, *ros_arguments(words)])
             if sole_name:
                 alone.enter_context(sole(context, sole_name))
             node = make(context)

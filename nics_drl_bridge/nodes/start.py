@@ -25,7 +25,7 @@ def start(node: str, args: list[str] | None = None) -> None:
     if sentence := usage.wrong_with(node, words):
         sys.stderr.write(f"{sentence}\n")
         ending.leave(EXIT_BAD_INPUT)
-    output.forward_output()
+    output.forward_output(output.log_file(node, words))
     faulthandler.enable()  # a crash of a library is told with the place in Python
     # As the log of ROS 2 would say it, which is there seconds later.
     sys.stderr.write(f"[INFO] [{time.time():.9f}] [{node}]: starting\n")
