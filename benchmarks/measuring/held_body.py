@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
+from nics_drl_bridge.gate import scan_motion
 from nics_drl_bridge.gate.gate import decide
 from nics_drl_bridge.gate.inputs import Command, Odometry, Scan, Tick
 from nics_drl_bridge.gate.limits import load_limits
-from nics_drl_bridge.gate.scan_motion import SETTINGS, judge_motion
-from nics_drl_bridge.gate.state import GateConfig, GateState, begin
+from nics_drl_bridge.gate.state import GateConfig, GateState, Push, begin
 from nics_drl_bridge.gate.stopping import gate_config
 from nics_drl_bridge.generator import open_model
 from nics_drl_bridge.geometry import between, compose, exp
@@ -25,9 +25,18 @@ from nics_drl_bridge.robot.kinds import steady_twist
 
 Array = NDArray[np.float64]
 RULE = "body_held"
+ALWAYS = Push(0.0, 0.0, 0.0, np.zeros(3))
 EPISODE_STEPS = 600
-ORDINARY_SPEED, ORDINARY_TURN = 0.15, 0.3
-"""Wheels that spin at less, on average over the first second, hardly move [m/s, rad/s]."""
+WHEEL_LAG_S = 0.15  # with which the wheels of a held body follow commands
+DRAWN_S = 0.5  # time for which a random command is kept
+ORDINARY = np.array([0.15, 0.3])
+"""Wheels that spin at less of both, on average over the first second, hardly move [m/s, rad/s]."""
+WATCHED_S, LONGEST_S = 1.0, 3.0
+"""Time within which a held body is to be stopped, and after which it is let go."""
+FREE_S = (2.0, 6.0)
+"""Time for which it drives before, drawn."""
+MOST_S_EACH = 60.0
+"""Time of driving after which no more bodies are held, for each that is to be [s]."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +78,7 @@ class Tally:
         trips: stops by the rule while the robot drove freely.
         other_stops: stops by other latching rules.
         delays_s: of each held body, the time until it was stopped; inf for never.
-        lowest: least share of the motion that scans showed of a free robot.
+        missed: what was too late.
     """
 
     driven_s: float = 0.0
@@ -78,8 +87,6 @@ class Tally:
     other_stops: Counter[str] = field(default_factory=Counter)
     delays_s: list[float] = field(default_factory=list)
     missed: list[str] = field(default_factory=list)
-    lowest: list[float] = field(default_factory=list)
-    near: int = 0
 
     def add(self, other: Tally) -> None:
         """Adds what came out of another case."""
@@ -89,7 +96,6 @@ class Tally:
         self.other_stops += other.other_stops
         self.delays_s += other.delays_s
         self.missed += other.missed
-        self.lowest += other.lowest
 
 
 class Watched:
@@ -105,6 +111,11 @@ class Watched:
         self.state: GateState = replace(begin(self.config), armed=True)
         self.stopped = ""
 
+    @property
+    def tells_motion(self) -> bool:
+        """Whether the newest scan told how far the robot moved."""
+        return not math.isnan(self.state.scan_motion.share)
+
     def give(self, event: object) -> Array:
         """Decides on an input; returns the twist that would be published."""
         self.state, decision = decide(self.config, self.state, event, self.now)
@@ -114,12 +125,29 @@ class Watched:
         return decision.twist
 
 
+class RuleAlone(Watched):
+    """The same with the rule alone, ten times as fast; the robot is always told to move."""
+
+    def give(self, event: object) -> Array:
+        """Takes odometry and scans."""
+        if isinstance(event, Odometry):
+            self.state = replace(self.state, odometry=event, push=ALWAYS)
+        elif isinstance(event, Scan):
+            motion = scan_motion.watch_scan(self.config, self.state, event)
+            self.state = replace(self.state, scan_motion=motion)
+            if (cause := scan_motion.body_held(self.config, self.state, self.now)) is not None:
+                self.state = replace(self.state, latched=cause)
+                self.stopped = RULE
+        return np.zeros(3)
+
+
 class Drive:
     """Worlds with a robot each, its own odometry, and a gate that watches."""
 
     def __init__(
-        self, case: Case, worlds: int, seed: int, change: Callable[[GateConfig], GateConfig]
-    ) -> None:
+        self, case: Case, worlds: int, seed: int, change: Callable[[GateConfig], GateConfig],
+        kind: type[Watched] = Watched,
+    ) -> None:  # fmt: skip
         self.case = case
         model = open_model(case.robot, case.lidar or None)
         lidar = model.lidar
@@ -148,15 +176,13 @@ class Drive:
         if case.driver != "random":
             self.policy, task = open_policy(case.driver, model)
         self.env = BridgeVectorEnv(worlds, model, case.world, task, None, EPISODE_STEPS, "SameStep")
-        noise = tuple(
-            case.noise_told * std for std in (lidar.noise_std, lidar.faults.noise_proportional)
-        )
         config = gate_config(
             model, load_limits(case.robot, model.robot), None, e_stop_required=False,
             estimate_required=False, odom_rate=1.0 / period,
         )  # fmt: skip
-        self.config = change(replace(config, range_noise=noise))
-        self.gates = [Watched(self.config) for _ in range(worlds)]
+        told = tuple(case.noise_told * std for std in config.range_noise)
+        self.config = change(replace(config, range_noise=told))
+        self.gates = [kind(self.config) for _ in range(worlds)]
         self.observation, _ = self.env.reset(seed=seed)
         data = self.env.simulator.data
         self.before = data.pose[:, 0].copy()
@@ -176,13 +202,11 @@ class Drive:
         data.noise[index, :, 2:] = 0.0 if held else self.noises[index, :, 2:]
 
     def _actions(self) -> NDArray[np.float32]:
-        count = len(self.gates)
         if self.policy is not None:
             return self.policy.act(self.observation)
-        if self.steps % max(1, round(0.5 / self.period)) == 0 or self.drawn is None:
+        if self.steps % max(1, round(DRAWN_S / self.period)) == 0 or self.drawn is None:
             self.drawn = np.asarray(self.env.action_space.sample())
             self.drawn[:] = self.rng.uniform(-1.0, 1.0, self.drawn.shape)
-        del count
         return self.drawn
 
     def step(self) -> NDArray[np.bool_]:
@@ -199,10 +223,9 @@ class Drive:
         for i in range(len(self.gates)):
             if self.held[i]:
                 told = steady_twist(robot, commands[i : i + 1])[0]
-                self.wheel[i] += (told - self.wheel[i]) * min(1.0, self.period / 0.15)
+                self.wheel[i] += (told - self.wheel[i]) * min(1.0, self.period / WHEEL_LAG_S)
                 moved[i] = exp(self.wheel[i] * self.period)
             else:
-                moved[i] = np.array([1.0, 1.0, 1.0]) * moved[i]
                 self.wheel[i] = moved[i] / self.period
         noise = self.model.noise.odometry
         shown = moved * scale
@@ -236,28 +259,86 @@ class Drive:
 def drive_freely(
     case: Case, worlds: int, seconds: float, seed: int,
     change: Callable[[GateConfig], GateConfig] = lambda config: config,
-    watch: bool = False,
 ) -> Tally:  # fmt: skip
     """Drives robots freely, and counts by what their gates were stopped."""
-    drive, tally = Drive(case, worlds, seed, change), Tally()
+    drive, tally = Drive(case, worlds, seed, change, RuleAlone), Tally()
     for _ in range(round(seconds / drive.period)):
         drive.step()
         for gate in drive.gates:
             tally.driven_s += drive.period
-            motion = gate.state.scan_motion
+            if gate.tells_motion:
+                tally.judged_s += drive.period
             if gate.stopped == RULE:
                 tally.trips.append(f"{case}: {gate.state.latched.detail}")
             elif gate.stopped:
                 tally.other_stops[gate.stopped] += 1
             if gate.stopped:
                 gate.arm()
-            if watch and len(motion.views) > 2:
-                verdict = judge_motion(gate.config, motion.views[:-1], motion.views[-1], SETTINGS)
-                if not math.isnan(verdict.share):
-                    tally.judged_s += drive.period
-                    tally.lowest.append(verdict.share)
-                    tally.near += verdict.held
     return tally
+
+
+class Hold:
+    """The body of one world: driven for a while, then held until it is stopped.
+
+    Args:
+        drive: the worlds.
+        index: of the world.
+    """
+
+    def __init__(self, drive: Drive, index: int) -> None:
+        self._drive, self._index = drive, index
+        self.release()
+
+    def release(self) -> None:
+        """Lets the body drive."""
+        self._drive.hold(self._index, False)
+        self._drive.gates[self._index].arm()
+        self._wait_s = self._drive.rng.uniform(*FREE_S)
+        self._since_s = 0.0
+        self._spun = np.zeros(2)
+
+    @property
+    def _wheels(self) -> Array:
+        """Speed [m/s] and turn rate [rad/s] that odometry shows, as magnitudes."""
+        x, y, turn = self._drive.wheel[self._index].tolist()
+        return np.array([math.hypot(x, y), abs(turn)])
+
+    @property
+    def _ordinary(self) -> bool:
+        passed = min(WATCHED_S, self._since_s)
+        return bool((self._spun / passed >= ORDINARY).any())
+
+    def step(self, began: bool, tally: Tally) -> None:
+        """Accounts for a step, in which another episode may have begun."""
+        drive, gate = self._drive, self._drive.gates[self._index]
+        held = drive.held[self._index]
+        self._since_s += drive.period
+        if began:
+            self.release()
+        elif not held:
+            if gate.stopped:
+                tally.trips += ["before it was held"] if gate.stopped == RULE else []
+                gate.arm()
+            if self._since_s >= self._wait_s and (self._wheels >= ORDINARY).any():
+                drive.hold(self._index, True)
+                self._since_s, self._spun = 0.0, np.zeros(2)
+        else:
+            if self._since_s <= WATCHED_S:
+                self._spun += self._wheels * drive.period
+            if gate.stopped or self._since_s >= LONGEST_S:
+                self._count(gate.stopped, tally)
+                self.release()
+
+    def _count(self, stopped: str, tally: Tally) -> None:
+        if not self._ordinary:
+            return
+        if stopped not in (RULE, ""):  # as of a lidar without noise, whose scans are frozen
+            tally.other_stops[stopped] += 1
+        delay = self._since_s if stopped else math.inf
+        tally.delays_s.append(delay)
+        if delay > WATCHED_S + 1e-6:
+            spun = (self._spun / WATCHED_S).round(2).tolist()
+            tally.missed.append(f"{self._drive.case} at {spun} m/s, rad/s: {delay:.2f} s")
 
 
 def hold_bodies(
@@ -266,51 +347,11 @@ def hold_bodies(
 ) -> Tally:  # fmt: skip
     """Holds bodies while they drive, and counts how long each was not stopped."""
     drive, tally = Drive(case, worlds, seed, change), Tally()
-    period = drive.period
-    free_s, held_s = 2.0, 3.0
-    began = np.zeros(worlds, int)
-    wait = drive.rng.integers(round(free_s / period), round(3 * free_s / period), worlds)
-    spun = np.zeros((worlds, 2))
-    steps = 0
-    while len(tally.delays_s) < holds and steps < 200 * holds:
-        steps += 1
-        new = drive.step()
-        for i, gate in enumerate(drive.gates):
-            began[i] += 1
-            if not drive.held[i]:
-                if gate.stopped:
-                    tally.trips += [gate.stopped] if gate.stopped == RULE else []
-                    gate.arm()
-                if new[i]:
-                    began[i] = 0
-                fast = (
-                    abs(drive.wheel[i, :2]).max() > ORDINARY_SPEED
-                    or abs(drive.wheel[i, 2]) > ORDINARY_TURN
-                )
-                if began[i] >= wait[i] and fast:
-                    drive.hold(i, True)
-                    began[i], spun[i] = 0, 0.0
-                continue
-            if new[i]:
-                drive.hold(i, False)
-                began[i] = 0
-                gate.arm()
-                continue
-            if began[i] * period <= 1.0:
-                spun[i] += np.hypot(*drive.wheel[i, :2]) * period, abs(drive.wheel[i, 2]) * period
-            over = began[i] * period >= held_s
-            if gate.stopped or over:
-                ordinary = spun[i] / min(1.0, began[i] * period)
-                if ordinary[0] >= ORDINARY_SPEED or ordinary[1] >= ORDINARY_TURN:
-                    delay = began[i] * period if gate.stopped == RULE else math.inf
-                    if gate.stopped in (RULE, ""):
-                        tally.delays_s.append(delay)
-                        if not delay <= 1.0:
-                            held_since_ns = gate.state.scan_motion.held_since_ns
-                            tally.missed.append(f"{delay:.2f} {ordinary.round(2)} {held_since_ns}")
-                    else:
-                        tally.other_stops[gate.stopped] += 1
-                drive.hold(i, False)
-                began[i] = 0
-                gate.arm()
+    bodies = [Hold(drive, index) for index in range(worlds)]
+    for _ in range(round(MOST_S_EACH * holds / worlds / drive.period)):
+        began = drive.step()
+        for body, new in zip(bodies, began.tolist(), strict=True):
+            body.step(new, tally)
+        if len(tally.delays_s) >= holds:
+            break
     return tally

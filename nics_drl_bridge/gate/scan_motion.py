@@ -38,7 +38,7 @@ class Settings:
 
     # Reduced scan: a direction is the median of the beams within `window` on each side of it.
     spacing: float = math.radians(2.0)
-    window: float = math.radians(2.0)
+    window: float = math.radians(3.0)
     sector: float = math.radians(20.0)  # a person nearby fills one or two of them
     # Scans that are compared: the oldest not older than `longest_s`, kept `kept_every_s` apart.
     longest_s: float = 0.56
@@ -51,17 +51,17 @@ class Settings:
     least_half: float = 0.25
     # Turns beyond which the next younger scan is taken, and none is: a room may repeat itself.
     usual_turn: float = 0.6
-    greatest_turn: float = 1.2
-    # A direction tells something if its range must change by this [m], and by so many standard
-    # deviations of the lidar's noise.
+    greatest_turn: float = 1.4
+    # A sector tells something if its ranges must change by this [m], and by so many standard
+    # deviations of the lidar's noise, in the root mean square.
     least_change: float = 0.03
-    deviations: float = 2.0
+    deviations: float = 1.8
     gap: float = 0.25  # neighbours whose ranges differ by this share are two surfaces
     # Held: of at least so many sectors that tell something this share shows less than
     # `sector_share` of the motion, and the median less than `held_share`. A skid-steer robot whose
     # odometry turns 30 % too far shows 0.77, one on ice 0.5.
     least_sectors: int = 5
-    agreeing: float = 0.7
+    agreeing: float = 0.6
     sector_share: float = 0.45
     held_share: float = 0.25
     confirmed_s: float = 0.15  # time over which scans must say so, without one that says otherwise
@@ -102,20 +102,21 @@ def watch_scan(
     )
     oldest_ns = scan.stamp_ns - round(_memory_s(config, settings) / S_PER_NS)
     kept = tuple(one for one in before.views if one.stamp_ns >= oldest_ns)
-    held_since_ns, held = None, ""
+    verdict = UNDECIDED
     if state.push is not None:  # only a robot that is told to move can be held
         verdict = judge_motion(config, kept, newest, settings)
-        held_since_ns = _held_since(before.held_since_ns, verdict, scan.stamp_ns, settings)
-        held = _contradiction(kept, newest, verdict, held_since_ns, settings)
+    since_ns = _held_since(before.held_since_ns, verdict, scan.stamp_ns, settings)
+    held = _contradiction(kept, newest, verdict, since_ns, settings)
     apart_ns = round(settings.kept_every_s / S_PER_NS)
     if not kept or newest.stamp_ns - kept[-1].stamp_ns >= apart_ns:
         kept = (*kept, newest)
-    return ScanMotion(kept, held_since_ns, held)
+    return ScanMotion(kept, since_ns, held, verdict.share)
 
 
 def _memory_s(config: GateConfig, settings: Settings) -> float:
-    """Returns for how long scans are kept: two periods of a slow lidar at least."""
-    return max(settings.longest_s, 2.25 / config.scan_rate)
+    """Returns for how long scans are kept [s]: three periods of a slow lidar, at least two."""
+    three = min(3.1 / config.scan_rate, 1.15 * settings.longest_s)
+    return max(settings.longest_s, three, 2.2 / config.scan_rate)
 
 
 def _held_since(
@@ -175,7 +176,7 @@ def _reference(
     """Returns the scan to compare the newest one with; None if odometry shows too little motion."""
     chosen = None
     for index, old in enumerate(kept[:-1]):
-        turn = abs(between(old.pose, newest.pose)[2])
+        turn = abs(_turn(old, newest))
         if turn > settings.greatest_turn:
             continue
         chosen = index
@@ -194,10 +195,15 @@ def _reference(
 
 def _motion(old: ReducedScan, new: ReducedScan, settings: Settings) -> float:
     """Returns the motion that odometry shows between two scans; 1 is the least that is judged."""
-    x, y, turn = (float(each) for each in between(old.pose, new.pose))
-    path = math.hypot(x, y)
+    path = math.hypot(*(new.pose[:2] - old.pose[:2]).tolist())
+    turn = abs(_turn(old, new))
     tiny = 1e-9  # of a control whose least motion is zero
-    return max(path / max(settings.least_path, tiny), abs(turn) / max(settings.least_turn, tiny))
+    return max(path / max(settings.least_path, tiny), turn / max(settings.least_turn, tiny))
+
+
+def _turn(old: ReducedScan, new: ReducedScan) -> float:
+    """Returns the turn that odometry shows between two scans, of at most half a circle."""
+    return math.remainder(float(new.pose[2] - old.pose[2]), FULL_CIRCLE)
 
 
 def _reduce(config: GateConfig, ranges: Ranges, settings: Settings) -> Ranges:

@@ -104,24 +104,25 @@ def compare_sectors(old, new, predicted, sector, noise, deviations, least):  # t
     """Returns, of each sector, the share of the predicted change that was observed; NaN: unknown.
 
     Ranges (K,) are those of an old scan, of a new one, and what the motion in between predicts.
-    A direction counts if its predicted change exceeds `least` [m] and `deviations` of the noise.
-    A `sector` has so many directions; one of which few count is unknown. The share is that of
-    least squares, with observed changes cut at twice the predicted ones.
+    A `sector` has so many directions. It is unknown if a third of them or fewer are, or if the root
+    mean square of its predicted changes is below `least` [m] or so many `deviations` of the noise.
+    The share is that of least squares, with observed changes cut at twice the predicted ones.
     """
     count = old.shape[0]
     shares = np.full((count + sector - 1) // sector, math.nan)
     for index in range(shares.shape[0]):
         begin, end = index * sector, min((index + 1) * sector, count)
-        counted, products, squares = 0, 0.0, 0.0
+        known, products, squares, needed = 0, 0.0, 0.0, 0.0
         for k in range(begin, end):
             change, observed = predicted[k] - old[k], new[k] - old[k]
-            threshold = max(least, deviations * (noise.constant + noise.proportional * old[k]))
-            if not abs(change) > threshold or not math.isfinite(observed):
+            if not (math.isfinite(change) and math.isfinite(observed)):
                 continue
+            threshold = max(least, deviations * (noise.constant + noise.proportional * old[k]))
             observed = min(max(observed, -2.0 * abs(change)), 2.0 * abs(change))
-            counted += 1
+            known += 1
             products += change * observed
             squares += change * change
-        if 3 * counted >= end - begin and counted >= 2:
+            needed += threshold * threshold
+        if 3 * known > end - begin and squares > needed:
             shares[index] = products / squares
     return shares

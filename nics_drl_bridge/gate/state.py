@@ -13,7 +13,7 @@ from nics_drl_bridge.interface import Array
 
 Ranges = NDArray[np.float32]
 Record = TypeVar("Record")
-INF = float("inf")
+INF, NAN = float("inf"), float("nan")
 
 
 def replace(record: Record, **changes: Any) -> Record:
@@ -188,6 +188,7 @@ class ScanMotion:
     views: tuple[ReducedScan, ...] = ()  # recent ones, oldest first
     held_since_ns: int | None = None  # stamp of the first scan that contradicts odometry
     held: str = ""  # what the newest scan contradicts, once others have before
+    share: float = NAN  # of the motion by odometry that the newest scan shows; NaN: undecided
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,128 @@
+"""Is a body that is held, while its wheels spin, stopped within a second, and nobody else?
+
+In the fast simulator, robots with real lidars' noise are driven by planners, policies and random
+commands through the shipped worlds, people among them. Their odometry drifts: scales of path and
+turn are wrong, that of a skid-steer robot's turns by 30 %. A gate watches each, and its rule
+`body_held` must not stop it in all those hours. Then bodies are held while the wheels turn on, and
+the gate must stop each within a second. Nobody obeys the gates, so that all is driven as it is.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from functools import partial
+
+import numpy as np
+from measuring.held_body import RULE, Case, Tally, drive_freely, hold_bodies
+from measuring.verdict import answer, parser_of
+
+from nics_drl_bridge.gate import scan_motion
+from nics_drl_bridge.gate.state import GateConfig, replace
+
+CONTROLS = {
+    "rule_off": "the rule: `stop_when_held` is false",
+    "zero_thresholds": "the rule's thresholds: any scan contradicts odometry",
+}
+CASES = (
+    Case("jackal", "crowd", turn_scale=1.3),
+    Case("jackal", "room", driver="random", rate=20.0, turn_scale=1.3),
+    Case("turtlebot3_burger", "room", rate=5.0),
+    Case("turtlebot3_waffle", "arena", driver="random", rate=5.0, path_scale=1.1),
+    Case("turtlebot3_burger", "crowd", rate=5.0, path_scale=0.9, turn_scale=1.3),
+    Case("differential", "crowd", "hokuyo_ust_10lx", "random", 40.0, turn_scale=1.3),
+    Case("differential", "corridor", "rplidar_a1", rate=5.5, path_scale=0.9),
+    Case("differential", "arena", "sick_tim571", "random", beams=180, turn_scale=1.3, dropout=0.05),
+    Case("differential", "arena", driver="differential", turn_scale=1.3),
+    Case("mecanum", "clutter", "sick_tim571", rate=15.0, path_scale=1.1, dropout=0.1),
+    Case("mecanum", "crowd", "rplidar_a2", "random", path_scale=0.95, turn_scale=0.9),
+    Case("ackermann", "corridor", "hokuyo_ust_10lx", rate=20.0, beams=180),
+    Case("ackermann", "doorway", "sick_tim571", "random", path_scale=1.05, noise_told=0.0),
+)
+WORLDS = 8
+WITHIN_S = 1.0
+LEAST_STOPPED = 0.94
+"""Share of the held bodies that must be stopped within that time: of some, no scan tells enough."""
+LEAST_JUDGED = 0.5
+"""Share of the time of driving in which scans must have told something about the motion."""
+
+
+def zero_thresholds() -> None:
+    """Lets any scan contradict odometry, in this process."""
+    settings = scan_motion.Settings(
+        least_path=0.0, least_turn=0.0, least_half=0.0, least_change=0.0, deviations=0.0,
+        least_sectors=1, agreeing=0.0, sector_share=np.inf, held_share=np.inf, confirmed_s=0.0,
+    )  # fmt: skip
+    scan_motion.watch_scan = partial(scan_motion.watch_scan, settings=settings)
+
+
+def summary(free: Tally, held: Tally) -> dict[str, object]:
+    """The figures, for the JSON object."""
+    delays = np.array(held.delays_s)
+    return {
+        "hours": round(free.driven_s / 3600.0, 3),
+        "judged_share": round(free.judged_s / max(free.driven_s, 1e-9), 3),
+        "trips": len(free.trips) + len(held.trips),
+        "tripped": free.trips[:20],
+        "held": len(delays),
+        "stopped_in_time": int((delays <= WITHIN_S + 1e-6).sum()),
+        "median_s": round(float(np.median(delays)), 3) if len(delays) else float("nan"),
+        "late": held.missed[:20],
+        "other_stops": dict(free.other_stops + held.other_stops),
+    }
+
+
+def missed(result: dict[str, object], hours: float, holds: int) -> list[str]:
+    """A sentence for each bar that was missed."""
+    found = []
+    if result["trips"]:
+        found.append(f"{result['trips']} robots that drove freely were stopped by {RULE}, bar 0")
+    if result["hours"] < 0.99 * hours:
+        found.append(f"invalid: {result['hours']} h were driven, not {hours}")
+    if result["judged_share"] < LEAST_JUDGED:
+        found.append(f"invalid: scans told something in {result['judged_share']} of the time")
+    if result["held"] < holds:
+        found.append(f"invalid: {result['held']} bodies were held, not {holds}")
+    share = result["stopped_in_time"] / max(result["held"], 1)
+    if not share >= LEAST_STOPPED:
+        found.append(f"{share:.3f} of the held bodies were stopped in time, bar {LEAST_STOPPED}")
+    return found
+
+
+def main() -> None:
+    """Prints figures, or one JSON object; ends with 1 when a bar was missed."""
+    parser = parser_of(__doc__, CONTROLS)
+    parser.add_argument("--hours", type=float, default=10.0, help="of free driving, all together")
+    parser.add_argument("--holds", type=int, default=390, help="bodies that are held, all together")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--case", type=int, action="append", choices=range(len(CASES)))
+    given = parser.parse_args()
+    warnings.simplefilter("ignore")  # robots may be driven faster than their recordings were
+
+    def change(config: GateConfig) -> GateConfig:
+        return replace(config, stop_when_held=given.control != "rule_off")
+
+    if given.control == "zero_thresholds":
+        zero_thresholds()
+    cases = CASES if given.case is None else [CASES[index] for index in given.case]
+    seconds = 3600.0 * given.hours / len(cases) / WORLDS
+    holds = -(-given.holds // len(cases))
+    free, held = Tally(), Tally()
+    for index, case in enumerate(cases):
+        seed = given.seed + 1000 * index
+        free.add(drive_freely(case, WORLDS, seconds, seed, change))
+        held.add(hold_bodies(case, WORLDS, holds, seed + 500, change))
+        late = f"{len(held.missed)} of {len(held.delays_s)} held bodies stopped late"
+        sys.stderr.write(f"{case.robot} in {case.world}: {len(free.trips)} trips so far, {late}\n")
+    result = summary(free, held)
+    table = (
+        f"{result['hours']} h of free driving: {result['trips']} stops by {RULE}; scans told "
+        f"something in {result['judged_share']:.0%} of the time\n"
+        f"{result['held']} held bodies: {result['stopped_in_time']} stopped within {WITHIN_S:g} s, "
+        f"after {result['median_s']} s in the median\n"
+    )
+    answer(result, missed(result, given.hours, holds * len(cases)), table, given.json)
+
+
+if __name__ == "__main__":
+    main()

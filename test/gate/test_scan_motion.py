@@ -1,0 +1,300 @@
+"""Scans that do not show the motion that odometry shows: a body that is held."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gate.rig import PERIOD_S, TICK_S, Rig, config
+from nics_drl_bridge.gate.inputs import Reset, Scan
+from nics_drl_bridge.gate.scan_motion import SETTINGS, directions_of
+from nics_drl_bridge.gate.scan_motion_kernels import (
+    Noise,
+    compare_sectors,
+    predict_scan,
+    reduce_scan,
+)
+from nics_drl_bridge.geometry import compose, exp
+from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.lidar.spec import LidarSpec, load_lidar
+
+ROOM = np.array(
+    [
+        [-3.0, -2.0, 3.0, -2.0], [3.0, -2.0, 3.0, 2.5], [3.0, 2.5, -3.0, 2.5],
+        [-3.0, 2.5, -3.0, -2.0], [0.5, 1.2, 1.4, 1.2], [-1.5, -0.8, -1.5, -1.4],
+    ]
+)  # fmt: skip
+CORRIDOR = np.array([[-500.0, -0.8, 500.0, -0.8], [500.0, 0.8, -500.0, 0.8]])
+NOWHERE = np.zeros((0, 4))
+
+
+def seen_from(pose, angles, walls):
+    """Ranges (B,) to the nearest of walls (W, 4) from a pose (3,)."""
+    bearings = angles + pose[2]
+    ux, uy = np.cos(bearings)[:, None], np.sin(bearings)[:, None]
+    ax, ay = walls[:, 0] - pose[0], walls[:, 1] - pose[1]
+    ex, ey = walls[:, 2] - walls[:, 0], walls[:, 3] - walls[:, 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        across = ux * ey - uy * ex
+        along = (ax * ey - ay * ex) / across
+        share = (ax * uy - ay * ux) / across
+    hit = (along > 0.0) & (share >= 0.0) & (share <= 1.0)
+    return np.where(hit, along, np.inf).min(axis=1, initial=np.inf)
+
+
+class Scene(Rig):
+    """A rig that sees walls and people from where its body is, which odometry may not know."""
+
+    def __init__(self, lidar=None, walls=ROOM, period_s=PERIOD_S, twist=(0.5, 0.0, 0.1), **changes):
+        self.lidar = lidar or load_lidar("sick_tim571")
+        given = config(
+            "mecanum", beam_angles=self.lidar.angles, range_max=self.lidar.range_max,
+            scan_rate=1.0 / period_s, odom_rate=1.0 / period_s, stop_when_held=True,
+            range_noise=(self.lidar.noise_std, self.lidar.faults.noise_proportional),
+            **changes,
+        )  # fmt: skip
+        super().__init__(given)
+        self.period_s, self.walls = period_s, walls
+        self.wish = np.array(twist)
+        self.body = np.zeros(3)
+        self.held, self.people, self.scale = False, None, np.ones(3)
+        self.rng = np.random.default_rng(3)
+
+    def run(self, seconds, without=""):
+        """Lets time pass; wheels do what the gate says, and the body does, unless it is held."""
+        for _ in range(round(seconds / TICK_S)):
+            self.now += TICK_S
+            self.ticks += 1
+            twist = self.decision.twist if self.decision else np.zeros(3)
+            step = exp(twist * TICK_S)
+            self.twist = twist * self.scale
+            self.pose = compose(self.pose, exp(self.twist * TICK_S))
+            if not self.held:
+                self.body = compose(self.body, step)
+            if self.ticks % round(self.period_s / TICK_S) == 0:
+                self.stamp += round((self.period_s - PERIOD_S) * NS_PER_S)  # `send` adds the rest
+                self.send(without)
+            self.tick()
+        return self.decision
+
+    def odom(self, **changes):
+        return super().odom(twist=self.twist.copy(), **changes)
+
+    def scan(self, **changes):
+        lidar, walls = self.lidar, self.walls
+        if self.people is not None:
+            walls = np.concatenate([walls, self.people(self)])
+        ranges = seen_from(self.body, lidar.angles, walls)
+        std = lidar.noise_std + lidar.faults.noise_proportional * np.where(
+            np.isfinite(ranges), ranges, 0.0
+        )
+        ranges = ranges + self.rng.normal(size=len(ranges)) * std
+        if quantum := lidar.faults.quantisation:
+            ranges = np.round(ranges / quantum) * quantum
+        ranges[(ranges > lidar.range_max) | (self.rng.random(len(ranges)) < 0.03)] = np.inf
+        angles = (lidar.angle_min, lidar.angle_increment)
+        return self.give(Scan(self.stamp, ranges.astype(np.float32), angles))
+
+    def stops_after(self, limit_s):
+        """Holds the body, and returns how long the gate lets the wheels spin [s]."""
+        self.held, began = True, self.now
+        while self.moves:
+            assert self.now - began < limit_s, f"still moves after {limit_s} s"
+            self.run(TICK_S)
+        return self.now - began
+
+
+def started(*given, **changes):
+    """A scene in which the robot drives."""
+    scene = Scene(*given, **changes)
+    scene.run(1.5)
+    assert scene.arm().granted, scene.decision.answer
+    scene.run(0.8)
+    assert scene.moves, scene.decision.cause
+    return scene
+
+
+def with_beams(name, beams):
+    return load_lidar(name).model_copy(update={"beams": beams})
+
+
+LIDARS = {
+    "sick": load_lidar("sick_tim571"),
+    "hokuyo": load_lidar("hokuyo_ust_10lx"),
+    "rplidar": load_lidar("rplidar_a1"),
+    "180 beams": with_beams("hokuyo_ust_10lx", 180),
+    "90 beams": with_beams("sick_tim571", 90),
+}
+
+
+@pytest.mark.parametrize("lidar", LIDARS)
+@pytest.mark.parametrize("period_s", [0.2, 0.1, 0.02])
+@pytest.mark.parametrize("twist", [(0.5, 0.0, 0.0), (0.0, 0.0, 0.8), (0.3, 0.0, -0.5)])
+def test_a_body_that_is_held_while_its_wheels_spin_is_stopped_within_a_second(
+    lidar, period_s, twist
+):
+    scene = started(LIDARS[lidar], period_s=period_s, twist=twist)
+    assert scene.stops_after(1.5) <= 1.0
+    assert scene.rule == "body_held"
+    assert "the scans show none of it" in scene.decision.cause.line
+
+
+def test_a_body_that_is_held_from_the_start_is_stopped_within_a_second():
+    scene = Scene()
+    scene.run(1.5)
+    assert scene.arm().granted
+    scene.run(0.2)
+    assert scene.moves
+    assert scene.stops_after(1.0) <= 1.0
+    assert scene.rule == "body_held"
+
+
+def test_the_stop_stays_until_the_gate_is_reset_and_armed():
+    scene = started()
+    scene.stops_after(1.0)
+    scene.held = False
+    scene.run(2.0)
+    assert scene.rule == "body_held"
+    assert scene.give(Reset()).granted
+    assert scene.arm().granted, scene.decision.answer
+    scene.run(1.0)
+    assert scene.moves
+
+
+def test_without_the_rule_a_held_body_is_not_stopped():
+    scene = started()
+    scene.config = config(
+        "mecanum", beam_angles=scene.lidar.angles, range_max=scene.lidar.range_max
+    )
+    scene.held = True
+    assert scene.run(3.0).cause is None
+
+
+@pytest.mark.parametrize("scale", [(1.0, 1.0, 1.3), (1.1, 1.1, 1.0), (0.9, 0.9, 0.8)])
+@pytest.mark.parametrize("twist", [(0.3, 0.0, 0.0), (0.0, 0.0, 0.8), (0.1, 0.0, -0.5)])
+def test_odometry_that_shows_too_much_or_too_little_does_not_stop_the_robot(scale, twist):
+    scene = started(twist=twist)
+    scene.scale = np.array(scale)
+    assert scene.run(4.0).cause is None
+
+
+@pytest.mark.parametrize("walls", [CORRIDOR, NOWHERE], ids=["corridor", "nothing in range"])
+def test_where_a_motion_can_not_be_seen_nothing_is_decided(walls):
+    scene = started(walls=walls, twist=(0.5, 0.0, 0.0))
+    scene.held = True
+    assert scene.run(4.0).cause is None
+
+
+def person(x, y, half=0.25):
+    return [[x - half, y, x + half, y], [x, y - half, x, y + half]]
+
+
+def test_a_person_who_walks_ahead_through_a_corridor_as_fast_as_the_robot_does_not_stop_it():
+    scene = started(walls=CORRIDOR, twist=(0.5, 0.0, 0.0))
+    scene.people = lambda one: np.array(person(one.body[0] + 0.8, 0.0))
+    assert scene.run(4.0).cause is None
+
+
+def test_people_who_walk_along_on_both_sides_in_a_room_do_not_stop_it():
+    scene = started(twist=(0.3, 0.0, 0.0))
+    scene.people = lambda one: np.array(
+        person(one.body[0] + 0.2, 0.7) + person(one.body[0] - 0.3, -0.7)
+    )
+    assert scene.run(4.0).cause is None
+
+
+def test_people_who_walk_about_a_held_body_do_not_hide_it():
+    scene = started(twist=(0.4, 0.0, 0.2))
+    begun = scene.now
+    scene.people = lambda one: np.array(
+        person(1.0 * np.cos(one.now - begun), 1.0 * np.sin(one.now - begun))
+        + person(-0.8, 1.5 - 0.8 * (one.now - begun))
+    )
+    assert scene.stops_after(1.5) <= 1.0
+
+
+def test_a_robot_at_rest_is_never_taken_for_a_held_one():
+    scene = started()
+    scene.wish = np.zeros(3)
+    scene.run(3.0)
+    scene.scale = np.array([0.0, 0.0, 0.0])
+    assert scene.run(3.0).cause is None
+
+
+@pytest.mark.parametrize("late_s", [0.1, 0.2])
+def test_scans_that_are_older_than_their_stamps_do_not_stop_a_robot_that_starts_and_stops(late_s):
+    scene = started(twist=(0.6, 0.0, 0.0))
+    past = [scene.body.copy()]
+    scan = scene.scan
+
+    def scan_of_before(**changes):
+        past.append(scene.body.copy())
+        now, scene.body = scene.body, past[max(0, len(past) - 1 - round(late_s / PERIOD_S))]
+        decision = scan(**changes)
+        scene.body = now
+        return decision
+
+    scene.scan = scan_of_before
+    for k in range(12):
+        scene.wish = np.array([0.0 if k % 2 else (0.6, -0.6)[k // 2 % 2], 0.0, 0.0])
+        scene.run(0.7)
+        assert scene.decision.cause is None
+
+
+def test_a_scan_is_reduced_to_medians_that_forget_lost_and_wrong_beams():
+    lidar = load_lidar("hokuyo_ust_10lx")
+    given = config("mecanum", beam_angles=lidar.angles)
+    directions = directions_of(given)
+    ranges = np.full(lidar.beams, 2.0, np.float32)
+    ranges[::7] = np.nan
+    ranges[3::11] = 0.5
+    out = np.empty(round(lidar.beams / directions.beams), np.float32)
+    reduce_scan(ranges, directions, out)
+    assert len(out) == 135
+    assert (out == 2.0).all()
+    ranges[:] = np.inf
+    reduce_scan(ranges, directions, out)
+    assert np.isnan(out).all()
+
+
+@pytest.mark.parametrize("moved", [(0.2, 0.0, 0.0), (0.0, -0.15, 0.0), (0.1, 0.05, 0.6), (0, 0, 3)])
+@pytest.mark.parametrize("name", ["paper_12m", "hokuyo_ust_10lx"])
+def test_a_predicted_scan_is_what_is_seen_after_the_motion(moved, name):
+    lidar = load_lidar(name)
+    directions = directions_of(config("mecanum", beam_angles=lidar.angles))
+    count = round(lidar.beams / directions.beams)
+    angles = directions.first + directions.step * np.arange(count)
+    walls = ROOM[:4]  # without corners that hide something
+    old = seen_from(np.array([0.3, 0.2, 0.1]), angles, walls)
+    new = seen_from(compose([0.3, 0.2, 0.1], moved), angles, walls)
+    predicted = np.empty(count, np.float32)
+    predict_scan(
+        old.astype(np.float32), directions, np.array(moved, float), SETTINGS.gap, predicted
+    )
+    known = np.isfinite(predicted)
+    assert known.mean() > (0.9 if directions.full_circle else 0.4)
+    assert np.median(np.abs(predicted[known] - new[known])) < 2e-3
+
+
+def test_sectors_show_the_share_of_the_motion_that_took_place():
+    old = np.full(30, 2.0, np.float32)
+    predicted = old.copy()
+    predicted[:20] += 0.2
+    new = old + 0.5 * (predicted - old)
+    new[25] = np.nan
+    shares = compare_sectors(old, new, predicted, 10, Noise(0.01, 0.0), 2.0, 0.03)
+    assert shares[:2] == pytest.approx(0.5, abs=1e-5)
+    assert np.isnan(shares[2])
+    noisy = compare_sectors(old, new, predicted, 10, Noise(0.2, 0.0), 2.0, 0.03)
+    assert np.isnan(noisy).all()
+
+
+@pytest.mark.parametrize("beams", [1, 2, 3, 24])
+def test_a_lidar_of_very_few_beams_decides_nothing_and_breaks_nothing(beams):
+    lidar = LidarSpec(
+        beams=beams, angle_min=-1.5, angle_max=1.5, range_min=0.1, range_max=10.0, rate=10.0
+    )
+    scene = Scene(lidar)
+    scene.run(1.5)
+    assert scene.arm().granted
+    assert scene.run(1.0).cause is None
