@@ -49,7 +49,8 @@ _KEPT: "OrderedDict[Any, Braking]" = OrderedDict()
 MOST_KEPT = 32
 
 
-class Drift(NamedTuple):
+@dataclass(frozen=True)
+class Drift:
     """How a robot leaves its arc while it brakes, as some of its motion ends before the rest.
 
     The components of a twist are compared as speeds, a turn as that of the whole footprint. While
@@ -82,7 +83,6 @@ class Braking:
     # by which a turn rate adds to the speed in the pace [m]: wheels that turn the robot brake both
     lever_m: float = 0.0
     drift: Drift = NO_DRIFT  # off its arc while it brakes
-
     # of the norm of ahead and sideways: infinite if the slower of both stops as if it were alone,
     # 1 if the brakes have to take away the sum, 2 otherwise
     order: float = 2.0
