@@ -69,7 +69,7 @@ def decide(
                 shielded=motion.shielded,
             )  # fmt: skip
             state, shielded = frozen.watch_motion(config, state, now), motion.shielded
-    twist = config.cmd_vel(state.value)
+    twist = limits.flush_denormals(config.cmd_vel(state.value))
     return state, records.Decision(twist, publish, cause, refused, answer, granted, shielded)
 
 
@@ -436,10 +436,14 @@ def follow(config: GateConfig, state: GateState, motion: Motion, now: float) -> 
 
 
 def bounded(config: GateConfig, state: GateState, motion: Motion, now: float) -> Motion:
-    """Replaces a motion that is not finite or beyond its limits by zero, whatever came before."""
+    """Replaces a motion that is not finite or beyond its limits by zero, whatever came before.
+
+    What is denormal becomes zero as well.
+    """
     good = config.limits is None or limits.within(motion.value, config.limits)
     if good and np.isfinite(motion.value).all() and np.isfinite(motion.slope).all():
-        return motion
+        value = limits.flush_denormals(motion.value)
+        return replace(motion, value=value, slope=limits.flush_denormals(motion.slope))
     zero = np.zeros_like(motion.value)
     return Motion(zero, zero, motion.shielded, f"a motion of {motion.value.tolist()} came out")
 

@@ -19,6 +19,7 @@ PERIOD_S = 0.02  # of the gate's ticks [s]; a limit that allows the whole range 
 SNAP = 1e-12  # a value this close to its target, as a share of the greatest value, has reached it
 GREATEST = 1e300  # numbers are clipped to this before a multiplication: inf times 0 would be NaN
 STILL = 1e-9
+LEAST_NORMAL = float(np.finfo(np.float64).tiny)  # numbers nearer to zero lose digits: denormal
 LEAST_MOTION = 0.01  # if no speed may exceed this, the robot can't be driven [m/s or rad/s]
 LONGEST_START_S, STARTED = 10.0, 0.01
 """Within the first [s] a command must be able to reach the second (share of its greatest value)."""
@@ -144,10 +145,15 @@ def within(value: Array, limits: Limits) -> bool:
     return bool(((value >= limits.low) & (value <= limits.high)).all())  # False for NaN
 
 
+def flush_denormals(values: Array) -> Array:
+    """Returns values (...) of which those that are denormal, hence no speeds, are exactly zero."""
+    return np.where(np.abs(values) < LEAST_NORMAL, 0.0, values)
+
+
 def saturate(command: Array, limits: Limits) -> Array:
     """Returns the command (C,) within its limits, speeds and turns scaled alike: the same path."""
     speeds, factor = limits.linear | limits.turn, 1.0
-    out = np.clip(command, -GREATEST, GREATEST)  # 0 times inf is NaN
+    out = flush_denormals(np.clip(command, -GREATEST, GREATEST))  # 0 times inf is NaN
     for i, value in enumerate(out):
         bound = limits.high[i] if value > 0.0 else limits.low[i]
         if bound == 0.0:
@@ -155,7 +161,7 @@ def saturate(command: Array, limits: Limits) -> Array:
         elif speeds[i] and abs(value) > abs(bound):
             factor = min(factor, bound / value)
     out[speeds] *= factor
-    return np.clip(out, limits.low, limits.high)
+    return flush_denormals(np.clip(out, limits.low, limits.high))
 
 
 def follow(

@@ -164,7 +164,8 @@ def body_of(shield: ShieldConfig) -> shield_kernels.Body:
     corners = np.array(shield.outline, np.float64).reshape(-1, 2)
     reach = float(np.hypot(*corners.T).max(initial=0.0))
     outline = Outline(corners, 0, len(corners))
-    return shield_kernels.Body(outline, shield.footprint_radius, reach, shield.margin)
+    radius = shield.footprint_radius
+    return shield_kernels.Body(outline, radius, reach, shield.margin, shield.lever, shield.order)
 
 
 def rehearse() -> None:
@@ -260,9 +261,26 @@ def _family(
         return _car_family(given.wheelbase, twists, odometry)
     if odometry is not None:
         twists = np.concatenate([twists, odometry[None]])
+    twists = _with_drift(given, twists)
     low, high = twists.min(axis=0), twists.max(axis=0)
     counts = np.where(high > low, (SPEEDS, SPEEDS, TURNS), 1)
     return np.asarray(shield_kernels.grid(low, high, counts))
+
+
+def _with_drift(given: ShieldConfig, twists: Array) -> Array:
+    """Returns twists (n, 3), and those of the arcs between which the robot leaves theirs."""
+    drift = given.drift
+    if drift.is_none:
+        return twists
+    scale = np.array([1.0, 1.0, given.footprint_radius])
+    greatest = np.abs(twists * scale).max(axis=1, keepdims=True)
+    is_lesser = np.abs(twists * scale) < greatest
+    bound = drift.share * greatest / scale
+    rows = [twists]
+    for factor in (drift.least, drift.greatest):
+        changed = np.clip(factor * twists, -bound, bound)
+        rows.append(np.where(is_lesser, changed, twists))
+    return np.concatenate(rows)
 
 
 def _car_family(wheelbase: float, commands: Array, odometry: Array | None) -> Array:

@@ -48,12 +48,16 @@ class Body(NamedTuple):
         radius: of the circle around it [m].
         reach: by which a turn moves it, [m/rad]; 0 for a circle.
         margin: clearance [m].
+        lever: by which a turn rate adds to the speed that is braked, [m/rad].
+        order: of the norm of ahead and sideways that is braked; see `robot.braking.Braking`.
     """
 
     outline: Outline
     radius: float
     reach: float
     margin: float
+    lever: float = 0.0
+    order: float = 2.0
 
 
 @kernel
@@ -113,7 +117,12 @@ def _steps_apart(spare, each, steps):  # type: ignore[no-untyped-def]
 def _path(twist, body, blind, deceleration):  # type: ignore[no-untyped-def]
     """Returns the longest path of a point of the footprint [m], and the speed that brakes [m/s]."""
     speed, turn = math.hypot(twist[0], twist[1]), abs(twist[2]) * body.reach
-    pace = max(speed, turn)
+    across = speed
+    if body.order == 1.0:
+        across = abs(twist[0]) + abs(twist[1])
+    elif body.order == math.inf:
+        across = max(abs(twist[0]), abs(twist[1]))
+    pace = max(across + abs(twist[2]) * body.lever, turn)
     return (speed + turn) * (blind + pace / (2.0 * deceleration)), pace
 
 

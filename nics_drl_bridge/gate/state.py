@@ -10,6 +10,7 @@ from nics_drl_bridge.gate.inputs import Command, Estimate, Odometry, Scan
 from nics_drl_bridge.gate.limits import Limits
 from nics_drl_bridge.geometry import Bicycle
 from nics_drl_bridge.interface import Array
+from nics_drl_bridge.robot.braking import NO_DRIFT, Drift
 
 Ranges = NDArray[np.float32]
 Record = TypeVar("Record")
@@ -43,6 +44,9 @@ class ShieldConfig:
     unknown_width: float = 0.35  # angle over which that share is taken [rad]
     # Corners of the footprint in `base_link`, in order [m]; none of a robot that is a circle.
     outline: tuple[tuple[float, float], ...] = ()
+    lever: float = 0.0  # by which a turn rate adds to the speed that is braked [m]
+    order: float = 2.0  # of the norm of ahead and sideways, see `Braking.order`
+    drift: Drift = NO_DRIFT  # off its arc while it brakes; of no account for a car
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,8 @@
 """Stopping behaviour of a robot, and a check for settings with which it could never move."""
 
+import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,16 +13,16 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate.limits import SPEED, TURN, Limits, LimitsFile, Stopping
 from nics_drl_bridge.gate.state import GateConfig, ShieldConfig
 from nics_drl_bridge.generator import SimulatorModel
+from nics_drl_bridge.robot.braking import Braking, braking_of
 from nics_drl_bridge.robot.spec import RobotSpec
-from nics_drl_bridge.robot.taylor import TaylorModel, term_name
 
 ANGLE = "rad"
 UNKNOWN_LAG_S = 0.5  # lag of a robot whose model shows none [s]
-SLOWEST_LAG_S = 5.0  # slower modes are not lags but combinations that no command moves [s]
 UNKNOWN_DECELERATION = 0.5  # deceleration of a robot whose limits are not known [m/s^2]
 SHIELD_SPANS = {  # beyond them the robot could never move
     "latency": (0, 10), "deceleration": (1e-3, 1e4), "margin": (0, 10), "obstacle_speed": (0, 100),
 }  # fmt: skip
+HARDEST = SHIELD_SPANS["deceleration"][1]
 LEAST_DATA = 2  # least number that must arrive while the gate settles, for a rate to be known
 
 
@@ -47,14 +49,19 @@ def shield_config(
     # It is the `shield` of a file of limits, else of model and limits; given values override it.
     path = find_config(file, "limits") if file else None
     measured = load_yaml(path, LimitsFile).shield if path else None
-    if (stopping := measured) is None:  # one command per period; brakes no harder than its limits
-        rates = [] if limits is None else limits.rate[limits.linear].tolist()
-        brakes = zip(model.robot.state, model.kinematics.braking.tolist(), strict=True)
-        hardest = [rate for v, rate in brakes if v.unit == SPEED]
-        reacts = model.calibration.command_latency_s + float(model.kinematics.delays.max(initial=0))
-        delay = reacts + lag(model.kinematics) + model.control_period
-        deceleration = min(min(rates, default=UNKNOWN_DECELERATION), min(hardest, default=np.inf))
-        stopping = Stopping(latency=max(0.0, delay), deceleration=deceleration)
+    told = set() if given is None else set(given)
+    try:
+        braking = braking_by(model, limits)
+    except ConfigError as error:  # how it stops has to be told
+        if measured is None and not told >= {"latency", "deceleration"}:
+            advice = "or tell it: `shield: {latency: .., deceleration: ..}` in the file of limits"
+            raise ConfigError(f"{str(error).removesuffix('.')}, {advice}.") from None
+        braking = Braking(0.0, math.inf)
+    stopping = measured
+    if stopping is None:
+        stopping = Stopping(
+            latency=braking.reaction_s, deceleration=min(braking.deceleration, HARDEST)
+        )
     values = stopping.model_copy(update=dict(given or {}))
     for name, value in values.model_dump().items():
         least, most = SHIELD_SPANS[name]
@@ -67,7 +74,8 @@ def shield_config(
         hold_s=GateConfig.gap_s, footprint_radius=model.robot.footprint_radius,
         wheelbase=wheelbase(model.robot), obstacle_speed=values.obstacle_speed,
         range_max=lidar.range_max, range_noise=(lidar.noise_std, lidar.faults.noise_proportional),
-        outline=model.robot.footprint or (),
+        outline=model.robot.footprint or (), lever=braking.lever_m,
+        order=braking.order, drift=braking.drift,
     )  # fmt: skip
     source = f"by {path}" if measured is not None else "derived from model and limits"
     if given:
@@ -76,17 +84,27 @@ def shield_config(
     return config, f"the shield is on: {listed} ({source})"
 
 
-def lag(kinematics: TaylorModel) -> float:
-    """Returns the slowest time constant [s] of the state's rates at rest; a guess if none shows."""
-    states = kinematics.variables[: kinematics.state_size]
-    names = [term_name(row, kinematics.variables) for row in kinematics.powers]
-    own = np.zeros((len(states), len(states)))
-    for column, state in enumerate(states):
-        if state in names:
-            own[:, column] = kinematics.coefficients[3:, names.index(state)]
-    decays = -np.linalg.eigvals(own).real if states else np.zeros(0)
-    settling = decays[decays > 1.0 / SLOWEST_LAG_S]
-    return float(1.0 / settling.min()) if len(settling) else UNKNOWN_LAG_S
+def braking_by(model: SimulatorModel, limits: Limits | None) -> Braking:
+    """Returns how a robot stops by its model, when it is told to by its gate.
+
+    Its base looks for one command per period, and brakes no harder than its limits allow.
+    Raises ConfigError for a model that does not come to rest.
+    """
+    robot = model.robot
+    linear = np.array([variable.unit == SPEED for variable in robot.command])
+    if limits is None:
+        low, high = robot.command_low, robot.command_high
+        rates = np.full(len(linear), UNKNOWN_DECELERATION)
+    else:
+        low, high = limits.low, limits.high
+        rates = limits.rate
+    ramp = np.where(linear, rates, np.inf)
+    braking = braking_of(robot, model.kinematics, low, high, ramp)
+    reaction = braking.reaction_s
+    if not model.kinematics.state_size or braking == Braking(0.0, math.inf):
+        reaction += UNKNOWN_LAG_S  # it shows no lag, and every robot has one
+    reaction += max(0.0, model.calibration.command_latency_s) + model.control_period
+    return replace(braking, reaction_s=round(reaction, 9))
 
 
 def wheelbase(robot: RobotSpec) -> float:

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.geometry import Array, depths
@@ -12,6 +13,8 @@ from nics_drl_bridge.robot.spec import RobotSpec
 CELL_M, MOST_M = 0.05, 4.0  # side of the cells of distances; greatest reach of a map
 FINE_M, DEEP_M, BORDER_M = 0.02, 0.03, 0.08
 """Lattice of the discs, depth from which they cover all, and space of points on the border."""
+MOST_POINTS = 5000  # of a lattice; that of a footprint with more of them is coarser
+ROWS = 64  # of distances between points that are computed at a time
 
 
 def rays_of(task: Navigation) -> kernels.ScanRays:
@@ -28,16 +31,12 @@ def outline_of(robot: RobotSpec) -> kernels.FootprintDiscs:
         return kernels.FootprintDiscs(np.zeros((0, 3)), np.zeros(2), radius, radius)
     corners = np.array(robot.footprint)
     low, high = corners.min(axis=0), corners.max(axis=0)
-    axes = (np.arange(a + FINE_M / 2, b, FINE_M) for a, b in zip(low, high, strict=True))
+    spacing = max(FINE_M, math.sqrt(float(np.prod(high - low)) / MOST_POINTS))
+    axes = (np.arange(a + spacing / 2, b, spacing) for a, b in zip(low, high, strict=True))
     lattice = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     depth = depths(lattice, corners)
     lattice, depth = lattice[depth > 0.0], depth[depth > 0.0]
-    left, chosen = depth > DEEP_M, list[Array]()
-    covers = np.linalg.norm(lattice[:, None] - lattice, axis=-1) < depth[:, None]
-    while left.any():
-        best = int((covers & left).sum(axis=1).argmax())
-        chosen.append(np.array([*lattice[best], depth[best]]))
-        left &= ~covers[best]
+    chosen = _cover(lattice, depth)
     sides = np.roll(corners, -1, axis=0) - corners
     for corner, side in zip(corners, sides, strict=True):
         count = max(1, round(float(np.linalg.norm(side)) / BORDER_M))
@@ -47,6 +46,32 @@ def outline_of(robot: RobotSpec) -> kernels.FootprintDiscs:
     return kernels.FootprintDiscs(
         np.array(chosen), lattice[middle], float(depth.max()), float(reach[middle])
     )
+
+
+def _cover(lattice: Array, depth: Array) -> list[Array]:
+    """Returns discs (3,) around points (N, 2) that cover all that are deep within a footprint.
+
+    Each of them covers the most points that were left; the radius of a disc is its depth (N,).
+    """
+    left = depth > DEEP_M
+    covered = _count_covered(lattice, depth, lattice[left])
+    chosen = []
+    while left.any():
+        best = int(covered.argmax())
+        chosen.append(np.array([*lattice[best], depth[best]]))
+        new = left & (np.linalg.norm(lattice - lattice[best], axis=-1) < depth[best])
+        covered -= _count_covered(lattice, depth, lattice[new])
+        left &= ~new
+    return chosen
+
+
+def _count_covered(centres: Array, radii: Array, points: Array) -> NDArray[np.int64]:
+    """Returns how many points (M, 2) lie within each disc (N,)."""
+    count = np.zeros(len(centres), np.int64)
+    for first in range(0, len(points), ROWS):
+        x, y = (points[first : first + ROWS, None] - centres).transpose(2, 0, 1)
+        count += (np.sqrt(x * x + y * y) < radii).sum(axis=0)
+    return count
 
 
 def scratch_of(

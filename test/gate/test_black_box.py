@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from nics_drl_bridge.gate.black_box import (
 from nics_drl_bridge.gate.inputs import EStop
 from nics_drl_bridge.gate.state import ShieldConfig
 from nics_drl_bridge.interface import NS_PER_S
+from nics_drl_bridge.robot.braking import Drift
 
 
 class Recorded(Rig):
@@ -45,6 +47,16 @@ def stopped(path, kept_s=30.0):
     rig.scan(stamp_ns=rig.stamp + 5 * NS_PER_S)
     write(rig.config, rig.box.copy(), path)
     return rig
+
+
+def test_a_robot_that_leaves_its_arc_while_it_brakes_is_replayed(tmp_path):
+    shield = ShieldConfig(0.2, 1.0, 0.05, 0.02, 0.15, lever=0.2, order=np.inf)
+    shield = replace(shield, drift=Drift(0.9, 2.0, 1.1))
+    rig = Recorded(config(shield=shield), 30.0).drive()
+    rig.command([np.nan, 1.0, -0.0])
+    rig.run(0.3)
+    write(rig.config, rig.box.copy(), tmp_path / "stop.jsonl")
+    assert replay(tmp_path / "stop.jsonl").differing == ()
 
 
 def test_a_stop_replays_to_the_same_decisions_bit_for_bit(tmp_path):

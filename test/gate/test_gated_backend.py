@@ -43,6 +43,31 @@ def test_the_shield_stops_a_robot_before_the_wall_that_it_hits_without_a_gate(mo
     assert {each["stopped_by"] for each in told} == {""}
 
 
+WEAK = "robot: jackal\ncommands:\n" + "".join(
+    f"  {name}: {{min: -0.5, max: {most}, rate: {rate}, jerk: {20 * rate}}}\n"
+    for name, most, rate in (("forward_command", 1.0, 2.0), ("turn_command", 2.5, 8.0))
+)
+ASSUMED = "shield: {latency: 0.305, deceleration: 2.0, margin: 0.05, obstacle_speed: 0.0}\n"
+
+
+@pytest.mark.parametrize(("shield", "hits"), [("", False), (ASSUMED, True)])
+def test_wheels_that_brake_weakly_stop_before_the_wall_unless_more_is_assumed(
+    tmp_path, shield, hits
+):
+    model = builtin_model("jackal")
+    brakes = 0.2 / model.robot.parameters["wheel_radius"]
+    limits = np.array([[-brakes, 4.0 * brakes], [-brakes, 4.0 * brakes]])
+    weak = replace(model, kinematics=replace(model.kinematics, limits=limits))
+    (tmp_path / "jackal.yaml").write_text(WEAK + shield)
+    bare = SimBackend(weak, field(8.0), estimator=True)
+    behind = GatedBackend(bare, weak, str(tmp_path / "jackal.yaml"))
+    behind.reset(START)
+    told = [behind.step(np.array([1.0, 0.0]))[1] for _ in range(250)]
+    assert any(each["true_collision"] for each in told) == hits
+    if not hits:  # and it does not stand far away from it
+        assert 2.5 < bare.simulator.data.pose[0, 0, 0] < 4.0 - 0.25
+
+
 def test_commands_rise_at_the_rate_of_the_limits(model):
     behind, bare = gated(model)
     behind.reset(START)

@@ -14,6 +14,7 @@ from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate import gate
 from nics_drl_bridge.gate.inputs import Command
 from nics_drl_bridge.gate.limits import Limits, follow, implausible, load_limits, saturate, within
+from nics_drl_bridge.geometry import Bicycle
 from nics_drl_bridge.robot.spec import load_robot
 
 ROBOTS = shipped_names("limits")
@@ -277,3 +278,30 @@ def test_a_motion_beyond_its_limits_after_all_is_a_zero(monkeypatch, far):
     monkeypatch.setattr(gate, "SHAPERS", (broken, gate.SHAPERS[-1]))
     assert not rig.run(TICK_S).twist.any()
     assert rig.rule == "motion_unfit"
+
+
+@pytest.mark.parametrize("speed", [1e-310, -1e-310, 5e-324])
+def test_a_denormal_speed_is_exactly_zero(speed):
+    limits = LIMITS["differential"]
+    assert not saturate(np.array([speed, speed]), limits).any()
+    for settings_of_gate in (config(), config(bicycle=Bicycle(0.2))):
+        rig = Rig(settings_of_gate).drive()
+        rig.wish = np.array([speed, 0.0, speed])
+        rig.speed = 0.0
+        rig.run(2.0)
+        assert rig.decision.publish
+        assert rig.decision.cause is None
+        assert not rig.decision.twist.any()
+        assert rig.state.value[0] == 0.0
+
+
+def test_a_denormal_that_the_shield_leaves_of_a_speed_is_exactly_zero(monkeypatch):
+    def leave(_, state, motion, now):
+        return replace(motion, value=np.full_like(motion.value, 1e-310))
+
+    rig = driving()
+    monkeypatch.setattr(gate, "SHAPERS", (*gate.SHAPERS[:-1], leave, gate.bounded))
+    rig.speed = 0.0
+    rig.run(0.1)
+    assert rig.decision.publish
+    assert not rig.decision.twist.any()

@@ -4,13 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from robots import field
 
 from gate.rig import Rig, config
+from nics_drl_bridge.config import find_config
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.gate.limits import load_limits
-from nics_drl_bridge.gate.stopping import doubtful, lag, require_possible, shield_config, wheelbase
+from nics_drl_bridge.gate.stopping import doubtful, require_possible, shield_config, wheelbase
 from nics_drl_bridge.generator import builtin_model
+from nics_drl_bridge.robot.noise import Noise
 from nics_drl_bridge.robot.spec import load_robot
+from nics_drl_bridge.sim.simulator import FastSimulator
 
 ROBOTS = ("ackermann", "differential", "mecanum")
 
@@ -51,23 +55,99 @@ def test_what_no_file_tells_is_derived_with_care(robot):
     assert "derived from model and limits" in said
     slow = replace(model.calibration, command_latency_s=0.3)
     later = shield_config(replace(model, calibration=slow), None)[0]
-    assert later.latency_s == pytest.approx(shield.latency_s + 0.3)
+    assert later.latency_s == pytest.approx(shield.latency_s + 0.3, abs=0.02)
     assert later.deceleration < 1.0
+
+
+def limited(model, rate):
+    """The model, whose states change by at most a rate per second."""
+    limits = np.tile([-rate, rate], (model.kinematics.state_size, 1))
+    return replace(model, kinematics=replace(model.kinematics, limits=limits))
+
+
+def kept_free(shield, speed):
+    """The distance that a shield keeps free straight ahead, without margin and hold [m]."""
+    return speed * (shield.latency_s + speed / (2.0 * shield.deceleration))
+
+
+def stopping_distance(model, limits, speed, command=0):
+    """How far a robot still moves in the simulator: its base hears the stop a period late [m]."""
+    sim = FastSimulator(model, field(60.0))
+    commands = np.zeros((1, 1, len(model.robot.command)))
+    sim.reset([0], starts=np.zeros((1, 1, 3)))
+    commands[..., command] = speed
+    for _ in range(round(12.0 / model.control_period)):
+        sim.step(commands)
+        before = sim.data.pose[0, 0].copy()
+    sim.step(commands)
+    path = float(np.hypot(*(sim.data.pose[0, 0] - before)[:2]))
+    while abs(commands[0, 0, command]) > 0.0:
+        slower = abs(commands[0, 0, command]) - limits.rate[command] * model.control_period
+        commands[..., command] = np.sign(speed) * max(0.0, slower)
+        path += moved_by(sim, commands)
+    while (step := moved_by(sim, commands)) > 1e-4 * model.control_period:
+        path += step
+    return path
+
+
+def moved_by(sim, commands):
+    before = sim.data.pose[0, 0].copy()
+    sim.step(commands)
+    return float(np.hypot(*(sim.data.pose[0, 0] - before)[:2]))
+
+
+@pytest.mark.parametrize(("at_the_rim", "least"), [(None, 0.45), (0.2, 2.4), (0.5, 1.05)])
+def test_the_way_that_is_kept_free_is_what_the_simulator_needs(at_the_rim, least):
+    """Also for wheels, whose limits of rates are in rad/s^2: at 0.2 m/s^2 it is over 2.5 m."""
+    model = replace(builtin_model("jackal"), noise=Noise())
+    if at_the_rim is not None:
+        model = limited(model, at_the_rim / model.robot.parameters["wheel_radius"])
+    limits = load_limits("jackal", model.robot)
+    shield, _ = shield_config(model, limits)
+    for speed in (1.0, 0.5, 0.2, -0.4):
+        needed = stopping_distance(model, limits, speed)
+        assert kept_free(shield, abs(speed)) >= needed - 0.01
+        assert kept_free(shield, abs(speed)) <= 1.3 * needed + 0.05
+    assert stopping_distance(model, limits, 1.0) > least
 
 
 def test_a_robot_brakes_no_harder_than_its_model_can():
     model = builtin_model("ackermann")
-    limits = np.array([[-0.3, 0.4], [-0.1, 0.1]])  # of its speed, and of its steering
-    slow = replace(model, kinematics=replace(model.kinematics, limits=limits))
-    assert shield_config(slow, load_limits("ackermann", model.robot))[0].deceleration == 0.3
-    assert shield_config(slow, None)[0].deceleration == 0.3
+    kinematics = replace(model.kinematics, limits=np.array([[-0.3, 0.4], [-0.1, 0.1]]))
+    slow = replace(model, kinematics=kinematics)
+    for limits in (load_limits("ackermann", model.robot), None):
+        assert 0.2 < shield_config(slow, limits)[0].deceleration < 0.33
 
 
-def test_the_lag_of_a_model_that_shows_none_is_guessed():
-    model = builtin_model("ackermann").kinematics
-    still = replace(model, coefficients=0.0 * model.coefficients)
-    assert lag(model) == pytest.approx(0.1, abs=0.01)
-    assert lag(still) == 0.5
+def test_wheels_that_brake_weakly_turn_the_robot_off_its_arc():
+    model = builtin_model("jackal")
+    weak = limited(model, 2.0)
+    limits = load_limits("jackal", model.robot)
+    assert shield_config(model, limits)[0].drift.is_none
+    shield = shield_config(weak, limits)[0]
+    assert shield.drift.greatest == pytest.approx(2.0, abs=0.1)
+    assert shield.lever > 0.2
+
+
+def test_a_model_that_shows_no_lag_has_an_assumed_one():
+    model = builtin_model("ackermann")
+    still = replace(model.kinematics, coefficients=0.0 * model.kinematics.coefficients)
+    limits = load_limits("ackermann", model.robot)
+    shield = shield_config(replace(model, kinematics=still), limits)[0]
+    assert shield.latency_s == pytest.approx(0.5 + model.control_period)
+
+
+def test_a_robot_that_does_not_stop_by_its_model_needs_to_be_told_how_it_stops(tmp_path):
+    model = builtin_model("jackal")
+    rolling = limited(model, 1e-4)
+    limits = load_limits("jackal", model.robot)
+    with pytest.raises(ConfigError, match=r"does not stop.* or tell it: `shield: {lat.*limits"):
+        shield_config(rolling, limits)
+    told = {"latency": 0.5, "deceleration": 0.05}
+    assert shield_config(rolling, limits, given=told)[0].deceleration == 0.05
+    text = find_config("jackal", "limits").read_text()
+    (tmp_path / "my.yaml").write_text(f"{text}shield: {{latency: 0.5, deceleration: 0.05}}\n")
+    assert shield_config(rolling, limits, tmp_path / "my.yaml")[0].latency_s == 0.5
 
 
 @pytest.mark.parametrize(

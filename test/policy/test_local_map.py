@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from nics_drl_bridge.policy.local_map_kernels import (
     touching,
     way_at,
 )
-from nics_drl_bridge.robot.spec import load_robot
+from nics_drl_bridge.robot.spec import load_robot, robot_from
 
 CLOSE = Clearance(margin=0.05, soft=0.3)
 GOAL = np.array([3.0, 0.0])
@@ -75,6 +76,28 @@ def test_room_is_the_distance_from_the_outline_up_to_a_cell(robot):
             assert room == pytest.approx(exact, abs=0.7 * CELL_M)
         else:
             assert room > CLOSE.margin + CLOSE.soft - CELL_M
+
+
+def box(length, width):
+    """A robot with a rectangular footprint."""
+    x, y = length / 2.0, width / 2.0
+    corners = [[x, y], [-x, y], [-x, -y], [x, -y]]
+    return robot_from({"name": "box", "kind": "differential", "footprint": corners})
+
+
+@pytest.mark.parametrize(("length", "width"), [(0.6, 0.4), (1.2, 0.8), (2.4, 1.6), (6.0, 3.0)])
+def test_the_discs_of_a_large_footprint_take_little_memory_and_leave_little_out(length, width):
+    tracemalloc.start()
+    outline = outline_of(box(length, width))
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < 30e6
+    rng = np.random.default_rng(0)
+    half = np.array([length, width]) / 2.0
+    points = rng.uniform(-half, half, (2000, 2))
+    apart = np.linalg.norm(points[:, None] - outline.discs[:, :2], axis=-1) - outline.discs[:, 2]
+    assert apart.min(axis=1).max() < CELL_M
+    assert (np.abs(outline.discs[:, :2]) + outline.discs[:, 2:] <= half + 1e-9).all()
 
 
 def test_a_robot_that_is_too_near_already_may_only_move_away():
