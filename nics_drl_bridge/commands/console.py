@@ -74,8 +74,11 @@ TopicOption = Annotated[list[str] | None, Option(
     metavar="ROLE=TOPIC", help="Topic of one role, as cmd_vel=/car/drive; may be given several "
     "times. Roles: cmd_vel, pose, odom, joint_states, imu; none as a topic leaves a role out.")
 ]  # fmt: skip
+HARDWARE_OPTIONS = (
+    "start", "namespace", "pose_type", "yes", "arm", "goal_frame", "confirm_beyond",
+)  # fmt: skip
 NEEDED: dict[str, dict[str, tuple[str, ...]]] = {  # options that do nothing without another
-    "evaluate": dict.fromkeys(("start", "namespace", "pose_type", "yes", "arm"), ("hardware",))
+    "evaluate": dict.fromkeys(HARDWARE_OPTIONS, ("hardware",))
     | {"topic": ("shadow",), "ahead": ("shadow",), "goal": ("hardware", "shadow")},
     "watch": {"topic": ("bag",), "namespace": ("ros",), "episodes": ("record",)},
 }
