@@ -125,9 +125,12 @@ start.main()
 
 @pytest.mark.process
 @pytest.mark.parametrize("then", ["raise", "pass; raise RuntimeError('lost')", "sys.exit(1)"])
-def test_a_command_that_is_interrupted_ends_with_130_whatever_the_moment(then):
+def test_a_command_that_is_interrupted_ends_with_130_whatever_the_moment(tmp_path, then):
+    (tmp_path / "loses_it.py").write_text(LOSES_IT.format(then=then))
+    words = [sys.executable, "-m", "loses_it"]
+    path = os.pathsep.join([str(tmp_path), *sys.path])
     with subprocess.Popen(
-        [sys.executable, "-c", LOSES_IT.format(then=then)], stdout=subprocess.PIPE, text=True
+        words, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": path}
     ) as process:
         assert process.stdout.readline() == "began\n"
         process.send_signal(signal.SIGINT)
