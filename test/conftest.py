@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 from importlib.metadata import PackageNotFoundError, version
@@ -17,6 +18,16 @@ ASK_ROS = """
 import os, rclpy
 print(os.environ.get("ROS_DISTRO", ""), rclpy.get_rmw_implementation_identifier())
 """
+
+
+def pytest_configure() -> None:
+    """Lets SIGINT interrupt again, here and in all children.
+
+    A shell starts a background job, as in `make test &` of a script, with SIGINT ignored, and every
+    process below it inherits that: Ctrl-C could not be tested.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_report_header() -> str:

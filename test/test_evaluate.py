@@ -7,11 +7,14 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import pytest
 from command_line import nics
 from domains import claimed_domain
 
+from nics_drl_bridge import geometry
 from nics_drl_bridge.config import dump_yaml
+from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.policy.policies import shipped_policies
 from nics_drl_bridge.robot.spec import load_robot
 
@@ -214,6 +217,85 @@ def test_a_vehicle_is_driven_in_real_time_through_the_armed_gate(tmp_path, monke
     assert list(driven.goal) == list(beside.goal)
     told = json.loads((tmp_path / "out" / "evaluation.json").read_text(encoding="utf-8"))
     assert list(told["policies"]["dynamic_window"]) == ["vehicle", "fast"]
+
+
+@pytest.fixture
+def far_from_the_origin(tmp_path, monkeypatch):
+    """A robot on a wide field whose odometry began elsewhere, behind what a gate listens to."""
+    from nics_drl_bridge.commands import episodes as vehicle
+    from nics_drl_bridge.nodes.processes import NodeProcess, Witness
+
+    world = tmp_path / "wide.yaml"
+    world.write_text("name: wide\nbounds: [-40, -40, 40, 40]\ngoal_distance: [2.0, 4.0]\n")
+    given = {"model": "differential", "world": str(world), "enable_stamped_cmd_vel": True}
+    given |= {"episode_start": [18.0, 5.0, 2.0], "mode": "realtime"}
+    monkeypatch.setattr(vehicle, "examine", lambda facts, expected: [])  # of a busy machine
+    monkeypatch.setattr(vehicle, "LISTEN_S", 0.1)
+    with claimed_domain() as domain_id:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain_id))
+        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        raw = {"cmd_vel": "cmd_vel_raw"}
+        with (
+            NodeProcess("simulator_node", tmp_path / "logs", given, domain_id, remap=raw),
+            Witness(domain_id) as witness,
+        ):
+            assert witness.sees(DEADLINE_S)
+            yield witness
+
+
+def vehicle_order(folder):
+    from nics_drl_bridge.commands import episodes as vehicle
+
+    return vehicle.EvaluationOrder(["dynamic_window"], folder, "differential", "circles", 1, 0)
+
+
+@pytest.mark.ros
+@pytest.mark.process
+@needs_nodes
+def test_a_goal_from_where_the_vehicle_stands_lies_there_wherever_odometry_began(
+    tmp_path, far_from_the_origin
+):
+    from nics_drl_bridge.commands import episodes as vehicle
+
+    said = []
+    options = {"start": "present", "stale_after_s": DEADLINE_S, "stamped": True}
+    order = vehicle_order(tmp_path / "out")
+    made = vehicle.drive_vehicle(order, (1.0, 0.5), False, said.append, said.append, **options)
+    driven = made.runs["vehicle"][0]
+    assert any("it will drive to 1.00 m ahead and 0.50 m to the left" in line for line in said)
+    assert driven.result == "success", said
+    assert driven.goal == pytest.approx([1.0, 0.5])
+    assert driven.path[0] == pytest.approx(np.zeros(3), abs=0.1)
+    witnessed = far_from_the_origin.path
+    assert witnessed[0] == pytest.approx([18.0, 5.0, 2.0], abs=0.1)
+    truly = geometry.between(witnessed[0], witnessed[-1])[:2]
+    assert np.hypot(*(truly - [1.0, 0.5])) < 0.5
+    assert driven.length < 3.0
+
+
+@pytest.mark.ros
+@pytest.mark.process
+@needs_nodes
+def test_a_goal_in_map_far_from_where_the_vehicle_stands_is_refused_unconfirmed(
+    tmp_path, far_from_the_origin
+):
+    from nics_drl_bridge.commands import episodes as vehicle
+
+    options = {"start": "present", "stale_after_s": DEADLINE_S, "goal_frame": "map"}
+    order = vehicle_order(tmp_path / "out")
+    far = r"\(2.00 m, 0.50 m\) in map, 16.\d+ m from where it stands, farther than 5 m.*say --yes"
+    with pytest.raises(ConfigError, match=far):
+        vehicle.drive_vehicle(order, (2.0, 0.5), False, str, str, stamped=True, **options)
+    assert np.ptp(far_from_the_origin.path[:, :2], axis=0).max() < 0.01
+
+
+def test_a_far_goal_is_refused_before_anything_is_waited_for_where_nobody_can_be_asked(tmp_path):
+    words = ("evaluate", "dynamic_window", "--backend", "dds", "--hardware", "--start", "present")
+    done = nics(*words, "--goal", "20,0", "--model", "differential", cwd=tmp_path)
+    assert done.returncode == 2
+    sentence = done.stderr.splitlines()[-1]
+    assert "it will drive to 20.00 m ahead" in sentence
+    assert "farther than 5 m: nobody can confirm that here; say --yes" in sentence
 
 
 @pytest.mark.ros

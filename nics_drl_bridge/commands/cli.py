@@ -16,6 +16,7 @@ from nics_drl_bridge.commands.examples import complete
 from nics_drl_bridge.commands.listing import list_
 from nics_drl_bridge.commands.model import drive, generate, import_, inspect, record, urdf
 from nics_drl_bridge.commands.policy import policy
+from nics_drl_bridge.commands.start import EXIT_INTERRUPTED, was_interrupted
 from nics_drl_bridge.commands.train import train
 from nics_drl_bridge.commands.warmup import warmup
 from nics_drl_bridge.commands.watch import watch
@@ -74,7 +75,10 @@ def main() -> None:
     """Entry point of the executable; a wrong option also gives one sentence and exit code 2."""
     try:
         code = app(prog_name="nics", standalone_mode=False)
-    except typer.Abort:
+    except typer.Abort as abort:
+        if was_interrupted(abort):
+            typer.echo("nics: interrupted; nothing was started.", err=True)
+            raise SystemExit(EXIT_INTERRUPTED) from None
         typer.echo("Aborted.", err=True)
         raise SystemExit(1) from None
     except BrokenPipeError:
@@ -91,4 +95,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    from nics_drl_bridge.commands import start
+
+    start.main()

@@ -15,6 +15,7 @@ import typer
 from typer import Option
 
 from nics_drl_bridge import extensions
+from nics_drl_bridge.commands.start import was_interrupted
 from nics_drl_bridge.errors import MISSING_ROS, BridgeError, ConfigError, nearest
 from nics_drl_bridge.files import json_of
 from nics_drl_bridge.robot import DEFAULT_ROBOT
@@ -74,8 +75,11 @@ TopicOption = Annotated[list[str] | None, Option(
     metavar="ROLE=TOPIC", help="Topic of one role, as cmd_vel=/car/drive; may be given several "
     "times. Roles: cmd_vel, pose, odom, joint_states, imu; none as a topic leaves a role out.")
 ]  # fmt: skip
+HARDWARE_OPTIONS = (
+    "start", "namespace", "pose_type", "yes", "arm", "goal_frame", "confirm_beyond",
+)  # fmt: skip
 NEEDED: dict[str, dict[str, tuple[str, ...]]] = {  # options that do nothing without another
-    "evaluate": dict.fromkeys(("start", "namespace", "pose_type", "yes", "arm"), ("hardware",))
+    "evaluate": dict.fromkeys(HARDWARE_OPTIONS, ("hardware",))
     | {"topic": ("shadow",), "ahead": ("shadow",), "goal": ("hardware", "shadow")},
     "watch": {"topic": ("bag",), "namespace": ("ros",), "episodes": ("record",)},
 }
@@ -141,13 +145,12 @@ def one_sentence() -> Iterator[None]:
     """Turns user errors into one sentence and exit code 2, never a traceback."""
     try:
         yield
-    except (KeyboardInterrupt, SystemError) as error:
-        # Ctrl-C in a compiled function leaves it as a SystemError.
-        if not isinstance(error.__cause__ or error, KeyboardInterrupt):
-            raise
-        typer.echo("nics: interrupted; everything that was started has ended.", err=True)
-        raise typer.Exit(EXIT_INTERRUPTED) from None
-    except Exception as error:
+    except (typer.Exit, SystemExit, GeneratorExit):
+        raise
+    except BaseException as error:
+        if was_interrupted(error):
+            typer.echo("nics: interrupted; everything that was started has ended.", err=True)
+            raise typer.Exit(EXIT_INTERRUPTED) from None
         clause = str(error) if isinstance(error, BridgeError) else extensions.own_fault(error)
         if clause is None and isinstance(error, ImportError):
             clause = extensions.unmet(error)

@@ -15,6 +15,7 @@ import gymnasium
 
 from nics_drl_bridge import extensions
 from nics_drl_bridge.commands.conditions import NO_CONDITIONS, Conditions
+from nics_drl_bridge.commands.vehicle_goals import FAR_M, NEAR_M, WAIT, GoalOrder
 from nics_drl_bridge.config import shipped_names
 from nics_drl_bridge.env.registry import NAVIGATION, register_envs
 from nics_drl_bridge.env.sim_backend import make_backend
@@ -22,6 +23,8 @@ from nics_drl_bridge.errors import MISSING_ROS, BackendError, ConfigError, neare
 from nics_drl_bridge.files import json_of, write_bytes, write_text
 from nics_drl_bridge.gate.gated_backend import GatedBackend
 from nics_drl_bridge.generator import SimulatorModel, open_model
+from nics_drl_bridge.interface import Backend
+from nics_drl_bridge.nodes.parameters import NO_POSE
 from nics_drl_bridge.policy import evaluation
 from nics_drl_bridge.policy.contract import Contract
 from nics_drl_bridge.policy.evaluation import Episode, Tally, drive, drive_all
@@ -34,7 +37,7 @@ from nics_drl_bridge.report.pictures import trajectories
 from nics_drl_bridge.robot import DEFAULT_ROBOT
 from nics_drl_bridge.robot.spec import RobotSpec
 from nics_drl_bridge.seeds import checked_seeds
-from nics_drl_bridge.sim.scenes import Scene, sample_scene
+from nics_drl_bridge.sim.scenes import sample_scene
 from nics_drl_bridge.sim.world_set import AnyWorld, load_worlds
 
 FAST, DDS, MUJOCO, VEHICLE = "fast", "dds", "mujoco_dds", "vehicle"
@@ -91,16 +94,23 @@ def env_of(
     conditions: Conditions = NO_CONDITIONS, **options: Any,
 ) -> tuple[gymnasium.Env[Any, Any], Policy]:  # fmt: skip
     """Makes the env of a policy's task with a backend, behind a gate if any; opens the policy."""
-    register_envs()
-    opened, task = open_policy(policy, model, conditions.fallback, conditions.kind)
-    task = replace(task, **conditions.task)
     field = load_worlds(world) if isinstance(world, str) else world
     given = {name: value for name, value in options.items() if value is not None}
     made = make_backend(backend, model, field, **given)
     if conditions.gate is not None:
         made = GatedBackend(made, model, conditions.gate)
-    given = {"backend": made, "model": model, "world": field, "task": task}
-    limit = conditions.steps or pace_of(model, [field]).steps
+    return env_with(made, policy, model, field, conditions)
+
+
+def env_with(
+    backend: Backend, policy: str, model: SimulatorModel, world: AnyWorld, conditions: Conditions
+) -> tuple[gymnasium.Env[Any, Any], Policy]:
+    """Makes the env of a policy's task on a backend; opens the policy."""
+    register_envs()
+    opened, task = open_policy(policy, model, conditions.fallback, conditions.kind)
+    task = replace(task, **conditions.task)
+    given = {"backend": backend, "model": model, "world": world, "task": task}
+    limit = conditions.steps or pace_of(model, [world]).steps
     return gymnasium.make(NAVIGATION, max_episode_steps=limit, **given), opened
 
 
@@ -314,17 +324,28 @@ def line_of(one: Evaluated) -> str:
 
 def drive_vehicle(
     order: EvaluationOrder, goal: tuple[float, float] | None, arm: bool, say: Say, ask: Say,
+    goal_frame: str | None = None, confirm: Say | None = None, confirm_beyond_m: float = FAR_M,
     **options: Any,
 ) -> Evaluated:  # fmt: skip
     """Drives episodes on the vehicle by `cmd_vel_raw`, so through an armed gate, and compares.
 
     Then the fast simulator drives them from the actual starting poses. `ask` gets each start, and
-    returns when it may begin. Raises BackendError if the vehicle does not fit its model or answer.
+    returns when it may begin; `confirm` gets each goal that is farther away than a limit, and
+    returns if it may be driven to: without it such a goal is refused. A goal is seen from where the
+    robot starts, or in `map`, see `GoalOrder`. Raises BackendError if the vehicle does not fit its
+    model or answer, ConfigError if a goal is refused.
     """
     policy = order.policies[0]
     contracts = contracts_of(order.policies, order.model)
     name, namespace = model_name(order.model, contracts), options.get("namespace", "")
     model, world = open_model(name), load_worlds(order.world)
+    localised = options.get("pose_type", NO_POSE) != NO_POSE
+    start = options.get("start", WAIT)
+    wanted = GoalOrder(goal, goal_frame, start, localised, confirm_beyond_m)
+    radius = model.robot.footprint_radius
+    if not wanted.needs_pose:  # refused before anybody waits for anything
+        planned = [wanted.episode(sample_scene(world, radius, seed)) for seed in order.seeds]
+        max(planned, key=lambda one: one.distance).confirm(confirm)
     under = limited(order.conditions, contracts, model, world, say)
     # A misfit is an error before anything moves.
     open_policy(policy, model, order.conditions.fallback, order.conditions.kind)
@@ -339,14 +360,25 @@ def drive_vehicle(
     if errors:
         raise BackendError(f"the vehicle is not driven: {errors[0]}; see nics doctor for the rest.")
     given = {"mode": "realtime", "vehicle": True, "command_topic": RAW, "say": say, **options}
-    env, driver = env_of(policy, model, order.world, "dds", under, **given)
-    episodes, chosen = list[Episode](), {} if goal is None else {"goal": goal}
+    given["lays_map"] = wanted.lays_map
+    ground = wanted.ground(world)
+    backend = make_backend("dds", model, ground, **given)
+    env, driver = env_with(backend, policy, model, ground, under)
+    episodes = list[Episode]()
     with closing(env):
         for count, seed in enumerate(order.seeds, 1):
-            scene = sample_scene(world, model.robot.footprint_radius, seed)
-            placed = _placed(scene, goal, options.get("start") == "present", arm)
-            ask(f"episode {count} of {order.episodes}: {placed}")
-            driven = drive(env, driver, seed, chosen, partial(_arm, arm, namespace, say))
+            present = backend.present_pose() if wanted.needs_pose else None
+            episode = wanted.episode(sample_scene(world, radius, seed), present)
+            if wanted.needs_pose:
+                episode.confirm(confirm)
+            last = "" if arm else f"; arm {GATE}"
+            ask(f"episode {count} of {order.episodes}: {episode.sentence()}{last}")
+            if wanted.needs_pose:  # it may have been moved meanwhile
+                confirmed = episode.distance
+                episode = wanted.episode(sample_scene(world, radius, seed), backend.present_pose())
+                if episode.distance > confirmed + NEAR_M:
+                    episode.confirm(confirm)
+            driven = drive(env, driver, seed, episode.options, partial(_arm, arm, namespace, say))
             # The vehicle's own estimate is all that is known of its path.
             episodes.append(replace(driven, path=driven.estimate))
             say(f"  {driven.result}, {driven.steps} steps, {episodes[-1].length:.2f} m")
@@ -361,16 +393,6 @@ def drive_vehicle(
     made = judged(policy, runs, model, world, order.out)
     write_evaluation(replace(order, conditions=under), name, model, [made])
     return made
-
-
-def _placed(scene: Scene, goal: tuple[float, float] | None, present: bool, armed: bool) -> str:
-    x, y = scene.goals[0] if goal is None else goal
-    where = f"it will drive to ({x:.2f} m, {y:.2f} m)"
-    order = "" if armed else f"; arm {GATE}"
-    if present:
-        return f"{where} from where it stands{order}"
-    sx, sy, heading = scene.starts[0]
-    return f"place the vehicle at ({sx:.2f} m, {sy:.2f} m, {heading:.2f} rad); {where}{order}"
 
 
 def _arm(wanted: bool, namespace: str, say: Say) -> None:

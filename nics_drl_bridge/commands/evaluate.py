@@ -42,7 +42,14 @@ def evaluate(
         "--hardware", help="Drive the vehicle, through command_gate.")] = False,
     start: Annotated[str, Option(
         help="For --hardware: wait until it stands at the start, or start where it is.")] = "wait",
-    goal: Annotated[str | None, Option(metavar="X,Y", help="In map [m]; else the world's.")] = None,
+    goal: Annotated[str | None, Option(
+        metavar="X,Y", help="Goal [m], see --goal-frame; else the world's. For --shadow: in map.",
+    )] = None,
+    goal_frame: Annotated[str | None, Option(
+        metavar="robot|map", help="For --hardware: the goal is ahead and left of where the robot "
+        "starts, or in map; robot with --start present, else map.")] = None,
+    confirm_beyond: Annotated[float, Option(
+        metavar="METRES", help="For --hardware: a goal that is farther away is confirmed.")] = 5.0,
     namespace: Annotated[str, Option(help="For --hardware: namespace of its topics.")] = "",
     pose_type: Annotated[str, Option(help="For --hardware: type of `pose`, in map.")] = "none",
     yes: Annotated[bool, Option("--yes", help="For --hardware: ask no questions.")] = False,
@@ -74,7 +81,10 @@ def evaluate(
     console.tell_replaced(out / driving.EVALUATION)
     if hardware:
         options = {"start": start, "namespace": namespace, "pose_type": pose_type}
-        driven = partial(driving.drive_vehicle, order, place, arm, tell, partial(_ask, yes))
+        driven = partial(
+            driving.drive_vehicle, order, place, arm, tell, partial(_ask, yes),
+            goal_frame=goal_frame, confirm=partial(_confirm, yes), confirm_beyond_m=confirm_beyond,
+        )  # fmt: skip
         with console.needs_ros("nics evaluate --hardware"):
             evaluated = [driven(**options)]
     else:
@@ -93,6 +103,15 @@ def _ask(yes: bool, question: str) -> None:
     typer.echo(question, err=True)
     if not yes:
         typer.prompt("Enter when ready", default="", show_default=False, err=True)
+
+
+def _confirm(yes: bool, question: str) -> None:
+    from nics_drl_bridge.commands.vehicle_goals import confirm_at_terminal
+
+    if yes:
+        typer.echo(question, err=True)
+    else:
+        confirm_at_terminal(question)
 
 
 def _point(text: str | None) -> tuple[float, float] | None:

@@ -1,12 +1,53 @@
 """Entry point of `nics`: one sentence, not a traceback, where a library is missing or too old."""
 
+import atexit
+import contextlib
+import os
 import signal
 import sys
 import threading
+import time
 from types import FrameType
+from typing import NoReturn
 
 EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
 ENDING = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+_interrupts: list[int] = []  # the times [ns] at which Ctrl-C came
+
+
+def take_signals() -> None:
+    """Lets SIGINT and SIGTERM end the command, unless somebody wants them ignored."""
+    if threading.current_thread() is not threading.main_thread():
+        return  # Python sets handlers in the main thread only
+    for number, usual in ENDING.items():
+        if signal.getsignal(number) is usual:
+            signal.signal(number, _note_and_end)
+
+
+def was_interrupted(error: BaseException | None) -> bool:
+    """True if an error came of Ctrl-C, whatever the library that it went through made of it.
+
+    A compiled function makes a SystemError of it, a prompt an Abort, and an interrupt between two
+    statements of a library leaves an error of its own behind.
+    """
+    if _interrupts:
+        return True
+    seen = set[int]()
+    waiting = [error]
+    while waiting:
+        known = waiting.pop()
+        if isinstance(known, KeyboardInterrupt):
+            return True
+        if known is not None and id(known) not in seen:
+            seen.add(id(known))
+            waiting += [known.__cause__, known.__context__]
+    return False
+
+
+def _note_and_end(number: int, frame: FrameType | None) -> None:
+    if number == signal.SIGINT:
+        _interrupts.append(time.monotonic_ns())
+    _end(number, frame)
 
 
 def _end(number: int, frame: FrameType | None) -> None:
@@ -22,29 +63,59 @@ def _end(number: int, frame: FrameType | None) -> None:
 
 def main() -> None:
     """Runs a command, which imports what it needs as it runs."""
-    for number, usual in ENDING.items():
-        if signal.getsignal(number) is usual:  # else somebody wants it ignored
-            signal.signal(number, _end)
+    take_signals()
+    try:
+        _run()
+    except SystemExit as end:
+        if _interrupts and end.code not in (0, None):  # unless the command has dealt with it
+            _leave_interrupted()
+        raise
+
+
+def _run() -> None:
     try:
         from nics_drl_bridge.commands.cli import main as run
 
         run()
-    except ImportError as error:
+    except SystemExit:
+        raise
+    except BaseException as error:  # noqa: BLE001  (what it can't explain it raises)
+        _explain(error)
+
+
+def _leave_interrupted() -> NoReturn:
+    """Ends the process with the code of an interrupt, whatever became of that on its way.
+
+    Python would end it by the signal instead, where Ctrl-C came while the text of a function was
+    run (as dataclasses make them), and with other codes where libraries end beside their threads.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second one changes nothing any more
+    with contextlib.suppress(Exception):
+        atexit._run_exitfuncs()  # zero commands, files and processes of the command
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(Exception):  # whoever read it has gone
+            stream.flush()
+    os._exit(EXIT_INTERRUPTED)
+
+
+def _explain(error: BaseException) -> NoReturn:
+    """Ends the process by a sentence about an error outside of a command, or raises it."""
+    if was_interrupted(error):
+        sys.stderr.write("nics: interrupted; nothing was started.\n")
+        raise SystemExit(EXIT_INTERRUPTED) from None
+    if isinstance(error, ImportError):
         from nics_drl_bridge import extensions
 
         if (clause := extensions.unmet(error)) is None:
-            raise
+            raise error
         sys.stderr.write(f"nics: {clause}\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
-    except RuntimeError as error:
-        if "no locator available" not in str(error):  # numba's, as kernels are imported
-            raise
+    if isinstance(error, RuntimeError) and "no locator available" in str(error):
+        # It is numba's, as kernels are imported.
         reason = "neither the package's folder nor your home can be written to, to keep kernels in"
         sys.stderr.write(f"nics: {reason}; set NUMBA_CACHE_DIR to a folder that can.\n")
         raise SystemExit(EXIT_BAD_INPUT) from None
-    except KeyboardInterrupt:  # before a command has begun
-        sys.stderr.write("nics: interrupted; nothing was started.\n")
-        raise SystemExit(EXIT_INTERRUPTED) from None
+    raise error
 
 
 if __name__ == "__main__":

@@ -86,6 +86,7 @@ class Link:
             self._topic = self.commands.topic_name
             self._timeout = CommandTimeout(self.commands, self._kind, command_timeout_s)
             self._resources.timeout = self._timeout
+            INTERRUPTS.watch(self)
         except BaseException:
             self.close()
             raise
@@ -122,6 +123,11 @@ class Link:
         if self._context.ok():
             self._timeout.begin(moving=False)
             self.commands.publish(self._kind())
+
+    def halt_if_moving(self) -> None:
+        """Publishes a zero command unless the last one was zero."""
+        if self._timeout.moving:
+            self.halt()
 
     def check_open(self) -> None:
         """Raises BackendError if the link is closed."""
@@ -184,6 +190,46 @@ class Link:
     def close(self) -> None:
         """Publishes a zero command and ends the node."""
         self._closing()
+        INTERRUPTS.forget(self)
+
+
+class Interrupts:
+    """Halts all open links at Ctrl-C, also where it comes between two of their calls.
+
+    The interrupt then goes on to who had it before: the process may live on, as that of a notebook
+    does, and in lock-step no timeout would end the last command.
+    """
+
+    def __init__(self) -> None:
+        self._links: weakref.WeakSet[Link] = weakref.WeakSet()
+        self._before: Any = None
+
+    def watch(self, link: Link) -> None:
+        """Halts a link at Ctrl-C from now on, unless the process ignores or handles it itself."""
+        self._links.add(link)
+        handler = signal.getsignal(signal.SIGINT)
+        in_main = threading.current_thread() is threading.main_thread()
+        if in_main and callable(handler) and handler != self._interrupt:
+            self._before = handler
+            signal.signal(signal.SIGINT, self._interrupt)
+
+    def forget(self, link: Link) -> None:
+        """Leaves a link alone, which is closed."""
+        self._links.discard(link)
+        last = not self._links and signal.getsignal(signal.SIGINT) == self._interrupt
+        if last and threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, self._before)
+
+    def _interrupt(self, number: int, frame: Any) -> None:
+        try:
+            for link in list(self._links):
+                with contextlib.suppress(Exception):  # the others are halted, too
+                    link.halt_if_moving()
+        finally:
+            self._before(number, frame)
+
+
+INTERRUPTS = Interrupts()
 
 
 @dataclass
@@ -236,9 +282,11 @@ class CommandTimeout:
     def __init__(self, publisher: Publisher, kind: Any, limit_s: float) -> None:
         self._publisher, self._kind, self._limit_s = publisher, kind, limit_s
         self._due_s = self._answered_s = math.inf
+        self.moving = False  # the last command that was sent is none of zero
 
     def begin(self, moving: bool) -> None:
         """Restarts the timeout; call it before a command is published, zero or not."""
+        self.moving = moving
         self._due_s = time.monotonic() + self._limit_s if moving else math.inf
 
     def look(self) -> None:

@@ -43,17 +43,28 @@ def free_domain_id() -> int:
     return int(given)
 
 
-def _dies_with_parent() -> Callable[[], None] | None:
-    if sys.platform != "linux":
-        return None
-    prctl, parent = ctypes.CDLL(None).prctl, os.getpid()
+def interruptible() -> None:
+    """Lets SIGINT end a process that is about to begin, also below a shell that ignores it.
 
-    def ask() -> None:
+    Shells start background jobs so, as in `make test &`, and children inherit it.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def _prepared() -> Callable[[], None]:
+    """Returns what a node's process does before it begins: it ends with its parent, on Linux."""
+    if sys.platform != "linux":
+        return interruptible
+    prctl = ctypes.CDLL(None).prctl
+    parent = os.getpid()
+
+    def prepare() -> None:
+        interruptible()
         prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
         if os.getppid() != parent:  # it died in between
             os._exit(1)
 
-    return ask
+    return prepare
 
 
 class NodeProcess(AbstractContextManager["NodeProcess", None]):
@@ -78,7 +89,7 @@ class NodeProcess(AbstractContextManager["NodeProcess", None]):
             # Its own session: Ctrl-C in the terminal reaches the parent alone, which then ends it.
             self._process = subprocess.Popen(
                 command, env=os.environ | chosen, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
-                start_new_session=True, preexec_fn=_dies_with_parent(),
+                start_new_session=True, preexec_fn=_prepared(),
             )  # fmt: skip
         self.pid = self._process.pid
 

@@ -42,6 +42,8 @@ class RealtimeOptions(Schema):
     stale_after_s: PositiveFloat = 0.5  # age from which data are too old for a view
     # An episode on a vehicle waits until it stands at the requested pose, or takes the present one.
     start: Literal["wait", "present"] = "wait"
+    # The place where it stands counts as the start: `map` is laid so. Not with a pose sensor.
+    lays_map: bool = False
     tolerance: tuple[PositiveFloat, PositiveFloat] = (0.1, 0.1)  # of the start's pose [m, rad]
     start_timeout_s: PositiveFloat = 300.0  # longest wait for that
     say: Callable[[str], None] | None = None  # told what is missing; the node's logger by default
@@ -110,6 +112,9 @@ class RealtimeBackend:
         self._link.halt()
         if self._is_vehicle():
             self._await_start(start)
+            if self._options.lays_map:
+                with self._topics.lock:
+                    self._topics.place(start.pose)
         if not self._is_vehicle():
             timeout_s = self._options.timeout_s
             stamp_ns = self._episodes.begin(start, timeout_s)
@@ -120,16 +125,24 @@ class RealtimeBackend:
         self._misses, self._deadline_ns = 0, time.monotonic_ns() + self._period_ns
         return self._fresh_view()[0]
 
+    def present_pose(self) -> Array:
+        """Waits until the robot stands, and returns its pose (3,) in `map`."""
+        self._link.check_open()
+        self._await_start(None)
+        with self._topics.lock:
+            pose: Array = self._topics.view().pose
+        return pose
+
     def _is_vehicle(self) -> bool:
         if self._options.vehicle is not None:
             return self._options.vehicle
         self._simulated = self._simulated or self._episodes.there
         return not self._simulated
 
-    def _await_start(self, start: Start) -> None:
+    def _await_start(self, start: Start | None) -> None:
         say = self._options.say or self._link.node.get_logger().info
         began, said = time.monotonic(), -math.inf
-        while self._is_vehicle() and (missing := self._missing(start)):
+        while (start is None or self._is_vehicle()) and (missing := self._missing(start)):
             now = time.monotonic()
             if now - began > self._options.start_timeout_s:
                 late = f"after {self._options.start_timeout_s:g} s the robot is not ready"
@@ -139,7 +152,8 @@ class RealtimeBackend:
                 said = now
             time.sleep(POLL_S)
 
-    def _missing(self, start: Start) -> str:
+    def _missing(self, start: Start | None) -> str:
+        """Returns what is missing for an episode, at a start or anywhere; empty for nothing."""
         topic, silence_s = self._oldest()
         if math.isinf(silence_s):
             return f"no {topic} yet"
@@ -149,7 +163,7 @@ class RealtimeBackend:
             view = self._topics.view()
         if abs(view.twist[2]) > STILL[1] or math.hypot(*view.twist[:2]) > STILL[0]:
             return "it is still moving"
-        if self._options.start == "present":
+        if start is None or self._options.start == "present":
             return ""
         off = geometry.between(view.pose, start.pose)
         distance, turn = math.hypot(*off[:2]), math.degrees(abs(off[2]))

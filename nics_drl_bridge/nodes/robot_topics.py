@@ -117,6 +117,10 @@ class RobotTopics:
         self._started, self._since_ns = True, stamp_ns
         self.middleware.reset(stamp_ns, pose)
 
+    def place(self, pose: Array) -> None:
+        """Takes the robot to stand at a pose (3,), which thereby defines `map`."""
+        self.middleware.place(pose, START_STD**2 * np.eye(3))
+
     def hear_initial_pose(self) -> None:
         """Subscribes to `initialpose`, which says where in the map the robot is."""
         kind = PoseWithCovarianceStamped

@@ -9,8 +9,9 @@ import time
 from pathlib import Path
 
 import pytest
+import typer
 
-from nics_drl_bridge.commands import start
+from nics_drl_bridge.commands import console, start
 
 NICS = [sys.executable, "-m", "nics_drl_bridge.commands.start"]
 DEADLINE_S = 60.0
@@ -66,3 +67,87 @@ def test_a_warm_up_that_is_ended_leaves_no_process_and_no_traceback(tmp_path):
         assert "Traceback" not in warming.communicate(timeout=DEADLINE_S)[1]
         assert warming.returncode == 128 + signal.SIGTERM
     until(lambda: not any(Path(f"/proc/{child}").exists() for child in children))
+
+
+class SwallowedError(Exception):
+    """What a library makes of an interrupt."""
+
+
+def swallow(make):
+    """Raises what `make` gives while an interrupt is handled."""
+    try:
+        raise KeyboardInterrupt
+    except KeyboardInterrupt as interrupt:
+        raise make(interrupt) from None
+
+
+def nested(interrupt):
+    inner = SystemError("a compiled function")
+    inner.__cause__ = interrupt
+    outer = SystemError("a compiled function that called it")
+    outer.__cause__ = inner
+    return outer
+
+
+@pytest.mark.parametrize(
+    "make", [nested, lambda _: SwallowedError("lost"), lambda _: typer.Abort()]
+)
+def test_an_interrupt_is_one_whatever_a_library_made_of_it(make, capsys):
+    with pytest.raises(typer.Exit) as caught, console.one_sentence():
+        swallow(make)
+    assert caught.value.exit_code == 130
+    assert capsys.readouterr().err.startswith("nics: interrupted;")
+
+
+def test_an_error_without_an_interrupt_stays_an_error():
+    with pytest.raises(typer.Abort), console.one_sentence():
+        raise typer.Abort from EOFError()
+    with pytest.raises(SystemError), console.one_sentence():
+        raise SystemError("of a library")
+
+
+# A command that a Ctrl-C meets in a text that is run, and that loses it in an error of its own.
+LOSES_IT = """
+import os, signal, sys
+from nics_drl_bridge.commands import cli, start
+
+def interrupted(**_):
+    print("began", flush=True)
+    try:
+        exec("while True: pass")
+    except KeyboardInterrupt:
+        {then}
+
+cli.app = interrupted
+start.main()
+"""
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("then", ["raise", "pass; raise RuntimeError('lost')", "sys.exit(1)"])
+def test_a_command_that_is_interrupted_ends_with_130_whatever_the_moment(tmp_path, then):
+    (tmp_path / "loses_it.py").write_text(LOSES_IT.format(then=then))
+    words = [sys.executable, "-m", "loses_it"]
+    path = os.pathsep.join([str(tmp_path), *sys.path])
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, text=True, env=os.environ | {"PYTHONPATH": path}
+    ) as process:
+        assert process.stdout.readline() == "began\n"
+        process.send_signal(signal.SIGINT)
+        assert process.wait(DEADLINE_S) == 130
+
+
+@pytest.mark.process
+@pytest.mark.skipif(sys.platform != "linux", reason="is about POSIX shells")
+def test_a_node_below_a_shell_that_ignores_ctrl_c_takes_it_again():
+    ignoring = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); "
+    run = "import subprocess, sys; from nics_drl_bridge.nodes.processes import interruptible; "
+    ask = "import signal; print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)"
+    child = f"subprocess.run([sys.executable, '-c', {ask!r}], preexec_fn=interruptible)"
+    done = subprocess.run(
+        [sys.executable, "-c", f"{ignoring}{run}{child}"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == "True\n"

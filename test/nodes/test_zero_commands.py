@@ -86,9 +86,9 @@ def drive(domain_id):
     """Starts a process that drives, `drive(what)`."""
     started = []
 
-    def start(what):
+    def start(what, driver=DRIVER):
         process = subprocess.Popen(
-            [sys.executable, "-u", "-c", DRIVER, what],
+            [sys.executable, "-u", "-c", driver, what],
             env=os.environ | {"ROS_DOMAIN_ID": str(domain_id)},
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
@@ -142,6 +142,72 @@ def test_the_last_command_of_a_process_is_zero(robot, drive, what, until, signal
     if until == "stepped":
         assert any(command.linear.x > 0.0 for command in heard)
     peer.until(lambda: heard and heard[-1] == Twist(), "a zero command")
+
+
+LOCK_STEP = """
+import select, sys, time
+import gymnasium
+import numpy as np
+from nics_drl_bridge.env.registry import NAVIGATION, register_envs
+
+what = sys.argv[1]
+register_envs()
+options = {"timeout_s": 60.0}
+env = gymnasium.make(
+    NAVIGATION, backend="dds", model="ackermann", world="empty", backend_options=options
+)
+env.reset(seed=3)
+try:
+    while not select.select([sys.stdin], [], [], 0.0)[0]:
+        env.step(np.array([1.0, 0.0], np.float32))
+    print("between two steps", flush=True)
+    if what == "error":
+        raise ValueError(what)
+    if what == "exit":
+        sys.exit(0)
+    time.sleep(600.0)
+except KeyboardInterrupt:
+    if what != "lives_on":
+        raise
+    print("lives on", flush=True)
+    time.sleep(600.0)
+"""
+
+
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize(
+    ("what", "signals", "code"),
+    [
+        ("interrupted", [signal.SIGINT], -signal.SIGINT),
+        ("lives_on", [signal.SIGINT], None),
+        many("interrupted", [signal.SIGINT] * 3, -signal.SIGINT),
+        many("terminated", [signal.SIGTERM], 128 + signal.SIGTERM),
+        many("error", [], 1),
+        many("exit", [], 0),
+    ],
+)
+def test_the_last_command_of_a_process_is_zero_in_lock_step_too(
+    launch, meet, domain_id, drive, what, signals, code
+):
+    simulator = launch("simulator_node", domain_id, mode="lockstep", world="empty")
+    peer = meet(domain_id)
+    peer.until(lambda: simulator.handler is not None, "its start")
+    heard = peer.listen(Twist, "cmd_vel", qos.EVERY_COMMAND)
+    process = drive(what, LOCK_STEP)
+    moving = lambda: any(command.linear.x > 0.0 for command in heard)  # noqa: E731
+    peer.until(lambda: moving() or process.poll() is not None, "its command")
+    process.stdin.write("\n")
+    process.stdin.flush()
+    peer.until(lambda: said(process, "between two steps"), "the end of its steps", 30.0)
+    for number in signals:
+        process.send_signal(number)
+        peer.until(lambda: True, "a moment")
+    peer.until(lambda: heard[-1] == Twist(), "a zero command", 30.0)
+    if code is None:
+        assert process.poll() is None, process.communicate()[1]
+    else:
+        peer.until(lambda: process.poll() is not None, "its end")
+        assert process.returncode in {code, abs(code), 130}, process.communicate()[1]
 
 
 POLICY = """
