@@ -3,7 +3,6 @@
 import os
 import shutil
 import sqlite3
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from nics_drl_bridge.errors import ConfigError, RecordingError
-from nics_drl_bridge.files import check_above, sync_folder
+from nics_drl_bridge.files import check_above, hidden_name, sync_folder
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.recording import messages as msgs
@@ -217,8 +216,8 @@ class BagSink:
 def bag_sink(path: str | Path, storage: Storage = "mcap", keep: bool = False) -> Iterator[BagSink]:
     """Yields a bag, a folder at the end; RecordingError: it exists, can't be made, no library.
 
-    Until then it is in a hidden folder `.NAME.*` beside it. If the storage fails, as on a full disk,
-    what was written stays there; so does what a killed process leaves, for `salvage`. If the block
+    Until then it is in a hidden folder `.NAME.*` beside it. What was written stays there if the
+    storage fails, as on a full disk, and if the process is killed; `salvage` reads it. If the block
     raises, nothing is left, unless `keep` is set: the bag is finished with what was written then.
     """
     path = Path(path)
@@ -230,7 +229,8 @@ def bag_sink(path: str | Path, storage: Storage = "mcap", keep: bool = False) ->
     check_above(path)
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    beside = hidden_name(path)  # of another kind than a file's: it may be all of a recording
+    beside.mkdir()
     unfinished = beside / path.name
     sink: BagSink | None = None
     raised: BaseException | None = None
