@@ -143,6 +143,27 @@ def _remove_if_left(path: Path) -> None:
 
 
 @contextmanager
+def whole_file(path: str | Path) -> Iterator[Path]:
+    """Yields a path for a library that writes files itself; it becomes `path` if the block ends.
+
+    It has the same ending. Nothing is left if the block raises.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with _named(path):
+        remove_leftovers(path.parent)
+        room, descriptor = _begin_folder(path)
+    try:
+        yield room / path.name
+        os.replace(room / path.name, path)
+        _fsync(path.parent)
+    finally:
+        shutil.rmtree(room, ignore_errors=True)
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+@contextmanager
 def _named(path: Path) -> Iterator[None]:
     """Lets errors of the system name the path that was asked for, and no temporary one."""
     try:

@@ -319,6 +319,9 @@ def parts():
 path = Path(sys.argv[2])
 if sys.argv[1] == "file":
     files.write_parts(path, parts())
+elif sys.argv[1] == "file of a library":
+    with files.whole_file(path) as part:
+        part.write_bytes(b"".join(parts()))
 else:
     with files.whole_folder(path, "model.yaml") as temporary:
         (temporary / "model.yaml").write_bytes(b"".join(parts()))
@@ -326,7 +329,7 @@ else:
 
 
 @pytest.mark.process
-@pytest.mark.parametrize("kind", ["file", "folder"])
+@pytest.mark.parametrize("kind", ["file", "file of a library", "folder"])
 def test_what_a_killed_writer_left_is_removed_and_what_a_living_one_writes_is_not(tmp_path, kind):
     def hidden():
         return sorted(path.name for path in tmp_path.iterdir() if path.name.startswith("."))
@@ -355,7 +358,7 @@ def test_what_a_killed_writer_left_is_removed_and_what_a_living_one_writes_is_no
             writer.kill()
             writer.communicate()
     assert not hidden()
-    found = tmp_path / "two" if kind == "file" else tmp_path / "two" / MARKER
+    found = tmp_path / "two" / MARKER if kind == "folder" else tmp_path / "two"
     assert found.read_bytes() == b"halfwhole"
 
 
