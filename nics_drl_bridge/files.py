@@ -86,7 +86,7 @@ def _begin_file(path: Path) -> tuple[Path, int]:
         os.close(descriptor)
 
 
-def _begin_folder(path: Path) -> tuple[Path, int | None]:
+def begin_folder(path: Path) -> tuple[Path, int | None]:
     """Makes a hidden folder beside a path; see `_begin_file`. Windows opens no folders: None."""
     while True:
         temporary = hidden_name(path, UNFINISHED)
@@ -152,7 +152,7 @@ def whole_file(path: str | Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     with _named(path):
         remove_leftovers(path.parent)
-        room, descriptor = _begin_folder(path)
+        room, descriptor = begin_folder(path)
     try:
         yield room / path.name
         os.replace(room / path.name, path)
@@ -222,7 +222,7 @@ def whole_folder(
     path.parent.mkdir(parents=True, exist_ok=True)
     with _named(path):
         remove_leftovers(path.parent)
-        temporary, descriptor = _begin_folder(path)
+        temporary, descriptor = begin_folder(path)
     try:
         yield temporary
         if path.is_dir():

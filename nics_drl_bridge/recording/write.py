@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from nics_drl_bridge.errors import ConfigError, RecordingError
-from nics_drl_bridge.files import check_above, hidden_name, sync_folder
+from nics_drl_bridge.files import (
+    begin_folder,
+    check_above,
+    hidden_name,
+    remove_leftovers,
+    sync_folder,
+)
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.recording import messages as msgs
@@ -216,9 +222,12 @@ class BagSink:
 def bag_sink(path: str | Path, storage: Storage = "mcap", keep: bool = False) -> Iterator[BagSink]:
     """Yields a bag, a folder at the end; RecordingError: it exists, can't be made, no library.
 
-    Until then it is in a hidden folder `.NAME.*` beside it. What was written stays there if the
-    storage fails, as on a full disk, and if the process is killed; `salvage` reads it. If the block
-    raises, nothing is left, unless `keep` is set: the bag is finished with what was written then.
+    Until then it is in a hidden folder `.NAME.*` beside it. If the storage fails, as on a full
+    disk, what was written stays in such a folder, for `salvage`.
+
+    `keep` is for what can't be had again, a recording: if the block raises, the bag is finished
+    with what was written, and what a killed process leaves stays there, too. Without it, the former
+    leaves nothing, and the latter is removed at the next write.
     """
     path = Path(path)
     msgs.check_libraries(path, "writing")
@@ -229,8 +238,10 @@ def bag_sink(path: str | Path, storage: Storage = "mcap", keep: bool = False) ->
     check_above(path)
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside = hidden_name(path)  # of another kind than a file's: it may be all of a recording
-    beside.mkdir()
+    remove_leftovers(path.parent)
+    beside, lock = begin_folder(path)
+    if keep:
+        beside = _set_apart(beside, path)
     unfinished = beside / path.name
     sink: BagSink | None = None
     raised: BaseException | None = None
@@ -251,19 +262,35 @@ def bag_sink(path: str | Path, storage: Storage = "mcap", keep: bool = False) ->
         written = sink is not None and any(sink.counts.values())
         fault = None if sink is None else sink.fault
         failed = isinstance(error, OSError | sqlite3.Error) or fault is not None
-        if not (failed or (keep and written)):
+        if not written or not (failed or keep):
             shutil.rmtree(beside)
-            raise
+            if not failed:
+                raise
+        elif not keep:
+            unfinished = _set_apart(beside, path) / path.name
         if not isinstance(error, Exception):  # Ctrl-C
             raise
         reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
         reason = reason.removeprefix(f"{path}: ").removesuffix(".")
         rest = f"what was written until then lies in {unfinished}"
         advice = "save it with `nics bag salvage` where there is room"
+        if not written:
+            rest = "nothing was written yet"
+            advice = "choose another place"
         raise RecordingError(f"{path}: {reason}; {rest}, {advice}.") from error
+    finally:
+        if lock is not None:
+            os.close(lock)
     beside.rmdir()
     if raised is not None:
         raise raised
+
+
+def _set_apart(unfinished: Path, path: Path) -> Path:
+    """Gives an unfinished folder a name under which no later writer removes it."""
+    apart = hidden_name(path)
+    os.rename(unfinished, apart)
+    return apart
 
 
 def _finish(unfinished: Path, path: Path, storage: Storage) -> None:

@@ -5,6 +5,7 @@ import re
 import shutil
 import sqlite3
 import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -301,3 +302,41 @@ def test_metadata_that_are_a_pipe_are_not_waited_for(sealed, tmp_path):
     os.mkfifo(sealed / "metadata.yaml")
     assert salvage(sealed, tmp_path / "kept").lost == 0
     assert held(tmp_path / "kept") == held(sealed)
+
+
+KILLED = """
+import sys
+from pathlib import Path
+from nics_drl_bridge.recording.write import bag_sink
+with bag_sink(Path(sys.argv[1]), keep=sys.argv[2] == "keep") as sink:
+    sink.add_topic("/chatter", "std_msgs/msg/String")
+    sink.write("/chatter", 1, b"\\0\\1\\0\\0\\2\\0\\0\\0x\\0\\0\\0")
+    sink.flush()
+    print("begun", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("kept", [True, False])
+def test_what_a_killed_recorder_left_stays_and_what_a_conversion_left_does_not(tmp_path, kept):
+    words = [sys.executable, "-c", KILLED, str(tmp_path / "drive"), "keep" if kept else "no"]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as writer:
+        assert writer.stdout.readline() == b"begun\n"
+        record(tmp_path / "first", "mcap", 12)
+        assert len(list(tmp_path.glob(".drive.*"))) == 1, "its writer lives"
+        writer.kill()
+    record(tmp_path / "second", "mcap", 12)
+    assert len(list(tmp_path.glob(".drive.*"))) == (1 if kept else 0)
+
+
+def test_a_disk_that_was_full_before_leaves_nothing(tmp_path, monkeypatch):
+    from rosbags.rosbag2 import Writer
+
+    def fail(*_, **__):
+        raise sqlite3.OperationalError("database or disk is full")
+
+    monkeypatch.setattr(Writer, "add_connection", fail)
+    with pytest.raises(RecordingError, match="disk is full; nothing was written"):
+        record(tmp_path / "drive", "sqlite3", 12)
+    assert not list(tmp_path.iterdir())
