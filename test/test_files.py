@@ -367,6 +367,7 @@ def test_what_somebody_else_hid_is_no_leftover(tmp_path):
     for name in others:
         (tmp_path / name).mkdir()
     (tmp_path / ".out.0123abcd.unfinished").symlink_to(tmp_path / ".git")
+    os.mkfifo(tmp_path / ".pipe.0123abcd.unfinished")  # to open one may last for ever
     write_text(tmp_path / "file", "text")
     assert len(os.listdir(tmp_path)) == len(others) + 2
 
