@@ -5,17 +5,25 @@ import errno
 import hashlib
 import json
 import os
+import re
+import secrets
 import shutil
-import tempfile
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from nics_drl_bridge.errors import ConfigError, ModelError
 
+fcntl: Any
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
 _AT_FDCWD, _RENAME_EXCHANGE = -100, 2
 _POSIX = hasattr(os, "O_DIRECTORY")  # Windows opens no folders
+_BINARY = getattr(os, "O_BINARY", 0)  # of Windows
 
 
 def _fsync(path: Path) -> None:
@@ -38,18 +46,121 @@ def write_parts(path: str | Path, parts: Iterable[bytes]) -> None:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     with _named(path):
-        descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        remove_leftovers(path.parent)
+        temporary, descriptor = _begin_file(path)
         try:
             with os.fdopen(descriptor, "wb") as file:
                 file.writelines(parts)
                 file.flush()
                 os.fsync(file.fileno())
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, path)
+                if _POSIX:  # while its lock tells that its writer lives
+                    os.replace(temporary, path)
+            if not _POSIX:  # Windows renames no open file
+                os.replace(temporary, path)
         except BaseException:
-            Path(temporary).unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
             raise
     _fsync(path.parent)
+
+
+# What is not whole yet has a hidden name beside its place. Its writer holds a lock on it, which the
+# system takes back when the writer ends, however that happens. Modes are those of the umask: it is
+# applied by the system when a file or folder is made, which `tempfile` does for its owner alone.
+
+UNFINISHED, REPLACED = "unfinished", "replaced"
+_HIDDEN = re.compile(rf"\.(.+)\.[0-9a-f]{{8}}\.({UNFINISHED}|{REPLACED})", re.DOTALL)
+
+
+def hidden_name(path: Path, ending: str = "") -> Path:
+    """A new hidden name beside a path; `ending` tells what is not needed after a crash."""
+    return path.parent / f".{path.name}.{secrets.token_hex(4)}{ending and f'.{ending}'}"
+
+
+def _begin_file(path: Path) -> tuple[Path, int]:
+    """Makes a hidden file beside a path; returns it with its descriptor, which holds the lock."""
+    while True:
+        temporary = hidden_name(path, UNFINISHED)
+        descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | _BINARY, 0o666)
+        if _lock_new(temporary, descriptor):
+            return temporary, descriptor
+        os.close(descriptor)
+
+
+def begin_folder(path: Path) -> tuple[Path, int | None]:
+    """Makes a hidden folder beside a path; see `_begin_file`. Windows opens no folders: None."""
+    while True:
+        temporary = hidden_name(path, UNFINISHED)
+        temporary.mkdir()
+        if not _POSIX:
+            return temporary, None
+        with suppress(FileNotFoundError):  # removed as a leftover before it was locked
+            descriptor = os.open(temporary, os.O_RDONLY)
+            if _lock_new(temporary, descriptor):
+                return temporary, descriptor
+            os.close(descriptor)
+
+
+def _lock_new(path: Path, descriptor: int) -> bool:
+    """Locks what was just made; False if somebody took it for a leftover and removed it."""
+    if fcntl is None:
+        return True
+    with suppress(OSError):  # a file system without locks, on which nothing is removed either
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+    try:
+        return os.path.samestat(os.stat(path), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Removes what killed writers left in a folder; never what belongs to a living one."""
+    if fcntl is None:
+        return
+    with suppress(OSError), os.scandir(folder) as entries:
+        for entry in entries:
+            found = _HIDDEN.fullmatch(entry.name)
+            if found is None or entry.is_symlink():
+                continue
+            # The old version of a folder may be the only one, if its writer was killed just then.
+            if found[2] == REPLACED and not (folder / found[1]).exists():
+                continue
+            _remove_if_left(Path(entry.path))
+
+
+def _remove_if_left(path: Path) -> None:
+    with suppress(OSError):  # somebody else removes it, or its writer lives
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not os.path.samestat(os.stat(path), os.fstat(descriptor)):
+                return
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink()
+        finally:
+            os.close(descriptor)
+
+
+@contextmanager
+def whole_file(path: str | Path) -> Iterator[Path]:
+    """Yields a path for a library that writes files itself; it becomes `path` if the block ends.
+
+    It has the same ending. Nothing is left if the block raises.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with _named(path):
+        remove_leftovers(path.parent)
+        room, descriptor = begin_folder(path)
+    try:
+        yield room / path.name
+        os.replace(room / path.name, path)
+        _fsync(path.parent)
+    finally:
+        shutil.rmtree(room, ignore_errors=True)
+        if descriptor is not None:
+            os.close(descriptor)
 
 
 @contextmanager
@@ -97,23 +208,50 @@ def check_above(path: Path) -> None:
 
 
 @contextmanager
-def whole_folder(path: str | Path, marker: str) -> Iterator[Path]:
+def whole_folder(
+    path: str | Path, marker: str, is_own: Callable[[str], bool] = lambda _: True
+) -> Iterator[Path]:
     """Yields a temporary folder that replaces `path` if the block succeeds, else is removed.
 
     It replaces only an empty folder or one with `marker`, a file of all of this kind, so that a
-    wrong `--out` never deletes work; a symbolic link stays. Raises ConfigError, see `check_folder`.
+    wrong `--out` never deletes work; a symbolic link stays. Of the folder that it replaces, files
+    remain that the block did not write and of which `is_own` is false for their path in it: the
+    user put them there. Raises ConfigError, see `check_folder`.
     """
     path = check_folder(path, marker)
     path.parent.mkdir(parents=True, exist_ok=True)
     with _named(path):
-        temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+        remove_leftovers(path.parent)
+        temporary, descriptor = begin_folder(path)
     try:
         yield temporary
+        if path.is_dir():
+            _keep_others(path, temporary, is_own)
         sync_folder(temporary)
-        temporary.chmod(0o755)
         _swap(temporary, path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+def _keep_others(old: Path, new: Path, is_own: Callable[[str], bool]) -> None:
+    """Puts what the user put into an old folder into the new one too."""
+    for folder, folders, names in os.walk(old):
+        whole = Path(folder).relative_to(old)
+        if not (folders or names or is_own(whole.as_posix())):
+            (new / whole).mkdir(parents=True, exist_ok=True)
+        links = [name for name in folders if Path(folder, name).is_symlink()]
+        for name in (*names, *links):
+            source = Path(folder, name)
+            place = source.relative_to(old)
+            if is_own(place.as_posix()) or os.path.lexists(new / place):
+                continue
+            (new / place).parent.mkdir(parents=True, exist_ok=True)
+            try:
+                os.link(source, new / place, follow_symlinks=False)
+            except (OSError, NotImplementedError):  # a file system without links
+                shutil.copy2(source, new / place, follow_symlinks=False)
 
 
 def _swap(new: Path, path: Path) -> None:
@@ -121,19 +259,19 @@ def _swap(new: Path, path: Path) -> None:
     if path.exists() and _exchange(new, path):
         _fsync(path.parent)
         return
-    old = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.old.")) / path.name
+    old = hidden_name(path, REPLACED)
     try:
         if path.exists():
             os.replace(path, old)
         try:
             os.replace(new, path)
         except BaseException:
-            if not path.exists():
+            if not path.exists() and old.exists():
                 os.rename(old, path)
             raise
         _fsync(path.parent)
     finally:
-        shutil.rmtree(old.parent, ignore_errors=True)
+        shutil.rmtree(old, ignore_errors=True)
 
 
 def _exchange(one: Path, other: Path) -> bool:
@@ -195,6 +333,16 @@ def read_file(path: Path) -> bytes:
     if path.stat().st_size > MOST_BYTES:
         raise ValueError(f"it is larger than {MOST_BYTES // 2**20} MB")
     return path.read_bytes()
+
+
+def names_in_sums(folder: Path) -> set[str]:
+    """The names that the `SHA256SUMS` of a folder lists; none if it can't be read."""
+    try:
+        with (folder / SUMS).open("rb") as file:
+            lines = file.read(_PART).decode(errors="replace").splitlines()
+    except OSError:
+        return set()
+    return {line[66:] for line in lines}
 
 
 def write_sums(folder: Path) -> None:

@@ -31,6 +31,12 @@ FORMAT = "nics_drl_bridge/simulator_model/4"
 MODEL_FILE, TABLE_FOLDER, REPORT_FILE = "model.yaml", "lidar_table", "report.txt"
 _OF_TABLE = (f"{TABLE_FOLDER}/{name}" for name in (files.SUMS, *TABLE_FILES))
 MODEL_FILES = (MODEL_FILE, REPORT_FILE, *_OF_TABLE)  # and a manifest
+REPORT_PAGE, PICTURES_FOLDER = "report.html", "pictures"  # what `nics generate` draws of a fit
+PICTURES = (
+    "accuracy", "alignment", "bursts", "inputs", "mounting", "noise", "paths", "residuals",
+    "timing", "wheels",
+)  # fmt: skip
+DRAWN_FILES = (REPORT_PAGE, *(f"{PICTURES_FOLDER}/{name}.png" for name in PICTURES))
 CONTROL_PERIOD_S = 0.1
 MOTORS = "inputs", "limits"  # of a calibration
 DEFAULT_LIDAR = "paper"
@@ -193,8 +199,13 @@ def check_place(folder: str | Path) -> None:
 
 
 def save_model(model: SimulatorModel, folder: str | Path) -> None:
-    """Writes a model as a folder, completely or not at all; see `check_place`."""
-    with files.whole_folder(folder, MODEL_FILE) as temporary:
+    """Writes a model as a folder, completely or not at all; see `check_place`.
+
+    In the place of an older model, it replaces that with its report and pictures. What the user put
+    into the folder stays there.
+    """
+    own = {*MODEL_FILES, files.SUMS, *DRAWN_FILES, *files.names_in_sums(Path(folder))}
+    with files.whole_folder(folder, MODEL_FILE, own.__contains__) as temporary:
         files.write_text(temporary / MODEL_FILE, model.text)
         files.write_text(temporary / REPORT_FILE, model.report)
         model.table.save(temporary / TABLE_FOLDER)

@@ -5,7 +5,6 @@ import io
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 
@@ -72,7 +71,7 @@ def test_text_is_written_as_utf_8(tmp_path):
     assert (tmp_path / "file").read_bytes() == "größe\n".encode()
 
 
-@pytest.mark.parametrize("moment", ["fsync", "chmod", "replace"])
+@pytest.mark.parametrize("moment", ["fsync", "replace"])
 def test_a_crash_while_writing_leaves_the_old_file_and_no_other(tmp_path, monkeypatch, moment):
     path = tmp_path / "file"
     write_bytes(path, b"old")
@@ -94,9 +93,9 @@ def in_folder(path):
 @pytest.mark.parametrize(
     ("write", "fails"),
     [
-        (write_text, (tempfile, "mkstemp")),
+        (write_text, (os, "open")),
         (write_text, (os, "replace")),
-        (lambda path, _: in_folder(path), (tempfile, "mkdtemp")),
+        (lambda path, _: in_folder(path), (os, "mkdir")),
     ],
     ids=["create", "replace", "folder"],
 )
@@ -286,6 +285,112 @@ def test_a_place_is_checked_without_making_anything(tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match=f"{tmp_path} can't be written to"):
         check_folder(tmp_path / "a" / "b", "model.yaml")
     assert os.listdir(tmp_path) == ["file"]
+
+
+@pytest.fixture(params=[0o022, 0o002, 0o077], ids=oct)
+def umask(request):
+    before = os.umask(request.param)
+    yield request.param
+    os.umask(before)
+
+
+def test_the_umask_decides_who_may_read_what_is_written(tmp_path, umask):
+    write_text(tmp_path / "a" / "file", "text")
+    with whole_folder(tmp_path / "folder", MARKER) as temporary:
+        fill(temporary)
+        write_text(temporary / "more", "text")
+    for path in (tmp_path / "a", tmp_path / "folder", tmp_path / "folder" / "sub"):
+        assert path.stat().st_mode & 0o777 == 0o777 & ~umask, path
+    for path in (tmp_path / "a" / "file", tmp_path / "folder" / "more"):
+        assert path.stat().st_mode & 0o777 == 0o666 & ~umask, path
+
+
+LEAVING = """
+import sys
+from pathlib import Path
+from nics_drl_bridge import files
+
+def parts():
+    yield b"half"
+    print("begun", flush=True)
+    sys.stdin.read()
+    yield b"whole"
+
+path = Path(sys.argv[2])
+if sys.argv[1] == "file":
+    files.write_parts(path, parts())
+elif sys.argv[1] == "file of a library":
+    with files.whole_file(path) as part:
+        part.write_bytes(b"".join(parts()))
+else:
+    with files.whole_folder(path, "model.yaml") as temporary:
+        (temporary / "model.yaml").write_bytes(b"".join(parts()))
+"""
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("kind", ["file", "file of a library", "folder"])
+def test_what_a_killed_writer_left_is_removed_and_what_a_living_one_writes_is_not(tmp_path, kind):
+    def hidden():
+        return sorted(path.name for path in tmp_path.iterdir() if path.name.startswith("."))
+
+    command = [sys.executable, "-c", LEAVING, kind]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    killed = subprocess.Popen([*command, str(tmp_path / "one")], **pipes)
+    living = subprocess.Popen([*command, str(tmp_path / "two")], **pipes)
+    try:
+        for writer in (killed, living):
+            assert writer.stdout.readline() == b"begun\n"
+        assert len(hidden()) == 2
+        write_text(tmp_path / "third", "text")
+        assert len(hidden()) == 2, "both are at work"
+        killed.kill()
+        killed.wait()
+        write_text(tmp_path / "third", "text")
+        assert [name.split(".")[1] for name in hidden()] == ["two"]
+        with whole_folder(tmp_path / "fourth", MARKER) as temporary:
+            fill(temporary)
+            assert len(hidden()) == 2
+        assert living.communicate(b"", timeout=60) == (b"", None)
+        assert living.returncode == 0
+    finally:
+        for writer in (killed, living):
+            writer.kill()
+            writer.communicate()
+    assert not hidden()
+    found = tmp_path / "two" / MARKER if kind == "folder" else tmp_path / "two"
+    assert found.read_bytes() == b"halfwhole"
+
+
+def test_what_somebody_else_hid_is_no_leftover(tmp_path):
+    others = (".git", ".out.a1b2c3d4", ".out.8charact", ".x.unfinished", ".out.a1b2c3d4.replaced")
+    for name in others:
+        (tmp_path / name).mkdir()
+    (tmp_path / ".out.0123abcd.unfinished").symlink_to(tmp_path / ".git")
+    os.mkfifo(tmp_path / ".pipe.0123abcd.unfinished")  # to open one may last for ever
+    write_text(tmp_path / "file", "text")
+    assert len(os.listdir(tmp_path)) == len(others) + 2
+
+
+def test_what_the_user_put_into_a_folder_stays_there(old):
+    (old / "notes").mkdir()
+    (old / "notes" / "mine.md").write_text("years of work")
+    (old / "notes" / "link").symlink_to("mine.md")
+    (old / "empty").mkdir()
+    (old / "script.sh").write_text("echo")
+    (old / "script.sh").chmod(0o750)
+    with whole_folder(old, MARKER, {MARKER, "extra", "sub/deep"}.__contains__) as temporary:
+        fill(temporary)
+    assert tree(old) == {
+        MARKER: b"new",
+        "notes/link": b"years of work",
+        "notes/mine.md": b"years of work",
+        "script.sh": b"echo",
+        "sub/deep": b"deep",
+    }
+    assert (old / "notes" / "link").is_symlink()
+    assert (old / "empty").is_dir()
+    assert (old / "script.sh").stat().st_mode & 0o777 == 0o750
 
 
 def test_an_empty_folder_is_filled(tmp_path):

@@ -106,6 +106,24 @@ def test_saving_twice_gives_the_same_bytes(saved, tmp_path):
     assert len(contents(saved)) == len(MODEL_FILES) + 1
 
 
+def test_a_model_over_an_older_one_keeps_what_the_user_put_there_and_nothing_else(tmp_path):
+    folder, model = tmp_path / "model", direct_model()
+    save_model(model, folder)
+    own = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
+    (folder / "pictures").mkdir()
+    drawn = ("report.html", "pictures/accuracy.png")  # of the older one's fit
+    users = ("notes.md", "pictures/robot.jpg", "lidar_table/why.txt", "drives/monday.npz")
+    (folder / "drives").mkdir()
+    for name in (*drawn, *users):
+        (folder / name).write_text(name)
+    save_model(replace(model, report="another"), folder)
+    assert load_model(folder).report == "another"
+    found = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+    assert found == {name for name in own if (folder / name).is_file()} | set(users)
+    for name in users:
+        assert (folder / name).read_text() == name
+
+
 def test_sha256sum_checks_a_model(saved):
     check = ["sha256sum", "--strict", "-c", SUMS]
     done = subprocess.run(check, cwd=saved, capture_output=True, check=True)

@@ -15,7 +15,14 @@ from pydantic import Field
 
 from nics_drl_bridge.config import Schema, read_text, validate
 from nics_drl_bridge.errors import ModelError
-from nics_drl_bridge.files import MOST_BYTES, check_sums, whole_folder, write_sums, write_text
+from nics_drl_bridge.files import (
+    MOST_BYTES,
+    SUMS,
+    check_sums,
+    whole_folder,
+    write_sums,
+    write_text,
+)
 from nics_drl_bridge.lidar.baked_kernels import TABLE_SHAPE, TableArrays
 from nics_drl_bridge.lidar.sensor_models import SensorModel, SensorModels
 from nics_drl_bridge.lidar.shapes import Circle, Outlines, Shape
@@ -152,7 +159,8 @@ class LidarTable:
 
     def save(self, folder: str | Path) -> None:
         """Writes the table as a folder, whole or not at all; ConfigError if not of its kind."""
-        with whole_folder(folder, ABOUT_FILE) as temporary:
+        own = {*TABLE_FILES, SUMS}
+        with whole_folder(folder, ABOUT_FILE, own.__contains__) as temporary:
             write_text(temporary / ABOUT_FILE, self._about)
             for name, array in self._arrays.items():
                 np.save(temporary / f"{name}.npy", array, allow_pickle=False)

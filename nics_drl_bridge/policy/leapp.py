@@ -55,13 +55,16 @@ def export_bundle(policy: PolicyFile, folder: str | Path) -> Path:
     if restored(model) != content:
         reason = "was not written by `export_policy`, so that it could not be restored."
         raise PolicyError(str(policy.path), "file", reason)
-    with whole_folder(place, marker) as temporary:
-        write_bytes(temporary / f"{NODE}.onnx", made)
+    network = f"{NODE}.onnx"
+    start_values = f"{place.resolve().name}_initial_values.safetensors"
+    own = {marker, network, start_values}
+    with whole_folder(place, marker, own.__contains__) as temporary:
+        write_bytes(temporary / network, made)
         state = policy.contract.state
         if state is not None:
             start = np.full((1, state.size), state.start, np.float32)
             data = _safetensors(f"{NODE}/{onnx_graph.STATE_IN}", start)
-            write_bytes(temporary / f"{place.resolve().name}_initial_values.safetensors", data)
+            write_bytes(temporary / start_values, data)
         write_text(temporary / marker, dump_yaml(_described(policy, pieces, made, place)))
     return place / marker
 

@@ -2,9 +2,9 @@
 
 import os
 import shutil
-import tempfile
+import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from nics_drl_bridge.errors import ConfigError, RecordingError
-from nics_drl_bridge.files import check_above, sync_folder
+from nics_drl_bridge.files import (
+    begin_folder,
+    check_above,
+    hidden_name,
+    remove_leftovers,
+    sync_folder,
+)
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.interface import NS_PER_S
 from nics_drl_bridge.recording import messages as msgs
@@ -161,6 +167,7 @@ class BagSink:
         self._writer, self.store = writer, msgs.typestore()  # the known message types
         self._connections: dict[str, Connection] = {}
         self.counts: dict[str, int] = {}  # number of messages by topic
+        self.fault: BaseException | None = None  # the first one of the file or the database
 
     def add_topic(
         self, topic: str, kind: str, offers: Sequence[msgs.Offer] = (),
@@ -174,63 +181,125 @@ class BagSink:
             if name not in fields:
                 self.store.register(get_types_from_msg(text, name))
         given = {} if kind in fields else {"msgdef": definition or "", "rihs01": NO_HASH}
-        self._connections[topic] = self._writer.add_connection(
-            topic, kind, typestore=self.store, **given,
-            offered_qos_profiles=[msgs.profile_of(offer) for offer in offers],
-        )  # fmt: skip
+        profiles = [msgs.profile_of(offer) for offer in offers]
+        with self._noting_faults():
+            self._connections[topic] = self._writer.add_connection(
+                topic, kind, typestore=self.store, **given, offered_qos_profiles=profiles
+            )
         self.counts[topic] = 0
 
     def write(self, topic: str, receive_ns: int, data: bytes) -> None:
         """Writes a serialized message."""
-        self._writer.write(self._connections[topic], receive_ns, data)
-        self.counts[topic] += 1
         storage: Any = self._writer.storage
-        if hasattr(storage, "close_chunk") and storage.chunk.bio.tell() > CHUNK_BYTES:
-            storage.close_chunk()
+        with self._noting_faults():
+            self._writer.write(self._connections[topic], receive_ns, data)
+            self.counts[topic] += 1
+            if hasattr(storage, "close_chunk") and storage.chunk.bio.tell() > CHUNK_BYTES:
+                storage.close_chunk()
 
     def flush(self) -> None:
         """Flushes written messages to the file, so that a crash of this process can't lose them."""
         storage: Any = self._writer.storage
-        if hasattr(storage, "close_chunk"):
-            if storage.chunk.msgs:
-                storage.close_chunk()
-            storage.bio.flush()
-        else:
-            storage.conn.commit()
+        with self._noting_faults():
+            if hasattr(storage, "close_chunk"):
+                if storage.chunk.msgs:
+                    storage.close_chunk()
+                storage.bio.flush()
+            else:
+                storage.conn.commit()
+
+    @contextmanager
+    def _noting_faults(self) -> Iterator[None]:
+        """Notes that the storage failed; a full disk is an error of SQLite, or of the system."""
+        try:
+            yield
+        except Exception as error:
+            self.fault = self.fault or error
+            raise
 
 
 @contextmanager
-def bag_sink(path: str | Path, storage: Storage = "mcap") -> Iterator[BagSink]:
-    """Yields a bag, a folder at the end; RecordingError: it exists, can't be made, no library."""
-    # Until then it is in a hidden folder `.NAME.*` beside it, of which an error leaves nothing;
-    # after a kill or on a full disk `salvage` recovers flushed messages (MCAP alone has checksums).
+def bag_sink(path: str | Path, storage: Storage = "mcap", keep: bool = False) -> Iterator[BagSink]:
+    """Yields a bag, a folder at the end; RecordingError: it exists, can't be made, no library.
+
+    Until then it is in a hidden folder `.NAME.*` beside it. If the storage fails, as on a full
+    disk, what was written stays in such a folder, for `salvage`.
+
+    `keep` is for what can't be had again, a recording: if the block raises, the bag is finished
+    with what was written, and what a killed process leaves stays there, too. Without it, the former
+    leaves nothing, and the latter is removed at the next write.
+    """
     path = Path(path)
     msgs.check_libraries(path, "writing")
     from rosbags.rosbag2 import StoragePlugin, Writer
-
-    from nics_drl_bridge.recording.mcap import seal
 
     if path.exists():
         raise RecordingError(f"{path}: is there already; give the name of a new folder.")
     check_above(path)
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    remove_leftovers(path.parent)
+    beside, lock = begin_folder(path)
+    if keep:
+        beside = _set_apart(beside, path)
     unfinished = beside / path.name
+    sink: BagSink | None = None
+    raised: BaseException | None = None
     try:
         with Writer(unfinished, version=8, storage_plugin=plugin) as writer:
-            yield BagSink(writer)
-        if storage == "mcap":
-            seal(unfinished / f"{path.name}.mcap")
-        sync_folder(unfinished)
-        if path.exists():
-            raise RecordingError(f"{path}: was made meanwhile; give the name of a new folder.")
-        os.rename(unfinished, path)
-    except OSError as error:
+            sink = BagSink(writer)
+            try:
+                yield sink
+            except BaseException as error:
+                keepable = keep and sink.fault is None and any(sink.counts.values())
+                if not keepable:
+                    with suppress(Exception):  # the writer takes back what was not flushed
+                        sink.flush()
+                    raise
+                raised = error
+        _finish(unfinished, path, storage)
+    except BaseException as error:
+        written = sink is not None and any(sink.counts.values())
+        fault = None if sink is None else sink.fault
+        failed = isinstance(error, OSError | sqlite3.Error) or fault is not None
+        if not written or not (failed or keep):
+            shutil.rmtree(beside)
+            if not failed:
+                raise
+        elif not keep:
+            unfinished = _set_apart(beside, path) / path.name
+        if not isinstance(error, Exception):  # Ctrl-C
+            raise
+        reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+        reason = reason.removeprefix(f"{path}: ").removesuffix(".")
         rest = f"what was written until then lies in {unfinished}"
         advice = "save it with `nics bag salvage` where there is room"
-        raise RecordingError(f"{path}: {error.strerror or error}; {rest}, {advice}.") from None
-    except BaseException:
-        shutil.rmtree(beside)
-        raise
+        if not written:
+            rest = "nothing was written yet"
+            advice = "choose another place"
+        raise RecordingError(f"{path}: {reason}; {rest}, {advice}.") from error
+    finally:
+        if lock is not None:
+            os.close(lock)
     beside.rmdir()
+    if raised is not None:
+        raise raised
+
+
+def _set_apart(unfinished: Path, path: Path) -> Path:
+    """Gives an unfinished folder a name under which no later writer removes it."""
+    apart = hidden_name(path)
+    os.rename(unfinished, apart)
+    return apart
+
+
+def _finish(unfinished: Path, path: Path, storage: Storage) -> None:
+    """Makes a closed bag safe on the disk, and gives it its name."""
+    from nics_drl_bridge.recording.mcap import seal
+
+    if storage == "mcap":
+        seal(unfinished / f"{path.name}.mcap")
+    sync_folder(unfinished)
+    if path.exists():
+        raise RecordingError(f"{path}: was made meanwhile; give the name of a new folder.")
+    os.rename(unfinished, path)

@@ -1,7 +1,6 @@
 """Files of what the page shows: MP4, GIF, and `.rrd` for Rerun's viewer."""
 
 import io
-import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from itertools import chain
@@ -17,7 +16,7 @@ from nics_drl_bridge.env.rendering import WorldPicture
 from nics_drl_bridge.env.snapshot import hits_of
 from nics_drl_bridge.errors import ConfigError, nearest
 from nics_drl_bridge.extensions import require
-from nics_drl_bridge.files import check_above, write_bytes
+from nics_drl_bridge.files import check_above, whole_file, write_bytes
 from nics_drl_bridge.lidar.exact_kernels import HEADING, RADIUS, SHAPE, X, Y
 from nics_drl_bridge.watch.frame import Frame, Stage, WorldFrame
 
@@ -85,38 +84,30 @@ def write_mp4(path: Path, shown: Iterable[Pixels], fps: float) -> None:
     import imageio_ffmpeg
 
     shown = iter(shown)
-    first, part = next(shown), path.with_name(f".{path.stem}.{os.getpid()}.mp4")
+    first = next(shown)
     height, width = first.shape[:2]
-    try:
+    with whole_file(path) as part:
         options = {"fps": fps, "macro_block_size": 2, "quality": 8, "ffmpeg_log_level": "error"}
         with closing(imageio_ffmpeg.write_frames(str(part), (width, height), **options)) as video:
             video.send(None)
             for each in chain([first], shown):
                 video.send(np.ascontiguousarray(each))
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def write_rrd(path: Path, stage: Stage, frames: Iterable[Frame]) -> None:
     """Writes a recording of Rerun."""
     import rerun
 
-    part = path.with_name(f".{path.stem}.{os.getpid()}.rrd")
-    try:
-        with rerun.RecordingStream("nics_drl_bridge") as recording:
-            recording.save(str(part))
-            members = [member for world in stage.worlds for member in world.members]
-            for frame in frames:
-                recording.set_time("time", duration=frame.time_s)
-                for n, world in enumerate(frame.worlds):
-                    _log(rerun, recording, f"world_{n}", stage, world)
-                    walls = members[world.place].all_walls().reshape(-1, 2, 2)
-                    recording.log(f"world_{n}/walls", rerun.LineStrips2D(walls * FLIP))
-            recording.flush()
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
+    with whole_file(path) as part, rerun.RecordingStream("nics_drl_bridge") as recording:
+        recording.save(str(part))
+        members = [member for world in stage.worlds for member in world.members]
+        for frame in frames:
+            recording.set_time("time", duration=frame.time_s)
+            for n, world in enumerate(frame.worlds):
+                _log(rerun, recording, f"world_{n}", stage, world)
+                walls = members[world.place].all_walls().reshape(-1, 2, 2)
+                recording.log(f"world_{n}/walls", rerun.LineStrips2D(walls * FLIP))
+        recording.flush()
 
 
 FLIP = np.array([1.0, -1.0])  # Rerun draws y downwards

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from nics_drl_bridge import generator
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.report import fit_report, with_error
 from nics_drl_bridge.recording.textbook import record
@@ -27,6 +28,7 @@ def found():
 @slow
 def test_every_picture_of_a_fit_is_drawn(found, tmp_path):
     files = write_pictures(*found, tmp_path / "pictures")
+    assert {file.stem for file in files} <= set(generator.PICTURES), "a new model removes them"
     assert {f.stem for f in files} >= {"accuracy", "alignment", "paths", "residuals", "timing"}
     assert all(f.read_bytes().startswith(PNG) for f in files)
 

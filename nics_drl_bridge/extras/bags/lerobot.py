@@ -49,7 +49,7 @@ def write_dataset(
     columns = _columns(frames, succeeded)
     ends = np.cumsum(frames.lengths)
     files = _files(frames)
-    with whole_folder(folder, INFO) as root:
+    with whole_folder(folder, INFO, _is_of_a_dataset) as root:
         rows = []
         for k, (end, length) in enumerate(zip(ends, frames.lengths, strict=True)):
             part = {name: column[end - length : end] for name, column in columns.items()}
@@ -63,6 +63,11 @@ def write_dataset(
         _write(_tasks(task), root / TASKS)
         for name, told in ((INFO, _info(frames, columns, robot)), (STATS, _stats(columns))):
             write_text(root / name, json.dumps(told, indent=4) + "\n")
+
+
+def _is_of_a_dataset(name: str) -> bool:
+    """True for the path of a file of any dataset in its folder."""
+    return name.split("/")[0] in ("data", "meta", "videos", "images")
 
 
 def _columns(frames: BagFrames, succeeded: Collection[int] | None) -> Columns:

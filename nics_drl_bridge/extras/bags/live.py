@@ -132,7 +132,7 @@ class BagRecorder(QosWatch):
 
 def record_bag(order: BagOrder, say: Callable[[str], None]) -> dict[str, int]:
     """Records until the duration or a signal; counts by topic. BackendError, RecordingError."""
-    with bag_sink(order.out, order.storage) as sink:
+    with bag_sink(order.out, order.storage, keep=True) as sink:
         node = run_node(lambda context: BagRecorder(context, order, sink, say), ["nics"])
         if not sum(sink.counts.values()):
             skipped = " ".join(node.skipped.values())

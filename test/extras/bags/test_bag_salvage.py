@@ -3,6 +3,9 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import sqlite3
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -15,7 +18,7 @@ from nics_drl_bridge.commands.console import intact
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.extras.bags.info import bag_info
 from nics_drl_bridge.extras.bags.salvage import salvage
-from nics_drl_bridge.recording import textbook
+from nics_drl_bridge.recording import textbook, write
 from nics_drl_bridge.recording.bag_file import opened
 from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.recording.write import bag_sink, write_bag
@@ -131,6 +134,102 @@ def test_of_a_killed_recorder_all_that_was_flushed_is_saved(tmp_path, storage):
     assert not list(tmp_path.glob(".drive.*"))
 
 
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 400 kB."""
+    place = tmp_path / "small"
+    place.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(place)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("no file system can be mounted here")
+    yield place
+    subprocess.run(["umount", "-l", str(place)], check=True)
+
+
+def record(place, storage, count, keep=True, then=None, flush_every=10):
+    """Messages of a second, as the recorder writes them; `then` is raised after the last one."""
+    message = bags.STORE.serialize_cdr(bags.twist(1.0, 0.0, 0.0), bags.kinds.TWIST)
+    with bag_sink(place, storage, keep=keep) as sink:
+        sink.add_topic("/cmd_vel", bags.kinds.TWIST, [Offer(depth=1)])
+        for k in range(count):
+            sink.write("/cmd_vel", bags.ns(0.1 * k), bytes(message))
+            if k % flush_every == flush_every - 1:
+                sink.flush()
+        if then is not None:
+            raise then
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_a_full_disk_keeps_what_was_recorded(small_disk, tmp_path, storage):
+    with pytest.raises(RecordingError, match="what was written until then lies in") as refused:
+        record(small_disk / "drive", storage, 100_000)
+    assert "full" in str(refused.value) or "No space left" in str(refused.value)
+    (left,) = small_disk.glob(".drive.*/drive")
+    assert str(left) in str(refused.value)
+    kept = salvage(left, tmp_path / "kept")
+    assert kept.kept["/cmd_vel"] > 500
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+@pytest.mark.parametrize(
+    "fault", [sqlite3.OperationalError("database or disk is full"), ValueError("of any kind")]
+)
+@pytest.mark.parametrize("method", ["write", "close"])
+def test_an_error_of_the_storage_of_any_type_keeps_what_was_recorded(
+    tmp_path, monkeypatch, storage, fault, method
+):
+    from rosbags.rosbag2 import Writer
+
+    working, count = getattr(Writer, method), [0]
+
+    def fail(self, *given):
+        count[0] += 1
+        if method == "close" or count[0] > 50:
+            raise fault
+        return working(self, *given)
+
+    monkeypatch.setattr(Writer, method, fail)
+    with pytest.raises(RecordingError, match=f"drive: {fault}; what was written until then lies"):
+        record(tmp_path / "drive", storage, 60)
+    (left,) = tmp_path.glob(".drive.*/drive")
+    monkeypatch.undo()
+    assert salvage(left, tmp_path / "kept").kept["/cmd_vel"] == (50 if method == "write" else 60)
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+@pytest.mark.parametrize(
+    "raised", [RuntimeError("of a callback"), KeyboardInterrupt(), SystemExit(1)]
+)
+def test_a_recording_that_something_else_ends_is_a_whole_bag(tmp_path, storage, raised):
+    with pytest.raises(type(raised)) as caught:
+        record(tmp_path / "drive", storage, 45, then=raised)
+    assert caught.value is raised
+    assert len(held(tmp_path / "drive")["/cmd_vel"]) == 45
+    assert not list(tmp_path.glob(".drive.*"))
+
+
+@pytest.mark.parametrize("storage", STORAGES)
+def test_a_conversion_that_fails_leaves_nothing(tmp_path, storage):
+    with pytest.raises(RuntimeError):
+        record(tmp_path / "drive", storage, 45, keep=False, then=RuntimeError())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_bag_whose_place_was_taken_meanwhile_is_kept(tmp_path, monkeypatch):
+    finish = write._finish
+
+    def taken(unfinished, path, storage):
+        path.mkdir()
+        finish(unfinished, path, storage)
+
+    monkeypatch.setattr(write, "_finish", taken)
+    with pytest.raises(RecordingError, match=r"was made meanwhile.* lies in") as refused:
+        record(tmp_path / "drive", "mcap", 12)
+    (left,) = tmp_path.glob(".drive.*/drive")
+    assert str(left) in str(refused.value)
+    assert len(held(left)["/cmd_vel"]) == 12
+
+
 @pytest.mark.parametrize("storage", STORAGES)
 def test_what_publishers_offer_is_kept(tmp_path, storage):
     offers = (Offer(depth=1, transient_local=True), Offer(depth=7, reliable=False))
@@ -203,3 +302,41 @@ def test_metadata_that_are_a_pipe_are_not_waited_for(sealed, tmp_path):
     os.mkfifo(sealed / "metadata.yaml")
     assert salvage(sealed, tmp_path / "kept").lost == 0
     assert held(tmp_path / "kept") == held(sealed)
+
+
+KILLED = """
+import sys
+from pathlib import Path
+from nics_drl_bridge.recording.write import bag_sink
+with bag_sink(Path(sys.argv[1]), keep=sys.argv[2] == "keep") as sink:
+    sink.add_topic("/chatter", "std_msgs/msg/String")
+    sink.write("/chatter", 1, b"\\0\\1\\0\\0\\2\\0\\0\\0x\\0\\0\\0")
+    sink.flush()
+    print("begun", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("kept", [True, False])
+def test_what_a_killed_recorder_left_stays_and_what_a_conversion_left_does_not(tmp_path, kept):
+    words = [sys.executable, "-c", KILLED, str(tmp_path / "drive"), "keep" if kept else "no"]
+    with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as writer:
+        assert writer.stdout.readline() == b"begun\n"
+        record(tmp_path / "first", "mcap", 12)
+        assert len(list(tmp_path.glob(".drive.*"))) == 1, "its writer lives"
+        writer.kill()
+    record(tmp_path / "second", "mcap", 12)
+    assert len(list(tmp_path.glob(".drive.*"))) == (1 if kept else 0)
+
+
+def test_a_disk_that_was_full_before_leaves_nothing(tmp_path, monkeypatch):
+    from rosbags.rosbag2 import Writer
+
+    def fail(*_, **__):
+        raise sqlite3.OperationalError("database or disk is full")
+
+    monkeypatch.setattr(Writer, "add_connection", fail)
+    with pytest.raises(RecordingError, match="disk is full; nothing was written"):
+        record(tmp_path / "drive", "sqlite3", 12)
+    assert not list(tmp_path.iterdir())
