@@ -135,7 +135,11 @@ class DriveLog:
         except RecordingError:
             # Poorer stamps are better than no recording of a drive that is over.
             kept = streams(data, "receive", PLACE)
-        return Recording(**kept, source=PLACE, variables=self._spec.variable_names)
+        tracked = len(self.rows["pose"]) >= FEWEST
+        return Recording(
+            **kept, source=PLACE, variables=self._spec.variable_names,
+            measured_by="tracker" if tracked else "odometry",
+        )  # fmt: skip
 
 
 def pace(receive: Nanoseconds, header: Nanoseconds) -> float:

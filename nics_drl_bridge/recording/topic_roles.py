@@ -36,7 +36,7 @@ USUAL = {
     "pose": (r"(vrpn|mocap|optitrack|vicon|qualisys)", GROUND_TRUTH, r"/pose$"),
     "odom": (r"/odom$", r"/(odom|odometry)[^/]*$", r"odom"),
     "joint_states": (r"/joint_states$", r"/joint_state[^/]*$"),
-    "imu": (r"/imu(/data)?$", r"/imu[^/]*$", r"imu"),
+    "imu": (r"/imu(/data)?$", r"/imu[^/]*$", r"imu", r""),  # no other role has its type
 }
 """Patterns of usual names, the most reliable first; the first that matches a topic decides."""
 
