@@ -15,11 +15,14 @@ from nics_drl_bridge.geometry import Array
 BLOCK_S = 0.5  # length of the pieces in which both turns are compared
 WINDOW_S = 5.0  # over which the disagreement is told
 LONGEST_GAP_S = 0.25  # between two yaw rates that are joined
-FEWEST_BLOCKS = 10
+FEWEST_BLOCKS = 6
+FEWEST_TO_DRIFT = 10
 STANDING_MPS = 0.005  # wheels that roll more slowly in a whole block are at rest
 STANDING_RADPS = 0.005
 FEWEST_AT_REST = 2  # blocks; of fewer, the bias is taken from the drive instead
 LEAST_BIAS_STD = 1e-5  # rad/s
+USUAL_BIAS, USUAL_FACTOR = 0.01, 0.5  # deviations of a bias [rad/s], of a factor of turns from 1
+LEAST_RATE_NOISE = 1e-3  # of a block's mean rate [rad/s]
 UNLIKE_BLOCKS = 2.0  # factor of errors, as blocks of a drive are not independent of each other
 DRIFTS = 4.0  # standard errors of its slope beyond which a bias drifts
 DRIFT_SPAN_S = 20.0  # a drift of the bias shows only between rests so far apart
@@ -43,7 +46,8 @@ class Turning:
     scale: float  # odometry's turn for a turn of 1 rad by the gyro; NaN if it turned too little
     scale_std: float
     alike: float  # correlation of both rates; NaN if it turned too little
-    apart: float  # root mean square disagreement after `WINDOW_S` [rad]; NaN if the drive is short
+    window_s: float
+    apart: float  # root mean square disagreement after `window_s` [rad]; NaN if the drive is short
     apart_std: float  # what the bias alone may contribute to that [rad]
 
     def bias_at(self, t: Array) -> Array:
@@ -94,9 +98,18 @@ def compare_turning(
     unbiased = blocks.gyro_rate - (bias + slope * (blocks.middle - bias_time))
     scale, scale_std, alike = _scale_of(blocks.odom_rate, unbiased, blocks.span)
     apart = _disagreement(blocks, unbiased, window_s)
-    apart_std = bias_std * window_s
     return Turning(
-        bias, bias_std, slope, bias_time, rest_s, scale, scale_std, alike, apart, apart_std
+        bias=bias,
+        bias_std=bias_std,
+        bias_slope=slope,
+        bias_time=bias_time,
+        rest_s=rest_s,
+        scale=scale,
+        scale_std=scale_std,
+        alike=alike,
+        window_s=window_s,
+        apart=apart,
+        apart_std=bias_std * window_s,
     )
 
 
@@ -177,7 +190,7 @@ def _bias_of(blocks: _Blocks) -> tuple[float, float, float, float, float]:
     bias = float(rate.mean())
     std = max(float(rate.std()) / np.sqrt(len(rate)), LEAST_BIAS_STD)
     apart = when - middle
-    if len(rate) < FEWEST_BLOCKS or float(np.ptp(when)) < DRIFT_SPAN_S:
+    if len(rate) < FEWEST_TO_DRIFT or float(np.ptp(when)) < DRIFT_SPAN_S:
         return bias, std, 0.0, middle, rest_s
     power = float(apart @ apart)
     slope = float(apart @ rate) / power
@@ -191,13 +204,17 @@ def _bias_of(blocks: _Blocks) -> tuple[float, float, float, float, float]:
 
 def _bias_while_driving(blocks: _Blocks) -> tuple[float, float, float, float, float]:
     """Returns the bias that is left if odometry's turns are too large or small by a factor."""
+    # A robot that turns at one rate only does not show both: the usual bias and factor then count.
     chi = np.stack([np.ones_like(blocks.odom_rate), blocks.odom_rate], axis=1)
     found, *_ = np.linalg.lstsq(chi, blocks.gyro_rate, rcond=None)
     left = blocks.gyro_rate - chi @ found
-    freedom = max(len(left) - 2, 1)
-    spread = np.linalg.pinv(chi.T @ chi) * float(left @ left) / freedom
-    std = UNLIKE_BLOCKS * float(np.sqrt(max(spread[0, 0], 0.0)))
-    return float(found[0]), max(std, LEAST_BIAS_STD), 0.0, float(blocks.middle.mean()), 0.0
+    noise = max(float(left @ left) / max(len(left) - 2, 1), LEAST_RATE_NOISE**2)
+    noise *= UNLIKE_BLOCKS**2
+    usual, deviation = np.array([0.0, 1.0]), np.array([USUAL_BIAS, USUAL_FACTOR])
+    spread = np.linalg.inv(chi.T @ chi / noise + np.diag(deviation**-2.0))
+    bias = (spread @ (chi.T @ blocks.gyro_rate / noise + usual / deviation**2))[0]
+    std = float(np.sqrt(spread[0, 0]))
+    return float(bias), max(std, LEAST_BIAS_STD), 0.0, float(blocks.middle.mean()), 0.0
 
 
 def _scale_of(odom_rate: Array, gyro_rate: Array, span: Array) -> tuple[float, float, float]:
