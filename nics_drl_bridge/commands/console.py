@@ -75,7 +75,9 @@ TopicOption = Annotated[list[str] | None, Option(
     "times. Roles: cmd_vel, pose, odom, joint_states, imu; none as a topic leaves a role out.")
 ]  # fmt: skip
 NEEDED: dict[str, dict[str, tuple[str, ...]]] = {  # options that do nothing without another
-    "evaluate": dict.fromkeys(("start", "namespace", "pose_type", "yes", "arm"), ("hardware",))
+    "evaluate": dict.fromkeys(
+        ("start", "namespace", "pose_type", "imu", "yes", "arm"), ("hardware",)
+    )
     | {"topic": ("shadow",), "ahead": ("shadow",), "goal": ("hardware", "shadow")},
     "watch": {"topic": ("bag",), "namespace": ("ros",), "episodes": ("record",)},
 }

@@ -45,6 +45,8 @@ def evaluate(
     goal: Annotated[str | None, Option(metavar="X,Y", help="In map [m]; else the world's.")] = None,
     namespace: Annotated[str, Option(help="For --hardware: namespace of its topics.")] = "",
     pose_type: Annotated[str, Option(help="For --hardware: type of `pose`, in map.")] = "none",
+    imu: Annotated[str, Option(metavar="TOPIC", help="For --hardware: topic of the gyro that turns "
+        "odometry; auto: imu or imu/data, if the model was made with one; none.")] = "auto",
     yes: Annotated[bool, Option("--yes", help="For --hardware: ask no questions.")] = False,
     arm: Annotated[bool, Option("--arm", help="For --hardware: arm command_gate.")] = False,
     as_json: console.JsonOption = False,
@@ -73,7 +75,7 @@ def evaluate(
     )
     console.tell_replaced(out / driving.EVALUATION)
     if hardware:
-        options = {"start": start, "namespace": namespace, "pose_type": pose_type}
+        options = {"start": start, "namespace": namespace, "pose_type": pose_type, "imu": imu}
         driven = partial(driving.drive_vehicle, order, place, arm, tell, partial(_ask, yes))
         with console.needs_ros("nics evaluate --hardware"):
             evaluated = [driven(**options)]

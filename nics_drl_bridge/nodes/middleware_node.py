@@ -74,7 +74,8 @@ class MiddlewareNode(ManagedNode):
         if new := sorted(health.rejected.keys() - self._rejected.keys()):
             told = shortened("; ".join(new), LONGEST)
             self.get_logger().warning(f"not used, but counted in /diagnostics: {told}")
-        trouble = silence(health, self._topics.expected, self._rejected)
+        awaited = dict.fromkeys((*self._topics.expected, *self._topics.hoped_for))
+        trouble = silence(health, tuple(awaited), self._rejected)
         self._rejected = health.rejected
         message = trouble or ("receiving" if self.state == ACTIVE else self.state)
         return runner.Condition(message, bool(trouble), facts(health), self._hardware)
