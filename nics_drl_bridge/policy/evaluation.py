@@ -96,8 +96,9 @@ def drive(
             observation, reward, terminated, truncated, info = env.step(action)
             paths.append(info.get("true_pose", info["pose"]))
             estimates.append(info["pose"])
-            if np.shape(info.get("covariance")) == (3, 3):
-                covariances = [*covariances[:1], info["covariance"]]
+            covariance = info.get("covariance")
+            if covariance is not None and np.shape(covariance) == (3, 3):
+                covariances = [*covariances[:1], covariance]
             total += float(reward)
             ended = bool(terminated or truncated)
         collided = "collision" if np.any(info.get("collision", False)) else "time-out"

@@ -162,8 +162,11 @@ def _free_yaw_rate(
 ) -> tuple[TableSurvey, Survey] | None:
     """Returns the yaw rate of a gyro, unless it may be a command."""
     found = guess_yaw_rate(tables)
+    if found is None:
+        return None
+    table, column = found
     commands = (*guess.commands.values(), *guess.candidates.values())
-    taken = any(found == (each.table, each.column) for each in commands)
+    taken = any(each.table is table and each.column.name == column.name for each in commands)
     return None if taken else found
 
 
