@@ -36,6 +36,7 @@ def drive_skid_steer(
     bias: float = BIAS,
     hold: float = 1.0,
     rest_s: float = REST_S,
+    noise: float = GYRO_NOISE,
 ) -> SlippingDrive:
     """Drives random commands after a rest, as Euler steps of a centimetre at most."""
     count = round(duration / STEP_S)
@@ -49,7 +50,7 @@ def drive_skid_steer(
     true_rate = motion[:, 1] / over_reported
     truth = _integrate(motion[:, 0], true_rate)
     wandering = np.cumsum(rng.normal(0.0, BIAS_WALK * np.sqrt(STEP_S), count))
-    gyro = true_rate + bias + wandering + rng.normal(0.0, GYRO_NOISE, count)
+    gyro = true_rate + bias + wandering + rng.normal(0.0, noise, count)
     wheels = _integrate(motion[:, 0], motion[:, 1])
     some = slice(None, None, ODOM_EVERY)
     twist = np.stack([motion[:, 0], np.zeros(count), motion[:, 1]], axis=1)

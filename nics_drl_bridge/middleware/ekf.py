@@ -216,7 +216,11 @@ class Estimator:
         turned = turn_odometry(
             self._gyro, self._anchor.odom, measurement.odom, measurement.value, self.time_ns, known
         )
-        return measurement._replace(value=turned.twist, odom=turned.odom), turned
+        noise = measurement.noise
+        if turned.rate_variance > self._noise[Kind.TWIST][2, 2]:
+            noise = np.array(self._noise[Kind.TWIST])
+            noise[2, 2] = turned.rate_variance
+        return measurement._replace(value=turned.twist, odom=turned.odom, noise=noise), turned
 
     def correct(self, measurement: Measurement) -> Judgement:
         """Corrects by a measurement at this time, after bridging unobserved motion."""

@@ -83,7 +83,7 @@ def estimate(path: str | Path, model: SimulatorModel, topics: Mapping[str, str])
 def with_gyro(path: str | Path, topics: Mapping[str, str]) -> Mapping[str, str]:
     """Returns topics by role with that of a gyro, if a bag has a usual one and none is named."""
     if IMU in topics:
-        named = topics[IMU].strip("/") != topic_roles.NO_IMU
+        named = topics[IMU].strip("/") != topic_roles.NONE
         return topics if named else {role: t for role, t in topics.items() if role != IMU}
     with opened(path) as bag:
         for name in (f"/{name}" for name in topic_roles.IMU_NAMES):

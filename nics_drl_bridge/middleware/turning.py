@@ -26,7 +26,8 @@ CLAIM = 25.0  # factor by which a variance may differ from what is seen, and is 
 FEWEST_SEEN = 30  # yaw rates that show their noise
 SMOOTHING = 0.05  # weight of a new yaw rate in that
 LONGEST_GAP_NS = 250_000_000  # between two yaw rates; beyond, the wheels turn the robot [ns]
-FROZEN = 25  # equal yaw rates in a row of a gyro that is stuck, if the wheels turn
+FROZEN = 25  # equal yaw rates in a row of a gyro that is stuck,
+CHANGED_RADPS = 0.1  # if the wheels turn the robot so much faster or slower since
 GREATEST_CHANGE = 40.0  # angular acceleration that no robot exceeds [rad/s^2]
 ALWAYS_ALLOWED = 0.3  # change from one yaw rate to the next [rad/s]
 FASTER = 2.0  # times its greatest turn rate that a robot may be turned
@@ -73,6 +74,7 @@ class Gyro(NamedTuple):
     odom_ns: int = 0
     odom_total: float = 0.0  # integral of all rates until then [rad]
     wheels_rate: float = 0.0  # yaw rate of its twist [rad/s]
+    wheels_rate_when_equal: float = 0.0  # the same before the gyro was `FROZEN` times equal
 
     @property
     def variance(self) -> float:
@@ -128,7 +130,8 @@ class Turned(NamedTuple):
     odom: Array  # (3,) pose on a path of the same displacements
     twist: Array  # (3,)
     gyro: Gyro
-    heading_variance: float  # gained by the heading, beside what the filter adds [rad^2]
+    heading_variance: float = 0.0  # gained by the heading, beside what the filter adds [rad^2]
+    rate_variance: float = 0.0  # of the twist's yaw rate, as far as it is the gyro's [rad^2/s^2]
 
 
 def believable_variance(variance: float | None) -> float | None:
@@ -209,7 +212,7 @@ def turn_odometry(
     seconds = (now_ns - gyro.odom_ns) / NS_PER_S
     if not _covers(gyro, now_ns) or seconds <= 0.0:
         moved = geometry.compose(before, geometry.exp(step))
-        return Turned(moved, twist, here, 0.0)
+        return Turned(moved, twist, here)
     by_gyro = here.odom_total - gyro.odom_total
     by_wheels = float(step[2])
     still = bool((step == 0.0).all() and (twist == 0.0).all())
@@ -217,10 +220,12 @@ def turn_odometry(
     noise = gyro.variance * max(gyro.period_s, 1e-3) * seconds
     spread = noise + gyro.bias_variance * seconds**2
     doubted = not still and here.contradicts(by_gyro - gyro.bias * seconds, by_wheels, spread)
-    stuck = here.equal >= FROZEN and by_wheels != 0.0
+    if here.equal < FROZEN:
+        here = here._replace(wheels_rate_when_equal=here.wheels_rate)
+    stuck = abs(here.wheels_rate - here.wheels_rate_when_equal) > CHANGED_RADPS
     if doubted or stuck or not here.fits:
         moved = geometry.compose(before, geometry.exp(step))
-        return Turned(moved, twist, here, 0.0)
+        return Turned(moved, twist, here)
     wheels_variance = rate_variance * seconds**2 + (here.slip * by_wheels) ** 2
     here = _learn_bias(here, by_gyro, by_wheels, seconds, noise, wheels_variance, still)
     unbiased = by_gyro - here.bias * seconds
@@ -236,7 +241,8 @@ def turn_odometry(
     grown = -2.0 * share * here.cross * seconds
     cross = here.cross - share * here.bias_variance * seconds
     moved = geometry.compose(before, geometry.exp(step))
-    return Turned(moved, turned, here._replace(cross=cross), max(grown, 0.0))
+    measured = share**2 * (gyro.variance + here.bias_variance)
+    return Turned(moved, turned, here._replace(cross=cross), max(grown, 0.0), measured)
 
 
 def _covers(gyro: Gyro, now_ns: int) -> bool:

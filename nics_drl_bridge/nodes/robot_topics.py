@@ -27,7 +27,7 @@ from nics_drl_bridge.nodes.conversions import INITIAL_POSE, initial_pose
 from nics_drl_bridge.nodes.parameters import AUTO, IMU, NO_POSE, POSE_TYPES, STAMPED, sensors
 from nics_drl_bridge.nodes.runner import declare_row
 from nics_drl_bridge.recording import messages
-from nics_drl_bridge.recording.topic_roles import NO_IMU, imu_topics
+from nics_drl_bridge.recording.topic_roles import IMU_NAMES, imu_topics
 
 KINDS_OF_POSE = {each.__name__: each for each in (PoseStamped, PoseWithCovarianceStamped)}
 
@@ -101,15 +101,24 @@ class RobotTopics:
         made = self._node.create_subscription(kind, topic, self._locked(take), quality)
         self._subscriptions.append(made)
 
+    @property
+    def lacks_gyro(self) -> bool:
+        """True if the model was made with a gyro, and nobody publishes one."""
+        if not self.hoped_for:
+            return False
+        return not any(self._node.count_publishers(topic) for topic in IMU_NAMES)
+
     def _hear_imu(self) -> None:
         """Subscribes to the gyro, if one is named or the model was made with one."""
         wanted = str(self._node.get_parameter(IMU).value)
         topics = imu_topics(wanted, self._model.gyro)
-        self.hoped_for = (measurement.IMU,) if topics else ()
         self._imu_topic = ""  # the first that speaks
         for topic in topics:
             self._subscribe(topic, Imu, partial(self._take_imu, topic), qos.SENSOR)
-        if wanted not in (AUTO, NO_IMU):
+        self.hoped_for: tuple[str, ...] = ()
+        if wanted == AUTO and topics:
+            self.hoped_for = (measurement.IMU,)
+        elif topics:
             self.expected = (*self.expected, measurement.IMU)
             self.expected_topics = (*self.expected_topics, wanted)
 

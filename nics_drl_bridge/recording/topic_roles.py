@@ -14,7 +14,6 @@ from nics_drl_bridge.errors import ConfigError, RecordingError, nearest
 Stamps = Literal["auto", "header", "receive"]
 NONE = "none"
 ROLES = ("cmd_vel", "pose", "odom", "joint_states", "imu")
-NO_IMU = NONE
 IMU_NAMES = ("imu", "imu/data")  # usual topics of a gyro, in a robot's namespace
 MOST_LISTED = 20  # maximum number of topics listed in an error
 TWIST, TWIST_STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
@@ -82,7 +81,7 @@ def imu_topics(wanted: str, by_default: bool) -> tuple[str, ...]:
     """
     if wanted == "auto":
         return IMU_NAMES if by_default else ()
-    return () if wanted in (NO_IMU, "") else (wanted,)
+    return () if wanted in (NONE, "") else (wanted,)
 
 
 def topic_roles(file: str | Path | None = None, options: Iterable[str] = ()) -> TopicRoles:

@@ -92,6 +92,29 @@ def test_a_slow_gyro_helps_as_well(slipping, every):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.0, 0.03])
+def test_neither_an_exact_nor_a_noisy_gyro_makes_odometry_an_outlier(noise):
+    drive = drive_skid_steer(np.random.default_rng(3), duration=60.0, noise=noise)
+    middleware, poses, truths = believed(drive)
+    assert off(poses, truths)[1] < 0.1
+    assert middleware.health(0).rejected.get("odom: outlier", 0) < 5
+
+
+def test_an_exact_gyro_that_turns_steadily_is_not_taken_for_stuck():
+    middleware = Middleware(builtin_model("differential"))
+    middleware.reset(0, np.zeros(3))
+    heading = 0.0
+    for k in range(1, 600):
+        now = k * NS // 100
+        rate = 0.0 if k < 100 else min(0.4, 0.01 * (k - 100))
+        middleware.imu(now, now, rate)
+        heading += 0.01 * 1.5 * rate
+        if k % 10 == 0:
+            middleware.odometry(now, now, [0.0, 0.0, heading], [0.0, 0.0, 1.5 * rate])
+    assert middleware.view(6 * NS).pose[2] == pytest.approx(heading / 1.5, abs=0.08)
+
+
+@pytest.mark.slow
 def test_the_error_is_within_what_the_estimate_says_of_its_uncertainty(slipping):
     middleware, poses, truths = believed(slipping, commands=1.0 / OVER_REPORTED)
     error = np.append((poses - truths)[-1, :2], geometry.wrap_angle(poses[-1, 2] - truths[-1, 2]))
