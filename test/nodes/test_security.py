@@ -15,6 +15,7 @@ NEEDS_MORE = {
     ("subscribe", "/clock"),  # use_sim_time
     ("subscribe", "/pose"),  # pose_type
     ("subscribe", "/imu"),  # imu
+    ("subscribe", "/imu/data"),
     ("subscribe", "/ackermann_cmd"),  # ackermann_msgs
     ("publish", "/tf"),  # tf2_msgs
     ("publish", "/tf_static"),
