@@ -31,24 +31,27 @@ def turned_by_gyro(recording: Recording) -> Recording:
     """
     if recording.imu is None or recording.gyro is not None:
         return recording
+    if recording.imu.clock != recording.pose.clock:
+        told = "The gyro is on another clock than the pose, and was not compared with it."
+        return replace(recording, repairs=(*recording.repairs, told))
     turning = _compared(recording)
     if turning is None:
         return recording
-    told = tuple(_about(recording, turning))
+    sentences = tuple(_about(recording, turning))
     if not _fits(recording, turning):
-        return replace(recording, repairs=(*recording.repairs, *told))
+        return replace(recording, repairs=(*recording.repairs, *sentences))
     pose = recording.pose
     if recording.measured_by == "odometry" and turning.contradicts:
         yaw_rate = recording.imu.values[:, 2]
         turned, covered = turn_by_gyro(pose.t, pose.values, recording.imu.t, yaw_rate, turning)
         if covered < LEAST_COVERED:
-            told = (
+            sentences = (
                 f"The gyro covers {covered:.0%} of the drive only, so the heading is that of "
                 "odometry, which it contradicts; record its topic without gaps.",
             )
-            return replace(recording, repairs=(*recording.repairs, *told))
+            return replace(recording, repairs=(*recording.repairs, *sentences))
         pose = replace(pose, values=turned)
-    return replace(recording, pose=pose, gyro=turning, repairs=(*recording.repairs, *told))
+    return replace(recording, pose=pose, gyro=turning, repairs=(*recording.repairs, *sentences))
 
 
 def relative_to(recording: Recording) -> str:
@@ -80,7 +83,7 @@ def relative_to(recording: Recording) -> str:
 def _compared(recording: Recording) -> Turning | None:
     """Compares pose and gyro; None if they can't be compared."""
     pose, imu = recording.pose, recording.imu
-    if imu is None or imu.clock != pose.clock:
+    if imu is None:
         return None
     turning = compare_turning(pose.t, pose.values, imu.t, imu.values[:, 2])
     return turning if turning is not None and turning.compared else None
@@ -118,7 +121,8 @@ def _about(recording: Recording, turning: Turning) -> Iterator[str]:
         return
     where = f"over {turning.rest_s:.1f} s at rest" if turning.rest_s > 0.0 else "while driving"
     bias = f"bias of {turning.bias:.4f} +- {turning.bias_std:.2g} rad/s was found {where}"
-    if not turning.contradicts:
+    agrees = recording.measured_by == "tracker" and _fits(recording, turning)
+    if agrees or not turning.contradicts:
         yield (
             f"The gyro confirms the heading: they differ by {turning.apart:.2g} rad in "
             f"{WINDOW_S:g} s; its {bias}."

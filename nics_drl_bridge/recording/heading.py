@@ -31,6 +31,7 @@ ALIKE = 0.7  # least correlation of two sources that measure the same motion
 PLAUSIBLE_SCALES = (0.33, 5.0)  # of odometry's turns, relative to those of the gyro
 IN_DEGREES = (40.0, 80.0)  # ratio of a rate in degrees to one in radians
 LEAST_APART_RAD = 0.02  # a smaller disagreement in `WINDOW_S` is not worth a correction
+GYRO_SCALE_STD = 0.015  # of the scale of a usual gyro, as a share
 CLEARLY = 3.0  # standard errors
 
 
@@ -48,7 +49,7 @@ class Turning:
     alike: float  # correlation of both rates; NaN if it turned too little
     window_s: float
     apart: float  # root mean square disagreement after `window_s` [rad]; NaN if the drive is short
-    apart_std: float  # what the bias alone may contribute to that [rad]
+    apart_std: float  # what bias and scale of the gyro may contribute to that [rad]
 
     def bias_at(self, t: Array) -> Array:
         """Returns the bias (T,) at times (T,) [s]."""
@@ -97,7 +98,8 @@ def compare_turning(
     bias, bias_std, slope, bias_time, rest_s = _bias_of(blocks)
     unbiased = blocks.gyro_rate - (bias + slope * (blocks.middle - bias_time))
     scale, scale_std, alike = _scale_of(blocks.odom_rate, unbiased, blocks.span)
-    apart = _disagreement(blocks, unbiased, window_s)
+    apart = _root_mean_square(blocks, blocks.odom_rate - unbiased, window_s)
+    turned = _root_mean_square(blocks, unbiased, window_s)
     return Turning(
         bias=bias,
         bias_std=bias_std,
@@ -109,7 +111,7 @@ def compare_turning(
         alike=alike,
         window_s=window_s,
         apart=apart,
-        apart_std=bias_std * window_s,
+        apart_std=float(np.hypot(bias_std * window_s, GYRO_SCALE_STD * turned)),
     )
 
 
@@ -188,7 +190,7 @@ def _bias_of(blocks: _Blocks) -> tuple[float, float, float, float, float]:
     rate, when = rate[near], when[near]
     middle = float(when.mean())
     bias = float(rate.mean())
-    std = max(float(rate.std()) / np.sqrt(len(rate)), LEAST_BIAS_STD)
+    std = max(float(rate.std() / np.sqrt(len(rate))), LEAST_BIAS_STD)
     apart = when - middle
     if len(rate) < FEWEST_TO_DRIFT or float(np.ptp(when)) < DRIFT_SPAN_S:
         return bias, std, 0.0, middle, rest_s
@@ -198,7 +200,7 @@ def _bias_of(blocks: _Blocks) -> tuple[float, float, float, float, float]:
     slope_std = max(float(left.std()), LEAST_BIAS_STD) / np.sqrt(power)
     if abs(slope) < DRIFTS * slope_std:
         return bias, std, 0.0, middle, rest_s
-    std = max(float(left.std()) / np.sqrt(len(rate)), LEAST_BIAS_STD)
+    std = max(float(left.std() / np.sqrt(len(rate))), LEAST_BIAS_STD)
     return bias, std, slope, middle, rest_s
 
 
@@ -230,9 +232,9 @@ def _scale_of(odom_rate: Array, gyro_rate: Array, span: Array) -> tuple[float, f
     return scale, std, together / float(np.sqrt(power * odom_power))
 
 
-def _disagreement(blocks: _Blocks, unbiased: Array, window_s: float) -> float:
-    """Returns the root mean square difference of both turns over windows [rad]."""
-    each = (blocks.odom_rate - unbiased) * blocks.span
+def _root_mean_square(blocks: _Blocks, rate: Array, window_s: float) -> float:
+    """Returns the root mean square of turns at rates (n,) over windows [rad]."""
+    each = rate * blocks.span
     count = max(1, round(window_s / BLOCK_S))
     if len(each) < count:
         return np.nan
