@@ -57,6 +57,7 @@ class SimulatorModel:
     report: str = ""  # how the model was made, as readable text
     latency: Latency = field(default_factory=Latency)  # of scan and odometry, where it was shown
     sensors: tuple[Sensor, ...] = ()  # that the robot has beside its lidar
+    gyro: bool = False  # a gyro turned the recorded poses, or confirmed how they turned
 
     def __post_init__(self) -> None:
         robot, known = self.robot, (self.kinematics.variables, self.kinematics.dofs)
@@ -93,6 +94,8 @@ class SimulatorModel:
             data["latency"] = self.latency.model_dump(mode="json")
         if self.sensors:
             data["sensors"] = [sensor.model_dump(mode="json") for sensor in self.sensors]
+        if self.gyro:
+            data["gyro"] = True
         return dump_yaml(data)
 
     @property
@@ -111,6 +114,7 @@ class _File(Schema):
     noise: Noise
     latency: Latency = Field(default_factory=Latency)
     sensors: tuple[AnySensor, ...] = ()
+    gyro: bool = False
 
 
 def generate(
@@ -136,7 +140,7 @@ def generate(
         robot, identified.model, replace(identified.calibration, inputs=(), limits={}), lidar,
         bake(lidar, (*shapes, footprint_shape(robot))), identified.noise,
         round(round(steps) * dt, 9), fit_report(recording.source, robot, identified),
-        recording.latency, tuple(sensors),
+        recording.latency, tuple(sensors), identified.recording.gyro is not None,
     )  # fmt: skip
     return model, identified
 
@@ -238,6 +242,7 @@ def load_model(folder: str | Path) -> SimulatorModel:
         return SimulatorModel(
             file.robot, file.kinematics.model(), file.calibration, file.lidar, table, file.noise,
             file.control_period, report, file.latency, file.sensors,
+            file.gyro,
         )  # fmt: skip
     except ModelError as error:
         raise ModelError(f"{path}: {error}") from None

@@ -76,7 +76,7 @@ TopicOption = Annotated[list[str] | None, Option(
     "times. Roles: cmd_vel, pose, odom, joint_states, imu; none as a topic leaves a role out.")
 ]  # fmt: skip
 HARDWARE_OPTIONS = (
-    "start", "namespace", "pose_type", "yes", "arm", "goal_frame", "confirm_beyond",
+    "start", "namespace", "pose_type", "imu", "yes", "arm", "goal_frame", "confirm_beyond",
 )  # fmt: skip
 NEEDED: dict[str, dict[str, tuple[str, ...]]] = {  # options that do nothing without another
     "evaluate": dict.fromkeys(HARDWARE_OPTIONS, ("hardware",))

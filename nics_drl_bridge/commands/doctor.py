@@ -21,6 +21,8 @@ def doctor(
     policy: Annotated[str | None, Option(help="Check against a policy file instead.")] = None,
     namespace: Annotated[str, Option(help="Namespace of the robot's topics.")] = "",
     duration: Annotated[float, Option(min=1.0, help="How long to listen to a robot [s].")] = 5.0,
+    imu: Annotated[str, Option(metavar="TOPIC",
+        help="Topic of the gyro; auto: the one that is there; none.")] = "auto",
     install: Annotated[bool, Option("--install",
         help="Check this machine instead: what works here.")] = False,
     as_json: console.JsonOption = False,
@@ -42,12 +44,12 @@ def doctor(
         contract = load_any(policy).contract
         expected = expected_of(contract, contract.scan)
     if bag is not None:
-        facts = facts_of_bag(bag, namespace)
+        facts = facts_of_bag(bag, namespace, imu)
     else:
         with console.needs_ros("nics doctor"):
             from nics_drl_bridge.nodes.listen import listen
         with console.progress_bar(f"listening for {duration:g} s"):
-            facts = listen(duration, namespace)
+            facts = listen(duration, namespace, imu=imu)
     findings = examine(facts, expected)
     told = f"{facts.source}: all fits {policy or model or DEFAULT_ROBOT}."
     if findings:

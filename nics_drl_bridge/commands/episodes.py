@@ -313,7 +313,10 @@ def _percent(share: float) -> str:
 
 def line_of(one: Evaluated) -> str:
     """Summarises a policy in one line."""
-    each = ", ".join(f"{LABELS[p]} {_percent(t.success.value)}" for p, t in one.tallies.items())
+    each = ", ".join(
+        f"{LABELS[place]}{', as believed,' if place == VEHICLE else ''} {_percent(t.success.value)}"
+        for place, t in one.tallies.items()
+    )
     planned = ", ".join(
         f"{_percent(tally.fallback)} {LABELS[place]}"
         for place, tally in one.tallies.items()
@@ -353,7 +356,8 @@ def drive_vehicle(
 
     say(f"listening to the vehicle for {LISTEN_S:g} s, as nics doctor does")
     errors = []
-    for finding in examine(listen(LISTEN_S, namespace), expected_of(model)):
+    heard = listen(LISTEN_S, namespace, imu=options.get("imu", "auto"))
+    for finding in examine(heard, expected_of(model)):
         sentence = f"{finding.where}: {finding.what} ({finding.fix})"
         say(f"  {finding.severity}: {sentence}")
         errors += [sentence] if finding.severity == "error" else []
@@ -381,7 +385,7 @@ def drive_vehicle(
             driven = drive(env, driver, seed, episode.options, partial(_arm, arm, namespace, say))
             # The vehicle's own estimate is all that is known of its path.
             episodes.append(replace(driven, path=driven.estimate))
-            say(f"  {driven.result}, {driven.steps} steps, {episodes[-1].length:.2f} m")
+            say(f"  {told_end(episodes[-1])}")
     env, driver = env_of(policy, model, order.world, "sim", under, estimator=True)
     runs: dict[str, list[Episode]] = {VEHICLE: episodes}
     starts = [(one.seed, {"start": one.path[0], "goal": one.goal}) for one in episodes]
@@ -393,6 +397,18 @@ def drive_vehicle(
     made = judged(policy, runs, model, world, order.out)
     write_evaluation(replace(order, conditions=under), name, model, [made])
     return made
+
+
+ENDS_BELIEVED = {"success": "reached", "collision": "touched"}
+
+
+def told_end(episode: Episode) -> str:
+    """Tells the end of an episode on a vehicle: as it believes, for nothing else is known."""
+    end = ENDS_BELIEVED.get(episode.result, episode.result)
+    end = f"{end}, as believed"
+    if episode.uncertain is not None:
+        end = f"{end}; {episode.uncertain.told_since('the start')}"
+    return f"{end}; {episode.steps} steps, {episode.length:.2f} m"
 
 
 def _arm(wanted: bool, namespace: str, say: Say) -> None:

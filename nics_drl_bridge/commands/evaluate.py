@@ -52,6 +52,8 @@ def evaluate(
         metavar="METRES", help="For --hardware: a goal that is farther away is confirmed.")] = 5.0,
     namespace: Annotated[str, Option(help="For --hardware: namespace of its topics.")] = "",
     pose_type: Annotated[str, Option(help="For --hardware: type of `pose`, in map.")] = "none",
+    imu: Annotated[str, Option(metavar="TOPIC", help="For --hardware: topic of the gyro that turns "
+        "odometry; auto: imu or imu/data, if the model was made with one; none.")] = "auto",
     yes: Annotated[bool, Option("--yes", help="For --hardware: ask no questions.")] = False,
     arm: Annotated[bool, Option("--arm", help="For --hardware: arm command_gate.")] = False,
     as_json: console.JsonOption = False,
@@ -80,7 +82,7 @@ def evaluate(
     )
     console.tell_replaced(out / driving.EVALUATION)
     if hardware:
-        options = {"start": start, "namespace": namespace, "pose_type": pose_type}
+        options = {"start": start, "namespace": namespace, "pose_type": pose_type, "imu": imu}
         driven = partial(
             driving.drive_vehicle, order, place, arm, tell, partial(_ask, yes),
             goal_frame=goal_frame, confirm=partial(_confirm, yes), confirm_beyond_m=confirm_beyond,

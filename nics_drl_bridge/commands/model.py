@@ -30,6 +30,8 @@ def record(
     remap: Annotated[list[str] | None, Option(help="Rename a topic: odom:=/wheels.")] = None,
     topics: Annotated[Path | None, Option(help="YAML: joints of state and wheels.")] = None,
     stamped: Annotated[bool | None, Option(help="Send cmd_vel as TwistStamped.")] = None,
+    imu: Annotated[str, Option(metavar="TOPIC",
+        help="Topic of an IMU to record; auto: imu or imu/data, if there is one; none.")] = "auto",
     use_sim_time: Annotated[bool, Option("--use-sim-time", help="Take time from /clock.")] = False,
     preview: Annotated[bool, Option("--preview", help="Only show the planned drive.")] = False,
     yes: Annotated[bool, Option("--yes", help="Do not ask before the robot moves.")] = False,
@@ -39,7 +41,7 @@ def record(
     arguments = node_arguments(namespace, remap or ())
     given = {
         "robot": robot, "out": str(out), "bound": bound, "duration": duration, "speed": speed,
-        "seed": seed, "topics": str(topics or ""), "use_sim_time": use_sim_time,
+        "seed": seed, "topics": str(topics or ""), "use_sim_time": use_sim_time, "imu": imu,
     } | ({} if stamped is None else {"stamped": stamped})  # fmt: skip
     if not preview:
         # First: with ROS 2 from wheels it restarts Python.

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from nics_drl_bridge.identify.command_doubts import doubts_of_commands
 from nics_drl_bridge.identify.excitation import narrow
+from nics_drl_bridge.identify.gyro import relative_to
 from nics_drl_bridge.identify.identify import Identified
 from nics_drl_bridge.identify.judgement import shortfall, usual
 from nics_drl_bridge.identify.verdict import Mistake, doubts, missed
@@ -52,7 +53,8 @@ def conclude(identified: Identified) -> Conclusion:
     else:
         first = ", or first fix the points above" if gaps else ""
         advice, ready = f"train a policy in the simulator{first}", True
-    return Conclusion(accuracy(identified), about, gaps, f"Next: {advice}.", ready)
+    told = f"{accuracy(identified)} {relative_to(identified.recording)}".strip()
+    return Conclusion(told, about, gaps, f"Next: {advice}.", ready)
 
 
 def accuracy(identified: Identified) -> str:

@@ -17,6 +17,7 @@ from nics_drl_bridge.identify.assume import assume_textbook
 from nics_drl_bridge.identify.calibration import Calibration, Response, align
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.forms import CLEAR, curve_of, likely_delay, reached
+from nics_drl_bridge.identify.gyro import turned_by_gyro
 from nics_drl_bridge.identify.judgement import bands_of, judged, shortfall
 from nics_drl_bridge.identify.mounting import Mounting, mounted, mounting_of
 from nics_drl_bridge.identify.noise import motion_noise, sensor_noise
@@ -543,7 +544,7 @@ def identify(
 ) -> Identified:  # fmt: skip
     """Learns a motion up to `train_until` [s], and tests it on the rest; see `Settings`."""
     # Default: two thirds. RecordingError: unusable for this robot. FitError: it shows too little.
-    drive = Drive(check(recording, spec), spec)
+    drive = Drive(turned_by_gyro(check(recording, spec)), spec)
     until = TRAIN_SHARE * drive.duration_s if train_until is None else train_until
     found = run(STAGES, replace(drive, settings=Settings(order, alpha, until, assume, strict)))
     return _result(found, found.refit or found)

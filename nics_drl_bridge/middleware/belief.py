@@ -9,6 +9,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.generator import SimulatorModel
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.middleware.kernels import Anchor
+from nics_drl_bridge.middleware.turning import Gyro
 
 JITTER_S = 0.2  # Uncertainty of the unobserved time: transmission takes longer now and then [s]
 MARGIN = 1.2  # Factor by which odometry, through noise or slip, may exceed the greatest speed
@@ -27,6 +28,7 @@ class Belief(NamedTuple):
     error: Array  # (3 + S, S) derivative to a constant error of the state's rates since before
     roughness: tuple[float, ...] = (1.0, 1.0, 1.0)  # (3,) factors of variances, by kind
     missed: Array = np.zeros((3, 3))  # (3, 3) the newest innovation, by kind
+    gyro: Gyro | None = None  # None before the first yaw rate
 
 
 class Foreseen(NamedTuple):
@@ -76,14 +78,14 @@ class Unseen:
 
     def __init__(self, model: SimulatorModel, process: Array, noise: Array, news: Array) -> None:
         self._news = news
-        self._fastest = greatest_twist(model)
+        self.fastest = greatest_twist(model)  # [m/s], [rad/s]
         # Variance (3,) that a pose by odometry gains in a second [m^2, m^2, rad^2]: it integrates
         # its twists, so their noise is a random walk with a step each period.
         self.walk = np.diag(process)[:3] + np.diag(noise) * model.control_period
 
     def reach(self, seconds: float) -> tuple[float, float]:
         """Greatest distance [m] and turn [rad] in a time, by the greatest speeds."""
-        speed, rate = self._fastest
+        speed, rate = self.fastest
         longest = max(seconds, 0.0) + JITTER_S
         return speed * longest, min(rate * longest, np.pi)
 

@@ -12,6 +12,12 @@ from nics_drl_bridge.middleware import kernels
 from nics_drl_bridge.middleware.belief import Belief, Foreseen, Unseen, parted
 from nics_drl_bridge.middleware.kernels import Anchor, Log, MotionModel, log_of
 from nics_drl_bridge.middleware.measurement import Acceptance, Judgement, Kind, Measurement
+from nics_drl_bridge.middleware.turning import (
+    Turned,
+    believable_variance,
+    take_rate,
+    turn_odometry,
+)
 from nics_drl_bridge.robot.kernels import SERIES, term_arrays, wrap
 
 LEAST_POSE_DRIFT, LEAST_STATE_DRIFT = 1e-2, 2e-2
@@ -21,11 +27,9 @@ LEAST_SLIP = 5e-3  # Lower bound on the motion that wheels miss [m or rad / sqrt
 LEAST_TWIST_STD = LEAST_POSE_STD = START_STD = 1e-3
 """Lower bounds on the standard deviations of a twist [m/s, rad/s] and of a pose [m, rad], and that
 of the pose at a reset."""
-GYRO_STD = 0.02  # of a yaw rate without a covariance [rad/s]: a cheap gyro with its bias
-# Gates on the squared, normalised innovation: 99.9 % of chi-squared with 3, 1 degrees of freedom.
-GATE = {Kind.TWIST: 16.27, Kind.YAW_RATE: 10.83, Kind.POSE: 16.27}
-# Consecutive outliers after which they are believed. A gyro never is: odometry has precedence.
-PATIENCE: dict[Kind, float] = {Kind.TWIST: 3, Kind.YAW_RATE: np.inf, Kind.POSE: 5}
+# Gates on the squared, normalised innovation: 99.9 % of chi-squared with 3 degrees of freedom.
+GATE = {Kind.TWIST: 16.27, Kind.POSE: 16.27}
+PATIENCE = {Kind.TWIST: 3, Kind.POSE: 5}  # consecutive outliers after which they are believed
 # Factors of variances, after each outlier and after each measurement that fits well, and the
 # greatest: noise may be more than was told, and nearly all measurements would then be outliers.
 ROUGHER, SMOOTHER, ROUGHEST = 4.0, 0.93, 100.0
@@ -61,7 +65,6 @@ class Estimator:
         linear, angular = (max(std, LEAST_TWIST_STD) for std in model.noise.odometry)
         self._noise = {
             Kind.TWIST: np.diag([linear, linear, angular]) ** 2,
-            Kind.YAW_RATE: np.diag([GYRO_STD**2]),
             Kind.POSE: np.diag(np.maximum(model.noise.pose, LEAST_POSE_STD) ** 2),
         }
         # Measured drift is motion that the model misses, wheels do not; an assumed one may be slip.
@@ -101,7 +104,8 @@ class Estimator:
         known = self._anchor is not None and continuous
         since = anchor._replace(time_ns=time_ns - round(seconds * NS_PER_S)) if known else None
         known_so = anchor.mean, covariance, (0, 0, 0), since, True, self._suddenly
-        self.belief = Belief(time_ns, *known_so, self._roughness, self._missed)
+        gyro = None if self._gyro is None else self._gyro.restarted()
+        self.belief = Belief(time_ns, *known_so, self._roughness, self._missed, gyro)
         self._log = log_of(np.minimum(np.maximum(command, self._least), self._most))
 
     @property
@@ -109,13 +113,13 @@ class Estimator:
         """State of the filter; set to an earlier one when the past has changed."""
         own = self._filter
         known = self.time_ns, own.x, own.P, self._outliers, self._anchor, self._lost
-        return Belief(*known, self._error, self._roughness, self._missed)
+        return Belief(*known, self._error, self._roughness, self._missed, self._gyro)
 
     @belief.setter
     def belief(self, belief: Belief) -> None:
         self.time_ns, self._filter.x, self._filter.P = belief[:3]
         self._outliers, self._anchor, self._lost, self._error = belief[3:7]
-        self._roughness, self._missed = belief[7:]
+        self._roughness, self._missed, self._gyro = belief[7:]
         self._foreseen = None
 
     @property
@@ -194,8 +198,35 @@ class Estimator:
         noise = None if std is None else np.diag(np.atleast_1d(std) ** 2.0)
         return self.correct(Measurement(kind, np.atleast_1d(value).astype(np.float64), noise))
 
+    def turn(self, time_ns: int, measurement: Measurement) -> Judgement:
+        """Takes a yaw rate measured at a time; the next odometry turns by it, see `turning`."""
+        variance = None if measurement.noise is None else float(measurement.noise[0, 0])
+        rate, fastest = float(measurement.value[0]), self.unseen.fastest[1]
+        self._gyro, distance, used = take_rate(self._gyro, time_ns, rate, variance, fastest)
+        outcome = Acceptance.USED if used else Acceptance.OUTLIER
+        self._count(Kind.YAW_RATE, 0 if used else self._outliers[Kind.YAW_RATE] + 1)
+        return Judgement(distance, outcome)
+
+    def _turned(self, measurement: Measurement) -> tuple[Measurement, Turned | None]:
+        """Returns an odometry that turns by the gyro; the same one where there is none."""
+        if self._gyro is None or self._anchor is None or measurement.odom is None:
+            return measurement, None
+        variance = believable_variance(measurement.turn_variance)
+        known = float(self._noise[Kind.TWIST][2, 2]) if variance is None else variance
+        turned = turn_odometry(
+            self._gyro, self._anchor.odom, measurement.odom, measurement.value, self.time_ns, known
+        )
+        noise = measurement.noise
+        if turned.rate_variance > self._noise[Kind.TWIST][2, 2]:
+            noise = np.array(self._noise[Kind.TWIST])
+            noise[2, 2] = turned.rate_variance
+        return measurement._replace(value=turned.twist, odom=turned.odom, noise=noise), turned
+
     def correct(self, measurement: Measurement) -> Judgement:
         """Corrects by a measurement at this time, after bridging unobserved motion."""
+        if measurement.kind is Kind.YAW_RATE:
+            return self.turn(self.time_ns, measurement)
+        measurement, turned = self._turned(measurement)
         kind, odom, anchor = measurement.kind, measurement.odom, self._anchor
         lost = self._lost
         if lost and odom is not None:
@@ -207,6 +238,12 @@ class Estimator:
         verdict = self._correct(measurement, odom is not None and not lost)
         if verdict.outcome is Acceptance.OUTLIER and not (lost and odom is not None):
             return verdict  # the next odometry's way then leads past this one
+        if turned is not None:
+            self._gyro = turned.gyro
+            if turned.heading_variance > 0.0:
+                spread = np.array(self._filter.P)
+                spread[2, 2] += turned.heading_variance
+                self._filter.P = spread
         if odom is not None:
             self.anchor(np.array(odom), np.array(measurement.value))
         elif kind is Kind.POSE:
@@ -214,7 +251,7 @@ class Estimator:
         return verdict
 
     def _correct(self, measurement: Measurement, follows: bool) -> Judgement:
-        kind, value, given_noise, odom = measurement
+        kind, value, given_noise, odom, _ = measurement
         noise = self._noise_of(kind, given_noise)
         expected, derivative = self._expect(kind)
         residual = _between_poses if kind is Kind.POSE else np.subtract
@@ -272,7 +309,7 @@ class Estimator:
 
     def _roughen(self, kind: Kind, factor: float) -> None:
         rough = min(max(1.0, factor * self._roughness[kind]), ROUGHEST)
-        if rough != self._roughness[kind] and kind is not Kind.YAW_RATE:
+        if rough != self._roughness[kind]:
             self._roughness = _with(self._roughness, kind, rough)
             self._foreseen = None  # whose gains are those of the former noise
 
@@ -301,7 +338,7 @@ class Estimator:
         else:
             now = self.time_ns
             twist, derivative = kernels.expect(self._filter.x, now, self._motion, self._log)
-        return (twist, derivative) if kind is Kind.TWIST else (twist[2:], derivative[2:])
+        return twist, derivative
 
     @property
     def _foreseen_here(self) -> Foreseen | None:

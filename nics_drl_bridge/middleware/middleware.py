@@ -173,11 +173,15 @@ class Middleware:
             return self.cache.reject(f"{topic}: {fault}")
         return self.cache.put(topic, stamp_ns, arrival_ns, values)
 
-    def odometry(self, stamp_ns: int, arrival_ns: int, pose: ArrayLike, twist: ArrayLike) -> bool:
+    def odometry(
+        self, stamp_ns: int, arrival_ns: int, pose: ArrayLike, twist: ArrayLike,
+        turn_variance: float | None = None,
+    ) -> bool:  # fmt: skip
         """Takes an odometry: pose (3,) in `odom`, body twist (3,); True if it was accepted.
 
         The twist corrects the estimate, and so does the way between two poses; the pose, which
-        drifts, bridges motion for which there are no other data.
+        drifts, bridges motion for which there are no other data. With a gyro both turn by it, as
+        far as the variance of the twist's yaw rate, by default the model's, is the greater.
         """
         value = np.array((pose, twist), dtype=np.float64)
         if not np.isfinite(value).all():
@@ -191,16 +195,16 @@ class Middleware:
         elif self._trail.contradicts(odometry):
             self._follow_clock(odometry)
         else:
-            return self._measure_odometry(odometry)
+            return self._measure_odometry(odometry, turn_variance)
         self._stamps.accept(stamp_ns, arrival_ns)
         self.cache.take(ODOM, stamp_ns, arrival_ns, value)
         self._trail.use(odometry)
         return True
 
-    def _measure_odometry(self, odometry: ReportedPose) -> bool:
+    def _measure_odometry(self, odometry: ReportedPose, turn_variance: float | None) -> bool:
         """Measures an odometry; True if accepted. Continues from it if the clock was set."""
         stamp_ns, arrival_ns, pose, twist = odometry
-        measurement = Measurement(Kind.TWIST, twist, odom=pose)
+        measurement = Measurement(Kind.TWIST, twist, odom=pose, turn_variance=turn_variance)
         reason = self._measure(stamp_ns, arrival_ns, measurement, (pose, twist))
         if not reason:
             self._trail.use(odometry)
@@ -220,7 +224,10 @@ class Middleware:
     def imu(
         self, stamp_ns: int, arrival_ns: int, yaw_rate: float, variance: float | None = None
     ) -> bool:
-        """Takes a yaw rate [rad/s], by default with a cheap gyro's variance; True if used."""
+        """Takes a yaw rate [rad/s], by default with a cheap gyro's variance; True if used.
+
+        Odometry then turns by it, see `turning`.
+        """
         covariance = None if variance is None else [[variance]]
         return self._optional(Kind.YAW_RATE, stamp_ns, arrival_ns, [yaw_rate], covariance)
 

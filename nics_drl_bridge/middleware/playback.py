@@ -21,7 +21,14 @@ from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCA
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.recording import topic_roles
 from nics_drl_bridge.recording.bag_file import BagFile, Message, opened
-from nics_drl_bridge.recording.messages import commanded, gyro, stamp, twist_row, whole_pose
+from nics_drl_bridge.recording.messages import (
+    commanded,
+    gyro,
+    stamp,
+    turn_variance,
+    twist_row,
+    whole_pose,
+)
 
 SCAN_TYPE = "sensor_msgs/msg/LaserScan"
 TYPES: Mapping[str, tuple[str, ...]] = {
@@ -56,7 +63,7 @@ def estimate(path: str | Path, model: SimulatorModel, topics: Mapping[str, str])
     The estimate is identical on every machine with the same versions. Raises RecordingError if the
     bag is damaged, a topic missing or of a wrong type, or the data are stamped by several clocks.
     """
-    messages = played(path, topics)
+    messages = played(path, topics, model.gyro)
     playback, rows = Playback(model, POSE in messages), []
     middleware = playback.middleware
     for role, message in in_order(messages):
@@ -73,8 +80,23 @@ def estimate(path: str | Path, model: SimulatorModel, topics: Mapping[str, str])
     )  # fmt: skip
 
 
-def played(path: str | Path, topics: Mapping[str, str]) -> dict[str, list[Message]]:
+def with_gyro(path: str | Path, topics: Mapping[str, str]) -> Mapping[str, str]:
+    """Returns topics by role with that of a gyro, if a bag has a usual one and none is named."""
+    if IMU in topics:
+        named = topics[IMU].strip("/") != topic_roles.NONE
+        return topics if named else {role: t for role, t in topics.items() if role != IMU}
+    with opened(path) as bag:
+        for name in (f"/{name}" for name in topic_roles.IMU_NAMES):
+            if bag.types.get(name) == topic_roles.IMU and name not in bag.empty:
+                return {**topics, IMU: name}
+    return topics
+
+
+def played(
+    path: str | Path, topics: Mapping[str, str], use_gyro: bool = False
+) -> dict[str, list[Message]]:
     """Returns the messages of each role that is played. Raises as `estimate` does."""
+    topics = with_gyro(path, topics) if use_gyro else topics
     with opened(path) as bag:
         roles = chosen(bag, topics)
         messages = {role: bag.messages(topic) for role, topic in roles.items()}
@@ -174,7 +196,8 @@ class Playback:
         if not self._started and np.isfinite(pose).all():
             self.middleware.reset(stamp_ns, pose, ANYWHERE if self._posed else START_STD)
             self._started = True
-        return self.middleware.odometry(stamp_ns, arrival_ns, pose, np.array(twist_row(message)))
+        twist, variance = np.array(twist_row(message)), turn_variance(message)
+        return self.middleware.odometry(stamp_ns, arrival_ns, pose, twist, variance)
 
     def _command(self, _: int, message: Any) -> bool:
         command = commanded(message, self._model.robot)

@@ -103,8 +103,11 @@ class Timeline:
         return ""
 
     def _run(self, moment: Moment, measurement: Measurement) -> _Entry:
-        self._estimator.predict(moment[0])
-        verdict = self._estimator.correct(measurement)
+        if measurement.kind is Kind.YAW_RATE:  # the next odometry turns by it
+            verdict = self._estimator.turn(moment[0], measurement)
+        else:
+            self._estimator.predict(moment[0])
+            verdict = self._estimator.correct(measurement)
         self.outcomes[measurement.kind, verdict.outcome] += 1
         self.distances[measurement.kind] = verdict.distance
         return _Entry(moment, self._estimator.belief, measurement, verdict)

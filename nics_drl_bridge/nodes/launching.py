@@ -17,7 +17,7 @@ from launch_ros.parameter_descriptions import ParameterValue
 from launch import LaunchDescription
 from nics_drl_bridge.config import PACKAGE, find_config, parse_yaml, read_text, share_folder
 from nics_drl_bridge.errors import ConfigError
-from nics_drl_bridge.nodes.parameters import BASE_FRAME, MODEL, STAMPED
+from nics_drl_bridge.nodes.parameters import BASE_FRAME, IMU, MODEL, STAMPED
 
 STATE_PUBLISHER = "robot_state_publisher"
 SHIPPED_LASER = "laser"  # frame of the lidar in the URDFs of the shipped robots
@@ -179,7 +179,7 @@ def bridge(setup: Setup) -> Iterator[Any]:
     """Starts gate, middleware and policy of each robot."""
     shared = {"model": value(setup["model"]), STAMPED: value(setup["stamped"], bool)}
     shared["use_sim_time"] = value(setup["use_sim_time"], bool)
-    managed = shared | {"autostart": value(setup["autostart"], bool)}
+    managed = shared | {"autostart": value(setup["autostart"], bool), IMU: value(setup[IMU])}
     required = value(setup["e_stop_required"] or "true", bool)
     gate = shared | {"e_stop_required": required, "limits": value(setup.limits())}
     named = {name: value(setup[name]) for name in ("policy", "fallback")}
@@ -268,6 +268,7 @@ def of_bridge() -> list[Any]:
         argument("fallback", "", "Planner behind the policy; empty: of params_file"),
         argument("limits", "", "Of the gate; empty: of the model, if given, or of params_file"),
         argument("autostart", "true", "Managed nodes configure and activate themselves"),
+        argument(IMU, "", "Topic of the gyro, auto or none; empty: of params_file"),
     ]
 
 

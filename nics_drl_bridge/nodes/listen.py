@@ -11,31 +11,40 @@ from nics_drl_bridge.nodes.conversions import message_type
 from nics_drl_bridge.nodes.qos import offer_of, profile_of
 from nics_drl_bridge.nodes.runner import open_context
 from nics_drl_bridge.recording.messages import Offer
-from nics_drl_bridge.report.doctor_facts import KINDS, Endpoints, Facts, names_in
+from nics_drl_bridge.report.doctor_facts import (
+    GYRO,
+    KINDS,
+    Endpoints,
+    Facts,
+    name_of_gyro,
+    names_in,
+)
 
 NAME = "nics_doctor"
 SPIN_S, LOOK_S, DISCOVERY_S = 0.1, 0.5, 10.0
 ANY_PUBLISHER = profile_of(Offer(100, reliable=False))  # matches any offer, so hears every topic
 
 
-def listen(seconds: float, namespace: str = "", domain_id: int | None = None) -> Facts:
+def listen(
+    seconds: float, namespace: str = "", domain_id: int | None = None, imu: str = "auto"
+) -> Facts:
     """Listens so long [s] from the first message on, awaited for at most 10 s; sends nothing."""
     context = open_context([], domain_id)
     node = Node(NAME, context=context, start_parameter_services=False)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
-    facts = Facts(f"the robot in {namespace or '/'}", True, names_in(namespace))
+    facts = Facts(f"the robot in {namespace or '/'}", True, names_in(namespace, imu))
     subscribed: set[str] = set()
     began, looked, end = time.monotonic(), 0.0, None
     try:
         while time.monotonic() < (began + DISCOVERY_S if end is None else end):
             if time.monotonic() - looked > LOOK_S:
                 looked = time.monotonic()
-                _look(node, facts, subscribed)
+                _look(node, facts, subscribed, imu)
             executor.spin_once(timeout_sec=SPIN_S)
             if end is None and facts.heard:
                 end = time.monotonic() + seconds
-        _look(node, facts, subscribed)
+        _look(node, facts, subscribed, imu)
     finally:
         executor.shutdown(timeout_sec=1.0)
         node.destroy_node()
@@ -44,13 +53,16 @@ def listen(seconds: float, namespace: str = "", domain_id: int | None = None) ->
     return facts
 
 
-def _look(node: Node, facts: Facts, subscribed: set[str]) -> None:
+def _look(node: Node, facts: Facts, subscribed: set[str], imu: str) -> None:
     for topic, kinds in node.get_topic_names_and_types():
         offers = node.get_publishers_info_by_topic(topic)
         asks = [i for i in node.get_subscriptions_info_by_topic(topic) if i.node_name != NAME]
         told = {info.topic_type for info in offers} or set(kinds)
         both = (tuple(offer_of(info.qos_profile) for info in some) for some in (offers, asks))
         facts.topics[topic] = Endpoints(tuple(sorted(told)), *both)
+    if GYRO in facts.names and GYRO not in subscribed:
+        types = {topic: ends.types for topic, ends in facts.topics.items() if ends.offers}
+        facts.names[GYRO] = name_of_gyro(facts.names, imu, types)
     for role, topic in facts.names.items():
         there = facts.topics.get(topic, Endpoints(()))
         wanted = [kind for kind in there.types if kind in KINDS[role]]

@@ -74,10 +74,17 @@ class MiddlewareNode(ManagedNode):
         if new := sorted(health.rejected.keys() - self._rejected.keys()):
             told = shortened("; ".join(new), LONGEST)
             self.get_logger().warning(f"not used, but counted in /diagnostics: {told}")
-        trouble = silence(health, self._topics.expected, self._rejected)
+        awaited, missing = self._topics.expected, ""
+        if self._topics.lacks_gyro:
+            missing = "nobody publishes one, though the model was made with it: the wheels turn"
+            self.get_logger().warning(f"imu: {missing}", once=True)
+        else:
+            awaited = tuple(dict.fromkeys((*awaited, *self._topics.hoped_for)))
+        trouble = silence(health, awaited, self._rejected)
         self._rejected = health.rejected
         message = trouble or ("receiving" if self.state == ACTIVE else self.state)
-        return runner.Condition(message, bool(trouble), facts(health), self._hardware)
+        told = facts(health) | ({"imu": missing} if missing else {})
+        return runner.Condition(message, bool(trouble), told, self._hardware)
 
 
 def silence(health: Health, expected: Sequence[str], before: Mapping[str, int]) -> str:

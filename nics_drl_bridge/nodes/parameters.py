@@ -49,6 +49,11 @@ def stamped(what: str) -> Row:
     return Row(STAMPED, stamped_by_default(), about)
 
 
+IMU, AUTO = "imu", "auto"
+ABOUT_IMU = (
+    "Topic of the gyro that turns odometry. auto: imu or imu/data, if the model was made with a "
+    "gyro; none: the wheels alone."
+)
 MODEL = Row("model", DEFAULT_ROBOT, "Folder of a SimulatorModel, or a shipped robot.")
 BASE_FRAME = Row("base_frame", "base_link", "Frame id of the robot.", fixed=False)
 ROBOT_FRAME = Row(
@@ -84,7 +89,7 @@ def sensors() -> list[Row]:
     return [
         Row("pose_type", NO_POSE, f"Type of `pose`, in the map frame: {types}."),
         Row("lidar_upside_down", False, upside_down),
-        Row("use_imu", False, "Whether to use the yaw rate of `imu`."),
+        Row(IMU, AUTO, ABOUT_IMU),
         stamped("cmd_vel"),
     ]
 
@@ -308,6 +313,7 @@ def drive() -> list[Row]:
         Row("speed", 1.0, "Share of the greatest speeds to use."),
         Row("seed", 0, "Seed of the pattern."),
         Row("topics", "", "YAML file that names joints; none if empty."),
+        Row(IMU, AUTO, "Topic of an IMU to record; auto: imu or imu/data; none."),
         Row("odom_timeout", 0.5, "Stops after this silence of odom [s].", (0.05, 10.0)),
         stamped("cmd_vel")._replace(name="stamped"),
     ]  # fmt: skip
@@ -330,7 +336,7 @@ TOLD = ("scan", "odom", "the model's further sensors", "joint_states", "ground_t
         "/clock", "/tf, /tf_static (with tf2_msgs)", "/diagnostics")  # fmt: skip
 SERVED = ("~/reset", "~/pause", "~/repeat", "~/touched")
 HEARD = ("scan", "odom", "the model's further sensors", "cmd_vel", "pose (with pose_type)",
-         "imu (with use_imu)")  # fmt: skip
+         "imu (or that of the parameter)")  # fmt: skip
 NODES: dict[str, Callable[[], NodeFacts]] = {
     "simulator_node": lambda: NodeFacts(
         "A simulator behind the topics of the hardware.", DRIVEN_BY, TOLD, SERVED,
@@ -345,7 +351,7 @@ NODES: dict[str, Callable[[], NodeFacts]] = {
         "Caches a robot's topics and publishes the estimate of its state; a managed node.",
         (*HEARD, "initialpose"),
         ("odometry/filtered", "/tf (with tf2_msgs)", "/diagnostics"), ("~/reset",),
-        [*managed(), *sensors(), *middleware()], "-p use_imu:=true -r __ns:=/car",
+        [*managed(), *sensors(), *middleware()], "-p imu:=imu/data -r __ns:=/car",
     ),
     "policy_node": lambda: NodeFacts(
         "Drives a robot to goals by a policy, which answers each scan; a managed node.",
@@ -366,7 +372,7 @@ NODES: dict[str, Callable[[], NodeFacts]] = {
     ),
     "record_node": lambda: NodeFacts(
         "Drives a robot through its full range of motion and records it; the robot moves.",
-        ("odom", "joint_states", "imu", "pose"), ("cmd_vel",), (), drive(),
+        ("odom", "joint_states", "imu or imu/data", "pose"), ("cmd_vel",), (), drive(),
         "-p bound:=3.0 -p out:=drive.npz",
     ),
 }  # fmt: skip

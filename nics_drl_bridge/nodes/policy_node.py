@@ -15,6 +15,7 @@ from nics_drl_bridge.interface import S_PER_NS, Array, RobotView
 from nics_drl_bridge.lidar.spec import LidarSpec
 from nics_drl_bridge.middleware.measurement import ODOM, SCAN
 from nics_drl_bridge.middleware.middleware import rehearse
+from nics_drl_bridge.middleware.uncertainty import gained_uncertainty
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.follow_path import PathActions, Wish
 from nics_drl_bridge.nodes.goal_frames import GoalFrames
@@ -64,6 +65,7 @@ class PolicyNode(ManagedNode):
         self.undo.callback(self.destroy_subscription, goals)
         self._topics = RobotTopics(self, model, self._act, self._act, self._on_lidar)
         self.undo.callback(self._topics.close)
+        self._covariance = self._topics.middleware.estimator.covariance[:3, :3]  # at a new goal
         self._topics.hear_initial_pose()
         self._frames = GoalFrames(self, self._topics)
         self.undo.callback(self._frames.close)
@@ -110,6 +112,7 @@ class PolicyNode(ManagedNode):
         if not np.array_equal(goal, self._goal):
             begin(self._policy)
         self._goal = goal
+        self._covariance = self._topics.middleware.estimator.covariance[:3, :3]
         self.get_logger().info(f"new goal ({self._goal[0]:.2f}, {self._goal[1]:.2f}) m")
 
     def _act(self, _: int = 0) -> None:
@@ -156,10 +159,15 @@ class PolicyNode(ManagedNode):
             return np.zeros(3)
         verdict = self._task.judge(self._topics.view(), {"goal": self._goal})
         if verdict.reached or verdict.touched:
-            why = "touching something, stopped" if verdict.touched else "goal reached"
+            why = "touching something, stopped" if verdict.touched else self._told_reached()
             self.get_logger().info(why, throttle_duration_sec=5.0)
             return np.zeros(3)
         return self._toward(self._goal).twist
+
+    def _told_reached(self) -> str:
+        now = self._topics.middleware.estimator.covariance[:3, :3]
+        gained = gained_uncertainty(self._covariance, now)
+        return f"goal reached, as believed; {gained.told_since('it was set')}"
 
     def _toward(self, goal: Array) -> Wish:
         view = self._topics.view()

@@ -52,7 +52,8 @@ class RealtimeOptions(Schema):
     command_topic: str = Field("cmd_vel", min_length=1)
     stamped: bool | None = None  # `cmd_vel` is a TwistStamped; None: as the robot hears it
     pose_type: str = "none"  # of `pose`, a pose sensor in `map`
-    use_imu: bool = False  # the yaw rate of `imu`
+    # Topic of the gyro that turns odometry; `auto`: the usual ones, if the model was made with one
+    imu: str = Field("auto", min_length=1)
 
     @property
     def gated(self) -> bool:
@@ -79,7 +80,7 @@ class RealtimeBackend:
         self._link = Link(
             chosen.namespace, chosen.domain_id, chosen.command_topic,
             stamped=True if chosen.gated else chosen.stamped, patience_s=chosen.timeout_s,
-            parameters={"pose_type": chosen.pose_type, "use_imu": chosen.use_imu},
+            parameters={"pose_type": chosen.pose_type, "imu": chosen.imu},
             command_timeout_s=math.inf  # a gate has its own timeout
             if chosen.gated
             else max(COMMAND_S, PERIODS * self._period_ns / NS_PER_S),
@@ -90,7 +91,8 @@ class RealtimeBackend:
             self._episodes = EpisodeServices(self._link, chosen.simulator, model, world)
             self._link.begin()
             clients = self._episodes.clients if chosen.vehicle is False else []
-            self._link.wait_for_peers(self._topics.expected, clients, chosen.timeout_s, ADVICE)
+            topics = self._topics.expected_topics
+            self._link.wait_for_peers(topics, clients, chosen.timeout_s, ADVICE)
             # A simulator's services may be found later than its topics.
             if chosen.vehicle is None:
                 holds(lambda: not self._is_vehicle(), SERVICES_S, POLL_S)

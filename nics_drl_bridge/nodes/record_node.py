@@ -24,14 +24,14 @@ from nics_drl_bridge.errors import BackendError, BridgeError, RecordingError
 from nics_drl_bridge.interface import NS_PER_S, Array
 from nics_drl_bridge.nodes import conversions, qos, runner
 from nics_drl_bridge.nodes.command_types import deaf_subscribers, heard_stamped
-from nics_drl_bridge.nodes.parameters import drive
+from nics_drl_bridge.nodes.parameters import IMU, drive
 from nics_drl_bridge.recording.bag_file import Message
 from nics_drl_bridge.recording.bag_reader import joint_streams
 from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S, DrivePlan
-from nics_drl_bridge.recording.messages import imu_row, pose_row, stamp, twist_row
+from nics_drl_bridge.recording.messages import gyro, imu_row, pose_row, stamp, twist_row
 from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.recording.stamping import Nanoseconds, TopicData, streams
-from nics_drl_bridge.recording.topic_roles import TopicRoles, topic_roles
+from nics_drl_bridge.recording.topic_roles import TopicRoles, imu_topics, topic_roles
 from nics_drl_bridge.recording.write import check_out, write_drive
 from nics_drl_bridge.robot.spec import RobotSpec, load_robot
 
@@ -53,6 +53,7 @@ class DriveParameters:
     odom_timeout: float  # silence of odometry that stops the robot [s]
     stamped: bool  # `cmd_vel` is a TwistStamped, if chosen; else as the robot hears it
     roles: TopicRoles  # may name the joints of state and wheels
+    imu: str  # topic of the IMU, auto or none
 
 
 def declare_drive(node: Node) -> DriveParameters:
@@ -63,7 +64,8 @@ def declare_drive(node: Node) -> DriveParameters:
     out = check_out(Path(get["out"]()))
     plan = DrivePlan(robot, *(get[name]() for name in ("bound", "duration", "speed", "seed")))
     topics, silence, stamped = (get[name]() for name in ("topics", "odom_timeout", "stamped"))
-    return DriveParameters(plan, out, silence, stamped, topic_roles(topics or None))
+    roles = topic_roles(topics or None)
+    return DriveParameters(plan, out, silence, stamped, roles, get[IMU]())
 
 
 class DriveLog:
@@ -135,7 +137,11 @@ class DriveLog:
         except RecordingError:
             # Poorer stamps are better than no recording of a drive that is over.
             kept = streams(data, "receive", PLACE)
-        return Recording(**kept, source=PLACE, variables=self._spec.variable_names)
+        tracked = len(self.rows["pose"]) >= FEWEST
+        return Recording(
+            **kept, source=PLACE, variables=self._spec.variable_names,
+            measured_by="tracker" if tracked else "odometry",
+        )  # fmt: skip
 
 
 def pace(receive: Nanoseconds, header: Nanoseconds) -> float:
@@ -176,8 +182,11 @@ class RecordNode(qos.QosWatch):
             self._speak(self._order.stamped)
         self.create_subscription(Odometry, "odom", self._on_odometry, qos.SENSOR)
         self.create_subscription(JointState, "joint_states", self._log.joints, qos.SENSOR)
-        for each, topic, row in ((PoseStamped, "pose", pose_row), (Imu, "imu", imu_row)):
-            self.create_subscription(each, topic, partial(self._take, topic, row), qos.SENSOR)
+        take_pose = partial(self._take, "pose", pose_row)
+        self.create_subscription(PoseStamped, "pose", take_pose, qos.SENSOR)
+        self._imu_topic = ""  # the first that speaks
+        for topic in imu_topics(self._order.imu, by_default=True):
+            self.create_subscription(Imu, topic, partial(self._take_imu, topic), qos.SENSOR)
         self._began, self._heard = time.monotonic(), -np.inf
         self._ticks = self._origin_ns = self._stamp_ns = 0
         self._pose: Array | None = None
@@ -199,6 +208,11 @@ class RecordNode(qos.QosWatch):
 
     def _take(self, topic: str, row: Callable[[Any], ArrayLike], message: Any) -> None:
         self._log.add(topic, stamp(message), row(message))
+
+    def _take_imu(self, topic: str, message: Imu) -> None:
+        self._imu_topic = self._imu_topic or topic
+        if topic == self._imu_topic and gyro(message) is not None:
+            self._take("imu", imu_row, message)
 
     def _on_odometry(self, message: Odometry) -> None:
         self._stamp_ns = max(self._stamp_ns, conversions.stamp_from_ros(message.header.stamp))

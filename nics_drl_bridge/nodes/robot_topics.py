@@ -24,9 +24,10 @@ from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.nodes import conversions, qos
 from nics_drl_bridge.nodes.command_types import CommandListener
 from nics_drl_bridge.nodes.conversions import INITIAL_POSE, initial_pose
-from nics_drl_bridge.nodes.parameters import NO_POSE, POSE_TYPES, STAMPED, sensors
+from nics_drl_bridge.nodes.parameters import AUTO, IMU, NO_POSE, POSE_TYPES, STAMPED, sensors
 from nics_drl_bridge.nodes.runner import declare_row
 from nics_drl_bridge.recording import messages
+from nics_drl_bridge.recording.topic_roles import IMU_NAMES, imu_topics
 
 KINDS_OF_POSE = {each.__name__: each for each in (PoseStamped, PoseWithCovarianceStamped)}
 
@@ -80,14 +81,14 @@ class RobotTopics:
                 fix = nearest(pose_type, (NO_POSE, *POSE_TYPES))
                 raise ConfigError(f"parameter 'pose_type': there is no {pose_type!r}; {fix}")
             heard[measurement.POSE] = (KINDS_OF_POSE[pose_type], self._take_pose)
-        if node.get_parameter("use_imu").value:
-            heard[measurement.IMU] = (Imu, self._take_imu)
         for sensor in model.sensors:
             take_reading = partial(self._take_reading, sensor)
             heard[sensor.name] = (conversions.sensor_type(sensor), take_reading)
         for topic, (kind, take) in heard.items():
             self._subscribe(topic, kind, take, qos.SENSOR)
         self.expected = tuple(heard)
+        self.expected_topics = self.expected
+        self._hear_imu()
 
     def _locked(self, take: Callable[[Any], None]) -> Callable[[Any], None]:
         def locked(message: Any) -> None:
@@ -99,6 +100,27 @@ class RobotTopics:
     def _subscribe(self, topic: str, kind: Any, take: Callable[[Any], None], quality: Any) -> None:
         made = self._node.create_subscription(kind, topic, self._locked(take), quality)
         self._subscriptions.append(made)
+
+    @property
+    def lacks_gyro(self) -> bool:
+        """True if the model was made with a gyro, and nobody publishes one."""
+        if not self.hoped_for:
+            return False
+        return not any(self._node.count_publishers(topic) for topic in IMU_NAMES)
+
+    def _hear_imu(self) -> None:
+        """Subscribes to the gyro, if one is named or the model was made with one."""
+        wanted = str(self._node.get_parameter(IMU).value)
+        topics = imu_topics(wanted, self._model.gyro)
+        self._imu_topic = ""  # the first that speaks
+        for topic in topics:
+            self._subscribe(topic, Imu, partial(self._take_imu, topic), qos.SENSOR)
+        self.hoped_for: tuple[str, ...] = ()
+        if wanted == AUTO and topics:
+            self.hoped_for = (measurement.IMU,)
+        elif topics:
+            self.expected = (*self.expected, measurement.IMU)
+            self.expected_topics = (*self.expected_topics, wanted)
 
     def close(self) -> None:
         """Ends the subscriptions."""
@@ -209,7 +231,8 @@ class RobotTopics:
             self._started = True
             if self._placed is not None:
                 self.middleware.place(*self._placed)
-        used = self.middleware.odometry(stamp, self.now_ns(), pose, twist)
+        variance = messages.turn_variance(message)
+        used = self.middleware.odometry(stamp, self.now_ns(), pose, twist, variance)
         newest = self.middleware.cache.newest
         if used and self._on_odometry is not None and newest[measurement.ODOM].stamp_ns == stamp:
             self._on_odometry(stamp)
@@ -218,7 +241,10 @@ class RobotTopics:
         measured = conversions.pose_from_ros(message)
         self.middleware.pose(messages.stamp(message), self.now_ns(), *measured)
 
-    def _take_imu(self, message: Imu) -> None:
+    def _take_imu(self, topic: str, message: Imu) -> None:
+        self._imu_topic = self._imu_topic or topic
+        if topic != self._imu_topic:
+            return
         if (measured := messages.gyro(message)) is None:
             self.middleware.cache.reject(f"{measurement.IMU}: no angular velocity")
         else:

@@ -16,6 +16,7 @@ from nics_drl_bridge.env.navigation import Navigation
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.middleware.uncertainty import Uncertainty, gained_uncertainty
 from nics_drl_bridge.policy.fallback import acted
 from nics_drl_bridge.policy.stateful import Policy, begin
 from nics_drl_bridge.seeds import checked_seeds
@@ -42,6 +43,7 @@ class Episode:
     reward: float  # sum over the episode
     believed: str | None = None  # by the robot itself, where `result` is by the truth
     planned: int | None = None  # actions of the fallback, if the policy has one
+    uncertain: Uncertainty | None = None  # of the estimate, gained since the start, where known
 
     @property
     def believed_success(self) -> bool:
@@ -70,6 +72,7 @@ class Episode:
             "goal_distance_m": round(self.miss, 4), "steps": self.steps,
             "length_m": round(self.length, 4), "fallback_actions": self.planned,
             "goal": self.goal.tolist(), "path": np.round(self.path, 4).tolist(),
+            "uncertain": None if self.uncertain is None else self.uncertain._asdict(),
         }  # fmt: skip
 
 
@@ -87,19 +90,24 @@ def drive(
         if goal is None:  # a task of one's own may not show it
             goal = env.get_wrapper_attr("scene").goals[0]
         paths, estimates, total, ended = [info["start"]], [info["pose"]], 0.0, False
+        covariances: list[Array] = []
         while not ended:
             action = _answer(policy.act, observation, len(paths))
             observation, reward, terminated, truncated, info = env.step(action)
             paths.append(info.get("true_pose", info["pose"]))
             estimates.append(info["pose"])
+            covariance = info.get("covariance")
+            if covariance is not None and np.shape(covariance) == (3, 3):
+                covariances = [*covariances[:1], covariance]
             total += float(reward)
             ended = bool(terminated or truncated)
         collided = "collision" if np.any(info.get("collision", False)) else "time-out"
         believed = "success" if np.all(info.get("is_success", False)) else collided
         driven = np.array(paths), np.array(estimates), goal, bodies, total
         planned = None if before is None else (acted(policy) or 0) - before
+        uncertain = gained_uncertainty(covariances[0], covariances[-1]) if covariances else None
         if "true_pose" not in info:
-            return Episode(seed, believed, *driven, planned=planned)
+            return Episode(seed, believed, *driven, planned=planned, uncertain=uncertain)
         known = info.get("true_collision")
         if known is None:  # then `touched` tells, or else the robot itself
             known = believed == "collision" if touched is None else touched()

@@ -75,7 +75,7 @@ def shadow(
     """
     if goal is None and not ahead_s > 0.0:
         raise ConfigError(f"--ahead {ahead_s:g}: must be more than 0 s.")
-    messages = played(path, topics)
+    messages = played(path, topics, model.gyro)
     for role in (SCAN, CMD_VEL):
         if role not in messages:
             reason = f"has no {role}, which a policy is compared by; say which topic it is"

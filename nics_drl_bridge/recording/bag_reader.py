@@ -14,6 +14,7 @@ from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.recording import messages as msgs
 from nics_drl_bridge.recording import topic_roles as roles
 from nics_drl_bridge.recording.bag_file import BagFile, Message, opened, times_of
+from nics_drl_bridge.recording.pose_source import source_of_pose
 from nics_drl_bridge.recording.recording import W_FIRST, Recording, check, w_first
 from nics_drl_bridge.recording.stamping import SAME_CLOCK_S, Nanoseconds, TopicData, streams
 from nics_drl_bridge.recording.topic_roles import JointSource, TopicRoles
@@ -44,8 +45,13 @@ def load_bag(path: str | Path, spec: RobotSpec | None, mapping: TopicRoles) -> R
         if "imu" in topics:
             data["imu"] = _table(bag, topics["imu"], msgs.imu_row)
         latency = latency_of(bag, topics.get("odom"))
+        pose = topics.get("pose") or topics["odom"]
+        measured_by = source_of_pose(pose, bag.types[pose])
     made: Any = streams(data, mapping.stamps, str(path))
-    recording = Recording(**made, source=str(path), variables=spec.variable_names, latency=latency)
+    recording = Recording(
+        **made, source=str(path), variables=spec.variable_names, latency=latency,
+        measured_by=measured_by,
+    )  # fmt: skip
     return check(recording, spec)
 
 

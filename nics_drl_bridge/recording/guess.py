@@ -14,6 +14,7 @@ from nics_drl_bridge.recording.command_guess import (
     guess_command,
     look_alikes,
 )
+from nics_drl_bridge.recording.imu_guess import guess_yaw_rate, imu_line
 from nics_drl_bridge.recording.mapped import POSES
 from nics_drl_bridge.recording.mapping import UNITS
 from nics_drl_bridge.recording.motion_check import doubts_of_commands, reversed_wheels
@@ -65,7 +66,10 @@ def first_mapping(tables: Sequence[TableSurvey]) -> str:
     lines += _clock_lines(pose, guess.commands or guess.candidates)
     backwards = reversed_wheels(guess, values)
     lines += _command_lines(guess, switch, backwards, alone, common)
-    lines += _unused_lines(tables, pose, guess, switch)
+    gyro = _free_yaw_rate(tables, guess)
+    if gyro is not None:
+        lines.append(f"{imu_line(*gyro, alone, common)}  {GUESSED}")
+    lines += _unused_lines(tables, pose, guess, switch, gyro)
     return "\n".join(lines) + "\n"
 
 
@@ -153,11 +157,25 @@ def _clock_lines(pose: PoseGuess | None, commands: Mapping[str, Candidate]) -> l
     return [f"  clock: tracker  {GUESSED}: {why}"]
 
 
+def _free_yaw_rate(
+    tables: Sequence[TableSurvey], guess: CommandGuess
+) -> tuple[TableSurvey, Survey] | None:
+    """Returns the yaw rate of a gyro, unless it may be a command."""
+    found = guess_yaw_rate(tables)
+    if found is None:
+        return None
+    table, column = found
+    commands = (*guess.commands.values(), *guess.candidates.values())
+    taken = any(each.table is table and each.column.name == column.name for each in commands)
+    return None if taken else found
+
+
 def _unused_lines(
     tables: Sequence[TableSurvey],
     pose: PoseGuess | None,
     guess: CommandGuess,
     switch: Switch | None,
+    gyro: tuple[TableSurvey, Survey] | None,
 ) -> Iterator[str]:
     """Yields a comment for each table that names the columns of values that the draft lacks."""
     taken = {
@@ -168,6 +186,8 @@ def _unused_lines(
         taken |= {(id(pose.table), column) for column in pose.columns}
     if switch is not None:
         taken.add((id(switch.table), switch.column))
+    if gyro is not None:
+        taken.add((id(gyro[0]), gyro[1].name))
     for table in tables:
         rest = []
         for column in table.columns:

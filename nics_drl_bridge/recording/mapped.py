@@ -13,6 +13,7 @@ from nics_drl_bridge.recording import mapping as schema
 from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording import stamping
 from nics_drl_bridge.recording.mapping import (
+    ImuSource,
     Mapping,
     Measured,
     PoseSource,
@@ -21,7 +22,14 @@ from nics_drl_bridge.recording.mapping import (
     why_no_command,
 )
 from nics_drl_bridge.recording.names import words_of
-from nics_drl_bridge.recording.recording import Recording, Stream, check_streams, implausible_pose
+from nics_drl_bridge.recording.pose_source import source_by_names
+from nics_drl_bridge.recording.recording import (
+    MeasuredBy,
+    Recording,
+    Stream,
+    check_streams,
+    implausible_pose,
+)
 from nics_drl_bridge.recording.table import Source, numbers_of
 from nics_drl_bridge.recording.values import MappedReader, Series, together, unit_of
 
@@ -46,15 +54,21 @@ def read_mapped(source: Source, mapping: Mapping) -> Recording:
             held = name == "command"
             parts = [reader.series(f"{name}.{k}", v, None, held) for k, v in values.items()]
             found[name] = together(name, parts, held)
+    if mapping.imu is not None and mapping.imu.heading is not None:
+        found["imu"] = _turn_rate_of_heading(reader, mapping.imu, mapping.imu.heading)
     for name in ("wheels", "imu", "odometry"):
-        if (stream := getattr(mapping, name)) is not None:
+        if name not in found and (stream := getattr(mapping, name)) is not None:
             found[name] = _measured(reader, name, stream)
     for name, stream in found.items():
         keep, note = stamping.not_repeated(stream.t, stream.values, name)
         reader.say(note)
         found[name] = stream.rows(keep)
     names, streams = (*mapping.state, *mapping.command), cast(Any, found)
-    made = Recording(**streams, source=source.place, variables=names, latency=source.latency)
+    measured_by = mapping.pose.measured_by or _source_of_pose(source, mapping)
+    made = Recording(
+        **streams, source=source.place, variables=names, latency=source.latency,
+        measured_by=measured_by,
+    )  # fmt: skip
     check_streams(made, {"command": len(mapping.command), "state": len(mapping.state), "wheels": 2})
     shifted: Any = _from_zero(found, mapping.clock or schema.ROBOT_CLOCK, reader)
     return replace(made, **shifted, repairs=tuple(reader.notes))
@@ -79,6 +93,37 @@ def _stays_near(values: Array) -> bool:
     """True for values that stay within a degree, far from zero, as places on the earth do."""
     known = values[np.isfinite(values)]
     return len(known) > 0 and np.ptp(known) < NEAR_DEG <= np.abs(known).max()
+
+
+def _source_of_pose(source: Source, mapping: Mapping) -> MeasuredBy:
+    """Returns what measured the pose, by the names of its topic or file, columns and frames."""
+    pose = mapping.pose
+    values = (pose.x, pose.y, pose.heading)
+    references = [value.from_ for value in values if value is not None]
+    tables = [pose.in_, *(str(each).partition(":")[0] for each in references)]
+    topics = [name for table in tables if table for name in (table, f"/{table}")]
+    kinds = [source.table(name).kind for name in topics if name in source.names]
+    kind = next((each for each in kinds if each), "")
+    names = [pose.in_, pose.clock, *pose.frames, *references]
+    return source_by_names((str(name) for name in names if name is not None), kind)
+
+
+def _turn_rate_of_heading(reader: MappedReader, imu: ImuSource, heading: Value) -> Stream:
+    """Reads a second heading as accelerations of zero and the turn rate that integrates to it."""
+    heading = heading.model_copy(update={"unit": heading.unit or "rad"})
+    unit = unit_of(heading).si
+    if unit != "rad":
+        raise ConfigError(f"imu.heading: is in {unit}, where rad is needed; check its unit.")
+    series = reader.series("imu.heading", heading, imu, held=False)
+    joined = together("imu", [series], held=False)
+    t = joined.t
+    keep = np.concatenate([[True], np.diff(t) > 0.0])
+    joined, t = joined.rows(keep), t[keep]
+    if len(t) < 2:
+        return replace(joined, values=np.zeros((len(t), 3)))
+    turned = np.unwrap(joined.values[:, 0])
+    rate = np.gradient(turned, t)
+    return replace(joined, values=np.stack([np.zeros_like(t), np.zeros_like(t), rate], axis=1))
 
 
 def _check_units(reader: MappedReader, pose: Stream) -> None:

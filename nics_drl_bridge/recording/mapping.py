@@ -2,7 +2,7 @@
 
 import math
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, field_validator, model_validator
 
@@ -190,6 +190,9 @@ class PoseSource(Measured):
     heading_unit: Annotated[str, _of_kind(("rad",))] = "rad"  # of the heading and its variance
     # variances of x, y, heading; or all of a 3 x 3 or 6 x 6 matrix, by rows; or a message's field
     covariance: str | list[Reference] | None = None
+    # what measured it: `odometry`, which drifts, or a `tracker`, as motion capture or a localiser;
+    # None: as the names of topic, file and columns tell
+    measured_by: Literal["odometry", "tracker"] | None = None
     frame: str | None = None  # parent of the transforms to use, of a topic like /tf
     child_frame: str | None = None  # their child, the tracked body
 
@@ -223,7 +226,15 @@ class ImuSource(Measured):
 
     ax: AValue | None = None  # acceleration along x, forward [m/s^2]; None: 0
     ay: AValue | None = None  # acceleration along y, to the left [m/s^2]; None: 0
-    yaw_rate: AValue  # turn rate, counter-clockwise [rad/s]
+    yaw_rate: AValue | None = None  # turn rate, counter-clockwise [rad/s]
+    # instead of the turn rate: a second heading, as of a compass, counter-clockwise [rad]
+    heading: AValue | None = None
+
+    @model_validator(mode="after")
+    def _turns(self) -> "ImuSource":
+        if (self.yaw_rate is None) == (self.heading is None):
+            raise ValueError("imu needs either yaw_rate or heading")
+        return self
 
 
 class OdometrySource(Measured):
@@ -245,7 +256,7 @@ class Mapping(Schema):
     command: dict[str, AValue]  # by the names of the robot's commands
     state: dict[str, AValue] = Field(default_factory=dict)  # measured states, by their names
     wheels: WheelSource | None = None  # wheel speeds, if they were recorded
-    imu: ImuSource | None = None  # acceleration and yaw rate, if they were recorded
+    imu: ImuSource | None = None  # acceleration and yaw rate, or a second heading, if recorded
     odometry: OdometrySource | None = None  # the robot's own body velocity, if it was recorded
 
     @model_validator(mode="before")

@@ -143,6 +143,12 @@ def twist_row(message: Any) -> Row:
     return twist.linear.x, twist.linear.y, twist.angular.z
 
 
+def turn_variance(message: Any) -> float | None:
+    """Returns the variance of an Odometry's yaw rate [rad^2/s^2]; None if it says nothing."""
+    variance = float(message.twist.covariance[35])
+    return variance if math.isfinite(variance) and variance > 0.0 else None
+
+
 def imu_row(message: Any) -> Row:
     """Returns acceleration along x and y [m/s^2] and yaw rate [rad/s]."""
     acceleration = message.linear_acceleration

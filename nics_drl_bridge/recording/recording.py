@@ -5,7 +5,7 @@ import json
 import zipfile
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,7 @@ from nics_drl_bridge import files, geometry
 from nics_drl_bridge.config import no_device
 from nics_drl_bridge.errors import RecordingError
 from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.recording.heading import Turning
 from nics_drl_bridge.recording.mapping import UNITS
 from nics_drl_bridge.robot.noise import Latency
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -23,6 +24,8 @@ PLAIN_FORMAT = "nics_drl_bridge/recording/3"  # without deviations and repairs
 COMMENT_FORMAT = "nics_drl_bridge/recording/2"  # checksum in the comment of the archive
 UNSEALED_FORMAT = "nics_drl_bridge/recording/1"  # without checksum; all three can still be read
 STREAMS = ("command", "pose", "state", "wheels", "imu", "odometry")
+MeasuredBy = Literal["", "odometry", "tracker", "truth"]
+"""What measured a pose: odometry, which drifts; motion capture or a localiser; a simulation."""
 IRREGULAR = 0.5  # share of the median by which a step differs if it is a gap or a repetition
 JITTER, ROUNDING_S = 1e-4, 1e-6  # steps that differ by less are equally long, but for rounding
 
@@ -90,6 +93,9 @@ class Recording:
     robot: dict[str, Any] | None = None  # its definition as in its YAML file, if a mapping says it
     latency: Latency = field(default_factory=Latency)  # of scan and odometry, if it shows
     repairs: tuple[str, ...] = ()  # a sentence on each thing that reading mended, as of its clocks
+    measured_by: MeasuredBy = ""  # what measured the pose; empty if nothing tells
+    # How odometry and gyro turned, if the heading is from the gyro or confirmed by it
+    gyro: Turning | None = None
 
     @property
     def streams(self) -> dict[str, Stream]:
@@ -187,6 +193,8 @@ def save_recording(recording: Recording, path: str | Path) -> None:
         "clocks": {name: stream.clock for name, stream in streams.items()},
         "variables": recording.variables, "repairs": recording.repairs,
     }  # fmt: skip
+    if recording.measured_by:
+        meta["measured_by"] = recording.measured_by
     if recording.robot is not None:
         meta["robot"] = recording.robot
     if recording.latency.measured:
@@ -214,7 +222,10 @@ def load_recording(path: str | Path) -> Recording:
         latency = Latency.model_validate(meta.get("latency", {}))
         variables, repairs = tuple(meta["variables"]), tuple(meta.get("repairs", ()))
         found = Recording(**streams, source=str(path), variables=variables, latency=latency)
-        return replace(found, repairs=repairs, robot=meta.get("robot"))
+        measured_by = meta.get("measured_by", "")
+        if measured_by not in get_args(MeasuredBy):
+            raise ValueError(f"measured_by is {measured_by!r}")
+        return replace(found, repairs=repairs, robot=meta.get("robot"), measured_by=measured_by)
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file; check the path.") from None
     except (AttributeError, KeyError, RecursionError, TypeError) as error:

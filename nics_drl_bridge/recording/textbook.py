@@ -50,5 +50,5 @@ def record(
     return Recording(
         Stream(t, np.repeat(held, per_hold, axis=0)), Stream(t, pose[::inner]),
         Stream(t, state[::inner]) if spec.state else None, source=f"textbook {spec.name}",
-        variables=spec.variable_names,
+        variables=spec.variable_names, measured_by="truth",
     )  # fmt: skip

@@ -14,6 +14,7 @@ from nics_drl_bridge.errors import ConfigError, RecordingError, nearest
 Stamps = Literal["auto", "header", "receive"]
 NONE = "none"
 ROLES = ("cmd_vel", "pose", "odom", "joint_states", "imu")
+IMU_NAMES = ("imu", "imu/data")  # usual topics of a gyro, in a robot's namespace
 MOST_LISTED = 20  # maximum number of topics listed in an error
 TWIST, TWIST_STAMPED = "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
 ACKERMANN = "ackermann_msgs/msg/AckermannDrive"
@@ -36,7 +37,7 @@ USUAL = {
     "pose": (r"(vrpn|mocap|optitrack|vicon|qualisys)", GROUND_TRUTH, r"/pose$"),
     "odom": (r"/odom$", r"/(odom|odometry)[^/]*$", r"odom"),
     "joint_states": (r"/joint_states$", r"/joint_state[^/]*$"),
-    "imu": (r"/imu(/data)?$", r"/imu[^/]*$", r"imu"),
+    "imu": (r"/imu(/data)?$", r"/imu[^/]*$", r"imu", r""),  # no other role has its type
 }
 """Patterns of usual names, the most reliable first; the first that matches a topic decides."""
 
@@ -71,6 +72,16 @@ class TopicRoles(Schema):
     # `header` takes all times from the messages' headers, `receive` from their receipt by the bag,
     # `auto` from the header if there is one
     stamps: Stamps = "auto"
+
+
+def imu_topics(wanted: str, by_default: bool) -> tuple[str, ...]:
+    """Returns the topics on which a gyro may speak: the wanted one, of `auto` the usual ones.
+
+    `auto` is none unless `by_default`, as for a model that was made with a gyro; so is `none`.
+    """
+    if wanted == "auto":
+        return IMU_NAMES if by_default else ()
+    return () if wanted in (NONE, "") else (wanted,)
 
 
 def topic_roles(file: str | Path | None = None, options: Iterable[str] = ()) -> TopicRoles:

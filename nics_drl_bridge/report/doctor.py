@@ -10,8 +10,18 @@ from numpy.typing import NDArray
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.geometry import Array, wrap_angle
 from nics_drl_bridge.interface import S_PER_NS
+from nics_drl_bridge.recording.heading import WINDOW_S, Turning, compare_turning
 from nics_drl_bridge.report import doctor_facts
-from nics_drl_bridge.report.doctor_facts import CLOCK, CMD_VEL, KINDS, ODOM, SCAN, Expected, Facts
+from nics_drl_bridge.report.doctor_facts import (
+    CLOCK,
+    CMD_VEL,
+    GYRO,
+    KINDS,
+    ODOM,
+    SCAN,
+    Expected,
+    Facts,
+)
 from nics_drl_bridge.robot.spec import RobotSpec
 
 Mismatch = doctor_facts.Mismatch
@@ -25,6 +35,7 @@ ALIKE, LEAST_ALIKE = 0.8, 0.3
 JUMP, JUMP_M = 5.0, 0.2  # a step is a jump beyond this multiple of the top speed's, and this length
 QUATERNION_TOLERANCE = 0.05
 LEAST_STEPS = 10
+SHORT_WINDOW_S = 2.0  # over which turns are compared if the robot was heard for a few seconds only
 UNITS = ((1000.0, "mm/s"), (100.0, "cm/s"), (3.6, "km/h"), (180.0 / np.pi, "degrees per second"))
 RATE_TOLERANCE = 0.2
 # Stamps are from the future if this much after their arrival; too old for the command gate if this
@@ -39,12 +50,15 @@ error, warning = partial(Mismatch, "error"), partial(Mismatch, "warning")
 no_match, layout_error = partial(error, "quality of service"), partial(error, "beam layout", SCAN)
 odometry_error = partial(error, "odometry", ODOM)
 odometry_warning = partial(warning, "odometry", ODOM)
+gyro_warning = partial(warning, "gyro", GYRO)
 
 
 def examine(facts: Facts, expected: Expected) -> list[Mismatch]:
     """Runs all checks and returns their findings, errors first."""
     expected = doctor_facts.seen(facts, expected)
-    checks = presence, quality, speakers, frames, rates, latency, clock, layout, ranges, motion
+    checks = (
+        presence, quality, speakers, frames, rates, latency, clock, layout, ranges, motion, turning,
+    )  # fmt: skip
     found = [finding for check in checks for finding in check(facts, expected)]
     named = [replace(finding, where=facts.names[finding.where]) for finding in found]
     return sorted(named, key=lambda finding: finding.severity)
@@ -203,6 +217,63 @@ def motion(facts: Facts, expected: Expected) -> Findings:
     if ratio is not None and ratio < 0.0:
         fix = "swap the wheels or turn the sign of angular.z: counter-clockwise is positive"
         yield error("command", CMD_VEL, "the robot turns against its commands", fix)
+
+
+def turning(facts: Facts, expected: Expected) -> Findings:
+    """Compares how odometry and the gyro turn, and checks that a gyro is there if one is needed."""
+    if GYRO not in facts.names:
+        return
+    if GYRO not in facts.heard:
+        if expected.gyro:
+            what = "the model was made with a gyro, and nothing is heard of one"
+            fix = "start its driver, or name its topic: --imu TOPIC here, imu:=TOPIC of the nodes"
+            yield gyro_warning(what, fix)
+        return
+    if not facts.yaw_rates:
+        yield gyro_warning("says that it measures no yaw rate", "choose another topic by --imu")
+        return
+    found = _compared_turns(facts)
+    if found is None:
+        return
+    if found.mirrored:
+        fix = "turn the sign in the driver: the z axis points up, counter-clockwise is positive"
+        yield error("gyro", GYRO, "turns against odometry", fix)
+    elif found.in_degrees:
+        what = f"turns {1.0 / found.scale:.3g} times as far as odometry: degrees per second"
+        yield error("gyro", GYRO, what, "let the driver send radians per second")
+    elif not found.plausible:
+        what = f"does not turn as odometry does (correlation {found.alike:.2f})"
+        yield gyro_warning(what, "look at both while the robot turns on the spot")
+    elif found.contradicts and not expected.gyro:
+        what = (
+            f"contradicts odometry by {found.apart:.2g} rad in {found.window_s:g} s: odometry "
+            f"turns {found.scale:.2f} times as far"
+        )
+        fix = (
+            "believe the gyro where wheels slip: record it and generate the model anew, which then "
+            "uses it; or give imu:=TOPIC to the nodes, --imu to nics evaluate"
+        )
+        yield gyro_warning(what, fix)
+
+
+def _compared_turns(facts: Facts) -> Turning | None:
+    """Compares the turns of both; None if the robot turned too little."""
+    stamps = facts.heard[ODOM].stamps_ns if ODOM in facts.heard else []
+    if not facts.poses or len(stamps) != len(facts.poses):
+        return None
+    origin = stamps[0]
+    odom_t, places = np.unique((np.array(stamps) - origin) * S_PER_NS, return_index=True)
+    poses = np.array(facts.poses)[places]
+    gyro_t = np.array([(stamp - origin) * S_PER_NS for stamp, _ in facts.yaw_rates])
+    gyro_t, rows = np.unique(gyro_t, return_index=True)
+    rates = np.array([rate for _, rate in facts.yaw_rates])[rows]
+    if not (np.isfinite(poses).all() and np.isfinite(rates).all()):
+        return None
+    for window_s in (WINDOW_S, SHORT_WINDOW_S):
+        found = compare_turning(odom_t, poses, gyro_t, rates, window_s)
+        if found is not None and found.compared:
+            return found
+    return None
 
 
 def _odometry(facts: Facts, robot: RobotSpec) -> Findings:

@@ -1,7 +1,7 @@
 """Facts about a robot, live or from a bag; expectations of the doctor, and its findings."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -19,15 +19,17 @@ from nics_drl_bridge.policy.contract import Contract
 from nics_drl_bridge.recording import messages
 from nics_drl_bridge.recording.bag_file import opened
 from nics_drl_bridge.recording.messages import Offer, Row
+from nics_drl_bridge.recording.topic_roles import IMU, IMU_NAMES, imu_topics
 from nics_drl_bridge.robot.spec import RobotSpec
 
-SCAN, ODOM, CMD_VEL, CLOCK = "scan", "odom", "cmd_vel", "/clock"
+SCAN, ODOM, CMD_VEL, CLOCK, GYRO = "scan", "odom", "cmd_vel", "/clock", "imu"
 TWIST_STAMPED_TYPE = "geometry_msgs/msg/TwistStamped"
 KINDS: dict[str, Sequence[str]] = {  # message types of each role; others are not read
     SCAN: ("sensor_msgs/msg/LaserScan",),
     ODOM: ("nav_msgs/msg/Odometry",),
     CMD_VEL: ("geometry_msgs/msg/Twist", TWIST_STAMPED_TYPE),
     CLOCK: ("rosgraph_msgs/msg/Clock",),
+    GYRO: (IMU,),
 }
 MOST_SCANS = 200  # maximum number of scans whose ranges are kept; of the others only the times are
 MOST_RAD = 7.0
@@ -71,7 +73,7 @@ class Layout(NamedTuple):
 
 @dataclass
 class Facts:
-    """All facts that were collected; a role is `scan`, `odom`, `cmd_vel` or `/clock`."""
+    """All facts that were collected; a role is `scan`, `odom`, `cmd_vel`, `imu` or `/clock`."""
 
     source: str
     live: bool  # True over DDS, False from a bag
@@ -87,6 +89,7 @@ class Facts:
     uncovered: int = 0  # number of odometry messages whose covariance of pose or twist is all zeros
     commands: list[Row] = field(default_factory=list)  # vx, vy [m/s], wz [rad/s]
     clock_ns: list[int] = field(default_factory=list)  # content of `/clock` [ns]
+    yaw_rates: list[tuple[int, float]] = field(default_factory=list)  # of the gyro: stamp [ns]
 
     def take(self, role: str, arrival_ns: int, message: Any) -> None:
         """Records a message from ROS or from a bag, which have the same fields."""
@@ -112,20 +115,41 @@ class Facts:
             self.uncovered += any(not np.any(one) for one in covariances)
         elif role == CMD_VEL:
             self.commands.append(messages.command_row(message))
+        elif role == GYRO:
+            if (measured := messages.gyro(message)) is not None:
+                self.yaw_rates.append((messages.stamp(message), measured[0]))
         else:
             self.clock_ns.append(int(message.clock.sec) * NS_PER_S + int(message.clock.nanosec))
 
 
-def names_in(namespace: str) -> dict[str, str]:
-    """Role -> topic of a robot in a namespace."""
+def names_in(namespace: str, imu: str = "auto") -> dict[str, str]:
+    """Role -> topic of a robot in a namespace; none of a gyro if `imu` is none."""
     space = namespace_of(namespace)
-    return {role: f"{space}/{role}" for role in (SCAN, ODOM, CMD_VEL)} | {CLOCK: CLOCK}
+    names = {role: f"{space}/{role}" for role in (SCAN, ODOM, CMD_VEL)} | {CLOCK: CLOCK}
+    if gyros := imu_topics(imu, by_default=True):
+        names[GYRO] = gyros[0] if gyros[0].startswith("/") else f"{space}/{gyros[0]}"
+    return names
 
 
-def facts_of_bag(path: str | Path, namespace: str = "") -> Facts:
+def name_of_gyro(names: Mapping[str, str], imu: str, types: Mapping[str, Sequence[str]]) -> str:
+    """Returns the topic of the gyro: the wanted one, or that which is there, by its type."""
+    usual = names[GYRO]
+    if imu != "auto" or IMU in types.get(usual, ()):
+        return usual
+    space = usual.removesuffix(GYRO)
+    there = sorted(name for name, kinds in types.items() if IMU in kinds)
+    near = [name for name in there if name.startswith(space)]
+    second = f"{space}{IMU_NAMES[1]}"
+    return second if second in near else next(iter(near), usual)
+
+
+def facts_of_bag(path: str | Path, namespace: str = "", imu: str = "auto") -> Facts:
     """Collects the facts of a robot from a bag. Raises RecordingError if it is damaged."""
-    facts = Facts(str(path), False, names_in(namespace))
+    facts = Facts(str(path), False, names_in(namespace, imu))
     with opened(path) as bag:
+        if GYRO in facts.names:
+            types = {topic: kind.split(" and ") for topic, kind in bag.types.items()}
+            facts.names[GYRO] = name_of_gyro(facts.names, imu, types)
         facts.end_ns = bag.span_ns[1]
         for topic, kind in bag.types.items():
             facts.topics[topic] = Endpoints(tuple(kind.split(" and ")), bag.offers(topic))
@@ -155,11 +179,13 @@ class Expected:
     lidar: LidarSpec
     period_s: float  # between commands
     scan: ScanLayout | None = None  # that any lidar may fill; None: the beams of exactly this one
+    gyro: bool = False  # the model was made with one
 
 
 def expected_of(source: SimulatorModel | Contract, scan: ScanLayout | None = None) -> Expected:
     """Expectations of a model, or of a policy file with the sectors of its scan."""
-    return Expected(source.robot, source.lidar, source.control_period, scan)
+    gyro = getattr(source, "gyro", False)
+    return Expected(source.robot, source.lidar, source.control_period, scan, gyro)
 
 
 def seen(facts: Facts, expected: Expected) -> Expected:

@@ -81,7 +81,7 @@ def _read(
     path: str | Path, model: SimulatorModel, topics: Mapping[str, str]
 ) -> tuple[list[float], list[Snapshot], Any]:
     """Times from the first on [s], shots, and the lidar of the bag."""
-    messages = played(path, topics)
+    messages = played(path, topics, model.gyro)
     playback = Playback(model, POSE in messages, any_lidar=True)
     stamps, shots = list[int](), list[Snapshot]()
     middleware, every = playback.middleware, SCAN if SCAN in messages else ODOM

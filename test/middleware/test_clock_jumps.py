@@ -169,7 +169,7 @@ def silent(seconds, pose=None, twist=0.0, robot="differential"):
     if pose is not None:
         assert middleware.odometry(now, now, pose, [twist, 0.0, 0.0])
     else:
-        assert middleware.imu(now, now, 0.0)
+        middleware.estimator.predict(now)
     return middleware
 
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from nics_drl_bridge.generator import builtin_model, save_model
 from nics_drl_bridge.interface import NS_PER_S
 
 pytest.importorskip("rclpy", reason="needs ROS 2: rclpy is not installed")
@@ -207,7 +208,7 @@ def test_what_it_can_not_use_is_counted_in_the_diagnostics(launch, meet, domain_
 def sensed(launch, meet, domain_id):
     """A middleware that hears a pose sensor and a gyro, and a robot that the test plays."""
     middleware = launch(
-        "middleware_node", domain_id, pose_type="PoseWithCovarianceStamped", use_imu=True
+        "middleware_node", domain_id, pose_type="PoseWithCovarianceStamped", imu="imu"
     )
     peer = meet(domain_id)
     said = {
@@ -297,7 +298,7 @@ def test_pose_and_gyro_correct_the_estimate_and_are_told_of_in_the_diagnostics(s
     }
     peer.until(lambda: wanted.items() <= facts().items(), f"the counts {wanted}")
     speakers["pose"].publish(measured_pose(90.0, 0.0, 0.0, 14, 0.05))
-    speakers["imu"].publish(measured_rate(3.0, 14))
+    speakers["imu"].publish(measured_rate(40.0, 14))
     wanted = {"rejected, pose: outlier": "1", "rejected, imu: outlier": "1"}
     peer.until(lambda: wanted.items() <= facts().items(), f"the counts {wanted}")
     pose = conversions.odometry_from_ros(stand(15))[0]
@@ -306,6 +307,49 @@ def test_pose_and_gyro_correct_the_estimate_and_are_told_of_in_the_diagnostics(s
     speakers["pose"].publish(measured_pose(30.1, -20.0, 2.0, 12, 0.02))
     peer.until(lambda: facts()["pose received"] == "3", "a late pose")
     assert conversions.odometry_from_ros(stand(16))[0][0] == pytest.approx(30.085, abs=0.005)
+
+
+def test_odometry_turns_by_the_gyro_if_the_model_was_made_with_one(
+    launch, meet, domain_id, tmp_path
+):
+    """Its wheels turn 1.6 rad where the robot turns 1 rad."""
+    save_model(replace(builtin_model("differential"), gyro=True), tmp_path / "model")
+    middleware = launch("middleware_node", domain_id, model=str(tmp_path / "model"))
+    peer = meet(domain_id)
+    filtered = peer.listen(Odometry, "odometry/filtered")
+    diagnostics = peer.listen(DiagnosticArray, "/diagnostics")
+    wheels, gyro = peer.speak(Odometry, "odom"), peer.speak(Imu, "imu/data")
+    peer.until(lambda: diagnostics, "diagnostics")
+    hundredths = 0
+
+    def speak(rate):
+        nonlocal hundredths
+        for _ in range(10):
+            hundredths += 1
+            message = Imu()
+            message.header.stamp = conversions.stamp_to_ros(hundredths * NS_PER_S // 100)
+            message.angular_velocity.z = rate + 0.002 * (-1) ** hundredths
+            gyro.publish(message)
+        speak.heading += 0.1 * 1.6 * rate
+        stamp = hundredths * NS_PER_S // 100
+        wheels.publish(conversions.odometry_to_ros(
+            [0.0, 0.0, speak.heading], [0.0, 0.0, 1.6 * rate], stamp, ("odom", "base_link"),
+            VARIANCE,
+        ))  # fmt: skip
+        return stamp
+
+    speak.heading = 0.0
+    for _ in range(30):  # at rest, until both are heard
+        stamp = speak(0.0)
+        with contextlib.suppress(AssertionError):
+            peer.until(lambda s=stamp: filtered and stamp_ns(filtered[-1]) == s, "it", 1.0)
+    assert filtered
+    for rate in [0.25] * 40:
+        stamp = speak(rate)
+        peer.until(lambda s=stamp: stamp_ns(filtered[-1]) == s, f"the estimate at {stamp}")
+    heading = conversions.odometry_from_ros(filtered[-1])[0][2]
+    assert heading == pytest.approx(1.0, abs=0.06)
+    middleware.check()
 
 
 def test_a_pose_type_that_does_not_exist_is_refused_with_the_nearest(launch, domain_id):

@@ -14,7 +14,8 @@ FOLDER = share_folder() / "config" / "sros2"
 NEEDS_MORE = {
     ("subscribe", "/clock"),  # use_sim_time
     ("subscribe", "/pose"),  # pose_type
-    ("subscribe", "/imu"),  # use_imu
+    ("subscribe", "/imu"),  # imu
+    ("subscribe", "/imu/data"),
     ("subscribe", "/ackermann_cmd"),  # ackermann_msgs
     ("publish", "/tf"),  # tf2_msgs
     ("publish", "/tf_static"),

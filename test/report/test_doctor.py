@@ -275,6 +275,56 @@ def test_a_missing_topic_is_named_with_one_of_its_type():
     assert "/front/scan is of its type: remap it" in finding.fix
 
 
+def with_gyro(rate, noise=0.003, seconds=SECONDS):
+    """Facts of a robot on a circle, beside a gyro that measures a rate."""
+    facts, rng = heard(), np.random.default_rng(0)
+    for t in bags.times(0.01, seconds):
+        message = bags.imu(t, 0.0, 0.0, rate + rng.normal(0.0, noise))
+        facts.take("imu", bags.ns(t + 0.002), message)
+    facts.topics["/imu"] = Endpoints(("sensor_msgs/msg/Imu",), (RELIABLE,))
+    return facts
+
+
+def test_a_gyro_that_turns_as_odometry_does_is_no_finding():
+    assert examine(with_gyro(0.25), EXPECTED) == []
+
+
+@pytest.mark.parametrize("seconds", [SECONDS, 5.0])
+def test_odometry_that_turns_further_than_the_gyro_is_named_with_the_cure(seconds):
+    finding = only(with_gyro(0.25 / 1.6, seconds=seconds))
+    assert finding.check == "gyro"
+    assert finding.where == "/imu"
+    assert "contradicts odometry by 0." in finding.what
+    assert "imu:=TOPIC" in finding.fix
+
+
+def test_a_model_that_was_made_with_the_gyro_knows_that_odometry_slips():
+    assert examine(with_gyro(0.25 / 1.6), replace(EXPECTED, gyro=True)) == []
+    [missing] = examine(heard(), replace(EXPECTED, gyro=True))
+    assert "made with a gyro" in missing.what
+
+
+@pytest.mark.parametrize(
+    ("rate", "said"), [(-0.25, "against odometry"), (0.25 * 180.0 / np.pi, "degrees per second")]
+)
+def test_a_gyro_of_another_sign_or_unit_is_an_error(rate, said):
+    finding = only(with_gyro(rate))
+    assert finding.severity == "error"
+    assert said in finding.what
+
+
+def test_the_gyro_of_a_bag_is_found_by_its_type(tmp_path):
+    rows = {
+        "/scan": [(t + 0.002, scan(t)) for t in bags.times(1.0 / LIDAR.rate, SECONDS)],
+        "/odom": [(t + 0.002, odometry(t)) for t in bags.times(0.02, SECONDS)],
+        "/cmd_vel": [(t, bags.twist(0.5, 0.0, 0.2)) for t in bags.times(0.1, SECONDS)],
+        "/gyroscope": [(t, bags.imu(t, 0.0, 0.0, 0.15)) for t in bags.times(0.01, SECONDS)],
+    }
+    bag = bags.write(tmp_path / "bag", rows)
+    assert only(facts_of_bag(bag)).where == "/gyroscope"
+    assert examine(facts_of_bag(bag, imu="none"), EXPECTED) == []
+
+
 def test_a_bag_is_judged_like_the_robot(tmp_path):
     rows = {
         "/scan": [(t + 0.002, scan(t)) for t in bags.times(1.0 / LIDAR.rate, SECONDS)],

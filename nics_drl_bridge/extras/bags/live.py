@@ -29,8 +29,8 @@ from nics_drl_bridge.recording.messages import Offer
 from nics_drl_bridge.recording.write import BagSink, Storage, bag_sink
 
 ROBOT = (  # topics of a robot, in its namespace
-    "scan", "odom", "cmd_vel", "cmd_vel_raw", "joint_states", "imu", "pose", "ground_truth",
-    "odometry/filtered", "e_stop", "goal_pose",
+    "scan", "odom", "cmd_vel", "cmd_vel_raw", "joint_states", "imu", "imu/data", "pose",
+    "ground_truth", "odometry/filtered", "e_stop", "goal_pose",
 )  # fmt: skip
 SHARED = ("/tf", "/tf_static", "/clock", "/diagnostics")
 LOOK_S = 0.25  # period of the search for new topics [s]

@@ -303,4 +303,6 @@ def record(
         reading = robot.step(command, dt)
     t = np.asarray(np.arange(len(commands)) * dt, dtype=np.float64)
     drive = Stream(t, commands), Stream(t, np.array(poses)), Stream(t, np.array(states))
-    return Recording(*drive, source=f"MuJoCo {spec.name}", variables=spec.variable_names)
+    return Recording(
+        *drive, source=f"MuJoCo {spec.name}", variables=spec.variable_names, measured_by="truth"
+    )

@@ -1,0 +1,152 @@
+"""Lets a recorded gyro turn the poses of odometry, and says relative to what a model's errors are.
+
+Odometry's heading is only as good as the grip of the wheels: those of a skid-steer slip in every
+turn. Its displacements along the heading of the gyro are the better pose to learn from.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from nics_drl_bridge.identify.verdict import Mistake
+from nics_drl_bridge.recording.heading import (
+    CLEARLY,
+    WINDOW_S,
+    Turning,
+    compare_turning,
+    turn_by_gyro,
+)
+from nics_drl_bridge.recording.recording import Recording
+
+LEAST_COVERED = 0.9  # share of a drive for which there must be a gyro
+UNLIKE_TRACKER = 0.1  # difference from 1 of the ratio of turns, if the gyro is to fit a tracker
+
+
+def turned_by_gyro(recording: Recording) -> Recording:
+    """Returns a recording whose odometry turns by the gyro, if one was recorded and both differ.
+
+    `gyro` then tells how they compare. Other poses are not changed, but compared; `repairs` hold a
+    sentence on what was found.
+    """
+    if recording.imu is None or recording.gyro is not None:
+        return recording
+    if recording.imu.clock != recording.pose.clock:
+        told = "The gyro is on another clock than the pose, and was not compared with it."
+        return replace(recording, repairs=(*recording.repairs, told))
+    turning = _compared(recording)
+    if turning is None:
+        return recording
+    sentences = tuple(_about(recording, turning))
+    if not _fits(recording, turning):
+        return replace(recording, repairs=(*recording.repairs, *sentences))
+    pose = recording.pose
+    if recording.measured_by == "odometry" and turning.contradicts:
+        yaw_rate = recording.imu.values[:, 2]
+        turned, covered = turn_by_gyro(pose.t, pose.values, recording.imu.t, yaw_rate, turning)
+        if covered < LEAST_COVERED:
+            sentences = (
+                f"The gyro covers {covered:.0%} of the drive only, so the heading is that of "
+                "odometry, which it contradicts; record its topic without gaps.",
+            )
+            return replace(recording, repairs=(*recording.repairs, *sentences))
+        pose = replace(pose, values=turned)
+    return replace(recording, pose=pose, gyro=turning, repairs=(*recording.repairs, *sentences))
+
+
+def relative_to(recording: Recording) -> str:
+    """Says relative to what the errors of a model are that was learnt from a recording."""
+    by, turning = recording.measured_by, recording.gyro
+    if by == "truth":
+        return ""
+    if by == "tracker":
+        return "That is relative to motion capture or a localiser."
+    if by == "odometry" and turning is not None:
+        if turning.contradicts:
+            return (
+                "That is relative to odometry with its heading from the gyro, which contradicts "
+                f"odometry's own by {turning.apart:.2g} rad in {WINDOW_S:g} s; nothing here tells "
+                "how far the path drifts."
+            )
+        return (
+            "That is relative to odometry, whose heading the gyro confirms; nothing here tells "
+            "how far the path drifts."
+        )
+    if by == "odometry":
+        return "That is relative to odometry; nothing here tells how far that drifts."
+    return (
+        "That is relative to the recorded pose; nothing here tells whether it is odometry, which "
+        "drifts."
+    )
+
+
+def _compared(recording: Recording) -> Turning | None:
+    """Compares pose and gyro; None if they can't be compared."""
+    pose, imu = recording.pose, recording.imu
+    if imu is None:
+        return None
+    turning = compare_turning(pose.t, pose.values, imu.t, imu.values[:, 2])
+    return turning if turning is not None and turning.compared else None
+
+
+def _fits(recording: Recording, turning: Turning) -> bool:
+    """True if the gyro can be believed, beside this pose."""
+    if not turning.plausible:
+        return False
+    if recording.measured_by == "odometry":
+        return True
+    return abs(turning.scale - 1.0) < UNLIKE_TRACKER or not turning.contradicts
+
+
+def _about(recording: Recording, turning: Turning) -> Iterator[str]:
+    """Yields a sentence on how gyro and pose turn."""
+    if turning.mirrored:
+        yield Mistake(
+            "The gyro turns against the heading: one of them is mirrored, and the gyro was not "
+            "used. Counter-clockwise is positive; write `scale: -1` beside its `from:`, or mend "
+            "its driver."
+        )
+        return
+    if turning.in_degrees:
+        yield Mistake(
+            f"The gyro turns {1.0 / turning.scale:.3g} times as far as the heading, as degrees "
+            "would, and was not used: write `unit: deg/s` beside its `from:`, or mend its driver."
+        )
+        return
+    if not turning.plausible:
+        yield (
+            "The gyro does not turn as the heading does (correlation "
+            f"{turning.alike:.2f}), and was not used: find out which of them is wrong."
+        )
+        return
+    where = f"over {turning.rest_s:.1f} s at rest" if turning.rest_s > 0.0 else "while driving"
+    bias = f"bias of {turning.bias:.4f} +- {turning.bias_std:.2g} rad/s was found {where}"
+    agrees = recording.measured_by == "tracker" and _fits(recording, turning)
+    if agrees or not turning.contradicts:
+        yield (
+            f"The gyro confirms the heading: they differ by {turning.apart:.2g} rad in "
+            f"{WINDOW_S:g} s; its {bias}."
+        )
+        return
+    differ = f"by {turning.apart:.2g} rad in {WINDOW_S:g} s"
+    if recording.measured_by == "odometry":
+        slip = ""
+        if abs(turning.scale - 1.0) > CLEARLY * turning.scale_std:
+            slip = f": it turns {_factor(turning)} times as far, as wheels do that slip"
+        yield (
+            f"The gyro contradicts odometry {differ}{slip}. The model was learnt from the wheels' "
+            f"displacements along the heading of the gyro, whose {bias}."
+        )
+        return
+    yield (
+        f"The gyro contradicts the pose {differ}: the pose turns {_factor(turning)} times as far. "
+        "If it is odometry, write `measured_by: odometry` below `pose:`, and the gyro will turn it."
+        if recording.measured_by == ""
+        else f"The gyro contradicts the tracker {differ}: the tracker turns {_factor(turning)} "
+        "times as far; check the gyro's scale and mounting."
+    )
+
+
+def _factor(turning: Turning) -> str:
+    digits = max(2, int(np.ceil(-np.log10(max(turning.scale_std, 1e-4)))))
+    return f"{turning.scale:.{digits}f} +- {turning.scale_std:.1g}"

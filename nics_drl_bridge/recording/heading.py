@@ -1,0 +1,247 @@
+"""Compares how a robot turned by odometry and by its gyro, and lets the gyro turn the poses.
+
+Wheels slip where a robot turns, so odometry may report more or less turning than there was. A gyro
+does not slip, but has a bias, which shows while the wheels stand.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.geometry import Array
+
+BLOCK_S = 0.5  # length of the pieces in which both turns are compared
+WINDOW_S = 5.0  # over which the disagreement is told
+LONGEST_GAP_S = 0.25  # between two yaw rates that are joined
+FEWEST_BLOCKS = 6
+FEWEST_TO_DRIFT = 10
+STANDING_MPS = 0.005  # wheels that roll more slowly in a whole block are at rest
+STANDING_RADPS = 0.005
+FEWEST_AT_REST = 2  # blocks; of fewer, the bias is taken from the drive instead
+LEAST_BIAS_STD = 1e-5  # rad/s
+USUAL_BIAS, USUAL_FACTOR = 0.01, 0.5  # deviations of a bias [rad/s], of a factor of turns from 1
+LEAST_RATE_NOISE = 1e-3  # of a block's mean rate [rad/s]
+UNLIKE_BLOCKS = 2.0  # factor of errors, as blocks of a drive are not independent of each other
+DRIFTS = 4.0  # standard errors of its slope beyond which a bias drifts
+DRIFT_SPAN_S = 20.0  # a drift of the bias shows only between rests so far apart
+LEAST_TURN_RAD = 1.0  # sum of all turns, below which a drive does not show a scale
+ALIKE = 0.7  # least correlation of two sources that measure the same motion
+PLAUSIBLE_SCALES = (0.33, 5.0)  # of odometry's turns, relative to those of the gyro
+IN_DEGREES = (40.0, 80.0)  # ratio of a rate in degrees to one in radians
+LEAST_APART_RAD = 0.02  # a smaller disagreement in `WINDOW_S` is not worth a correction
+GYRO_SCALE_STD = 0.015  # of the scale of a usual gyro, as a share
+CLEARLY = 3.0  # standard errors
+
+
+@dataclass(frozen=True)
+class Turning:
+    """How odometry and a gyro say that a robot turned."""
+
+    bias: float  # of the gyro, at the middle of its rests or of the drive [rad/s]
+    bias_std: float  # [rad/s]
+    bias_slope: float  # its change [rad/s^2]; 0 if none shows
+    bias_time: float  # time to which `bias` belongs [s]
+    rest_s: float  # time at rest that shows the bias; 0 if it is from the drive itself
+    scale: float  # odometry's turn for a turn of 1 rad by the gyro; NaN if it turned too little
+    scale_std: float
+    alike: float  # correlation of both rates; NaN if it turned too little
+    window_s: float
+    apart: float  # root mean square disagreement after `window_s` [rad]; NaN if the drive is short
+    apart_std: float  # what bias and scale of the gyro may contribute to that [rad]
+
+    def bias_at(self, t: Array) -> Array:
+        """Returns the bias (T,) at times (T,) [s]."""
+        return np.asarray(self.bias + self.bias_slope * (t - self.bias_time))
+
+    @property
+    def compared(self) -> bool:
+        """True if the robot turned enough for a comparison."""
+        return bool(np.isfinite(self.alike) and np.isfinite(self.apart))
+
+    @property
+    def mirrored(self) -> bool:
+        """True if both turn opposite ways."""
+        return self.compared and self.alike < -ALIKE
+
+    @property
+    def in_degrees(self) -> bool:
+        """True if the gyro seems to measure in degrees per second."""
+        low, high = IN_DEGREES
+        return self.compared and self.alike > ALIKE and low < 1.0 / max(self.scale, 1e-9) < high
+
+    @property
+    def plausible(self) -> bool:
+        """True if both measure the same motion, in the same unit and direction."""
+        low, high = PLAUSIBLE_SCALES
+        return self.compared and self.alike > ALIKE and low < self.scale < high
+
+    @property
+    def contradicts(self) -> bool:
+        """True if they disagree by more than the gyro's own errors explain."""
+        return self.compared and self.apart > max(LEAST_APART_RAD, CLEARLY * self.apart_std)
+
+
+def compare_turning(
+    t: Array, pose: Array, gyro_t: Array, yaw_rate: Array, window_s: float = WINDOW_S
+) -> Turning | None:
+    """Compares poses (T, 3) at t (T,) with yaw rates (G,) at gyro_t (G,), all on one clock.
+
+    Returns None if they overlap for too short a time.
+    """
+    if len(t) < FEWEST_BLOCKS or len(gyro_t) < FEWEST_BLOCKS:
+        return None
+    blocks = _blocks(t, pose, gyro_t, yaw_rate)
+    if len(blocks.span) < FEWEST_BLOCKS:
+        return None
+    bias, bias_std, slope, bias_time, rest_s = _bias_of(blocks)
+    unbiased = blocks.gyro_rate - (bias + slope * (blocks.middle - bias_time))
+    scale, scale_std, alike = _scale_of(blocks.odom_rate, unbiased, blocks.span)
+    apart = _root_mean_square(blocks, blocks.odom_rate - unbiased, window_s)
+    turned = _root_mean_square(blocks, unbiased, window_s)
+    return Turning(
+        bias=bias,
+        bias_std=bias_std,
+        bias_slope=slope,
+        bias_time=bias_time,
+        rest_s=rest_s,
+        scale=scale,
+        scale_std=scale_std,
+        alike=alike,
+        window_s=window_s,
+        apart=apart,
+        apart_std=float(np.hypot(bias_std * window_s, GYRO_SCALE_STD * turned)),
+    )
+
+
+def turn_by_gyro(
+    t: Array, pose: Array, gyro_t: Array, yaw_rate: Array, turning: Turning
+) -> tuple[Array, float]:
+    """Returns poses (T, 3) of the same wheels' displacements along the heading of the gyro.
+
+    And the share of the time for which there was a gyro; for the rest, the wheels turn the robot.
+    """
+    gyro_turn, covered = _turns(t, gyro_t, yaw_rate - turning.bias_at(gyro_t))
+    step = geometry.log(geometry.between(pose[:-1], pose[1:]))
+    standing = (step == 0.0).all(axis=1)
+    step[covered, 2] = gyro_turn[covered]
+    step[standing, 2] = 0.0
+    moved = geometry.exp(step)
+    heading = pose[0, 2] + np.concatenate([[0.0], np.cumsum(moved[:, 2])])
+    shift = geometry.rotate(moved[:, :2], heading[:-1])
+    position = pose[0, :2] + np.concatenate([np.zeros((1, 2)), np.cumsum(shift, axis=0)])
+    turned = np.concatenate([position, geometry.wrap_angle(heading)[:, None]], axis=1)
+    span = np.diff(t)
+    return turned, float(span[covered].sum() / max(float(span.sum()), 1e-9))
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """Pieces of a drive for which there are both sources."""
+
+    middle: Array  # (n,) time [s]
+    span: Array  # (n,) [s]
+    odom_rate: Array  # (n,) mean yaw rate by odometry [rad/s]
+    gyro_rate: Array  # (n,) mean yaw rate by the gyro [rad/s]
+    speed: Array  # (n,) path of the wheels over time [m/s]
+
+
+def _turns(t: Array, gyro_t: Array, yaw_rate: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Returns the gyro's turns (T - 1,) between times (T,) [s], and whether it covers them."""
+    span = np.diff(gyro_t)
+    total = np.concatenate([[0.0], np.cumsum(0.5 * (yaw_rate[1:] + yaw_rate[:-1]) * span)])
+    turn = np.diff(np.interp(t, gyro_t, total))
+    # Time without a gyro up to each moment; none may pass within an interval that it covers.
+    lost = np.concatenate([[0.0], np.cumsum(np.where(span > LONGEST_GAP_S, span, 0.0))])
+    without = np.diff(np.interp(t, gyro_t, lost))
+    inside = (t[:-1] >= gyro_t[0] - 1e-9) & (t[1:] <= gyro_t[-1] + 1e-9)
+    return turn, np.asarray(inside & (without < 1e-9))
+
+
+def _blocks(t: Array, pose: Array, gyro_t: Array, yaw_rate: Array) -> _Blocks:
+    place = np.unique(np.searchsorted(t, np.arange(t[0], t[-1] + 1e-9, BLOCK_S)))
+    place = place[place < len(t)]
+    at = t[place]
+    heading = np.unwrap(pose[:, 2])
+    path = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T))])
+    gyro_turn, covered = _turns(at, gyro_t, yaw_rate)
+    span = np.diff(at)
+    usable = covered & (span > 0.5 * BLOCK_S) & (span < 2.0 * BLOCK_S)
+    span = span[usable]
+    return _Blocks(
+        middle=(0.5 * (at[1:] + at[:-1]))[usable],
+        span=span,
+        odom_rate=np.diff(heading[place])[usable] / span,
+        gyro_rate=gyro_turn[usable] / span,
+        speed=np.diff(path[place])[usable] / span,
+    )
+
+
+def _bias_of(blocks: _Blocks) -> tuple[float, float, float, float, float]:
+    """Returns the gyro's bias, its deviation, slope and time, and how long it was at rest."""
+    rest = (blocks.speed < STANDING_MPS) & (np.abs(blocks.odom_rate) < STANDING_RADPS)
+    if rest.sum() < FEWEST_AT_REST:
+        return _bias_while_driving(blocks)
+    rate, when, rest_s = blocks.gyro_rate[rest], blocks.middle[rest], float(blocks.span[rest].sum())
+    usual = float(np.median(rate))
+    scatter = 1.4826 * float(np.median(np.abs(rate - usual)))
+    near = np.abs(rate - usual) <= max(5.0 * scatter, 1e-3)  # not where somebody turned it
+    rate, when = rate[near], when[near]
+    middle = float(when.mean())
+    bias = float(rate.mean())
+    std = max(float(rate.std() / np.sqrt(len(rate))), LEAST_BIAS_STD)
+    apart = when - middle
+    if len(rate) < FEWEST_TO_DRIFT or float(np.ptp(when)) < DRIFT_SPAN_S:
+        return bias, std, 0.0, middle, rest_s
+    power = float(apart @ apart)
+    slope = float(apart @ rate) / power
+    left = rate - bias - slope * apart
+    slope_std = max(float(left.std()), LEAST_BIAS_STD) / np.sqrt(power)
+    if abs(slope) < DRIFTS * slope_std:
+        return bias, std, 0.0, middle, rest_s
+    std = max(float(left.std() / np.sqrt(len(rate))), LEAST_BIAS_STD)
+    return bias, std, slope, middle, rest_s
+
+
+def _bias_while_driving(blocks: _Blocks) -> tuple[float, float, float, float, float]:
+    """Returns the bias that is left if odometry's turns are too large or small by a factor."""
+    # A robot that turns at one rate only does not show both: the usual bias and factor then count.
+    chi = np.stack([np.ones_like(blocks.odom_rate), blocks.odom_rate], axis=1)
+    found, *_ = np.linalg.lstsq(chi, blocks.gyro_rate, rcond=None)
+    left = blocks.gyro_rate - chi @ found
+    noise = max(float(left @ left) / max(len(left) - 2, 1), LEAST_RATE_NOISE**2)
+    noise *= UNLIKE_BLOCKS**2
+    usual, deviation = np.array([0.0, 1.0]), np.array([USUAL_BIAS, USUAL_FACTOR])
+    spread = np.linalg.inv(chi.T @ chi / noise + np.diag(deviation**-2.0))
+    bias = (spread @ (chi.T @ blocks.gyro_rate / noise + usual / deviation**2))[0]
+    std = float(np.sqrt(spread[0, 0]))
+    return float(bias), max(std, LEAST_BIAS_STD), 0.0, float(blocks.middle.mean()), 0.0
+
+
+def _scale_of(odom_rate: Array, gyro_rate: Array, span: Array) -> tuple[float, float, float]:
+    """Returns odometry's turn per turn of the gyro, its deviation, and their correlation."""
+    turned = max(float((np.abs(rate) * span).sum()) for rate in (odom_rate, gyro_rate))
+    power, odom_power = float(gyro_rate @ gyro_rate), float(odom_rate @ odom_rate)
+    if turned < LEAST_TURN_RAD or power == 0.0 or odom_power == 0.0:
+        return np.nan, np.nan, np.nan
+    together = float(odom_rate @ gyro_rate)
+    scale = together / power
+    left = odom_rate - scale * gyro_rate
+    std = UNLIKE_BLOCKS * float(np.sqrt(left @ left / max(len(left) - 1, 1) / power))
+    return scale, std, together / float(np.sqrt(power * odom_power))
+
+
+def _root_mean_square(blocks: _Blocks, rate: Array, window_s: float) -> float:
+    """Returns the root mean square of turns at rates (n,) over windows [rad]."""
+    each = rate * blocks.span
+    count = max(1, round(window_s / BLOCK_S))
+    if len(each) < count:
+        return np.nan
+    total = np.concatenate([[0.0], np.cumsum(each)])
+    sums = total[count:] - total[:-count]
+    # Windows across a gap would compare less time than they say.
+    end = blocks.middle + 0.5 * blocks.span
+    begin = blocks.middle - 0.5 * blocks.span
+    whole = end[count - 1 :] - begin[: len(sums)] < 1.5 * window_s
+    return float(np.sqrt(np.mean(sums[whole] ** 2))) if whole.any() else np.nan

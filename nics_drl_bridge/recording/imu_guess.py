@@ -1,0 +1,53 @@
+"""Guesses by names which column of a recording is the yaw rate of a gyro."""
+
+from collections.abc import Iterator, Sequence
+
+from nics_drl_bridge.recording.names import words_of
+from nics_drl_bridge.recording.survey import Survey, TableSurvey, unit_in
+
+OF_MESSAGE = "angular_velocity.z"  # of sensor_msgs/Imu
+TURNING = ({"gyro", "z"}, {"gz"}, {"gyroz"}, {"gyro", "yaw"}, {"yaw", "rate"}, {"yawrate"})
+TURNING_OF_IMU = (*TURNING, {"w"}, {"wz"}, {"omega"}, {"angular", "z"}, {"z", "rate"})
+NOT_MEASURED = {"cmd", "command", "commanded", "ref", "setpoint", "target", "desired", "covariance"}
+NOT_OF_GYRO = {"odom", "odometry", "vicon", "mocap", "gt", "truth"}
+USUAL_NAMES = ("/imu", "/imu/data")  # of topics; the first that is there is chosen
+FASTEST_RADPS = 20.0  # a robot that seems to turn faster does so in degrees
+
+
+def guess_yaw_rate(tables: Sequence[TableSurvey]) -> tuple[TableSurvey, Survey] | None:
+    """Finds the yaw rate of a gyro; None if no column is called one."""
+    found = [*_of_messages(tables)] or [*_of_columns(tables)]
+    usual = [each for each in found if each[0].name in USUAL_NAMES]
+    return next(iter(usual or found), None)
+
+
+def imu_line(table: TableSurvey, column: Survey, alone: bool, common: str | None) -> str:
+    """Returns the line of a mapping for a yaw rate, beside the stamps that are common to all."""
+    keys = [f"from: {table.reference(column.name, alone)}"]
+    unit = unit_in(column.name)[1]
+    if unit == "deg" or max(-column.low, column.high) > FASTEST_RADPS:
+        keys.append("unit: deg/s")
+    if table.time not in (common, None):
+        keys.append(f"time: {table.time}")
+    value = f"{{{', '.join(keys)}}}" if len(keys) > 1 else keys[0].removeprefix("from: ")
+    return f"imu: {{yaw_rate: {value}}}"
+
+
+def _of_messages(tables: Sequence[TableSurvey]) -> Iterator[tuple[TableSurvey, Survey]]:
+    for table in tables:
+        names = {column.name for column in table.columns}
+        if {OF_MESSAGE, "linear_acceleration.x"} <= names:
+            for column in table.numbers:
+                if column.name == OF_MESSAGE and column.low < column.high:
+                    yield table, column
+
+
+def _of_columns(tables: Sequence[TableSurvey]) -> Iterator[tuple[TableSurvey, Survey]]:
+    for table in tables:
+        for column in table.numbers:
+            words = {*words_of(column.name)}
+            around = words | {*words_of(table.name)}
+            wanted = TURNING_OF_IMU if around & {"imu", "gyro"} else ()
+            named = any(each <= words for each in wanted)
+            if named and column.low < column.high and not around & (NOT_MEASURED | NOT_OF_GYRO):
+                yield table, column

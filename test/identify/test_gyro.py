@@ -1,0 +1,158 @@
+"""A recorded gyro turns odometry whose wheels slip; the report says relative to what it errs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from skid_steer import BIAS, OVER_REPORTED, drive_skid_steer
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.identify.conclusion import conclude
+from nics_drl_bridge.identify.gyro import relative_to, turned_by_gyro
+from nics_drl_bridge.identify.identify import identify
+from nics_drl_bridge.identify.verdict import Mistake
+from nics_drl_bridge.recording.recording import Recording, Stream
+from nics_drl_bridge.robot.spec import robot_from
+
+ROBOT = {
+    "kind": "differential",
+    "footprint_radius": 0.4,
+}
+
+
+def recorded(drive, measured_by="odometry", gyro=True):
+    """Returns the recording of a drive as a bag of the robot holds it."""
+    imu = np.stack([np.zeros_like(drive.t), np.zeros_like(drive.t), drive.gyro], axis=1)
+    pose = np.concatenate([drive.odom[:, :2], geometry.wrap_angle(drive.odom[:, 2:])], axis=1)
+    every = slice(None, None, 5)
+    return Recording(
+        command=Stream(drive.t[every], drive.command[every]),
+        pose=Stream(drive.odom_t, pose),
+        imu=Stream(drive.t, imu) if gyro else None,
+        measured_by=measured_by,
+    )
+
+
+@pytest.fixture(scope="module")
+def slipping():
+    return drive_skid_steer(np.random.default_rng(3))
+
+
+def off_the_truth(drive, pose):
+    """Returns the greatest distance [m] and turn [rad] of poses from the true ones."""
+    truth = drive.truth[:: len(drive.truth) // len(pose)][: len(pose)]
+    turn = np.abs(geometry.wrap_angle(pose[:, 2] - truth[:, 2]))
+    return np.hypot(*(pose - truth)[:, :2].T).max(), turn.max()
+
+
+def test_the_heading_of_slipping_wheels_is_taken_from_the_gyro(slipping):
+    recording = recorded(slipping)
+    before, turned_before = off_the_truth(slipping, recording.pose.values)
+    found = turned_by_gyro(recording)
+    after, turned_after = off_the_truth(slipping, found.pose.values)
+    assert turned_before > 0.5
+    assert before > 0.5
+    assert turned_after < 0.1
+    assert after < 0.3
+    turning = found.gyro
+    assert turning.scale == pytest.approx(OVER_REPORTED, abs=0.02)
+    assert abs(turning.bias - BIAS) < 5.0 * turning.bias_std + 3e-4
+    assert 0.0 < turning.bias_std < 2e-3
+    assert turning.rest_s >= 2.0
+    told = found.repairs[-1]
+    assert told.startswith("The gyro contradicts odometry by 0.")
+    assert "in 5 s: it turns 1." in told
+
+
+def test_the_bias_is_found_while_driving_if_the_robot_never_stood():
+    drive = drive_skid_steer(np.random.default_rng(5), rest_s=0.0)
+    found = turned_by_gyro(recorded(drive))
+    assert found.gyro.rest_s == 0.0
+    assert abs(found.gyro.bias - BIAS) < 5.0 * found.gyro.bias_std
+    assert off_the_truth(drive, found.pose.values)[1] < 0.5
+
+
+def test_a_gyro_that_agrees_changes_nothing_and_confirms_the_heading():
+    drive = drive_skid_steer(np.random.default_rng(6), over_reported=1.0)
+    recording = recorded(drive)
+    found = turned_by_gyro(recording)
+    assert np.array_equal(found.pose.values, recording.pose.values)
+    assert found.gyro is not None
+    assert "confirms" in relative_to(found)
+
+
+@pytest.mark.parametrize(
+    ("factor", "word"), [(-1.0, "mirrored"), (180.0 / np.pi, "unit: deg/s"), (0.0, "")]
+)
+def test_a_gyro_of_another_sign_or_unit_is_not_used_and_told(slipping, factor, word):
+    recording = recorded(slipping)
+    wrong = replace(recording.imu, values=recording.imu.values * factor)
+    found = turned_by_gyro(replace(recording, imu=wrong))
+    assert np.array_equal(found.pose.values, recording.pose.values)
+    assert found.gyro is None
+    if word:
+        assert isinstance(found.repairs[-1], Mistake)
+        assert word in found.repairs[-1]
+
+
+def test_poses_of_a_tracker_are_never_turned(slipping):
+    recording = recorded(slipping, measured_by="tracker")
+    found = turned_by_gyro(recording)
+    assert np.array_equal(found.pose.values, recording.pose.values)
+    assert "contradicts the tracker" in found.repairs[-1]
+
+
+def test_poses_of_unknown_origin_are_not_turned_but_the_fix_is_told(slipping):
+    found = turned_by_gyro(recorded(slipping, measured_by=""))
+    assert found.gyro is None
+    assert "measured_by: odometry" in found.repairs[-1]
+
+
+@pytest.mark.parametrize(
+    ("measured_by", "gyro", "said"),
+    [
+        ("odometry", False, "relative to odometry; nothing here tells how far that drifts."),
+        ("odometry", True, "relative to odometry with its heading from the gyro"),
+        ("tracker", False, "relative to motion capture or a localiser."),
+        ("", False, "relative to the recorded pose"),
+    ],
+)
+def test_the_report_says_relative_to_what_the_error_is(slipping, measured_by, gyro, said):
+    recording = turned_by_gyro(recorded(slipping, measured_by, gyro))
+    assert said in relative_to(recording)
+
+
+def heading_errors(model, drive, latency_s):
+    """Returns mean errors after 5 s, as shares of the turn: of headings, by a model alone."""
+    errors, turns = [], []
+    step = round(model.dt / 0.01)
+    for start in range(400, len(drive.t) - 600, 250):
+        pose = np.zeros(3)
+        state = np.zeros(len(model.dofs) - 3)
+        for k in range(start - 150, start, step):  # the state follows the commands
+            _, state = model.step(np.zeros(3), state, drive.command[k])
+        for k in range(start, start + 500, step):
+            late = max(k - round(latency_s / 0.01), 0)
+            pose, state = model.step(pose, state, drive.command[late])
+        true = geometry.between(drive.truth[start], drive.truth[start + 500])
+        turned = drive.truth[start + 500, 2] - drive.truth[start, 2]
+        errors.append(abs(geometry.wrap_angle(pose[2] - true[2])))
+        turns.append(abs(turned))
+    return float(np.sum(errors) / np.sum(turns))
+
+
+@pytest.mark.slow
+def test_the_model_turns_as_the_robot_truly_does(slipping):
+    unseen = drive_skid_steer(np.random.default_rng(11))
+    spec = robot_from(ROBOT, {"forward_command": (-0.2, 0.8), "turn_command": (-1.0, 1.0)})
+    by_wheels = identify(recorded(slipping, gyro=False), spec)
+    by_gyro = identify(recorded(slipping), spec)
+    wrong = heading_errors(by_wheels.model, unseen, by_wheels.calibration.command_latency_s)
+    right = heading_errors(by_gyro.model, unseen, by_gyro.calibration.command_latency_s)
+    assert wrong > 0.2
+    assert right < 0.05
+    first = conclude(by_gyro).accuracy
+    assert "relative to odometry with its heading from the gyro" in first
+    assert "relative to odometry; nothing here tells" in conclude(by_wheels).accuracy
