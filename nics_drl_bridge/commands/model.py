@@ -255,8 +255,8 @@ def generate(
         whole = [stack.enter_context(console.intact(each, salvage)) for each in recording]
         stack.enter_context(console.progress_bar(f"reading {named}"))
         spec, drives = robot_and_drives(whole, robot, roles, mapping)
-    pairs = zip(drives, recording, strict=True)
-    drives = [replace(drive, source=str(path)) for drive, path in pairs]
+    pairs = zip(drives, names_of_sources(recording), strict=True)
+    drives = [replace(drive, source=name) for drive, name in pairs]
     with console.progress_bar("generating"):
         model, identified = generate_model(
             drives if len(drives) > 1 else drives[0], spec, lidar_of(spec, lidar), shapes, terms,
@@ -278,6 +278,14 @@ def generate(
         f"model written to {out}",
     )  # fmt: skip
     console.say(as_json, "\n".join(lines), **fit_facts(out, spec.name, identified))
+
+
+def names_of_sources(recordings: Sequence[Path]) -> list[str]:
+    """Returns what to call recordings in a report: the path of one, short names of several."""
+    if len(recordings) == 1:
+        return [str(recordings[0])]
+    names = [path.name for path in recordings]
+    return names if len(set(names)) == len(names) else [str(path) for path in recordings]
 
 
 def fit_facts(out: Path, robot: str, identified: "Identified") -> dict[str, Any]:

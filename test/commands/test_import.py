@@ -72,7 +72,7 @@ def test_logs_of_two_robots_are_refused(tmp_path):
         driven = textbook.record(robot, np.random.default_rng(0), duration=10.0)
         write_drive(driven, tmp_path / f"{name}.npz", robot)
     done = nics("generate", "differential.npz", "ackermann.npz", "--out", "m", cwd=tmp_path)
-    assert done.returncode == 1
+    assert done.returncode == 2
     assert "fit only drives of one robot together" in done.stderr
 
 
