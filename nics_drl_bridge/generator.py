@@ -15,6 +15,7 @@ from nics_drl_bridge.errors import ConfigError, FitError, ModelError
 from nics_drl_bridge.identify import fit
 from nics_drl_bridge.identify.calibration import Calibration
 from nics_drl_bridge.identify.identify import Identified, identify
+from nics_drl_bridge.identify.joined import join_recordings
 from nics_drl_bridge.identify.report import fit_report, why_useless
 from nics_drl_bridge.lidar.bake import bake
 from nics_drl_bridge.lidar.sensor import AnySensor, Sensor, check_sensors
@@ -118,12 +119,14 @@ class _File(Schema):
 
 
 def generate(
-    recording: Recording, robot: RobotSpec, lidar: LidarSpec, shapes: Sequence[Shape],
+    recording: Recording | Sequence[Recording], robot: RobotSpec, lidar: LidarSpec,
+    shapes: Sequence[Shape],
     order: fit.Order = "auto", alpha: fit.Alpha = "auto", assume: bool = False,
     strict: bool = False, anyway: bool = False, sensors: Sequence[Sensor] = (),
 ) -> tuple[SimulatorModel, Identified]:  # fmt: skip
     """Calibrates, fits and prunes the kinematics, and bakes the lidar table.
 
+    Several recordings of one robot are fitted together (`identify.joined`).
     The shapes of obstacles are baked, and the robot's own footprint. `order` is that of the Taylor
     model, `auto` for the one that predicts best, `alpha` the pruning threshold of Eq. 2. `assume`
     fills in from the textbook what the drive did not show, marked as assumed; `strict` refuses a
@@ -131,6 +134,8 @@ def generate(
     standing robot's; `sensors` are beside its lidar. Raises RecordingError for a recording that is
     unfit for the robot, FitError for a useless model.
     """
+    if not isinstance(recording, Recording):
+        recording = join_recordings(recording, robot)
     identified = identify(recording, robot, order=order, alpha=alpha, assume=assume, strict=strict)
     if (reason := why_useless(identified, robot)) and not anyway:
         raise FitError(reason)

@@ -1,6 +1,7 @@
 """`nics record`, `inspect`, `import`, `generate` and `urdf`: from a robot to its model."""
 
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -211,7 +212,8 @@ def stream_facts(drive: "Recording") -> list[dict[str, Any]]:
 
 
 def generate(
-    recording: Annotated[Path, Argument(help="A bag, an .npz recording, or tables with a --map.")],
+    recording: Annotated[list[Path], Argument(
+        help="A bag, an .npz recording, or tables with a --map; several of one robot.")],
     out: Annotated[Path, Option(help="Folder of the model to write.")],
     robot: console.DrivenRobotOption = None,
     mapping: Annotated[Path | None, Option("--map",
@@ -233,13 +235,13 @@ def generate(
     pictures: Annotated[bool, Option(help="Draw the fit into the model's pictures/.")] = False,
     as_json: console.JsonOption = False,
 ) -> None:  # fmt: skip
-    """Generates a simulator from a recording and writes its folder."""
+    """Generates a simulator from one recording, or several, and writes its folder."""
     from nics_drl_bridge.generator import check_place, lidar_of, save_model
     from nics_drl_bridge.generator import generate as generate_model
     from nics_drl_bridge.identify.fit import parse_alpha, parse_order
     from nics_drl_bridge.lidar.sensor import load_sensor
     from nics_drl_bridge.lidar.spec import load_lidar
-    from nics_drl_bridge.recording.readers import robot_and_drive
+    from nics_drl_bridge.recording.readers import robot_and_drives
     from nics_drl_bridge.recording.topic_roles import topic_roles
     from nics_drl_bridge.sim.world import load_world
 
@@ -249,12 +251,17 @@ def generate(
         load_lidar(lidar)
     further = tuple(load_sensor(file) for file in sensor or ())
     shapes = load_world(world).shapes
-    named, reading = str(recording), console.progress_bar(f"reading {recording}")
-    with console.intact(recording, salvage) as whole, reading:
-        spec, drive = robot_and_drive(whole, robot, topic_roles(topics, topic or ()), mapping)
+    named = ", ".join(map(str, recording))
+    roles = topic_roles(topics, topic or ())
+    with ExitStack() as stack:
+        whole = [stack.enter_context(console.intact(each, salvage)) for each in recording]
+        stack.enter_context(console.progress_bar(f"reading {named}"))
+        spec, drives = robot_and_drives(whole, robot, roles, mapping)
+    pairs = zip(drives, names_of_sources(recording), strict=True)
+    drives = [replace(drive, source=name) for drive, name in pairs]
     with console.progress_bar("generating"):
         model, identified = generate_model(
-            replace(drive, source=named), spec, lidar_of(spec, lidar), shapes, terms,
+            drives if len(drives) > 1 else drives[0], spec, lidar_of(spec, lidar), shapes, terms,
             threshold, assume_textbook, strict, anyway, further,
         )  # fmt: skip
         save_model(model, out)
@@ -273,6 +280,14 @@ def generate(
         f"model written to {out}",
     )  # fmt: skip
     console.say(as_json, "\n".join(lines), **fit_facts(out, spec.name, identified))
+
+
+def names_of_sources(recordings: Sequence[Path]) -> list[str]:
+    """Returns what to call recordings in a report: the path of one, short names of several."""
+    if len(recordings) == 1:
+        return [str(recordings[0])]
+    names = [path.name for path in recordings]
+    return names if len(set(names)) == len(names) else [str(path) for path in recordings]
 
 
 def fit_facts(out: Path, robot: str, identified: "Identified") -> dict[str, Any]:

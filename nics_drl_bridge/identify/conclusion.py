@@ -3,6 +3,7 @@
 from math import isfinite
 from typing import NamedTuple
 
+from nics_drl_bridge.identify.by_recording import Alone
 from nics_drl_bridge.identify.command_doubts import doubts_of_commands
 from nics_drl_bridge.identify.excitation import narrow
 from nics_drl_bridge.identify.gyro import relative_to
@@ -38,6 +39,7 @@ def conclude(identified: Identified) -> Conclusion:
     wrong = tuple(str(note) for note in identified.notes if isinstance(note, Mistake))
     about = (
         *wrong,
+        *(str(note) for note in identified.notes if isinstance(note, Alone)),
         *doubts_of_commands(identified.judgement, identified.calibration),
         *shortfall(identified.judgement),
         *doubts(identified.held_out),

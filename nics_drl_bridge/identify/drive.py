@@ -64,7 +64,7 @@ class Drive:
     @cached_property
     def bursts(self) -> "Bursts | None":
         """Bursts of the poses; None if they arrive one by one."""
-        return find_bursts(self.recording.pose.t)
+        return find_bursts(self.recording.without_gaps(self.recording.pose.t))
 
     @cached_property
     def sample_t(self) -> Array:

@@ -14,6 +14,7 @@ from nics_drl_bridge.identify import fit as fitting
 from nics_drl_bridge.identify import followers, hypotheses, open_loop, shooting, verdict
 from nics_drl_bridge.identify import motion as motions
 from nics_drl_bridge.identify.assume import assume_textbook
+from nics_drl_bridge.identify.by_recording import about_recordings
 from nics_drl_bridge.identify.calibration import Calibration, Response, align
 from nics_drl_bridge.identify.drive import Drive, Settings
 from nics_drl_bridge.identify.forms import CLEAR, curve_of, likely_delay, reached
@@ -26,6 +27,7 @@ from nics_drl_bridge.identify.repair import check_axes, check_commands, check_un
 from nics_drl_bridge.identify.signals import speed_index
 from nics_drl_bridge.identify.structure import structures
 from nics_drl_bridge.identify.terms import linear_fit, shared, through_state
+from nics_drl_bridge.recording.joining import LEARNT_SHARE
 from nics_drl_bridge.recording.recording import Recording, Samples, Stream, check
 from nics_drl_bridge.robot.curve import InputCurve
 from nics_drl_bridge.robot.noise import Noise
@@ -35,7 +37,6 @@ from nics_drl_bridge.threads import one_blas_thread
 
 T = TypeVar("T")
 
-TRAIN_SHARE = 2.0 / 3.0
 ORDERS_OF_INFERRED = (2, 3, 4)  # of which `auto` chooses if the state follows commands
 
 
@@ -356,6 +357,7 @@ def _notes(drive: Drive, findings: Findings) -> tuple[str, ...]:
     linear, _ = _fitted(findings)
     spec, calibration = drive.spec, findings.calibration
     return (
+        *about_recordings(_fitted(findings)[1], calibration, findings.whole),
         *shortfall(findings.judgement), *drive.recording.repairs, *findings.repairs,
         *_sentences(findings), *findings.refinement,
         *verdict.mirror_note(known(findings.samples, "the training part", "fit"), spec),
@@ -419,7 +421,8 @@ def refit(drive: Drive, findings: Findings) -> Findings:
         worse = error.mean_position_error_m > verdict.WORSE * before.mean_position_error_m
     except (FitError, RecordingError):
         worse = True
-    sentence = verdict.refitted(until, drive.duration_s, worse)
+    driven = drive.recording.driven_s
+    sentence = verdict.refitted(driven(until), driven(), worse)
     if worse:
         findings = replace(findings, refinement=(*findings.refinement, sentence))
         return replace(findings, notes=_notes(drive, findings))
@@ -545,7 +548,8 @@ def identify(
     """Learns a motion up to `train_until` [s], and tests it on the rest; see `Settings`."""
     # Default: two thirds. RecordingError: unusable for this robot. FitError: it shows too little.
     drive = Drive(turned_by_gyro(check(recording, spec)), spec)
-    until = TRAIN_SHARE * drive.duration_s if train_until is None else train_until
+    until = train_until if train_until is not None else recording.learn_until_s
+    until = LEARNT_SHARE * drive.duration_s if until is None else until
     found = run(STAGES, replace(drive, settings=Settings(order, alpha, until, assume, strict)))
     return _result(found, found.refit or found)
 

@@ -71,6 +71,8 @@ def windows(
     end = after - before_is_nearer
     good = np.abs(t[end] - t[begin] - horizon) <= END_TOLERANCE * period
     good &= t[end] <= origin + stop
+    episode = drive.recording.episode_at(t)
+    good &= episode[begin] == episode[end]
     begin, end = begin[good], end[good]
     length = np.append(0.0, np.cumsum(np.hypot(*np.diff(pose[:, :2], axis=0).T)))
     return Windows(t[begin], t[end], pose[begin], pose[end], length[end] - length[begin])

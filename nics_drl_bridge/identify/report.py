@@ -26,6 +26,8 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
     """Returns the report on a recording from a source as text for people."""
     model = identified.model
     latency, until = identified.recording.latency.sentences(), identified.train_until_s
+    joined = bool(identified.recording.episodes)
+    apart = "the last third of each drive" if joined else f"after {until:.1f} s"
     units = units_of(spec)
     ranges = zip(model.variables, model.low, model.high, strict=True)
     around = list(stages(spec, identified))
@@ -38,7 +40,7 @@ def fit_report(source: str, spec: RobotSpec, identified: Identified) -> str:
         f"(X = {', '.join(model.variables)}), with standard errors:": equations_with_errors(model),
         **({"Effect of the motors (standard uncertainties):": around} if around else {}),
         **_linear_fit(identified),
-        f"Open loop, on data held out from the fit (after {until:.1f} s):": _held_out(identified),
+        f"Open loop, on data held out from the fit ({apart}):": _held_out(identified),
         **_compared(identified.judgement),
         "Valid range, as covered by the drive:": (
             f"{name:<24} {low:.4g} to {high:.4g} {units[name]}"

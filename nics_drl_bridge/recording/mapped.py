@@ -12,6 +12,8 @@ from nics_drl_bridge.geometry import Array, east_and_north, wrap_angle
 from nics_drl_bridge.recording import mapping as schema
 from nics_drl_bridge.recording import recording as recordings
 from nics_drl_bridge.recording import stamping
+from nics_drl_bridge.recording.episodes import episodes_by_time, episodes_of_table
+from nics_drl_bridge.recording.joining import join
 from nics_drl_bridge.recording.mapping import (
     ImuSource,
     Mapping,
@@ -45,6 +47,24 @@ MOST_RATIO = 100.0  # of durations of two streams of a drive
 
 def read_mapped(source: Source, mapping: Mapping) -> Recording:
     """Reads the streams of a mapping; ConfigError, RecordingError: what is missing or wrong."""
+    if mapping.episode is None:
+        return _read_drive(source, mapping)[0]
+    plain = mapping.model_copy(update={"episode": None})
+    single = episodes_of_table(source, mapping)
+    if not single:
+        recording, since = _read_drive(source, plain)
+        return episodes_by_time(source, mapping, recording, since)
+    drives = []
+    for episode in single:
+        try:
+            drives.append(replace(_read_drive(episode, plain)[0], source=episode.place))
+        except RecordingError as error:
+            raise RecordingError(f"episode {episode.episode}: {error}") from None
+    return replace(join(drives), source=source.place)
+
+
+def _read_drive(source: Source, mapping: Mapping) -> tuple[Recording, float]:
+    """Reads a drive, and what was subtracted from the stamps of its pose [s]."""
     reader = MappedReader(source, mapping)
     _check_commands(reader, mapping.command)
     found: dict[str, Stream] = {"pose": read_pose(reader, mapping.pose)}
@@ -71,7 +91,8 @@ def read_mapped(source: Source, mapping: Mapping) -> Recording:
     )  # fmt: skip
     check_streams(made, {"command": len(mapping.command), "state": len(mapping.state), "wheels": 2})
     shifted: Any = _from_zero(found, mapping.clock or schema.ROBOT_CLOCK, reader)
-    return replace(made, **shifted, repairs=tuple(reader.notes))
+    since = float(found["pose"].t[0] - shifted["pose"].t[0])
+    return replace(made, **shifted, repairs=tuple(reader.notes)), since
 
 
 def _check_commands(reader: MappedReader, commands: Names[str, Value]) -> None:

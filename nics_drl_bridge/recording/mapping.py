@@ -252,6 +252,8 @@ class Mapping(Schema):
     in_: str | None = Field(default=None, alias="in")  # file or topic of streams that name none
     time: Annotated[Time | None, _short("from")] = None  # stamps of all streams; None: a bag's own
     clock: str | None = None  # clock of all streams; None: `robot`, unless a bag's headers differ
+    # column whose value changes from one episode to the next; None: one drive
+    episode: Reference | None = None
     pose: Annotated[PoseSource, _short("in")]  # of the tracked body; a topic alone means its `in`
     command: dict[str, AValue]  # by the names of the robot's commands
     state: dict[str, AValue] = Field(default_factory=dict)  # measured states, by their names

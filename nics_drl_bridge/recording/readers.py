@@ -1,6 +1,6 @@
 """Readers of recordings: `FORMATS` recognises a recording and names the function that reads it."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -164,6 +164,38 @@ def robot_and_drive(
     drive = read_recording(path, None, topics)
     spec = _ranged(robot or drive.robot or DEFAULT_ROBOT, drive, drive.variables)
     return spec, drive if drive.robot is None else arranged(drive, spec)
+
+
+def robot_and_drives(
+    paths: Sequence[Path],
+    robot: str | None,
+    topics: TopicRoles,
+    mapping: Mapping | str | Path | None,
+) -> tuple[RobotSpec, list[Recording]]:
+    """Reads drives of one robot; its commands reach as far as in any of them."""
+    read = [robot_and_drive(path, robot, topics, mapping) for path in paths]
+    first, *others = [spec for spec, _ in read]
+    for path, spec in zip(paths[1:], others, strict=True):
+        if spec.variable_names != first.variable_names or spec.textbook != first.textbook:
+            fault = f"{path}: is a drive of {spec.name!r}, {paths[0]} of {first.name!r}"
+            raise RecordingError(f"{fault}; fit only drives of one robot together.")
+    if others:
+        ranges = {
+            stream: tuple(
+                _spanned([getattr(spec, stream)[k] for spec, _ in read])
+                for k in range(len(getattr(first, stream)))
+            )
+            for stream in ("command", "state")
+        }
+        first = first.model_copy(update=ranges)
+    return first, [check(drive, first) for _, drive in read]
+
+
+def _spanned(variables: Sequence[Any]) -> Any:
+    """Returns a variable that reaches as far as any of these."""
+    low = min(each.min for each in variables)
+    high = max(each.max for each in variables)
+    return variables[0].model_copy(update={"min": low, "max": high})
 
 
 def robot_of(mapping: Mapping | str | Path, recording: Recording) -> RobotSpec:

@@ -3,7 +3,7 @@
 import io
 import json
 import zipfile
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -79,8 +79,22 @@ class Stream:
 
 
 @dataclass(frozen=True)
+class Episode:
+    """A part of a recording that nothing leads to from the part before: another drive, a reset."""
+
+    source: str  # the recording that it is of, for the report
+    start_s: float  # first and last pose, on the clock that pose and commands share [s]
+    end_s: float
+
+    @property
+    def duration_s(self) -> float:
+        """Time that it lasts [s]."""
+        return self.end_s - self.start_s
+
+
+@dataclass(frozen=True)
 class Recording:
-    """A drive of a robot."""
+    """A drive of a robot, or several, as episodes on one time axis with gaps between them."""
 
     command: Stream  # (T, C) in the order of the RobotSpec
     pose: Stream  # (T, 3) x [m], y [m], heading [rad] of the tracked body, in a fixed frame
@@ -96,6 +110,38 @@ class Recording:
     measured_by: MeasuredBy = ""  # what measured the pose; empty if nothing tells
     # How odometry and gyro turned, if the heading is from the gyro or confirmed by it
     gyro: Turning | None = None
+    episodes: tuple[Episode, ...] = ()  # in order; empty for a drive in one go
+    # end of the episodes to learn from, which come first, from the first pose on [s]; None: no
+    # episodes, or the fit chooses
+    learn_until_s: float | None = None
+
+    def episode_at(self, t: ArrayLike) -> NDArray[np.intp]:
+        """Returns the number of the episode in which each time (...,) [s] lies, 0 for the first.
+
+        A gap between two episodes counts in halves.
+        """
+        ends = np.array([each.end_s for each in self.episodes[:-1]])
+        starts = np.array([each.start_s for each in self.episodes[1:]])
+        return np.asarray(np.searchsorted((ends + starts) / 2.0, t))
+
+    def without_gaps(self, t: Array) -> Array:
+        """Returns times (T,) [s] with a usual step in place of the gaps between episodes."""
+        if not self.episodes or len(t) < 2:
+            return t
+        step = np.diff(t)
+        across = np.diff(self.episode_at(t)) > 0
+        usual = float(np.median(step[~across])) if not across.all() else 0.0
+        return np.asarray(t[0] + np.append(0.0, np.cumsum(np.where(across, usual, step))))
+
+    def driven_s(self, until_s: float = np.inf) -> float:
+        """Returns how long the robot drove until a time from the first pose on [s], all gaps out.
+
+        An episode counts whole if it begins before that time.
+        """
+        first = float(self.pose.t[0])
+        if not self.episodes:
+            return float(min(self.pose.t[-1] - first, until_s))
+        return sum(e.duration_s for e in self.episodes if e.start_s - first <= until_s)
 
     @property
     def streams(self) -> dict[str, Stream]:
@@ -188,7 +234,7 @@ def save_recording(recording: Recording, path: str | Path) -> None:
         arrays[f"{name}_t"], arrays[name] = stream.t, stream.values
         if stream.sigma is not None:
             arrays[f"{name}_sigma"] = stream.sigma
-    meta = {
+    meta: dict[str, Any] = {
         "format": FORMAT, "source": recording.source,
         "clocks": {name: stream.clock for name, stream in streams.items()},
         "variables": recording.variables, "repairs": recording.repairs,
@@ -197,6 +243,9 @@ def save_recording(recording: Recording, path: str | Path) -> None:
         meta["measured_by"] = recording.measured_by
     if recording.robot is not None:
         meta["robot"] = recording.robot
+    if recording.episodes:
+        meta["episodes"] = [asdict(each) for each in recording.episodes]
+        meta["learn_until_s"] = recording.learn_until_s
     if recording.latency.measured:
         meta["latency"] = recording.latency.model_dump(mode="json")
     buffer = io.BytesIO()
@@ -225,7 +274,15 @@ def load_recording(path: str | Path) -> Recording:
         measured_by = meta.get("measured_by", "")
         if measured_by not in get_args(MeasuredBy):
             raise ValueError(f"measured_by is {measured_by!r}")
-        return replace(found, repairs=repairs, robot=meta.get("robot"), measured_by=measured_by)
+        episodes = tuple(Episode(**each) for each in meta.get("episodes", ()))
+        return replace(
+            found,
+            repairs=repairs,
+            robot=meta.get("robot"),
+            measured_by=measured_by,
+            episodes=episodes,
+            learn_until_s=meta.get("learn_until_s"),
+        )
     except FileNotFoundError:
         raise RecordingError(f"{path}: no such file; check the path.") from None
     except (AttributeError, KeyError, RecursionError, TypeError) as error:

@@ -13,6 +13,7 @@ from nics_drl_bridge.generator import load_model
 from nics_drl_bridge.recording import textbook
 from nics_drl_bridge.recording.mapping import UNITS, Mapping
 from nics_drl_bridge.recording.recording import load_recording
+from nics_drl_bridge.recording.write import write_drive
 from nics_drl_bridge.robot.spec import load_robot
 
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "recordings.md"
@@ -51,6 +52,28 @@ def test_a_log_becomes_a_mapping_a_recording_and_a_model(folder, tmp_path):
     kept = load_recording(tmp_path / "drive.npz")
     assert kept.variables == ("speed_command", "steering_command")
     assert kept.robot == {"kind": "ackermann", "footprint_radius": 0.2}
+
+
+def test_several_logs_become_one_simulator(tmp_path):
+    robot = load_robot("differential")
+    for k in range(2):
+        driven = textbook.record(robot, np.random.default_rng(k), duration=20.0)
+        write_drive(driven, tmp_path / f"{k}.npz", robot)
+    done = nics("generate", "0.npz", "1.npz", "--out", "my_robot", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = " ".join(load_model(tmp_path / "my_robot").report.split())
+    assert "2 drives were joined (0.npz, 1.npz)" in report
+    assert "held out from the fit (the last third of each drive)" in report
+
+
+def test_logs_of_two_robots_are_refused(tmp_path):
+    for name in ("differential", "ackermann"):
+        robot = load_robot(name)
+        driven = textbook.record(robot, np.random.default_rng(0), duration=10.0)
+        write_drive(driven, tmp_path / f"{name}.npz", robot)
+    done = nics("generate", "differential.npz", "ackermann.npz", "--out", "m", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "fit only drives of one robot together" in done.stderr
 
 
 @pytest.mark.slow

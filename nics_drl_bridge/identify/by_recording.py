@@ -1,0 +1,84 @@
+"""Errors of a model on each of the recordings that it was fitted to together."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from nics_drl_bridge.identify import open_loop
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.robot.taylor import TaylorModel
+
+HORIZONS_S = (5.0, 2.0, 1.0, 0.5)
+FEWEST = 5  # windows of each recording
+SPACING_S = 0.5
+ALONE = 2.5  # times the errors of the others from which on a recording is off alone
+LEAST_SHARE = 0.02  # of the path: smaller errors are no matter
+
+
+class Alone(str):
+    """A sentence on a recording that is off alone."""
+
+    __slots__ = ()
+
+
+class ErrorOfRecording(NamedTuple):
+    """Mean errors of predictions within one recording."""
+
+    source: str
+    horizon_s: float
+    position_m: float
+    path_m: float  # mean length of the measured path
+
+    @property
+    def share(self) -> float:
+        """Error as a share of the path."""
+        return self.position_m / max(self.path_m, 1e-9)
+
+
+def errors_by_recording(
+    model: TaylorModel, calibration: Calibration, drive: Drive
+) -> list[ErrorOfRecording]:
+    """Predicts each recording of a drive, over the longest time that all of them last."""
+    sources = [episode.source for episode in drive.recording.episodes]
+    for horizon in HORIZONS_S:
+        chosen = open_loop.windows(drive, calibration, 0.0, drive.duration_s, horizon, SPACING_S)
+        if not len(chosen.start_t):
+            continue
+        own = np.array(sources)[drive.recording.episode_at(chosen.start_t)]
+        if any((own == source).sum() < FEWEST for source in sources):
+            continue
+        ends = open_loop.predict(model, calibration, drive, chosen)
+        error = np.hypot(*(ends - chosen.end)[:, :2].T)
+        return [
+            ErrorOfRecording(
+                source,
+                horizon,
+                float(error[own == source].mean()),
+                float(chosen.path[own == source].mean()),
+            )
+            for source in dict.fromkeys(sources)
+        ]
+    return []
+
+
+def about_recordings(model: TaylorModel, calibration: Calibration, drive: Drive) -> Iterator[str]:
+    """Yields a sentence on the errors by recording, and one on each that is off alone."""
+    if not drive.recording.episodes:
+        return
+    errors = errors_by_recording(model, calibration, drive)
+    if len(errors) < 2:
+        return
+    for each in errors:
+        others = [other for other in errors if other is not each]
+        usual = float(np.median([other.share for other in others]))
+        if each.share > max(ALONE * usual, LEAST_SHARE) and np.isfinite(usual):
+            ends = f"end {each.position_m:.3g} m off after {each.horizon_s:g} s"
+            shares = f"{each.share:.1%} of the path, those of the others {usual:.1%}"
+            yield Alone(
+                f"{each.source} alone is off: its predictions {ends} ({shares}); check its clocks, "
+                "its mounting and the floor it was driven on, or leave it out."
+            )
+    listed = ", ".join(f"{each.source} {each.share:.1%}" for each in errors)
+    yield f"By recording, errors after {errors[0].horizon_s:g} s as shares of the path: {listed}."

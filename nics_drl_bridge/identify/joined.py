@@ -1,0 +1,32 @@
+"""Joins recordings of one robot for one fit: the clocks of each are aligned by itself."""
+
+from collections.abc import Sequence
+
+from nics_drl_bridge.errors import FitError, RecordingError
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.identify import clocks, repair, run
+from nics_drl_bridge.recording.joining import join
+from nics_drl_bridge.recording.recording import Recording, check
+from nics_drl_bridge.robot.spec import RobotSpec
+
+
+def join_recordings(recordings: Sequence[Recording], spec: RobotSpec) -> Recording:
+    """Joins recordings of a robot; RecordingError if one is not of it, or its clocks stay apart."""
+    if not recordings:
+        raise RecordingError("no recording was given; give one or more.")
+    if len(recordings) == 1:
+        return recordings[0]
+    offsets = [clock_offset(each, spec) for each in recordings]
+    return join(recordings, offsets)
+
+
+def clock_offset(recording: Recording, spec: RobotSpec) -> float:
+    """Returns what, added to the pose's stamps, gives the commands' clock [s], by this drive."""
+    if recording.pose.clock == recording.command.clock:
+        return 0.0
+    drive = Drive(check(recording, spec), spec)
+    try:
+        return run((repair, clocks), drive).calibration.clock_offset_s
+    except FitError as error:
+        fault = f"{recording.source}: its two clocks can't be aligned by this drive alone ({error})"
+        raise RecordingError(f"{fault}; record pose and commands by one clock.") from None

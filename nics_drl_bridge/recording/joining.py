@@ -1,0 +1,213 @@
+"""Joins recordings of one robot into one, as episodes on one time axis that no window crosses.
+
+Each recording is split: its first part is to learn from, the rest is held out. All parts to learn
+from come first, so that one time separates them from those that are held out.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import RecordingError
+from nics_drl_bridge.geometry import Array
+from nics_drl_bridge.recording.recording import STREAMS, Episode, Recording, Stream
+
+LEARNT_SHARE = 2.0 / 3.0  # of each recording
+APART_S = 30.0  # between two episodes: longer than any prediction and any search for a delay
+LEAD_S = 2.0  # of commands before an episode, for states to follow them
+SETTLE_S = 5.0  # for which the first of these commands counts before them
+AFTER_S = 5.0  # of commands after an episode, for searches of a delay
+SHORTEST_SPLIT_S = 6.0  # shorter recordings are learnt from whole
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A part of a recording that becomes an episode."""
+
+    recording: Recording
+    start_s: float  # first and last pose [s]
+    end_s: float
+    is_learnt: bool
+    source: str
+
+
+def join(recordings: Sequence[Recording], offsets: Sequence[float] = ()) -> Recording:
+    """Joins recordings of one robot; RecordingError if their variables differ.
+
+    `offsets` are added to the stamps of each pose to give those of its commands [s], where the two
+    have clocks of their own; by default none.
+    """
+    offsets = offsets or [0.0] * len(recordings)
+    aligned = [_on_one_clock(*pair) for pair in zip(recordings, offsets, strict=True)]
+    _check_alike(aligned)
+    parts = [part for recording in aligned for part in _parts_of(recording)]
+    learnt = [part for part in parts if part.is_learnt]
+    held_out = [part for part in parts if not part.is_learnt]
+    return _laid_out(aligned, learnt, held_out)
+
+
+def split_at(recording: Recording, starts: Sequence[float], names: Sequence[str]) -> Recording:
+    """Makes episodes of a recording that start at times [s] of the clock that its streams share."""
+    ends = [*starts[1:], np.inf]
+    parts = []
+    for start, end, name in zip(starts, ends, names, strict=True):
+        pose = recording.pose
+        own = replace(recording, pose=pose.rows((pose.t >= start) & (pose.t < end)), source=name)
+        if len(own.pose.t) > 1:
+            parts.append(own)
+    return replace(join(parts), source=recording.source) if len(parts) > 1 else recording
+
+
+def _on_one_clock(recording: Recording, offset: float) -> Recording:
+    pose, command = recording.pose, recording.command
+    if pose.clock == command.clock:
+        return recording
+    said = f"{recording.source}: the clock of its pose was aligned by {offset:.3f} s."
+    pose = replace(pose, t=pose.t + offset, clock=command.clock)
+    return replace(recording, pose=pose, repairs=(*recording.repairs, said))
+
+
+def _check_alike(recordings: Sequence[Recording]) -> None:
+    """Refuses recordings of different robots."""
+    first = recordings[0]
+    for other in recordings[1:]:
+        shapes = [each.command.values.shape[1] for each in (first, other)]
+        if shapes[0] != shapes[1] or first.variables != other.variables:
+            fault = f"{other.source}: has {', '.join(other.variables) or f'{shapes[1]} commands'}"
+            mine = ", ".join(first.variables) or f"{shapes[0]} commands"
+            advice = "join only drives of one robot, by one mapping"
+            raise RecordingError(f"{fault}, {first.source} has {mine}; {advice}.")
+
+
+def _parts_of(recording: Recording) -> list[_Part]:
+    """Splits a recording into the part to learn from and the rest; episodes stay as they are."""
+    if recording.episodes:
+        until = recording.learn_until_s
+        learnt_until = np.inf if until is None else float(recording.pose.t[0]) + until
+        return [
+            _Part(recording, e.start_s, e.end_s, e.start_s <= learnt_until, e.source)
+            for e in recording.episodes
+        ]
+    pose = recording.pose.t
+    begin = max(float(pose[0]), float(recording.command.t[0]))
+    end = float(pose[-1])
+    if not begin < end:
+        fault = "its commands and poses share no time"
+        raise RecordingError(f"{recording.source}: {fault}; check that they are of one drive.")
+    if end - begin < SHORTEST_SPLIT_S:
+        return [_Part(recording, begin, end, True, recording.source)]
+    middle = begin + LEARNT_SHARE * (end - begin)
+    last = float(pose[pose <= middle][-1])
+    first = float(pose[pose > middle][0])
+    return [
+        _Part(recording, begin, last, True, recording.source),
+        _Part(recording, first, end, False, recording.source),
+    ]
+
+
+def _laid_out(
+    recordings: Sequence[Recording], learnt: Sequence[_Part], held_out: Sequence[_Part]
+) -> Recording:
+    """Lays parts out on one time axis, each pose beginning where the one before ended."""
+    shared = [name for name in STREAMS if all(name in each.streams for each in recordings)]
+    streams: dict[str, list[Stream]] = {name: [] for name in shared}
+    episodes = []
+    start, place = 0.0, np.zeros(3)
+    for part in (*learnt, *held_out):
+        shift = start - part.start_s
+        cut = _cut(part, shared)
+        first = cut["pose"].values[0]
+        cut["pose"] = _moved(cut["pose"], first, place)
+        place = cut["pose"].values[-1]
+        for name, stream in cut.items():
+            streams[name].append(replace(stream, t=stream.t + shift))
+        episodes.append(Episode(part.source, start, part.end_s + shift))
+        start = part.end_s + shift + APART_S
+    made: dict[str, Any] = {name: _end_to_end(name, parts) for name, parts in streams.items()}
+    sources = list(dict.fromkeys(part.source for part in (*learnt, *held_out)))
+    until = episodes[len(learnt) - 1].end_s
+    without: dict[str, Any] = dict.fromkeys(name for name in STREAMS if name not in shared)
+    return replace(
+        recordings[0],
+        **without,
+        **made,
+        source=", ".join(dict.fromkeys(each.source for each in recordings)),
+        repairs=(*_about(sources, bool(held_out)), *_repairs_of(recordings, shared)),
+        robot=next((each.robot for each in recordings if each.robot is not None), None),
+        episodes=tuple(episodes),
+        learn_until_s=until,
+    )
+
+
+def _cut(part: _Part, names: Sequence[str]) -> dict[str, Stream]:
+    """Returns the streams of a part: the commands with those before and after it."""
+    cut = {}
+    for name in names:
+        stream = part.recording.streams[name]
+        if name == "command":
+            cut[name] = _commands_around(stream, part)
+            continue
+        rows = (stream.t >= part.start_s) & (stream.t <= part.end_s)
+        if rows.sum() < 2:
+            where = f"between {part.start_s:.1f} and {part.end_s:.1f} s"
+            fault = f"{part.source}: has no {name} {where}"
+            raise RecordingError(f"{fault}; leave this recording, or its {name}, out.")
+        cut[name] = stream.rows(rows)
+    return cut
+
+
+def _commands_around(command: Stream, part: _Part) -> Stream:
+    """Returns the commands of a part, and before them the one in effect, for states to settle."""
+    lead = part.start_s - LEAD_S
+    first = max(int(np.searchsorted(command.t, lead, side="right")) - 1, 0)
+    last = int(np.searchsorted(command.t, part.end_s + AFTER_S, side="right"))
+    rows = command.rows(slice(first, max(last, first + 1)))
+    t = np.maximum(rows.t, lead)
+    t = np.append(t[0] - SETTLE_S, t)
+    values = np.concatenate([rows.values[:1], rows.values])
+    sigma = None if rows.sigma is None else np.concatenate([rows.sigma[:1], rows.sigma])
+    return replace(rows, t=t, values=values, sigma=sigma)
+
+
+def _moved(pose: Stream, first: Array, place: Array) -> Stream:
+    """Moves poses (T, 3) rigidly so that the first lies at a place: a robot moves alike anywhere.
+
+    Between two episodes the pose is then at rest, whatever their frames are.
+    """
+    values = geometry.compose(place, geometry.between(first, pose.values))
+    if pose.sigma is None:
+        return replace(pose, values=values)
+    c, s = np.cos(place[2] - first[2]), np.sin(place[2] - first[2])
+    x, y, heading = pose.sigma.T
+    sigma = np.stack([np.hypot(c * x, s * y), np.hypot(s * x, c * y), heading], axis=1)
+    return replace(pose, values=values, sigma=sigma)
+
+
+def _end_to_end(name: str, parts: Sequence[Stream]) -> Stream:
+    """Appends streams; a deviation counts only if all of them have one."""
+    for before, after in pairwise(parts):
+        if after.t[0] < before.t[-1]:
+            raise RecordingError(f"{name}: two episodes overlap in time; this is a fault of ours.")
+    known = all(part.sigma is not None for part in parts)
+    sigmas = [part.sigma for part in parts if part.sigma is not None]
+    sigma = np.concatenate(sigmas) if known else None
+    t = np.concatenate([part.t for part in parts])
+    values = np.concatenate([part.values for part in parts])
+    return Stream(t, values, parts[0].clock, sigma)
+
+
+def _about(sources: Sequence[str], is_split: bool) -> tuple[str, ...]:
+    names = ", ".join(sources) if len(sources) <= 10 else f"{sources[0]} to {sources[-1]}"
+    held = "the last third of each was held out of the first fit"
+    held = held if is_split else "all were learnt from, as they are too short to hold a part out"
+    return (f"{len(sources)} drives were joined ({names}): {held}; no prediction crosses over.",)
+
+
+def _repairs_of(recordings: Sequence[Recording], shared: Sequence[str]) -> tuple[str, ...]:
+    lost = {name for each in recordings for name in each.streams} - {*shared}
+    told = [f"{name} was left out, as not all of the recordings have it." for name in sorted(lost)]
+    return (*told, *dict.fromkeys(said for each in recordings for said in each.repairs))

@@ -1,0 +1,142 @@
+"""Several recordings in one fit."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from nics_drl_bridge import geometry
+from nics_drl_bridge.errors import FitError
+from nics_drl_bridge.generator import generate, lidar_of
+from nics_drl_bridge.identify import open_loop
+from nics_drl_bridge.identify.by_recording import Alone
+from nics_drl_bridge.identify.calibration import Calibration
+from nics_drl_bridge.identify.conclusion import conclude
+from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.identify import identify
+from nics_drl_bridge.identify.joined import join_recordings
+from nics_drl_bridge.identify.report import fit_report
+from nics_drl_bridge.identify.shooting import Shooting
+from nics_drl_bridge.recording.recording import Recording, Stream
+from nics_drl_bridge.robot.spec import robot_from
+
+ROBOT = robot_from(
+    {"kind": "differential", "footprint_radius": 0.2},
+    {"forward_command": (-0.8, 0.8), "turn_command": (-1.5, 1.5)},
+)
+STEP = 0.02
+LAG_S = 0.1
+GAIN = np.array([0.9, 0.8])  # of forward and turn
+
+
+def driven(source: str, forward: float, turn: float, seconds: float = 24.0, seed: int = 0,
+           gain: np.ndarray = GAIN, clock_ahead: float = 0.0) -> Recording:  # fmt: skip
+    """A differential robot that lags behind commands up to these [m/s, rad/s], seen at 50 Hz."""
+    rng = np.random.default_rng(seed)
+    count = round(seconds / STEP)
+    t = STEP * np.arange(count)
+    held = rng.uniform(-1.0, 1.0, (count // 40 + 1, 2)).repeat(40, axis=0)[:count]
+    command = held * np.array([forward, turn])
+    twist, pose = np.zeros((count, 2)), np.zeros((count, 3))
+    for k in range(1, count):
+        twist[k] = twist[k - 1] + (STEP / LAG_S) * (gain * command[k - 1] - twist[k - 1])
+        arc = np.array([twist[k, 0], 0.0, twist[k, 1]]) * STEP
+        pose[k] = geometry.compose(pose[k - 1], geometry.exp(arc))
+    pose += rng.normal(0.0, [0.001, 0.001, 0.001], pose.shape)
+    clock = "mocap" if clock_ahead else "robot"
+    return Recording(Stream(t, command), Stream(t + clock_ahead, pose, clock), source=source)
+
+
+STRAIGHT = driven("straight.csv", 0.8, 0.0)
+TURNING = driven("turning.csv", 0.0, 1.5, seed=1)
+
+
+@pytest.fixture(scope="module")
+def together():
+    return generate([STRAIGHT, TURNING], ROBOT, lidar_of(ROBOT), (), strict=True)
+
+
+def test_no_prediction_window_crosses_from_one_drive_to_another():
+    joined = join_recordings([STRAIGHT, TURNING], ROBOT)
+    drive = Drive(joined, ROBOT)
+    for horizon in (0.5, 2.0, 5.0):
+        chosen = open_loop.windows(drive, Calibration(), 0.0, drive.duration_s, horizon, 0.1)
+        assert len(chosen.start_t) > 50
+        ends = joined.episode_at(chosen.end_t)
+        assert np.array_equal(joined.episode_at(chosen.start_t), ends)
+        assert set(ends) == {0, 1, 2, 3}
+
+
+def test_no_window_of_the_fit_crosses_either(together):
+    _, identified = together
+    samples, recording = identified.samples, identified.recording
+    problem = Shooting(samples, lambda _: samples.x, lambda model, _: model, lambda *_: np.ones(3))
+    first, steps = problem.starts()
+    at = recording.episode_at(samples.t)
+    assert set(at) == {0, 1, 2, 3}
+    for column in steps.T:
+        some = column > 0
+        assert np.array_equal(at[first[some]], at[(first + column)[some]])
+
+
+def test_not_even_episodes_without_a_gap_are_crossed():
+    whole = driven("whole.csv", 0.8, 1.5)
+    joined = join_recordings([STRAIGHT, TURNING], ROBOT)
+    start, end = (replace(joined.episodes[0], start_s=a, end_s=b) for a, b in ((0, 12), (12, 24)))
+    cut = replace(whole, episodes=(start, end))
+    chosen = open_loop.windows(Drive(cut, ROBOT), Calibration(), 0.0, 24.0, 2.0, 0.1)
+    crossing = (chosen.start_t < 12.0) & (chosen.end_t > 12.0)
+    assert len(chosen.start_t) > 100
+    assert not crossing.any()
+
+
+def test_two_drives_teach_together_what_neither_does_alone(together):
+    with pytest.raises(FitError):
+        generate(STRAIGHT, ROBOT, lidar_of(ROBOT), (), strict=True)
+    with pytest.raises(FitError):
+        generate(TURNING, ROBOT, lidar_of(ROBOT), (), strict=True)
+    model, identified = together
+    last = identified.judgement[-1]
+    assert last.model.position_m < 0.02
+    assert "(the last third of each drive)" in model.report
+    assert "straight.csv, turning.csv" in model.report
+    assert not identified.fit.unmoved
+
+
+def test_clocks_of_their_own_are_aligned_drive_by_drive():
+    drives = [
+        driven(f"{k}.csv", 0.8, 1.5, seed=k, clock_ahead=ahead)
+        for k, ahead in enumerate((3.0, -40.0))
+    ]
+    joined = join_recordings(drives, ROBOT)
+    said = " ".join(joined.repairs)
+    aligned = re.findall(r"(\d).csv: the clock of its pose was aligned by (-?[\d.]+) s", said)
+    # Each is sought by the commands, and so includes the same lag of the robot.
+    lags = [
+        float(offset) - sought for (_, offset), sought in zip(aligned, (-3.0, 40.0), strict=True)
+    ]
+    assert np.abs(lags).max() < 0.3
+    assert lags[0] == pytest.approx(lags[1], abs=0.03)
+    found = identify(joined, ROBOT)
+    assert found.judgement[-1].model.position_m < 0.05
+
+
+def test_a_recording_that_alone_is_off_is_named():
+    good = [driven(f"good{k}.csv", 0.8, 1.5, seed=k) for k in range(2)]
+    slippery = driven("slippery.csv", 0.8, 1.5, seed=5, gain=np.array([0.5, 0.4]))
+    found = identify(join_recordings([*good, slippery], ROBOT), ROBOT)
+    named = [note for note in found.notes if isinstance(note, Alone)]
+    assert len(named) == 1
+    assert named[0].startswith("slippery.csv alone is off: its predictions end")
+    assert named[0] in conclude(found).doubts
+    assert "slippery.csv alone is off" in " ".join(fit_report("three", ROBOT, found).split())
+
+
+def test_alike_recordings_are_listed_and_none_is_blamed():
+    good = [driven(f"good{k}.csv", 0.8, 1.5, seed=k) for k in range(2)]
+    found = identify(join_recordings(good, ROBOT), ROBOT)
+    assert not [note for note in found.notes if isinstance(note, Alone)]
+    assert any(note.startswith("By recording, errors after 5 s") for note in found.notes)
