@@ -148,7 +148,7 @@ def _numbers(release: str) -> tuple[int, ...]:
     return tuple(int(part) for part in re.findall(r"\d+", release.partition("+")[0])[:3])
 
 
-def own_fault(error: Exception) -> str | None:
+def own_fault(error: BaseException) -> str | None:
     """A clause about an error that a user's own task raised, with its place; else None."""
     for frame, line in reversed(list(walk_tb(error.__traceback__))):
         task, module = type(frame.f_locals.get("self")), str(frame.f_globals.get("__name__"))

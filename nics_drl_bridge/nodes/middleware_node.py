@@ -83,8 +83,8 @@ class MiddlewareNode(ManagedNode):
         trouble = silence(health, awaited, self._rejected)
         self._rejected = health.rejected
         message = trouble or ("receiving" if self.state == ACTIVE else self.state)
-        told = facts(health) | ({"imu": missing} if missing else {})
-        return runner.Condition(message, bool(trouble), told, self._hardware)
+        shown = facts(health) | ({"imu": missing} if missing else {})
+        return runner.Condition(message, bool(trouble), shown, self._hardware)
 
 
 def silence(health: Health, expected: Sequence[str], before: Mapping[str, int]) -> str:
