@@ -74,6 +74,14 @@ def bare_node() -> None:
     rclpy.spin(node)
 
 
+class FrozenWriter(gate_log.BoxWriter):
+    """A writer of the black box that does nothing, as if its disk hung."""
+
+    def _start(self) -> None:
+        super()._start()
+        self._process.send_signal(signal.SIGSTOP)
+
+
 def ill_gate(control: str, arguments: list[str]) -> None:
     """A control's gate: the real one, but for what is taken out."""
     if control == "busy":
@@ -81,7 +89,7 @@ def ill_gate(control: str, arguments: list[str]) -> None:
         for name in ("scan", "odometry", "estimate", "command", "e_stop"):
             setattr(command_gate, name, _often(getattr(command_gate, name)))
     else:
-        gate_log.write = lambda *_: time.sleep(10 * HUNG_S)
+        gate_log.BoxWriter = FrozenWriter
         gate_log.CLOSING_S = HUNG_S
     start(GATE, [GATE, *arguments])
 
