@@ -7,6 +7,9 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.kernels import kernel
 from nics_drl_bridge.policy import local_map_kernels as kernels
 
+INADMISSIBLE = 500.0  # half the price of a twist that hits before it can be stopped
+MOVING = 0.05  # speed above which a robot has to be stopped [m/s]
+
 
 class LookAhead(NamedTuple):
     """Parameters of the roll-outs of a robot."""
@@ -14,7 +17,10 @@ class LookAhead(NamedTuple):
     reach: Array  # (3,) greatest change of a twist in one period
     period: float  # time step [s]
     steps: int
-    rest: float  # time to come to rest [s]
+    reaction: float  # time until a robot that is told to stop brakes [s]
+    slowness: float  # inverse of the deceleration that follows [s^2/m]
+    lever: float  # by which a turn rate adds to the speed that is braked [m]
+    far: float  # distance along an axis, beyond which nothing is known [m]
 
 
 class TwistWeights(NamedTuple):
@@ -38,20 +44,30 @@ def choose_all(out, scans, goals, twists, candidates, ahead, weights, sense):  #
 def choose(around, twist, candidates, ahead, weights):  # type: ignore[no-untyped-def]
     """Returns the index of the cheapest candidate (K, 3), preferring those within the window."""
     best, least = 0, math.inf
+    # Where braking takes time, a robot that could not stop a period later is told to stop now.
+    late = ahead.slowness > 0.0 and math.hypot(twist[0], twist[1]) > MOVING
+    late = late and cost_of(around, twist, twist, ahead, weights) > INADMISSIBLE
     for k in range(candidates.shape[0]):
         far = False
+        moves = False
         for i in range(3):
+            moves |= candidates[k, i] != 0.0
             far |= abs(candidates[k, i] - twist[i]) > ahead.reach[i]
-        cost = cost_of(around, candidates[k], ahead, weights)
-        cost += 1e6 if far else 0.0
+        cost = cost_of(around, candidates[k], twist, ahead, weights)
+        # Where braking takes time a twist is judged from the present one, however far that is.
+        cost += 1e6 if far and ahead.slowness == 0.0 else 0.0
+        cost += 1e6 if late and moves else 0.0
         if cost < least:
             best, least = k, cost
     return best
 
 
 @kernel
-def cost_of(around, aimed, ahead, weights):  # type: ignore[no-untyped-def]
-    """Cost of holding a twist (3,), which is inadmissible if it hits before it can be stopped."""
+def cost_of(around, aimed, twist, ahead, weights):  # type: ignore[no-untyped-def]
+    """Cost of holding a twist (3,), which is inadmissible if it hits before it can be stopped.
+
+    A robot whose brakes take time comes from its present twist (3,), which may be faster.
+    """
     period, steps, keep = ahead.period, ahead.steps, around.clearance
     x, y, heading, c, s = 0.0, 0.0, 0.0, 1.0, 0.0
     least, near, free = kernels.way_at(x, y, around), math.inf, steps
@@ -63,7 +79,7 @@ def cost_of(around, aimed, ahead, weights):  # type: ignore[no-untyped-def]
         heading += aimed[2] * period
         c, s = math.cos(heading), math.sin(heading)
         room = kernels.room_at(x, y, c, s, around)
-        if room < limit:
+        if room < limit or max(abs(x), abs(y)) > ahead.far:
             free = step
             break
         near = min(near, room - keep.margin)
@@ -75,4 +91,13 @@ def cost_of(around, aimed, ahead, weights):  # type: ignore[no-untyped-def]
     cost += weights.clearance * (1.0 - min(max(near, 0.0), keep.soft) / keep.soft)
     cost += weights.time * (1.0 - free / steps)
     moves = abs(aimed[0]) + abs(aimed[1]) > 1e-9
-    return cost + (1e3 if moves and free * period < ahead.rest else 0.0)
+    # The path of an even braking is that of half its time at full speed.
+    speed = math.hypot(aimed[0], aimed[1])
+    pace = speed + ahead.lever * abs(aimed[2])
+    faster = 1.0
+    if ahead.slowness > 0.0 and speed > 0.0:
+        present = math.hypot(twist[0], twist[1])
+        faster = max(1.0, present / speed)
+        pace = max(pace, present + ahead.lever * abs(twist[2]))
+    rest = faster * (ahead.reaction + 0.5 * pace * ahead.slowness)
+    return cost + (2.0 * INADMISSIBLE if moves and free * period < rest else 0.0)

@@ -4,7 +4,7 @@ import math
 import os
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
@@ -16,9 +16,11 @@ from nics_drl_bridge.generator import BUILTIN_SEED, CONTROL_PERIOD_S, SimulatorM
 from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.policy import mppi_kernels as kernels
-from nics_drl_bridge.policy.local_map import outline_of, rays_of, scratch_of
+from nics_drl_bridge.policy.local_map import MOST_M, outline_of, rays_of, scratch_of
 from nics_drl_bridge.policy.local_map_kernels import Clearance, FootprintDiscs, MapScratch, ScanRays
+from nics_drl_bridge.policy.stopping import longest_stop_s
 from nics_drl_bridge.recording import textbook
+from nics_drl_bridge.robot.braking import braking_of
 from nics_drl_bridge.robot.kernels import SERIES, term_arrays, with_coefficients
 from nics_drl_bridge.robot.kinds import steady_twist
 from nics_drl_bridge.robot.taylor import TaylorModel
@@ -51,7 +53,7 @@ class Mppi:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        _ = self._plant
+        _ = self._halt
 
     def act(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """See `Policy`."""
@@ -70,10 +72,9 @@ class Mppi:
         scans, _, twists = self._seen(observation)
         out = np.empty(len(scans), np.bool_)
         given = out, np.atleast_2d(commands).astype(np.float64), scans, twists
-        angles = np.array([each.unit == "rad" for each in self.task.robot.command])
-        most = math.ceil(LONGEST_STOP_S / self._period)
-        halt = kernels.Halt(angles, still(self.task.robot), most)
-        self._run(kernels.stops_all, given, self._plant, halt)
+        tail = self._halt
+        most = max(tail.most, math.ceil(LONGEST_STOP_S / self._period))
+        self._run(kernels.stops_all, given, self._plant, tail._replace(most=most))
         return out.reshape(observation.shape[:-1])
 
     def _seen(self, observation: NDArray[np.float32]) -> tuple[Array, Array, Array]:
@@ -104,6 +105,8 @@ class Mppi:
         low, high = self.task.command_limits
         ends = np.stack([low, high]) if self.task.robot.takes_cmd_vel else np.zeros((1, len(low)))
         half = math.hypot(*np.abs(steady_twist(robot, ends))[:, :2].max(axis=0)) * self.horizon
+        if self._halt.most > 0:
+            half = self._reach
         half = min(half or np.inf, self.task.sight.range_max) + outline.outer
         scratch = scratch_of(self.task.scan_parts, outline, clearance, half)
         (states, count), many = self._plant.settled.shape, self.samples
@@ -130,6 +133,36 @@ class Mppi:
         return CONTROL_PERIOD_S if self.model is None else self.model.control_period
 
     @cached_property
+    def _top_twists(self) -> Array:
+        """Twists (K, 3) to which the ends of the commands lead."""
+        robot = self.task.robot
+        ends = np.array(list(product(*zip(*self.task.command_limits, strict=True))))
+        if robot.takes_cmd_vel:
+            return steady_twist(robot, ends)
+        state = ends @ self._plant.settled.T
+        x = np.concatenate([state, self._kinematics.in_effect(ends)], axis=-1)
+        return self._kinematics.rates(x)[:, :3]
+
+    @cached_property
+    def _halt(self) -> kernels.Halt:
+        """The stop that follows on a roll-out; none where half a roll-out is long enough for it."""
+        robot = self.task.robot
+        angles = np.array([each.unit == "rad" for each in robot.command])
+        braking = braking_of(robot, self._kinematics, *self.task.command_limits)
+        longest = longest_stop_s(braking, self._top_twists)
+        if longest <= 0.5 * self.horizon:
+            return kernels.Halt(angles, still(robot), 0, math.inf)
+        far = min(self._reach, self.task.sight.range_max, MOST_M)
+        return kernels.Halt(angles, still(robot), math.ceil(longest / self._period), far)
+
+    @property
+    def _reach(self) -> float:
+        """Way of a roll-out at full speed, and of the stop that follows on it [m]."""
+        fastest = np.hypot(*np.abs(self._top_twists)[:, :2].max(axis=0))
+        braking = braking_of(self.task.robot, self._kinematics, *self.task.command_limits)
+        return float(fastest * self.horizon + braking.distance(fastest))
+
+    @cached_property
     def _plant(self) -> kernels.Plant:
         model, robot, period = self._kinematics, self.task.robot, self._period
         terms, latency = term_arrays(model), float(model.delays.max(initial=0.0))
@@ -152,7 +185,9 @@ class Mppi:
         kernels.draw(offers, noise, rest, self.seed)
         places = np.linspace(0.0, self.knots - 1.0, round(self.horizon / self._period))
         between = np.maximum(0.0, 1.0 - np.abs(places[:, None] - np.arange(self.knots)))
-        return kernels.Sampling(offers, noise, np.array(self.spreads), between, self.temperature)
+        return kernels.Sampling(
+            offers, noise, np.array(self.spreads), between, self.temperature, self._halt
+        )
 
 
 def _settled(model: TaylorModel, high: Array) -> Array:

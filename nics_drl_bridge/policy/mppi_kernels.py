@@ -42,6 +42,7 @@ class Halt(NamedTuple):
     holds: NDArray[np.bool_]  # (C,) True for commands that are held while the robot stops
     rest: Array  # (C,) of the others
     most: int  # periods that it may take
+    far: float  # distance along an axis, beyond which nothing is known [m]
 
 
 class Sampling(NamedTuple):
@@ -52,6 +53,7 @@ class Sampling(NamedTuple):
     spreads: Array  # (R,) of the noise in these rounds
     between: Array  # (H, Q) shares of the knots in the action of each period
     temperature: float  # of the weights, as a cost
+    halt: Halt  # that follows on each roll-out
 
 
 class Worth(NamedTuple):
@@ -156,6 +158,8 @@ def _stops(command, twist, around, plant, halt, lanes):  # type: ignore[no-untyp
         pose = lanes.pose
         if maps.room_at(pose[0, 0], pose[1, 0], pose[2, 0], pose[3, 0], around) < limit:
             return False
+        if max(abs(pose[0, 0]), abs(pose[1, 0])) > halt.far:
+            return False
         dq = lanes.dq
         fastest = math.hypot(dq[0, 0], dq[1, 0]) + around.outline.outer * abs(dq[2, 0])
         if t > 0 and fastest < STOPPED:
@@ -250,12 +254,32 @@ def _roll(around, plant, sampling, worth, lanes):  # type: ignore[no-untyped-def
         for k in range(lanes.cost.shape[0]):
             if lanes.ended[k] < 0:
                 _judge(k, t, periods, limit, around, worth, lanes)
+    _halt(around, plant, sampling.halt, limit, lanes)
     best = 0
     for k in range(lanes.cost.shape[0]):
         lanes.cost[k] += (1.0 - worth.early) * lanes.way[k]
         if lanes.cost[k] < lanes.cost[best]:
             best = k
     return best
+
+
+@kernel
+def _halt(around, plant, halt, limit, lanes):  # type: ignore[no-untyped-def]
+    """Stops all lanes at the end of their roll-outs, and adds what a touch costs meanwhile."""
+    states = plant.settled.shape[0]
+    for t in range(halt.most):
+        for c in range(plant.low.shape[0]):
+            if not halt.holds[c]:
+                lanes.x[states + c, :] = bend(halt.rest[c], plant.single.curves[c])
+        run(lanes.pose, lanes.x, lanes.dq, plant.terms, plant.series, plant.dt, plant.substeps)
+        pose = lanes.pose
+        for k in range(lanes.cost.shape[0]):
+            if lanes.ended[k] >= 0:
+                continue
+            room = maps.room_at(pose[0, k], pose[1, k], pose[2, k], pose[3, k], around)
+            if room < limit or max(abs(pose[0, k]), abs(pose[1, k])) > halt.far:
+                lanes.cost[k] += HIT * (1.0 - t / halt.most)
+                lanes.ended[k] = t
 
 
 @kernel

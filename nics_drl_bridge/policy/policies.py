@@ -18,10 +18,11 @@ from nics_drl_bridge.geometry import Array
 from nics_drl_bridge.policy import dynamic_window_kernels as kernels
 from nics_drl_bridge.policy.contract import MAPPINGS, SUFFIX, shipped
 from nics_drl_bridge.policy.fallback import Fallback, check_readable
-from nics_drl_bridge.policy.local_map import outline_of, rays_of, scratch_of
+from nics_drl_bridge.policy.local_map import MOST_M, outline_of, rays_of, scratch_of
 from nics_drl_bridge.policy.local_map_kernels import Clearance, FootprintDiscs, MapScratch, ScanRays
 from nics_drl_bridge.policy.mppi import Mppi
 from nics_drl_bridge.policy.stateful import Policy, Stateful
+from nics_drl_bridge.policy.stopping import braking_for
 from nics_drl_bridge.robot.kinds import command_for, has_textbook, reach, steady_twist
 from nics_drl_bridge.robot.spec import RobotSpec
 
@@ -168,15 +169,26 @@ class DynamicWindow:
         twists = _settled(self.task, self._commands, self.model)
         lags = [value for name, value in robot.parameters.items() if name.endswith("_lag")]
         lag = max(lags, default=0.0)
-        brakes = [] if self.model is None else self.model.kinematics.braking.tolist()
-        states = zip(robot.state, brakes, strict=False)
-        fastest = float(np.hypot(twists[:, 0], twists[:, 1]).max())
-        slow = (fastest / rate for v, rate in states if v.unit == "m/s")
         share = 1.0 - math.exp(-self.period / lag) if lag > 0.0 else 1.0
+        braking = braking_for(self.task, self.model)
         steps = [np.diff(np.unique(speeds.round(6))).max(initial=0.0) for speeds in twists.T]
         reach = np.maximum(share * np.ptp(twists, axis=0), steps) + 1e-6  # one step at least
-        rest = 2.0 * self.period + lag + max(slow, default=0.0)
-        ahead = kernels.LookAhead(reach, 1.5 * self.period, self.steps, rest)
+        late = 0.0 if self.model is None else max(0.0, self.model.calibration.command_latency_s)
+        # A twist is held for a period and looked at a period later; then the robot reacts. Its
+        # reaction is known no finer than the steps of its model.
+        reaction = 2.0 * self.period + late + round(braking.reaction_s, 2)
+        step = 1.5 * self.period
+        slowest = float(braking.pace(twists).max()) / (2.0 * braking.deceleration)
+        needed = math.ceil((reaction + slowest) / step)
+        far = math.inf
+        count = self.steps
+        if needed > count:  # it looks ahead for as long as the robot needs, on ground that it sees
+            count = needed
+            fastest = float(np.hypot(twists[:, 0], twists[:, 1]).max())
+            far = min(fastest * step * count, self.task.sight.range_max, MOST_M)
+        ahead = kernels.LookAhead(
+            reach, step, count, reaction, 1.0 / braking.deceleration, braking.lever_m, far
+        )
         return twists, ahead, kernels.TwistWeights(*self.weights)
 
     @cached_property

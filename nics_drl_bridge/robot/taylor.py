@@ -87,11 +87,6 @@ class TaylorModel:
         return not any(each.any() for each in still)
 
     @property
-    def braking(self) -> Array:
-        """Greatest rate towards zero (S,) of each state, from both sides; infinite if unlimited."""
-        return np.asarray(np.minimum(-self.limits[:, 0], self.limits[:, 1]))
-
-    @property
     def delays(self) -> Array:
         """Delays (C,) of the commands beyond their common latency [s]."""
         return delays(self.variables[self.state_size :], self.inputs)

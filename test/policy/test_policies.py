@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from gymnasium.wrappers import TimeLimit
-from robots import lidar
+from robots import field, lidar
 from shapely.geometry import LineString, Point
 
 from nics_drl_bridge.config import share_folder
 from nics_drl_bridge.env.bridge_env import BridgeEnv
 from nics_drl_bridge.env.navigation import Navigation
+from nics_drl_bridge.env.sim_backend import SimBackend
 from nics_drl_bridge.env.vector_env import BridgeVectorEnv
 from nics_drl_bridge.errors import ConfigError
 from nics_drl_bridge.generator import builtin_model, open_model
-from nics_drl_bridge.interface import RobotView
+from nics_drl_bridge.interface import RobotView, Start
 from nics_drl_bridge.policy import policies
 from nics_drl_bridge.policy.evaluation import drive_all, drive_worlds, successes
 from nics_drl_bridge.policy.policies import POLICIES, DynamicWindow, RandomActions, make_policy
@@ -242,3 +244,50 @@ def test_a_shipped_policy_drives_where_it_was_learnt_to(name):
     found = drive_worlds(env, policy.act, range(50))
     assert found.success.mean() >= 0.9
     assert found.collision.mean() <= 0.04
+
+
+def weak_jackal(rate=0.2):
+    """A Jackal whose wheels brake weakly [m/s^2 at the rim], but speed up as ever."""
+    model = builtin_model("jackal")
+    brakes = rate / model.robot.parameters["wheel_radius"]
+    limits = np.array([[-brakes, 10.0 * brakes], [-brakes, 10.0 * brakes]])
+    return replace(model, kinematics=replace(model.kinematics, limits=limits))
+
+
+@pytest.mark.parametrize("name", ["dynamic_window", "mppi"])
+@pytest.mark.parametrize("rate", [0.2, 20.0])
+def test_a_planner_stops_a_robot_before_a_wall_also_if_its_wheels_brake_weakly(name, rate):
+    """The goal is behind the wall, so that it drives up to it, at a speed that it can brake."""
+    model = weak_jackal(rate)
+    task = Navigation(model.robot, model.lidar)
+    backend = SimBackend(model, field(9.0))
+    policy = make_policy(name, task, model)
+    view = backend.reset(Start(0, np.array([-3.0, 0.0, 0.0])))
+    fastest = farthest = -math.inf
+    for _ in range(120):
+        action = policy.act(task.observation(view, {"goal": np.array([6.0, 0.0])}))
+        view, told = backend.step(task.command(action))
+        fastest = max(fastest, float(view.twist[0]))
+        farthest = max(farthest, float(view.pose[0]))
+        assert not told["true_collision"]
+    assert fastest > 0.4
+    assert farthest > 0.5
+
+
+@pytest.mark.parametrize("robot", ["ackermann", "differential", "jackal", "mecanum", "f1tenth"])
+def test_planners_look_ahead_as_far_as_ever_for_robots_that_stop_soon(robot):
+    model = builtin_model(robot)
+    task = Navigation(model.robot, model.lidar)
+    ahead = make_policy("dynamic_window", task, model)._search[1]
+    lag = max(v for k, v in model.robot.parameters.items() if k.endswith("_lag"))
+    assert (ahead.steps, ahead.far) == (10, np.inf)
+    assert ahead.reaction == pytest.approx(2.0 * model.control_period + lag)
+    assert ahead.slowness == 0.0
+    assert make_policy("mppi", task, model)._halt.most == 0
+
+
+@pytest.mark.parametrize("name", ["dynamic_window", "mppi"])
+def test_a_planner_refuses_a_model_that_does_not_stop(name):
+    model = weak_jackal(1e-5)
+    with pytest.raises(ConfigError, match=r"'jackal': by its model it does not stop"):
+        make_policy(name, Navigation(model.robot, model.lidar), model)
