@@ -135,3 +135,31 @@ def test_a_rule_that_a_test_misses_is_found():
 )
 def test_a_rule_that_no_test_misses_is_reported(control, bar):
     assert bar in fails("gate_rules.py", control, *ONE_RULE)[0]
+
+
+@pytest.mark.campaign
+@pytest.mark.timeout(3600)
+def test_a_held_body_is_stopped_and_ten_hours_of_free_driving_are_not():
+    code, result = asked("gate_held.py", "--hours", "10", timeout_s=3500.0)
+    assert (code, result["failures"]) == (0, [])
+    assert result["trips"] == 0
+
+
+@pytest.mark.slow
+def test_a_held_body_is_stopped_and_free_driving_is_not():
+    few = ("--hours", "0.1", "--holds", "10", "--case", "0")
+    code, result = asked("gate_held.py", *few)
+    assert (code, result["failures"]) == (0, [])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("control", "bar"),
+    [
+        ("rule_off", "of the held bodies were stopped in time"),
+        ("zero_thresholds", "robots that drove freely were stopped by body_held, bar 0"),
+    ],
+)
+def test_a_rule_for_held_bodies_that_is_none_is_noticed(control, bar):
+    missed = fails("gate_held.py", control, "--hours", "0.01", "--holds", "4", "--case", "7")
+    assert any(bar in line for line in missed)

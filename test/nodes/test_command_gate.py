@@ -368,6 +368,40 @@ def test_another_publisher_of_commands_is_told_of_as_long_as_it_is_there(robot):
     robot.peer.until(lambda: "others publish" not in robot.diagnosed()[""], "its end")
 
 
+def test_a_second_policy_that_joins_while_the_robot_drives_stops_it_and_is_named(robot):
+    robot.drives()
+    node = robot.peer.node
+    commands = node.create_publisher(TwistStamped, "cmd_vel_raw", qos.COMMAND)
+    others = node.create_timer(PERIOD_S, lambda: commands.publish(robot.command()))
+    try:
+        robot.says("two_policies: topic=cmd_vel_raw")
+        said = robot.diagnosed()[""]
+        assert said.count(f"/{node.get_name()} (publisher ") == 2
+        assert "both publish on cmd_vel_raw" in said
+        robot.stops()
+        assert robot.call("reset").success
+        assert "one_policy" in robot.call("arm").message
+    finally:
+        node.destroy_timer(others)
+        node.destroy_publisher(commands)
+    robot.drives()
+
+
+def test_a_body_that_is_held_while_odometry_moves_is_stopped(robot):
+    robot.drives()
+    # Walls all around that stay where they are, however far odometry says that the robot went.
+    bearings = robot.lidar.angles
+    across = np.abs(np.sin(bearings)) / 1.2
+    along = np.abs(np.cos(bearings)) / 2.0
+    free, robot.walls = robot.walls, 1.0 / np.maximum(across, along)
+    try:
+        robot.says("body_held: topic=scan")
+        robot.stops()
+    finally:
+        robot.walls = free
+    robot.drives()
+
+
 def test_an_e_stop_that_falls_silent_stops_the_robot_by_default_and_stays(robot):
     robot.drives()
     robot.silent = {"e_stop"}

@@ -117,3 +117,15 @@ def test_the_clock_of_a_gate_that_runs_can_not_be_changed(domain_id, simulated):
     finally:
         node.destroy_node()
         context.try_shutdown()
+
+
+def test_the_parameter_that_was_split_names_the_two_that_it_is_now(declared):
+    with pytest.raises(ConfigError, match=r"'estimate_position' .* and 'estimate_heading'"):
+        declared({"estimate_std": 0.5})
+
+
+def test_metres_and_radians_of_the_estimate_have_parameters_of_their_own(declared):
+    config = declared({"estimate_position": 0.7, "estimate_heading": 0.2, "stop_when_held": False})
+    assert (config.estimate_position, config.estimate_heading) == (0.7, 0.2)
+    assert not config.stop_when_held
+    assert declared().stop_when_held
