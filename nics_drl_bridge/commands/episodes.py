@@ -109,7 +109,7 @@ def env_with(
     register_envs()
     opened, task = open_policy(policy, model, conditions.fallback, conditions.kind)
     task = replace(task, **conditions.task)
-    given = {"backend": backend, "model": model, "world": world, "task": task}
+    given: dict[str, Any] = {"backend": backend, "model": model, "world": world, "task": task}
     limit = conditions.steps or pace_of(model, [world]).steps
     return gymnasium.make(NAVIGATION, max_episode_steps=limit, **given), opened
 
