@@ -21,9 +21,9 @@ from nics_drl_bridge.middleware.measurement import CMD_VEL, IMU, ODOM, POSE, SCA
 from nics_drl_bridge.middleware.middleware import Middleware
 from nics_drl_bridge.recording import topic_roles
 from nics_drl_bridge.recording.bag_file import BagFile, Message, opened
+from nics_drl_bridge.recording.imu_axis import GyroReader
 from nics_drl_bridge.recording.messages import (
     commanded,
-    gyro,
     stamp,
     turn_variance,
     twist_row,
@@ -165,6 +165,7 @@ class Playback:
         self.middleware, self.lidar = Middleware(model), model.lidar
         self._reader: Reader | None = None
         self._started = False
+        self._gyro = GyroReader()
 
     def take(self, role: str, message: Message) -> bool:
         """Feeds a message; True if it was used and is the newest of its topic."""
@@ -212,7 +213,7 @@ class Playback:
         return self.middleware.pose(stamp(message), arrival_ns, whole_pose(message), covariance)
 
     def _imu(self, arrival_ns: int, message: Any) -> bool:
-        if (measured := gyro(message)) is None:
+        if (measured := self._gyro.read(message)) is None:
             return self.middleware.cache.reject(f"{IMU}: no angular velocity")
         return self.middleware.imu(stamp(message), arrival_ns, *measured)
 

@@ -28,7 +28,8 @@ from nics_drl_bridge.nodes.parameters import IMU, drive
 from nics_drl_bridge.recording.bag_file import Message
 from nics_drl_bridge.recording.bag_reader import joint_streams
 from nics_drl_bridge.recording.excite import PERIOD_S, STILL_S, DrivePlan
-from nics_drl_bridge.recording.messages import gyro, imu_row, pose_row, stamp, twist_row
+from nics_drl_bridge.recording.imu_axis import GyroReader
+from nics_drl_bridge.recording.messages import imu_row, pose_row, stamp, twist_row
 from nics_drl_bridge.recording.recording import Recording
 from nics_drl_bridge.recording.stamping import Nanoseconds, TopicData, streams
 from nics_drl_bridge.recording.topic_roles import TopicRoles, imu_topics, topic_roles
@@ -185,6 +186,7 @@ class RecordNode(qos.QosWatch):
         take_pose = partial(self._take, "pose", pose_row)
         self.create_subscription(PoseStamped, "pose", take_pose, qos.SENSOR)
         self._imu_topic = ""  # the first that speaks
+        self._gyro = GyroReader()
         for topic in imu_topics(self._order.imu, by_default=True):
             self.create_subscription(Imu, topic, partial(self._take_imu, topic), qos.SENSOR)
         self._began, self._heard = time.monotonic(), -np.inf
@@ -211,8 +213,10 @@ class RecordNode(qos.QosWatch):
 
     def _take_imu(self, topic: str, message: Imu) -> None:
         self._imu_topic = self._imu_topic or topic
-        if topic == self._imu_topic and gyro(message) is not None:
-            self._take("imu", imu_row, message)
+        measured = self._gyro.read(message) if topic == self._imu_topic else None
+        if measured is not None:
+            ax, ay, _ = imu_row(message)
+            self._log.add("imu", stamp(message), (ax, ay, measured[0]))
 
     def _on_odometry(self, message: Odometry) -> None:
         self._stamp_ns = max(self._stamp_ns, conversions.stamp_from_ros(message.header.stamp))

@@ -27,6 +27,7 @@ from nics_drl_bridge.nodes.conversions import INITIAL_POSE, initial_pose
 from nics_drl_bridge.nodes.parameters import AUTO, IMU, NO_POSE, POSE_TYPES, STAMPED, sensors
 from nics_drl_bridge.nodes.runner import declare_row
 from nics_drl_bridge.recording import messages
+from nics_drl_bridge.recording.imu_axis import GyroReader
 from nics_drl_bridge.recording.topic_roles import IMU_NAMES, imu_topics
 
 KINDS_OF_POSE = {each.__name__: each for each in (PoseStamped, PoseWithCovarianceStamped)}
@@ -113,6 +114,7 @@ class RobotTopics:
         wanted = str(self._node.get_parameter(IMU).value)
         topics = imu_topics(wanted, self._model.gyro)
         self._imu_topic = ""  # the first that speaks
+        self._gyro = GyroReader()
         for topic in topics:
             self._subscribe(topic, Imu, partial(self._take_imu, topic), qos.SENSOR)
         self.hoped_for: tuple[str, ...] = ()
@@ -245,7 +247,7 @@ class RobotTopics:
         self._imu_topic = self._imu_topic or topic
         if topic != self._imu_topic:
             return
-        if (measured := messages.gyro(message)) is None:
+        if (measured := self._gyro.read(message)) is None:
             self.middleware.cache.reject(f"{measurement.IMU}: no angular velocity")
         else:
             self.middleware.imu(messages.stamp(message), self.now_ns(), *measured)

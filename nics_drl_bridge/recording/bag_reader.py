@@ -14,6 +14,7 @@ from nics_drl_bridge.interface import S_PER_NS
 from nics_drl_bridge.recording import messages as msgs
 from nics_drl_bridge.recording import topic_roles as roles
 from nics_drl_bridge.recording.bag_file import BagFile, Message, opened, times_of
+from nics_drl_bridge.recording.imu_axis import AXES, UpAxis, up_axis_of, vector_of
 from nics_drl_bridge.recording.pose_source import source_of_pose
 from nics_drl_bridge.recording.recording import W_FIRST, Recording, check, w_first
 from nics_drl_bridge.recording.stamping import SAME_CLOCK_S, Nanoseconds, TopicData, streams
@@ -42,15 +43,19 @@ def load_bag(path: str | Path, spec: RobotSpec | None, mapping: TopicRoles) -> R
             data["odometry"] = _table(bag, topics["odom"], msgs.twist_row)
         if topic := topics.get("joint_states"):
             data |= joint_streams(topic, bag.messages(topic), spec, mapping, bag.place)
+        repairs: tuple[str, ...] = ()
         if "imu" in topics:
-            data["imu"] = _table(bag, topics["imu"], msgs.imu_row)
+            data["imu"], axis = _imu(bag, topics["imu"])
+            if not axis.is_usual:
+                told = f"imu: by gravity its axis {axis.name} points up, so that is its yaw axis."
+                repairs = (told,)
         latency = latency_of(bag, topics.get("odom"))
         pose = topics.get("pose") or topics["odom"]
         measured_by = source_of_pose(pose, bag.types[pose])
     made: Any = streams(data, mapping.stamps, str(path))
     recording = Recording(
         **made, source=str(path), variables=spec.variable_names, latency=latency,
-        measured_by=measured_by,
+        measured_by=measured_by, repairs=repairs,
     )  # fmt: skip
     return check(recording, spec)
 
@@ -66,6 +71,20 @@ def _table(
         advice = "find out why it was sent, cut the bag there, or choose another topic"
         raise RecordingError(f"{bag.place}: {fault}; {advice}.")
     return TopicData(topic, receive, header, values)
+
+
+def _imu(bag: BagFile, topic: str) -> tuple[TopicData, UpAxis]:
+    """Reads accelerations and yaw rates about the axis that points up."""
+    messages = bag.messages(topic)
+    accelerations = np.array([vector_of(m.content.linear_acceleration) for m in messages])
+    axis = up_axis_of(np.median(accelerations, axis=0))
+    data = _table(bag, topic, msgs.imu_row, messages)
+    if axis.is_usual:
+        return data, axis
+    rates = [getattr(m.content.angular_velocity, AXES[axis.index]) for m in messages]
+    values = data.values.copy()
+    values[:, 2] = axis.sign * np.array(rates)
+    return replace(data, values=values), axis
 
 
 def _command(bag: BagFile, topic: str, spec: RobotSpec) -> TopicData:

@@ -2,6 +2,9 @@
 
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
+from nics_drl_bridge.recording.imu_axis import AXES, UpAxis, up_axis_of
 from nics_drl_bridge.recording.names import words_of
 from nics_drl_bridge.recording.survey import Survey, TableSurvey, unit_in
 
@@ -24,6 +27,8 @@ def guess_yaw_rate(tables: Sequence[TableSurvey]) -> tuple[TableSurvey, Survey] 
 def imu_line(table: TableSurvey, column: Survey, alone: bool, common: str | None) -> str:
     """Returns the line of a mapping for a yaw rate, beside the stamps that are common to all."""
     keys = [f"from: {table.reference(column.name, alone)}"]
+    if column.name.startswith("angular_velocity.") and _up_axis(table).sign < 0.0:
+        keys.append("scale: -1")
     unit = unit_in(column.name)[1]
     if unit == "deg" or max(-column.low, column.high) > FASTEST_RADPS:
         keys.append("unit: deg/s")
@@ -37,9 +42,16 @@ def _of_messages(tables: Sequence[TableSurvey]) -> Iterator[tuple[TableSurvey, S
     for table in tables:
         names = {column.name for column in table.columns}
         if {OF_MESSAGE, "linear_acceleration.x"} <= names:
+            wanted = f"angular_velocity.{AXES[_up_axis(table).index]}"
             for column in table.numbers:
-                if column.name == OF_MESSAGE and column.low < column.high:
+                if column.name == wanted and column.low < column.high:
                     yield table, column
+
+
+def _up_axis(table: TableSurvey) -> UpAxis:
+    """Returns the axis of an IMU's messages that points up."""
+    columns = [table.data[f"linear_acceleration.{axis}"].astype(np.float64) for axis in AXES]
+    return up_axis_of(np.array([float(np.nanmedian(column)) for column in columns]))
 
 
 def _of_columns(tables: Sequence[TableSurvey]) -> Iterator[tuple[TableSurvey, Survey]]:

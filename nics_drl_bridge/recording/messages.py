@@ -155,14 +155,6 @@ def imu_row(message: Any) -> Row:
     return acceleration.x, acceleration.y, message.angular_velocity.z
 
 
-def gyro(message: Any) -> tuple[float, float] | None:
-    """Returns yaw rate [rad/s] and its variance [rad^2/s^2]; None if no rates are measured."""
-    covariance = message.angular_velocity_covariance
-    if covariance[0] == -1.0:
-        return None
-    return float(message.angular_velocity.z), float(covariance[8])
-
-
 @dataclass(frozen=True)
 class Offer:
     """Quality of service that a publisher offers, as far as it decides which subscribers match."""

@@ -18,6 +18,7 @@ from nics_drl_bridge.lidar.spec import LidarSpec, ScanHeader
 from nics_drl_bridge.policy.contract import Contract
 from nics_drl_bridge.recording import messages
 from nics_drl_bridge.recording.bag_file import opened
+from nics_drl_bridge.recording.imu_axis import GyroReader
 from nics_drl_bridge.recording.messages import Offer, Row
 from nics_drl_bridge.recording.topic_roles import IMU, IMU_NAMES, imu_topics
 from nics_drl_bridge.robot.spec import RobotSpec
@@ -89,6 +90,7 @@ class Facts:
     uncovered: int = 0  # number of odometry messages whose covariance of pose or twist is all zeros
     commands: list[Row] = field(default_factory=list)  # vx, vy [m/s], wz [rad/s]
     clock_ns: list[int] = field(default_factory=list)  # content of `/clock` [ns]
+    gyro: GyroReader = field(default_factory=GyroReader)
     yaw_rates: list[tuple[int, float]] = field(default_factory=list)  # of the gyro: stamp [ns]
 
     def take(self, role: str, arrival_ns: int, message: Any) -> None:
@@ -116,7 +118,7 @@ class Facts:
         elif role == CMD_VEL:
             self.commands.append(messages.command_row(message))
         elif role == GYRO:
-            if (measured := messages.gyro(message)) is not None:
+            if (measured := self.gyro.read(message)) is not None:
                 self.yaw_rates.append((messages.stamp(message), measured[0]))
         else:
             self.clock_ns.append(int(message.clock.sec) * NS_PER_S + int(message.clock.nanosec))

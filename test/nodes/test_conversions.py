@@ -14,7 +14,7 @@ from sensor_msgs.msg import Imu, LaserScan
 
 from nics_drl_bridge.lidar.spec import LidarSpec, from_device, load_lidar
 from nics_drl_bridge.nodes import conversions
-from nics_drl_bridge.recording import messages
+from nics_drl_bridge.recording.imu_axis import GyroReader
 from nics_drl_bridge.robot.spec import load_robot
 
 pytestmark = pytest.mark.ros
@@ -174,9 +174,9 @@ def test_an_imu_gives_its_yaw_rate_and_variance_unless_it_has_none():
     message = Imu()
     message.angular_velocity.z = -0.75
     message.angular_velocity_covariance[8] = 0.25
-    assert messages.gyro(over_the_wire(message)) == (-0.75, 0.25)
+    assert GyroReader().read(over_the_wire(message)) == (-0.75, 0.25)
     message.angular_velocity_covariance[0] = -1.0
-    assert messages.gyro(over_the_wire(message)) is None
+    assert GyroReader().read(over_the_wire(message)) is None
 
 
 def test_a_planar_covariance_survives_the_way_through_a_message():

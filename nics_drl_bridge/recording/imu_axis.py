@@ -1,0 +1,68 @@
+"""Which axis of an IMU points up, by gravity: it may be mounted on its side, or upside down."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from nics_drl_bridge.geometry import Array
+
+AXES = "xyz"
+GRAVITY = (7.0, 13.0)  # an acceleration at rest [m/s^2]; others have gravity removed, or are none
+UPRIGHT = 0.85  # least share of gravity along the axis that points up
+REMEMBERED = 200  # messages over which the acceleration is averaged while a robot drives
+
+
+class UpAxis(NamedTuple):
+    """The axis of an IMU that points up, or with the sign -1 down."""
+
+    index: int = 2  # of x, y, z
+    sign: float = 1.0
+
+    @property
+    def name(self) -> str:
+        """The axis as in `-y`."""
+        return f"{'-' if self.sign < 0.0 else ''}{AXES[self.index]}"
+
+    @property
+    def is_usual(self) -> bool:
+        """True if z points up."""
+        return self == UpAxis()
+
+
+def up_axis_of(acceleration: Array) -> UpAxis:
+    """Returns the axis that points up by a mean acceleration (3,) [m/s^2]; z if none shows."""
+    size = float(np.linalg.norm(acceleration))
+    if not GRAVITY[0] < size < GRAVITY[1]:
+        return UpAxis()
+    index = int(np.argmax(np.abs(acceleration)))
+    if abs(acceleration[index]) < UPRIGHT * size:
+        return UpAxis()
+    return UpAxis(index, 1.0 if acceleration[index] > 0.0 else -1.0)
+
+
+def vector_of(vector: Any) -> Array:
+    """Returns a message's vector as an array (3,)."""
+    return np.array([vector.x, vector.y, vector.z], dtype=np.float64)
+
+
+class GyroReader:
+    """Reads yaw rates of the messages of an IMU, however it is mounted."""
+
+    def __init__(self) -> None:
+        self._acceleration = np.zeros(3)
+        self._count = 0
+
+    def read(self, message: Any) -> tuple[float, float] | None:
+        """Returns yaw rate [rad/s] and its variance [rad^2/s^2]; None if none is measured."""
+        covariance = message.angular_velocity_covariance
+        if covariance[0] == -1.0:
+            return None
+        acceleration = vector_of(message.linear_acceleration)
+        if np.isfinite(acceleration).all() and message.linear_acceleration_covariance[0] != -1.0:
+            self._count = min(self._count + 1, REMEMBERED)
+            self._acceleration = self._acceleration + (acceleration - self._acceleration) / float(
+                self._count
+            )
+        axis = up_axis_of(self._acceleration)
+        rate = axis.sign * float(getattr(message.angular_velocity, AXES[axis.index]))
+        return rate, float(covariance[4 * axis.index])
