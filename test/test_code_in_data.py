@@ -330,3 +330,12 @@ def test_settings_of_a_task_of_ones_own_are_read_where_the_caller_names_it(trap)
     settings = load_training(file, task=place)
     assert (settings.task, settings.steps) == (place, 77)
     assert settings_of(run_of_a_task(trap, place), place).task == place
+
+
+def test_a_run_of_a_task_of_ones_own_is_resumed_where_the_caller_names_it(trap):
+    place = f"{trap.file}:Trap"
+    run_of_a_task(trap, place)
+    done = nics("train", "--resume", "--out", "run", cwd=trap.folder)
+    assert "is a program, which a file of data may not start; name it yourself" in done.stderr
+    done = nics("train", "--resume", "--out", "run", "--task", place, cwd=trap.folder)
+    assert "run: holds no checkpoint of these seeds" in done.stderr
