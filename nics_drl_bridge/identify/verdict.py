@@ -67,8 +67,11 @@ def time_without_pose(drive: Drive) -> float:
 
 
 def _gap_rows(drive: Drive) -> list[int]:
-    """Returns the poses after which there is a gap, that of the longest first."""
-    span = np.diff(drive.dated.t)
+    """Returns the poses after which there is a gap, that of the longest first.
+
+    The time between two episodes is no gap: the robot was not recorded there.
+    """
+    span = np.diff(drive.recording.without_gaps(drive.dated.t))
     usual = float(np.median(span[span > 0.0])) if (span > 0.0).any() else 0.0
     rows = np.flatnonzero(span > max(MAX_GAP_S, GAP_STEPS * usual))
     return [int(row) for row in rows[np.argsort(-span[rows], kind="stable")]]

@@ -20,6 +20,7 @@ from nics_drl_bridge.identify.identify import identify
 from nics_drl_bridge.identify.joined import join_recordings
 from nics_drl_bridge.identify.report import fit_report
 from nics_drl_bridge.identify.shooting import Shooting
+from nics_drl_bridge.identify.verdict import about_gaps, time_without_pose
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import robot_from
 
@@ -52,6 +53,12 @@ def driven(source: str, forward: float, turn: float, seconds: float = 24.0, seed
 
 STRAIGHT = driven("straight.csv", 0.8, 0.0)
 TURNING = driven("turning.csv", 0.0, 1.5, seed=1)
+
+
+def test_the_time_between_two_recordings_is_no_gap_in_the_pose():
+    drive = Drive(join_recordings([STRAIGHT, TURNING], ROBOT), ROBOT)
+    assert time_without_pose(drive) == 0.0
+    assert list(about_gaps(drive)) == []
 
 
 @pytest.fixture(scope="module")
