@@ -20,7 +20,7 @@ from nics_drl_bridge.gate.inputs import Input
 from nics_drl_bridge.gate.seal import SEAL, sealed
 from nics_drl_bridge.gate.state import Decision, GateConfig, GateState
 
-FORMAT = "nics_drl_bridge/black_box/3"
+FORMAT = "nics_drl_bridge/black_box/4"
 KEPT_S = 30.0
 LATEST_S = 1e12
 MOST_BYTES = 64 * 2**20  # greatest size of a file that is replayed
