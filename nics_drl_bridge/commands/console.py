@@ -151,6 +151,8 @@ def one_sentence() -> Iterator[None]:
         if was_interrupted(error):
             typer.echo("nics: interrupted; everything that was started has ended.", err=True)
             raise typer.Exit(EXIT_INTERRUPTED) from None
+        if not isinstance(error, Exception):
+            raise
         clause = str(error) if isinstance(error, BridgeError) else extensions.own_fault(error)
         if clause is None and isinstance(error, ImportError):
             clause = extensions.unmet(error)

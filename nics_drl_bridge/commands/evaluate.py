@@ -83,12 +83,15 @@ def evaluate(
     console.tell_replaced(out / driving.EVALUATION)
     if hardware:
         options: dict[str, Any] = {
-            "start": start, "namespace": namespace, "pose_type": pose_type, "imu": imu,
-        }  # fmt: skip
-        driven = partial(
-            driving.drive_vehicle, order, place, arm, tell, partial(_ask, yes),
-            goal_frame=goal_frame, confirm=partial(_confirm, yes), confirm_beyond_m=confirm_beyond,
-        )  # fmt: skip
+            "start": start,
+            "namespace": namespace,
+            "pose_type": pose_type,
+            "imu": imu,
+            "goal_frame": goal_frame,
+            "confirm": partial(_confirm, yes),
+            "confirm_beyond_m": confirm_beyond,
+        }
+        driven = partial(driving.drive_vehicle, order, place, arm, tell, partial(_ask, yes))
         with console.needs_ros("nics evaluate --hardware"):
             evaluated = [driven(**options)]
     else:
