@@ -161,7 +161,7 @@ class DdsBackend:
                 kind = LaserScan if topic == SCAN else Odometry
                 if topic in self._sensors:
                     kind = sensor_type(self._sensors[topic])
-                put = partial(self._mail.put, topic)
+                put = lambda message, mail=self._mail, topic=topic: mail.put(topic, message)  # noqa: E731
                 self._link.node.create_subscription(kind, topic, put, qos.SENSOR, raw=True)
             self._episodes = self._services(model, world, simulator, options, randomisation)
             self._link.begin()
