@@ -1,9 +1,11 @@
 """Joins recordings of one robot for one fit: the clocks of each are aligned by itself."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from nics_drl_bridge.errors import FitError, RecordingError
 from nics_drl_bridge.identify.drive import Drive
+from nics_drl_bridge.identify.gyro import turned_by_gyro
 from nics_drl_bridge.identify.identify import clocks, repair, run
 from nics_drl_bridge.recording.joining import join
 from nics_drl_bridge.recording.recording import Recording, check
@@ -16,8 +18,11 @@ def join_recordings(recordings: Sequence[Recording], spec: RobotSpec) -> Recordi
         raise RecordingError("no recording was given; give one or more.")
     if len(recordings) == 1:
         return recordings[0]
-    offsets = [clock_offset(each, spec) for each in recordings]
-    return join(recordings, offsets)
+    turned = [turned_by_gyro(each) for each in recordings]  # a gyro's bias is that of a drive
+    offsets = [clock_offset(each, spec) for each in turned]
+    joined = join(turned, offsets)
+    gyros = [each.gyro for each in turned]
+    return replace(joined, gyro=gyros[0] if all(each is not None for each in gyros) else None)
 
 
 def clock_offset(recording: Recording, spec: RobotSpec) -> float:

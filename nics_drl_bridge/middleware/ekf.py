@@ -39,6 +39,7 @@ STILL = np.zeros(3)
 REACHABLE = 2.0  # States and commands are cut at this many times their range
 FARTHEST = 1e8  # Innovations beyond this [m, rad, m/s, rad/s] are never believed
 ANYWHERE = (100.0, 100.0, np.pi)  # Std of a pose in a pose sensor's map, by odometry [m, rad]
+STANDS, ABOUT_STANDS = 0.01, 0.05  # of a robot at rest: expected and measured speeds [m/s, rad/s]
 LONGEST_GAP_S = 10.0  # Longest gap that is predicted [s]: beyond, the robot may be anywhere
 
 
@@ -214,13 +215,19 @@ class Estimator:
         variance = believable_variance(measurement.turn_variance)
         known = float(self._noise[Kind.TWIST][2, 2]) if variance is None else variance
         turned = turn_odometry(
-            self._gyro, self._anchor.odom, measurement.odom, measurement.value, self.time_ns, known
-        )
+            self._gyro, self._anchor.odom, measurement.odom, measurement.value, self.time_ns, known,
+            self._rests(measurement.value),
+        )  # fmt: skip
         noise = measurement.noise
         if turned.rate_variance > self._noise[Kind.TWIST][2, 2]:
             noise = np.array(self._noise[Kind.TWIST])
             noise[2, 2] = turned.rate_variance
         return measurement._replace(value=turned.twist, odom=turned.odom, noise=noise), turned
+
+    def _rests(self, twist: Array) -> bool:
+        """True if the robot is expected to stand, and odometry does not say otherwise."""
+        expected, _ = self._expect(Kind.TWIST)
+        return bool((np.abs(expected) < STANDS).all() and (np.abs(twist) < ABOUT_STANDS).all())
 
     def correct(self, measurement: Measurement) -> Judgement:
         """Corrects by a measurement at this time, after bridging unobserved motion."""

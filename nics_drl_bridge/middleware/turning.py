@@ -42,7 +42,11 @@ MEMORY_S = 30.0
 TURN_TO_TELL = 0.5  # rad by the wheels, before gyro and wheels are compared
 SLOPES = (-0.3, 3.0)  # of the gyro's turns to the wheels'; beyond, its axis or unit is wrong
 LEAST_CONTRADICTION = 0.005  # rad, between two odometries
-WRONG_FOR_S = 10.0  # an error of rolling wheels lasts so long: their turns are no independent news
+TURNING_RADPS = 0.1  # slower turns of the wheels do not show their slip
+SCATTER_KNOWN_S = 5.0  # of driving and standing, from which on the wheels' scatter is known
+WHEELS_BIAS = 0.004  # constant error of rolling wheels [rad/s]
+WRONG_FOR_S = 3.0  # other errors of rolling wheels last so long: they are no independent news
+ABOUT_RADPS = 0.005  # yaw rate of a robot that about stands, over a second
 STANDING = 4.0  # standard deviations from the bias within which the robot stands, too
 
 
@@ -69,6 +73,8 @@ class Gyro(NamedTuple):
     product: float = 0.0
     difference_square: float = 0.0
     wheels_turned: float = 0.0  # sum of the sizes [rad]
+    scatter: float = 0.0  # mean square difference of both rates while going straight [rad^2/s^2]
+    compared_s: float = 0.0
     # Of the newest odometry that was used; None before.
     odom: Array | None = None  # (3,) its pose, as it was received
     odom_ns: int = 0
@@ -196,12 +202,14 @@ def _distance(gyro: Gyro, rate: float) -> float:
 
 
 def turn_odometry(
-    gyro: Gyro, before: Array, odom: Array, twist: Array, now_ns: int, rate_variance: float
-) -> Turned:
+    gyro: Gyro, before: Array, odom: Array, twist: Array, now_ns: int, rate_variance: float,
+    resting: bool = False,
+) -> Turned:  # fmt: skip
     """Fuses the turn of an odometry, pose (3,) and twist (3,), with the gyro's since the last one.
 
     `before` (3,) is the pose that was returned for the last one; `rate_variance` that of the yaw
-    rate of the twist. Without a gyro in between, or with a faulty one, the wheels' turn is kept.
+    rate of the twist; `resting` says that the robot stands, as far as is known otherwise. Without
+    a gyro in between, or with a faulty one, the wheels' turn is kept.
     """
     last = before if gyro.odom is None else gyro.odom
     step = geometry.log(geometry.between(last, odom))
@@ -226,8 +234,14 @@ def turn_odometry(
     if doubted or stuck or not here.fits:
         moved = geometry.compose(before, geometry.exp(step))
         return Turned(moved, twist, here)
+    # Wheels may err less than they claim: their scatter beside the gyro is what is seen of it.
+    seen_long = here.compared_s > SCATTER_KNOWN_S
+    rate_variance = min(rate_variance, here.scatter) if seen_long else rate_variance
     wheels_variance = rate_variance * seconds**2 + (here.slip * by_wheels) ** 2
-    here = _learn_bias(here, by_gyro, by_wheels, seconds, noise, wheels_variance, still)
+    if still or resting:
+        here = _learn_bias_at_rest(here, by_gyro, seconds, noise, still)
+    else:
+        here = _learn_bias(here, by_gyro - by_wheels, seconds, noise, wheels_variance)
     unbiased = by_gyro - here.bias * seconds
     spread = noise + here.bias_variance * seconds**2
     # What neither explains is slip: the gyro's noise and bias are known.
@@ -253,29 +267,48 @@ def _covers(gyro: Gyro, now_ns: int) -> bool:
 
 
 def _compare(gyro: Gyro, by_gyro: float, by_wheels: float, seconds: float) -> Gyro:
-    """Adds turns by both to what is known of how the wheels slip."""
+    """Adds turns by both to what is known of how the wheels slip and scatter."""
     kept = math.exp(-seconds / MEMORY_S)
+    difference = by_gyro - by_wheels
+    turning = abs(by_wheels) > TURNING_RADPS * seconds
+    news = 1.0 - kept if gyro.compared_s > 0.0 else 1.0
+    scatter = gyro.scatter
+    if not turning:
+        scatter += news * ((difference / seconds) ** 2 - gyro.scatter)
     return gyro._replace(
-        wheels_square=kept * gyro.wheels_square + by_wheels**2,
-        product=kept * gyro.product + by_wheels * by_gyro,
-        difference_square=kept * gyro.difference_square + (by_gyro - by_wheels) ** 2,
+        wheels_square=kept * gyro.wheels_square + turning * by_wheels**2,
+        product=kept * gyro.product + by_wheels * by_gyro * turning,
+        difference_square=kept * gyro.difference_square + turning * difference**2,
         wheels_turned=gyro.wheels_turned + abs(by_wheels),
+        scatter=max(scatter, LEAST_STD**2),
+        compared_s=gyro.compared_s + seconds,
     )
 
 
-def _learn_bias(
-    gyro: Gyro, by_gyro: float, by_wheels: float, seconds: float, noise: float,
-    wheels_variance: float, still: bool,
-) -> Gyro:  # fmt: skip
-    """Corrects the bias by how both turned: by much while the wheels stand, else by little."""
+def _learn_bias_at_rest(
+    gyro: Gyro, by_gyro: float, seconds: float, noise: float, still: bool
+) -> Gyro:
+    """Corrects the bias by how the gyro turned while the robot stood, to the tick or about so."""
+    per_second = LEAST_BIAS_STD**2 if still else ABOUT_RADPS**2 / seconds
     variance = gyro.bias_variance + BIAS_WALK**2 * seconds
-    apart = (by_gyro - by_wheels) / seconds - gyro.bias
-    if still:
-        measured = noise / seconds**2 + LEAST_BIAS_STD**2
-    else:
-        repeated = max(1.0, WRONG_FOR_S / seconds)
-        measured = noise / seconds**2 + repeated * wheels_variance / seconds**2
-    spread = variance + measured
+    return _with_bias(gyro, by_gyro / seconds, variance, noise / seconds**2 + per_second)
+
+
+def _learn_bias(
+    gyro: Gyro, difference: float, seconds: float, noise: float, wheels_variance: float
+) -> Gyro:
+    """Corrects the bias by how differently both turned [rad], by little, while the wheels roll."""
+    variance = gyro.bias_variance + BIAS_WALK**2 * seconds
+    if variance < WHEELS_BIAS**2:  # wheels of unequal size turn a robot so much, too
+        return gyro._replace(bias_variance=variance)
+    repeated = max(1.0, WRONG_FOR_S / seconds)
+    measured = noise / seconds**2 + repeated * wheels_variance / seconds**2
+    return _with_bias(gyro, difference / seconds, variance, measured)
+
+
+def _with_bias(gyro: Gyro, seen: float, variance: float, measured: float) -> Gyro:
+    """Corrects a bias by one that was seen, with a variance of `measured`."""
+    apart, spread = seen - gyro.bias, variance + measured
     if apart**2 > STANDING**2 * spread:
         return gyro._replace(bias_variance=variance)  # it was pushed, or its wheels spin
     gain = variance / spread

@@ -81,7 +81,7 @@ def _imu(bag: BagFile, topic: str) -> tuple[TopicData, UpAxis]:
     data = _table(bag, topic, msgs.imu_row, messages)
     if axis.is_usual:
         return data, axis
-    rates = [getattr(m.content.angular_velocity, AXES[axis.number]) for m in messages]
+    rates = [getattr(m.content.angular_velocity, AXES[axis.place]) for m in messages]
     values = data.values.copy()
     values[:, 2] = axis.sign * np.array(rates)
     return replace(data, values=values), axis

@@ -15,6 +15,7 @@ from nics_drl_bridge.geometry import Array
 BLOCK_S = 0.5  # length of the pieces in which both turns are compared
 WINDOW_S = 5.0  # over which the disagreement is told
 LONGEST_GAP_S = 0.25  # between two yaw rates that are joined
+LONGEST_PAUSE_S = 1.0  # between two poses of one drive
 FEWEST_BLOCKS = 6
 FEWEST_TO_DRIFT = 10
 STANDING_MPS = 0.005  # wheels that roll more slowly in a whole block are at rest
@@ -133,7 +134,9 @@ def turn_by_gyro(
     position = pose[0, :2] + np.concatenate([np.zeros((1, 2)), np.cumsum(shift, axis=0)])
     turned = np.concatenate([position, geometry.wrap_angle(heading)[:, None]], axis=1)
     span = np.diff(t)
-    return turned, float(span[covered].sum() / max(float(span.sum()), 1e-9))
+    driven = span < LONGEST_PAUSE_S  # between two recordings there is no drive
+    share = span[covered & driven].sum() / max(float(span[driven].sum()), 1e-9)
+    return turned, float(share)
 
 
 @dataclass(frozen=True)

@@ -15,13 +15,13 @@ REMEMBERED = 200  # messages over which the acceleration is averaged while a rob
 class UpAxis(NamedTuple):
     """The axis of an IMU that points up, or with the sign -1 down."""
 
-    number: int = 2  # 0, 1 and 2 are x, y and z
+    place: int = 2  # among x, y, z
     sign: float = 1.0
 
     @property
     def name(self) -> str:
         """The axis as in `-y`."""
-        return f"{'-' if self.sign < 0.0 else ''}{AXES[self.number]}"
+        return f"{'-' if self.sign < 0.0 else ''}{AXES[self.place]}"
 
     @property
     def is_usual(self) -> bool:
@@ -64,5 +64,5 @@ class GyroReader:
                 self._count
             )
         axis = up_axis_of(self._acceleration)
-        rate = axis.sign * float(getattr(message.angular_velocity, AXES[axis.number]))
-        return rate, float(covariance[4 * axis.number])
+        rate = axis.sign * float(getattr(message.angular_velocity, AXES[axis.place]))
+        return rate, float(covariance[4 * axis.place])

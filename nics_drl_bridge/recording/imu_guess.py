@@ -42,7 +42,7 @@ def _of_messages(tables: Sequence[TableSurvey]) -> Iterator[tuple[TableSurvey, S
     for table in tables:
         names = {column.name for column in table.columns}
         if {OF_MESSAGE, "linear_acceleration.x"} <= names:
-            wanted = f"angular_velocity.{AXES[_up_axis(table).number]}"
+            wanted = f"angular_velocity.{AXES[_up_axis(table).place]}"
             for column in table.numbers:
                 if column.name == wanted and column.low < column.high:
                     yield table, column

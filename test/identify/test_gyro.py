@@ -12,6 +12,7 @@ from nics_drl_bridge import geometry
 from nics_drl_bridge.identify.conclusion import conclude
 from nics_drl_bridge.identify.gyro import relative_to, turned_by_gyro
 from nics_drl_bridge.identify.identify import identify
+from nics_drl_bridge.identify.joined import join_recordings
 from nics_drl_bridge.identify.verdict import Mistake
 from nics_drl_bridge.recording.recording import Recording, Stream
 from nics_drl_bridge.robot.spec import robot_from
@@ -122,6 +123,18 @@ def test_poses_of_unknown_origin_are_not_turned_but_the_fix_is_told(slipping):
 def test_the_report_says_relative_to_what_the_error_is(slipping, measured_by, gyro, said):
     recording = turned_by_gyro(recorded(slipping, measured_by, gyro))
     assert said in relative_to(recording)
+
+
+def test_each_of_several_recordings_turns_by_its_own_bias():
+    drives = [
+        drive_skid_steer(np.random.default_rng(k), duration=40.0, bias=0.02 * k) for k in (1, 2)
+    ]
+    spec = robot_from(ROBOT, {"forward_command": (-0.2, 0.8), "turn_command": (-1.0, 1.0)})
+    joined = join_recordings([recorded(each) for each in drives], spec)
+    assert joined.gyro is not None
+    turned = np.diff(np.unwrap(joined.pose.values[:, 2]))
+    true = sum(float(np.abs(np.diff(each.truth[:, 2])).sum()) for each in drives)
+    assert float(np.abs(turned).sum()) == pytest.approx(true, rel=0.03)
 
 
 def heading_errors(model, drive, latency_s):
